@@ -1,0 +1,1 @@
+"""Robotic slicing simulated in Drake: robot, compliance control and finite-element cutting."""

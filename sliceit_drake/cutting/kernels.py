@@ -1,0 +1,640 @@
+"""Warp kernels of one sub-step: elements, cut points, nodes, blade; and the energy of a state.
+
+One source for CPU and GPU, single and double precision: `kernels(real)` builds the set for a scalar
+type. Elements are handled eight a thread with eight-wide vectors, which halves their cost on a CPU.
+All vectors are in the frame C of the cut: x along the edge, y normal to the cut, z up.
+"""
+
+import functools
+import types
+from typing import Any
+
+import warp as wp
+
+__all__ = ["ACCUMULATED", "LANES", "PARAMETERS", "kernels"]
+
+LANES = 8
+
+PARAMETERS = (
+    "mu",
+    "lam",
+    "damping_time",
+    "bond_stiffness",
+    "strength",
+    "flank_stiffness",
+    "friction",
+    "static_friction",
+    "stribeck_velocity",
+    "unloading_length",
+    "board_stiffness",
+    "board_friction",
+    "blade_stiffness",
+    "blade_damping",
+)
+"""Scalars that the kernels read, in the order of their array."""
+
+ACCUMULATED = 22
+"""Sums kept for each cut point over an exchange, see `make.points`."""
+
+_INDEX = {name: k for k, name in enumerate(PARAMETERS)}
+
+
+@functools.cache
+def kernels(real: Any) -> types.SimpleNamespace:
+    """The kernels for `real` = wp.float32 or wp.float64."""
+    vec2 = wp.types.vector(2, real)
+    vec3 = wp.types.vector(3, real)
+    mat33 = wp.types.matrix((3, 3), real)
+    lanes = wp.types.vector(LANES, real)
+
+    MU = wp.constant(_INDEX["mu"])
+    LAM = wp.constant(_INDEX["lam"])
+    DAMPING_TIME = wp.constant(_INDEX["damping_time"])
+    BOND_STIFFNESS = wp.constant(_INDEX["bond_stiffness"])
+    STRENGTH = wp.constant(_INDEX["strength"])
+    FLANK_STIFFNESS = wp.constant(_INDEX["flank_stiffness"])
+    FRICTION = wp.constant(_INDEX["friction"])
+    STATIC_FRICTION = wp.constant(_INDEX["static_friction"])
+    STRIBECK_VELOCITY = wp.constant(_INDEX["stribeck_velocity"])
+    UNLOADING_LENGTH = wp.constant(_INDEX["unloading_length"])
+    BOARD_STIFFNESS = wp.constant(_INDEX["board_stiffness"])
+    BOARD_FRICTION = wp.constant(_INDEX["board_friction"])
+    BLADE_STIFFNESS = wp.constant(_INDEX["blade_stiffness"])
+    BLADE_DAMPING = wp.constant(_INDEX["blade_damping"])
+    TINY = wp.constant(real(1.0e-20))
+
+    @wp.func
+    def dot8(
+        ax: lanes, ay: lanes, az: lanes, bx: lanes, by: lanes, bz: lanes
+    ):
+        return wp.cw_mul(ax, bx) + wp.cw_mul(ay, by) + wp.cw_mul(az, bz)
+
+    @wp.func
+    def cross8(ax: lanes, ay: lanes, az: lanes, bx: lanes, by: lanes, bz: lanes):
+        return (
+            wp.cw_mul(ay, bz) - wp.cw_mul(az, by),
+            wp.cw_mul(az, bx) - wp.cw_mul(ax, bz),
+            wp.cw_mul(ax, by) - wp.cw_mul(ay, bx),
+        )
+
+    @wp.func
+    def corner8(
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        nodes: wp.array2d(dtype=wp.int32),
+        block: wp.int32,
+        corner: wp.int32,
+        tau: real,
+    ):
+        a = lanes()
+        b = lanes()
+        c = lanes()
+        for lane in range(LANES):
+            node = nodes[block, corner * LANES + lane]
+            p = x[node] + tau * v[node]
+            a[lane] = p[0]
+            b[lane] = p[1]
+            c[lane] = p[2]
+        return a, b, c
+
+    @wp.func
+    def column8(
+        ax: lanes, bx: lanes, cx: lanes, block: wp.int32, k: wp.int32, shape: wp.array2d(dtype=lanes)
+    ):
+        """Row of F: edges (ax, bx, cx) times column k of the inverse rest edges."""
+        return dot8(ax, bx, cx, shape[block, k], shape[block, 3 + k], shape[block, 6 + k])
+
+    @wp.kernel(enable_backward=True)
+    def elements(
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        nodes: wp.array2d(dtype=wp.int32),
+        shape: wp.array2d(dtype=lanes),
+        P: wp.array(dtype=real),
+        force: wp.array2d(dtype=lanes),
+    ):
+        """Nodal forces of eight elements: minus the gradient of the energy at x + tau v.
+
+        Evaluating at x + tau v is Kelvin-Voigt damping with viscosity tau times the tangent stiffness;
+        invariant under translation, and under rotation to second order in tau times its rate.
+        """
+        block = wp.tid()
+        mu = P[MU]
+        lam = P[LAM]
+        tau = P[DAMPING_TIME]
+        ox, oy, oz = corner8(x, v, nodes, block, 0, tau)
+        ax, ay, az = corner8(x, v, nodes, block, 1, tau)
+        bx, by, bz = corner8(x, v, nodes, block, 2, tau)
+        cx, cy, cz = corner8(x, v, nodes, block, 3, tau)
+        ax -= ox
+        ay -= oy
+        az -= oz
+        bx -= ox
+        by -= oy
+        bz -= oz
+        cx -= ox
+        cy -= oy
+        cz -= oz
+        f00 = column8(ax, bx, cx, block, 0, shape)
+        f10 = column8(ay, by, cy, block, 0, shape)
+        f20 = column8(az, bz, cz, block, 0, shape)
+        f01 = column8(ax, bx, cx, block, 1, shape)
+        f11 = column8(ay, by, cy, block, 1, shape)
+        f21 = column8(az, bz, cz, block, 1, shape)
+        f02 = column8(ax, bx, cx, block, 2, shape)
+        f12 = column8(ay, by, cy, block, 2, shape)
+        f22 = column8(az, bz, cz, block, 2, shape)
+        d00, d10, d20 = cross8(f01, f11, f21, f02, f12, f22)
+        d01, d11, d21 = cross8(f02, f12, f22, f00, f10, f20)
+        d02, d12, d22 = cross8(f00, f10, f20, f01, f11, f21)
+        J = dot8(f00, f10, f20, d00, d10, d20)
+        Ic = (
+            dot8(f00, f10, f20, f00, f10, f20)
+            + dot8(f01, f11, f21, f01, f11, f21)
+            + dot8(f02, f12, f22, f02, f12, f22)
+        )
+        one = lanes(real(1.0))
+        weight = shape[block, 9]
+        s = wp.cw_mul(weight, (one - wp.cw_div(one, Ic + one)) * mu)
+        p = wp.cw_mul(weight, J * lam - one * (lam + real(0.75) * mu))
+        p00 = wp.cw_mul(s, f00) + wp.cw_mul(p, d00)
+        p10 = wp.cw_mul(s, f10) + wp.cw_mul(p, d10)
+        p20 = wp.cw_mul(s, f20) + wp.cw_mul(p, d20)
+        p01 = wp.cw_mul(s, f01) + wp.cw_mul(p, d01)
+        p11 = wp.cw_mul(s, f11) + wp.cw_mul(p, d11)
+        p21 = wp.cw_mul(s, f21) + wp.cw_mul(p, d21)
+        p02 = wp.cw_mul(s, f02) + wp.cw_mul(p, d02)
+        p12 = wp.cw_mul(s, f12) + wp.cw_mul(p, d12)
+        p22 = wp.cw_mul(s, f22) + wp.cw_mul(p, d22)
+        hx = lanes()
+        hy = lanes()
+        hz = lanes()
+        for k in range(3):
+            m0 = shape[block, 3 * k]
+            m1 = shape[block, 3 * k + 1]
+            m2 = shape[block, 3 * k + 2]
+            gx = dot8(p00, p01, p02, m0, m1, m2)
+            gy = dot8(p10, p11, p12, m0, m1, m2)
+            gz = dot8(p20, p21, p22, m0, m1, m2)
+            force[block, 3 * k + 3] = gx
+            force[block, 3 * k + 4] = gy
+            force[block, 3 * k + 5] = gz
+            hx += gx
+            hy += gy
+            hz += gz
+        force[block, 0] = -hx
+        force[block, 1] = -hy
+        force[block, 2] = -hz
+
+    @wp.kernel(enable_backward=False)
+    def element_energy(
+        x: wp.array(dtype=vec3),
+        nodes: wp.array2d(dtype=wp.int32),
+        shape: wp.array2d(dtype=lanes),
+        P: wp.array(dtype=real),
+        energy: wp.array2d(dtype=real),
+        volume_ratio: wp.array2d(dtype=real),
+    ):
+        """Elastic energy and volume ratio J of each element."""
+        block, lane = wp.tid()
+        mu = P[MU]
+        lam = P[LAM]
+        o = x[nodes[block, lane]]
+        a = x[nodes[block, LANES + lane]] - o
+        b = x[nodes[block, 2 * LANES + lane]] - o
+        c = x[nodes[block, 3 * LANES + lane]] - o
+        M = mat33()
+        for k in range(9):
+            M[k // 3, k % 3] = shape[block, k][lane]
+        F = wp.matrix_from_cols(a, b, c) * M
+        Ic = wp.ddot(F, F)
+        J = wp.determinant(F)
+        alpha = real(1.0) + real(0.75) * mu / lam
+        psi = real(0.5) * (
+            mu * (Ic - real(3.0))
+            + lam * ((J - alpha) * (J - alpha) - (real(1.0) - alpha) * (real(1.0) - alpha))
+            - mu * wp.log(real(0.25) * (Ic + real(1.0)))
+        )
+        energy[block, lane] = -shape[block, 9][lane] * psi
+        volume_ratio[block, lane] = J
+
+    @wp.func
+    def table(values: wp.array2d(dtype=real), row: wp.int32, u: real):
+        last = values.shape[1] - 2
+        k = wp.clamp(wp.int32(wp.floor(u)), 0, last)
+        w = wp.clamp(u - real(k), real(0.0), real(1.0))
+        return values[row, k] * (real(1.0) - w) + values[row, k + 1] * w
+
+    @wp.func
+    def intact_share(parted: real, onset: real, failure: real):
+        """Secant over initial stiffness of a bilinear bond that spent the share `parted`."""
+        share = real(0.0)
+        if failure > onset:
+            share = onset * (real(1.0) - parted) / (onset + parted * (failure - onset))
+        return share
+
+    @wp.func
+    def wedge(y: real, height: real, knife: wp.array(dtype=real)):
+        """Distance to one side of the section and its gradient (y, height).
+
+        The side is known, so the section is the half of the knife that is convex and unbounded
+        towards the other side: a point that crossed the middle plane is still pushed back.
+        """
+        y0 = knife[0]
+        h0 = knife[1]
+        y1 = knife[2]
+        h1 = knife[3]
+        y2 = knife[4]
+        h2 = knife[5]
+        b = wp.normalize(vec2(h1 - h0, y0 - y1))
+        f = wp.normalize(vec2(h2 - h1, y1 - y2))
+        bevel = b[0] * (y - y0) + b[1] * (height - h0)
+        flank = f[0] * (y - y1) + f[1] * (height - h1)
+        spine = height - h2
+        phi = flank
+        n = f
+        if bevel > phi:
+            phi = bevel
+            n = b
+        if spine > phi:
+            phi = spine
+            n = vec2(real(0.0), real(1.0))
+        return phi - knife[6], n
+
+    @wp.func
+    def slide(slip: vec3, step: vec3, stiffness: real, limit: real):
+        """Coulomb friction with an elastic anchor, returned to the limit.
+
+        Args: slip from the anchor so far, its increment, tangential stiffness, largest force.
+        Returns: new slip, force on the slipping body, dissipated energy (never negative).
+        """
+        trial = slip + step
+        length = wp.length(trial)
+        reach = limit / wp.max(stiffness, TINY)
+        dissipated = real(0.0)
+        if length > reach:
+            trial = trial * (reach / length)
+            dissipated = limit * (length - reach)
+        return trial, -stiffness * trial, dissipated
+
+    @wp.func
+    def flank_contact(
+        p: vec3,
+        v: vec3,
+        side: real,
+        R: mat33,
+        origin: vec3,
+        velocity: vec3,
+        rotation_rate: vec3,
+        bend: real,
+        area: real,
+        shrink: real,
+        slip: vec3,
+        dt: real,
+        P: wp.array(dtype=real),
+        knife: wp.array(dtype=real),
+    ):
+        """Flank pressure and friction on one face of the cut.
+
+        Returns: normal force, friction force on the food, new slip, dissipation, depth.
+        """
+        arm = p - origin
+        r = wp.transpose(R) * arm
+        normal_force = vec3()
+        friction_force = vec3()
+        new_slip = vec3()
+        dissipated = real(0.0)
+        depth = real(0.0)
+        if wp.abs(r[0]) < knife[7]:
+            # Ky points to the minus side when the knife hangs upside down in C.
+            facing = side
+            if R[1, 1] < real(0.0):
+                facing = -side
+            height = wp.max(-r[2], real(0.0))
+            phi, n2 = wedge(facing * (r[1] - bend), height, knife)
+            if phi < real(0.0) and area > real(0.0):
+                depth = -phi
+                n = R * vec3(real(0.0), facing * n2[0], -n2[1])
+                N = P[FLANK_STIFFNESS] * area * depth
+                normal_force = N * n
+                relative = v - velocity - wp.cross(rotation_rate, arm)
+                sliding = relative - wp.dot(relative, n) * n
+                mu = P[FRICTION]
+                extra = P[STATIC_FRICTION] - mu
+                if extra > real(0.0):
+                    mu += extra * wp.exp(-wp.length(sliding) / P[STRIBECK_VELOCITY])
+                old = slip * shrink
+                old = old - wp.dot(old, n) * n
+                new_slip, friction_force, dissipated = slide(
+                    old, sliding * dt, P[FLANK_STIFFNESS] * area, mu * N
+                )
+        return normal_force, friction_force, new_slip, dissipated, depth
+
+    @wp.kernel(enable_backward=True)
+    def points(
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        nodes: wp.array2d(dtype=wp.int32),
+        weights: wp.array(dtype=vec2),
+        area: wp.array(dtype=real),
+        toughness: wp.array(dtype=real),
+        width: wp.array2d(dtype=real),
+        fraction: wp.array2d(dtype=real),
+        widest: wp.array(dtype=real),
+        reach: real,
+        per_spacing: real,
+        P: wp.array(dtype=real),
+        knife: wp.array(dtype=real),
+        k: wp.int32,
+        dt: real,
+        R_CK: wp.array(dtype=mat33),
+        p_CK: wp.array(dtype=vec3),
+        v_CK: wp.array(dtype=vec3),
+        w_CK: wp.array(dtype=vec3),
+        direction: wp.array(dtype=vec3),
+        blade: wp.array(dtype=real),
+        passed: wp.array(dtype=real),
+        parted: wp.array(dtype=real),
+        slip: wp.array2d(dtype=vec3),
+        force: wp.array2d(dtype=vec3),
+        lateral: wp.array(dtype=vec2),
+        total: wp.array2d(dtype=real),
+    ):
+        """Edge, opening, self contact, flank contact and friction at each cut point.
+
+        Advances the history: `passed`, the largest depth of the edge below the point; `parted`, the
+        share of the surface energy spent by opening; `slip`, from the friction anchors. Adds to
+        `total`: forces on the knife by edge, flank pressure, friction [0:9], their moments about Ko
+        [9:18], and energies: dissipated by the edge 18, by opening 19, by friction 20, released or
+        taken up when the cut fraction grows 21.
+        """
+        i = wp.tid()
+        w = weights[i]
+        xm = x[nodes[i, 0]] * w[0] + x[nodes[i, 1]] * w[1]
+        xp = x[nodes[i, 2]] * w[0] + x[nodes[i, 3]] * w[1]
+        vm = v[nodes[i, 0]] * w[0] + v[nodes[i, 1]] * w[1]
+        vp = v[nodes[i, 2]] * w[0] + v[nodes[i, 3]] * w[1]
+        middle = real(0.5) * (xm + xp)
+        R = R_CK[k]
+        origin = p_CK[k]
+        knife_x = vec3(R[0, 0], R[1, 0], R[2, 0])
+        knife_z = vec3(R[0, 2], R[1, 2], R[2, 2])
+        arm = middle - origin
+        A = area[i]
+        toughness_i = toughness[i]
+        old_passed = passed[i]
+        s = old_passed
+        if wp.abs(wp.dot(arm, knife_x)) < knife[7]:
+            s = -wp.dot(arm, knife_z)
+        new_passed = wp.max(old_passed, s)
+        passed[i] = new_passed
+        u0 = (old_passed + reach) * per_spacing
+        u1 = (new_passed + reach) * per_spacing
+        D0 = table(fraction, i, u0)
+        D = table(fraction, i, u1)
+
+        # Bonds of the part that is not cut; its faces may also press on each other.
+        gap = xp - xm
+        opening = vec3(gap[0], wp.max(gap[1], real(0.0)), gap[2])
+        length = wp.length(opening)
+        bond = P[BOND_STIFFNESS]
+        onset = P[STRENGTH] / bond
+        failure = real(2.0) * toughness_i / P[STRENGTH]
+        old_parted = parted[i]
+        new_parted = wp.max(
+            old_parted,
+            wp.clamp((length - onset) / wp.max(failure - onset, TINY), real(0.0), real(1.0)),
+        )
+        parted[i] = new_parted
+        intact = intact_share(new_parted, onset, failure)
+        stiffness = bond * A * (real(1.0) - D) * intact
+        closing = bond * A * wp.min(gap[1], real(0.0))
+        pull = stiffness * opening + vec3(real(0.0), closing, real(0.0))
+        opening_loss = toughness_i * A * (real(1.0) - D) * (new_parted - old_parted)
+        released = real(0.5) * bond * A * intact * length * length * (D - D0)
+
+        # Edge: toughness times the width carried, unloading elastically when the edge retreats.
+        left = toughness_i * (real(1.0) - new_parted)
+        q0 = left * table(width, i, u0)
+        q1 = left * table(width, i, u1)
+        unloading = toughness_i * widest[i] / P[UNLOADING_LENGTH]
+        q = wp.max(q1 - unloading * (new_passed - s), real(0.0))
+        d = direction[k]
+        edge = q * wp.max(wp.dot(d, knife_z), real(0.0)) * d
+        edge_loss = real(0.5) * (q0 + q1) * (new_passed - old_passed)
+        if unloading > real(0.0):
+            edge_loss -= real(0.5) * (q1 * q1 - q0 * q0) / unloading
+
+        # Flanks on the part that is cut.
+        bend = blade[0]
+        shrink = real(1.0)
+        if D > real(0.0):
+            shrink = D0 / D
+        normal_m, friction_m, slip_m, loss_m, depth_m = flank_contact(
+            xm, vm, real(-1.0), R, origin, v_CK[k], w_CK[k], bend, A * D, shrink, slip[i, 0], dt, P, knife
+        )
+        normal_p, friction_p, slip_p, loss_p, depth_p = flank_contact(
+            xp, vp, real(1.0), R, origin, v_CK[k], w_CK[k], bend, A * D, shrink, slip[i, 1], dt, P, knife
+        )
+        slip[i, 0] = slip_m
+        slip[i, 1] = slip_p
+        released -= (
+            real(0.5)
+            * P[FLANK_STIFFNESS]
+            * A
+            * (D - D0)
+            * (depth_m * depth_m + depth_p * depth_p)
+        )
+
+        force[i, 0] = pull + real(0.5) * edge + normal_m + friction_m
+        force[i, 1] = -pull + real(0.5) * edge + normal_p + friction_p
+
+        touching = real(0.0)
+        if depth_m > real(0.0):
+            touching += real(1.0)
+        if depth_p > real(0.0):
+            touching += real(1.0)
+        knife_y = vec3(R[0, 1], R[1, 1], R[2, 1])
+        lateral[i] = vec2(
+            -wp.dot(normal_m + normal_p + friction_m + friction_p, knife_y),
+            P[FLANK_STIFFNESS] * A * D * touching,
+        )
+
+        edge_moment = wp.cross(arm, edge)
+        normal_moment = wp.cross(xm - origin, normal_m) + wp.cross(xp - origin, normal_p)
+        friction_moment = wp.cross(xm - origin, friction_m) + wp.cross(xp - origin, friction_p)
+        normal = normal_m + normal_p
+        friction = friction_m + friction_p
+        for c in range(3):
+            total[i, c] = total[i, c] - edge[c]
+            total[i, 3 + c] = total[i, 3 + c] - normal[c]
+            total[i, 6 + c] = total[i, 6 + c] - friction[c]
+            total[i, 9 + c] = total[i, 9 + c] - edge_moment[c]
+            total[i, 12 + c] = total[i, 12 + c] - normal_moment[c]
+            total[i, 15 + c] = total[i, 15 + c] - friction_moment[c]
+        total[i, 18] = total[i, 18] + edge_loss
+        total[i, 19] = total[i, 19] + opening_loss
+        total[i, 20] = total[i, 20] + loss_m + loss_p
+        total[i, 21] = total[i, 21] + released
+
+    @wp.kernel(enable_backward=True)
+    def move_nodes(
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        moving: wp.array(dtype=wp.int32),
+        element_force: wp.array(dtype=real),
+        element_start: wp.array(dtype=wp.int32),
+        element_entry: wp.array(dtype=wp.int32),
+        point_force: wp.array(dtype=vec3),
+        point_start: wp.array(dtype=wp.int32),
+        point_entry: wp.array(dtype=wp.int32),
+        point_weight: wp.array(dtype=real),
+        inverse_mass: wp.array(dtype=real),
+        weight: wp.array(dtype=vec3),
+        board_area: wp.array(dtype=real),
+        board: wp.array(dtype=real),
+        P: wp.array(dtype=real),
+        dt: real,
+        board_slip: wp.array(dtype=vec3),
+        board_force: wp.array(dtype=vec3),
+        board_loss: wp.array(dtype=real),
+        internal_work: wp.array(dtype=real),
+        x_next: wp.array(dtype=vec3),
+        v_next: wp.array(dtype=vec3),
+    ):
+        """Gathers the forces of each moving node and steps it, semi-implicit Euler."""
+        i = moving[wp.tid()]
+        fx = real(0.0)
+        fy = real(0.0)
+        fz = real(0.0)
+        for e in range(element_start[i], element_start[i + 1]):
+            entry = element_entry[e]
+            fx += element_force[entry]
+            fy += element_force[entry + LANES]
+            fz += element_force[entry + 2 * LANES]
+        internal = vec3(fx, fy, fz)
+        f = internal + weight[i]
+        for e in range(point_start[i], point_start[i + 1]):
+            f += point_force[point_entry[e]] * point_weight[e]
+        xi = x[i]
+        vi = v[i]
+        if board_area[i] > real(0.0):
+            n = vec3(board[0], board[1], board[2])
+            depth = board[3] - wp.dot(n, xi)
+            slip = vec3()
+            if depth > real(0.0):
+                stiffness = P[BOARD_STIFFNESS] * board_area[i]
+                sliding = (vi - wp.dot(vi, n) * n) * dt
+                slip, friction, lost = slide(
+                    board_slip[i], sliding, stiffness, P[BOARD_FRICTION] * stiffness * depth
+                )
+                on_food = stiffness * depth * n + friction
+                f += on_food
+                board_force[i] = board_force[i] + on_food
+                board_loss[i] = board_loss[i] + lost
+            board_slip[i] = slip
+        v1 = vi + f * (inverse_mass[i] * dt)
+        internal_work[i] = internal_work[i] + wp.dot(internal, v1) * dt
+        v_next[i] = v1
+        x_next[i] = xi + v1 * dt
+
+    @wp.kernel(enable_backward=True)
+    def bend_blade(
+        lateral: wp.array(dtype=vec2), P: wp.array(dtype=real), dt: real, blade: wp.array(dtype=real)
+    ):
+        """Massless damped blade in series with the flanks, implicit in the flank stiffness."""
+        F = real(0.0)
+        K = real(0.0)
+        for i in range(lateral.shape[0]):
+            F += lateral[i][0]
+            K += lateral[i][1]
+        b = blade[0]
+        blade[0] = b + dt * (F - P[BLADE_STIFFNESS] * b) / (
+            P[BLADE_DAMPING] + dt * (P[BLADE_STIFFNESS] + K)
+        )
+
+    @wp.kernel(enable_backward=False)
+    def point_energy(
+        x: wp.array(dtype=vec3),
+        nodes: wp.array2d(dtype=wp.int32),
+        weights: wp.array(dtype=vec2),
+        area: wp.array(dtype=real),
+        toughness: wp.array(dtype=real),
+        width: wp.array2d(dtype=real),
+        fraction: wp.array2d(dtype=real),
+        widest: wp.array(dtype=real),
+        reach: real,
+        per_spacing: real,
+        P: wp.array(dtype=real),
+        knife: wp.array(dtype=real),
+        R_CK: wp.array(dtype=mat33),
+        p_CK: wp.array(dtype=vec3),
+        k: wp.int32,
+        blade: wp.array(dtype=real),
+        passed: wp.array(dtype=real),
+        parted: wp.array(dtype=real),
+        slip: wp.array2d(dtype=vec3),
+        energy: wp.array(dtype=real),
+        cut: wp.array(dtype=real),
+    ):
+        """Recoverable energy of each cut point and its cut fraction."""
+        i = wp.tid()
+        w = weights[i]
+        xm = x[nodes[i, 0]] * w[0] + x[nodes[i, 1]] * w[1]
+        xp = x[nodes[i, 2]] * w[0] + x[nodes[i, 3]] * w[1]
+        R = R_CK[k]
+        A = area[i]
+        u = (passed[i] + reach) * per_spacing
+        D = table(fraction, i, u)
+        gap = xp - xm
+        bond = P[BOND_STIFFNESS]
+        onset = P[STRENGTH] / bond
+        failure = real(2.0) * toughness[i] / P[STRENGTH]
+        intact = intact_share(parted[i], onset, failure)
+        opening = vec3(gap[0], wp.max(gap[1], real(0.0)), gap[2])
+        closing = wp.min(gap[1], real(0.0))
+        doubled = bond * A * (
+            (real(1.0) - D) * intact * wp.dot(opening, opening) + closing * closing
+        )
+        knife_x = vec3(R[0, 0], R[1, 0], R[2, 0])
+        knife_z = vec3(R[0, 2], R[1, 2], R[2, 2])
+        arm = real(0.5) * (xm + xp) - p_CK[k]
+        s = passed[i]
+        if wp.abs(wp.dot(arm, knife_x)) < knife[7]:
+            s = -wp.dot(arm, knife_z)
+        unloading = toughness[i] * widest[i] / P[UNLOADING_LENGTH]
+        if unloading > real(0.0):
+            q = toughness[i] * (real(1.0) - parted[i]) * table(width, i, u)
+            q = wp.max(q - unloading * wp.max(passed[i] - s, real(0.0)), real(0.0))
+            doubled += q * q / unloading
+        facing = real(1.0)
+        if R[1, 1] < real(0.0):
+            facing = real(-1.0)
+        for side in range(2):
+            p = xm
+            sign = -facing
+            if side == 1:
+                p = xp
+                sign = facing
+            r = wp.transpose(R) * (p - p_CK[k])
+            if wp.abs(r[0]) < knife[7]:
+                phi, _n = wedge(sign * (r[1] - blade[0]), wp.max(-r[2], real(0.0)), knife)
+                if phi < real(0.0):
+                    held = slip[i, side]
+                    doubled += P[FLANK_STIFFNESS] * A * D * (phi * phi + wp.dot(held, held))
+        energy[i] = real(0.5) * doubled
+        cut[i] = D
+
+    return types.SimpleNamespace(
+        real=real,
+        vec2=vec2,
+        vec3=vec3,
+        mat33=mat33,
+        lanes=lanes,
+        elements=elements,
+        element_energy=element_energy,
+        points=points,
+        move_nodes=move_nodes,
+        bend_blade=bend_blade,
+        point_energy=point_energy,
+    )

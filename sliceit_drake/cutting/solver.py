@@ -1,0 +1,501 @@
+"""Advances the food through one exchange: captured Warp graphs on a workspace, state in NumPy."""
+
+import dataclasses as dc
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from sliceit_drake.cutting.kernels import ACCUMULATED, LANES, PARAMETERS, kernels
+from sliceit_drake.cutting.model import CuttingModel, TimeStepError
+
+__all__ = ["CuttingError", "CuttingSolver", "Energies", "Exchange"]
+
+
+class CuttingError(RuntimeError):
+    """The cut became unphysical; the message names time, element and cause."""
+
+
+@dc.dataclass
+class Exchange:
+    """What one exchange gives. Wrenches act on the knife, at Ko at the end of the exchange, in C.
+
+    Attributes:
+        state: The food's new state.
+        wrench: Mean moment about Ko and force [6], Nm and N.
+        edge, normal, friction: The same, by mechanism; they sum to `wrench`.
+        work: Work done by the knife on the food, J.
+        edge_dissipation, opening_dissipation, friction_dissipation: J, each never negative.
+        released: Energy of bonds and contacts taken up by the growth of the cut, J.
+        internal_work: Work of the bulk's forces (elastic and damping) on the nodes, J.
+        board_force: Mean force of the board on the food [3], N.
+        board_dissipation: Friction of the food on the board, J.
+        gravity_work: Work of the weight, J.
+    """
+
+    state: np.ndarray
+    wrench: np.ndarray
+    edge: np.ndarray
+    normal: np.ndarray
+    friction: np.ndarray
+    work: float
+    edge_dissipation: float
+    opening_dissipation: float
+    friction_dissipation: float
+    released: float
+    internal_work: float
+    board_force: np.ndarray
+    board_dissipation: float
+    gravity_work: float
+
+
+@dc.dataclass
+class Energies:
+    """Energies of a state, J.
+
+    Attributes:
+        elastic: Of the bulk.
+        interface: Of bonds, contacts, friction anchors and the edge's unloading.
+        kinetic: Of the stepped (scaled) mass.
+        true_kinetic: Of the true mass.
+        least_volume_ratio: Smallest J of all elements.
+        least_element: Its element.
+        cut: Share of the section that is cut.
+    """
+
+    elastic: float
+    interface: float
+    kinetic: float
+    true_kinetic: float
+    least_volume_ratio: float
+    least_element: int
+    cut: float
+
+
+@dc.dataclass
+class Pose:
+    """A pose of the knife in C: rotation [3, 3] and position [3], metres."""
+
+    rotation: np.ndarray
+    position: np.ndarray
+
+
+class CuttingSolver:
+    """Steps the state of one `CuttingModel`.
+
+    The state is one contiguous array [state_size]: positions, velocities, history of the cut points,
+    friction anchors, blade deflection, direction of cutting. A call copies it into the workspace that
+    the captured graph is bound to and copies the result out; nothing is carried between calls.
+
+    Args:
+        model: The cut.
+        exchange_period: Duration of one `exchange`, s; the time step must divide it.
+
+    Raises:
+        TimeStepError: The time step does not divide the exchange period.
+    """
+
+    def __init__(self, model: CuttingModel, exchange_period: float) -> None:
+        self.model = model
+        self.exchange_period = exchange_period
+        dt = model.numerics.time_step
+        self.substeps = max(1, round(exchange_period / dt))
+        if abs(self.substeps * dt - exchange_period) > 1e-6 * exchange_period:
+            raise TimeStepError(
+                f"numerics.time_step = {dt:g} s does not divide the exchange period "
+                f"{exchange_period:g} s. Give {exchange_period / self.substeps:g}."
+            )
+        self.real = wp.float32 if model.numerics.precision == "float32" else wp.float64
+        self.dtype = np.float32 if model.numerics.precision == "float32" else np.float64
+        self._kernels = kernels(self.real)
+        self._device = wp.get_device(model.numerics.device)
+        self._lock = threading.Lock()
+        self._graph: Any = None
+        self._build()
+
+    def _array(self, values: np.ndarray, dtype: Any) -> wp.array:
+        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self._device)
+
+    def _build(self) -> None:
+        m, k = self.model, self._kernels
+        N, P, n = len(m.nodes), len(m.point_nodes), self.substeps
+        real, vec3 = k.real, k.vec3
+
+        fields = [
+            ("x", N, vec3, 3),
+            ("v", N, vec3, 3),
+            ("passed", P, real, 1),
+            ("parted", P, real, 1),
+            ("slip", 2 * P, vec3, 3),
+            ("board_slip", N, vec3, 3),
+            ("blade", 1, real, 1),
+        ]
+        self._layout, offset = {}, 0
+        for name, count, _, width in fields:
+            self._layout[name] = slice(offset, offset + count * width)
+            offset += count * width
+        self._layout["direction"] = slice(offset, offset + 3)
+        self.state_size = offset + 3
+        self._state = wp.zeros(offset, dtype=real, device=self._device)
+        self._w = {
+            name: self._view(self._state, self._layout[name].start, dtype, count)
+            for name, count, dtype, _ in fields
+        }
+        self._w["slip"] = self._w["slip"].reshape((P, 2))
+
+        motion = [("R_CK", k.mat33, 9), ("p_CK", vec3, 3), ("v_CK", vec3, 3), ("w_CK", vec3, 3)]
+        motion.append(("direction", vec3, 3))
+        self._motion = wp.zeros(n * sum(w for _, _, w in motion), dtype=real, device=self._device)
+        start = 0
+        for name, dtype, width in motion:
+            self._w[name] = self._view(self._motion, start, dtype, n)
+            start += n * width
+
+        B = len(m.blocks)
+        self._force = wp.zeros(B * 12 * LANES, dtype=real, device=self._device)
+        self._w["element_force"] = self._view(self._force, 0, k.lanes, B * 12).reshape((B, 12))
+        # Sums over an exchange, contiguous so that one call clears and one call reads them.
+        sums = [
+            ("total", P * ACCUMULATED, real, 1),
+            ("board_force", N, vec3, 3),
+            ("board_loss", N, real, 1),
+            ("internal_work", N, real, 1),
+        ]
+        self._sums = wp.zeros(sum(c * w for _, c, _, w in sums), dtype=real, device=self._device)
+        start = 0
+        self._sum_layout = {}
+        for name, count, dtype, width in sums:
+            self._w[name] = self._view(self._sums, start, dtype, count)
+            self._sum_layout[name] = slice(start, start + count * width)
+            start += count * width
+        self._w["total"] = self._w["total"].reshape((P, ACCUMULATED))
+
+        self._w["point_force"] = wp.zeros((P, 2), dtype=vec3, device=self._device)
+        self._w["lateral"] = wp.zeros(P, dtype=k.vec2, device=self._device)
+        self._w["energy"] = wp.zeros((B, LANES), dtype=real, device=self._device)
+        self._w["volume_ratio"] = wp.zeros((B, LANES), dtype=real, device=self._device)
+        self._w["point_energy"] = wp.zeros(P, dtype=real, device=self._device)
+        self._w["cut"] = wp.zeros(P, dtype=real, device=self._device)
+
+        inverse_mass = np.zeros(N)
+        inverse_mass[m.moving] = 1.0 / m.mass[m.moving]
+        element_start, element_entry = _element_gather(m.blocks, m.element_count, N)
+        point_start, point_entry, point_weight = _point_gather(m.point_nodes, m.point_weights, N)
+        arrays: dict[str, tuple[np.ndarray, Any]] = {
+            "nodes": (m.blocks.astype(np.int32), wp.int32),
+            "moving": (m.moving.astype(np.int32), wp.int32),
+            "element_start": (element_start, wp.int32),
+            "element_entry": (element_entry, wp.int32),
+            "point_start": (point_start, wp.int32),
+            "point_entry": (point_entry, wp.int32),
+            "point_weight": (point_weight, real),
+            "inverse_mass": (inverse_mass, real),
+            "weight": (m.weight, vec3),
+            "board_area": (m.board_area, real),
+            "board": (m.board, real),
+            "point_nodes": (m.point_nodes.astype(np.int32), wp.int32),
+            "point_weights": (m.point_weights, k.vec2),
+            "area": (m.tables.area, real),
+            "toughness": (m.toughness, real),
+            "width": (m.tables.width, real),
+            "fraction": (m.tables.fraction, real),
+            "widest": (m.tables.width.max(1), real),
+            "P": (np.array([m.parameters[name] for name in PARAMETERS]), real),
+            "knife": (m.knife.parameters(), real),
+        }
+        for name, (values, dtype) in arrays.items():
+            self._w[name] = self._array(values, dtype)
+        # Rows of `shape` are eight-wide vectors.
+        self._w["shape"] = self._array(m.shape, k.lanes)
+        weighted = np.average(m.split.points, axis=0, weights=m.tables.area)
+        self._centre = weighted
+
+    def _view(self, base: wp.array, start: int, dtype: Any, count: int) -> wp.array:
+        return wp.array(
+            ptr=base.ptr + start * np.dtype(self.dtype).itemsize,
+            dtype=dtype,
+            shape=(count,),
+            device=self._device,
+        )
+
+    def initial_state(self) -> np.ndarray:
+        """The food at rest [state_size]; the direction of cutting points down."""
+        state = np.zeros(self.state_size, self.dtype)
+        state[self._layout["x"]] = self.model.nodes.ravel()
+        state[self._layout["passed"]] = -self.model.tables.reach
+        state[self._layout["direction"]] = (0.0, 0.0, -1.0)
+        return state
+
+    def positions(self, state: np.ndarray) -> np.ndarray:
+        """Positions of the computed nodes in C [N, 3], metres."""
+        return np.asarray(state[self._layout["x"]]).reshape(-1, 3)
+
+    def velocities(self, state: np.ndarray) -> np.ndarray:
+        """Velocities of the computed nodes in C [N, 3], m/s."""
+        return np.asarray(state[self._layout["v"]]).reshape(-1, 3)
+
+    def field(self, state: np.ndarray, name: str) -> np.ndarray:
+        """A part of the state by name: x, v, passed, parted, slip, board_slip, blade, direction."""
+        return state[self._layout[name]]
+
+    def _launch_substep(self, k: int) -> None:
+        w, kern, m = self._w, self._kernels, self.model
+        dt = self.real(self.exchange_period / self.substeps)
+        launch: Callable[..., None] = lambda kernel, dim, inputs: wp.launch(  # noqa: E731
+            kernel, dim=dim, inputs=inputs, device=self._device
+        )
+        launch(
+            kern.elements,
+            len(m.blocks),
+            [w["x"], w["v"], w["nodes"], w["shape"], w["P"], w["element_force"]],
+        )
+        launch(
+            kern.points,
+            len(m.point_nodes),
+            [w["x"], w["v"], w["point_nodes"], w["point_weights"], w["area"], w["toughness"]]
+            + [w["width"], w["fraction"], w["widest"], self.real(m.tables.reach)]
+            + [self.real(1.0 / m.tables.spacing), w["P"], w["knife"], k, dt]
+            + [w[name] for name in ("R_CK", "p_CK", "v_CK", "w_CK", "direction")]
+            + [w["blade"], w["passed"], w["parted"], w["slip"]]
+            + [w["point_force"], w["lateral"], w["total"]],
+        )
+        launch(
+            kern.move_nodes,
+            len(m.moving),
+            [w["x"], w["v"], w["moving"], self._force, w["element_start"], w["element_entry"]]
+            + [w["point_force"].flatten(), w["point_start"], w["point_entry"], w["point_weight"]]
+            + [w["inverse_mass"], w["weight"], w["board_area"], w["board"], w["P"], dt]
+            + [w["board_slip"], w["board_force"], w["board_loss"], w["internal_work"]]
+            + [w["x"], w["v"]],
+        )
+        launch(kern.bend_blade, 1, [w["lateral"], w["P"], dt, w["blade"]])
+
+    def _capture(self) -> None:
+        wp.load_module(self._kernels.elements.module, device=self._device)
+        with wp.ScopedCapture(device=self._device) as capture:
+            for k in range(self.substeps):
+                self._launch_substep(k)
+        self._graph = capture.graph
+
+    def exchange(self, state: np.ndarray, start: Pose, end: Pose) -> Exchange:
+        """Advances the food while the knife moves from `start` to `end`.
+
+        Args:
+            state: The food's state [state_size]; not changed.
+            start: Knife pose in C at the beginning.
+            end: Knife pose in C at the end.
+
+        Raises:
+            CuttingError: A force is not finite, or the knife left the region that is modelled.
+        """
+        m, n, T = self.model, self.substeps, self.exchange_period
+        motion, direction, v, w = self._interpolate(state, start, end)
+        with self._lock:
+            if self._graph is None:
+                self._capture()
+            self._state.assign(state[: self._layout["direction"].start].astype(self.dtype))
+            self._motion.assign(motion)
+            self._sums.zero_()
+            before = self._w["x"].numpy()[m.moving, :] if n else None
+            before = np.array(before, np.float64)
+            wp.capture_launch(self._graph)
+            new = np.empty(self.state_size, self.dtype)
+            new[: self._layout["direction"].start] = self._state.numpy()
+            sums = self._sums.numpy().astype(np.float64)
+        new[self._layout["direction"]] = direction
+        total = sums[self._sum_layout["total"]].reshape(-1, ACCUMULATED).sum(0)
+        if not np.isfinite(total).all():
+            raise CuttingError(
+                "the knife's force is not finite: elements inverted or the step became unstable. "
+                "Use a smaller numerics.time_step or a finer mesh near the cut."
+            )
+        impulse = total[:18] / n
+        wrenches = [
+            np.concatenate([impulse[9 + 3 * i : 12 + 3 * i], impulse[3 * i : 3 * i + 3]])
+            for i in range(3)
+        ]
+        wrench = wrenches[0] + wrenches[1] + wrenches[2]
+        # Moments are about Ko at each sub-step; the mean position of Ko is half a period back.
+        work = -float(wrench[3:] @ v + wrench[:3] @ w) * T
+        moved = self.positions(new)[m.moving].astype(np.float64) - before
+        return Exchange(
+            state=new,
+            wrench=wrench,
+            edge=wrenches[0],
+            normal=wrenches[1],
+            friction=wrenches[2],
+            work=work,
+            edge_dissipation=float(total[18]),
+            opening_dissipation=float(total[19]),
+            friction_dissipation=float(total[20]),
+            released=float(total[21]),
+            internal_work=float(sums[self._sum_layout["internal_work"]].sum()),
+            board_force=sums[self._sum_layout["board_force"]].reshape(-1, 3).sum(0) / n,
+            board_dissipation=float(sums[self._sum_layout["board_loss"]].sum()),
+            gravity_work=float((m.weight[m.moving] * moved).sum()),
+        )
+
+    def _interpolate(
+        self, state: np.ndarray, start: Pose, end: Pose
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Knife poses at the ends of the sub-steps, constant velocity and rotation rate."""
+        n, T = self.substeps, self.exchange_period
+        v = (end.position - start.position) / T
+        turn = _rotation_vector(end.rotation @ start.rotation.T)
+        w = turn / T
+        share = np.arange(1, n + 1) / n
+        position = start.position + share[:, None] * (end.position - start.position)
+        if not turn.any():
+            rotation = np.broadcast_to(start.rotation, (n, 3, 3))
+        else:
+            rotation = _rotations(share[:, None] * turn) @ start.rotation
+
+        edge_x, down = end.rotation[:, 0], end.rotation[:, 2]
+        arm = edge_x * float((self._centre - end.position) @ edge_x)
+        in_plane = v + np.cross(w, arm)
+        in_plane = in_plane - (in_plane @ end.rotation[:, 1]) * end.rotation[:, 1]
+        d = np.asarray(state[self._layout["direction"]], np.float64)
+        speed = float(np.sqrt(in_plane @ in_plane))
+        directions = np.tile(d, (n, 1))
+        if speed > 0.0:
+            length = self.model.numerics.direction_length
+            for k in range(n):
+                keep = np.exp(-speed * T / n / length)
+                d = keep * d + (1.0 - keep) * in_plane / speed
+                size = np.sqrt(d @ d)
+                d = d / size if size > 1e-9 else down
+                directions[k] = d
+        flat = np.concatenate(
+            [
+                np.ascontiguousarray(rotation).ravel(),
+                position.ravel(),
+                np.tile(v, n),
+                np.tile(w, n),
+                directions.ravel(),
+            ]
+        )
+        return flat.astype(self.dtype), d, v, w
+
+    def energies(self, state: np.ndarray, pose: Pose) -> Energies:
+        """Energies of `state` with the knife at `pose`."""
+        w, kern, m = self._w, self._kernels, self.model
+        with self._lock:
+            self._state.assign(state[: self._layout["direction"].start].astype(self.dtype))
+            motion = self._motion.numpy().copy()
+            n = self.substeps
+            motion[:9] = pose.rotation.ravel()
+            motion[9 * n : 9 * n + 3] = pose.position
+            self._motion.assign(motion)
+            wp.launch(
+                kern.element_energy,
+                dim=(len(m.blocks), LANES),
+                inputs=[w["x"], w["nodes"], w["shape"], w["P"], w["energy"], w["volume_ratio"]],
+                device=self._device,
+            )
+            wp.launch(
+                kern.point_energy,
+                dim=len(m.point_nodes),
+                inputs=[w["x"], w["point_nodes"], w["point_weights"], w["area"], w["toughness"]]
+                + [w["width"], w["fraction"], w["widest"], self.real(m.tables.reach)]
+                + [self.real(1.0 / m.tables.spacing), w["P"], w["knife"], w["R_CK"], w["p_CK"]]
+                + [0, w["blade"], w["passed"], w["parted"], w["slip"]]
+                + [w["point_energy"], w["cut"]],
+                device=self._device,
+            )
+            elastic = w["energy"].numpy().astype(np.float64).sum()
+            ratio = w["volume_ratio"].numpy().ravel()[: m.element_count]
+            least = int(ratio.argmin())
+            least_ratio = float(ratio[least])
+            interface = w["point_energy"].numpy().astype(np.float64).sum()
+            cut = float(w["cut"].numpy() @ m.tables.area / m.tables.area.sum())
+        depth = np.maximum(m.board[3] - self.positions(state) @ m.board[:3], 0.0)
+        anchor = self.field(state, "board_slip").reshape(-1, 3)
+        rest = 0.5 * m.parameters["board_stiffness"] * m.board_area
+        interface += float(rest @ (depth**2 + (anchor**2).sum(1)))
+        blade = float(self.field(state, "blade")[0])
+        interface += 0.5 * m.parameters["blade_stiffness"] * blade**2
+        v2 = (self.velocities(state)[m.moving].astype(np.float64) ** 2).sum(1)
+        return Energies(
+            elastic=float(elastic),
+            interface=float(interface),
+            kinetic=float(0.5 * m.mass[m.moving] @ v2),
+            true_kinetic=float(0.5 * m.true_mass[m.moving] @ v2),
+            least_volume_ratio=least_ratio,
+            least_element=least,
+            cut=cut,
+        )
+
+    def held_reaction(self, state: np.ndarray) -> np.ndarray:
+        """Force of what holds the food on the food [3], N, in C, from the bulk's forces."""
+        w, m = self._w, self.model
+        with self._lock:
+            self._state.assign(state[: self._layout["direction"].start].astype(self.dtype))
+            wp.launch(
+                self._kernels.elements,
+                dim=len(m.blocks),
+                inputs=[w["x"], w["v"], w["nodes"], w["shape"], w["P"], w["element_force"]],
+                device=self._device,
+            )
+            force = self._force.numpy().astype(np.float64).reshape(-1, 4, 3, LANES)
+        held = np.ones(len(m.nodes), bool)
+        held[m.moving] = False
+        at_held = held[m.blocks.reshape(-1, 4, LANES)]
+        internal = (force * at_held[:, :, None, :]).sum((0, 1, 3))
+        return -internal - m.weight[held].sum(0)
+
+
+def _element_gather(
+    blocks: np.ndarray, count: int, node_count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """For each node, where its entries stand in the element forces (x; y and z follow)."""
+    B = len(blocks)
+    nodes = blocks.reshape(B, 4, LANES)
+    entry = (
+        np.arange(B)[:, None, None] * 12 * LANES
+        + np.arange(4)[None, :, None] * 3 * LANES
+        + np.arange(LANES)[None, None, :]
+    )
+    real = (np.arange(B)[:, None, None] * LANES + np.arange(LANES)[None, None, :]) < count
+    real = np.broadcast_to(real, nodes.shape)
+    node, entry = nodes[real], entry[real]
+    order = np.argsort(node, kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(node, minlength=node_count))])
+    return start.astype(np.int32), entry[order].astype(np.int32)
+
+
+def _point_gather(
+    point_nodes: np.ndarray, weights: np.ndarray, node_count: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For each node, the cut-point forces (2 point + side) that act on it and their weights."""
+    P = len(point_nodes)
+    entry = 2 * np.arange(P)[:, None] + np.array([0, 0, 1, 1])
+    weight = np.tile(weights, (1, 2))
+    use = weight > 0.0
+    node, entry, weight = point_nodes[use], entry[use], weight[use]
+    order = np.argsort(node, kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(node, minlength=node_count))])
+    return start.astype(np.int32), entry[order].astype(np.int32), weight[order]
+
+
+def _rotation_vector(R: np.ndarray) -> np.ndarray:
+    """Rotation vector of a small rotation [3]."""
+    skew = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    sine = float(np.sqrt(skew @ skew))
+    if sine < 1e-12:
+        return np.zeros(3)
+    angle = np.arctan2(sine, 0.5 * (np.trace(R) - 1.0))
+    return skew * (angle / sine)
+
+
+def _rotations(vectors: np.ndarray) -> np.ndarray:
+    """Rotation matrices [N, 3, 3] of rotation vectors [N, 3] (Rodrigues)."""
+    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    K = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    safe = np.where(angle > 0.0, angle, 1.0)
+    s = np.where(angle > 0.0, np.sin(angle) / safe, 1.0)
+    c = np.where(angle > 0.0, (1.0 - np.cos(angle)) / safe**2, 0.5)
+    return np.eye(3) + s * K + c * K @ K

@@ -1,0 +1,1 @@
+"""Records of slices: formats, validation and importers. Imports numpy and scipy only."""

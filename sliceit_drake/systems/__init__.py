@@ -1,0 +1,1 @@
+"""Drake systems of a slicing station, one a file."""

@@ -1,0 +1,58 @@
+"""A prescribed motion of the knife as a Drake system."""
+
+from pydrake.common.value import AbstractValue, Value
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.math import SpatialVelocity
+from pydrake.systems.framework import Context, LeafSystem
+
+from sliceit_drake.cutting.motion import Motion, MotionPlan, Pose
+
+__all__ = ["MotionSource"]
+
+
+class MotionSource(LeafSystem):
+    """Gives the target pose and velocity of the knife as functions of the context's time.
+
+    It has no inputs and no state.
+
+    Outputs:
+        target_pose: RigidTransform X_WK.
+        target_velocity: SpatialVelocity V_WK of the knife frame K in W.
+
+    Attributes:
+        motion: The motion; its `phase_at` names the phase at a time.
+    """
+
+    def __init__(self, plan: MotionPlan, X_WK: RigidTransform) -> None:
+        """Places a plan at a start pose.
+
+        Args:
+            plan: The segments of the motion.
+            X_WK: Pose of the knife at time 0. A plan that begins with a record placed in the world
+                starts from the record's first pose instead.
+
+        Raises:
+            ConfigurationError: If the plan is invalid, or a record in it is.
+        """
+        super().__init__()
+        self.motion = Motion(plan, Pose(X_WK.rotation().matrix(), X_WK.translation()))
+        self.DeclareAbstractOutputPort(
+            "target_pose",
+            lambda: Value(RigidTransform()),
+            self._calc_target_pose,
+            {self.time_ticket()},
+        )
+        self.DeclareAbstractOutputPort(
+            "target_velocity",
+            lambda: Value(SpatialVelocity.Zero()),
+            self._calc_target_velocity,
+            {self.time_ticket()},
+        )
+
+    def _calc_target_pose(self, context: Context, output: AbstractValue) -> None:
+        pose = self.motion.pose(context.get_time())
+        output.set_value(RigidTransform(RotationMatrix(pose.R), pose.p))
+
+    def _calc_target_velocity(self, context: Context, output: AbstractValue) -> None:
+        velocity = self.motion.velocity(context.get_time())
+        output.set_value(SpatialVelocity(velocity.w, velocity.v))

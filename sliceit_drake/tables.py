@@ -1,0 +1,92 @@
+"""Reading of comma-separated tables of numbers, with errors that name file, row and column."""
+
+import csv
+import difflib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sliceit_drake.configuration import ConfigurationError
+
+__all__ = ["read_columns", "require_increasing"]
+
+
+def read_columns(file: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
+    """Reads named columns of a CSV file whose first row holds the column names.
+
+    Args:
+        file: CSV file, UTF-8. Columns that are not asked for are ignored.
+        columns: Names of the columns to read.
+
+    Returns:
+        For each name a float array [N], N >= 1, all finite.
+
+    Raises:
+        ConfigurationError: If the file cannot be read, lacks a column or rows, or has a cell that
+            is not a finite number.
+    """
+    try:
+        with open(file, newline="", encoding="utf-8") as stream:
+            rows = list(csv.reader(stream))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigurationError(
+            f"the table cannot be read ({error})", source=str(file), fix="Check the path."
+        ) from error
+    header = [name.strip() for name in rows[0]] if rows else []
+    for name in columns:
+        if name not in header:
+            close = difflib.get_close_matches(name, header, n=1)
+            fix = f'Rename "{close[0]}"?' if close else "Add it."
+            raise ConfigurationError(
+                f'there is no column "{name}"; the first row has: {", ".join(header) or "nothing"}',
+                source=str(file),
+                fix=fix,
+            )
+    lines = [(number, row) for number, row in enumerate(rows[1:], start=2) if row]
+    if not lines:
+        raise ConfigurationError(
+            "the table has no rows", source=str(file), fix="Add rows of numbers under the names."
+        )
+    result = {}
+    for name in columns:
+        index = header.index(name)
+        values = []
+        for number, row in lines:
+            text = row[index].strip() if index < len(row) else ""
+            try:
+                value = float(text)
+            except ValueError:
+                value = np.nan
+            if not np.isfinite(value):
+                raise ConfigurationError(
+                    f"is {text!r}, which is not a finite number",
+                    source=f"{file}, line {number}",
+                    field=name,
+                    fix="Correct the cell or remove the row.",
+                )
+            values.append(value)
+        result[name] = np.array(values)
+    return result
+
+
+def require_increasing(values: np.ndarray, file: str | Path, column: str) -> None:
+    """Refuses a column that does not increase from row to row.
+
+    Args:
+        values: Float array [N], in the order of the file.
+        file: The file, for the error.
+        column: Name of the column, for the error.
+
+    Raises:
+        ConfigurationError: At the first value that is not greater than the one before it.
+    """
+    wrong = np.flatnonzero(np.diff(values) <= 0.0)
+    if wrong.size:
+        index = int(wrong[0]) + 1
+        raise ConfigurationError(
+            f"row {index + 1} has {values[index]:.9g} after {values[index - 1]:.9g}",
+            source=str(file),
+            field=column,
+            fix="Sort the rows so that it increases, and remove repeated ones.",
+        )
