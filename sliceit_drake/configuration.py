@@ -177,10 +177,13 @@ def validate(config: Any, where: str) -> None:
 
 
 def _check_field(value: Any, field: dc.Field, where: str) -> None:
+    if value is None:
+        # YAML leaves a None out, so that one in a field with another default would not read back.
+        if field.default is not None:
+            raise ConfigurationError("is None", field=where, fix="Give a value.")
+        return
     rule = field.metadata.get(_METADATA_KEY)
     if isinstance(rule, _Quantity):
-        if value is None and field.default is None:
-            return
         _check_quantity(value, rule, where, is_integer=field.type is int)
     elif isinstance(rule, _Choice):
         if value not in rule.options:
@@ -194,8 +197,7 @@ def _check_field(value: Any, field: dc.Field, where: str) -> None:
 
 
 def _check_quantity(value: Any, rule: _Quantity, where: str, *, is_integer: bool) -> None:
-    is_sequence = isinstance(value, list | tuple | np.ndarray) and np.ndim(value) > 0
-    if is_sequence:
+    if isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim > 0):
         if rule.size is not None and len(value) != rule.size:
             raise ConfigurationError(
                 f"has {len(value)} values", field=where, fix=f"Give {rule.size} values."

@@ -110,6 +110,7 @@ def test_overrides_win_over_the_file_and_the_file_over_the_defaults(tmp_path):
     assert (station.tilt, station.name) == (0.2, "two")
     assert (defaults.tilt, defaults.board.spheres) == (0.3, 7)
     assert load_yaml(Station, None, overrides_text="tilt: 0.4").tilt == 0.4
+    assert load_yaml(Station, None, defaults=defaults) is not defaults
 
 
 def test_a_merged_anchor_may_be_overridden(tmp_path):
@@ -224,7 +225,8 @@ def test_rules_between_fields_are_checked_with_the_path_of_their_owner():
     [
         ({"tilt": "0.1"}, "station.tilt: is '0.1'. Give a number in rad"),
         ({"tilt": True}, "station.tilt: is True"),
-        ({"tilt": None}, "station.tilt: is None"),
+        ({"tilt": None}, "station.tilt: is None. Give a value"),
+        ({"board": None}, "station.board: is None. Give a value"),
         ({"tilt": np.float64("nan")}, "station.tilt: is nan"),
         ({"board": Board(spheres=2.5)}, "station.board.spheres: is 2.5. Give a whole number"),
         ({"gains": np.array([0.0, np.inf])}, r"station.gains\[1\]: is inf"),

@@ -38,7 +38,12 @@ def edge_contact_positions(knife: Knife) -> np.ndarray:
 
 
 def board_wrench(
-    board: Board, knife: Knife, R_WK: np.ndarray, p_WK: np.ndarray, v_WK: np.ndarray, w_WK: np.ndarray
+    board: Board,
+    knife: Knife,
+    R_WK: np.ndarray,
+    p_WK: np.ndarray,
+    v_WK: np.ndarray,
+    w_WK: np.ndarray,
 ) -> np.ndarray:
     """Wrench of the board on a knife that moves on a prescribed path, frictionless.
 

@@ -64,9 +64,7 @@ def kernels(real: Any) -> types.SimpleNamespace:
     TINY = wp.constant(real(1.0e-20))
 
     @wp.func
-    def dot8(
-        ax: lanes, ay: lanes, az: lanes, bx: lanes, by: lanes, bz: lanes
-    ):
+    def dot8(ax: lanes, ay: lanes, az: lanes, bx: lanes, by: lanes, bz: lanes):
         return wp.cw_mul(ax, bx) + wp.cw_mul(ay, by) + wp.cw_mul(az, bz)
 
     @wp.func
@@ -99,7 +97,12 @@ def kernels(real: Any) -> types.SimpleNamespace:
 
     @wp.func
     def column8(
-        ax: lanes, bx: lanes, cx: lanes, block: wp.int32, k: wp.int32, shape: wp.array2d(dtype=lanes)
+        ax: lanes,
+        bx: lanes,
+        cx: lanes,
+        block: wp.int32,
+        k: wp.int32,
+        shape: wp.array2d(dtype=lanes),
     ):
         """Row of F: edges (ax, bx, cx) times column k of the inverse rest edges."""
         return dot8(ax, bx, cx, shape[block, k], shape[block, 3 + k], shape[block, 6 + k])
@@ -431,19 +434,41 @@ def kernels(real: Any) -> types.SimpleNamespace:
         if D > real(0.0):
             shrink = D0 / D
         normal_m, friction_m, slip_m, loss_m, depth_m = flank_contact(
-            xm, vm, real(-1.0), R, origin, v_CK[k], w_CK[k], bend, A * D, shrink, slip[i, 0], dt, P, knife
+            xm,
+            vm,
+            real(-1.0),
+            R,
+            origin,
+            v_CK[k],
+            w_CK[k],
+            bend,
+            A * D,
+            shrink,
+            slip[i, 0],
+            dt,
+            P,
+            knife,
         )
         normal_p, friction_p, slip_p, loss_p, depth_p = flank_contact(
-            xp, vp, real(1.0), R, origin, v_CK[k], w_CK[k], bend, A * D, shrink, slip[i, 1], dt, P, knife
+            xp,
+            vp,
+            real(1.0),
+            R,
+            origin,
+            v_CK[k],
+            w_CK[k],
+            bend,
+            A * D,
+            shrink,
+            slip[i, 1],
+            dt,
+            P,
+            knife,
         )
         slip[i, 0] = slip_m
         slip[i, 1] = slip_p
         released -= (
-            real(0.5)
-            * P[FLANK_STIFFNESS]
-            * A
-            * (D - D0)
-            * (depth_m * depth_m + depth_p * depth_p)
+            real(0.5) * P[FLANK_STIFFNESS] * A * (D - D0) * (depth_m * depth_m + depth_p * depth_p)
         )
 
         force[i, 0] = pull + real(0.5) * edge + normal_m + friction_m
@@ -534,13 +559,17 @@ def kernels(real: Any) -> types.SimpleNamespace:
                 board_loss[i] = board_loss[i] + lost
             board_slip[i] = slip
         v1 = vi + f * (inverse_mass[i] * dt)
-        internal_work[i] = internal_work[i] + wp.dot(internal, v1) * dt
+        # Trapezoidal rule for the work along the path, summed by parts.
+        internal_work[i] = internal_work[i] + real(0.5) * wp.dot(internal, vi + v1) * dt
         v_next[i] = v1
         x_next[i] = xi + v1 * dt
 
     @wp.kernel(enable_backward=True)
     def bend_blade(
-        lateral: wp.array(dtype=vec2), P: wp.array(dtype=real), dt: real, blade: wp.array(dtype=real)
+        lateral: wp.array(dtype=vec2),
+        P: wp.array(dtype=real),
+        dt: real,
+        blade: wp.array(dtype=real),
     ):
         """Massless damped blade in series with the flanks, implicit in the flank stiffness."""
         F = real(0.0)
@@ -575,9 +604,8 @@ def kernels(real: Any) -> types.SimpleNamespace:
         parted: wp.array(dtype=real),
         slip: wp.array2d(dtype=vec3),
         energy: wp.array(dtype=real),
-        cut: wp.array(dtype=real),
     ):
-        """Recoverable energy of each cut point and its cut fraction."""
+        """Recoverable energy of each cut point."""
         i = wp.tid()
         w = weights[i]
         xm = x[nodes[i, 0]] * w[0] + x[nodes[i, 1]] * w[1]
@@ -593,8 +621,8 @@ def kernels(real: Any) -> types.SimpleNamespace:
         intact = intact_share(parted[i], onset, failure)
         opening = vec3(gap[0], wp.max(gap[1], real(0.0)), gap[2])
         closing = wp.min(gap[1], real(0.0))
-        doubled = bond * A * (
-            (real(1.0) - D) * intact * wp.dot(opening, opening) + closing * closing
+        doubled = (
+            bond * A * ((real(1.0) - D) * intact * wp.dot(opening, opening) + closing * closing)
         )
         knife_x = vec3(R[0, 0], R[1, 0], R[2, 0])
         knife_z = vec3(R[0, 2], R[1, 2], R[2, 2])
@@ -623,7 +651,6 @@ def kernels(real: Any) -> types.SimpleNamespace:
                     held = slip[i, side]
                     doubled += P[FLANK_STIFFNESS] * A * D * (phi * phi + wp.dot(held, held))
         energy[i] = real(0.5) * doubled
-        cut[i] = D
 
     return types.SimpleNamespace(
         real=real,

@@ -23,10 +23,16 @@ class Knife:
         3.5e-3, "m", low=2e-4, high=2e-2, doc="Thickness at the spine."
     )
     edge_thickness: float = quantity(
-        8e-5, "m", low=1e-6, high=2e-3, doc="Thickness at the shoulder, where the edge bevel begins."
+        8e-5,
+        "m",
+        low=1e-6,
+        high=2e-3,
+        doc="Thickness at the shoulder, where the edge bevel begins.",
     )
     height: float = quantity(59e-3, "m", low=5e-3, high=0.3, doc="From the shoulder to the spine.")
-    tip_height: float = quantity(4e-5, "m", low=1e-6, high=5e-3, doc="From the edge to the shoulder.")
+    tip_height: float = quantity(
+        4e-5, "m", low=1e-6, high=5e-3, doc="From the edge to the shoulder."
+    )
     length: float = quantity(0.150, "m", low=0.02, high=0.6, doc="Length of the edge.")
     edge_radius: float = quantity(
         0.0, "m", low=0.0, high=5e-4, doc="Radius of the rounded edge and of the other corners."
@@ -48,14 +54,16 @@ class Knife:
     def check(self, where: str) -> None:
         if self.edge_thickness >= self.spine_thickness:
             raise ConfigurationError(
-                f"{where}.edge_thickness = {self.edge_thickness} m must be smaller than "
-                f"spine_thickness = {self.spine_thickness} m."
+                f"= {self.edge_thickness} m is not below spine_thickness = {self.spine_thickness} m",
+                field=f"{where}.edge_thickness",
+                fix="Give the thickness of the bevel's shoulder, as 8e-5.",
             )
         limit = 0.5 * min(self.edge_thickness, self.tip_height)
         if self.edge_radius > limit:
             raise ConfigurationError(
-                f"{where}.edge_radius = {self.edge_radius} m does not fit into the edge bevel: give "
-                f"at most half of edge_thickness and of tip_height, {limit} m."
+                f"= {self.edge_radius} m does not fit into the edge bevel",
+                field=f"{where}.edge_radius",
+                fix=f"Give at most half of edge_thickness and of tip_height, {limit} m.",
             )
 
     def half_section(self) -> np.ndarray:
@@ -92,9 +100,7 @@ class Knife:
 
     def parameters(self) -> np.ndarray:
         """The section as the kernels take it: six coordinates, radius, half length [8]."""
-        return np.concatenate(
-            [self.half_section().ravel(), [self.edge_radius, 0.5 * self.length]]
-        )
+        return np.concatenate([self.half_section().ravel(), [self.edge_radius, 0.5 * self.length]])
 
 
 def _outward_normals(section: np.ndarray) -> np.ndarray:
@@ -104,7 +110,9 @@ def _outward_normals(section: np.ndarray) -> np.ndarray:
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
-def section_distance(knife: Knife, y: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def section_distance(
+    knife: Knife, y: np.ndarray, height: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Signed distance to the knife's section and its gradient.
 
     Args:
@@ -132,7 +140,9 @@ def section_distance(knife: Knife, y: np.ndarray, height: np.ndarray) -> tuple[n
         offset = p - (a + along[..., None] * (b - a))
         length = np.linalg.norm(offset, axis=-1)
         use = (distance > 0.0) & (length < nearest) & (length > 0.0)
-        gradient = np.where(use[..., None], offset / np.where(use, length, 1.0)[..., None], gradient)
+        gradient = np.where(
+            use[..., None], offset / np.where(use, length, 1.0)[..., None], gradient
+        )
         nearest = np.where(distance > 0.0, np.minimum(nearest, length), nearest)
     distance = np.where(distance > 0.0, nearest, distance) - knife.edge_radius
     return distance, gradient * np.stack([mirror, np.ones_like(mirror)], axis=-1)

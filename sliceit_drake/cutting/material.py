@@ -21,7 +21,7 @@ class Material:
         2.6e6, "Pa", low=1e3, high=1e9, doc="Young's modulus at small strain."
     )
     poisson_ratio: float = quantity(0.37, "", low=0.0, high=0.49, doc="Poisson's ratio.")
-    density: float = quantity(950.0, "kg/m^3", low=50.0, high=3000.0, doc="True density.")
+    density: float = quantity(950.0, "kg/m3", low=50.0, high=3000.0, doc="True density.")
     damping_time: float = quantity(
         4e-6,
         "s",
@@ -30,7 +30,7 @@ class Material:
         doc="Kelvin-Voigt viscosity over stiffness; the viscous stress is that of the strain rate.",
     )
     toughness: float = quantity(
-        350.0, "J/m^2", low=0.0, high=1e5, doc="Energy to part one unit of cut surface."
+        350.0, "J/m2", low=0.0, high=1e5, doc="Energy to part one unit of cut surface."
     )
     strength: float = quantity(
         3e5, "Pa", low=1e2, high=1e8, doc="Traction at which the uncut faces begin to part."
@@ -81,7 +81,9 @@ def energy_density(F: np.ndarray, mu: float, lam: float) -> np.ndarray:
     Ic = (F * F).sum((-1, -2))
     J = np.linalg.det(F)
     at_rest = 0.5 * lam * (1.0 - alpha) ** 2 - 0.5 * mu * np.log(4.0)
-    return 0.5 * mu * (Ic - 3.0) + 0.5 * lam * (J - alpha) ** 2 - 0.5 * mu * np.log(Ic + 1.0) - at_rest
+    return (
+        0.5 * mu * (Ic - 3.0) + 0.5 * lam * (J - alpha) ** 2 - 0.5 * mu * np.log(Ic + 1.0) - at_rest
+    )
 
 
 def first_piola_stress(F: np.ndarray, mu: float, lam: float) -> np.ndarray:

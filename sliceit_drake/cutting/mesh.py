@@ -179,7 +179,10 @@ def cylinder_mesh(diameter: float, layers: np.ndarray, rings: int) -> Tetrahedra
         rings: Concentric rings of the section; edges are about diameter / (2 rings).
     """
     section, triangles = _disc(rings)
-    section = 0.5 * diameter * (section + [0.0, 1.0])
+    # The polygon has the circle's area, so that its corners stand out by as much as its sides cut in.
+    corners = 6 * rings
+    radius = 0.5 * diameter * np.sqrt(np.pi / (0.5 * corners * np.sin(2.0 * np.pi / corners)))
+    section = radius * (section + [0.0, 1.0])
     return _extruded(section, triangles, np.asarray(layers, float))
 
 

@@ -1,10 +1,11 @@
 """Everything about one cut that does not change: geometry, parameters, masses, tables."""
 
 import dataclasses as dc
+from collections.abc import Sequence
 
 import numpy as np
 
-from sliceit_drake.configuration import ConfigurationError, quantity
+from sliceit_drake.configuration import ConfigurationError, choice, quantity
 from sliceit_drake.cutting.cut_surface import EdgeTables, edge_tables
 from sliceit_drake.cutting.kernels import LANES, PARAMETERS
 from sliceit_drake.cutting.knife import Knife
@@ -26,7 +27,7 @@ class Numerics:
     """How the cut is computed. Stiffnesses of contacts and bonds scale with E over the edge length."""
 
     time_step: float = quantity(
-        2e-4, "s", low=1e-7, high=5e-3, doc="Sub-step; must divide the exchange period."
+        5e-4, "s", low=1e-7, high=5e-3, doc="Sub-step; must divide the exchange period."
     )
     mass_scaling: bool = True
     stability_margin: float = quantity(
@@ -39,7 +40,7 @@ class Numerics:
         4.0, "E/h", low=0.1, high=1e3, doc="Stiffness of the uncut faces and of their self contact."
     )
     flank_stiffness: float = quantity(
-        1.0, "E/h", low=0.01, high=1e3, doc="Contact stiffness of the flanks, also in friction."
+        4.0, "E/h", low=0.01, high=1e3, doc="Contact stiffness of the flanks, also in friction."
     )
     board_stiffness: float = quantity(
         1.0, "E/h", low=0.01, high=1e3, doc="Contact stiffness of the food on the board."
@@ -51,14 +52,8 @@ class Numerics:
     direction_length: float = quantity(
         2e-4, "m", low=1e-7, high=1e-2, doc="Travel over which the direction of cutting follows."
     )
-    precision: str = "float32"
+    precision: str = choice("float32", ("float32", "float64"), doc="Arithmetic of the kernels.")
     device: str = "cpu"
-
-    def check(self, where: str) -> None:
-        if self.precision not in ("float32", "float64"):
-            raise ConfigurationError(
-                f"{where}.precision = {self.precision!r}: give float32 or float64."
-            )
 
 
 @dc.dataclass
@@ -146,7 +141,7 @@ def make_cutting_model(
     material: Material,
     knife: Knife,
     numerics: Numerics,
-    up: np.ndarray = np.array([0.0, 0.0, 1.0]),
+    up: Sequence[float] = (0.0, 0.0, 1.0),
     board_height: float | None = 0.0,
 ) -> CuttingModel:
     """Splits the mesh and prepares one cut.
@@ -170,14 +165,16 @@ def make_cutting_model(
     split = split_mesh(mesh, plane)
     R_FC = plane.rotation()
     p_FC = np.asarray(plane.point, float)
-    up = np.asarray(up, float) / np.linalg.norm(up)
-    up_C = up @ R_FC
+    upward = np.asarray(up, float) / np.linalg.norm(up)
+    up_C = upward @ R_FC
 
     held_node = held[split.node_source]
     active = ~held_node[split.tetrahedra].all(1)
     if not active.any():
         raise ConfigurationError(
-            "food.hold: every element at the cut is held; leave material free around the cut plane."
+            "every element at the cut is held",
+            field="food.hold",
+            fix="Hold the food farther from the cut plane.",
         )
     tetrahedra = split.tetrahedra[active]
     computed, t = np.unique(tetrahedra, return_inverse=True)
@@ -205,8 +202,10 @@ def make_cutting_model(
     free = (point_nodes >= 0).all(1)
     if not free.all():
         raise ConfigurationError(
-            f"food.hold: {np.count_nonzero(~free)} of {len(free)} points of the cut lie in elements "
-            "that are held; hold the food farther from the cut plane."
+            f"{np.count_nonzero(~free)} of {len(free)} points of the cut lie in elements that are "
+            "held",
+            field="food.hold",
+            fix="Hold the food farther from the cut plane.",
         )
     point_weights = split.point_weights
 
@@ -236,7 +235,7 @@ def make_cutting_model(
     board = np.concatenate([up_C, [0.0]])
     board_area = np.zeros(len(nodes))
     if board_height is not None:
-        board[3] = board_height - up @ p_FC
+        board[3] = board_height - upward @ p_FC
         board_area = _downward_area(split, up_C)[computed]
 
     need = _stiffness_bound(t, inverse, volume, material)

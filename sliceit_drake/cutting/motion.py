@@ -7,7 +7,10 @@ time. A segment with an `acceleration` starts and stops at rest with ramps of th
 without one its velocity steps, which is exact for a prescribed motion and shakes a robot.
 """
 
+import bisect
 import dataclasses as dc
+import itertools
+import math
 import typing
 from collections.abc import Callable, Sequence
 
@@ -72,11 +75,11 @@ class _Path(typing.Protocol):
 
 def _acceleration_field() -> typing.Any:
     return quantity(
-        1.0,
+        None,
         "m/s2",
         low=1e-3,
         high=100.0,
-        doc="Acceleration of the ramps at start and stop; null for steps of the velocity.",
+        doc="Acceleration of the ramps at start and stop; if not given, the velocity steps.",
     )
 
 
@@ -149,20 +152,20 @@ class PressAndDraw:
 
     def build(self) -> _Path:
         """Returns the motion as a function of time."""
-        omega = 2.0 * np.pi * self.frequency
+        omega = 2.0 * math.pi * self.frequency
 
         def position(tau: float) -> np.ndarray:
             z = self.press_speed * tau
-            x = self.draw_ratio * z + self.amplitude * np.sin(omega * tau)
+            x = self.draw_ratio * z + self.amplitude * math.sin(omega * tau)
             return np.array([x, 0.0, z])
 
         def derivative(tau: float) -> np.ndarray:
-            draw = self.amplitude * omega * np.cos(omega * tau)
+            draw = self.amplitude * omega * math.cos(omega * tau)
             return np.array([self.draw_ratio * self.press_speed + draw, 0.0, self.press_speed])
 
         # The sinusoid starts at its fastest, so that the ramps see the greatest speed.
         draw_speed = abs(self.draw_ratio) * self.press_speed + self.amplitude * omega
-        ramp = _ramp_time(float(np.hypot(draw_speed, self.press_speed)), self.acceleration)
+        ramp = _ramp_time(math.hypot(draw_speed, self.press_speed), self.acceleration)
         scale = _TimeScale(self.distance / self.press_speed, ramp)
         return _Translation(position, derivative, scale)
 
@@ -340,7 +343,11 @@ class MotionPlan:
     """A sequence of segments, each of which begins where the one before it ended."""
 
     segments: list[Segment] = dc.field(
-        default_factory=lambda: [ConstantSpeed(distance=0.03), Hold(), Retract()]
+        default_factory=lambda: [
+            ConstantSpeed(distance=0.03, acceleration=0.5),
+            Hold(),
+            Retract(acceleration=0.5),
+        ]
     )
 
     def check(self, where: str) -> None:
@@ -389,14 +396,15 @@ class Motion:
             raise ValueError(f"start.R is not a rotation matrix: {start.R}")
         self._labels = [segment.label for segment in plan.segments]
         self._paths = [segment.build() for segment in plan.segments]
-        self._begins = np.cumsum([0.0, *(path.duration for path in self._paths)])
+        durations = (path.duration for path in self._paths)
+        self._begins = list(itertools.accumulate(durations, initial=0.0))
         self._starts = [pose]
         for path in self._paths:
             self._starts.append(_compose(self._starts[-1], path.pose(path.duration)))
         for at_rest in self._starts:  # These are handed out by pose(), and must not change.
             at_rest.R.setflags(write=False)
             at_rest.p.setflags(write=False)
-        self.duration = float(self._begins[-1])
+        self.duration = self._begins[-1]
 
     def pose(self, t: float) -> Pose:
         """Returns the pose X_WK at the time `t`, s."""
@@ -444,18 +452,13 @@ class Motion:
     @property
     def phases(self) -> list[tuple[str, float, float]]:
         """Label, begin and end (s) of every segment in order."""
-        ends = zip(self._begins[:-1], self._begins[1:], strict=True)
-        return [
-            (label, float(begin), float(end))
-            for label, (begin, end) in zip(self._labels, ends, strict=True)
-        ]
+        return list(zip(self._labels, self._begins[:-1], self._begins[1:], strict=True))
 
     def _index(self, t: float) -> int:
-        index = int(np.searchsorted(self._begins, t, side="right")) - 1
+        index = bisect.bisect_right(self._begins, t) - 1
         return min(max(index, 0), len(self._paths) - 1)
 
 
-@dc.dataclass(frozen=True)
 class _TimeScale:
     """Time tau of the path without ramps, as a function of time.
 
@@ -463,31 +466,21 @@ class _TimeScale:
     path too short for that it turns back at half way.
     """
 
-    ideal_duration: float
-    ramp: float
-
-    @property
-    def _ramp_used(self) -> float:
-        return min(self.ramp, float(np.sqrt(self.ideal_duration * self.ramp)))
-
-    @property
-    def duration(self) -> float:
-        if self.ramp == 0.0:
-            return self.ideal_duration
-        peak = self._ramp_used / self.ramp
-        return self.ideal_duration / peak + self._ramp_used
+    def __init__(self, ideal_duration: float, ramp: float) -> None:
+        self._ideal_duration = ideal_duration
+        self._slope = np.inf if ramp == 0.0 else 1.0 / ramp
+        self._ramp = min(ramp, math.sqrt(ideal_duration * ramp))
+        self._peak = 1.0 if ramp == 0.0 else self._ramp / ramp
+        self.duration = ideal_duration / self._peak + self._ramp
 
     def at(self, t: float) -> tuple[float, float]:
         """Returns tau and its rate at the time `t` in [0, duration]."""
-        if self.ramp == 0.0:
-            return t, 1.0
         left = self.duration - t
-        if t < self._ramp_used:
-            return 0.5 * t * t / self.ramp, t / self.ramp
-        if left < self._ramp_used:
-            return self.ideal_duration - 0.5 * left * left / self.ramp, left / self.ramp
-        peak = self._ramp_used / self.ramp
-        return peak * (t - 0.5 * self._ramp_used), peak
+        if t < self._ramp:
+            return 0.5 * self._slope * t * t, self._slope * t
+        if left < self._ramp:
+            return self._ideal_duration - 0.5 * self._slope * left * left, self._slope * left
+        return self._peak * (t - 0.5 * self._ramp), self._peak
 
 
 @dc.dataclass(frozen=True)
@@ -517,7 +510,7 @@ class _Legs:
     def __init__(
         self, times: np.ndarray, positions: np.ndarray, rotations: Rotation, *, smooth: bool
     ) -> None:
-        self._times = times
+        self._times: list[float] = times.tolist()
         self._p = positions
         self._dp = np.diff(positions, axis=0)
         self._R = rotations.as_matrix()
@@ -527,7 +520,7 @@ class _Legs:
 
     @property
     def duration(self) -> float:
-        return float(self._times[-1])
+        return self._times[-1]
 
     def pose(self, t: float) -> Pose:
         leg, share, _ = self._at(t)
@@ -540,7 +533,7 @@ class _Legs:
 
     def _at(self, t: float) -> tuple[int, float, float]:
         """Returns the leg at the time `t`, the share of it that is done, and the share's rate."""
-        leg = int(np.searchsorted(self._times, t, side="right")) - 1
+        leg = bisect.bisect_right(self._times, t) - 1
         leg = min(max(leg, 0), len(self._dp) - 1)
         period = self._times[leg + 1] - self._times[leg]
         u = (t - self._times[leg]) / period

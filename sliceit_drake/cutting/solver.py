@@ -10,6 +10,7 @@ import warp as wp
 
 from sliceit_drake.cutting.kernels import ACCUMULATED, LANES, PARAMETERS, kernels
 from sliceit_drake.cutting.model import CuttingModel, TimeStepError
+from sliceit_drake.cutting.motion import Pose
 
 __all__ = ["CuttingError", "CuttingSolver", "Energies", "Exchange"]
 
@@ -62,7 +63,6 @@ class Energies:
         true_kinetic: Of the true mass.
         least_volume_ratio: Smallest J of all elements.
         least_element: Its element.
-        cut: Share of the section that is cut.
     """
 
     elastic: float
@@ -71,15 +71,6 @@ class Energies:
     true_kinetic: float
     least_volume_ratio: float
     least_element: int
-    cut: float
-
-
-@dc.dataclass
-class Pose:
-    """A pose of the knife in C: rotation [3, 3] and position [3], metres."""
-
-    rotation: np.ndarray
-    position: np.ndarray
 
 
 class CuttingSolver:
@@ -177,7 +168,6 @@ class CuttingSolver:
         self._w["energy"] = wp.zeros((B, LANES), dtype=real, device=self._device)
         self._w["volume_ratio"] = wp.zeros((B, LANES), dtype=real, device=self._device)
         self._w["point_energy"] = wp.zeros(P, dtype=real, device=self._device)
-        self._w["cut"] = wp.zeros(P, dtype=real, device=self._device)
 
         inverse_mass = np.zeros(N)
         inverse_mass[m.moving] = 1.0 / m.mass[m.moving]
@@ -209,8 +199,9 @@ class CuttingSolver:
             self._w[name] = self._array(values, dtype)
         # Rows of `shape` are eight-wide vectors.
         self._w["shape"] = self._array(m.shape, k.lanes)
-        weighted = np.average(m.split.points, axis=0, weights=m.tables.area)
-        self._centre = weighted
+        self._centre = np.average(m.split.points, axis=0, weights=m.tables.area)
+        self._rows = np.arange(P)
+        self._share = np.arange(1, n + 1)[:, None] / n
 
     def _view(self, base: wp.array, start: int, dtype: Any, count: int) -> wp.array:
         return wp.array(
@@ -298,8 +289,6 @@ class CuttingSolver:
             self._state.assign(state[: self._layout["direction"].start].astype(self.dtype))
             self._motion.assign(motion)
             self._sums.zero_()
-            before = self._w["x"].numpy()[m.moving, :] if n else None
-            before = np.array(before, np.float64)
             wp.capture_launch(self._graph)
             new = np.empty(self.state_size, self.dtype)
             new[: self._layout["direction"].start] = self._state.numpy()
@@ -319,7 +308,7 @@ class CuttingSolver:
         wrench = wrenches[0] + wrenches[1] + wrenches[2]
         # Moments are about Ko at each sub-step; the mean position of Ko is half a period back.
         work = -float(wrench[3:] @ v + wrench[:3] @ w) * T
-        moved = self.positions(new)[m.moving].astype(np.float64) - before
+        moved = self.positions(new)[m.moving].astype(np.float64) - self.positions(state)[m.moving]
         return Exchange(
             state=new,
             wrench=wrench,
@@ -340,43 +329,61 @@ class CuttingSolver:
     def _interpolate(
         self, state: np.ndarray, start: Pose, end: Pose
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Knife poses at the ends of the sub-steps, constant velocity and rotation rate."""
-        n, T = self.substeps, self.exchange_period
-        v = (end.position - start.position) / T
-        turn = _rotation_vector(end.rotation @ start.rotation.T)
-        w = turn / T
-        share = np.arange(1, n + 1) / n
-        position = start.position + share[:, None] * (end.position - start.position)
-        if not turn.any():
-            rotation = np.broadcast_to(start.rotation, (n, 3, 3))
-        else:
-            rotation = _rotations(share[:, None] * turn) @ start.rotation
+        """Knife poses at the ends of the sub-steps, constant velocity and rotation rate.
 
-        edge_x, down = end.rotation[:, 0], end.rotation[:, 2]
-        arm = edge_x * float((self._centre - end.position) @ edge_x)
-        in_plane = v + np.cross(w, arm)
-        in_plane = in_plane - (in_plane @ end.rotation[:, 1]) * end.rotation[:, 1]
-        d = np.asarray(state[self._layout["direction"]], np.float64)
-        speed = float(np.sqrt(in_plane @ in_plane))
-        directions = np.tile(d, (n, 1))
-        if speed > 0.0:
-            length = self.model.numerics.direction_length
-            for k in range(n):
-                keep = np.exp(-speed * T / n / length)
-                d = keep * d + (1.0 - keep) * in_plane / speed
-                size = np.sqrt(d @ d)
-                d = d / size if size > 1e-9 else down
-                directions[k] = d
-        flat = np.concatenate(
+        Returns:
+            The kernels' motion buffer, the direction of cutting at the end, velocity [3] of Ko and
+            rotation rate [3].
+        """
+        n, T = self.substeps, self.exchange_period
+        v = (end.p - start.p) / T
+        turn = _rotation_vector(end.R @ start.R.T)
+        w = turn / T
+        motion = np.empty(21 * n)
+        share = self._share
+        if turn.any():
+            rotation = _rotations(share * turn) @ start.R
+            motion[: 9 * n] = rotation.ravel()
+        else:
+            motion[: 9 * n].reshape(n, 9)[:] = start.R.ravel()
+        motion[9 * n : 12 * n].reshape(n, 3)[:] = start.p + share * (v * T)
+        motion[12 * n : 15 * n].reshape(n, 3)[:] = v
+        motion[15 * n : 18 * n].reshape(n, 3)[:] = w
+        directions = motion[18 * n :].reshape(n, 3)
+        directions[:], d = self._directions(state, end, v, w)
+        return motion.astype(self.dtype), d, v, w
+
+    def _directions(
+        self, state: np.ndarray, end: Pose, v: np.ndarray, w: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Direction of cutting in each sub-step [n, 3] and at the end [3].
+
+        It is the direction of the edge's velocity in the blade's plane, at the middle of the section,
+        followed over `direction_length` of travel, so that it exists at rest.
+        """
+        n = self.substeps
+        old = state[self._layout["direction"]].astype(np.float64)
+        edge_x, normal = end.R[:, 0], end.R[:, 1]
+        ax, ay, az = edge_x * float((self._centre - end.p) @ edge_x)
+        u = np.array(
             [
-                np.ascontiguousarray(rotation).ravel(),
-                position.ravel(),
-                np.tile(v, n),
-                np.tile(w, n),
-                directions.ravel(),
+                v[0] + w[1] * az - w[2] * ay,
+                v[1] + w[2] * ax - w[0] * az,
+                v[2] + w[0] * ay - w[1] * ax,
             ]
         )
-        return flat.astype(self.dtype), d, v, w
+        u -= (u @ normal) * normal
+        speed = float(np.sqrt(u @ u))
+        if speed == 0.0:
+            return old, old
+        u /= speed
+        keep = np.exp(-speed * self.exchange_period / n / self.model.numerics.direction_length)
+        kept = keep ** np.arange(1, n + 1)[:, None]
+        directions = kept * old + (1.0 - kept) * u
+        size = np.sqrt((directions * directions).sum(1, keepdims=True))
+        # A reversal passes through zero; there the old direction holds for one more sub-step.
+        directions = np.where(size > 1e-9, directions / np.maximum(size, 1e-9), old)
+        return directions, directions[-1]
 
     def energies(self, state: np.ndarray, pose: Pose) -> Energies:
         """Energies of `state` with the knife at `pose`."""
@@ -385,8 +392,8 @@ class CuttingSolver:
             self._state.assign(state[: self._layout["direction"].start].astype(self.dtype))
             motion = self._motion.numpy().copy()
             n = self.substeps
-            motion[:9] = pose.rotation.ravel()
-            motion[9 * n : 9 * n + 3] = pose.position
+            motion[:9] = pose.R.ravel()
+            motion[9 * n : 9 * n + 3] = pose.p
             self._motion.assign(motion)
             wp.launch(
                 kern.element_energy,
@@ -401,7 +408,7 @@ class CuttingSolver:
                 + [w["width"], w["fraction"], w["widest"], self.real(m.tables.reach)]
                 + [self.real(1.0 / m.tables.spacing), w["P"], w["knife"], w["R_CK"], w["p_CK"]]
                 + [0, w["blade"], w["passed"], w["parted"], w["slip"]]
-                + [w["point_energy"], w["cut"]],
+                + [w["point_energy"]],
                 device=self._device,
             )
             elastic = w["energy"].numpy().astype(np.float64).sum()
@@ -409,7 +416,6 @@ class CuttingSolver:
             least = int(ratio.argmin())
             least_ratio = float(ratio[least])
             interface = w["point_energy"].numpy().astype(np.float64).sum()
-            cut = float(w["cut"].numpy() @ m.tables.area / m.tables.area.sum())
         depth = np.maximum(m.board[3] - self.positions(state) @ m.board[:3], 0.0)
         anchor = self.field(state, "board_slip").reshape(-1, 3)
         rest = 0.5 * m.parameters["board_stiffness"] * m.board_area
@@ -424,8 +430,16 @@ class CuttingSolver:
             true_kinetic=float(0.5 * m.true_mass[m.moving] @ v2),
             least_volume_ratio=least_ratio,
             least_element=least,
-            cut=cut,
         )
+
+    def cut_fraction(self, state: np.ndarray) -> float:
+        """Share of the section that the edge has passed."""
+        tables = self.model.tables
+        u = (np.asarray(self.field(state, "passed"), np.float64) + tables.reach) / tables.spacing
+        cell = np.clip(u.astype(int), 0, tables.fraction.shape[1] - 2)
+        w = np.clip(u - cell, 0.0, 1.0)
+        low, high = tables.fraction[self._rows, cell], tables.fraction[self._rows, cell + 1]
+        return float(((1.0 - w) * low + w * high) @ tables.area / self.model.section_area)
 
     def held_reaction(self, state: np.ndarray) -> np.ndarray:
         """Force of what holds the food on the food [3], N, in C, from the bulk's forces."""
@@ -480,7 +494,7 @@ def _point_gather(
 
 
 def _rotation_vector(R: np.ndarray) -> np.ndarray:
-    """Rotation vector of a small rotation [3]."""
+    """Rotation vector [3] of a rotation by less than pi."""
     skew = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     sine = float(np.sqrt(skew @ skew))
     if sine < 1e-12:

@@ -148,7 +148,9 @@ def _minority_part(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     add(two, [a, a2, a3, b])
     add(two, [a2, a3, b, b3])
     add(two, [a2, b, b2, b3])
-    centroid = np.divide(moment, share[:, None], out=np.full_like(moment, 0.25), where=share[:, None] > 0)
+    centroid = np.divide(
+        moment, share[:, None], out=np.full_like(moment, 0.25), where=share[:, None] > 0
+    )
     return share, centroid
 
 
@@ -158,7 +160,9 @@ def _side_parts(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     flip = count == 3
     share, centroid = _minority_part(np.where(flip[:, None], -height, height))
     complement = 1.0 - share
-    other = (0.25 - share[:, None] * centroid) / np.where(complement > 0.0, complement, 1.0)[:, None]
+    other = (0.25 - share[:, None] * centroid) / np.where(complement > 0.0, complement, 1.0)[
+        :, None
+    ]
     share = np.where(flip, complement, share)
     centroid = np.where(flip[:, None], other, centroid)
     whole = (height >= 0.0).all(1)

@@ -1,9 +1,9 @@
-"""Writes the visual meshes of the UR5e, one glTF file per link, beside this file.
+"""Writes the visual meshes of the robot's links and of the gripper: glTF files in ur5e and gripper.
 
-Run ``python models/ur5e/make_meshes.py``. All shapes are surfaces of revolution that we drew after
-the robot's main dimensions (kinematics in ur5e.urdf; footprint, tube and joint diameters of the
-UR5e technical data sheet and drawings by Universal Robots). They are for the eye only: no physics
-uses them.
+Run ``python models/make_meshes.py``. The shapes are surfaces of revolution and extruded outlines
+that we drew after the main dimensions of the real parts (for the arm the kinematics in ur5e.urdf,
+a foot of 149 mm and joints of about 120, 110 and 77 mm diameter; for the gripper the envelope of a
+Robotiq 2F-85). They are for the eye only: no physics uses them.
 """
 
 import base64
@@ -14,16 +14,17 @@ from pathlib import Path
 
 import numpy as np
 
-SEGMENTS = 40
+SEGMENTS = 32
 CREASE = math.radians(40)
 
 # Base colour (linear RGB), metallic and roughness factors.
 MATERIALS = {
-    "tube": ((0.66, 0.67, 0.68), 0.35, 0.42),
-    "housing": ((0.085, 0.09, 0.10), 0.30, 0.48),
-    "lid": ((0.13, 0.36, 0.60), 0.05, 0.38),
-    "seal": ((0.012, 0.012, 0.013), 0.0, 0.75),
-    "steel": ((0.55, 0.56, 0.58), 0.85, 0.28),
+    "tube": ((0.72, 0.73, 0.74), 0.10, 0.45),
+    "housing": ((0.20, 0.21, 0.22), 0.10, 0.50),
+    "lid": ((0.16, 0.40, 0.66), 0.0, 0.40),
+    "seal": ((0.015, 0.015, 0.016), 0.0, 0.75),
+    "steel": ((0.55, 0.56, 0.58), 0.40, 0.35),
+    "black": ((0.030, 0.031, 0.033), 0.10, 0.55),
 }
 
 X, Y, Z = np.eye(3)
@@ -39,7 +40,7 @@ class Part:
     faces: np.ndarray
 
 
-def rounded(profile: list[tuple[float, ...]], steps: int = 4) -> np.ndarray:
+def rounded(profile: list[tuple[float, ...]], steps: int = 3) -> np.ndarray:
     """Replaces corners of a profile by arcs.
 
     Args:
@@ -135,6 +136,84 @@ def drum(
     top = radius if radius_high is None else radius_high
     profile = [(0.0, low), (radius, low, fillet), (top, high, fillet), (0.0, high)]
     return lathe(material, profile, origin, axis)
+
+
+def extrusion(
+    material: str,
+    outline: list[tuple[float, ...]],
+    origin: np.ndarray,
+    axes: tuple[np.ndarray, np.ndarray, np.ndarray],
+    low: float,
+    high: float,
+    bevel: float = 0.0015,
+) -> Part:
+    """Convex outline swept along an axis, its rims bevelled.
+
+    Args:
+        material: Name in MATERIALS.
+        outline: Corners (u, v[, fillet]) of a convex polygon, counter-clockwise, metres.
+        origin: Origin of (u, v) and of the height, link frame, metres.
+        axes: Right-handed unit vectors of u, v and height, link frame.
+        low: Least height.
+        high: Greatest height.
+        bevel: Width of the bevel.
+
+    Returns:
+        The part, its sides shaded smooth except at edges sharper than CREASE.
+    """
+    corners = [np.array(p[:2]) for p in outline]
+    closed = [tuple(0.5 * (corners[-1] + corners[0])), *outline, tuple(0.5 * (corners[-1] + corners[0]))]
+    ring = rounded(closed)[:-1]
+    edge = np.roll(ring, -1, axis=0) - ring
+    side = np.stack([edge[:, 1], -edge[:, 0]], axis=1)
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    mitre = side + np.roll(side, 1, axis=0)
+    mitre /= 1.0 + np.sum(side * np.roll(side, 1, axis=0), axis=1)[:, None]
+    inner = ring - bevel * mitre
+    u, v, w = axes
+    vertices: list[np.ndarray] = []
+    normals: list[np.ndarray] = []
+    faces: list[tuple[int, int, int]] = []
+
+    def face(points: list[np.ndarray], shades: list[np.ndarray]) -> None:
+        start = len(vertices)
+        vertices.extend(origin + p[0] * u + p[1] * v + p[2] * w for p in points)
+        normals.extend(n[0] * u + n[1] * v + n[2] * w for n in shades)
+        faces.extend((start, start + k, start + k + 1) for k in range(1, len(points) - 1))
+
+    count = len(ring)
+    for i in range(count):
+        j = (i + 1) % count
+        shade = []
+        for k, neighbour in ((i, i - 1), (j, j)):
+            smooth = side[i] @ side[neighbour] > math.cos(CREASE)
+            n = side[i] + side[neighbour] if smooth else side[i]
+            shade.append(n / np.linalg.norm(n))
+        a, b = (np.append(n, 0.0) for n in shade)
+        walls = [
+            (inner, low, ring, low + bevel, -1.0),
+            (ring, low + bevel, ring, high - bevel, 0.0),
+            (ring, high - bevel, inner, high, 1.0),
+        ]
+        for lower, z0, upper, z1, tilt in walls:
+            t = np.array([0.0, 0.0, tilt])
+            na, nb = ((n + t) / np.linalg.norm(n + t) for n in (a, b))
+            points = [np.append(lower[i], z0), np.append(lower[j], z0)]
+            points += [np.append(upper[j], z1), np.append(upper[i], z1)]
+            face(points, [na, nb, nb, na])
+    top = np.array([0.0, 0.0, 1.0])
+    face([np.append(p, high) for p in inner], [top] * count)
+    face([np.append(p, low) for p in inner[::-1]], [-top] * count)
+    return Part(material, np.array(vertices), np.array(normals), np.array(faces))
+
+
+def block(
+    material: str, centre: tuple[float, float, float], size: tuple[float, float, float], fillet: float
+) -> Part:
+    """Box with rounded vertical edges and bevelled rims, aligned with the link frame."""
+    x, y, z = 0.5 * np.array(size)
+    outline = [(-x, -y, fillet), (x, -y, fillet), (x, y, fillet), (-x, y, fillet)]
+    return extrusion(material, outline, np.array(centre), (X, Y, Z), -z, z)
 
 
 def lid(origin: np.ndarray, axis: np.ndarray, height: float, radius: float) -> list[Part]:
@@ -258,14 +337,58 @@ def wrist_3() -> list[Part]:
     return parts
 
 
-LINKS = {
-    "base": base,
-    "shoulder": shoulder,
-    "upper_arm": upper_arm,
-    "forearm": forearm,
-    "wrist_1": wrist_1,
-    "wrist_2": wrist_2,
-    "wrist_3": wrist_3,
+def gripper() -> list[Part]:
+    """Two-finger gripper, closed by its fingers' adapters on the spine of a knife in the plane y = 0.
+
+    The frame is the flange's: z leaves the robot, the fingers move along y.
+    """
+    o = np.zeros(3)
+    body = [
+        (-0.0375, -0.0200, 0.012),
+        (0.0375, -0.0200, 0.012),
+        (0.0375, 0.0200, 0.012),
+        (-0.0375, 0.0200, 0.012),
+    ]
+    parts = [
+        drum("steel", o, Z, 0.0, 0.0115, 0.0375, fillet=0.001),
+        drum("black", o, Z, 0.0115, 0.0300, 0.0365, 0.0350, fillet=0.003),
+        extrusion("black", body, o, (Y, -X, Z), 0.026, 0.094, bevel=0.003),
+        block("tube", (0.0, 0.0, 0.062), (0.0412, 0.040, 0.026), 0.004),
+    ]
+    for s in (-1.0, 1.0):
+        # Knuckle, inner and outer link, and finger, as outlines in the plane (y, z).
+        links = [
+            ("black", [(0.016, 0.083), (0.040, 0.083), (0.040, 0.100), (0.022, 0.103)], 0.013),
+            ("steel", [(0.030, 0.088), (0.041, 0.088), (0.031, 0.126), (0.021, 0.126)], 0.011),
+            ("steel", [(0.013, 0.092), (0.020, 0.092), (0.021, 0.122), (0.015, 0.122)], 0.008),
+            ("black", [(0.010, 0.114), (0.030, 0.114), (0.028, 0.140), (0.010, 0.144)], 0.012),
+        ]
+        for material, outline, half in links:
+            corners = [(s * y, z, 0.003) for y, z in outline]
+            ordered = corners if s > 0 else corners[::-1]
+            parts.append(extrusion(material, ordered, o, (Y, Z, X), -half, half))
+        for y, z in ((0.036, 0.090), (0.026, 0.122)):
+            pin = np.array([0.0, s * y, z])
+            parts.append(drum("black", pin, X, -0.0145, 0.0145, 0.0045, fillet=0.001))
+        # The adapter's jaw.
+        jaw = [(s * 0.0018, 0.132), (s * 0.0115, 0.132), (s * 0.0095, 0.168), (s * 0.0018, 0.168)]
+        corners = [(y, z, 0.0015) for y, z in (jaw if s > 0 else jaw[::-1])]
+        parts.append(extrusion("tube", corners, o, (Y, Z, X), -0.034, 0.034, bevel=0.0012))
+        for x in (-0.024, 0.024):
+            screw = np.array([x, s * 0.010, 0.151])
+            parts.append(drum("black", screw, s * Y, -0.002, 0.0045, 0.0040, fillet=0.001))
+    return parts
+
+
+MESHES = {
+    "ur5e/base": base,
+    "ur5e/shoulder": shoulder,
+    "ur5e/upper_arm": upper_arm,
+    "ur5e/forearm": forearm,
+    "ur5e/wrist_1": wrist_1,
+    "ur5e/wrist_2": wrist_2,
+    "ur5e/wrist_3": wrist_3,
+    "gripper/gripper": gripper,
 }
 
 
@@ -321,7 +444,7 @@ def gltf(parts: list[Part]) -> dict:
         )
     blob = b"".join(blobs)
     return {
-        "asset": {"version": "2.0", "generator": "models/ur5e/make_meshes.py"},
+        "asset": {"version": "2.0", "generator": "models/make_meshes.py"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
@@ -350,7 +473,7 @@ def gltf(parts: list[Part]) -> dict:
 
 def main() -> None:
     folder = Path(__file__).parent
-    for name, build in LINKS.items():
+    for name, build in MESHES.items():
         text = json.dumps(gltf(build()), separators=(",", ":"))
         (folder / f"{name}.gltf").write_text(text + "\n", encoding="utf-8")
 

@@ -1,0 +1,242 @@
+"""One slice on a prescribed knife motion, without a robot."""
+
+import dataclasses as dc
+
+import numpy as np
+
+from sliceit_drake.cutting.board import Board, board_wrench
+from sliceit_drake.cutting.knife import signed_distance
+from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.cutting.motion import Motion, Pose
+from sliceit_drake.cutting.solver import CuttingError, CuttingSolver, Energies, Exchange
+
+__all__ = [
+    "EnergyLedger",
+    "SliceResult",
+    "check_clear",
+    "check_energies",
+    "check_in_plane",
+    "simulate_slice",
+]
+
+ENERGY_RATIO_LIMIT = 0.05
+LATERAL_LIMIT = 3e-3
+TILT_LIMIT = 0.15
+LEAST_VOLUME_RATIO = 0.0
+
+
+@dc.dataclass
+class EnergyLedger:
+    """Work and dissipation since the start of a slice, J.
+
+    Attributes:
+        work: Done by the knife on the food.
+        gravity: Done by the food's weight.
+        edge, opening, friction, board_friction: Dissipated.
+        released: Taken up by the growth of the cut.
+        internal: Done by the bulk's forces on the nodes.
+    """
+
+    work: float = 0.0
+    gravity: float = 0.0
+    edge: float = 0.0
+    opening: float = 0.0
+    friction: float = 0.0
+    board_friction: float = 0.0
+    released: float = 0.0
+    internal: float = 0.0
+
+    def add(self, step: Exchange) -> None:
+        """Adds one exchange."""
+        self.work += step.work
+        self.gravity += step.gravity_work
+        self.edge += step.edge_dissipation
+        self.opening += step.opening_dissipation
+        self.friction += step.friction_dissipation
+        self.board_friction += step.board_dissipation
+        self.released += step.released
+        self.internal += step.internal_work
+
+    def damping(self, energies: Energies) -> float:
+        """Dissipated by the bulk's viscosity: work on the elements that they do not store."""
+        return -self.internal - energies.elastic
+
+    def imbalance(self, energies: Energies) -> float:
+        """Work put in minus everything that it went into; 0 if the books close."""
+        stored = energies.elastic + energies.interface + energies.kinetic
+        spent = self.edge + self.opening + self.friction + self.board_friction + self.released
+        return self.work + self.gravity - stored - spent - self.damping(energies)
+
+
+@dc.dataclass
+class SliceResult:
+    """A slice on a prescribed motion. Row k holds the mean over the exchange that ends at time[k].
+
+    Attributes:
+        time: s [n].
+        position: Of Ko in F [n, 3], metres.
+        food_wrench, board_wrench: On the knife, moment about Ko and force, in F [n, 6].
+        edge, normal, friction: Force of the food by mechanism, in F [n, 3].
+        cut: Share of the section that is cut [n].
+        state: The food at the end.
+        pose: The knife in C at the end.
+        ledger: Work and dissipation.
+        energies: At the end.
+        energy_ratio: Largest kinetic over internal energy.
+    """
+
+    time: np.ndarray
+    position: np.ndarray
+    food_wrench: np.ndarray
+    board_wrench: np.ndarray
+    edge: np.ndarray
+    normal: np.ndarray
+    friction: np.ndarray
+    cut: np.ndarray
+    state: np.ndarray
+    pose: Pose
+    ledger: EnergyLedger
+    energies: Energies
+    energy_ratio: float
+
+
+def check_clear(model: CuttingModel, X_CK: Pose) -> None:
+    """Refuses a knife that starts inside the food.
+
+    Raises:
+        CuttingError: With how far to raise it.
+    """
+    nodes = model.split.nodes[model.split.node_is_material]
+    distance, _ = signed_distance(model.knife, (nodes - X_CK.p) @ X_CK.R)
+    points = model.split.points - X_CK.p
+    reached = np.abs(points @ X_CK.R[:, 0]) < 0.5 * model.knife.length
+    depth = float((-(points @ X_CK.R[:, 2]))[reached].max(initial=-1.0))
+    if depth > 0.0 or distance.min() < 0.0:
+        raise CuttingError(
+            f"the knife starts inside the food: its edge is {max(depth, 0.0):.4g} m below the top "
+            "of the cut. Raise the start by at least that (start.clearance)."
+        )
+
+
+def check_in_plane(model: CuttingModel, X_CK: Pose, time: float) -> None:
+    """Refuses a knife that left the plane that the model can cut.
+
+    Raises:
+        CuttingError: The edge is in the food and the blade is off the plane or turned out of it.
+    """
+    if X_CK.p[2] > model.top or X_CK.p[2] < model.bottom - model.knife.height:
+        return
+    offset, lean = abs(X_CK.p[1]), abs(X_CK.R[1, 2])
+    turn = abs(X_CK.R[1, 0])
+    if offset > LATERAL_LIMIT or lean > TILT_LIMIT or turn > TILT_LIMIT:
+        raise CuttingError(
+            f"at {time:.4g} s the blade is {1e3 * offset:.3g} mm off the cut plane, leans "
+            f"{lean:.3g} rad and is turned {turn:.3g} rad about the vertical; the model holds up to "
+            f"{1e3 * LATERAL_LIMIT:g} mm and {TILT_LIMIT:g} rad. Give the knife's path the plane "
+            "of the cut."
+        )
+
+
+def check_energies(
+    energies: Energies, dissipated: float, model: CuttingModel, time: float
+) -> float:
+    """Refuses inverted elements and too much kinetic energy.
+
+    Args:
+        energies: Of the state.
+        dissipated: Since the start, J.
+        model: The cut.
+        time: For the message, s.
+
+    Returns:
+        Kinetic energy over internal energy, at least 1 % of that needed to cut through.
+
+    Raises:
+        CuttingError: With time, element and cause.
+    """
+    if energies.least_volume_ratio <= LEAST_VOLUME_RATIO:
+        raise CuttingError(
+            f"at {time:.4g} s element {energies.least_element} is inverted (volume ratio "
+            f"{energies.least_volume_ratio:.3g}): the edge deforms the food more than its mesh can "
+            "follow. Use a finer mesh near the cut or a stiffer, less tough food."
+        )
+    through = float(model.toughness @ model.tables.area)
+    internal = max(energies.elastic + energies.interface + dissipated, 0.01 * through, 1e-9)
+    ratio = energies.kinetic / internal
+    if ratio > ENERGY_RATIO_LIMIT:
+        raise CuttingError(
+            f"at {time:.4g} s the kinetic energy is {100 * ratio:.1f} % of the internal energy, "
+            f"more than {100 * ENERGY_RATIO_LIMIT:.0f} %: scaled masses are not quasi-static here. "
+            "Use a smaller numerics.time_step or a slower motion."
+        )
+    return ratio
+
+
+def simulate_slice(
+    solver: CuttingSolver, motion: Motion, board: Board | None = None, check_period: float = 0.02
+) -> SliceResult:
+    """Drives the knife along `motion` through the food.
+
+    Args:
+        solver: The cut and its exchange period.
+        motion: Poses X_FK of the knife.
+        board: Board under the knife, its height in F; None for none.
+        check_period: Interval of the energy and inversion checks, s.
+
+    Raises:
+        CuttingError: The knife starts in the food, or the cut became unphysical.
+    """
+    model, T = solver.model, solver.exchange_period
+    R_FC = model.X_FC_rotation
+
+    def in_cut_frame(t: float) -> Pose:
+        X_FK = motion.pose(t)
+        return Pose(R_FC.T @ X_FK.R, model.to_cut_frame(X_FK.p))
+
+    count = max(1, round(motion.duration / T))
+    every = max(1, round(check_period / T))
+    state, pose = solver.initial_state(), in_cut_frame(0.0)
+    check_clear(model, pose)
+    ledger = EnergyLedger()
+    rows = np.full((count, 26), np.nan)
+    ratio = 0.0
+    for k in range(count):
+        end = in_cut_frame((k + 1) * T)
+        check_in_plane(model, end, (k + 1) * T)
+        try:
+            step = solver.exchange(state, pose, end)
+        except CuttingError as error:
+            raise CuttingError(f"at {(k + 1) * T:.4g} s {error}") from error
+        state = step.state
+        ledger.add(step)
+        rows[k, 0] = (k + 1) * T
+        rows[k, 1:4] = R_FC @ end.p + model.X_FC_position
+        rows[k, 4:7], rows[k, 7:10] = R_FC @ step.wrench[:3], R_FC @ step.wrench[3:]
+        if board is not None:
+            v = R_FC @ (end.p - pose.p) / T
+            rows[k, 10:16] = board_wrench(board, model.knife, R_FC @ end.R, rows[k, 1:4], v, 0 * v)
+        else:
+            rows[k, 10:16] = 0.0
+        for column, wrench in ((16, step.edge), (19, step.normal), (22, step.friction)):
+            rows[k, column : column + 3] = R_FC @ wrench[3:]
+        rows[k, 25] = solver.cut_fraction(state)
+        pose = end
+        if (k + 1) % every == 0 or k + 1 == count:
+            energies = solver.energies(state, pose)
+            spent = ledger.edge + ledger.opening + ledger.friction
+            ratio = max(ratio, check_energies(energies, spent, model, rows[k, 0]))
+    return SliceResult(
+        time=rows[:, 0],
+        position=rows[:, 1:4],
+        food_wrench=rows[:, 4:10],
+        board_wrench=rows[:, 10:16],
+        edge=rows[:, 16:19],
+        normal=rows[:, 19:22],
+        friction=rows[:, 22:25],
+        cut=rows[:, 25],
+        state=state,
+        pose=pose,
+        ledger=ledger,
+        energies=energies,
+        energy_ratio=ratio,
+    )

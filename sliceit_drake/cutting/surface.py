@@ -1,0 +1,104 @@
+"""The food's surface for drawing: outer skin and cut faces, following the computed nodes."""
+
+import dataclasses as dc
+
+import numpy as np
+
+from sliceit_drake.cutting.mesh import boundary_faces
+from sliceit_drake.cutting.model import CuttingModel
+
+__all__ = ["FoodSurface", "food_surface"]
+
+
+@dc.dataclass
+class FoodSurface:
+    """Triangles whose corners are weighted pairs of nodes.
+
+    Attributes:
+        ends: Nodes of the split mesh at each corner [V, 2].
+        weights: Their weights [V, 2].
+        triangles: Corners [M, 3], outward oriented.
+        is_cut_face: Whether each corner belongs to the cut rather than the skin [V].
+    """
+
+    ends: np.ndarray
+    weights: np.ndarray
+    triangles: np.ndarray
+    is_cut_face: np.ndarray
+
+    def positions(self, model: CuttingModel, computed: np.ndarray) -> np.ndarray:
+        """Corners in the food frame [V, 3], metres.
+
+        Args:
+            model: The cut.
+            computed: Positions of the computed nodes in C [N, 3].
+        """
+        nodes = model.split.nodes.copy()
+        nodes[model.computed] = computed
+        corners = (nodes[self.ends] * self.weights[..., None]).sum(1)
+        return corners @ model.X_FC_rotation.T + model.X_FC_position
+
+
+def food_surface(model: CuttingModel) -> FoodSurface:
+    """The drawable surface of both halves.
+
+    Outer faces that the plane crosses are clipped, so that each side keeps its own part.
+    """
+    split = model.split
+    node_of: dict[tuple[int, int], int] = {
+        (int(v), int(s)): i
+        for i, (v, s) in enumerate(zip(split.node_source, split.node_side, strict=True))
+    }
+    y = split.vertex_position[:, 1].copy()
+    on_plane = np.zeros(len(y), bool)
+    ends = split.point_nodes
+    single = split.point_weights[:, 1] == 0.0
+    on_plane[split.node_source[ends[single, 0, 0]]] = True
+    y[on_plane] = 0.0
+
+    corner_ends: list[tuple[int, int]] = []
+    corner_weights: list[tuple[float, float]] = []
+    cut_face: list[bool] = []
+    triangles: list[tuple[int, int, int]] = []
+    known: dict[tuple, int] = {}
+
+    def corner(a: int, b: int, side: int, is_cut: bool) -> int:
+        key = (min(a, b), max(a, b), side, is_cut)
+        if key not in known:
+            w = 1.0 if a == b else y[b] / (y[b] - y[a])
+            known[key] = len(corner_ends)
+            corner_ends.append((node_of[a, side], node_of[b, side]))
+            corner_weights.append((w, 1.0 - w))
+            cut_face.append(is_cut)
+        return known[key]
+
+    faces, _ = boundary_faces(split.source_tetrahedra)
+    for face in faces.tolist():
+        for side, sign in ((0, -1.0), (1, 1.0)):
+            height = [sign * y[v] for v in face]
+            if max(height) <= 0.0:
+                continue
+            polygon = []
+            for k in range(3):
+                a, b = face[k], face[(k + 1) % 3]
+                ha, hb = height[k], height[(k + 1) % 3]
+                if ha >= 0.0:
+                    polygon.append(corner(a, a, side, False))
+                if ha * hb < 0.0:
+                    polygon.append(corner(a, b, side, False))
+            triangles += [
+                (polygon[0], polygon[k], polygon[k + 1]) for k in range(1, len(polygon) - 1)
+            ]
+
+    source = split.node_source[ends[:, 0, :]]
+    for triangle in split.triangles.tolist():
+        for side in (0, 1):
+            p, q, r = (
+                corner(int(source[i, 0]), int(source[i, 1 if not single[i] else 0]), side, True)
+                for i in triangle
+            )
+            # Section triangles face +y, which is outward on the minus side.
+            triangles.append((p, q, r) if side == 0 else (p, r, q))
+    return FoodSurface(
+        np.array(corner_ends), np.array(corner_weights), np.array(triangles), np.array(cut_face)
+    )

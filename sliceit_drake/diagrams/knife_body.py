@@ -1,0 +1,144 @@
+"""The knife as a rigid body of a plant: mass, looks, and the edge that touches the board."""
+
+import numpy as np
+from pydrake.common import MemoryFile
+from pydrake.geometry import (
+    AddContactMaterial,
+    GeometryProperties,
+    InMemoryMesh,
+    Mesh,
+    ProximityProperties,
+    Sphere,
+    SurfaceTriangle,
+    TriangleSurfaceMesh,
+)
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
+from pydrake.multibody.tree import CalcSpatialInertia, Frame, RigidBody
+
+from sliceit_drake.cutting.board import Board, edge_contact_positions
+from sliceit_drake.cutting.knife import Knife
+
+__all__ = ["add_knife", "contact_properties"]
+
+STEEL_DENSITY = 7800.0
+# Polyoxymethylene, the usual plastic of kitchen knives' handles.
+HANDLE_DENSITY = 1410.0
+
+HANDLE_LENGTH = 0.115
+HANDLE_HEIGHT = 0.028
+HANDLE_THICKNESS = 0.020
+EDGE_SPHERE_RADIUS = 1e-3
+
+STEEL = np.array([0.80, 0.82, 0.84, 1.0])
+PLASTIC = np.array([0.06, 0.06, 0.07, 1.0])
+
+
+def add_knife(
+    plant: MultibodyPlant,
+    knife: Knife,
+    board: Board,
+    parent_frame: Frame,
+    X_PK: RigidTransform,
+) -> RigidBody:
+    """Adds the rigid body ``knife``, welded to a frame.
+
+    The body's frame is the knife frame K: origin at the middle of the edge, Kx along the edge, Kz
+    from spine to edge. Mass and inertia are those of the steel prism and of a plastic handle behind
+    it. The edge is a row of small spheres that touch the edge line from inside and share the
+    board's contact law equally (`edge_contact_positions`, the points of `board_wrench`): several
+    points hold a blade steadily where one box would flip between its ends.
+
+    Args:
+        plant: Plant, not finalized, registered with a scene graph.
+        knife: The blade.
+        board: The board, whose stiffness and dissipation the contact of knife and board has.
+        parent_frame: Frame P that carries the knife.
+        X_PK: Pose of the knife frame in P.
+
+    Returns:
+        The body.
+    """
+    blade, handle = _blade(knife), _handle(knife)
+    inertia = CalcSpatialInertia(blade, STEEL_DENSITY)
+    inertia += CalcSpatialInertia(handle, HANDLE_DENSITY)
+    body = plant.AddRigidBody("knife", plant.AddModelInstance("knife"), inertia)
+    plant.WeldFrames(parent_frame, body.body_frame(), X_PK)
+    for name, mesh, colour in (("blade", blade, STEEL), ("handle", handle, PLASTIC)):
+        plant.RegisterVisualGeometry(body, RigidTransform(), _shape(mesh, name), name, colour)
+    properties = contact_properties(board, len(edge_contact_positions(knife)))
+    for i, x in enumerate(edge_contact_positions(knife)):
+        X_KS = RigidTransform([x, 0.0, -EDGE_SPHERE_RADIUS])
+        plant.RegisterCollisionGeometry(
+            body, X_KS, Sphere(EDGE_SPHERE_RADIUS), f"edge_{i}", properties
+        )
+    return body
+
+
+def contact_properties(board: Board, contacts: int) -> GeometryProperties:
+    """Contact properties of both surfaces, so that `contacts` points together have the board's law.
+
+    Drake combines the stiffnesses of two surfaces in series, so each gets twice the point's, and
+    averages their dissipations. The contact is without friction, as in `board_wrench`.
+    """
+    properties = ProximityProperties()
+    AddContactMaterial(
+        board.dissipation,
+        2.0 * board.stiffness / contacts,
+        CoulombFriction(0.0, 0.0),
+        properties,
+    )
+    return properties
+
+
+def _blade(knife: Knife) -> TriangleSurfaceMesh:
+    """The blade as a closed prism in K, faces outward."""
+    half = [
+        (0.0, 0.0),
+        (0.5 * knife.edge_thickness, -knife.tip_height),
+        (0.5 * knife.spine_thickness, -knife.tip_height - knife.height),
+    ]
+    outline = half + [(-y, z) for y, z in half[:0:-1]]
+    return _loft([(x, outline) for x in (-0.5 * knife.length, 0.5 * knife.length)])
+
+
+def _handle(knife: Knife) -> TriangleSurfaceMesh:
+    """The handle behind the blade's heel, along -Kx, a closed surface in K, faces outward."""
+    centre = -0.55 * (knife.tip_height + knife.height)
+    angle = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
+    round_y = np.sign(np.cos(angle)) * np.abs(np.cos(angle)) ** 0.6
+    round_z = np.sign(np.sin(angle)) * np.abs(np.sin(angle)) ** 0.6
+    # Positions along the handle from butt to blade, and the section's size there.
+    sections = [(0.00, 0.70), (0.04, 0.96), (0.12, 1.0), (0.35, 0.90), (0.6, 0.88), (0.9, 1.0)]
+    sections += [(0.97, 0.96), (1.0, 0.80)]
+    rings = []
+    for along, size in sections:
+        y = 0.5 * size * HANDLE_THICKNESS * round_y
+        z = centre - 0.5 * size * HANDLE_HEIGHT * round_z
+        x = -0.5 * knife.length - HANDLE_LENGTH * (1.0 - along)
+        rings.append((x, list(zip(y, z, strict=True))))
+    return _loft(rings)
+
+
+def _loft(rings: list[tuple[float, list[tuple[float, float]]]]) -> TriangleSurfaceMesh:
+    """Closes a surface through outlines (y, z), clockwise about +x, at increasing x."""
+    count = len(rings[0][1])
+    vertices = [np.array([x, y, z]) for x, outline in rings for y, z in outline]
+    triangles = []
+    for ring in range(len(rings) - 1):
+        for i in range(count):
+            a, b = ring * count + i, ring * count + (i + 1) % count
+            c, d = a + count, b + count
+            triangles += [(a, c, b), (b, c, d)]
+    last = (len(rings) - 1) * count
+    for i in range(1, count - 1):
+        triangles += [(0, i, i + 1), (last, last + i + 1, last + i)]
+    return TriangleSurfaceMesh([SurfaceTriangle(*t) for t in triangles], vertices)
+
+
+def _shape(mesh: TriangleSurfaceMesh, name: str) -> Mesh:
+    lines = ["v {:.9g} {:.9g} {:.9g}".format(*v) for v in mesh.vertices()]
+    for triangle in mesh.triangles():
+        lines.append("f " + " ".join(str(triangle.vertex(i) + 1) for i in range(3)))
+    contents = "\n".join(lines) + "\n"
+    return Mesh(InMemoryMesh(mesh_file=MemoryFile(contents, ".obj", name)))

@@ -1,0 +1,98 @@
+"""A scenario: everything about one simulated or real slice, and the YAML that holds it."""
+
+import dataclasses as dc
+from pathlib import Path
+
+import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
+
+from sliceit_drake.configuration import load_yaml, quantity, validate
+from sliceit_drake.cutting.board import Board
+from sliceit_drake.cutting.food import Food
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.model import Numerics
+from sliceit_drake.cutting.motion import MotionPlan
+from sliceit_drake.diagrams.robot import RobotConfig
+from sliceit_drake.systems.analytic_cutter import AnalyticFood
+from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
+from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig
+
+__all__ = ["Measurement", "Placement", "Scenario", "Start", "load_scenario"]
+
+
+@dc.dataclass
+class Placement:
+    """Where the food lies on the board, in the world."""
+
+    position: list[float] = quantity(
+        [0.026, -0.505], "m", low=-3.0, high=3.0, size=2, doc="Origin of F, x and y."
+    )
+    yaw: float = quantity(
+        0.5 * np.pi, "rad", low=-6.3, high=6.3, doc="Direction of Fx, along the blade, about Wz."
+    )
+
+
+@dc.dataclass
+class Start:
+    """Where the knife starts, relative to the top of the cut."""
+
+    clearance: float = quantity(
+        0.01, "m", low=-0.05, high=0.5, doc="Height of the edge above the food."
+    )
+    offset: float = quantity(
+        0.0, "m", low=-0.2, high=0.2, doc="Shift of the edge's middle along the edge."
+    )
+
+
+@dc.dataclass
+class Measurement:
+    """A measured force profile to compare with."""
+
+    file: str = ""
+    """CSV of `records.force_profile`, relative to the resources or to the working directory."""
+    speed: float = quantity(0.02, "m/s", low=1e-4, high=1.0, doc="Downward speed of the record.")
+    time_offset: float | None = quantity(
+        None, "s", low=-10.0, high=10.0, doc="Record time at first contact; null: fitted."
+    )
+
+
+@dc.dataclass
+class Scenario:
+    """One slice: robot, controller, knife, food, board, motion."""
+
+    name: str = "cucumber"
+    seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Seed of everything random.")
+    exchange_period: float = quantity(
+        0.002, "s", low=2.5e-4, high=0.02, doc="Interval at which food, controller and sensor update."
+    )
+    robot: RobotConfig = dc.field(default_factory=RobotConfig)
+    sensor: WrenchSensorConfig = dc.field(default_factory=WrenchSensorConfig)
+    controller: ComplianceControllerConfig = dc.field(default_factory=ComplianceControllerConfig)
+    knife: Knife = dc.field(default_factory=Knife)
+    board: Board = dc.field(default_factory=Board)
+    food: Food | AnalyticFood = dc.field(default_factory=Food)
+    numerics: Numerics = dc.field(default_factory=Numerics)
+    placement: Placement = dc.field(default_factory=Placement)
+    start: Start = dc.field(default_factory=Start)
+    motion: MotionPlan = dc.field(default_factory=MotionPlan)
+    measurement: Measurement | None = None
+
+    def X_WF(self) -> RigidTransform:
+        """Pose of the food frame: on the board's top surface."""
+        p_WF = np.array([*self.placement.position, self.board.height])
+        return RigidTransform(RotationMatrix.MakeZRotation(self.placement.yaw), p_WF)
+
+
+def load_scenario(file: str | Path, overrides: str | None = None) -> Scenario:
+    """Reads and validates a scenario.
+
+    Args:
+        file: YAML with one document of `Scenario` fields.
+        overrides: YAML text whose fields replace those of the file.
+
+    Raises:
+        ConfigurationError: Naming file, field and fix.
+    """
+    scenario = load_yaml(Scenario, file, defaults=Scenario(), overrides_text=overrides)
+    validate(scenario, "scenario")
+    return scenario

@@ -1,0 +1,236 @@
+"""The simulated slicing station: a Scenario becomes a Diagram."""
+
+import numpy as np
+from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import RigidBody
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.primitives import Demultiplexer
+
+from sliceit_drake.cutting.food import Food, make_food_model, start_pose
+from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.diagrams.ports import STATION_PORTS
+from sliceit_drake.diagrams.robot import (
+    ArmController,
+    Robot,
+    add_plant,
+    add_robot,
+    connect_arm_controller,
+    set_joint_positions,
+)
+from sliceit_drake.diagrams.scenario import Scenario
+from sliceit_drake.diagrams.start import solve_start_joints
+from sliceit_drake.diagrams.workspace import add_board, add_holder, add_table
+from sliceit_drake.systems.analytic_cutter import AnalyticCutter
+from sliceit_drake.systems.compliance_controller import ComplianceController
+from sliceit_drake.systems.cutting_system import CuttingSystem
+from sliceit_drake.systems.food_visualizer import FoodVisualizer
+from sliceit_drake.systems.knife_force import KnifeForceSystem
+from sliceit_drake.systems.knife_kinematics import BoardContact, KnifeKinematics
+from sliceit_drake.systems.motion_sources import MotionSource
+from sliceit_drake.systems.servo import JOINTS
+from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
+from sliceit_drake.systems.wrench_sensor import WrenchSensor
+
+__all__ = ["MakeScenarioDiagram", "MakeSlicingStation", "SlicingStation"]
+
+FRAMES_PER_SECOND = 32.0
+
+
+class SlicingStation(Diagram):
+    """Arm, knife, controller, sensor, board and food behind the ports of `ports.STATION_PORTS`.
+
+    Attributes:
+        scenario: What it was made from.
+        plant: The arm with gripper and knife, and the board.
+        cutting: The food: finite elements or analytic.
+        controller: The compliance controller.
+        start_pose: X_WK at the start.
+        start_joints: Joint positions there [6], rad.
+        meshcat: The viewer, or None.
+    """
+
+    def __init__(self, scenario: Scenario, meshcat: Meshcat | None = None) -> None:
+        super().__init__()
+        self.scenario = scenario
+        self.meshcat = meshcat
+        builder = DiagramBuilder()
+        self.plant, scene_graph = add_plant(builder, scenario.robot)
+        self.robot: Robot = add_robot(self.plant, scenario.robot, scenario.knife, scenario.board)
+        add_table(self.plant, (0.1, -0.3))
+        add_board(self.plant, scenario.board, scenario.X_WF())
+        _add_holder(self.plant, scenario)
+        self.plant.Finalize()
+
+        self.cutting: KnifeForceSystem
+        self.cutting, X_FK = _make_cutting(scenario, self.robot.knife)
+        self.start_pose = scenario.X_WF() @ X_FK
+        self.start_joints = solve_start_joints(
+            self.plant,
+            self.robot.knife,
+            self.start_pose,
+            np.array(scenario.robot.joint_positions),
+        )
+        self._arm: ArmController = connect_arm_controller(
+            builder, self.plant, self.robot, scenario.robot
+        )
+        self.controller = ComplianceController(
+            scenario.controller, ur5e_chain(scenario.robot.X_TK()), X_WB=scenario.robot.X_WB()
+        )
+        sensor = WrenchSensor(
+            self.plant, self.robot.sensor_weld, scenario.exchange_period, scenario.sensor
+        )
+        kinematics = KnifeKinematics(self.robot.knife.index())
+        board_contact = BoardContact(self.robot.knife.index())
+        named = {
+            "cutting": self.cutting,
+            "controller": self.controller,
+            "sensor": sensor,
+            "kinematics": kinematics,
+            "board_contact": board_contact,
+        }
+        for name, system in named.items():
+            builder.AddNamedSystem(name, system)
+
+        plant = self.plant
+        for source, target in (
+            (plant.get_body_poses_output_port(), kinematics.GetInputPort("body_poses")),
+            (
+                plant.get_body_spatial_velocities_output_port(),
+                kinematics.GetInputPort("body_velocities"),
+            ),
+            (kinematics.GetOutputPort("knife_pose"), self.cutting.GetInputPort("knife_pose")),
+            (
+                kinematics.GetOutputPort("knife_velocity"),
+                self.cutting.GetInputPort("knife_velocity"),
+            ),
+            (
+                self.cutting.GetOutputPort("applied_force"),
+                plant.get_applied_spatial_force_input_port(),
+            ),
+            (
+                plant.get_contact_results_output_port(),
+                board_contact.GetInputPort("contact_results"),
+            ),
+            (kinematics.GetOutputPort("knife_pose"), board_contact.GetInputPort("knife_pose")),
+            (plant.get_reaction_forces_output_port(), sensor.GetInputPort("reaction_forces")),
+            (sensor.GetOutputPort("sensor_wrench"), self.controller.GetInputPort("sensor_wrench")),
+            (
+                self.controller.GetOutputPort("joint_positions_command"),
+                self._arm.GetInputPort("joint_positions_command"),
+            ),
+        ):
+            builder.Connect(source, target)
+        joints = builder.AddNamedSystem("joints", Demultiplexer([JOINTS, JOINTS]))
+        builder.Connect(plant.get_state_output_port(self.robot.arm), joints.get_input_port())
+        builder.Connect(
+            joints.get_output_port(0), self.controller.GetInputPort("joint_positions")
+        )
+
+        outputs = {
+            "joint_positions": joints.get_output_port(0),
+            "joint_velocities": joints.get_output_port(1),
+            "joint_positions_command": self.controller.GetOutputPort("joint_positions_command"),
+            "commanded_pose": self.controller.GetOutputPort("commanded_pose"),
+            "knife_pose": kinematics.GetOutputPort("knife_pose"),
+            "knife_velocity": kinematics.GetOutputPort("knife_velocity"),
+            "sensor_wrench": sensor.GetOutputPort("sensor_wrench"),
+            "food_wrench": self.cutting.GetOutputPort("food_wrench"),
+            "board_wrench": board_contact.GetOutputPort("board_wrench"),
+            "cut_progress": self.cutting.GetOutputPort("cut_progress"),
+        }
+        for port in STATION_PORTS:
+            if port.direction == "input":
+                builder.ExportInput(self.controller.GetInputPort(port.name), port.name)
+            else:
+                builder.ExportOutput(outputs[port.name], port.name)
+        if isinstance(self.cutting, CuttingSystem):
+            for name in ("force_components", "ledger", "energy", "coupling_work_error"):
+                builder.ExportOutput(self.cutting.GetOutputPort(name), name)
+
+        self.visualizer: MeshcatVisualizer | None = None
+        self.food_visualizer: FoodVisualizer | None = None
+        if meshcat is not None:
+            self._add_visualization(builder, scene_graph, meshcat)
+        builder.BuildInto(self)
+        self.set_name("station")
+
+    def _add_visualization(self, builder: DiagramBuilder, scene_graph: SceneGraph, meshcat: Meshcat) -> None:
+        self.visualizer = MeshcatVisualizer.AddToBuilder(
+            builder,
+            scene_graph,
+            meshcat,
+            MeshcatVisualizerParams(publish_period=1.0 / FRAMES_PER_SECOND),
+        )
+        if isinstance(self.cutting, CuttingSystem):
+            self.food_visualizer = builder.AddNamedSystem(
+                "food_visualizer", FoodVisualizer(self.cutting, meshcat, 1.0 / FRAMES_PER_SECOND)
+            )
+            for name in ("surface_vertices", "food_index"):
+                builder.Connect(
+                    self.cutting.GetOutputPort(name), self.food_visualizer.GetInputPort(name)
+                )
+
+    def SetStart(self, root_context: Context) -> None:
+        """Puts arm and controller at rest at the scenario's start, in the context of the diagram."""
+        set_joint_positions(root_context, self.plant, self.robot, self._arm, self.start_joints)
+
+
+def MakeSlicingStation(scenario: Scenario, meshcat: Meshcat | None = None) -> SlicingStation:
+    """The simulated station of a scenario; connect a source of targets to its input ports.
+
+    Args:
+        scenario: What to simulate.
+        meshcat: Viewer to draw in, or None.
+
+    Raises:
+        ConfigurationError, MeshError, TimeStepError: The scenario cannot be built.
+    """
+    return SlicingStation(scenario, meshcat)
+
+
+def MakeScenarioDiagram(scenario: Scenario, meshcat: Meshcat | None = None) -> Diagram:
+    """The station of a scenario driven by the scenario's motion.
+
+    Returns:
+        A diagram with systems "station" and "motion".
+    """
+    builder = DiagramBuilder()
+    station = builder.AddNamedSystem("station", MakeSlicingStation(scenario, meshcat))
+    motion = builder.AddNamedSystem("motion", MotionSource(scenario.motion, station.start_pose))
+    builder.Connect(motion.GetOutputPort("target_pose"), station.GetInputPort("target_pose"))
+    diagram = builder.Build()
+    diagram.set_name(scenario.name)
+    return diagram
+
+
+def _make_cutting(scenario: Scenario, knife: RigidBody) -> tuple[KnifeForceSystem, RigidTransform]:
+    """The cutting system of a scenario and X_FK at the start."""
+    period = scenario.exchange_period
+    if isinstance(scenario.food, Food):
+        model = make_food_model(scenario.food, scenario.knife, scenario.numerics)
+        pose = start_pose(model, scenario.start.clearance, scenario.start.offset)
+        solver = CuttingSolver(model, period)
+        cutting = CuttingSystem([solver], scenario.X_WF(), knife.index())
+        return cutting, RigidTransform(RotationMatrix(pose.R), pose.p)
+    height = scenario.food.diameter + scenario.start.clearance
+    X_FK = RigidTransform(
+        RotationMatrix(np.diag([1.0, -1.0, -1.0])), [scenario.start.offset, 0.0, height]
+    )
+    return AnalyticCutter(scenario.food, scenario.board.height, knife.index(), period), X_FK
+
+
+def _add_holder(plant: MultibodyPlant, scenario: Scenario) -> None:
+    food = scenario.food
+    if not isinstance(food, Food) or food.held_sides not in ("both", "plus"):
+        return
+    vertices = food.shape.mesh().vertices
+    add_holder(
+        plant,
+        scenario.board,
+        scenario.X_WF(),
+        food_width=float(np.ptp(vertices[:, 0])),
+        food_height=float(np.ptp(vertices[:, 2])),
+        distance=food.hold_distance + 0.005,
+    )

@@ -1,0 +1,70 @@
+"""Finds the files that ship beside the code: models, calibrations, robot configurations, scenarios.
+
+In a checkout (or an editable install) they stand at the top of the repository; in a wheel they
+stand inside the package, under ``_resources``. Everything else asks here and does not care.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pydrake.multibody.parsing import Parser
+
+__all__ = ["MODEL_PACKAGE", "add_package_map", "resource_path"]
+
+MODEL_PACKAGE = "sliceit_drake_models"
+FOLDERS = ("calibration", "hardware", "models", "scenarios")
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def resource_path(relative: str) -> Path:
+    """Returns the absolute path of a file or folder that ships with the project.
+
+    Args:
+        relative: Path that begins with one of ``models``, ``calibration``, ``hardware`` or
+            ``scenarios``, with forward slashes, such as ``"scenarios/cucumber.yaml"``.
+
+    Raises:
+        ValueError: If `relative` does not begin with one of these folders or leaves it.
+        FileNotFoundError: If there is no such file or folder.
+    """
+    parts = Path(relative).parts
+    if not parts or parts[0] not in FOLDERS or ".." in parts:
+        raise ValueError(
+            f'resource_path("{relative}"): give a path that begins with one of '
+            f"{', '.join(FOLDERS)} and does not go up, such as "
+            '"models/ur5e/ur5e.urdf".'
+        )
+    root = _resource_root()
+    path = root / relative
+    if not path.exists():
+        raise FileNotFoundError(
+            f'resource_path("{relative}"): there is no {path}. Check the spelling; if it is right, '
+            "the installation is incomplete: reinstall sliceit_drake."
+        )
+    return path
+
+
+def add_package_map(parser: "Parser") -> None:
+    """Lets `parser` resolve ``package://sliceit_drake_models/...`` to our models.
+
+    Args:
+        parser: A Drake parser; its package map gains our package unless it has it already.
+    """
+    package_map = parser.package_map()
+    if not package_map.Contains(MODEL_PACKAGE):
+        package_map.Add(MODEL_PACKAGE, str(resource_path("models")))
+
+
+def _resource_root() -> Path:
+    # A wheel is tried first: beside its package lie other packages, whose folder "models" is not
+    # ours.
+    for root in (_PACKAGE / "_resources", _PACKAGE.parent):
+        if (root / "models" / "package.xml").is_file():
+            return root
+    raise FileNotFoundError(
+        f"The models of sliceit_drake are neither in {_PACKAGE / '_resources'} (wheel) nor in "
+        f"{_PACKAGE.parent} (checkout). Install the wheel, or run "
+        '"pip install -e ." in a complete checkout.'
+    )

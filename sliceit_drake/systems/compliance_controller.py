@@ -1,0 +1,544 @@
+"""Forward dynamics compliance control (FDCC) as a Drake system.
+
+Scherzinger, Roennau and Dillmann, "Forward Dynamics Compliance Control (FDCC): A new approach to
+cartesian compliance for robotic manipulators", IROS 2017. A virtual model of the arm, nearly all of
+whose mass sits at its end effector, is pushed by the net force of a spring to the target pose and
+of the measured and the target wrench; the joint positions that it reaches are the command. The steps
+are those of the authors' cartesian_controllers (commit f53f798), reproduced to rounding.
+
+Inside this module wrenches and pose errors are arrays [2, 3] whose first row is the translational
+part and whose second is the rotational one, so that a change of axes is one product from the right:
+v_B = v_C @ R_BC.T.
+"""
+
+import dataclasses as dc
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from pydrake.common.value import AbstractValue, Value
+from pydrake.math import RigidTransform
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    JacobianWrtVariable,
+    RevoluteJoint,
+    SpatialInertia,
+    UnitInertia,
+)
+from pydrake.systems.framework import (
+    CacheEntry,
+    Context,
+    DependencyTicket,
+    DiscreteValues,
+    LeafSystem,
+    ValueProducer,
+)
+from scipy.linalg.lapack import dposv
+
+from sliceit_drake.configuration import ConfigurationError, choice, quantity, validate
+from sliceit_drake.systems.ur5e_kinematics import KinematicChain
+
+__all__ = ["ComplianceController", "ComplianceControllerConfig", "make_virtual_model"]
+
+_MODES = ("compliance", "motion", "force", "parallel")
+_END_EFFECTOR = "end_effector"
+
+# Virtual mass [kg] and moment of inertia [kg m2] of the end effector, moment of inertia of a link.
+_END_EFFECTOR_MASS = 1.0
+_END_EFFECTOR_INERTIA = 1.0
+_LINK_INERTIA = 1e-6
+
+# A pose error is limited to this length [m] and to this angle [rad].
+_MAX_DISTANCE = 1.0
+_MAX_ANGLE = 1.0
+
+# Threshold of KDL (orocos_kinematics_dynamics, frames.cpp): shorter vectors count as zero, and
+# rotation matrices whose opposite elements differ by less count as symmetric.
+_KDL_THRESHOLD = 1e-6
+# Without the dead zones the same tests only keep divisions by zero away.
+_ROUNDING_THRESHOLD = 1e-12
+
+_ORIGIN = np.zeros(3)
+_ZERO = np.zeros((2, 3))
+
+
+@dc.dataclass
+class ComplianceControllerConfig:
+    """How a `ComplianceController` works, and its values for input ports that are not connected.
+
+    Vectors of six have the translational x, y, z first. The defaults of the gains are those of the
+    README of cartesian_controllers, without its D gains.
+    """
+
+    mode: str = choice(
+        "compliance",
+        _MODES,
+        doc="compliance: spring plus wrenches. motion: pose error alone, without stiffness. "
+        "force: wrenches alone. parallel: spring and wrenches weighted by the selection.",
+    )
+    period: float = quantity(
+        0.002, "s", low=1e-4, high=0.1, doc="Time between updates, which is the exchange period."
+    )
+    iterations: int = quantity(
+        1, "", low=1, high=100, doc="Virtual steps per update; force mode always takes one."
+    )
+    virtual_time_step: float = quantity(
+        0.02, "s", low=1e-4, high=0.1, doc="Virtual time that one step advances the model."
+    )
+    damping_factor: float = quantity(
+        0.9, "", low=0.0, high=1.0, doc="Factor on the virtual joint velocity at each step."
+    )
+    link_mass: float = quantity(
+        0.1, "kg", low=1e-9, high=10.0, doc="Virtual mass at the origin of each moving link."
+    )
+    dead_zones: bool = dc.field(default=True)
+    """Whether pose errors below about 1e-6 m and 5e-7 rad count as zero, as KDL has it."""
+    hand_frame_control: bool = dc.field(default=False)
+    """Whether the target wrench is given in the axes of the end effector E, not of the world."""
+    error_scale: float = quantity(0.5, "", low=0.0, doc="Factor on the controlled error.")
+    stiffness: list[float] = quantity(
+        [500.0, 500.0, 500.0, 20.0, 20.0, 20.0],
+        "N/m and Nm/rad",
+        low=0.0,
+        size=6,
+        doc="Stiffness along and about the axes of the compliance reference frame C.",
+    )
+    p_gains: list[float] = quantity(
+        [0.05, 0.05, 0.05, 1.5, 1.5, 1.5],
+        "",
+        low=0.0,
+        size=6,
+        doc="Proportional gains along and about the axes of the base B (in motion mode N/m and "
+        "Nm/rad).",
+    )
+    d_gains: list[float] = quantity(
+        [0.0] * 6,
+        "s",
+        low=0.0,
+        size=6,
+        doc="Derivative gains, per virtual second, along and about the axes of the base B.",
+    )
+    selection: list[float] = quantity(
+        [1.0, 1.0, 0.5, 1.0, 0.5, 1.0],
+        "",
+        low=0.0,
+        high=1.0,
+        size=6,
+        doc="Weight of the spring in parallel mode (1: position only, 0: force only), along and "
+        "about the axes of the base B. The default is that of the SliceIt! agent.",
+    )
+
+
+def make_virtual_model(chain: KinematicChain, link_mass: float) -> MultibodyPlant:
+    """Makes the arm that FDCC moves instead of the real one.
+
+    A point-like mass sits at the origin of every link that a joint moves, and 1 kg with 1 kg m2
+    about every axis at the end effector. There is no gravity. If the last link is itself the end
+    effector, it has the end effector's inertia alone.
+
+    Args:
+        chain: The arm; its base B is the plant's world frame.
+        link_mass: Mass [kg] of each moving link.
+
+    Returns:
+        The finalized plant, one position [rad] per joint, with a body named ``end_effector``.
+
+    Raises:
+        ConfigurationError: If the chain has no joints, or a joint's limits are the wrong way round.
+    """
+    if not chain.joints:
+        raise ConfigurationError("the chain has no joints", field="chain.joints", fix="Give one.")
+    plant = MultibodyPlant(0.0)
+    plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, 0.0])
+    parent = plant.world_body()
+    end_effector_inertia = _inertia(_END_EFFECTOR_MASS, _END_EFFECTOR_INERTIA)
+    for index, joint in enumerate(chain.joints):
+        if not joint.lower <= joint.upper:
+            raise ConfigurationError(
+                f"the limits of {joint.name} are [{joint.lower:.6g}, {joint.upper:.6g}] rad",
+                field=f"chain.joints[{index}]",
+                fix="Give lower <= upper.",
+            )
+        is_end_effector = chain.X_LE is None and index == len(chain.joints) - 1
+        link = plant.AddRigidBody(
+            _END_EFFECTOR if is_end_effector else joint.name,
+            end_effector_inertia if is_end_effector else _inertia(link_mass, _LINK_INERTIA),
+        )
+        mount = FixedOffsetFrame(f"{joint.name}_mount", parent.body_frame(), joint.X_PL)
+        plant.AddJoint(
+            RevoluteJoint(
+                f"{joint.name}_joint", plant.AddFrame(mount), link.body_frame(), [0.0, 0.0, 1.0]
+            )
+        )
+        parent = link
+    if chain.X_LE is not None:
+        end_effector = plant.AddRigidBody(_END_EFFECTOR, end_effector_inertia)
+        plant.WeldFrames(parent.body_frame(), end_effector.body_frame(), chain.X_LE)
+    plant.Finalize()
+    return plant
+
+
+def _inertia(mass: float, moment: float) -> SpatialInertia:
+    """Returns the inertia of a body with equal moments [kg m2] about its origin."""
+    return SpatialInertia(mass, np.zeros(3), UnitInertia.TriaxiallySymmetric(moment / mass))
+
+
+class _Settings(NamedTuple):
+    """What the input ports that change seldom ask for.
+
+    Attributes:
+        stiffness: [2, 3], in C.
+        selection: [2, 3], in B.
+        proportional: P gains times the error scale, [2, 3], in B.
+        derivative: D gains times the error scale over the virtual time step, [2, 3], in B.
+        target_wrench: [2, 3], in B, or in E with `hand_frame_control`.
+    """
+
+    stiffness: np.ndarray
+    selection: np.ndarray
+    proportional: np.ndarray
+    derivative: np.ndarray
+    target_wrench: np.ndarray
+
+
+class ComplianceController(LeafSystem):
+    """Turns a target pose, a target wrench and a measured wrench into joint positions.
+
+    Frames: W world, B base of the arm, E end effector (the knife frame K in a station),
+    C compliance reference and S sensor, both fixed to E. Vectors of six have translations first.
+
+    Each period the virtual model starts at the measured joint positions and takes `iterations`
+    steps of `virtual_time_step`: with the net force e of the mode, in the axes of B,
+
+    - compliance: ``e = K (pose error) + f``,
+    - motion: ``e = pose error``,
+    - force: ``e = f``, one step,
+    - parallel: ``e = S K (pose error) + (1 - S) f``,
+
+    where f is the sum of the sensor wrench and the target wrench, a step is
+    ``u = error_scale (p e + d de/dt)``, ``q += v dt``, ``v = damping_factor (v + H^-1 J^T u dt)``,
+    and then q is clamped to the position limits. At rest K (target - pose) + f = 0.
+
+    Three properties come from the reference implementation and are kept:
+
+    - The pose in the first error of an update is that of the model after its last step, not that of
+      the measured joints (`commanded_pose`).
+    - K is taken in the axes of C, p, d and S in those of B.
+    - The sensor wrench is moved to the origin of C once, by the fixed transform from S. The moment
+      about C then acts as if it were about E.
+
+    The initialization event puts the model at the measured joints, at rest. Run it
+    (`Simulator.Initialize`) before the first update.
+
+    Inputs (n joints):
+        joint_positions: Measured joint positions [n] [rad].
+        sensor_wrench: SpatialForce of the environment on the robot, about So, in S. Zero if not
+            connected.
+        target_pose: RigidTransform X_WE. Not used in force mode.
+        target_wrench: SpatialForce that pulls on the robot, about Eo, in W (in E with
+            `hand_frame_control`). Zero if not connected.
+        stiffness: [6] N/m and Nm/rad, in C.
+        p_gains: [6] in B.
+        d_gains: [6] in B [s of virtual time].
+        selection: [6] in B; used in parallel mode.
+        error_scale: [1].
+
+    Outputs, functions of the state alone:
+        joint_positions_command: [n] [rad].
+        joint_velocities_command: [n], rad per *virtual* second. A real second has
+            ``iterations * virtual_time_step / period`` virtual ones.
+        commanded_pose: RigidTransform X_WE at `joint_positions_command`.
+    """
+
+    def __init__(
+        self,
+        config: ComplianceControllerConfig,
+        chain: KinematicChain,
+        *,
+        X_WB: RigidTransform | None = None,
+        X_EC: RigidTransform | None = None,
+        X_ES: RigidTransform | None = None,
+    ) -> None:
+        """Makes the controller of an arm.
+
+        Args:
+            config: Mode, steps and values for unconnected ports. Later changes have no effect.
+            chain: The arm from B to E.
+            X_WB: Pose of the arm's base in the world; None for the identity.
+            X_EC: Pose of the compliance reference in E; None for the identity.
+            X_ES: Pose of the sensor in E; None for a sensor at the last moving link's frame (the
+                tool flange of a UR5e).
+
+        Raises:
+            ConfigurationError: If the configuration or the chain is invalid.
+        """
+        super().__init__()
+        validate(config, "compliance_controller")
+        self._mode = config.mode
+        self._iterations = 1 if config.mode == "force" else config.iterations
+        self._time_step = config.virtual_time_step
+        self._damping_factor = config.damping_factor
+        self._threshold = _KDL_THRESHOLD if config.dead_zones else _ROUNDING_THRESHOLD
+        self._hand_frame_control = config.hand_frame_control
+
+        self._plant = make_virtual_model(chain, config.link_mass)
+        self._end_effector = self._plant.GetBodyByName(_END_EFFECTOR)
+        self._frame_E = self._end_effector.body_frame()
+        self._frame_B = self._plant.world_frame()
+        self._lower = np.array([joint.lower for joint in chain.joints])
+        self._upper = np.array([joint.upper for joint in chain.joints])
+
+        self._X_WB = X_WB or RigidTransform()
+        self._X_BW = self._X_WB.inverse().GetAsMatrix34()
+        self._R_EC = (X_EC or RigidTransform()).rotation().matrix()
+        if X_ES is None:
+            X_ES = RigidTransform() if chain.X_LE is None else chain.X_LE.inverse()
+        self._wrench_C_from_S = _wrench_transform((X_EC or RigidTransform()).InvertAndCompose(X_ES))
+
+        size = len(chain.joints)
+        wrench = Value(SpatialForce.Zero())
+        self._joint_positions = self.DeclareVectorInputPort("joint_positions", size)
+        self._sensor_wrench = self.DeclareAbstractInputPort("sensor_wrench", wrench).get_index()
+        self._target_pose = self.DeclareAbstractInputPort("target_pose", Value(RigidTransform()))
+        self._target_wrench = self.DeclareAbstractInputPort("target_wrench", wrench).get_index()
+        self._stiffness = self._parameter_input("stiffness", config.stiffness)
+        self._p_gains = self._parameter_input("p_gains", config.p_gains)
+        self._d_gains = self._parameter_input("d_gains", config.d_gains)
+        self._selection = self._parameter_input("selection", config.selection)
+        self._error_scale = self._parameter_input("error_scale", [config.error_scale])
+
+        # A context of the virtual model is scratch paper: every use overwrites its positions before
+        # it reads anything. It lies in the cache of this system's own context, so that contexts do
+        # not disturb each other, in other threads either.
+        self._scratch = self._cache_entry(
+            "virtual model",
+            lambda context: self._plant.CreateDefaultContext(),
+            {self.nothing_ticket()},
+        )
+        # A policy changes these far less often than the controller runs.
+        self._settings = self._cache_entry(
+            "settings",
+            self._calc_settings,
+            {
+                self.input_port_ticket(index)
+                for index in (
+                    self._target_wrench,
+                    self._stiffness[0],
+                    self._p_gains[0],
+                    self._d_gains[0],
+                    self._selection[0],
+                    self._error_scale[0],
+                )
+            },
+        )
+
+        self._positions_state = self.DeclareDiscreteState(size)
+        self._velocities_state = self.DeclareDiscreteState(size)
+        self._error_state = self.DeclareDiscreteState(6)
+        self.DeclareStateOutputPort("joint_positions_command", self._positions_state)
+        self.DeclareStateOutputPort("joint_velocities_command", self._velocities_state)
+        self.DeclareAbstractOutputPort(
+            "commanded_pose",
+            lambda: Value(RigidTransform()),
+            self._calc_commanded_pose,
+            {self.discrete_state_ticket(self._positions_state)},
+        )
+        self.DeclareInitializationDiscreteUpdateEvent(self._activate)
+        self.DeclarePeriodicDiscreteUpdateEvent(config.period, 0.0, self._update)
+
+    def _parameter_input(self, name: str, default: Sequence[float]) -> tuple[int, np.ndarray]:
+        """Declares an input port; returns its index, and its value while it is not connected."""
+        index = self.DeclareVectorInputPort(name, len(default)).get_index()
+        return index, np.array(default, dtype=float)
+
+    def _cache_entry(
+        self, name: str, calc: Callable[[Context], object], prerequisites: set[DependencyTicket]
+    ) -> CacheEntry:
+        return self.DeclareCacheEntry(
+            name,
+            ValueProducer(
+                allocate=lambda: Value(object()),
+                calc=lambda context, value: value.set_value(calc(context)),
+            ),
+            prerequisites,
+        )
+
+    def _activate(self, context: Context, discrete_state: DiscreteValues) -> None:
+        # The previous error is left alone, as in the reference implementation.
+        positions = self._joint_positions.Eval(context)
+        discrete_state.set_value(self._positions_state, positions)
+        discrete_state.set_value(self._velocities_state, np.zeros_like(positions))
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        scratch = self._scratch.Eval(context)
+        settings = self._settings.Eval(context)
+        target = None if self._mode == "force" else self._eval_target(context)
+        sensor_wrench = _ZERO if self._mode == "motion" else self._eval_sensor_wrench(context)
+        q = self._joint_positions.Eval(context)
+        state = context.get_discrete_state()
+        v = state.value(self._velocities_state)
+        previous_error = state.value(self._error_state).reshape(2, 3)
+        dt = self._time_step
+
+        # The first error is that of the pose which the model reached in the last update, although
+        # everything else is taken at the measured joints, as in the reference implementation.
+        X_BE_of_error = self._calc_pose(scratch, state.value(self._positions_state))
+        X_BE = self._calc_pose(scratch, q)
+        for step in range(self._iterations):
+            if step > 0:
+                X_BE_of_error = X_BE = self._calc_pose(scratch, q)
+            pose_error = (
+                _ZERO if target is None else _pose_error(target, X_BE_of_error, self._threshold)
+            )
+            error = self._calc_error(settings, pose_error, sensor_wrench, X_BE[:, :3])
+            u = settings.proportional * error + settings.derivative * (error - previous_error)
+            acceleration = self._calc_acceleration(scratch, u, context)
+            q = np.minimum(np.maximum(q + dt * v, self._lower), self._upper)
+            v = self._damping_factor * (v + dt * acceleration)
+            previous_error = error
+        discrete_state.set_value(self._positions_state, q)
+        discrete_state.set_value(self._velocities_state, v)
+        discrete_state.set_value(self._error_state, error.reshape(6))
+
+    def _calc_settings(self, context: Context) -> _Settings:
+        def axes(port: tuple[int, np.ndarray]) -> np.ndarray:
+            return self._parameter(context, port).reshape(2, 3)
+
+        error_scale = self._parameter(context, self._error_scale)
+        target_wrench = _ZERO
+        value = self.EvalAbstractInput(context, self._target_wrench)
+        if value is not None:
+            # Drake's spatial forces have the moment first.
+            target_wrench = value.get_value().get_coeffs().reshape(2, 3)[::-1]
+            if not self._hand_frame_control:
+                target_wrench = target_wrench.dot(self._X_BW[:, :3].T)
+        return _Settings(
+            stiffness=axes(self._stiffness),
+            selection=axes(self._selection),
+            proportional=error_scale * axes(self._p_gains),
+            derivative=error_scale * axes(self._d_gains) / self._time_step,
+            target_wrench=target_wrench,
+        )
+
+    def _parameter(self, context: Context, port: tuple[int, np.ndarray]) -> np.ndarray:
+        index, default = port
+        vector = self.EvalVectorInput(context, index)
+        # The copy outlives the input's value, as a view of it would not.
+        return default if vector is None else vector.CopyToVector()
+
+    def _eval_target(self, context: Context) -> np.ndarray:
+        """Returns the target X_BE as [3, 4]."""
+        return self._X_BW.dot(self._target_pose.Eval(context).GetAsMatrix4())
+
+    def _eval_sensor_wrench(self, context: Context) -> np.ndarray:
+        """Returns the sensor wrench [2, 3] about Co in C."""
+        value = self.EvalAbstractInput(context, self._sensor_wrench)
+        if value is None:
+            return _ZERO
+        return self._wrench_C_from_S.dot(value.get_value().get_coeffs()).reshape(2, 3)
+
+    def _calc_error(
+        self,
+        settings: _Settings,
+        pose_error: np.ndarray,
+        sensor_wrench: np.ndarray,
+        R_BE: np.ndarray,
+    ) -> np.ndarray:
+        """Returns the net force, or the pose error in motion mode, [2, 3] in B."""
+        if self._mode == "motion":
+            return pose_error
+        R_BC = R_BE.dot(self._R_EC)
+        R_CB = R_BC.T
+        target_wrench = settings.target_wrench
+        if self._hand_frame_control:
+            target_wrench = target_wrench.dot(R_BE.T)
+        if self._mode == "force":
+            return sensor_wrench.dot(R_CB) + target_wrench
+        spring = settings.stiffness * pose_error.dot(R_BC)
+        if self._mode == "compliance":
+            return (spring + sensor_wrench).dot(R_CB) + target_wrench
+        force = sensor_wrench.dot(R_CB) + target_wrench
+        return settings.selection * spring.dot(R_CB) + (1.0 - settings.selection) * force
+
+    def _calc_pose(self, scratch: Context, q: np.ndarray) -> np.ndarray:
+        """Puts the virtual model at `q`, and returns X_BE there as [3, 4]."""
+        self._plant.SetPositions(scratch, q)
+        return self._end_effector.EvalPoseInWorld(scratch).GetAsMatrix34()
+
+    def _calc_acceleration(self, scratch: Context, u: np.ndarray, context: Context) -> np.ndarray:
+        """Returns H^-1 J^T u [n] at the positions in `scratch`, `u` [2, 3] acting at Eo, in B."""
+        J = self._plant.CalcJacobianSpatialVelocity(
+            scratch, JacobianWrtVariable.kV, self._frame_E, _ORIGIN, self._frame_B, self._frame_B
+        )
+        # Drake's Jacobian has the rotational rows first.
+        joint_torques = u[::-1].reshape(6).dot(J)
+        _, acceleration, info = dposv(self._plant.CalcMassMatrix(scratch), joint_torques)
+        if info != 0 or not math.isfinite(acceleration.dot(acceleration)):
+            raise RuntimeError(
+                f"{self.GetSystemPathname()}: the virtual model has no finite acceleration at "
+                f"t = {context.get_time():.6g} s (joint positions "
+                f"{self._plant.GetPositions(scratch)} rad, scaled net force {u.reshape(6)}). An "
+                "input is not finite, or the loop has diverged: lower error_scale or the stiffness."
+            )
+        return acceleration
+
+    def _calc_commanded_pose(self, context: Context, output: AbstractValue) -> None:
+        q = context.get_discrete_state(self._positions_state).value()
+        scratch = self._scratch.Eval(context)
+        self._plant.SetPositions(scratch, q)
+        output.set_value(self._X_WB @ self._end_effector.EvalPoseInWorld(scratch))
+
+
+def _wrench_transform(X_CS: RigidTransform) -> np.ndarray:
+    """Returns the matrix [6, 6] from a wrench about So in S, moment first, to one about Co in C.
+
+    The result has the force first: f_C = R f_S and tau_C = R tau_S + p x (R f_S).
+    """
+    R = X_CS.rotation().matrix()
+    x, y, z = X_CS.translation()
+    p_cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.block([[np.zeros((3, 3)), R], [R, p_cross @ R]])
+
+
+def _pose_error(target: np.ndarray, pose: np.ndarray, threshold: float) -> np.ndarray:
+    """Returns the displacement and the rotation vector from `pose` to `target`.
+
+    Args:
+        target: Target pose [3, 4].
+        pose: Pose [3, 4].
+        threshold: A displacement shorter than this [m] counts as zero, and so does a rotation whose
+            matrix differs from its transpose by less.
+
+    Returns:
+        Float array [2, 3]: the displacement [m], limited to 1 m, and axis times angle [rad], the
+        angle limited to 1 rad; both in the axes in which the poses are given.
+    """
+    dx, dy, dz = (target[:, 3] - pose[:, 3]).tolist()
+    distance = math.hypot(dx, dy, dz)
+    scale = 0.0 if distance < threshold else min(1.0, _MAX_DISTANCE / distance)
+    rotation = _rotation_vector(target[:, :3].dot(pose[:, :3].T).tolist(), threshold)
+    return np.array([[scale * dx, scale * dy, scale * dz], rotation])
+
+
+def _rotation_vector(R: list[list[float]], threshold: float) -> list[float]:
+    """Returns axis times angle of a rotation matrix, the angle limited to 1 rad."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R
+    # These are 2 sin(angle) axis and 2 cos(angle).
+    x, y, z = zy - yz, xz - zx, yx - xy
+    cosine = xx + yy + zz - 1.0
+    if abs(x) < threshold and abs(y) < threshold and abs(z) < threshold:
+        if cosine > 0.0:
+            return [0.0, 0.0, 0.0]
+        # A half turn, R = 2 a a^T - 1, leaves the sign of the axis a open. As in KDL, the component
+        # with the largest diagonal element is positive.
+        i = 0 if xx > yy and xx > zz else 1 if yy > zz else 2
+        largest = math.sqrt(0.5 * (R[i][i] + 1.0))
+        axis = [0.25 * (R[i][j] + R[j][i]) / largest for j in range(3)]
+        axis[i] = largest
+        return [_MAX_ANGLE * component for component in axis]
+    norm = math.hypot(x, y, z)
+    scale = min(math.atan2(norm, cosine), _MAX_ANGLE) / norm
+    return [scale * x, scale * y, scale * z]

@@ -1,0 +1,194 @@
+"""The finite-element food as a Drake system."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from pydrake.math import RigidTransform
+from pydrake.multibody.math import SpatialVelocity
+from pydrake.multibody.tree import BodyIndex
+from pydrake.systems.framework import BasicVector, Context, State
+
+from sliceit_drake.cutting.motion import Pose
+from sliceit_drake.cutting.simulate import check_clear, check_energies, check_in_plane
+from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
+from sliceit_drake.cutting.surface import FoodSurface, food_surface
+from sliceit_drake.systems.knife_force import KnifeForceSystem
+
+__all__ = ["ENERGY_NAMES", "LEDGER_NAMES", "CuttingSystem"]
+
+LEDGER_NAMES = (
+    "work",
+    "gravity",
+    "edge",
+    "opening",
+    "friction",
+    "board_friction",
+    "released",
+    "internal",
+)
+ENERGY_NAMES = ("elastic", "interface", "kinetic", "largest_energy_ratio", "least_volume_ratio")
+
+
+class CuttingSystem(KnifeForceSystem):
+    """Advances a finite-element food by its own sub-steps once per exchange.
+
+    All state is in the Context: the food's nodes and history as one discrete vector, the food that is
+    cut as an index into the prepared foods. The solvers hold only workspaces that each update fills
+    and empties, so contexts do not disturb each other.
+
+    Further output ports:
+        force_components: Forces on the knife by edge, flank pressure, friction [9], N, in W.
+        ledger: Cumulative work and dissipation [8], J, see `LEDGER_NAMES`.
+        food_index: Which of the prepared foods is cut [1].
+        energy: At the last check [5], see `ENERGY_NAMES`, J.
+        surface_vertices: Corners of the food's surface [3 V], metres, in W, padded with zeros.
+
+    Args:
+        solvers: Prepared foods with one exchange period.
+        X_WF: Pose of the food frame.
+        knife_body: Index of the knife's body.
+        check_period: Interval of the energy and inversion checks, s.
+    """
+
+    def __init__(
+        self,
+        solvers: Sequence[CuttingSolver],
+        X_WF: RigidTransform,
+        knife_body: BodyIndex,
+        check_period: float = 0.02,
+    ) -> None:
+        super().__init__(knife_body, solvers[0].exchange_period)
+        self._solvers = tuple(solvers)
+        self.surfaces: tuple[FoodSurface, ...] = tuple(food_surface(s.model) for s in solvers)
+        self._X_WF = X_WF
+        frames = [Pose(s.model.X_FC_rotation, s.model.X_FC_position) for s in self._solvers]
+        X_WF_R, X_WF_p = X_WF.rotation().matrix(), X_WF.translation()
+        self._R_CW = [(X_WF_R @ X_FC.R).T for X_FC in frames]
+        self._p_WC = [X_WF_R @ X_FC.p + X_WF_p for X_FC in frames]
+        self._check_every = max(1, round(check_period / self.exchange_period))
+        size = max(s.state_size for s in self._solvers)
+        self._food = self.DeclareDiscreteState(self._padded(self._solvers[0].initial_state(), size))
+        self._food_index = self.DeclareDiscreteState(1)
+        self._components = self.DeclareDiscreteState(9)
+        self._ledger = self.DeclareDiscreteState(len(LEDGER_NAMES))
+        self._energy = self.DeclareDiscreteState([0.0, 0.0, 0.0, 0.0, 1.0])
+        self._count = self.DeclareDiscreteState(1)
+        self.DeclareStateOutputPort("force_components", self._components)
+        self.DeclareStateOutputPort("ledger", self._ledger)
+        self.DeclareStateOutputPort("energy", self._energy)
+        self.DeclareStateOutputPort("food_index", self._food_index)
+        self.DeclareVectorOutputPort(
+            "surface_vertices",
+            3 * max(len(surface.ends) for surface in self.surfaces),
+            self._calc_surface,
+            {self.discrete_state_ticket(self._food), self.discrete_state_ticket(self._food_index)},
+        )
+
+    @staticmethod
+    def _padded(values: np.ndarray, size: int) -> np.ndarray:
+        out = np.zeros(size)
+        out[: len(values)] = values
+        return out
+
+    def food_index(self, context: Context) -> int:
+        """Which prepared food this context cuts."""
+        return int(context.get_discrete_state(self._food_index).value()[0])
+
+    def food_state(self, context: Context) -> np.ndarray:
+        """State of the food as its solver reads it."""
+        size = self._solvers[self.food_index(context)].state_size
+        return context.get_discrete_state(self._food).value()[:size]
+
+    def solver(self, context: Context) -> CuttingSolver:
+        """Solver of the food that this context cuts."""
+        return self._solvers[self.food_index(context)]
+
+    def SetFood(self, context: Context, index: int) -> None:
+        """Puts an uncut food into the context.
+
+        Args:
+            context: This system's context.
+            index: Into the prepared foods.
+
+        Raises:
+            IndexError: There is no such food.
+        """
+        if not 0 <= index < len(self._solvers):
+            raise IndexError(f"food {index}: {len(self._solvers)} foods are prepared.")
+        size = len(context.get_discrete_state(self._food).value())
+        state = self._padded(self._solvers[index].initial_state(), size)
+        context.SetDiscreteState(self._food, state)
+        context.SetDiscreteState(self._food_index, [index])
+
+    def randomize_context(self, context: Context, rng: np.random.Generator) -> None:
+        """Puts an uncut food, drawn from the prepared ones, into the context."""
+        self.SetFood(context, int(rng.integers(len(self._solvers))))
+
+    def _in_cut_frame(self, index: int, X_WK: RigidTransform) -> Pose:
+        R = self._R_CW[index]
+        return Pose(R @ X_WK.rotation().matrix(), R @ (X_WK.translation() - self._p_WC[index]))
+
+    def start(self, context: Context, state: State, X_WK: RigidTransform) -> None:
+        index = self.food_index(context)
+        check_clear(self._solvers[index].model, self._in_cut_frame(index, X_WK))
+
+    def advance(
+        self, context: Context, state: State, X_WK: RigidTransform, V_WK: SpatialVelocity
+    ) -> tuple[np.ndarray, float]:
+        index = self.food_index(context)
+        solver, time = self._solvers[index], context.get_time()
+        old = self.food_state(context)
+        last = self._in_cut_frame(index, self.last_pose(context))
+        pose = self._in_cut_frame(index, X_WK)
+        check_in_plane(solver.model, pose, time)
+        try:
+            step = solver.exchange(old, last, pose)
+        except CuttingError as error:
+            raise CuttingError(f"at {time:.4g} s {error}") from error
+        state.get_mutable_discrete_state(self._food).get_mutable_value()[: len(old)] = step.state
+        R_WC = self._R_CW[index].T
+        forces = np.concatenate(
+            [R_WC @ part[3:] for part in (step.edge, step.normal, step.friction)]
+        )
+        self._set(state, self._components, forces)
+        change = [
+            step.work,
+            step.gravity_work,
+            step.edge_dissipation,
+            step.opening_dissipation,
+            step.friction_dissipation,
+            step.board_dissipation,
+            step.released,
+            step.internal_work,
+        ]
+        ledger = context.get_discrete_state(self._ledger).value() + change
+        self._set(state, self._ledger, ledger)
+        count = int(context.get_discrete_state(self._count).value()[0]) + 1
+        self._set(state, self._count, [count])
+        if count % self._check_every == 0:
+            energies = solver.energies(step.state, pose)
+            ratio = check_energies(energies, float(ledger[2:5].sum()), solver.model, time)
+            old_energy = context.get_discrete_state(self._energy).value()
+            self._set(
+                state,
+                self._energy,
+                [
+                    energies.elastic,
+                    energies.interface,
+                    energies.kinetic,
+                    max(ratio, old_energy[3]),
+                    min(energies.least_volume_ratio, old_energy[4]),
+                ],
+            )
+        wrench = np.concatenate([R_WC @ step.wrench[:3], R_WC @ step.wrench[3:]])
+        return wrench, solver.cut_fraction(step.state)
+
+    def _calc_surface(self, context: Context, output: BasicVector) -> None:
+        index = self.food_index(context)
+        solver = self._solvers[index]
+        nodes = solver.positions(self.food_state(context))
+        corners = self.surfaces[index].positions(solver.model, nodes)
+        p_W = corners @ self._X_WF.rotation().matrix().T + self._X_WF.translation()
+        values = np.zeros(output.size())
+        values[: p_W.size] = p_W.ravel()
+        output.SetFromVector(values)

@@ -1,0 +1,131 @@
+"""The ports that every cutting system has; a subclass says what force the food gives."""
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform
+from pydrake.multibody.math import SpatialForce, SpatialVelocity
+from pydrake.multibody.plant import ExternallyAppliedSpatialForce
+from pydrake.multibody.tree import BodyIndex
+from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+
+__all__ = ["KnifeForceSystem"]
+
+
+class KnifeForceSystem(LeafSystem):
+    """Exchanges pose for force with a knife, once per `exchange_period`.
+
+    At t_k the update takes the knife's pose and velocity and holds the wrench that `advance` returns
+    over [t_k, t_{k+1}). It is an unrestricted update, so it runs before the discrete updates of
+    controller and plant at the same time, and they see the new wrench without a further delay.
+
+    Input ports:
+        knife_pose: RigidTransform X_WK.
+        knife_velocity: SpatialVelocity V_WK.
+
+    Output ports:
+        food_wrench: SpatialForce F_K_W of the food on the knife, at Ko, in W.
+        applied_force: The same as a list of one ExternallyAppliedSpatialForce for the plant.
+        cut_progress: Share of the section that is cut [1].
+        coupling_work_error: Work that the held wrench did on the knife minus work that the food did
+            on it [1], J; it comes from the delay of one exchange.
+
+    Args:
+        knife_body: Index of the knife's body, whose frame is K.
+        exchange_period: s.
+    """
+
+    def __init__(self, knife_body: BodyIndex, exchange_period: float) -> None:
+        super().__init__()
+        self._knife_body = knife_body
+        self.exchange_period = exchange_period
+        self._pose_input = self.DeclareAbstractInputPort("knife_pose", Value(RigidTransform()))
+        self._velocity_input = self.DeclareAbstractInputPort(
+            "knife_velocity", Value(SpatialVelocity.Zero())
+        )
+        self._wrench = self.DeclareDiscreteState(6)
+        self._progress = self.DeclareDiscreteState(1)
+        self._coupling = self.DeclareDiscreteState(1)
+        self._last_pose = self.DeclareDiscreteState(12)
+        self.DeclareAbstractOutputPort(
+            "food_wrench",
+            lambda: Value(SpatialForce.Zero()),
+            self._calc_food_wrench,
+            {self.discrete_state_ticket(self._wrench)},
+        )
+        self.DeclareAbstractOutputPort(
+            "applied_force",
+            lambda: Value[list[ExternallyAppliedSpatialForce]](),
+            self._calc_applied_force,
+            {self.discrete_state_ticket(self._wrench)},
+        )
+        self.DeclareStateOutputPort("cut_progress", self._progress)
+        self.DeclareStateOutputPort("coupling_work_error", self._coupling)
+        self.DeclareInitializationUnrestrictedUpdateEvent(self._initialize)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(exchange_period, exchange_period, self._update)
+
+    def start(self, context: Context, state: State, X_WK: RigidTransform) -> None:
+        """Called once at initialization; a subclass may check the start and set its state."""
+
+    def advance(
+        self, context: Context, state: State, X_WK: RigidTransform, V_WK: SpatialVelocity
+    ) -> tuple[np.ndarray, float]:
+        """Advances the food to the context's time.
+
+        Args:
+            context: Before the update.
+            state: To write to.
+            X_WK: Pose of the knife now.
+            V_WK: Velocity of the knife now.
+
+        Returns:
+            Wrench F_K_W on the knife, moment and force [6], and the share that is cut.
+        """
+        raise NotImplementedError
+
+    def last_pose(self, context: Context) -> RigidTransform:
+        """X_WK at the previous exchange."""
+        value = context.get_discrete_state(self._last_pose).value()
+        return RigidTransform(value.reshape(3, 4))
+
+    def wrench(self, context: Context) -> np.ndarray:
+        """The held wrench F_K_W, moment and force [6]."""
+        return context.get_discrete_state(self._wrench).value()
+
+    def _initialize(self, context: Context, state: State) -> EventStatus:
+        X_WK = self._pose_input.Eval(context)
+        self._set(state, self._last_pose, X_WK.GetAsMatrix34().ravel())
+        self.start(context, state, X_WK)
+        return EventStatus.Succeeded()
+
+    def _update(self, context: Context, state: State) -> EventStatus:
+        X_WK = self._pose_input.Eval(context)
+        V_WK = self._velocity_input.Eval(context)
+        wrench, progress = self.advance(context, state, X_WK, V_WK)
+        last = context.get_discrete_state(self._last_pose).value().reshape(3, 4)
+        now = X_WK.GetAsMatrix34()
+        dR = now[:, :3] @ last[:, :3].T
+        turn = 0.5 * np.array([dR[2, 1] - dR[1, 2], dR[0, 2] - dR[2, 0], dR[1, 0] - dR[0, 1]])
+        moved = np.concatenate([turn, now[:, 3] - last[:, 3]])
+        error = context.get_discrete_state(self._coupling).value()[0]
+        self._set(state, self._coupling, [error + (self.wrench(context) - wrench) @ moved])
+        self._set(state, self._wrench, wrench)
+        self._set(state, self._progress, [progress])
+        self._set(state, self._last_pose, now.ravel())
+        return EventStatus.Succeeded()
+
+    @staticmethod
+    def _set(state: State, index: int, value: np.ndarray | list[float]) -> None:
+        vector: BasicVector = state.get_mutable_discrete_state(index)
+        vector.SetFromVector(value)
+
+    def _calc_food_wrench(self, context: Context, output: Value) -> None:
+        wrench = self.wrench(context)
+        output.set_value(SpatialForce(wrench[:3], wrench[3:]))
+
+    def _calc_applied_force(self, context: Context, output: Value) -> None:
+        wrench = self.wrench(context)
+        force = ExternallyAppliedSpatialForce()
+        force.body_index = self._knife_body
+        force.p_BoBq_B = np.zeros(3)
+        force.F_Bq_W = SpatialForce(wrench[:3], wrench[3:])
+        output.set_value([force])
