@@ -33,7 +33,7 @@ PARAMETERS = (
 )
 """Scalars that the kernels read, in the order of their array."""
 
-ACCUMULATED = 22
+ACCUMULATED = 23
 """Sums kept for each cut point over an exchange, see `make.points`."""
 
 _INDEX = {name: k for k, name in enumerate(PARAMETERS)}
@@ -369,7 +369,7 @@ def kernels(real: Any) -> types.SimpleNamespace:
         share of the surface energy spent by opening; `slip`, from the friction anchors. Adds to
         `total`: forces on the knife by edge, flank pressure, friction [0:9], their moments about Ko
         [9:18], and energies: dissipated by the edge 18, by opening 19, by friction 20, released or
-        taken up when the cut fraction grows 21.
+        taken up when the cut fraction grows 21. Writes the area that is cut 22.
         """
         i = wp.tid()
         w = weights[i]
@@ -501,6 +501,7 @@ def kernels(real: Any) -> types.SimpleNamespace:
         total[i, 19] = total[i, 19] + opening_loss
         total[i, 20] = total[i, 20] + loss_m + loss_p
         total[i, 21] = total[i, 21] + released
+        total[i, 22] = A * D
 
     @wp.kernel(enable_backward=True)
     def move_nodes(

@@ -219,7 +219,7 @@ def simulate_slice(
             rows[k, 10:16] = 0.0
         for column, wrench in ((16, step.edge), (19, step.normal), (22, step.friction)):
             rows[k, column : column + 3] = R_FC @ wrench[3:]
-        rows[k, 25] = solver.cut_fraction(state)
+        rows[k, 25] = step.cut
         pose = end
         if (k + 1) % every == 0 or k + 1 == count:
             energies = solver.energies(state, pose)

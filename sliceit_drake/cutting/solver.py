@@ -1,6 +1,7 @@
 """Advances the food through one exchange: captured Warp graphs on a workspace, state in NumPy."""
 
 import dataclasses as dc
+import math
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -34,6 +35,7 @@ class Exchange:
         board_force: Mean force of the board on the food [3], N.
         board_dissipation: Friction of the food on the board, J.
         gravity_work: Work of the weight, J.
+        cut: Share of the section that the edge has passed.
     """
 
     state: np.ndarray
@@ -50,6 +52,7 @@ class Exchange:
     board_force: np.ndarray
     board_dissipation: float
     gravity_work: float
+    cut: float
 
 
 @dc.dataclass
@@ -199,8 +202,8 @@ class CuttingSolver:
             self._w[name] = self._array(values, dtype)
         # Rows of `shape` are eight-wide vectors.
         self._w["shape"] = self._array(m.shape, k.lanes)
-        self._centre = np.average(m.split.points, axis=0, weights=m.tables.area)
-        self._rows = np.arange(P)
+        self._centre = np.average(m.split.points, axis=0, weights=m.tables.area).tolist()
+        self._weight = m.weight.ravel().astype(self.dtype)
         self._share = np.arange(1, n + 1)[:, None] / n
 
     def _view(self, base: wp.array, start: int, dtype: Any, count: int) -> wp.array:
@@ -308,7 +311,7 @@ class CuttingSolver:
         wrench = wrenches[0] + wrenches[1] + wrenches[2]
         # Moments are about Ko at each sub-step; the mean position of Ko is half a period back.
         work = -float(wrench[3:] @ v + wrench[:3] @ w) * T
-        moved = self.positions(new)[m.moving].astype(np.float64) - self.positions(state)[m.moving]
+        nodes = self._layout["x"]
         return Exchange(
             state=new,
             wrench=wrench,
@@ -323,7 +326,8 @@ class CuttingSolver:
             internal_work=float(sums[self._sum_layout["internal_work"]].sum()),
             board_force=sums[self._sum_layout["board_force"]].reshape(-1, 3).sum(0) / n,
             board_dissipation=float(sums[self._sum_layout["board_loss"]].sum()),
-            gravity_work=float((m.weight[m.moving] * moved).sum()),
+            gravity_work=float(self._weight @ (new[nodes] - state[nodes])),
+            cut=float(total[22]) / m.section_area,
         )
 
     def _interpolate(
@@ -331,59 +335,66 @@ class CuttingSolver:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Knife poses at the ends of the sub-steps, constant velocity and rotation rate.
 
+        Rotation matrices are interpolated linearly: for a turn of angle a between exchanges they are
+        orthonormal to a^2 / 8, 1e-6 at 1 rad/s and 2 ms.
+
         Returns:
             The kernels' motion buffer, the direction of cutting at the end, velocity [3] of Ko and
             rotation rate [3].
         """
         n, T = self.substeps, self.exchange_period
         v = (end.p - start.p) / T
-        turn = _rotation_vector(end.R @ start.R.T)
-        w = turn / T
-        motion = np.empty(21 * n)
+        R0, R1 = start.R, end.R
+        dR = R1 @ R0.T
+        w = np.array([dR[2, 1] - dR[1, 2], dR[0, 2] - dR[2, 0], dR[1, 0] - dR[0, 1]]) * (0.5 / T)
+        motion = np.empty(21 * n, self.dtype)
         share = self._share
-        if turn.any():
-            rotation = _rotations(share * turn) @ start.R
-            motion[: 9 * n] = rotation.ravel()
-        else:
-            motion[: 9 * n].reshape(n, 9)[:] = start.R.ravel()
+        motion[: 9 * n].reshape(n, 9)[:] = R0.ravel() + share * (R1 - R0).ravel()
         motion[9 * n : 12 * n].reshape(n, 3)[:] = start.p + share * (v * T)
         motion[12 * n : 15 * n].reshape(n, 3)[:] = v
         motion[15 * n : 18 * n].reshape(n, 3)[:] = w
-        directions = motion[18 * n :].reshape(n, 3)
-        directions[:], d = self._directions(state, end, v, w)
-        return motion.astype(self.dtype), d, v, w
+        directions = self._directions(state, end, v.tolist(), w.tolist())
+        motion[18 * n :] = directions
+        return motion, np.array(directions[-3:]), v, w
 
     def _directions(
-        self, state: np.ndarray, end: Pose, v: np.ndarray, w: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Direction of cutting in each sub-step [n, 3] and at the end [3].
+        self, state: np.ndarray, end: Pose, v: list[float], w: list[float]
+    ) -> list[float]:
+        """Direction of cutting in each sub-step [3 n].
 
         It is the direction of the edge's velocity in the blade's plane, at the middle of the section,
         followed over `direction_length` of travel, so that it exists at rest.
         """
         n = self.substeps
-        old = state[self._layout["direction"]].astype(np.float64)
-        edge_x, normal = end.R[:, 0], end.R[:, 1]
-        ax, ay, az = edge_x * float((self._centre - end.p) @ edge_x)
-        u = np.array(
-            [
-                v[0] + w[1] * az - w[2] * ay,
-                v[1] + w[2] * ax - w[0] * az,
-                v[2] + w[0] * ay - w[1] * ax,
-            ]
-        )
-        u -= (u @ normal) * normal
-        speed = float(np.sqrt(u @ u))
+        dx, dy, dz = state[self._layout["direction"]].tolist()
+        (xx, yx, _), (xy, yy, _), (xz, yz, _) = end.R.tolist()
+        px, py, pz = end.p.tolist()
+        cx, cy, cz = self._centre
+        along = (cx - px) * xx + (cy - py) * xy + (cz - pz) * xz
+        ax, ay, az = along * xx, along * xy, along * xz
+        ux = v[0] + w[1] * az - w[2] * ay
+        uy = v[1] + w[2] * ax - w[0] * az
+        uz = v[2] + w[0] * ay - w[1] * ax
+        out_of_plane = ux * yx + uy * yy + uz * yz
+        ux, uy, uz = ux - out_of_plane * yx, uy - out_of_plane * yy, uz - out_of_plane * yz
+        speed = math.sqrt(ux * ux + uy * uy + uz * uz)
         if speed == 0.0:
-            return old, old
-        u /= speed
-        keep = np.exp(-speed * self.exchange_period / n / self.model.numerics.direction_length)
-        kept = keep ** np.arange(1, n + 1)[:, None]
-        directions = kept * old + (1.0 - kept) * u
-        size = np.sqrt((directions * directions).sum(1, keepdims=True))
-        # A reversal passes through zero; there the old direction holds for one more sub-step.
-        directions = np.where(size > 1e-9, directions / np.maximum(size, 1e-9), old)
-        return directions, directions[-1]
+            return [dx, dy, dz] * n
+        ux, uy, uz = ux / speed, uy / speed, uz / speed
+        keep = math.exp(-speed * self.exchange_period / n / self.model.numerics.direction_length)
+        directions: list[float] = []
+        for _ in range(n):
+            ex, ey, ez = (
+                keep * dx + (1.0 - keep) * ux,
+                keep * dy + (1.0 - keep) * uy,
+                keep * dz + (1.0 - keep) * uz,
+            )
+            size = math.sqrt(ex * ex + ey * ey + ez * ez)
+            # A reversal passes through zero; there the old direction holds for one more sub-step.
+            if size > 1e-9:
+                dx, dy, dz = ex / size, ey / size, ez / size
+            directions += (dx, dy, dz)
+        return directions
 
     def energies(self, state: np.ndarray, pose: Pose) -> Energies:
         """Energies of `state` with the knife at `pose`."""
@@ -431,15 +442,6 @@ class CuttingSolver:
             least_volume_ratio=least_ratio,
             least_element=least,
         )
-
-    def cut_fraction(self, state: np.ndarray) -> float:
-        """Share of the section that the edge has passed."""
-        tables = self.model.tables
-        u = (np.asarray(self.field(state, "passed"), np.float64) + tables.reach) / tables.spacing
-        cell = np.clip(u.astype(int), 0, tables.fraction.shape[1] - 2)
-        w = np.clip(u - cell, 0.0, 1.0)
-        low, high = tables.fraction[self._rows, cell], tables.fraction[self._rows, cell + 1]
-        return float(((1.0 - w) * low + w * high) @ tables.area / self.model.section_area)
 
     def held_reaction(self, state: np.ndarray) -> np.ndarray:
         """Force of what holds the food on the food [3], N, in C, from the bulk's forces."""
@@ -491,25 +493,3 @@ def _point_gather(
     order = np.argsort(node, kind="stable")
     start = np.concatenate([[0], np.cumsum(np.bincount(node, minlength=node_count))])
     return start.astype(np.int32), entry[order].astype(np.int32), weight[order]
-
-
-def _rotation_vector(R: np.ndarray) -> np.ndarray:
-    """Rotation vector [3] of a rotation by less than pi."""
-    skew = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    sine = float(np.sqrt(skew @ skew))
-    if sine < 1e-12:
-        return np.zeros(3)
-    angle = np.arctan2(sine, 0.5 * (np.trace(R) - 1.0))
-    return skew * (angle / sine)
-
-
-def _rotations(vectors: np.ndarray) -> np.ndarray:
-    """Rotation matrices [N, 3, 3] of rotation vectors [N, 3] (Rodrigues)."""
-    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    K = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-    safe = np.where(angle > 0.0, angle, 1.0)
-    s = np.where(angle > 0.0, np.sin(angle) / safe, 1.0)
-    c = np.where(angle > 0.0, (1.0 - np.cos(angle)) / safe**2, 0.5)
-    return np.eye(3) + s * K + c * K @ K

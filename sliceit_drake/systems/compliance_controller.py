@@ -1,10 +1,10 @@
 """Forward dynamics compliance control (FDCC) as a Drake system.
 
 Scherzinger, Roennau and Dillmann, "Forward Dynamics Compliance Control (FDCC): A new approach to
-cartesian compliance for robotic manipulators", IROS 2017. A virtual model of the arm, nearly all of
-whose mass sits at its end effector, is pushed by the net force of a spring to the target pose and
-of the measured and the target wrench; the joint positions that it reaches are the command. The steps
-are those of the authors' cartesian_controllers (commit f53f798), reproduced to rounding.
+cartesian compliance for robotic manipulators", IROS 2017. A virtual model of the arm, nearly all
+of whose mass sits at its end effector, is pushed by the net force of a spring to the target pose,
+the measured wrench and the target wrench; the joint positions that it reaches are the command. The
+steps are those of the authors' cartesian_controllers (commit f53f798), reproduced to rounding.
 
 Inside this module wrenches and pose errors are arrays [2, 3] whose first row is the translational
 part and whose second is the rotational one, so that a change of axes is one product from the right:
@@ -94,9 +94,9 @@ class ComplianceControllerConfig:
     link_mass: float = quantity(
         0.1, "kg", low=1e-9, high=10.0, doc="Virtual mass at the origin of each moving link."
     )
-    dead_zones: bool = dc.field(default=True)
+    dead_zones: bool = True
     """Whether pose errors below about 1e-6 m and 5e-7 rad count as zero, as KDL has it."""
-    hand_frame_control: bool = dc.field(default=False)
+    hand_frame_control: bool = False
     """Whether the target wrench is given in the axes of the end effector E, not of the world."""
     error_scale: float = quantity(0.5, "", low=0.0, doc="Factor on the controlled error.")
     stiffness: list[float] = quantity(
@@ -318,7 +318,8 @@ class ComplianceController(LeafSystem):
             lambda context: self._plant.CreateDefaultContext(),
             {self.nothing_ticket()},
         )
-        # A policy changes these far less often than the controller runs.
+        # A policy changes these far less often than the controller runs, so they are read only when
+        # they change (at every update if what feeds them depends on the time).
         self._settings = self._cache_entry(
             "settings",
             self._calc_settings,
@@ -412,7 +413,7 @@ class ComplianceController(LeafSystem):
         value = self.EvalAbstractInput(context, self._target_wrench)
         if value is not None:
             # Drake's spatial forces have the moment first.
-            target_wrench = value.get_value().get_coeffs().reshape(2, 3)[::-1]
+            target_wrench = value.get_value().get_coeffs().copy().reshape(2, 3)[::-1]
             if not self._hand_frame_control:
                 target_wrench = target_wrench.dot(self._X_BW[:, :3].T)
         return _Settings(

@@ -55,7 +55,7 @@ class CuttingSystem(KnifeForceSystem):
         solvers: Sequence[CuttingSolver],
         X_WF: RigidTransform,
         knife_body: BodyIndex,
-        check_period: float = 0.02,
+        check_period: float = 0.05,
     ) -> None:
         super().__init__(knife_body, solvers[0].exchange_period)
         self._solvers = tuple(solvers)
@@ -181,7 +181,7 @@ class CuttingSystem(KnifeForceSystem):
                 ],
             )
         wrench = np.concatenate([R_WC @ step.wrench[:3], R_WC @ step.wrench[3:]])
-        return wrench, solver.cut_fraction(step.state)
+        return wrench, step.cut
 
     def _calc_surface(self, context: Context, output: BasicVector) -> None:
         index = self.food_index(context)

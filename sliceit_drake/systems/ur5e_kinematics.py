@@ -55,12 +55,11 @@ def ur5e_chain(X_TE: RigidTransform) -> KinematicChain:
     Returns:
         The chain; its last link is ``wrist_3_link``, whose frame is T.
     """
-    half_turn, turn = math.pi, 2.0 * math.pi
+    quarter_turn, half_turn, turn = 0.5 * math.pi, math.pi, 2.0 * math.pi
 
     def pose(rpy: tuple[float, float, float], xyz: tuple[float, float, float]) -> RigidTransform:
         return RigidTransform(RollPitchYaw(*rpy), xyz)
 
-    quarter_turn = math.pi / 2.0
     return KinematicChain(
         joints=(
             ChainJoint("shoulder_link", pose((0, 0, 0), (0, 0, 0.1625)), -turn, turn),

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
+from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import WeldJoint
@@ -20,9 +21,15 @@ from sliceit_drake.configuration import ConfigurationError, quantity
 
 __all__ = ["WrenchSensor", "WrenchSensorConfig"]
 
-# Parts of the discrete state. The sum is written at every plant step, the reading at exchanges only.
-_SUM = 0  # Sum of the wrenches since the last exchange [6], their number, and whether to skip one.
-_READING = 1  # Reading [6], filtered wrench [6], tare [6], number of exchanges.
+# Parts of the state, one vector so that an update fetches it once.
+_SUM = slice(0, 6)  # Sum of the plant's reactions since the last exchange.
+_COUNT = 6  # How many are in the sum.
+_SKIP = 7  # Whether the exchange at this instant has taken the next one already.
+_READING = slice(8, 14)
+_FILTERED = slice(14, 20)  # Wrench behind the low-pass filter.
+_ZERO = slice(20, 26)  # What is subtracted: the tare less the bias.
+_EXCHANGES = 26  # How many there have been.
+_STATE_SIZE = 27
 
 
 @dc.dataclass
@@ -106,27 +113,27 @@ class WrenchSensor(LeafSystem):
                 "the plant's output ports are not sampled",
                 fix="Leave use_sampled_output_ports at its default, true.",
             )
+        self._steps = steps
         self._index = int(weld.index())
-        X_SJc = weld.X_FM()
-        self._R_SJc = X_SJc.rotation().matrix()
-        self._p_SJc = X_SJc.translation()
+        # From the sum of reactions on the tool at Jc to the mean wrench on the arm at So, in S.
+        self._mean_on_arm = _shift_matrix(weld.X_FM()) / -steps
         self._bias = np.concatenate([config.moment_bias, config.force_bias])
         self._noise = np.repeat([config.moment_noise, config.force_noise], 3)
+        self._is_noisy = bool(self._noise.any())
         self._tare_at_start = config.tare_at_start
         turn = 2.0 * math.pi * config.cutoff_frequency * exchange_period
         self._filter_share = -math.expm1(-turn) if turn > 0.0 else 1.0
 
         self._reactions = self.DeclareAbstractInputPort(
             "reaction_forces", Value[list[SpatialForce]]()
-        )
+        ).get_index()
         self._seed = self.DeclareNumericParameter(BasicVector([float(config.seed)]))
-        self.DeclareDiscreteState(np.zeros(8))
-        reading = self.DeclareDiscreteState(np.zeros(19))
+        self.DeclareDiscreteState(np.zeros(_STATE_SIZE))
         self.DeclareAbstractOutputPort(
             "sensor_wrench",
             lambda: Value(SpatialForce.Zero()),
             self._calc_sensor_wrench,
-            {self.discrete_state_ticket(reading)},
+            {self.xd_ticket()},
         )
         if steps > 1:
             self.DeclarePeriodicDiscreteUpdateEvent(plant.time_step(), 0.0, self._accumulate)
@@ -137,50 +144,55 @@ class WrenchSensor(LeafSystem):
         context.get_mutable_numeric_parameter(self._seed).SetAtIndex(0, rng.integers(2**31))
 
     def _reaction(self, context: Context) -> np.ndarray:
-        return self._reactions.Eval(context)[self._index].get_coeffs()
+        # The whole list crosses into Python for the one wrench wanted; no port gives less.
+        return self.EvalAbstractInput(context, self._reactions).get_value()[self._index].get_coeffs()
 
     def _accumulate(self, context: Context, discrete_state: DiscreteValues) -> None:
-        total = discrete_state.get_mutable_value(_SUM)
-        if total[7]:  # The exchange at this instant has taken this step's wrench.
-            total[7] = 0.0
+        x = discrete_state.get_mutable_value()
+        if x[_SKIP]:
+            x[_SKIP] = 0.0
             return
-        total[:6] += self._reaction(context)
-        total[6] += 1.0
+        x[_SUM] += self._reaction(context)
+        x[_COUNT] += 1.0
 
     def _read(self, context: Context, state: State) -> None:
-        discrete = state.get_mutable_discrete_state()
-        total = discrete.get_mutable_value(_SUM)
-        reading = discrete.get_mutable_value(_READING)
-        exchange = int(reading[18])
-        reading[18] += 1.0
+        x = state.get_mutable_discrete_state().get_mutable_value()
+        # Rounding can put the plant's step of this instant before the exchange; it has then been
+        # accumulated. Else it is taken here, and must not be taken again.
+        pending = x[_COUNT] < self._steps
+        exchange = int(x[_EXCHANGES])
         if exchange > 0:  # The plant has no reaction forces before its first step.
-            mean = (total[:6] + self._reaction(context)) / (total[6] + 1.0)
-            self._update_reading(context, reading, self._in_sensor_frame(-mean), exchange)
-        total[:] = 0.0
-        total[7] = 1.0
-
-    def _in_sensor_frame(self, F_Jc: np.ndarray) -> np.ndarray:
-        force = self._R_SJc @ F_Jc[3:]
-        moment = self._R_SJc @ F_Jc[:3] + np.cross(self._p_SJc, force)
-        return np.concatenate([moment, force])
+            if pending:
+                x[_SUM] += self._reaction(context)
+            self._update_reading(context, x, self._mean_on_arm @ x[_SUM], exchange)
+        x[_SUM] = 0.0
+        x[_COUNT] = 0.0
+        x[_SKIP] = pending
+        x[_EXCHANGES] += 1.0
 
     def _update_reading(
-        self, context: Context, reading: np.ndarray, wrench: np.ndarray, exchange: int
+        self, context: Context, x: np.ndarray, wrench: np.ndarray, exchange: int
     ) -> None:
-        filtered, tare = reading[6:12], reading[12:18]
         if exchange == 1:
-            filtered[:] = wrench
-            if self._tare_at_start:
-                tare[:] = wrench
-        else:
-            filtered += self._filter_share * (wrench - filtered)
-        reading[:6] = filtered - tare + self._bias
-        if self._noise.any():
+            x[_FILTERED] = wrench
+            x[_ZERO] = wrench * self._tare_at_start - self._bias
+        elif self._filter_share < 1.0:
+            wrench = x[_FILTERED] + self._filter_share * (wrench - x[_FILTERED])
+            x[_FILTERED] = wrench
+        x[_READING] = wrench - x[_ZERO]
+        if self._is_noisy:
             # A counter-based generator needs no state: a reading's noise follows from seed and time.
             seed = int(context.get_numeric_parameter(self._seed)[0])
             draw = np.random.Generator(np.random.Philox(key=seed, counter=[0, exchange, 0, 0]))
-            reading[:6] += self._noise * draw.standard_normal(6)
+            x[_READING] += self._noise * draw.standard_normal(6)
 
     def _calc_sensor_wrench(self, context: Context, output: AbstractValue) -> None:
-        reading = context.get_discrete_state(_READING).value()
-        output.set_value(SpatialForce(reading[:3], reading[3:6]))
+        reading = context.get_discrete_state_vector().value()[_READING]
+        output.set_value(SpatialForce(reading[:3], reading[3:]))
+
+
+def _shift_matrix(X_SJ: RigidTransform) -> np.ndarray:
+    """Matrix [6, 6] that turns a wrench at Jo in J into the same at So in S, moment first."""
+    R, p = X_SJ.rotation().matrix(), X_SJ.translation()
+    cross = np.array([[0.0, -p[2], p[1]], [p[2], 0.0, -p[0]], [-p[1], p[0], 0.0]])
+    return np.block([[R, cross @ R], [np.zeros((3, 3)), R]])

@@ -1,0 +1,71 @@
+"""`sliceit diagram`: draw the systems of a scenario and their connections."""
+
+import argparse
+import shutil
+import subprocess
+from pathlib import Path
+
+from sliceit_drake.cli.scenario_argument import add_scenario_arguments, scenario_of
+
+__all__ = ["add_parser"]
+
+DESCRIPTION = """\
+Draw the block diagram of a scenario.
+
+With Graphviz installed (its program `dot`) the picture is written in the format of FILE's ending:
+.svg, .png or .pdf. Without it, give a .dot file and draw that elsewhere.
+"""
+
+
+def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        "diagram",
+        help="draw the systems of a scenario, or print its port contract",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_scenario_arguments(parser)
+    parser.add_argument(
+        "--output", metavar="FILE", type=Path, default=Path("diagram.svg"), help="picture to write"
+    )
+    parser.add_argument("--depth", type=int, default=2, help="levels of nested diagrams (default 2)")
+    parser.add_argument(
+        "--ports", action="store_true", help="print the station's port contract and draw nothing"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the command."""
+    if options.ports:
+        from sliceit_drake.diagrams.ports import ports_as_markdown
+
+        print(ports_as_markdown())
+        return 0
+
+    from sliceit_drake.configuration import ConfigurationError
+    from sliceit_drake.diagrams.station import MakeScenarioDiagram
+
+    kind = options.output.suffix.lstrip(".")
+    dot = shutil.which("dot")
+    if kind not in ("dot", "svg", "png", "pdf"):
+        raise ConfigurationError(
+            f'"{options.output}" has an ending that is not known',
+            field="--output",
+            fix="Give .svg, .png, .pdf or .dot.",
+        )
+    if kind != "dot" and dot is None:
+        raise ConfigurationError(
+            "the program `dot` of Graphviz is not installed, and it draws the picture",
+            field="--output",
+            fix="Install Graphviz (Debian: apt install graphviz), or give a .dot file.",
+        )
+    text = MakeScenarioDiagram(scenario_of(options)).GetGraphvizString(options.depth)
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    if kind == "dot" or dot is None:
+        options.output.write_text(text, encoding="utf-8")
+    else:
+        subprocess.run([dot, f"-T{kind}", "-o", str(options.output)], input=text.encode(), check=True)
+    print(f"Wrote {options.output}")
+    return 0

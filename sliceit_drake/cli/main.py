@@ -1,0 +1,58 @@
+"""Entry point of `sliceit`: parses the command line and turns bad input into a message."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from sliceit_drake.cli import diagram, simulate
+
+__all__ = ["main"]
+
+COMMANDS = (simulate, diagram)
+BAD_INPUT = 2
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of the whole program."""
+    parser = argparse.ArgumentParser(
+        prog="sliceit",
+        description="Simulate a robot that slices food, in Drake.",
+        epilog="`sliceit COMMAND --help` explains a command. SI units everywhere.",
+    )
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for command in COMMANDS:
+        command.add_parser(commands)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs `sliceit`.
+
+    Args:
+        arguments: Command line without the program's name; None for that of the process.
+
+    Returns:
+        0 on success, 1 if a run stopped early, 2 for bad input.
+    """
+    options = make_parser().parse_args(arguments)
+    try:
+        return options.run(options)
+    except Exception as error:
+        if not _is_bad_input(error):
+            raise
+        print(f"sliceit: {error}", file=sys.stderr)
+        return BAD_INPUT
+
+
+def _is_bad_input(error: Exception) -> bool:
+    """Whether an error tells a user what to change; anything else is a fault of ours."""
+    from sliceit_drake.configuration import ConfigurationError
+    from sliceit_drake.cutting.mesh import MeshError
+    from sliceit_drake.cutting.model import TimeStepError
+    from sliceit_drake.cutting.solver import CuttingError
+
+    return isinstance(error, ConfigurationError | MeshError | TimeStepError | CuttingError)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

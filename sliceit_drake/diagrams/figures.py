@@ -1,0 +1,90 @@
+"""Figures of a run."""
+
+from pathlib import Path
+
+import numpy as np
+
+from sliceit_drake.diagrams.comparison import Comparison
+from sliceit_drake.diagrams.record import Record
+
+__all__ = ["plot_force"]
+
+# Okabe and Ito's palette: distinct for colour-blind readers and in grey.
+SIMULATED = "#0072B2"
+NORM = "#56B4E9"
+MEASURED = "#000000"
+FOOD_PHASE = "#009E73"
+BOARD_PHASE = "#E69F00"
+CONTACT_THRESHOLD = 0.05
+
+
+def plot_force(
+    record: Record,
+    file: Path,
+    title: str,
+    top_height: float,
+    comparison: Comparison | None,
+    caption: str,
+) -> None:
+    """Draws force over time and over depth.
+
+    Args:
+        record: The run.
+        file: PNG to write.
+        title: What is shown.
+        top_height: World height of the food's top at the cut, metres.
+        comparison: Measured profile with its fitted offset, or None.
+        caption: Conditions and provenance, below the plots.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    time = record["time"]
+    food, board = record.vector("food_wrench_f"), record.vector("board_wrench_f")
+    total = food + board
+    norm = np.linalg.norm(total, axis=1)
+    depth = 1e3 * (top_height - record["knife_pose_p_z"])
+
+    figure = Figure(figsize=(9.0, 4.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    over_time, over_depth = figure.subplots(1, 2, sharey=True, width_ratios=[1.5, 1.0])
+    for axes, x in ((over_time, time), (over_depth, depth)):
+        axes.plot(x, norm, color=NORM, lw=3.2, label="simulated norm")
+        axes.plot(x, total[:, 2], color=SIMULATED, lw=1.2, label="simulated vertical")
+        axes.axhline(0.0, color="0.8", lw=0.8, zorder=0)
+        axes.grid(alpha=0.25)
+        axes.spines[["top", "right"]].set_visible(False)
+    for forces, colour, label in ((food, FOOD_PHASE, "food"), (board, BOARD_PHASE, "board")):
+        touching = np.linalg.norm(forces, axis=1) > CONTACT_THRESHOLD
+        over_time.fill_between(
+            time,
+            0.0,
+            1.0,
+            where=touching,
+            transform=over_time.get_xaxis_transform(),
+            color=colour,
+            alpha=0.14,
+            lw=0,
+            label=f"contact with {label}",
+        )
+    if comparison is not None:
+        first_contact = time[int(np.argmax(depth > 0.0))]
+        measured_time = first_contact + comparison.time_since_contact
+        label = "measured (SliceIt! UR5e)"
+        style = {"color": MEASURED, "lw": 1.3, "ls": (0, (4, 1.5)), "label": label}
+        over_time.plot(measured_time, comparison.measured, **style)
+        over_depth.plot(1e3 * comparison.depth, comparison.measured, **style)
+    end = max(float(depth.max()), 1.0)
+    over_depth.set_xlim(-0.12 * end, 1.05 * end)
+    over_time.set_xlim(time[0], time[-1])
+    over_time.set_xlabel("time [s]")
+    over_depth.set_xlabel("depth of the edge below the food's top [mm]")
+    over_time.set_ylabel("force on the knife [N]")
+    over_time.margins(y=0.08)
+    handles, labels = over_time.get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=8.5
+    )
+    figure.suptitle(title, fontsize=12)
+    figure.supxlabel(caption, fontsize=7.5, color="0.35", wrap=True)
+    figure.savefig(file, dpi=150)

@@ -1,0 +1,308 @@
+"""Runs a scenario and writes what a user wants of it: record, summary, figure, replay."""
+
+import dataclasses as dc
+import importlib.metadata
+import json
+import platform
+import time as clock
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Diagram, DiagramBuilder
+
+from sliceit_drake.configuration import dump_yaml
+from sliceit_drake.cutting.discretization import estimate_discretization_error
+from sliceit_drake.cutting.food import Food, start_pose
+from sliceit_drake.cutting.motion import Motion
+from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.diagrams.comparison import Comparison, compare_with_measurement
+from sliceit_drake.diagrams.figures import CONTACT_THRESHOLD, plot_force
+from sliceit_drake.diagrams.record import Record, Recorder, add_recorder
+from sliceit_drake.diagrams.scenario import Scenario
+from sliceit_drake.diagrams.station import MakeSlicingStation, SlicingStation
+from sliceit_drake.records.force_profile import load_force_profile
+from sliceit_drake.resources import resource_path
+from sliceit_drake.systems.cutting_system import CuttingSystem
+from sliceit_drake.systems.motion_sources import MotionSource
+
+__all__ = ["Run", "prepare_run", "simulate", "write_outputs"]
+
+CHUNK = 0.02
+
+
+@dc.dataclass
+class Run:
+    """A scenario ready to simulate, and what came of it.
+
+    Attributes:
+        scenario: What is simulated.
+        diagram: Station, motion and recorder.
+        station: The station in it.
+        motion: The prescribed targets.
+        recorder: The log in it.
+        simulator: Initialized.
+        wall_time: Seconds spent in the simulator.
+        stopped: Why the run ended early, or None.
+    """
+
+    scenario: Scenario
+    diagram: Diagram
+    station: SlicingStation
+    motion: Motion
+    recorder: Recorder
+    simulator: Simulator
+    wall_time: float = 0.0
+    stopped: str | None = None
+
+    def record(self) -> Record:
+        """The record so far."""
+        return self.recorder.record(self.simulator.get_context())
+
+
+def prepare_run(scenario: Scenario, meshcat: Meshcat | None = None) -> Run:
+    """Builds the diagram of a scenario and puts it at its start.
+
+    Raises:
+        ConfigurationError, MeshError, TimeStepError, CuttingError: The scenario cannot start.
+    """
+    builder = DiagramBuilder()
+    station = builder.AddNamedSystem("station", MakeSlicingStation(scenario, meshcat))
+    motion = builder.AddNamedSystem("motion", MotionSource(scenario.motion, station.start_pose))
+    builder.Connect(motion.GetOutputPort("target_pose"), station.GetInputPort("target_pose"))
+    recorder = add_recorder(builder, station, {"target_pose": motion.GetOutputPort("target_pose")})
+    diagram = builder.Build()
+    diagram.set_name(scenario.name)
+    simulator = Simulator(diagram)
+    station.SetStart(simulator.get_mutable_context())
+    if meshcat is not None:
+        _set_scene(meshcat, station.start_pose)
+        meshcat.StartRecording(set_visualizations_while_recording=True)
+        if station.food_visualizer is not None:
+            station.food_visualizer.StartRecording()
+    simulator.Initialize()
+    return Run(scenario, diagram, station, motion.motion, recorder, simulator)
+
+
+def simulate(
+    run: Run, duration: float | None = None, progress: Callable[[float, float], None] | None = None
+) -> None:
+    """Advances a run to its end; an error or Ctrl-C ends it early and is noted in `run.stopped`.
+
+    Args:
+        run: Prepared.
+        duration: Simulated time, s; None for the motion's.
+        progress: Called with simulated time and wall time, s, after each part.
+    """
+    end = run.motion.duration if duration is None else duration
+    begin = clock.perf_counter()
+    try:
+        while (now := run.simulator.get_context().get_time()) < end - 1e-9:
+            run.simulator.AdvanceTo(min(now + CHUNK, end))
+            run.wall_time = clock.perf_counter() - begin
+            if progress is not None:
+                progress(run.simulator.get_context().get_time(), run.wall_time)
+    except CuttingError as error:
+        run.stopped = str(error)
+    except KeyboardInterrupt:
+        run.stopped = "interrupted by the user"
+
+
+def write_outputs(run: Run, directory: Path, meshcat: Meshcat | None) -> dict:
+    """Writes record.csv, summary.json, force.png, scenario.yaml and, with a viewer, replay.html.
+
+    Args:
+        run: After `simulate`.
+        directory: Made if absent.
+        meshcat: The viewer that recorded the run, or None.
+
+    Returns:
+        The summary.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    record = run.record()
+    record.write_csv(directory / "record.csv")
+    dump_yaml(run.scenario, directory / "scenario.yaml")
+    comparison = _comparison(run, record)
+    summary = _summary(run, record, comparison)
+    (directory / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    plot_force(
+        record,
+        directory / "force.png",
+        _title(run.scenario),
+        _top_height(run),
+        comparison,
+        _caption(run, comparison, summary),
+    )
+    if meshcat is not None:
+        if run.station.food_visualizer is not None:
+            run.station.food_visualizer.PublishRecording()
+        meshcat.StopRecording()
+        meshcat.PublishRecording()
+        (directory / "replay.html").write_text(meshcat.StaticHtml())
+    return summary
+
+
+def make_meshcat() -> Meshcat:
+    """A viewer on the loopback interface."""
+    return Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
+
+
+def _set_scene(meshcat: Meshcat, X_WK: RigidTransform) -> None:
+    target = X_WK.translation() + [0.0, 0.0, 0.05]
+    # The viewer's camera path is +y up; SetCameraPose takes world coordinates.
+    meshcat.SetCameraPose(target + [0.75, -0.55, 0.35], target)
+    meshcat.SetProperty("/Grid", "visible", False)
+    meshcat.SetProperty("/Axes", "visible", False)
+    meshcat.SetProperty("/Background", "top_color", [0.92, 0.94, 0.96])
+    meshcat.SetProperty("/Background", "bottom_color", [0.80, 0.83, 0.86])
+
+
+def _top_height(run: Run) -> float:
+    return float(run.station.start_pose.translation()[2] - run.scenario.start.clearance)
+
+
+def _descent(run: Run, record: Record) -> tuple[np.ndarray, np.ndarray]:
+    """Depth [k], increasing, and norm of the force [k] until the deepest point."""
+    depth = _top_height(run) - record["knife_pose_p_z"]
+    force = record.vector("food_wrench_f") + record.vector("board_wrench_f")
+    norm = np.linalg.norm(force, axis=1)
+    deepest = int(np.argmax(depth)) + 1
+    depth, norm = depth[:deepest], norm[:deepest]
+    rising = np.concatenate([[True], depth[1:] > np.maximum.accumulate(depth)[:-1]])
+    return depth[rising], norm[rising]
+
+
+def _comparison(run: Run, record: Record) -> Comparison | None:
+    measurement = run.scenario.measurement
+    if measurement is None:
+        return None
+    depth, force = _descent(run, record)
+    if run.stopped is not None and (len(depth) < 10 or depth[-1] < 1e-3):
+        return None
+    file = Path(measurement.file)
+    profile = load_force_profile(file if file.exists() else resource_path(measurement.file))
+    return compare_with_measurement(profile, measurement, depth, force)
+
+
+def _title(scenario: Scenario) -> str:
+    speeds = [getattr(s, "speed", None) for s in scenario.motion.segments]
+    speed = next((s for s in speeds if s), None)
+    at = f" at {1e3 * speed:.3g} mm/s" if speed else ""
+    return f"A UR5e slices {scenario.name}{at}"
+
+
+def _caption(run: Run, comparison: Comparison | None, summary: dict) -> str:
+    lines = []
+    food = run.scenario.food
+    if isinstance(food, Food):
+        m = food.material
+        lines.append(
+            f"Parameters set by hand: E = {m.youngs_modulus:.3g} Pa, toughness {m.toughness:.3g} J/m², "
+            f"flank friction {m.friction:.2g}; {summary['elements']} tetrahedra, "
+            f"sub-step {1e3 * run.scenario.numerics.time_step:.3g} ms."
+        )
+    if comparison is not None:
+        lines.append(
+            f"Measured curve digitised from the SliceIt! paper's project page; first contact fitted at "
+            f"{comparison.contact_time:.3f} s of its record; RMS difference {comparison.rms:.2f} N."
+        )
+    if run.stopped:
+        lines.append(f"Stopped early: {run.stopped}")
+    return "\n".join(lines)
+
+
+def _phase_times(mask: np.ndarray, time: np.ndarray) -> list[float] | None:
+    touching = np.flatnonzero(mask)
+    return [float(time[touching[0]]), float(time[touching[-1]])] if len(touching) else None
+
+
+def _summary(run: Run, record: Record, comparison: Comparison | None) -> dict:
+    scenario, station = run.scenario, run.station
+    time = record["time"]
+    food, board = record.vector("food_wrench_f"), record.vector("board_wrench_f")
+    norm = np.linalg.norm(food + board, axis=1)
+    on_food = np.linalg.norm(food, axis=1) > CONTACT_THRESHOLD
+    on_board = np.linalg.norm(board, axis=1) > CONTACT_THRESHOLD
+    contact = norm[on_food | on_board]
+    summary: dict = {
+        "scenario": scenario.name,
+        "stopped": run.stopped,
+        "simulated_time_s": float(time[-1]),
+        "wall_time_s": run.wall_time,
+        "real_time_factor": float(time[-1] / run.wall_time) if run.wall_time else None,
+        "peak_force_N": float(norm.max()),
+        "mean_contact_force_N": float(contact.mean()) if len(contact) else 0.0,
+        "board_peak_N": float(np.linalg.norm(board, axis=1).max()),
+        "cut_progress": float(record["cut_progress"][-1]),
+        "phase_times_s": {
+            "food": _phase_times(on_food, time),
+            "board": _phase_times(on_board, time),
+            "motion": {label: [a, b] for label, a, b in run.motion.phases},
+        },
+        "settings": {
+            "exchange_period_s": scenario.exchange_period,
+            "plant_time_step_s": scenario.robot.plant_time_step,
+            "seed": scenario.seed,
+        },
+        "versions": {
+            name: importlib.metadata.version(name)
+            for name in ("sliceit_drake", "drake", "warp-lang", "numpy")
+        }
+        | {"python": platform.python_version()},
+    }
+    if isinstance(station.cutting, CuttingSystem) and isinstance(scenario.food, Food):
+        summary |= _cutting_summary(run, record)
+    if comparison is not None:
+        summary["measurement"] = {
+            "file": scenario.measurement.file if scenario.measurement else None,
+            "rms_N": comparison.rms,
+            "measured_peak_N": comparison.measured_peak,
+            "simulated_peak_N": comparison.simulated_peak,
+            "fitted_contact_time_s": comparison.contact_time,
+            "height_offset_mm": 1e3 * comparison.contact_time * scenario.measurement.speed
+            if scenario.measurement
+            else None,
+        }
+    return summary
+
+
+def _cutting_summary(run: Run, record: Record) -> dict:
+    """Numbers of the finite-element food."""
+    scenario, station = run.scenario, run.station
+    assert isinstance(station.cutting, CuttingSystem) and isinstance(scenario.food, Food)
+    solver = station.cutting.solver(
+        station.cutting.GetMyContextFromRoot(run.simulator.get_context())
+    )
+    model = solver.model
+    work = float(record["energy_work"][-1])
+    motion = Motion(scenario.motion, start_pose(model, scenario.start.clearance))
+    summary = {
+        "elements": model.element_count,
+        "cut_points": len(model.point_nodes),
+        "sub_step_s": scenario.numerics.time_step,
+        "mass_ratio": model.mass_ratio,
+        "section_area_mm2": 1e6 * model.section_area,
+        "work_of_cutting_J": work,
+        "work_by_mechanism_J": {
+            name: float(record[f"energy_{name}"][-1])
+            for name in ("edge", "opening", "friction", "board_friction", "released")
+        },
+        "work_per_area_J_m2": work / model.section_area,
+        "energy_ratio": float(record["energy_largest_energy_ratio"][-1]),
+        "least_volume_ratio": float(record["energy_least_volume_ratio"][-1]),
+        "coupling_work_error_J": float(record["coupling_work_error"][-1]),
+    }
+    error = estimate_discretization_error(
+        scenario.food,
+        scenario.knife,
+        scenario.numerics,
+        scenario.exchange_period,
+        motion,
+        None,
+    )
+    summary["discretization_error"] = dc.asdict(error)
+    return summary
