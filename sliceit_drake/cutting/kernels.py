@@ -30,6 +30,7 @@ PARAMETERS = (
     "board_friction",
     "blade_stiffness",
     "blade_damping",
+    "blade_mass",
 )
 """Scalars that the kernels read, in the order of their array."""
 
@@ -61,6 +62,7 @@ def kernels(real: Any) -> types.SimpleNamespace:
     BOARD_FRICTION = wp.constant(_INDEX["board_friction"])
     BLADE_STIFFNESS = wp.constant(_INDEX["blade_stiffness"])
     BLADE_DAMPING = wp.constant(_INDEX["blade_damping"])
+    BLADE_MASS = wp.constant(_INDEX["blade_mass"])
     TINY = wp.constant(real(1.0e-20))
 
     @wp.func
@@ -238,27 +240,19 @@ def kernels(real: Any) -> types.SimpleNamespace:
 
     @wp.func
     def wedge(y: real, height: real, knife: wp.array(dtype=real)):
-        """Distance to one side of the section and its gradient (y, height).
+        """Distance to flank or spine on one side of the section and its gradient (y, height).
 
-        The side is known, so the section is the half of the knife that is convex and unbounded
-        towards the other side: a point that crossed the middle plane is still pushed back.
+        The side is known, so a point that crossed the middle plane is still pushed back to its own
+        side. The bevel at the edge is left out: what it does to the food is the work of the edge,
+        which the toughness holds; its steep normal would count that twice, in spikes.
         """
-        y0 = knife[0]
-        h0 = knife[1]
         y1 = knife[2]
         h1 = knife[3]
         y2 = knife[4]
         h2 = knife[5]
-        b = wp.normalize(vec2(h1 - h0, y0 - y1))
-        f = wp.normalize(vec2(h2 - h1, y1 - y2))
-        bevel = b[0] * (y - y0) + b[1] * (height - h0)
-        flank = f[0] * (y - y1) + f[1] * (height - h1)
+        n = wp.normalize(vec2(h2 - h1, y1 - y2))
+        phi = n[0] * (y - y1) + n[1] * (wp.max(height, h1) - h1)
         spine = height - h2
-        phi = flank
-        n = f
-        if bevel > phi:
-            phi = bevel
-            n = b
         if spine > phi:
             phi = spine
             n = vec2(real(0.0), real(1.0))
@@ -290,6 +284,7 @@ def kernels(real: Any) -> types.SimpleNamespace:
         velocity: vec3,
         rotation_rate: vec3,
         bend: real,
+        bend_rate: real,
         area: real,
         shrink: real,
         slip: vec3,
@@ -313,14 +308,14 @@ def kernels(real: Any) -> types.SimpleNamespace:
             facing = side
             if R[1, 1] < real(0.0):
                 facing = -side
-            height = wp.max(-r[2], real(0.0))
-            phi, n2 = wedge(facing * (r[1] - bend), height, knife)
+            phi, n2 = wedge(facing * (r[1] - bend), -r[2], knife)
             if phi < real(0.0) and area > real(0.0):
                 depth = -phi
                 n = R * vec3(real(0.0), facing * n2[0], -n2[1])
                 N = P[FLANK_STIFFNESS] * area * depth
                 normal_force = N * n
-                relative = v - velocity - wp.cross(rotation_rate, arm)
+                knife_y = vec3(R[0, 1], R[1, 1], R[2, 1])
+                relative = v - velocity - wp.cross(rotation_rate, arm) - bend_rate * knife_y
                 sliding = relative - wp.dot(relative, n) * n
                 mu = P[FRICTION]
                 extra = P[STATIC_FRICTION] - mu
@@ -360,7 +355,7 @@ def kernels(real: Any) -> types.SimpleNamespace:
         parted: wp.array(dtype=real),
         slip: wp.array2d(dtype=vec3),
         force: wp.array2d(dtype=vec3),
-        lateral: wp.array(dtype=vec2),
+        lateral: wp.array(dtype=real),
         total: wp.array2d(dtype=real),
     ):
         """Edge, opening, self contact, flank contact and friction at each cut point.
@@ -387,8 +382,11 @@ def kernels(real: Any) -> types.SimpleNamespace:
         toughness_i = toughness[i]
         old_passed = passed[i]
         s = old_passed
+        s0 = old_passed
         if wp.abs(wp.dot(arm, knife_x)) < knife[7]:
             s = -wp.dot(arm, knife_z)
+            rate = real(0.5) * (vm + vp) - v_CK[k] - wp.cross(w_CK[k], arm)
+            s0 = s + dt * wp.dot(rate, knife_z)
         new_passed = wp.max(old_passed, s)
         passed[i] = new_passed
         u0 = (old_passed + reach) * per_spacing
@@ -428,11 +426,12 @@ def kernels(real: Any) -> types.SimpleNamespace:
         if unloading > real(0.0):
             edge_loss -= real(0.5) * (q1 * q1 - q0 * q0) / unloading
 
-        # Flanks on the part that is cut.
-        bend = blade[0]
+        # Flanks on the part that is cut and lies above the edge now.
+        above0 = wp.min(table(fraction, i, (s0 + reach) * per_spacing), D0)
+        above = wp.min(table(fraction, i, (s + reach) * per_spacing), D)
         shrink = real(1.0)
-        if D > real(0.0):
-            shrink = D0 / D
+        if above > above0:
+            shrink = above0 / above
         normal_m, friction_m, slip_m, loss_m, depth_m = flank_contact(
             xm,
             vm,
@@ -441,8 +440,9 @@ def kernels(real: Any) -> types.SimpleNamespace:
             origin,
             v_CK[k],
             w_CK[k],
-            bend,
-            A * D,
+            blade[0],
+            blade[1],
+            A * above,
             shrink,
             slip[i, 0],
             dt,
@@ -457,8 +457,9 @@ def kernels(real: Any) -> types.SimpleNamespace:
             origin,
             v_CK[k],
             w_CK[k],
-            bend,
-            A * D,
+            blade[0],
+            blade[1],
+            A * above,
             shrink,
             slip[i, 1],
             dt,
@@ -468,22 +469,14 @@ def kernels(real: Any) -> types.SimpleNamespace:
         slip[i, 0] = slip_m
         slip[i, 1] = slip_p
         released -= (
-            real(0.5) * P[FLANK_STIFFNESS] * A * (D - D0) * (depth_m * depth_m + depth_p * depth_p)
+            real(0.5) * P[FLANK_STIFFNESS] * A * (above - above0) * (depth_m * depth_m + depth_p * depth_p)
         )
 
         force[i, 0] = pull + real(0.5) * edge + normal_m + friction_m
         force[i, 1] = -pull + real(0.5) * edge + normal_p + friction_p
 
-        touching = real(0.0)
-        if depth_m > real(0.0):
-            touching += real(1.0)
-        if depth_p > real(0.0):
-            touching += real(1.0)
         knife_y = vec3(R[0, 1], R[1, 1], R[2, 1])
-        lateral[i] = vec2(
-            -wp.dot(normal_m + normal_p + friction_m + friction_p, knife_y),
-            P[FLANK_STIFFNESS] * A * D * touching,
-        )
+        lateral[i] = -wp.dot(normal_m + normal_p + friction_m + friction_p, knife_y)
 
         edge_moment = wp.cross(arm, edge)
         normal_moment = wp.cross(xm - origin, normal_m) + wp.cross(xp - origin, normal_p)
@@ -567,21 +560,17 @@ def kernels(real: Any) -> types.SimpleNamespace:
 
     @wp.kernel(enable_backward=True)
     def bend_blade(
-        lateral: wp.array(dtype=vec2),
-        P: wp.array(dtype=real),
-        dt: real,
-        blade: wp.array(dtype=real),
+        lateral: wp.array(dtype=real), P: wp.array(dtype=real), dt: real, blade: wp.array(dtype=real)
     ):
-        """Massless damped blade in series with the flanks, implicit in the flank stiffness."""
+        """Steps the blade's lateral deflection and its rate, pushed by the flanks."""
         F = real(0.0)
-        K = real(0.0)
         for i in range(lateral.shape[0]):
-            F += lateral[i][0]
-            K += lateral[i][1]
-        b = blade[0]
-        blade[0] = b + dt * (F - P[BLADE_STIFFNESS] * b) / (
-            P[BLADE_DAMPING] + dt * (P[BLADE_STIFFNESS] + K)
-        )
+            F += lateral[i]
+        m = P[BLADE_MASS]
+        rate = blade[1] + dt * (F - P[BLADE_STIFFNESS] * blade[0]) / m
+        rate = rate / (real(1.0) + dt * P[BLADE_DAMPING] / m)
+        blade[1] = rate
+        blade[0] = blade[0] + dt * rate
 
     @wp.kernel(enable_backward=False)
     def point_energy(
@@ -631,6 +620,7 @@ def kernels(real: Any) -> types.SimpleNamespace:
         s = passed[i]
         if wp.abs(wp.dot(arm, knife_x)) < knife[7]:
             s = -wp.dot(arm, knife_z)
+        above = wp.min(table(fraction, i, (s + reach) * per_spacing), D)
         unloading = toughness[i] * widest[i] / P[UNLOADING_LENGTH]
         if unloading > real(0.0):
             q = toughness[i] * (real(1.0) - parted[i]) * table(width, i, u)
@@ -647,10 +637,10 @@ def kernels(real: Any) -> types.SimpleNamespace:
                 sign = facing
             r = wp.transpose(R) * (p - p_CK[k])
             if wp.abs(r[0]) < knife[7]:
-                phi, _n = wedge(sign * (r[1] - blade[0]), wp.max(-r[2], real(0.0)), knife)
+                phi, _n = wedge(sign * (r[1] - blade[0]), -r[2], knife)
                 if phi < real(0.0):
                     held = slip[i, side]
-                    doubled += P[FLANK_STIFFNESS] * A * D * (phi * phi + wp.dot(held, held))
+                    doubled += P[FLANK_STIFFNESS] * A * above * (phi * phi + wp.dot(held, held))
         energy[i] = real(0.5) * doubled
 
     return types.SimpleNamespace(

@@ -238,6 +238,11 @@ def make_cutting_model(
         board[3] = board_height - upward @ p_FC
         board_area = _downward_area(split, up_C)[computed]
 
+    pushing = 2.0 * parameters["flank_stiffness"] * float(tables.area.sum())
+    blade_need = 0.25 * (2.0 * pushing + knife.lateral_stiffness)
+    parameters["blade_mass"] = max(
+        knife.lateral_mass(), blade_need * (numerics.time_step / numerics.stability_margin) ** 2
+    )
     need = _stiffness_bound(t, inverse, volume, material)
     per_point = tables.area * (2.0 * bond + 2.0 * parameters["flank_stiffness"])
     per_point += 0.5 * toughness * tables.width.max(1) / numerics.unloading_length

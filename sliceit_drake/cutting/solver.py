@@ -124,7 +124,7 @@ class CuttingSolver:
             ("parted", P, real, 1),
             ("slip", 2 * P, vec3, 3),
             ("board_slip", N, vec3, 3),
-            ("blade", 1, real, 1),
+            ("blade", 2, real, 1),
         ]
         self._layout, offset = {}, 0
         for name, count, _, width in fields:
@@ -167,7 +167,7 @@ class CuttingSolver:
         self._w["total"] = self._w["total"].reshape((P, ACCUMULATED))
 
         self._w["point_force"] = wp.zeros((P, 2), dtype=vec3, device=self._device)
-        self._w["lateral"] = wp.zeros(P, dtype=k.vec2, device=self._device)
+        self._w["lateral"] = wp.zeros(P, dtype=real, device=self._device)
         self._w["energy"] = wp.zeros((B, LANES), dtype=real, device=self._device)
         self._w["volume_ratio"] = wp.zeros((B, LANES), dtype=real, device=self._device)
         self._w["point_energy"] = wp.zeros(P, dtype=real, device=self._device)
@@ -431,8 +431,9 @@ class CuttingSolver:
         anchor = self.field(state, "board_slip").reshape(-1, 3)
         rest = 0.5 * m.parameters["board_stiffness"] * m.board_area
         interface += float(rest @ (depth**2 + (anchor**2).sum(1)))
-        blade = float(self.field(state, "blade")[0])
-        interface += 0.5 * m.parameters["blade_stiffness"] * blade**2
+        deflection, rate = (float(b) for b in self.field(state, "blade"))
+        interface += 0.5 * m.parameters["blade_stiffness"] * deflection**2
+        interface += 0.5 * m.parameters["blade_mass"] * rate**2
         v2 = (self.velocities(state)[m.moving].astype(np.float64) ** 2).sum(1)
         return Energies(
             elastic=float(elastic),

@@ -137,8 +137,10 @@ def _loft(rings: list[tuple[float, list[tuple[float, float]]]]) -> TriangleSurfa
 
 
 def _shape(mesh: TriangleSurfaceMesh, name: str) -> Mesh:
+    """The surface as an OBJ file in memory, each triangle shaded flat."""
     lines = ["v {:.9g} {:.9g} {:.9g}".format(*v) for v in mesh.vertices()]
-    for triangle in mesh.triangles():
-        lines.append("f " + " ".join(str(triangle.vertex(i) + 1) for i in range(3)))
+    for i, triangle in enumerate(mesh.triangles(), start=1):
+        lines.append("vn {:.6f} {:.6f} {:.6f}".format(*mesh.face_normal(i - 1)))
+        lines.append("f " + " ".join(f"{triangle.vertex(k) + 1}//{i}" for k in range(3)))
     contents = "\n".join(lines) + "\n"
     return Mesh(InMemoryMesh(mesh_file=MemoryFile(contents, ".obj", name)))

@@ -132,6 +132,10 @@ def add_plant(builder: DiagramBuilder, config: RobotConfig) -> tuple[MultibodyPl
             contact_model="point",
             # Hunt and Crossley's law; "sap" would replace its dissipation by a relaxation time.
             discrete_contact_approximation="lagged",
+            # A plant with sampled ports steps in an unrestricted update: before the controllers of
+            # the same instant, beside the cutting system instead of after it, and with a copy of
+            # the whole diagram's state at every step.
+            use_sampled_output_ports=False,
         ),
         builder,
     )
@@ -211,10 +215,7 @@ class ArmController(Diagram):
         self._servo = builder.AddNamedSystem(
             "servo", Servo(config.servo, period, config.joint_positions)
         )
-        gravity = builder.AddNamedSystem(
-            "gravity_compensation",
-            InverseDynamics(plant, InverseDynamics.InverseDynamicsMode.kGravityCompensation),
-        )
+        feedforward = builder.AddNamedSystem("inverse_dynamics", InverseDynamics(plant))
         errors = builder.AddNamedSystem(
             "inputs", Multiplexer([2 * JOINTS, 2 * JOINTS, JOINTS])
         )
@@ -223,12 +224,17 @@ class ArmController(Diagram):
         )
         builder.ExportInput(self._servo.get_input_port(), "joint_positions_command")
         state = builder.ExportInput(errors.get_input_port(1), "joint_state")
-        builder.ConnectInput(state, gravity.get_input_port_estimated_state())
-        builder.Connect(self._servo.get_output_port(), errors.get_input_port(0))
-        builder.Connect(gravity.get_output_port(), errors.get_input_port(2))
+        builder.ConnectInput(state, feedforward.get_input_port_estimated_state())
+        desired_state = self._servo.GetOutputPort("desired_state")
+        builder.Connect(desired_state, errors.get_input_port(0))
+        builder.Connect(
+            self._servo.GetOutputPort("desired_acceleration"),
+            feedforward.get_input_port_desired_acceleration(),
+        )
+        builder.Connect(feedforward.get_output_port(), errors.get_input_port(2))
         builder.Connect(errors.get_output_port(), self._joint_control.get_input_port())
         builder.ExportOutput(self._joint_control.get_output_port(), "joint_torques")
-        builder.ExportOutput(self._servo.get_output_port(), "desired_state")
+        builder.ExportOutput(desired_state, "desired_state")
         builder.BuildInto(self)
 
     def set_positions(self, context: Context, positions: Sequence[float]) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
-from pydrake.systems.primitives import LinearSystem
+from pydrake.systems.primitives import Demultiplexer, LinearSystem
 from scipy.linalg import expm
 
 from sliceit_drake.configuration import ConfigurationError, quantity
@@ -73,6 +73,8 @@ class Servo(Diagram):
 
     Outputs:
         desired_state: Positions and velocities asked of the arm [12], rad and rad/s.
+        desired_acceleration: Mean acceleration until the next step [6], rad/s2; depends directly on
+            the targets.
     """
 
     def __init__(
@@ -96,13 +98,18 @@ class Servo(Diagram):
                 field="servo.delay",
                 fix=f"Write {self._delay_steps * period:.6g}.",
             )
-        A, B, C = self._matrices(config, period)
-        tracking = LinearSystem(A, B, C, np.zeros((2 * JOINTS, JOINTS)), period)
-        tracking.configure_default_state(self._state_at_rest(initial_positions))
+        A, B = self._matrices(config, period)
+        velocity = np.kron(np.eye(2, A.shape[0] // JOINTS)[1:], np.eye(JOINTS))
+        C = np.vstack([np.eye(2 * JOINTS, A.shape[0]), velocity @ (A - np.eye(len(A))) / period])
+        D = np.vstack([np.zeros((2 * JOINTS, JOINTS)), velocity @ B / period])
         builder = DiagramBuilder()
-        self._tracking = builder.AddNamedSystem("tracking", tracking)
-        builder.ExportInput(tracking.get_input_port(), "joint_positions_command")
-        builder.ExportOutput(tracking.get_output_port(), "desired_state")
+        self._tracking = builder.AddNamedSystem("tracking", LinearSystem(A, B, C, D, period))
+        self._tracking.configure_default_state(self._state_at_rest(initial_positions))
+        outputs = builder.AddNamedSystem("outputs", Demultiplexer([2 * JOINTS, JOINTS]))
+        builder.Connect(self._tracking.get_output_port(), outputs.get_input_port())
+        builder.ExportInput(self._tracking.get_input_port(), "joint_positions_command")
+        builder.ExportOutput(outputs.get_output_port(0), "desired_state")
+        builder.ExportOutput(outputs.get_output_port(1), "desired_acceleration")
         builder.BuildInto(self)
 
     def set_positions(self, context: Context, positions: Sequence[float]) -> None:
@@ -114,9 +121,7 @@ class Servo(Diagram):
         q = np.asarray(positions, float)
         return np.concatenate([q, np.zeros(JOINTS), np.tile(q, self._delay_steps)])
 
-    def _matrices(
-        self, config: ServoConfig, period: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _matrices(self, config: ServoConfig, period: float) -> tuple[np.ndarray, np.ndarray]:
         """State q, v, and the targets still on their way, the oldest first."""
         g, t = config.gain, config.lookahead_time
         step = expm(period * np.array([[0.0, 1.0, 0.0], [-g, -g * t, g], [0.0, 0.0, 0.0]]))
@@ -131,6 +136,4 @@ class Servo(Diagram):
             A[:2, 2:3] = push
             A[2:-1, 3:] = np.eye(n - 1)
             B[-1] = 1.0
-        C = np.eye(2, 2 + n)
-        each_joint = np.eye(JOINTS)
-        return np.kron(A, each_joint), np.kron(B, each_joint), np.kron(C, each_joint)
+        return np.kron(A, np.eye(JOINTS)), np.kron(B, np.eye(JOINTS))

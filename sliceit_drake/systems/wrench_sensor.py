@@ -1,6 +1,7 @@
 """The force/torque sensor between the robot's flange and its tool."""
 
 import dataclasses as dc
+import functools
 import math
 
 import numpy as np
@@ -24,12 +25,13 @@ __all__ = ["WrenchSensor", "WrenchSensorConfig"]
 # Parts of the state, one vector so that an update fetches it once.
 _SUM = slice(0, 6)  # Sum of the plant's reactions since the last exchange.
 _COUNT = 6  # How many are in the sum.
-_SKIP = 7  # Whether the exchange at this instant has taken the next one already.
-_READING = slice(8, 14)
-_FILTERED = slice(14, 20)  # Wrench behind the low-pass filter.
-_ZERO = slice(20, 26)  # What is subtracted: the tare less the bias.
-_EXCHANGES = 26  # How many there have been.
-_STATE_SIZE = 27
+_READING = slice(7, 13)
+_FILTERED = slice(13, 19)  # Wrench behind the low-pass filter.
+_ZERO = slice(19, 25)  # What is subtracted: the tare less the bias.
+_READINGS = 25  # How many there have been.
+_STATE_SIZE = 26
+
+_NOISE_BLOCK = 1024  # Readings whose noise is drawn at once.
 
 
 @dc.dataclass
@@ -63,17 +65,15 @@ class WrenchSensor(LeafSystem):
     F_reaction = M A``, so ``-F_reaction = F_environment + F_gravity - M A``: the sensor shows the
     environment's force, the tool's weight and its inertia, as a real one does. It is moved to the
     sensor's frame S (the weld's frame on the arm). With `tare_at_start` the first reading is
-    subtracted from all; what stays of the weight when the tool is then tilted is not compensated.
+    subtracted from all; what appears of the weight when the tool is then tilted is not compensated.
 
     A reading is the mean over the exchange before it, the plant's impulse divided by the period.
     It is then filtered, tared, and given bias and noise, and held until the next exchange. It is
-    published by an unrestricted update, hence in time for discrete updates at the same instant.
-    Before the end of the first exchange it is zero.
-
-    Cost, measured: see docs of the station (about 20 us a plant step of Python).
+    published by an unrestricted update, in time for discrete updates at the same instant (the
+    compliance controller's). It is zero until the end of the first exchange.
 
     Inputs:
-        reaction_forces: The plant's port of that name, sampled (the plant's default).
+        reaction_forces: The plant's port of that name.
 
     Outputs:
         sensor_wrench: SpatialForce at So, in S; held over each exchange. No direct feedthrough.
@@ -101,22 +101,22 @@ class WrenchSensor(LeafSystem):
             ConfigurationError: If the periods do not fit, or the plant's ports are not sampled.
         """
         super().__init__()
-        steps = round(exchange_period / plant.time_step()) if plant.time_step() > 0.0 else 0
-        if steps < 1 or abs(steps * plant.time_step() - exchange_period) > 1e-9:
+        step = plant.time_step()
+        steps = round(exchange_period / step) if step > 0.0 else 0
+        if steps < 1 or abs(steps * step - exchange_period) > 1e-9:
             raise ConfigurationError(
                 f"exchange period {exchange_period:.6g} s is not a whole number of plant steps of "
-                f"{plant.time_step():.6g} s",
+                f"{step:.6g} s",
                 fix="Change one of the two.",
             )
-        if not plant.has_sampled_output_ports():
+        if plant.has_sampled_output_ports():
             raise ConfigurationError(
-                "the plant's output ports are not sampled",
-                fix="Leave use_sampled_output_ports at its default, true.",
+                "the plant's output ports are sampled: their reaction forces are a step old",
+                fix="Set use_sampled_output_ports to false, as diagrams.robot.add_plant does.",
             )
-        self._steps = steps
         self._index = int(weld.index())
-        # From the sum of reactions on the tool at Jc to the mean wrench on the arm at So, in S.
-        self._mean_on_arm = _shift_matrix(weld.X_FM()) / -steps
+        # From the reaction on the tool, at Jc in Jc, to the wrench on the arm, at So in S.
+        self._on_arm = -_shift_matrix(weld.X_FM())
         self._bias = np.concatenate([config.moment_bias, config.force_bias])
         self._noise = np.repeat([config.moment_noise, config.force_noise], 3)
         self._is_noisy = bool(self._noise.any())
@@ -135,45 +135,29 @@ class WrenchSensor(LeafSystem):
             self._calc_sensor_wrench,
             {self.xd_ticket()},
         )
-        if steps > 1:
-            self.DeclarePeriodicDiscreteUpdateEvent(plant.time_step(), 0.0, self._accumulate)
+        self.DeclarePeriodicDiscreteUpdateEvent(step, 0.0, self._accumulate)
         self.DeclarePeriodicUnrestrictedUpdateEvent(exchange_period, 0.0, self._read)
 
     def randomize_context(self, context: Context, rng: np.random.Generator) -> None:
         """Draws a new seed of the noise."""
         context.get_mutable_numeric_parameter(self._seed).SetAtIndex(0, rng.integers(2**31))
 
-    def _reaction(self, context: Context) -> np.ndarray:
-        # The whole list crosses into Python for the one wrench wanted; no port gives less.
-        return self.EvalAbstractInput(context, self._reactions).get_value()[self._index].get_coeffs()
-
     def _accumulate(self, context: Context, discrete_state: DiscreteValues) -> None:
+        # The whole list crosses into Python for the one wrench wanted; no port gives less.
+        reactions = self.EvalAbstractInput(context, self._reactions).get_value()
         x = discrete_state.get_mutable_value()
-        if x[_SKIP]:
-            x[_SKIP] = 0.0
-            return
-        x[_SUM] += self._reaction(context)
+        total = x[_SUM]
+        total += reactions[self._index].get_coeffs()
         x[_COUNT] += 1.0
 
     def _read(self, context: Context, state: State) -> None:
         x = state.get_mutable_discrete_state().get_mutable_value()
-        # Rounding can put the plant's step of this instant before the exchange; it has then been
-        # accumulated. Else it is taken here, and must not be taken again.
-        pending = x[_COUNT] < self._steps
-        exchange = int(x[_EXCHANGES])
-        if exchange > 0:  # The plant has no reaction forces before its first step.
-            if pending:
-                x[_SUM] += self._reaction(context)
-            self._update_reading(context, x, self._mean_on_arm @ x[_SUM], exchange)
-        x[_SUM] = 0.0
-        x[_COUNT] = 0.0
-        x[_SKIP] = pending
-        x[_EXCHANGES] += 1.0
-
-    def _update_reading(
-        self, context: Context, x: np.ndarray, wrench: np.ndarray, exchange: int
-    ) -> None:
-        if exchange == 1:
+        if x[_COUNT] == 0.0:  # The start: no exchange has passed.
+            return
+        wrench = self._on_arm.dot(x[_SUM]) / x[_COUNT]
+        x[: _COUNT + 1] = 0.0
+        x[_READINGS] += 1.0
+        if x[_READINGS] == 1.0:
             x[_FILTERED] = wrench
             x[_ZERO] = wrench * self._tare_at_start - self._bias
         elif self._filter_share < 1.0:
@@ -181,14 +165,23 @@ class WrenchSensor(LeafSystem):
             x[_FILTERED] = wrench
         x[_READING] = wrench - x[_ZERO]
         if self._is_noisy:
-            # A counter-based generator needs no state: a reading's noise follows from seed and time.
             seed = int(context.get_numeric_parameter(self._seed)[0])
-            draw = np.random.Generator(np.random.Philox(key=seed, counter=[0, exchange, 0, 0]))
-            x[_READING] += self._noise * draw.standard_normal(6)
+            block, row = divmod(int(x[_READINGS]), _NOISE_BLOCK)
+            x[_READING] += self._noise * _standard_noise(seed, block)[row]
 
     def _calc_sensor_wrench(self, context: Context, output: AbstractValue) -> None:
         reading = context.get_discrete_state_vector().value()[_READING]
         output.set_value(SpatialForce(reading[:3], reading[3:]))
+
+
+@functools.lru_cache(maxsize=16)
+def _standard_noise(seed: int, block: int) -> np.ndarray:
+    """Standard normal numbers [_NOISE_BLOCK, 6] that follow from seed and block alone.
+
+    A counter-based generator needs no state in the Context; making one is slow, hence blocks.
+    """
+    generator = np.random.Generator(np.random.Philox(key=seed, counter=[0, block, 0, 0]))
+    return generator.standard_normal((_NOISE_BLOCK, 6))
 
 
 def _shift_matrix(X_SJ: RigidTransform) -> np.ndarray:
