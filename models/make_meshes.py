@@ -19,11 +19,11 @@ CREASE = math.radians(40)
 
 # Base colour (linear RGB), metallic and roughness factors.
 MATERIALS = {
-    "tube": ((0.72, 0.73, 0.74), 0.10, 0.45),
-    "housing": ((0.20, 0.21, 0.22), 0.10, 0.50),
-    "lid": ((0.16, 0.40, 0.66), 0.0, 0.40),
+    "tube": ((0.47, 0.48, 0.49), 0.10, 0.45),
+    "housing": ((0.115, 0.12, 0.128), 0.10, 0.50),
+    "lid": ((0.10, 0.29, 0.53), 0.0, 0.40),
     "seal": ((0.015, 0.015, 0.016), 0.0, 0.75),
-    "steel": ((0.55, 0.56, 0.58), 0.40, 0.35),
+    "steel": ((0.40, 0.41, 0.43), 0.40, 0.35),
     "black": ((0.030, 0.031, 0.033), 0.10, 0.55),
 }
 
@@ -117,7 +117,9 @@ def lathe(
     next_k = (k + 1) % SEGMENTS
     faces = []
     for a, b in quads:
-        a_k, a_n, b_k, b_n = (r * SEGMENTS + j for r, j in ((a, k), (a, next_k), (b, k), (b, next_k)))
+        a_k, a_n, b_k, b_n = (
+            r * SEGMENTS + j for r, j in ((a, k), (a, next_k), (b, k), (b, next_k))
+        )
         faces += [np.stack([a_k, a_n, b_n], axis=1), np.stack([a_k, b_n, b_k], axis=1)]
     return Part(material, vertices, shading, np.concatenate(faces))
 
@@ -162,8 +164,8 @@ def extrusion(
         The part, its sides shaded smooth except at edges sharper than CREASE.
     """
     corners = [np.array(p[:2]) for p in outline]
-    closed = [tuple(0.5 * (corners[-1] + corners[0])), *outline, tuple(0.5 * (corners[-1] + corners[0]))]
-    ring = rounded(closed)[:-1]
+    seam = tuple(0.5 * (corners[-1] + corners[0]))
+    ring = rounded([seam, *outline, seam])[:-1]
     edge = np.roll(ring, -1, axis=0) - ring
     side = np.stack([edge[:, 1], -edge[:, 0]], axis=1)
     side /= np.linalg.norm(side, axis=1, keepdims=True)
@@ -185,7 +187,7 @@ def extrusion(
     for i in range(count):
         j = (i + 1) % count
         shade = []
-        for k, neighbour in ((i, i - 1), (j, j)):
+        for neighbour in (i - 1, j):
             smooth = side[i] @ side[neighbour] > math.cos(CREASE)
             n = side[i] + side[neighbour] if smooth else side[i]
             shade.append(n / np.linalg.norm(n))
@@ -208,7 +210,10 @@ def extrusion(
 
 
 def block(
-    material: str, centre: tuple[float, float, float], size: tuple[float, float, float], fillet: float
+    material: str,
+    centre: tuple[float, float, float],
+    size: tuple[float, float, float],
+    fillet: float,
 ) -> Part:
     """Box with rounded vertical edges and bevelled rims, aligned with the link frame."""
     x, y, z = 0.5 * np.array(size)
@@ -338,7 +343,7 @@ def wrist_3() -> list[Part]:
 
 
 def gripper() -> list[Part]:
-    """Two-finger gripper, closed by its fingers' adapters on the spine of a knife in the plane y = 0.
+    """Two-finger gripper whose fingers carry an adapter for a knife's spine, in the plane y = 0.
 
     The frame is the flange's: z leaves the robot, the fingers move along y.
     """

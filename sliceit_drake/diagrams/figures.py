@@ -85,6 +85,7 @@ def plot_force(
     figure.legend(
         handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, fontsize=8.5
     )
-    figure.suptitle(title, fontsize=12)
+    over_time.set_title(title, loc="left", fontsize=11)
+    over_depth.set_title("the same over depth", loc="left", fontsize=11)
     figure.supxlabel(caption, fontsize=7.5, color="0.35", wrap=True)
     figure.savefig(file, dpi=150)

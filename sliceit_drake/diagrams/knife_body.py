@@ -30,7 +30,7 @@ HANDLE_HEIGHT = 0.028
 HANDLE_THICKNESS = 0.020
 EDGE_SPHERE_RADIUS = 1e-3
 
-STEEL = np.array([0.80, 0.82, 0.84, 1.0])
+STEEL = np.array([0.66, 0.68, 0.70, 1.0])
 PLASTIC = np.array([0.06, 0.06, 0.07, 1.0])
 
 

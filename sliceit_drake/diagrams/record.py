@@ -1,11 +1,17 @@
 """The record of a run: a table at the exchange rate, from a log of the station's outputs."""
 
 import dataclasses as dc
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from pydrake.systems.framework import Context, DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput, VectorLogSink
+from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
+from pydrake.systems.primitives import (
+    ConstantVectorSource,
+    LogVectorOutput,
+    Multiplexer,
+    VectorLogSink,
+)
 
 from sliceit_drake.diagrams.station import SlicingStation
 from sliceit_drake.systems.cutting_system import ENERGY_NAMES, LEDGER_NAMES, CuttingSystem
@@ -65,17 +71,16 @@ class Recorder:
 
 
 def add_recorder(
-    builder: DiagramBuilder, station: SlicingStation, sources: dict[str, object] | None = None
+    builder: DiagramBuilder, station: SlicingStation, sources: Mapping[str, OutputPort]
 ) -> Recorder:
     """Logs the station's outputs and commands once per exchange.
 
     Args:
         builder: Builder of the diagram that holds the station.
         station: The station.
-        sources: Output ports that drive the station's command inputs, by input name; for the others
-            the configured constants are recorded.
+        sources: Output ports that drive the station's inputs, by input name, target_pose at least;
+            for the other commands the configured constants are recorded.
     """
-    sources = sources or {}
     vectors = {
         "joint_positions": [f"q_{i}" for i in range(1, 7)],
         "joint_velocities": [f"qd_{i}" for i in range(1, 7)],
@@ -89,34 +94,43 @@ def add_recorder(
         vectors["ledger"] = [f"energy_{name}" for name in LEDGER_NAMES]
         vectors["energy"] = [f"energy_{name}" for name in ENERGY_NAMES]
         vectors["coupling_work_error"] = ["coupling_work_error"]
-    row = builder.AddNamedSystem(
-        "record_row",
+    typed = builder.AddNamedSystem(
+        "record_typed",
         RowRecorder(
-            vectors,
             poses=["knife_pose", "commanded_pose", "target_pose"],
             velocities=["knife_velocity"],
             wrenches=["food_wrench", "board_wrench", "sensor_wrench"],
         ),
     )
-    config = station.scenario.controller
-    for name in [*vectors, "knife_pose", "commanded_pose", "knife_velocity"] + [
-        "food_wrench",
-        "board_wrench",
-        "sensor_wrench",
-    ]:
-        if name in _COMMANDS:
-            source = sources.get(name)
-            if source is None:
-                constant = np.atleast_1d(np.asarray(getattr(config, name), float))
-                source = builder.AddNamedSystem(
-                    f"configured_{name}", ConstantVectorSource(constant)
-                ).get_output_port()
-        else:
-            source = station.GetOutputPort(name)
-        builder.Connect(source, row.GetInputPort(name))
-    builder.Connect(sources["target_pose"], row.GetInputPort("target_pose"))
+    for i in range(typed.num_input_ports()):
+        port = typed.get_input_port(i)
+        name = port.get_name()
+        source = sources["target_pose"] if name == "target_pose" else station.GetOutputPort(name)
+        builder.Connect(source, port)
+
+    row = builder.AddNamedSystem(
+        "record_row", Multiplexer([*(len(columns) for columns in vectors.values()), len(typed.columns)])
+    )
+    for i, name in enumerate(vectors):
+        builder.Connect(_vector_source(builder, station, sources, name), row.get_input_port(i))
+    builder.Connect(typed.get_output_port(), row.get_input_port(len(vectors)))
     log = LogVectorOutput(
-        row.GetOutputPort("row"), builder, publish_period=station.scenario.exchange_period
+        row.get_output_port(), builder, publish_period=station.scenario.exchange_period
     )
     log.set_name("record")
-    return Recorder(log, row.columns)
+    columns = [column for group in vectors.values() for column in group]
+    return Recorder(log, columns + typed.columns)
+
+
+def _vector_source(
+    builder: DiagramBuilder, station: SlicingStation, sources: Mapping[str, OutputPort], name: str
+) -> OutputPort:
+    """Where a recorded vector comes from: the station, a command source, or the configuration."""
+    if name not in _COMMANDS:
+        return station.GetOutputPort(name)
+    if name in sources:
+        return sources[name]
+    constant = np.atleast_1d(np.asarray(getattr(station.scenario.controller, name), float))
+    return builder.AddNamedSystem(
+        f"configured_{name}", ConstantVectorSource(constant)
+    ).get_output_port()

@@ -14,9 +14,10 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
-from sliceit_drake.configuration import dump_yaml
+from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.discretization import estimate_discretization_error
 from sliceit_drake.cutting.food import Food, start_pose
+from sliceit_drake.cutting.mesh import MeshError
 from sliceit_drake.cutting.motion import Motion
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.comparison import Comparison, compare_with_measurement
@@ -24,7 +25,7 @@ from sliceit_drake.diagrams.figures import CONTACT_THRESHOLD, plot_force
 from sliceit_drake.diagrams.record import Record, Recorder, add_recorder
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.station import MakeSlicingStation, SlicingStation
-from sliceit_drake.records.force_profile import load_force_profile
+from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.cutting_system import CuttingSystem
 from sliceit_drake.systems.motion_sources import MotionSource
@@ -45,6 +46,7 @@ class Run:
         motion: The prescribed targets.
         recorder: The log in it.
         simulator: Initialized.
+        profile: The measured force to compare with, or None.
         wall_time: Seconds spent in the simulator.
         stopped: Why the run ended early, or None.
     """
@@ -55,6 +57,7 @@ class Run:
     motion: Motion
     recorder: Recorder
     simulator: Simulator
+    profile: ForceProfile | None
     wall_time: float = 0.0
     stopped: str | None = None
 
@@ -69,6 +72,7 @@ def prepare_run(scenario: Scenario, meshcat: Meshcat | None = None) -> Run:
     Raises:
         ConfigurationError, MeshError, TimeStepError, CuttingError: The scenario cannot start.
     """
+    profile = _measured_profile(scenario)
     builder = DiagramBuilder()
     station = builder.AddNamedSystem("station", MakeSlicingStation(scenario, meshcat))
     motion = builder.AddNamedSystem("motion", MotionSource(scenario.motion, station.start_pose))
@@ -84,7 +88,7 @@ def prepare_run(scenario: Scenario, meshcat: Meshcat | None = None) -> Run:
         if station.food_visualizer is not None:
             station.food_visualizer.StartRecording()
     simulator.Initialize()
-    return Run(scenario, diagram, station, motion.motion, recorder, simulator)
+    return Run(scenario, diagram, station, motion.motion, recorder, simulator, profile)
 
 
 def simulate(
@@ -152,9 +156,8 @@ def make_meshcat() -> Meshcat:
 
 
 def _set_scene(meshcat: Meshcat, X_WK: RigidTransform) -> None:
-    target = X_WK.translation() + [0.0, 0.0, 0.05]
-    # The viewer's camera path is +y up; SetCameraPose takes world coordinates.
-    meshcat.SetCameraPose(target + [0.75, -0.55, 0.35], target)
+    target = X_WK.translation() + [0.0, 0.0, 0.03]
+    meshcat.SetCameraPose(target + [0.32, -0.26, 0.17], target)
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
     meshcat.SetProperty("/Background", "top_color", [0.92, 0.94, 0.96])
@@ -163,6 +166,22 @@ def _set_scene(meshcat: Meshcat, X_WK: RigidTransform) -> None:
 
 def _top_height(run: Run) -> float:
     return float(run.station.start_pose.translation()[2] - run.scenario.start.clearance)
+
+
+def _measured_profile(scenario: Scenario) -> ForceProfile | None:
+    if scenario.measurement is None:
+        return None
+    file = Path(scenario.measurement.file)
+    if not file.exists():
+        try:
+            file = resource_path(scenario.measurement.file)
+        except (FileNotFoundError, ValueError):
+            raise ConfigurationError(
+                f'there is no file "{scenario.measurement.file}", neither here nor in the package',
+                field="scenario.measurement.file",
+                fix="Give a force profile such as those in calibration/measured.",
+            ) from None
+    return load_force_profile(file)
 
 
 def _descent(run: Run, record: Record) -> tuple[np.ndarray, np.ndarray]:
@@ -178,14 +197,12 @@ def _descent(run: Run, record: Record) -> tuple[np.ndarray, np.ndarray]:
 
 def _comparison(run: Run, record: Record) -> Comparison | None:
     measurement = run.scenario.measurement
-    if measurement is None:
+    if measurement is None or run.profile is None:
         return None
     depth, force = _descent(run, record)
     if run.stopped is not None and (len(depth) < 10 or depth[-1] < 1e-3):
         return None
-    file = Path(measurement.file)
-    profile = load_force_profile(file if file.exists() else resource_path(measurement.file))
-    return compare_with_measurement(profile, measurement, depth, force)
+    return compare_with_measurement(run.profile, measurement, depth, force)
 
 
 def _title(scenario: Scenario) -> str:
@@ -296,13 +313,18 @@ def _cutting_summary(run: Run, record: Record) -> dict:
         "least_volume_ratio": float(record["energy_least_volume_ratio"][-1]),
         "coupling_work_error_J": float(record["coupling_work_error"][-1]),
     }
-    error = estimate_discretization_error(
-        scenario.food,
-        scenario.knife,
-        scenario.numerics,
-        scenario.exchange_period,
-        motion,
-        None,
-    )
-    summary["discretization_error"] = dc.asdict(error)
+    summary["discretization_error"] = None
+    if run.stopped is None:
+        try:
+            error = estimate_discretization_error(
+                scenario.food,
+                scenario.knife,
+                scenario.numerics,
+                scenario.exchange_period,
+                motion,
+                None,
+            )
+            summary["discretization_error"] = dc.asdict(error)
+        except (CuttingError, MeshError) as problem:
+            summary["discretization_error"] = {"relative_rms": None, "problem": str(problem)}
     return summary

@@ -9,6 +9,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer
 
 from sliceit_drake.cutting.food import Food, make_food_model, start_pose
+from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.ports import STATION_PORTS
 from sliceit_drake.diagrams.robot import (
@@ -22,7 +23,7 @@ from sliceit_drake.diagrams.robot import (
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.start import solve_start_joints
 from sliceit_drake.diagrams.workspace import add_board, add_holder, add_table
-from sliceit_drake.systems.analytic_cutter import AnalyticCutter
+from sliceit_drake.systems.analytic_cutter import AnalyticCutter, AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceController
 from sliceit_drake.systems.cutting_system import CuttingSystem
 from sliceit_drake.systems.food_visualizer import FoodVisualizer
@@ -55,16 +56,17 @@ class SlicingStation(Diagram):
         super().__init__()
         self.scenario = scenario
         self.meshcat = meshcat
+        model = _food_model(scenario)
         builder = DiagramBuilder()
         self.plant, scene_graph = add_plant(builder, scenario.robot)
         self.robot: Robot = add_robot(self.plant, scenario.robot, scenario.knife, scenario.board)
         add_table(self.plant, (0.1, -0.3))
         add_board(self.plant, scenario.board, scenario.X_WF())
-        _add_holder(self.plant, scenario)
+        _add_holder(self.plant, scenario, model)
         self.plant.Finalize()
 
         self.cutting: KnifeForceSystem
-        self.cutting, X_FK = _make_cutting(scenario, self.robot.knife)
+        self.cutting, X_FK = _make_cutting(scenario, model, self.robot.knife)
         self.start_pose = scenario.X_WF() @ X_FK
         self.start_joints = solve_start_joints(
             self.plant,
@@ -205,32 +207,39 @@ def MakeScenarioDiagram(scenario: Scenario, meshcat: Meshcat | None = None) -> D
     return diagram
 
 
-def _make_cutting(scenario: Scenario, knife: RigidBody) -> tuple[KnifeForceSystem, RigidTransform]:
+def _food_model(scenario: Scenario) -> CuttingModel | None:
+    """The prepared cut, or None for an analytic food."""
+    if not isinstance(scenario.food, Food):
+        return None
+    return make_food_model(scenario.food, scenario.knife, scenario.numerics)
+
+
+def _make_cutting(
+    scenario: Scenario, model: CuttingModel | None, knife: RigidBody
+) -> tuple[KnifeForceSystem, RigidTransform]:
     """The cutting system of a scenario and X_FK at the start."""
-    period = scenario.exchange_period
-    if isinstance(scenario.food, Food):
-        model = make_food_model(scenario.food, scenario.knife, scenario.numerics)
-        pose = start_pose(model, scenario.start.clearance, scenario.start.offset)
-        solver = CuttingSolver(model, period)
-        cutting = CuttingSystem([solver], scenario.X_WF(), knife.index())
+    period, start = scenario.exchange_period, scenario.start
+    if model is not None:
+        pose = start_pose(model, start.clearance, start.offset)
+        cutting = CuttingSystem([CuttingSolver(model, period)], scenario.X_WF(), knife.index())
         return cutting, RigidTransform(RotationMatrix(pose.R), pose.p)
-    height = scenario.food.diameter + scenario.start.clearance
-    X_FK = RigidTransform(
-        RotationMatrix(np.diag([1.0, -1.0, -1.0])), [scenario.start.offset, 0.0, height]
-    )
+    assert isinstance(scenario.food, AnalyticFood)
+    p_FK = [start.offset, 0.0, scenario.food.diameter + start.clearance]
+    X_FK = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), p_FK)
     return AnalyticCutter(scenario.food, scenario.board.height, knife.index(), period), X_FK
 
 
-def _add_holder(plant: MultibodyPlant, scenario: Scenario) -> None:
+def _add_holder(plant: MultibodyPlant, scenario: Scenario, model: CuttingModel | None) -> None:
+    """Draws the clamp where the food is held."""
     food = scenario.food
-    if not isinstance(food, Food) or food.held_sides not in ("both", "plus"):
+    if model is None or not isinstance(food, Food) or food.held_sides not in ("both", "plus"):
         return
-    vertices = food.shape.mesh().vertices
+    size = np.ptp(model.split.vertex_position @ model.X_FC_rotation.T, axis=0)
     add_holder(
         plant,
         scenario.board,
         scenario.X_WF(),
-        food_width=float(np.ptp(vertices[:, 0])),
-        food_height=float(np.ptp(vertices[:, 2])),
+        food_width=float(size[0]),
+        food_height=float(size[2]),
         distance=food.hold_distance + 0.005,
     )

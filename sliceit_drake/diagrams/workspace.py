@@ -5,7 +5,7 @@ from pydrake.geometry import Box, Cylinder, Shape
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 
-from sliceit_drake.cutting.board import Board, EDGE_CONTACTS
+from sliceit_drake.cutting.board import EDGE_CONTACTS, Board
 from sliceit_drake.diagrams.knife_body import contact_properties
 
 __all__ = ["add_board", "add_holder", "add_table"]

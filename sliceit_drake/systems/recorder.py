@@ -1,4 +1,4 @@
-"""Gathers a station's typed outputs into one vector, for logging."""
+"""Turns a station's poses, velocities and wrenches into a vector, for logging."""
 
 from collections.abc import Callable, Sequence
 
@@ -14,14 +14,13 @@ _AXES = ("x", "y", "z")
 
 
 class RowRecorder(LeafSystem):
-    """One row of a record as a vector output; connect a VectorLogSink to it.
+    """Abstract outputs of a station as one vector; a Multiplexer joins it to the vector outputs.
 
     Columns of a pose are position and quaternion, those of a velocity and of a wrench are the
     translational part, then the rotational one.
 
     Args:
-        vectors: Name of each vector input and the names of its columns.
-        poses, velocities, wrenches: Names of the abstract inputs.
+        poses, velocities, wrenches: Names of the input ports.
 
     Output port:
         row: All columns [len(columns)].
@@ -31,26 +30,20 @@ class RowRecorder(LeafSystem):
     """
 
     def __init__(
-        self,
-        vectors: dict[str, Sequence[str]],
-        poses: Sequence[str],
-        velocities: Sequence[str],
-        wrenches: Sequence[str],
+        self, poses: Sequence[str], velocities: Sequence[str], wrenches: Sequence[str]
     ) -> None:
         super().__init__()
         self.columns: list[str] = []
         self._parts: list[tuple[InputPort, Callable[[object], np.ndarray]]] = []
-        for name, columns in vectors.items():
-            self._add(self.DeclareVectorInputPort(name, len(columns)), np.asarray, columns)
         for name in poses:
             columns = [f"{name}_p_{a}" for a in _AXES] + [f"{name}_quat_{a}" for a in "wxyz"]
             self._add(self._declare(name, Value(RigidTransform())), _pose, columns)
         for name in velocities:
             columns = [f"{name}_v_{a}" for a in _AXES] + [f"{name}_w_{a}" for a in _AXES]
-            self._add(self._declare(name, Value(SpatialVelocity.Zero())), _velocity, columns)
+            self._add(self._declare(name, Value(SpatialVelocity.Zero())), _halves_swapped, columns)
         for name in wrenches:
             columns = [f"{name}_f_{a}" for a in _AXES] + [f"{name}_m_{a}" for a in _AXES]
-            self._add(self._declare(name, Value(SpatialForce.Zero())), _wrench, columns)
+            self._add(self._declare(name, Value(SpatialForce.Zero())), _halves_swapped, columns)
         self.DeclareVectorOutputPort("row", len(self.columns), self._calc_row)
 
     def _declare(self, name: str, model: AbstractValue) -> InputPort:
@@ -72,11 +65,6 @@ def _pose(X: RigidTransform) -> np.ndarray:
     return np.concatenate([X.translation(), X.rotation().ToQuaternion().wxyz()])
 
 
-def _velocity(V: SpatialVelocity) -> np.ndarray:
-    coefficients = V.get_coeffs()
-    return np.concatenate([coefficients[3:], coefficients[:3]])
-
-
-def _wrench(F: SpatialForce) -> np.ndarray:
-    coefficients = F.get_coeffs()
-    return np.concatenate([coefficients[3:], coefficients[:3]])
+def _halves_swapped(quantity: SpatialVelocity | SpatialForce) -> np.ndarray:
+    """Translational part first; Drake's coefficients have the rotational one first."""
+    return np.roll(quantity.get_coeffs(), 3)

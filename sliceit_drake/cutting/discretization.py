@@ -1,0 +1,65 @@
+"""How far the force is from that of an infinitely fine mesh, estimated from coarser ones."""
+
+import dataclasses as dc
+
+import numpy as np
+
+from sliceit_drake.cutting.board import Board
+from sliceit_drake.cutting.food import Food, make_food_model
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.model import Numerics
+from sliceit_drake.cutting.motion import Motion
+from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
+from sliceit_drake.cutting.solver import CuttingSolver
+
+__all__ = ["DiscretizationError", "estimate_discretization_error"]
+
+
+@dc.dataclass
+class DiscretizationError:
+    """Estimated error of the force from mesh and step.
+
+    Attributes:
+        relative_rms: Root mean square over the contact samples, relative to that of the force.
+        order: Order of convergence that is assumed.
+        elements: Elements of the coarse and of the given mesh.
+    """
+
+    relative_rms: float
+    order: float
+    elements: list[int]
+
+
+def estimate_discretization_error(
+    food: Food,
+    knife: Knife,
+    numerics: Numerics,
+    exchange_period: float,
+    motion: Motion,
+    board: Board | None,
+    refinement: float = 0.75,
+    order: float = 1.0,
+) -> DiscretizationError:
+    """Richardson's estimate from the given mesh and a coarser one, on a prescribed motion.
+
+    Args:
+        food, knife, numerics, exchange_period: The cut.
+        motion: Poses X_FK of the knife.
+        board: Board under the knife, or None.
+        refinement: Elements along an edge of the coarse mesh, relative to the given one.
+        order: Order p of convergence: the error is the difference over refinement^-p - 1.
+    """
+
+    def force(scale: float) -> tuple[SliceResult, int]:
+        model = make_food_model(food, knife, numerics, scale)
+        result = simulate_slice(CuttingSolver(model, exchange_period), motion, board)
+        return result, model.element_count
+
+    coarse, coarse_count = force(refinement)
+    given, count = force(1.0)
+    norms = [np.linalg.norm(r.food_wrench[:, 3:], axis=1) for r in (coarse, given)]
+    contact = norms[1] > 0.05
+    difference = np.sqrt(np.mean((norms[0] - norms[1])[contact] ** 2))
+    scale = np.sqrt(np.mean(norms[1][contact] ** 2))
+    error = float(difference / scale / (refinement**-order - 1.0)) if contact.any() else 0.0
+    return DiscretizationError(error, order, [coarse_count, count])
