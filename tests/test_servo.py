@@ -123,7 +123,7 @@ def test_it_stays_at_rest_where_it_is_put(delay):
 
 
 def test_a_delay_between_steps_is_refused():
-    with pytest.raises(ConfigurationError, match=r"servo.delay: 0.0025 s .* of 0.001 s. Write 0.00"):
+    with pytest.raises(ConfigurationError, match=r"servo.delay: 0.0025 s .* 0.001 s. Write 0.00"):
         Servo(ServoConfig(delay=0.0025), PERIOD, START)
 
 

@@ -1,6 +1,7 @@
 """`sliceit simulate`: run a scenario and write its results."""
 
 import argparse
+import logging
 from pathlib import Path
 
 from sliceit_drake.cli.scenario_argument import add_scenario_arguments, scenario_of
@@ -45,7 +46,12 @@ def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     scenario = scenario_of(options)
 
+    import warp
     from tqdm import tqdm
+
+    warp.config.log_level = warp.LOG_WARNING
+    if not options.meshcat:
+        logging.getLogger("drake").setLevel(logging.WARNING)
 
     from sliceit_drake.diagrams.run import make_meshcat, prepare_run, simulate, write_outputs
 

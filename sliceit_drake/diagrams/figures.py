@@ -6,6 +6,7 @@ import numpy as np
 
 from sliceit_drake.diagrams.comparison import Comparison
 from sliceit_drake.diagrams.record import Record
+from sliceit_drake.diagrams.snapshot import Snapshot, draw_snapshot
 
 __all__ = ["plot_force"]
 
@@ -25,8 +26,9 @@ def plot_force(
     top_height: float,
     comparison: Comparison | None,
     caption: str,
+    snapshot: Snapshot | None = None,
 ) -> None:
-    """Draws force over time and over depth.
+    """Draws the knife in the food, and its force over time and over depth.
 
     Args:
         record: The run.
@@ -35,6 +37,7 @@ def plot_force(
         top_height: World height of the food's top at the cut, metres.
         comparison: Measured profile with its fitted offset, or None.
         caption: Conditions and provenance, below the plots.
+        snapshot: Knife and food at some instant, or None to leave that panel out.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -45,9 +48,14 @@ def plot_force(
     norm = np.linalg.norm(total, axis=1)
     depth = 1e3 * (top_height - record["knife_pose_p_z"])
 
-    figure = Figure(figsize=(9.0, 4.6), layout="constrained")
+    figure = Figure(figsize=(9.0 if snapshot is None else 12.0, 4.6), layout="constrained")
     FigureCanvasAgg(figure)
-    over_time, over_depth = figure.subplots(1, 2, sharey=True, width_ratios=[1.5, 1.0])
+    grid = figure.add_gridspec(1, 3, width_ratios=[0.0 if snapshot is None else 1.0, 1.5, 1.0])
+    over_time = figure.add_subplot(grid[1])
+    over_depth = figure.add_subplot(grid[2], sharey=over_time)
+    over_depth.tick_params(labelleft=False)
+    if snapshot is not None:
+        draw_snapshot(figure.add_subplot(grid[0], projection="3d", computed_zorder=False), snapshot)
     for axes, x in ((over_time, time), (over_depth, depth)):
         axes.plot(x, norm, color=NORM, lw=3.2, label="simulated norm")
         axes.plot(x, total[:, 2], color=SIMULATED, lw=1.2, label="simulated vertical")

@@ -19,7 +19,7 @@ from pydrake.multibody.tree import CalcSpatialInertia, Frame, RigidBody
 from sliceit_drake.cutting.board import Board, edge_contact_positions
 from sliceit_drake.cutting.knife import Knife
 
-__all__ = ["add_knife", "contact_properties"]
+__all__ = ["add_knife", "blade_surface", "contact_properties"]
 
 STEEL_DENSITY = 7800.0
 # Polyoxymethylene, the usual plastic of kitchen knives' handles.
@@ -47,7 +47,9 @@ def add_knife(
     from spine to edge. Mass and inertia are those of the steel prism and of a plastic handle behind
     it. The edge is a row of small spheres that touch the edge line from inside and share the
     board's contact law equally (`edge_contact_positions`, the points of `board_wrench`): several
-    points hold a blade steadily where one box would flip between its ends.
+    points hold a blade steadily where one box would flip between its ends. With a plant step of
+    1 ms the peak of an impact is within 1 % of that with 0.1 ms up to 3e5 N/m (measured at 50 and
+    100 mm/s); at 1e6 N/m it is 17 % low.
 
     Args:
         plant: Plant, not finalized, registered with a scene graph.
@@ -59,7 +61,7 @@ def add_knife(
     Returns:
         The body.
     """
-    blade, handle = _blade(knife), _handle(knife)
+    blade, handle = blade_surface(knife), _handle(knife)
     inertia = CalcSpatialInertia(blade, STEEL_DENSITY)
     inertia += CalcSpatialInertia(handle, HANDLE_DENSITY)
     body = plant.AddRigidBody("knife", plant.AddModelInstance("knife"), inertia)
@@ -91,7 +93,7 @@ def contact_properties(board: Board, contacts: int) -> GeometryProperties:
     return properties
 
 
-def _blade(knife: Knife) -> TriangleSurfaceMesh:
+def blade_surface(knife: Knife) -> TriangleSurfaceMesh:
     """The blade as a closed prism in K, faces outward."""
     half = [
         (0.0, 0.0),

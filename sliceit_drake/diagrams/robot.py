@@ -1,9 +1,9 @@
 """The robot of a station: arm, gripper and knife in a plant, and the controller of the joints."""
 
 import dataclasses as dc
-from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
@@ -240,7 +240,7 @@ class ArmController(Diagram):
         builder.ExportOutput(desired_state, "desired_state")
         builder.BuildInto(self)
 
-    def set_positions(self, context: Context, positions: Sequence[float]) -> None:
+    def set_positions(self, context: Context, positions: ArrayLike) -> None:
         """Sets servo and joint control at rest at `positions` [6], rad, in the root context."""
         self._servo.set_positions(context, positions)
         control = self._joint_control.GetMyMutableContextFromRoot(context)
@@ -274,7 +274,7 @@ def set_joint_positions(
     plant: MultibodyPlant,
     robot: Robot,
     controller: ArmController,
-    positions: Sequence[float],
+    positions: ArrayLike,
 ) -> None:
     """Puts arm and controller at rest at `positions` [6], rad, in the context of the diagram."""
     plant_context = plant.GetMyMutableContextFromRoot(context)

@@ -24,6 +24,7 @@ from sliceit_drake.diagrams.comparison import Comparison, compare_with_measureme
 from sliceit_drake.diagrams.figures import CONTACT_THRESHOLD, plot_force
 from sliceit_drake.diagrams.record import Record, Recorder, add_recorder
 from sliceit_drake.diagrams.scenario import Scenario
+from sliceit_drake.diagrams.snapshot import Snapshot, take_snapshot
 from sliceit_drake.diagrams.station import MakeSlicingStation, SlicingStation
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.resources import resource_path
@@ -33,6 +34,7 @@ from sliceit_drake.systems.motion_sources import MotionSource
 __all__ = ["Run", "prepare_run", "simulate", "write_outputs"]
 
 CHUNK = 0.02
+SNAPSHOT_PROGRESS = 0.5
 
 
 @dc.dataclass
@@ -49,6 +51,7 @@ class Run:
         profile: The measured force to compare with, or None.
         wall_time: Seconds spent in the simulator.
         stopped: Why the run ended early, or None.
+        snapshot: Knife and food when half of the section was cut, or None.
     """
 
     scenario: Scenario
@@ -60,6 +63,7 @@ class Run:
     profile: ForceProfile | None
     wall_time: float = 0.0
     stopped: str | None = None
+    snapshot: Snapshot | None = None
 
     def record(self) -> Record:
         """The record so far."""
@@ -106,6 +110,8 @@ def simulate(
     try:
         while (now := run.simulator.get_context().get_time()) < end - 1e-9:
             run.simulator.AdvanceTo(min(now + CHUNK, end))
+            if run.snapshot is None and _cut_progress(run) > SNAPSHOT_PROGRESS:
+                run.snapshot = take_snapshot(run.station, run.simulator.get_context())
             run.wall_time = clock.perf_counter() - begin
             if progress is not None:
                 progress(run.simulator.get_context().get_time(), run.wall_time)
@@ -140,6 +146,7 @@ def write_outputs(run: Run, directory: Path, meshcat: Meshcat | None) -> dict:
         _top_height(run),
         comparison,
         _caption(run, comparison, summary),
+        run.snapshot,
     )
     if meshcat is not None:
         if run.station.food_visualizer is not None:
@@ -157,11 +164,16 @@ def make_meshcat() -> Meshcat:
 
 def _set_scene(meshcat: Meshcat, X_WK: RigidTransform) -> None:
     target = X_WK.translation() + [0.0, 0.0, 0.03]
-    meshcat.SetCameraPose(target + [0.32, -0.26, 0.17], target)
+    meshcat.SetCameraPose(target + [0.16, 0.22, 0.16], target)
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
-    meshcat.SetProperty("/Background", "top_color", [0.92, 0.94, 0.96])
-    meshcat.SetProperty("/Background", "bottom_color", [0.80, 0.83, 0.86])
+    meshcat.SetProperty("/Background/<object>", "top_color", [0.92, 0.94, 0.96])
+    meshcat.SetProperty("/Background/<object>", "bottom_color", [0.80, 0.83, 0.86])
+
+
+def _cut_progress(run: Run) -> float:
+    context = run.station.GetMyContextFromRoot(run.simulator.get_context())
+    return float(run.station.GetOutputPort("cut_progress").Eval(context)[0])
 
 
 def _top_height(run: Run) -> float:

@@ -8,8 +8,8 @@ from sliceit_drake.systems.cutting_system import CuttingSystem
 
 __all__ = ["FoodVisualizer"]
 
-SKIN = (0.16, 0.42, 0.13)
-FLESH = (0.80, 0.88, 0.62)
+SKIN = (0.24, 0.52, 0.20)
+FLESH = (0.84, 0.91, 0.68)
 
 
 class FoodVisualizer(LeafSystem):

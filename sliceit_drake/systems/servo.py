@@ -2,9 +2,9 @@
 
 import dataclasses as dc
 import math
-from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer, LinearSystem
 from scipy.linalg import expm
@@ -21,8 +21,8 @@ class ServoConfig:
     """Parameters of ``servoj``: `lookahead_time` and `gain` have its names, ranges 0.03 to 0.2 s
     and 100 to 2000. Values outside are allowed here, for studies.
 
-    The defaults are the fastest tracking that the real command allows, the choice of Universal
-    Robots' own ROS driver.
+    The defaults are the fastest tracking that the real command allows, and those of Universal
+    Robots' own client library (`UrDriver`).
     """
 
     lookahead_time: float = quantity(
@@ -77,9 +77,7 @@ class Servo(Diagram):
             the targets.
     """
 
-    def __init__(
-        self, config: ServoConfig, period: float, initial_positions: Sequence[float]
-    ) -> None:
+    def __init__(self, config: ServoConfig, period: float, initial_positions: ArrayLike) -> None:
         """Builds the servo at rest.
 
         Args:
@@ -112,12 +110,12 @@ class Servo(Diagram):
         builder.ExportOutput(outputs.get_output_port(1), "desired_acceleration")
         builder.BuildInto(self)
 
-    def set_positions(self, context: Context, positions: Sequence[float]) -> None:
+    def set_positions(self, context: Context, positions: ArrayLike) -> None:
         """Sets targets and motion at rest at `positions` [6], rad, in the root context."""
         state = self._tracking.GetMyMutableContextFromRoot(context)
         state.SetDiscreteState(self._state_at_rest(positions))
 
-    def _state_at_rest(self, positions: Sequence[float]) -> np.ndarray:
+    def _state_at_rest(self, positions: ArrayLike) -> np.ndarray:
         q = np.asarray(positions, float)
         return np.concatenate([q, np.zeros(JOINTS), np.tile(q, self._delay_steps)])
 

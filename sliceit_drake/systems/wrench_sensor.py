@@ -15,7 +15,6 @@ from pydrake.systems.framework import (
     Context,
     DiscreteValues,
     LeafSystem,
-    State,
 )
 
 from sliceit_drake.configuration import ConfigurationError, quantity
@@ -36,7 +35,12 @@ _NOISE_BLOCK = 1024  # Readings whose noise is drawn at once.
 
 @dc.dataclass
 class WrenchSensorConfig:
-    """What the sensor adds to the true wrench. The defaults are an ideal sensor."""
+    """What the sensor adds to the true wrench. The defaults are an ideal sensor.
+
+    Attributes:
+        tare_at_start: Whether the first reading is subtracted from all, as zeroing a UR's sensor
+            does.
+    """
 
     tare_at_start: bool = True
     force_bias: list[float] = quantity(
@@ -69,8 +73,9 @@ class WrenchSensor(LeafSystem):
 
     A reading is the mean over the exchange before it, the plant's impulse divided by the period.
     It is then filtered, tared, and given bias and noise, and held until the next exchange. It is
-    published by an unrestricted update, in time for discrete updates at the same instant (the
-    compliance controller's). It is zero until the end of the first exchange.
+    zero until the end of the first exchange. Like the plant's own state at the end of a step, it is
+    set by the discrete update at the beginning of the exchange's last plant step: whatever reads
+    it at the exchange, in an unrestricted or a discrete update, finds it.
 
     Inputs:
         reaction_forces: The plant's port of that name.
@@ -98,7 +103,7 @@ class WrenchSensor(LeafSystem):
             config: The sensor's imperfections.
 
         Raises:
-            ConfigurationError: If the periods do not fit, or the plant's ports are not sampled.
+            ConfigurationError: If the periods do not fit, or the plant's ports are sampled.
         """
         super().__init__()
         step = plant.time_step()
@@ -115,8 +120,9 @@ class WrenchSensor(LeafSystem):
                 fix="Set use_sampled_output_ports to false, as diagrams.robot.add_plant does.",
             )
         self._index = int(weld.index())
-        # From the reaction on the tool, at Jc in Jc, to the wrench on the arm, at So in S.
-        self._on_arm = -_shift_matrix(weld.X_FM())
+        self._steps = steps
+        # From the sum of reactions on the tool, at Jc in Jc, to the mean on the arm, at So in S.
+        self._on_arm = _shift_matrix(weld.X_FM()) / -steps
         self._bias = np.concatenate([config.moment_bias, config.force_bias])
         self._noise = np.repeat([config.moment_noise, config.force_noise], 3)
         self._is_noisy = bool(self._noise.any())
@@ -135,26 +141,24 @@ class WrenchSensor(LeafSystem):
             self._calc_sensor_wrench,
             {self.xd_ticket()},
         )
-        self.DeclarePeriodicDiscreteUpdateEvent(step, 0.0, self._accumulate)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(exchange_period, 0.0, self._read)
+        self.DeclarePeriodicDiscreteUpdateEvent(step, 0.0, self._update)
 
     def randomize_context(self, context: Context, rng: np.random.Generator) -> None:
         """Draws a new seed of the noise."""
         context.get_mutable_numeric_parameter(self._seed).SetAtIndex(0, rng.integers(2**31))
 
-    def _accumulate(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         # The whole list crosses into Python for the one wrench wanted; no port gives less.
         reactions = self.EvalAbstractInput(context, self._reactions).get_value()
         x = discrete_state.get_mutable_value()
         total = x[_SUM]
         total += reactions[self._index].get_coeffs()
         x[_COUNT] += 1.0
+        if x[_COUNT] == self._steps:
+            self._read(context, x)
 
-    def _read(self, context: Context, state: State) -> None:
-        x = state.get_mutable_discrete_state().get_mutable_value()
-        if x[_COUNT] == 0.0:  # The start: no exchange has passed.
-            return
-        wrench = self._on_arm.dot(x[_SUM]) / x[_COUNT]
+    def _read(self, context: Context, x: np.ndarray) -> None:
+        wrench = self._on_arm.dot(x[_SUM])
         x[: _COUNT + 1] = 0.0
         x[_READINGS] += 1.0
         if x[_READINGS] == 1.0:

@@ -1,0 +1,124 @@
+"""A still picture of knife and food, drawn without a display or a browser."""
+
+import dataclasses as dc
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from pydrake.systems.framework import Context
+
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.diagrams.station import SlicingStation
+from sliceit_drake.systems.cutting_system import CuttingSystem
+from sliceit_drake.systems.food_visualizer import FLESH, SKIN
+
+__all__ = ["Snapshot", "draw_snapshot", "take_snapshot"]
+
+STEEL = (0.62, 0.66, 0.70)
+SHOWN_LENGTH = 0.035
+
+
+@dc.dataclass
+class Snapshot:
+    """Knife and food at one instant, in the food frame F.
+
+    Attributes:
+        time: s.
+        depth: Of the edge below the top of the food, metres.
+        triangles: Corners of the food's triangles [M, 3, 3], metres.
+        is_cut_face: Whether each is on the cut [M].
+        blade: Corners of the blade's faces, each [4, 3], metres.
+    """
+
+    time: float
+    depth: float
+    triangles: np.ndarray
+    is_cut_face: np.ndarray
+    blade: list[np.ndarray]
+
+
+def take_snapshot(station: SlicingStation, root_context: Context) -> Snapshot | None:
+    """Knife and food as they are in the context of the diagram; None for an analytic food."""
+    cutting = station.cutting
+    if not isinstance(cutting, CuttingSystem):
+        return None
+    context = cutting.GetMyContextFromRoot(root_context)
+    surface = cutting.surfaces[cutting.food_index(context)]
+    values = cutting.GetOutputPort("surface_vertices").Eval(context).reshape(-1, 3)
+    X_FW = station.scenario.X_WF().inverse()
+    vertices = X_FW.multiply(values[: len(surface.ends)].T).T
+    X_WK = station.GetOutputPort("knife_pose").Eval(station.GetMyContextFromRoot(root_context))
+    X_FK = X_FW @ X_WK
+    return Snapshot(
+        time=root_context.get_time(),
+        depth=cutting.solver(context).model.top - float(X_FK.translation()[2]),
+        triangles=vertices[surface.triangles],
+        is_cut_face=surface.is_cut_face[surface.triangles[:, 0]],
+        blade=[X_FK.multiply(face.T).T for face in _blade_faces(station.scenario.knife)],
+    )
+
+
+def _blade_faces(knife: Knife) -> list[np.ndarray]:
+    """Flanks, spine and ends of the blade in K, in strips so that they sort by depth."""
+    top = knife.tip_height + knife.height
+    half, edge = 0.5 * knife.spine_thickness, 0.5 * knife.edge_thickness
+    length = min(knife.length, 0.11)
+    x = np.linspace(-0.5 * length, 0.5 * length, 23)
+    heights = np.linspace(0.0, top, 13)
+    faces = []
+    for a, b in zip(x[:-1], x[1:], strict=True):
+        for low, high in zip(heights[:-1], heights[1:], strict=True):
+            for side in (-1.0, 1.0):
+                y0, y1 = (side * (edge + (half - edge) * h / top) for h in (low, high))
+                faces.append(np.array([[a, y0, -low], [b, y0, -low], [b, y1, -high], [a, y1, -high]]))
+        faces.append(np.array([[a, -half, -top], [b, -half, -top], [b, half, -top], [a, half, -top]]))
+    for end in (x[0], x[-1]):
+        faces.append(
+            np.array([[end, -edge, 0], [end, edge, 0], [end, half, -top], [end, -half, -top]])
+        )
+    return faces
+
+
+def draw_snapshot(axes: Any, snapshot: Snapshot) -> None:
+    """Draws on matplotlib 3-D axes made with computed_zorder=False, millimetres, flat shading.
+
+    Seen from the side y < 0: the far half, the blade and the near half are drawn in this order, which
+    is exact because the cut plane parts them; matplotlib sorts faces only by their middles.
+    """
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    triangles = snapshot.triangles.copy()
+    triangles[..., 1] = np.clip(triangles[..., 1], -SHOWN_LENGTH, SHOWN_LENGTH)
+    end = np.ptp(triangles[..., 1], axis=1) < 1e-6
+    end &= np.abs(triangles[:, 0, 1]) > 0.99 * SHOWN_LENGTH
+    flesh = snapshot.is_cut_face | end
+    near = triangles[..., 1].mean(1) < 0.0
+    layers: list[tuple[Sequence[np.ndarray], Sequence[tuple[float, float, float]]]] = [
+        (triangles[~near], [FLESH if f else SKIN for f in flesh[~near]]),
+        (snapshot.blade, [STEEL] * len(snapshot.blade)),
+        (triangles[near], [FLESH if f else SKIN for f in flesh[near]]),
+    ]
+    light = np.array([0.45, -0.55, 0.75]) / np.linalg.norm([0.45, -0.55, 0.75])
+    for order, (faces, base) in enumerate(layers):
+        colours = []
+        for face, colour in zip(faces, base, strict=True):
+            normal = np.cross(face[1] - face[0], face[2] - face[0])
+            size = np.linalg.norm(normal)
+            shade = 0.6 + 0.5 * max(normal @ light, 0.0) / size if size > 0.0 else 1.0
+            colours.append(np.clip(np.array(colour) * shade, 0.0, 1.0))
+        axes.add_collection3d(
+            Poly3DCollection(
+                [1e3 * face for face in faces],
+                facecolors=colours,
+                edgecolors=colours,
+                lw=0.3,
+                zorder=order,
+            )
+        )
+    axes.set_xlim(-45, 45)
+    axes.set_ylim(-45, 45)
+    axes.set_zlim(0, 80)
+    axes.set_box_aspect((90, 90, 80), zoom=1.5)
+    axes.view_init(elev=22.0, azim=-33.0)
+    axes.set_axis_off()
+    axes.set_title(f"edge {1e3 * snapshot.depth:.1f} mm below the top", fontsize=11, y=-0.04)
