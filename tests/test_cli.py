@@ -45,8 +45,20 @@ def test_simulate_writes_replay_figure_record_and_summary(tmp_path):
     assert all(f"food/frame_{k:04d}".encode() in scene for k in (0, 50, 98))
     assert not re.search(r'<(script|link)[^>]*(src|href)="https?:', html)
     # What was simulated can be simulated again from what was written.
-    assert main(["simulate", str(tmp_path / "scenario.yaml"), "--duration", "0.02", "--no-replay",
-                 "--output", str(tmp_path / "again")]) == 0
+    assert (
+        main(
+            [
+                "simulate",
+                str(tmp_path / "scenario.yaml"),
+                "--duration",
+                "0.02",
+                "--no-replay",
+                "--output",
+                str(tmp_path / "again"),
+            ]
+        )
+        == 0
+    )
 
 
 def test_a_run_that_breaks_off_keeps_its_record_and_says_why(tmp_path, capsys):
@@ -125,7 +137,9 @@ def test_bad_mesh_file_is_refused_with_exit_code_2(vertices, words, tmp_path, ca
 def test_help_is_quick_and_lists_the_commands():
     shown = subprocess.run(
         [sys.executable, "-X", "importtime", "-m", "sliceit_drake.cli.main", "--help"],
-        capture_output=True, text=True, check=True,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert "simulate" in shown.stdout and "diagram" in shown.stdout
     for heavy in ("pydrake", "warp", "scipy", "matplotlib"):

@@ -30,7 +30,7 @@ LAYERS["cli"] = set(LAYERS)
 # All that some packages may import from others' libraries.
 LIBRARIES = {
     "": {"numpy", "yaml", "pydrake"},
-    "cutting": {"numpy", "scipy", "warp"},
+    "cutting": {"numpy", "scipy", "warp", "meshio"},
     "records": {"numpy", "scipy"},
 }
 

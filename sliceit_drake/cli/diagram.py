@@ -29,7 +29,9 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument(
         "--output", metavar="FILE", type=Path, default=Path("diagram.svg"), help="picture to write"
     )
-    parser.add_argument("--depth", type=int, default=2, help="levels of nested diagrams (default 2)")
+    parser.add_argument(
+        "--depth", type=int, default=2, help="levels of nested diagrams (default 2)"
+    )
     parser.add_argument(
         "--ports", action="store_true", help="print the station's port contract and draw nothing"
     )
@@ -45,7 +47,7 @@ def run(options: argparse.Namespace) -> int:
         return 0
 
     from sliceit_drake.configuration import ConfigurationError
-    from sliceit_drake.diagrams.station import MakeScenarioDiagram
+    from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
 
     kind = options.output.suffix.lstrip(".")
     dot = shutil.which("dot")
@@ -66,6 +68,8 @@ def run(options: argparse.Namespace) -> int:
     if kind == "dot" or dot is None:
         options.output.write_text(text, encoding="utf-8")
     else:
-        subprocess.run([dot, f"-T{kind}", "-o", str(options.output)], input=text.encode(), check=True)
+        subprocess.run(
+            [dot, f"-T{kind}", "-o", str(options.output)], input=text.encode(), check=True
+        )
     print(f"Wrote {options.output}")
     return 0

@@ -13,7 +13,7 @@ Simulate a scenario: the arm moves the knife through the food under compliance c
 
 Writes to DIR:
   replay.html    the run in 3-D, opens in any browser without a server
-  force.png      force on the knife over time and depth, with a measured curve if the scenario has one
+  force.png      knife, and force over time and depth beside a measured curve if there is one
   record.csv     joints, poses, wrenches, energies at every exchange (500 Hz), SI units
   summary.json   peak and mean force, work by mechanism, real-time factor, discretisation error, ...
   scenario.yaml  what was simulated, complete
@@ -36,7 +36,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument(
         "--meshcat",
         action="store_true",
-        help="show the run live in a browser, at real time if the machine keeps up; print its address",
+        help="show the run live in a browser, not faster than real time; print its address",
     )
     parser.add_argument("--no-replay", action="store_true", help="do not write replay.html")
     parser.set_defaults(run=run)
@@ -91,12 +91,14 @@ def run(options: argparse.Namespace) -> int:
 
 def _report(summary: dict, directory: Path) -> None:
     peak, board = summary["peak_force_N"], summary["board_peak_N"]
-    print(f"Peak force {peak:.1f} N (board {board:.1f} N), cut {100 * summary['cut_progress']:.0f} %")
+    print(
+        f"Peak force {peak:.1f} N (board {board:.1f} N), cut {100 * summary['cut_progress']:.0f} %"
+    )
     if "measurement" in summary:
         m = summary["measurement"]
         print(
-            f"Against the measured curve: RMS {m['rms_N']:.2f} N, peak {m['simulated_peak_N']:.1f} N "
-            f"(measured {m['measured_peak_N']:.1f} N)"
+            f"Against the measured curve: RMS {m['rms_N']:.2f} N, peak {m['simulated_peak_N']:.1f} "
+            f"N (measured {m['measured_peak_N']:.1f} N)"
         )
     if summary["stopped"]:
         print(f"Stopped early: {summary['stopped']}. What there is so far is kept.")

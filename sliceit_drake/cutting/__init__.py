@@ -1,1 +1,1 @@
-"""Cutting physics: finite elements, cut surface, knife and board. Imports numpy, scipy and warp only."""
+"""Cutting physics: finite elements, cut surface, knife and board; no Drake."""

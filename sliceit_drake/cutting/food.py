@@ -95,7 +95,8 @@ class Ellipsoid:
     def mesh(self, refinement: float = 1.0) -> TetrahedralMesh:
         """The mesh in F; `refinement` is rounded to a power of two."""
         steps = self.refinements + round(np.log2(refinement))
-        return ellipsoid_mesh(tuple(self.diameters), max(0, steps))
+        x, y, z = self.diameters
+        return ellipsoid_mesh((x, y, z), max(0, steps))
 
 
 @dc.dataclass

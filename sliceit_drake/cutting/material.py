@@ -1,4 +1,4 @@
-"""Bulk material: stable Neo-Hookean elasticity with the small-strain E and nu that the user gives."""
+"""Bulk material: stable Neo-Hookean elasticity with the E and nu of small strain."""
 
 import dataclasses as dc
 
@@ -13,8 +13,8 @@ __all__ = ["Material", "energy_density", "first_piola_stress", "small_strain_sti
 class Material:
     """Bulk and cut-surface properties of a food.
 
-    The cut surface dissipates `toughness` per area, by the edge that passes or by opening, whichever
-    comes first (docs/physics.md).
+    The cut surface dissipates `toughness` per area, by the edge that passes or by opening,
+    whichever comes first (docs/physics.md).
     """
 
     youngs_modulus: float = quantity(
@@ -87,7 +87,7 @@ def energy_density(F: np.ndarray, mu: float, lam: float) -> np.ndarray:
 
 
 def first_piola_stress(F: np.ndarray, mu: float, lam: float) -> np.ndarray:
-    """Derivative of `energy_density` with respect to F [..., 3, 3], Pa (Smith et al. 2018, eq. 18)."""
+    """Derivative of `energy_density` by F [..., 3, 3], Pa (Smith et al. 2018, eq. 18)."""
     alpha = _rest_volume_ratio(mu, lam)
     Ic = (F * F).sum((-1, -2))[..., None, None]
     J = np.linalg.det(F)[..., None, None]

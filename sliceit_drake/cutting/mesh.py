@@ -179,7 +179,7 @@ def cylinder_mesh(diameter: float, layers: np.ndarray, rings: int) -> Tetrahedra
         rings: Concentric rings of the section; edges are about diameter / (2 rings).
     """
     section, triangles = _disc(rings)
-    # The polygon has the circle's area, so that its corners stand out by as much as its sides cut in.
+    # The polygon has the circle's area: its corners stand out as much as its sides cut in.
     corners = 6 * rings
     radius = 0.5 * diameter * np.sqrt(np.pi / (0.5 * corners * np.sin(2.0 * np.pi / corners)))
     section = radius * (section + [0.0, 1.0])
@@ -187,7 +187,7 @@ def cylinder_mesh(diameter: float, layers: np.ndarray, rings: int) -> Tetrahedra
 
 
 def box_mesh(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> TetrahedralMesh:
-    """A box meshed on the grid of the given increasing coordinates, metres, six tetrahedra a cell."""
+    """A box meshed on a grid of increasing coordinates, metres, six tetrahedra a cell."""
     x, y, z = (np.asarray(c, float) for c in (x, y, z))
     section = np.array([(a, c) for a in x for c in z])
     index = np.arange(len(section)).reshape(len(x), len(z))

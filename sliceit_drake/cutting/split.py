@@ -1,11 +1,11 @@
 """Virtual-node split of a tetrahedral mesh by a plane, with material fractions.
 
-Each tetrahedron with material on one side of the plane gets a copy for that side that refers to that
-side's copies of its vertices; a copy holds the share of the volume on its side (Molino, Bao, Fedkiw
-2004; Sifakis, Der, Fedkiw 2007). Nothing is moved, so volume, mass and section are conserved for any
-plane. A vertex within `snap` of the plane counts as on it. Slivers need no merging: a copy's stiffness
-and its lumped mass shrink by the same share, so no copy is stiffer for its mass than its parent
-(docs/physics.md has the histogram of the step limit over 1,000 random planes).
+Each tetrahedron with material on one side of the plane gets a copy for that side, which refers to
+that side's copies of its vertices and holds the share of the volume on its side (Molino, Bao and
+Fedkiw 2004; Sifakis, Der and Fedkiw 2007). Nothing is moved, so volume, mass and section are
+conserved for any plane. A vertex within `snap` of the plane counts as on it. Slivers need no
+merging: a copy's stiffness and its lumped mass shrink by the same share, so no copy is stiffer for
+its mass than its parent (docs/physics.md has the step limit over 1,000 random planes).
 """
 
 import dataclasses as dc
@@ -165,7 +165,7 @@ def _side_parts(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     ]
     share = np.where(flip, complement, share)
     centroid = np.where(flip[:, None], other, centroid)
-    whole = (height >= 0.0).all(1)
+    whole = np.all(height >= 0.0, axis=1)
     return np.where(whole, 1.0, share), np.where(whole[:, None], 0.25, centroid)
 
 
@@ -197,17 +197,16 @@ def split_mesh(mesh: TetrahedralMesh, plane: CutPlane, snap: float = 1e-6) -> Sp
         )
 
     parents, fractions, centroids, sides = [], [], [], []
-    for side, sign in ((0, -1.0), (1, 1.0)):
-        rows = np.flatnonzero((sign * h > 0.0).any(1))
-        share, centroid = _side_parts(sign * h[rows])
+    for which, outward in ((0, -1.0), (1, 1.0)):
+        rows = np.flatnonzero((outward * h > 0.0).any(1))
+        share, centroid = _side_parts(outward * h[rows])
         parents.append(rows)
         fractions.append(share)
         centroids.append(centroid)
-        sides.append(np.full(len(rows), side))
+        sides.append(np.full(len(rows), which))
     parent = np.concatenate(parents)
-    side = np.concatenate(sides)
 
-    key = 2 * t0[parent] + side[:, None]
+    key = 2 * t0[parent] + np.concatenate(sides)[:, None]
     used, tetrahedra = np.unique(key, return_inverse=True)
     tetrahedra = tetrahedra.reshape(-1, 4)
     node_of = np.full(2 * len(vertices), -1)
@@ -254,7 +253,7 @@ def _section(t0: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         h: Signed heights of their vertices [T0, 4], 0 on the plane.
 
     Returns:
-        End vertices of each cut point [P, 2], equal for a vertex on the plane, and triangles [M, 3].
+        End vertices of each cut point [P, 2], equal for a vertex on the plane; triangles [M, 3].
     """
     vertex_count = int(t0.max()) + 1
     corners: list[np.ndarray] = []

@@ -1,6 +1,7 @@
 """Figures of a run."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -50,9 +51,10 @@ def plot_force(
 
     figure = Figure(figsize=(9.0 if snapshot is None else 12.0, 4.6), layout="constrained")
     FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(1, 3, width_ratios=[0.0 if snapshot is None else 1.0, 1.5, 1.0])
-    over_time = figure.add_subplot(grid[1])
-    over_depth = figure.add_subplot(grid[2], sharey=over_time)
+    widths = [1.5, 1.0] if snapshot is None else [1.0, 1.5, 1.0]
+    grid = figure.add_gridspec(1, len(widths), width_ratios=widths)
+    over_time = figure.add_subplot(grid[-2])
+    over_depth = figure.add_subplot(grid[-1], sharey=over_time)
     over_depth.tick_params(labelleft=False)
     if snapshot is not None:
         draw_snapshot(figure.add_subplot(grid[0], projection="3d", computed_zorder=False), snapshot)
@@ -79,7 +81,7 @@ def plot_force(
         first_contact = time[int(np.argmax(depth > 0.0))]
         measured_time = first_contact + comparison.time_since_contact
         label = "measured (SliceIt! UR5e)"
-        style = {"color": MEASURED, "lw": 1.3, "ls": (0, (4, 1.5)), "label": label}
+        style: dict[str, Any] = {"color": MEASURED, "lw": 1.3, "ls": (0, (4, 1.5)), "label": label}
         over_time.plot(measured_time, comparison.measured, **style)
         over_depth.plot(1e3 * comparison.depth, comparison.measured, **style)
     end = max(float(depth.max()), 1.0)

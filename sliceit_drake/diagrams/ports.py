@@ -42,8 +42,15 @@ class StationPort:
         return f"vector[{self.type}]" if isinstance(self.type, int) else self.type.__name__
 
 
-def _input(name: str, kind: type | int, unit: str, frame: str, point: str, meaning: str,
-           required: bool = False) -> StationPort:
+def _input(
+    name: str,
+    kind: type | int,
+    unit: str,
+    frame: str,
+    point: str,
+    meaning: str,
+    required: bool = False,
+) -> StationPort:
     return StationPort(name, "input", kind, unit, frame, point, meaning, "exchange", required)
 
 
@@ -70,10 +77,17 @@ STATION_PORTS: tuple[StationPort, ...] = (
     _output("knife_pose", RigidTransform, "m", "W", "Ko", "X_WK measured", "plant"),
     _output("knife_velocity", SpatialVelocity, "m/s, rad/s", "W", "Ko", "V_WK measured", "plant"),
     _output(
-        "sensor_wrench", SpatialForce, "N, Nm", "S", "So",
-        "of the environment on the robot, after taring", "exchange",
+        "sensor_wrench",
+        SpatialForce,
+        "N, Nm",
+        "S",
+        "So",
+        "of the environment on the robot, after taring",
+        "exchange",
     ),
-    _output("food_wrench", SpatialForce, "N, Nm", "W", "Ko", "of the food on the knife", "exchange"),
+    _output(
+        "food_wrench", SpatialForce, "N, Nm", "W", "Ko", "of the food on the knife", "exchange"
+    ),
     _output("board_wrench", SpatialForce, "N, Nm", "W", "Ko", "of the board on the knife", "plant"),
     _output("cut_progress", 1, "1", "-", "-", "share of the section that is cut", "exchange"),
 )

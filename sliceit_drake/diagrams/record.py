@@ -59,15 +59,18 @@ class Record:
 class Recorder:
     """Handle of the log in a diagram."""
 
-    def __init__(self, log: VectorLogSink, columns: list[str]) -> None:
+    def __init__(self, log: VectorLogSink, columns: list[str], typed: RowRecorder) -> None:
         self._log = log
         self._columns = columns
+        self._typed = typed
 
     def record(self, root_context: Context) -> Record:
         """What has been logged so far in the context of the diagram."""
         log = self._log.FindLog(root_context)
-        values = np.column_stack([log.sample_times(), log.data().T])
-        return Record(["time", *self._columns], values)
+        data = log.data().T
+        vectors, rows = data[:, : len(self._columns)], data[:, len(self._columns) :]
+        values = np.column_stack([log.sample_times(), vectors, self._typed.table(rows)])
+        return Record(["time", *self._columns, *self._typed.columns], values)
 
 
 def add_recorder(
@@ -109,7 +112,7 @@ def add_recorder(
         builder.Connect(source, port)
 
     row = builder.AddNamedSystem(
-        "record_row", Multiplexer([*(len(columns) for columns in vectors.values()), len(typed.columns)])
+        "record_row", Multiplexer([*(len(columns) for columns in vectors.values()), typed.size])
     )
     for i, name in enumerate(vectors):
         builder.Connect(_vector_source(builder, station, sources, name), row.get_input_port(i))
@@ -119,7 +122,7 @@ def add_recorder(
     )
     log.set_name("record")
     columns = [column for group in vectors.values() for column in group]
-    return Recorder(log, columns + typed.columns)
+    return Recorder(log, columns, typed)
 
 
 def _vector_source(

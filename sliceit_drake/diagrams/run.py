@@ -12,7 +12,6 @@ import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.discretization import estimate_discretization_error
@@ -22,14 +21,14 @@ from sliceit_drake.cutting.motion import Motion
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.comparison import Comparison, compare_with_measurement
 from sliceit_drake.diagrams.figures import CONTACT_THRESHOLD, plot_force
-from sliceit_drake.diagrams.record import Record, Recorder, add_recorder
+from sliceit_drake.diagrams.record import Record
 from sliceit_drake.diagrams.scenario import Scenario
+from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram, ScenarioDiagram
 from sliceit_drake.diagrams.snapshot import Snapshot, take_snapshot
-from sliceit_drake.diagrams.station import MakeSlicingStation, SlicingStation
+from sliceit_drake.diagrams.station import SlicingStation
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.cutting_system import CuttingSystem
-from sliceit_drake.systems.motion_sources import MotionSource
 
 __all__ = ["Run", "prepare_run", "simulate", "write_outputs"]
 
@@ -43,10 +42,7 @@ class Run:
 
     Attributes:
         scenario: What is simulated.
-        diagram: Station, motion and recorder.
-        station: The station in it.
-        motion: The prescribed targets.
-        recorder: The log in it.
+        diagram: Station, motion and record.
         simulator: Initialized.
         profile: The measured force to compare with, or None.
         wall_time: Seconds spent in the simulator.
@@ -55,10 +51,7 @@ class Run:
     """
 
     scenario: Scenario
-    diagram: Diagram
-    station: SlicingStation
-    motion: Motion
-    recorder: Recorder
+    diagram: ScenarioDiagram
     simulator: Simulator
     profile: ForceProfile | None
     wall_time: float = 0.0
@@ -67,7 +60,17 @@ class Run:
 
     def record(self) -> Record:
         """The record so far."""
-        return self.recorder.record(self.simulator.get_context())
+        return self.diagram.record(self.simulator.get_context())
+
+    @property
+    def station(self) -> SlicingStation:
+        """The station in the diagram."""
+        return self.diagram.station
+
+    @property
+    def motion(self) -> Motion:
+        """The prescribed targets of the knife."""
+        return self.diagram.motion
 
 
 def prepare_run(scenario: Scenario, meshcat: Meshcat | None = None) -> Run:
@@ -77,22 +80,17 @@ def prepare_run(scenario: Scenario, meshcat: Meshcat | None = None) -> Run:
         ConfigurationError, MeshError, TimeStepError, CuttingError: The scenario cannot start.
     """
     profile = _measured_profile(scenario)
-    builder = DiagramBuilder()
-    station = builder.AddNamedSystem("station", MakeSlicingStation(scenario, meshcat))
-    motion = builder.AddNamedSystem("motion", MotionSource(scenario.motion, station.start_pose))
-    builder.Connect(motion.GetOutputPort("target_pose"), station.GetInputPort("target_pose"))
-    recorder = add_recorder(builder, station, {"target_pose": motion.GetOutputPort("target_pose")})
-    diagram = builder.Build()
-    diagram.set_name(scenario.name)
+    diagram = MakeScenarioDiagram(scenario, meshcat)
+    station = diagram.station
     simulator = Simulator(diagram)
-    station.SetStart(simulator.get_mutable_context())
+    diagram.SetStart(simulator.get_mutable_context())
     if meshcat is not None:
         _set_scene(meshcat, station.start_pose)
         meshcat.StartRecording(set_visualizations_while_recording=True)
         if station.food_visualizer is not None:
             station.food_visualizer.StartRecording()
     simulator.Initialize()
-    return Run(scenario, diagram, station, motion.motion, recorder, simulator, profile)
+    return Run(scenario, diagram, simulator, profile)
 
 
 def simulate(
@@ -228,16 +226,17 @@ def _caption(run: Run, comparison: Comparison | None, summary: dict) -> str:
     lines = []
     food = run.scenario.food
     if isinstance(food, Food):
-        m = food.material
+        m, dt = food.material, run.scenario.numerics.time_step
         lines.append(
-            f"Parameters set by hand: E = {m.youngs_modulus:.3g} Pa, toughness {m.toughness:.3g} J/m², "
-            f"flank friction {m.friction:.2g}; {summary['elements']} tetrahedra, "
-            f"sub-step {1e3 * run.scenario.numerics.time_step:.3g} ms."
+            f"Parameters set by hand: E = {m.youngs_modulus:.3g} Pa, toughness {m.toughness:.3g} "
+            f"J/m², flank friction {m.friction:.2g}; {summary['elements']} tetrahedra, sub-step "
+            f"{1e3 * dt:.3g} ms."
         )
     if comparison is not None:
         lines.append(
-            f"Measured curve digitised from the SliceIt! paper's project page; first contact fitted at "
-            f"{comparison.contact_time:.3f} s of its record; RMS difference {comparison.rms:.2f} N."
+            "Measured curve digitised from the SliceIt! paper's project page; first contact fitted "
+            f"at {comparison.contact_time:.3f} s of its record; RMS difference "
+            f"{comparison.rms:.2f} N."
         )
     if run.stopped:
         lines.append(f"Stopped early: {run.stopped}")

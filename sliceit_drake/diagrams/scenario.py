@@ -63,7 +63,11 @@ class Scenario:
     name: str = "cucumber"
     seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Seed of everything random.")
     exchange_period: float = quantity(
-        0.002, "s", low=2.5e-4, high=0.02, doc="Interval at which food, controller and sensor update."
+        0.002,
+        "s",
+        low=2.5e-4,
+        high=0.02,
+        doc="Interval at which food, controller and sensor update.",
     )
     robot: RobotConfig = dc.field(default_factory=RobotConfig)
     sensor: WrenchSensorConfig = dc.field(default_factory=WrenchSensorConfig)

@@ -70,8 +70,12 @@ def _blade_faces(knife: Knife) -> list[np.ndarray]:
         for low, high in zip(heights[:-1], heights[1:], strict=True):
             for side in (-1.0, 1.0):
                 y0, y1 = (side * (edge + (half - edge) * h / top) for h in (low, high))
-                faces.append(np.array([[a, y0, -low], [b, y0, -low], [b, y1, -high], [a, y1, -high]]))
-        faces.append(np.array([[a, -half, -top], [b, -half, -top], [b, half, -top], [a, half, -top]]))
+                faces.append(
+                    np.array([[a, y0, -low], [b, y0, -low], [b, y1, -high], [a, y1, -high]])
+                )
+        faces.append(
+            np.array([[a, -half, -top], [b, -half, -top], [b, half, -top], [a, half, -top]])
+        )
     for end in (x[0], x[-1]):
         faces.append(
             np.array([[end, -edge, 0], [end, edge, 0], [end, half, -top], [end, -half, -top]])
@@ -82,8 +86,8 @@ def _blade_faces(knife: Knife) -> list[np.ndarray]:
 def draw_snapshot(axes: Any, snapshot: Snapshot) -> None:
     """Draws on matplotlib 3-D axes made with computed_zorder=False, millimetres, flat shading.
 
-    Seen from the side y < 0: the far half, the blade and the near half are drawn in this order, which
-    is exact because the cut plane parts them; matplotlib sorts faces only by their middles.
+    Seen from the side y < 0: the far half, the blade and the near half are drawn in this order,
+    which is exact because the cut plane parts them; matplotlib sorts faces only by their middles.
     """
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 

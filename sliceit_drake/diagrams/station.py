@@ -29,12 +29,11 @@ from sliceit_drake.systems.cutting_system import CuttingSystem
 from sliceit_drake.systems.food_visualizer import FoodVisualizer
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 from sliceit_drake.systems.knife_kinematics import BoardContact, KnifeKinematics
-from sliceit_drake.systems.motion_sources import MotionSource
 from sliceit_drake.systems.servo import JOINTS
 from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
 from sliceit_drake.systems.wrench_sensor import WrenchSensor
 
-__all__ = ["MakeScenarioDiagram", "MakeSlicingStation", "SlicingStation"]
+__all__ = ["MakeSlicingStation", "SlicingStation"]
 
 FRAMES_PER_SECOND = 32.0
 
@@ -84,7 +83,9 @@ class SlicingStation(Diagram):
             self.plant, self.robot.sensor_weld, scenario.exchange_period, scenario.sensor
         )
         kinematics = KnifeKinematics(self.robot.knife.index())
-        board_contact = BoardContact(self.robot.knife.index())
+        board_contact = BoardContact(
+            self.robot.knife.index(), scenario.knife.length, scenario.board.height
+        )
         named = {
             "cutting": self.cutting,
             "controller": self.controller,
@@ -126,9 +127,7 @@ class SlicingStation(Diagram):
             builder.Connect(source, target)
         joints = builder.AddNamedSystem("joints", Demultiplexer([JOINTS, JOINTS]))
         builder.Connect(plant.get_state_output_port(self.robot.arm), joints.get_input_port())
-        builder.Connect(
-            joints.get_output_port(0), self.controller.GetInputPort("joint_positions")
-        )
+        builder.Connect(joints.get_output_port(0), self.controller.GetInputPort("joint_positions"))
 
         outputs = {
             "joint_positions": joints.get_output_port(0),
@@ -158,7 +157,9 @@ class SlicingStation(Diagram):
         builder.BuildInto(self)
         self.set_name("station")
 
-    def _add_visualization(self, builder: DiagramBuilder, scene_graph: SceneGraph, meshcat: Meshcat) -> None:
+    def _add_visualization(
+        self, builder: DiagramBuilder, scene_graph: SceneGraph, meshcat: Meshcat
+    ) -> None:
         self.visualizer = MeshcatVisualizer.AddToBuilder(
             builder,
             scene_graph,
@@ -175,7 +176,7 @@ class SlicingStation(Diagram):
                 )
 
     def SetStart(self, root_context: Context) -> None:
-        """Puts arm and controller at rest at the scenario's start, in the context of the diagram."""
+        """Puts arm and controller at rest at the start, in the context of the whole diagram."""
         set_joint_positions(root_context, self.plant, self.robot, self._arm, self.start_joints)
 
 
@@ -190,21 +191,6 @@ def MakeSlicingStation(scenario: Scenario, meshcat: Meshcat | None = None) -> Sl
         ConfigurationError, MeshError, TimeStepError: The scenario cannot be built.
     """
     return SlicingStation(scenario, meshcat)
-
-
-def MakeScenarioDiagram(scenario: Scenario, meshcat: Meshcat | None = None) -> Diagram:
-    """The station of a scenario driven by the scenario's motion.
-
-    Returns:
-        A diagram with systems "station" and "motion".
-    """
-    builder = DiagramBuilder()
-    station = builder.AddNamedSystem("station", MakeSlicingStation(scenario, meshcat))
-    motion = builder.AddNamedSystem("motion", MotionSource(scenario.motion, station.start_pose))
-    builder.Connect(motion.GetOutputPort("target_pose"), station.GetInputPort("target_pose"))
-    diagram = builder.Build()
-    diagram.set_name(scenario.name)
-    return diagram
 
 
 def _food_model(scenario: Scenario) -> CuttingModel | None:

@@ -32,9 +32,9 @@ ENERGY_NAMES = ("elastic", "interface", "kinetic", "largest_energy_ratio", "leas
 class CuttingSystem(KnifeForceSystem):
     """Advances a finite-element food by its own sub-steps once per exchange.
 
-    All state is in the Context: the food's nodes and history as one discrete vector, the food that is
-    cut as an index into the prepared foods. The solvers hold only workspaces that each update fills
-    and empties, so contexts do not disturb each other.
+    All state is in the Context: the food's nodes and history as one discrete vector, the food that
+    is cut as an index into the prepared foods. The solvers hold only workspaces that each update
+    fills and empties, so contexts do not disturb each other.
 
     Further output ports:
         force_components: Forces on the knife by edge, flank pressure, friction [9], N, in W.

@@ -52,7 +52,7 @@ class FoodVisualizer(LeafSystem):
         self._meshcat.Delete(self._path)
 
     def PublishRecording(self) -> None:
-        """Writes when each kept frame is visible into Meshcat's recording, and stops keeping them."""
+        """Writes when each kept frame is visible into the recording, and stops keeping them."""
         animation = self._meshcat.get_mutable_recording()
         for k, time in enumerate(self._frames):
             path = self._frame_path(k)

@@ -14,9 +14,10 @@ __all__ = ["KnifeForceSystem"]
 class KnifeForceSystem(LeafSystem):
     """Exchanges pose for force with a knife, once per `exchange_period`.
 
-    At t_k the update takes the knife's pose and velocity and holds the wrench that `advance` returns
-    over [t_k, t_{k+1}). It is an unrestricted update, so it runs before the discrete updates of
-    controller and plant at the same time, and they see the new wrench without a further delay.
+    At t_k the update takes the knife's pose and velocity and holds the wrench that `advance`
+    returns over [t_k, t_{k+1}). It is an unrestricted update, so it runs before the discrete
+    updates of controller and plant at the same time, and they see the new wrench without a further
+    delay.
 
     Input ports:
         knife_pose: RigidTransform X_WK.

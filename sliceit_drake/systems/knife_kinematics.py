@@ -10,6 +10,8 @@ from pydrake.systems.framework import Context, LeafSystem
 
 __all__ = ["BoardContact", "KnifeKinematics"]
 
+NEAR_BOARD = 1e-3
+
 
 class KnifeKinematics(LeafSystem):
     """Picks the knife from the plant's lists of poses and velocities.
@@ -61,13 +63,20 @@ class BoardContact(LeafSystem):
     Output ports:
         board_wrench: SpatialForce F_K_W of the board on the knife, at Ko, in W.
 
+    The plant computes contact results by solving its step once more, so they are asked for only
+    when the edge is near the board.
+
     Args:
         knife_body: Index of the knife's body.
+        edge_length: Of the knife, metres.
+        board_height: In the world, metres.
     """
 
-    def __init__(self, knife_body: BodyIndex) -> None:
+    def __init__(self, knife_body: BodyIndex, edge_length: float, board_height: float) -> None:
         super().__init__()
         self._knife_body = knife_body
+        self._half_length = 0.5 * edge_length
+        self._near_height = board_height + NEAR_BOARD
         self._results = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
         self._pose = self.DeclareAbstractInputPort("knife_pose", Value(RigidTransform()))
         self.DeclareAbstractOutputPort(
@@ -78,12 +87,12 @@ class BoardContact(LeafSystem):
         )
 
     def _calc_wrench(self, context: Context, output: Value) -> None:
-        results = self._results.Eval(context)
-        count = results.num_point_pair_contacts()
+        X_WK = self._pose.Eval(context).GetAsMatrix34()
+        lowest = X_WK[2, 3] - abs(X_WK[2, 0]) * self._half_length
         moment, force = np.zeros(3), np.zeros(3)
-        if count:
-            p_WK = self._pose.Eval(context).translation()
-            for i in range(count):
+        if lowest < self._near_height:
+            results = self._results.Eval(context)
+            for i in range(results.num_point_pair_contacts()):
                 info = results.point_pair_contact_info(i)
                 # contact_force acts on body B of the pair.
                 if info.bodyB_index() == self._knife_body:
@@ -93,5 +102,5 @@ class BoardContact(LeafSystem):
                 else:
                     continue
                 force += f
-                moment += np.cross(info.contact_point() - p_WK, f)
+                moment += np.cross(info.contact_point() - X_WK[:, 3], f)
         output.set_value(SpatialForce(moment, force))

@@ -1,0 +1,58 @@
+"""A whole scenario as a diagram: station, motion and record."""
+
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+
+from sliceit_drake.cutting.motion import Motion
+from sliceit_drake.diagrams.record import Record, Recorder, add_recorder
+from sliceit_drake.diagrams.scenario import Scenario
+from sliceit_drake.diagrams.station import MakeSlicingStation, SlicingStation
+from sliceit_drake.systems.motion_sources import MotionSource
+
+__all__ = ["MakeScenarioDiagram", "ScenarioDiagram"]
+
+
+class ScenarioDiagram(Diagram):
+    """A station driven by its scenario's motion, with a log of all ports.
+
+    Attributes:
+        station: The slicing station.
+        motion: The prescribed targets of the knife.
+    """
+
+    def __init__(self, scenario: Scenario, meshcat: Meshcat | None = None) -> None:
+        super().__init__()
+        builder = DiagramBuilder()
+        self.station: SlicingStation = builder.AddNamedSystem(
+            "station", MakeSlicingStation(scenario, meshcat)
+        )
+        source = builder.AddNamedSystem(
+            "motion", MotionSource(scenario.motion, self.station.start_pose)
+        )
+        self.motion: Motion = source.motion
+        target_pose = source.GetOutputPort("target_pose")
+        builder.Connect(target_pose, self.station.GetInputPort("target_pose"))
+        self._recorder: Recorder = add_recorder(builder, self.station, {"target_pose": target_pose})
+        builder.BuildInto(self)
+        self.set_name(scenario.name)
+
+    def SetStart(self, context: Context) -> None:
+        """Puts the robot at rest at the scenario's start."""
+        self.station.SetStart(context)
+
+    def record(self, context: Context) -> Record:
+        """What has been logged so far in this diagram's context."""
+        return self._recorder.record(context)
+
+
+def MakeScenarioDiagram(scenario: Scenario, meshcat: Meshcat | None = None) -> ScenarioDiagram:
+    """The diagram of a scenario, ready for a Simulator.
+
+    Args:
+        scenario: What to simulate.
+        meshcat: Viewer to draw in, or None.
+
+    Raises:
+        ConfigurationError, MeshError, TimeStepError: The scenario cannot be built.
+    """
+    return ScenarioDiagram(scenario, meshcat)
