@@ -5,11 +5,10 @@ import dataclasses as dc
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.scenario import Measurement
 from sliceit_drake.records.force_profile import ForceProfile
 
-__all__ = ["Comparison", "compare_with_measurement"]
+__all__ = ["Comparison", "can_compare", "compare_with_measurement"]
 
 
 @dc.dataclass
@@ -36,6 +35,11 @@ class Comparison:
     simulated_peak: float
 
 
+def can_compare(depth: np.ndarray) -> bool:
+    """Whether a descent [k], metres, went at least 1 mm into the food."""
+    return len(depth) >= 10 and depth[-1] >= 1e-3
+
+
 def compare_with_measurement(
     profile: ForceProfile, measurement: Measurement, depth: np.ndarray, force: np.ndarray
 ) -> Comparison:
@@ -49,14 +53,10 @@ def compare_with_measurement(
         force: Norm of the simulated force [k], N.
 
     Raises:
-        ConfigurationError: The simulated knife did not cut.
+        ValueError: The simulated knife did not cut, see `can_compare`.
     """
-    if len(depth) < 10 or depth[-1] < 1e-3:
-        raise ConfigurationError(
-            "the simulated knife did not descend into the food, so nothing can be compared",
-            field="scenario.motion",
-            fix="Give a motion that cuts, or leave measurement out.",
-        )
+    if not can_compare(depth):
+        raise ValueError("the knife did not descend into the food: ask can_compare first")
 
     def simulated(contact_time: float) -> np.ndarray:
         d = measurement.speed * (profile.time - contact_time)

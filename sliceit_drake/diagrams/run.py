@@ -19,7 +19,7 @@ from sliceit_drake.cutting.food import Food, start_pose
 from sliceit_drake.cutting.mesh import MeshError
 from sliceit_drake.cutting.motion import Motion
 from sliceit_drake.cutting.solver import CuttingError
-from sliceit_drake.diagrams.comparison import Comparison, compare_with_measurement
+from sliceit_drake.diagrams.comparison import Comparison, can_compare, compare_with_measurement
 from sliceit_drake.diagrams.figures import CONTACT_THRESHOLD, plot_force
 from sliceit_drake.diagrams.record import Record
 from sliceit_drake.diagrams.scenario import Scenario
@@ -210,7 +210,7 @@ def _comparison(run: Run, record: Record) -> Comparison | None:
     if measurement is None or run.profile is None:
         return None
     depth, force = _descent(run, record)
-    if run.stopped is not None and (len(depth) < 10 or depth[-1] < 1e-3):
+    if not can_compare(depth):
         return None
     return compare_with_measurement(run.profile, measurement, depth, force)
 

@@ -51,7 +51,7 @@ def solve_start_joints(
     if not result.is_success() or missed > 1e-4:
         raise ConfigurationError(
             f"the arm cannot put the knife at {np.round(p_WK, 4).tolist()} m; it comes "
-            f" within {1e3 * missed:.3g} mm",
+            f"within {1e3 * missed:.3g} mm",
             field="scenario.placement and scenario.start",
             fix="Place the food nearer to the robot's base (reach of the knife: about 0.85 m), or "
             "give robot.joint_positions near a posture that reaches it.",
