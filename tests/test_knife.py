@@ -59,7 +59,9 @@ def section_points(knife: Knife, seed: int = 1, count: int = 400) -> np.ndarray:
     """Points about the whole section and, half of them, close to the edge [N, 2]."""
     rng = np.random.default_rng(seed)
     top = knife.tip_height + knife.height
-    wide = rng.uniform([-knife.spine_thickness, -0.3 * top], [knife.spine_thickness, 1.3 * top], (count, 2))
+    wide = rng.uniform(
+        [-knife.spine_thickness, -0.3 * top], [knife.spine_thickness, 1.3 * top], (count, 2)
+    )
     near = 4.0 * max(knife.edge_thickness, knife.tip_height)
     return np.concatenate([wide, rng.uniform(-near, near, (count, 2))])
 
@@ -73,8 +75,8 @@ def test_section_distance_is_the_distance_to_the_outline(name):
     expected = brute_force(knife, points, spacing)
     assert (expected < -1e-5).sum() > 20 and (expected > 1e-5).sum() > 20
     # The nearest sample lies at most half a spacing from the nearest point of the boundary.
-    gap = np.hypot(np.abs(expected) + knife.edge_radius, 0.5 * spacing)
-    tolerance = gap - np.abs(expected) - knife.edge_radius + 1e-9
+    to_outline = np.abs(distance + knife.edge_radius)
+    tolerance = np.hypot(to_outline, 0.5 * spacing) - to_outline + 1e-12
     assert (np.abs(distance - expected) <= tolerance).all()
 
 

@@ -35,6 +35,11 @@ def scenario_of(options: argparse.Namespace) -> "Scenario":
     Raises:
         ConfigurationError: It is missing or invalid.
     """
+    import warp
+
+    # Its greeting and its regret that there is no GPU would stand between the user and the result.
+    warp.config.log_level = warp.LOG_ERROR
+
     from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.diagrams.scenario import load_scenario
     from sliceit_drake.resources import resource_path

@@ -46,10 +46,8 @@ def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     scenario = scenario_of(options)
 
-    import warp
     from tqdm import tqdm
 
-    warp.config.log_level = warp.LOG_WARNING
     if not options.meshcat:
         logging.getLogger("drake").setLevel(logging.WARNING)
 
