@@ -4,12 +4,13 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from sliceit_drake.cli import diagram, simulate
+from sliceit_drake.cli import diagram, simulate, study
 
 __all__ = ["main"]
 
-COMMANDS = (simulate, diagram)
+COMMANDS = (simulate, diagram, study)
 BAD_INPUT = 2
+INTERRUPTED = 130
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -32,11 +33,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Command line without the program's name; None for that of the process.
 
     Returns:
-        0 on success, 1 if a run stopped early, 2 for bad input.
+        0 on success, 1 if a run stopped early, 2 for bad input, 130 for Ctrl-C outside a run.
     """
     options = make_parser().parse_args(arguments)
     try:
         return options.run(options)
+    except KeyboardInterrupt:
+        print("sliceit: interrupted", file=sys.stderr)
+        return INTERRUPTED
     except Exception as error:
         if not _is_bad_input(error):
             raise

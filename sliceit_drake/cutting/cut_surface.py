@@ -82,9 +82,9 @@ def edge_tables(
         carried = (chord * 0.5 * hat).reshape(len(triangles), grid, oversampling).mean(-1)
         np.add.at(width, triangles[:, k], carried)
 
+    # A point between two lines carries all of its area at its own height, so that it too is cut.
+    width[~width.any(1), grid // 2] = 1.0
     trapezoid = 0.5 * spacing * (width[:, 1:] + width[:, :-1])
     integral = np.concatenate([np.zeros((len(points), 1)), np.cumsum(trapezoid, axis=1)], axis=1)
     total = integral[:, -1:]
-    safe = np.where(total > 0.0, total, 1.0)
-    width *= np.where(total > 0.0, area[:, None] / safe, 0.0)
-    return EdgeTables(reach, width, integral / safe, area)
+    return EdgeTables(reach, width * area[:, None] / total, integral / total, area)
