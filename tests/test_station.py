@@ -78,7 +78,7 @@ def test_knife_work_in_the_log_less_every_other_mechanism_is_toughness_times_are
     stored = sum(record[f"energy_{name}"][-1] for name in ("elastic", "interface", "kinetic"))
     other = sum(
         record[f"energy_{name}"][-1]
-        for name in ("opening", "friction", "board_friction", "released")
+        for name in ("opening", "friction", "board_friction", "blade")
     )
     through = run.scenario.food.material.toughness * model.section_area
     assert work + record["energy_gravity"][-1] - stored - other - damping == pytest.approx(

@@ -26,12 +26,14 @@ class EdgeTables:
         reach: The grid runs over s in [-reach, reach], metres.
         width: T_i on the grid [P, G], metres.
         fraction: Cut fraction on the grid [P, G]: the integral of T_i up to s over A_i.
+        rise: Height of the centroid of the part that is cut above the point [P, G], metres.
         area: Areas A_i [P], m^2.
     """
 
     reach: float
     width: np.ndarray
     fraction: np.ndarray
+    rise: np.ndarray
     area: np.ndarray
 
     @property
@@ -82,9 +84,19 @@ def edge_tables(
         carried = (chord * 0.5 * hat).reshape(len(triangles), grid, oversampling).mean(-1)
         np.add.at(width, triangles[:, k], carried)
 
-    # A point between two lines carries all of its area at its own height, so that it too is cut.
-    width[~width.any(1), grid // 2] = 1.0
-    trapezoid = 0.5 * spacing * (width[:, 1:] + width[:, :-1])
-    integral = np.concatenate([np.zeros((len(points), 1)), np.cumsum(trapezoid, axis=1)], axis=1)
-    total = integral[:, -1:]
-    return EdgeTables(reach, width * area[:, None] / total, integral / total, area)
+    total = 0.5 * spacing * (width[:, 1:] + width[:, :-1]).sum(1, keepdims=True)
+    width *= np.divide(area[:, None], total, out=np.zeros_like(total), where=total > 0.0)
+    cut = _integral(width, spacing)
+    # The centroid of the part that is cut lies the mean of s - s' above the edge, weight T_i(s').
+    above_edge = np.divide(
+        _integral(cut, spacing), cut, out=np.zeros_like(cut), where=cut > 1e-9 * area[:, None]
+    )
+    grid_s = np.linspace(-reach, reach, grid)
+    fraction = np.divide(cut, area[:, None], out=np.zeros_like(cut), where=area[:, None] > 0.0)
+    return EdgeTables(reach, width, fraction, above_edge - grid_s, area)
+
+
+def _integral(values: np.ndarray, spacing: float) -> np.ndarray:
+    """Integral from the start of each row, trapezoidal."""
+    steps = 0.5 * spacing * (values[:, 1:] + values[:, :-1])
+    return np.concatenate([np.zeros((len(values), 1)), np.cumsum(steps, axis=1)], axis=1)

@@ -11,9 +11,13 @@ from typing import Any
 
 import warp as wp
 
-__all__ = ["ACCUMULATED", "LANES", "PARAMETERS", "kernels"]
+__all__ = ["ACCUMULATED", "GATHER", "LANES", "PARAMETERS", "kernels"]
 
 LANES = 8
+"""Elements that a thread handles."""
+
+GATHER = 4
+"""Element forces that a node adds at a time."""
 
 PARAMETERS = (
     "mu",
@@ -34,7 +38,7 @@ PARAMETERS = (
 )
 """Scalars that the kernels read, in the order of their array."""
 
-ACCUMULATED = 23
+ACCUMULATED = 26
 """Sums kept for each cut point over an exchange, see `make.points`."""
 
 _INDEX = {name: k for k, name in enumerate(PARAMETERS)}
@@ -43,10 +47,16 @@ _INDEX = {name: k for k, name in enumerate(PARAMETERS)}
 @functools.cache
 def kernels(real: Any) -> types.SimpleNamespace:
     """The kernels for `real` = wp.float32 or wp.float64."""
+    # A module for each precision, so that using both compiles neither twice.
+    module = f"{__name__}.{real.__name__}"
     vec2 = wp.types.vector(2, real)
     vec3 = wp.types.vector(3, real)
     mat33 = wp.types.matrix((3, 3), real)
     lanes = wp.types.vector(LANES, real)
+    indices = wp.types.vector(LANES, wp.int32)
+    # From the x component of a nodal force in `elements` to its z component.
+    strided = wp.types.vector(2 * LANES + 1, real)
+    entries = wp.types.vector(GATHER, wp.int32)
 
     MU = wp.constant(_INDEX["mu"])
     LAM = wp.constant(_INDEX["lam"])
@@ -80,18 +90,16 @@ def kernels(real: Any) -> types.SimpleNamespace:
     @wp.func
     def corner8(
         x: wp.array(dtype=vec3),
-        v: wp.array(dtype=vec3),
-        nodes: wp.array2d(dtype=wp.int32),
+        nodes: wp.array2d(dtype=indices),
         block: wp.int32,
         corner: wp.int32,
-        tau: real,
     ):
+        node = nodes[block, corner]
         a = lanes()
         b = lanes()
         c = lanes()
         for lane in range(LANES):
-            node = nodes[block, corner * LANES + lane]
-            p = x[node] + tau * v[node]
+            p = x[node[lane]]
             a[lane] = p[0]
             b[lane] = p[1]
             c[lane] = p[2]
@@ -109,28 +117,26 @@ def kernels(real: Any) -> types.SimpleNamespace:
         """Row of F: edges (ax, bx, cx) times column k of the inverse rest edges."""
         return dot8(ax, bx, cx, shape[block, k], shape[block, 3 + k], shape[block, 6 + k])
 
-    @wp.kernel(enable_backward=True)
+    @wp.kernel(enable_backward=False, module=module)
     def elements(
         x: wp.array(dtype=vec3),
-        v: wp.array(dtype=vec3),
-        nodes: wp.array2d(dtype=wp.int32),
+        nodes: wp.array2d(dtype=indices),
         shape: wp.array2d(dtype=lanes),
         P: wp.array(dtype=real),
         force: wp.array2d(dtype=lanes),
     ):
-        """Nodal forces of eight elements: minus the gradient of the energy at x + tau v.
+        """Nodal forces of eight elements: minus the gradient of the energy at x.
 
-        Evaluating at x + tau v is Kelvin-Voigt damping with viscosity tau times the tangent stiffness;
+        `x` is `ahead`: positions plus tau times velocities. Evaluating at x + tau v is Kelvin-Voigt damping with viscosity tau times the tangent stiffness;
         invariant under translation, and under rotation to second order in tau times its rate.
         """
         block = wp.tid()
         mu = P[MU]
         lam = P[LAM]
-        tau = P[DAMPING_TIME]
-        ox, oy, oz = corner8(x, v, nodes, block, 0, tau)
-        ax, ay, az = corner8(x, v, nodes, block, 1, tau)
-        bx, by, bz = corner8(x, v, nodes, block, 2, tau)
-        cx, cy, cz = corner8(x, v, nodes, block, 3, tau)
+        ox, oy, oz = corner8(x, nodes, block, 0)
+        ax, ay, az = corner8(x, nodes, block, 1)
+        bx, by, bz = corner8(x, nodes, block, 2)
+        cx, cy, cz = corner8(x, nodes, block, 3)
         ax -= ox
         ay -= oy
         az -= oz
@@ -191,10 +197,21 @@ def kernels(real: Any) -> types.SimpleNamespace:
         force[block, 1] = -hy
         force[block, 2] = -hz
 
-    @wp.kernel(enable_backward=False)
+    @wp.kernel(enable_backward=False, module=module)
+    def look_ahead(
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        P: wp.array(dtype=real),
+        ahead: wp.array(dtype=vec3),
+    ):
+        """Positions at which the elements are evaluated."""
+        i = wp.tid()
+        ahead[i] = x[i] + P[DAMPING_TIME] * v[i]
+
+    @wp.kernel(enable_backward=False, module=module)
     def element_energy(
         x: wp.array(dtype=vec3),
-        nodes: wp.array2d(dtype=wp.int32),
+        nodes: wp.array2d(dtype=indices),
         shape: wp.array2d(dtype=lanes),
         P: wp.array(dtype=real),
         energy: wp.array2d(dtype=real),
@@ -204,10 +221,10 @@ def kernels(real: Any) -> types.SimpleNamespace:
         block, lane = wp.tid()
         mu = P[MU]
         lam = P[LAM]
-        o = x[nodes[block, lane]]
-        a = x[nodes[block, LANES + lane]] - o
-        b = x[nodes[block, 2 * LANES + lane]] - o
-        c = x[nodes[block, 3 * LANES + lane]] - o
+        o = x[nodes[block, 0][lane]]
+        a = x[nodes[block, 1][lane]] - o
+        b = x[nodes[block, 2][lane]] - o
+        c = x[nodes[block, 3][lane]] - o
         M = mat33()
         for k in range(9):
             M[k // 3, k % 3] = shape[block, k][lane]
@@ -263,16 +280,14 @@ def kernels(real: Any) -> types.SimpleNamespace:
         """Coulomb friction with an elastic anchor, returned to the limit.
 
         Args: slip from the anchor so far, its increment, tangential stiffness, largest force.
-        Returns: new slip, force on the slipping body, dissipated energy (never negative).
+        Returns: new slip.
         """
         trial = slip + step
         length = wp.length(trial)
         reach = limit / wp.max(stiffness, TINY)
-        dissipated = real(0.0)
         if length > reach:
             trial = trial * (reach / length)
-            dissipated = limit * (length - reach)
-        return trial, -stiffness * trial, dissipated
+        return trial
 
     @wp.func
     def flank_contact(
@@ -286,7 +301,9 @@ def kernels(real: Any) -> types.SimpleNamespace:
         bend: real,
         bend_rate: real,
         area: real,
-        shrink: real,
+        old_area: real,
+        growth: real,
+        rise: real,
         slip: vec3,
         dt: real,
         P: wp.array(dtype=real),
@@ -294,41 +311,53 @@ def kernels(real: Any) -> types.SimpleNamespace:
     ):
         """Flank pressure and friction on one face of the cut.
 
-        Returns: normal force, friction force on the food, new slip, dissipation, depth.
+        The edge has passed a part of the point's area: `area` now, `old_area` before the sub-step.
+        The mean of the flank's thickness over that part is that at its centroid, `rise` above the
+        point, for the flank is straight.
+
+        The normal force is minus the gradient of 1/2 stiffness area depth^2, `growth` of the area
+        with the depth of the edge included: a knife at rest then puts no energy into a vibration.
+
+        Returns: normal force and friction force on the food, new slip, energy lost by friction.
         """
+        stiffness = P[FLANK_STIFFNESS]
         arm = p - origin
-        r = wp.transpose(R) * arm
+        r = wp.transpose(R) * (arm + vec3(real(0.0), real(0.0), rise))
         normal_force = vec3()
         friction_force = vec3()
         new_slip = vec3()
-        dissipated = real(0.0)
-        depth = real(0.0)
-        if wp.abs(r[0]) < knife[7]:
+        # What the anchor stored and what is done on it, less what it stores then.
+        lost = real(0.5) * stiffness * old_area * wp.dot(slip, slip)
+        if area > real(0.0) and wp.abs(r[0]) < knife[7]:
             # Ky points to the minus side when the knife hangs upside down in C.
             facing = side
             if R[1, 1] < real(0.0):
                 facing = -side
-            phi, n2 = wedge(facing * (r[1] - bend), -r[2], knife)
-            if phi < real(0.0) and area > real(0.0):
-                depth = -phi
+            height = -r[2]
+            phi, n2 = wedge(facing * (r[1] - bend), height, knife)
+            if phi < real(0.0):
                 n = R * vec3(real(0.0), facing * n2[0], -n2[1])
-                N = P[FLANK_STIFFNESS] * area * depth
-                normal_force = N * n
                 knife_y = vec3(R[0, 1], R[1, 1], R[2, 1])
+                knife_z = vec3(R[0, 2], R[1, 2], R[2, 2])
+                N = -stiffness * area * phi
+                # The part grows at the edge, where the flank is thinner than at the centroid.
+                at_edge = stiffness * growth * phi * (real(0.5) * phi - n2[1] * height)
+                normal_force = N * n + at_edge * knife_z
                 relative = v - velocity - wp.cross(rotation_rate, arm) - bend_rate * knife_y
                 sliding = relative - wp.dot(relative, n) * n
                 mu = P[FRICTION]
                 extra = P[STATIC_FRICTION] - mu
                 if extra > real(0.0):
                     mu += extra * wp.exp(-wp.length(sliding) / P[STRIBECK_VELOCITY])
-                old = slip * shrink
+                old = slip * wp.min(old_area / area, real(1.0))
                 old = old - wp.dot(old, n) * n
-                new_slip, friction_force, dissipated = slide(
-                    old, sliding * dt, P[FLANK_STIFFNESS] * area, mu * N
-                )
-        return normal_force, friction_force, new_slip, dissipated, depth
+                new_slip = slide(old, sliding * dt, stiffness * area, mu * N)
+                friction_force = -stiffness * area * new_slip
+                lost -= wp.dot(friction_force, sliding) * dt
+                lost -= real(0.5) * stiffness * area * wp.dot(new_slip, new_slip)
+        return normal_force, friction_force, new_slip, lost
 
-    @wp.kernel(enable_backward=True)
+    @wp.kernel(enable_backward=False, module=module)
     def points(
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
@@ -338,7 +367,8 @@ def kernels(real: Any) -> types.SimpleNamespace:
         toughness: wp.array(dtype=real),
         width: wp.array2d(dtype=real),
         fraction: wp.array2d(dtype=real),
-        widest: wp.array(dtype=real),
+        centroid: wp.array2d(dtype=real),
+        unloading: wp.array(dtype=real),
         reach: real,
         per_spacing: real,
         P: wp.array(dtype=real),
@@ -353,6 +383,7 @@ def kernels(real: Any) -> types.SimpleNamespace:
         blade: wp.array(dtype=real),
         passed: wp.array(dtype=real),
         parted: wp.array(dtype=real),
+        edge_force: wp.array(dtype=real),
         slip: wp.array2d(dtype=vec3),
         force: wp.array2d(dtype=vec3),
         lateral: wp.array(dtype=real),
@@ -361,10 +392,10 @@ def kernels(real: Any) -> types.SimpleNamespace:
         """Edge, opening, self contact, flank contact and friction at each cut point.
 
         Advances the history: `passed`, the largest depth of the edge below the point; `parted`, the
-        share of the surface energy spent by opening; `slip`, from the friction anchors. Adds to
+        share of the surface energy spent by opening; `edge_force`; `slip`, from the friction anchors. Adds to
         `total`: forces on the knife by edge, flank pressure, friction [0:9], their moments about Ko
-        [9:18], and energies: dissipated by the edge 18, by opening 19, by friction 20, released or
-        taken up when the cut fraction grows 21. Writes the area that is cut 22.
+        [9:18], and energies dissipated by the edge 18, by opening 19, by friction 20. Writes the
+        area that is cut 21, the part of it above the edge 22, and its moment about Ko [23:26].
         """
         i = wp.tid()
         w = weights[i]
@@ -376,17 +407,28 @@ def kernels(real: Any) -> types.SimpleNamespace:
         R = R_CK[k]
         origin = p_CK[k]
         knife_x = vec3(R[0, 0], R[1, 0], R[2, 0])
+        knife_y = vec3(R[0, 1], R[1, 1], R[2, 1])
         knife_z = vec3(R[0, 2], R[1, 2], R[2, 2])
         arm = middle - origin
+        motion = (v_CK[k] + wp.cross(w_CK[k], arm) - real(0.5) * (vm + vp)) * dt
         A = area[i]
         toughness_i = toughness[i]
+        # s: depth of the edge below the point. Nothing happens beyond the ends of the blade.
         old_passed = passed[i]
         s = old_passed
         s0 = old_passed
+        share = real(0.0)
+        old_share = real(0.0)
+        growth = real(0.0)
+        rise = real(0.0)
         if wp.abs(wp.dot(arm, knife_x)) < knife[7]:
             s = -wp.dot(arm, knife_z)
-            rate = real(0.5) * (vm + vp) - v_CK[k] - wp.cross(w_CK[k], arm)
-            s0 = s + dt * wp.dot(rate, knife_z)
+            s0 = s - wp.dot(motion, knife_z)
+            u = (s + reach) * per_spacing
+            share = table(fraction, i, u)
+            growth = table(width, i, u)
+            old_share = table(fraction, i, (s0 + reach) * per_spacing)
+            rise = table(centroid, i, u)
         new_passed = wp.max(old_passed, s)
         passed[i] = new_passed
         u0 = (old_passed + reach) * per_spacing
@@ -411,28 +453,30 @@ def kernels(real: Any) -> types.SimpleNamespace:
         stiffness = bond * A * (real(1.0) - D) * intact
         closing = bond * A * wp.min(gap[1], real(0.0))
         pull = stiffness * opening + vec3(real(0.0), closing, real(0.0))
-        opening_loss = toughness_i * A * (real(1.0) - D) * (new_parted - old_parted)
-        released = real(0.5) * bond * A * intact * length * length * (D - D0)
+        opening_loss = toughness_i * A * (real(1.0) - D0) * (new_parted - old_parted)
 
-        # Edge: toughness times the width carried, unloading elastically when the edge retreats.
-        left = toughness_i * (real(1.0) - new_parted)
-        q0 = left * table(width, i, u0)
-        q1 = left * table(width, i, u1)
-        unloading = toughness_i * widest[i] / P[UNLOADING_LENGTH]
-        q = wp.max(q1 - unloading * (new_passed - s), real(0.0))
+        # Edge: elastic up to the toughness that opening left, less what the bonds that it cuts give
+        # up, times the width carried; less where the edge has retreated.
+        bonded = real(0.5) * bond * intact * length * length
+        left = wp.max(toughness_i * (real(1.0) - new_parted) - bonded, real(0.0))
+        slope = unloading[i]
+        limit = left * table(width, i, u1) - slope * (new_passed - s)
+        q0 = edge_force[i]
+        q = wp.max(wp.min(q0 + slope * (s - s0), limit), real(0.0))
+        edge_force[i] = q
         d = direction[k]
         edge = q * wp.max(wp.dot(d, knife_z), real(0.0)) * d
-        edge_loss = real(0.5) * (q0 + q1) * (new_passed - old_passed)
-        if unloading > real(0.0):
-            edge_loss -= real(0.5) * (q1 * q1 - q0 * q0) / unloading
+        stored = real(0.5) * (q * q - q0 * q0) / wp.max(slope, TINY)
+        done = wp.dot(edge, motion)
+        if done < real(0.0):
+            # The direction lags behind a turn; no more may come back than was stored.
+            back = wp.clamp(stored / done, real(0.0), real(1.0))
+            edge = edge * back
+            done = done * back
+        edge_loss = done - stored + bonded * A * (D - D0)
 
-        # Flanks on the part that is cut and lies above the edge now.
-        above0 = wp.min(table(fraction, i, (s0 + reach) * per_spacing), D0)
-        above = wp.min(table(fraction, i, (s + reach) * per_spacing), D)
-        shrink = real(1.0)
-        if above > above0:
-            shrink = above0 / above
-        normal_m, friction_m, slip_m, loss_m, depth_m = flank_contact(
+        # Flanks on the part that is cut.
+        normal_m, friction_m, slip_m, loss_m = flank_contact(
             xm,
             vm,
             real(-1.0),
@@ -442,14 +486,16 @@ def kernels(real: Any) -> types.SimpleNamespace:
             w_CK[k],
             blade[0],
             blade[1],
-            A * above,
-            shrink,
+            A * share,
+            A * old_share,
+            growth,
+            rise,
             slip[i, 0],
             dt,
             P,
             knife,
         )
-        normal_p, friction_p, slip_p, loss_p, depth_p = flank_contact(
+        normal_p, friction_p, slip_p, loss_p = flank_contact(
             xp,
             vp,
             real(1.0),
@@ -459,8 +505,10 @@ def kernels(real: Any) -> types.SimpleNamespace:
             w_CK[k],
             blade[0],
             blade[1],
-            A * above,
-            shrink,
+            A * share,
+            A * old_share,
+            growth,
+            rise,
             slip[i, 1],
             dt,
             P,
@@ -468,14 +516,10 @@ def kernels(real: Any) -> types.SimpleNamespace:
         )
         slip[i, 0] = slip_m
         slip[i, 1] = slip_p
-        released -= (
-            real(0.5) * P[FLANK_STIFFNESS] * A * (above - above0) * (depth_m * depth_m + depth_p * depth_p)
-        )
 
         force[i, 0] = pull + real(0.5) * edge + normal_m + friction_m
         force[i, 1] = -pull + real(0.5) * edge + normal_p + friction_p
 
-        knife_y = vec3(R[0, 1], R[1, 1], R[2, 1])
         lateral[i] = -wp.dot(normal_m + normal_p + friction_m + friction_p, knife_y)
 
         edge_moment = wp.cross(arm, edge)
@@ -493,17 +537,19 @@ def kernels(real: Any) -> types.SimpleNamespace:
         total[i, 18] = total[i, 18] + edge_loss
         total[i, 19] = total[i, 19] + opening_loss
         total[i, 20] = total[i, 20] + loss_m + loss_p
-        total[i, 21] = total[i, 21] + released
-        total[i, 22] = A * D
+        total[i, 21] = A * D
+        total[i, 22] = A * share
+        for c in range(3):
+            total[i, 23 + c] = A * share * arm[c]
 
-    @wp.kernel(enable_backward=True)
+    @wp.kernel(enable_backward=False, module=module)
     def move_nodes(
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
         moving: wp.array(dtype=wp.int32),
-        element_force: wp.array(dtype=real),
+        element_force: wp.array(dtype=strided),
         element_start: wp.array(dtype=wp.int32),
-        element_entry: wp.array(dtype=wp.int32),
+        element_entry: wp.array(dtype=entries),
         point_force: wp.array(dtype=vec3),
         point_start: wp.array(dtype=wp.int32),
         point_entry: wp.array(dtype=wp.int32),
@@ -520,17 +566,26 @@ def kernels(real: Any) -> types.SimpleNamespace:
         internal_work: wp.array(dtype=real),
         x_next: wp.array(dtype=vec3),
         v_next: wp.array(dtype=vec3),
+        ahead: wp.array(dtype=vec3),
     ):
-        """Gathers the forces of each moving node and steps it, semi-implicit Euler."""
+        """Gathers the forces of each moving node and steps it, semi-implicit Euler.
+
+        Row k of `element_force` begins at the k-th number of the elements' forces. Entries come in
+        fours, filled up with a row of zeros.
+        """
         i = moving[wp.tid()]
         fx = real(0.0)
         fy = real(0.0)
         fz = real(0.0)
         for e in range(element_start[i], element_start[i + 1]):
             entry = element_entry[e]
-            fx += element_force[entry]
-            fy += element_force[entry + LANES]
-            fz += element_force[entry + 2 * LANES]
+            a = element_force[entry[0]]
+            b = element_force[entry[1]]
+            c = element_force[entry[2]]
+            d = element_force[entry[3]]
+            fx += (a[0] + b[0]) + (c[0] + d[0])
+            fy += (a[LANES] + b[LANES]) + (c[LANES] + d[LANES])
+            fz += (a[2 * LANES] + b[2 * LANES]) + (c[2 * LANES] + d[2 * LANES])
         internal = vec3(fx, fy, fz)
         f = internal + weight[i]
         for e in range(point_start[i], point_start[i + 1]):
@@ -540,29 +595,41 @@ def kernels(real: Any) -> types.SimpleNamespace:
         if board_area[i] > real(0.0):
             n = vec3(board[0], board[1], board[2])
             depth = board[3] - wp.dot(n, xi)
+            stiffness = P[BOARD_STIFFNESS] * board_area[i]
+            old = board_slip[i]
             slip = vec3()
+            lost = real(0.5) * stiffness * wp.dot(old, old)
             if depth > real(0.0):
-                stiffness = P[BOARD_STIFFNESS] * board_area[i]
                 sliding = (vi - wp.dot(vi, n) * n) * dt
-                slip, friction, lost = slide(
-                    board_slip[i], sliding, stiffness, P[BOARD_FRICTION] * stiffness * depth
+                slip = slide(
+                    old, sliding, stiffness, P[BOARD_FRICTION] * stiffness * depth
                 )
-                on_food = stiffness * depth * n + friction
+                on_food = stiffness * (depth * n - slip)
                 f += on_food
                 board_force[i] = board_force[i] + on_food
-                board_loss[i] = board_loss[i] + lost
+                lost += stiffness * (wp.dot(slip, sliding) - real(0.5) * wp.dot(slip, slip))
+            board_loss[i] = board_loss[i] + lost
             board_slip[i] = slip
         v1 = vi + f * (inverse_mass[i] * dt)
         # Trapezoidal rule for the work along the path, summed by parts.
         internal_work[i] = internal_work[i] + real(0.5) * wp.dot(internal, vi + v1) * dt
         v_next[i] = v1
-        x_next[i] = xi + v1 * dt
+        x1 = xi + v1 * dt
+        x_next[i] = x1
+        ahead[i] = x1 + P[DAMPING_TIME] * v1
 
-    @wp.kernel(enable_backward=True)
+    @wp.kernel(enable_backward=False, module=module)
     def bend_blade(
-        lateral: wp.array(dtype=real), P: wp.array(dtype=real), dt: real, blade: wp.array(dtype=real)
+        lateral: wp.array(dtype=real),
+        P: wp.array(dtype=real),
+        dt: real,
+        blade: wp.array(dtype=real),
+        blade_sums: wp.array(dtype=real),
     ):
-        """Steps the blade's lateral deflection and its rate, pushed by the flanks."""
+        """Steps the blade's lateral deflection and its rate, pushed by the flanks.
+
+        Adds to `blade_sums`: energy lost, force that reaches the knife's body, force of the flanks.
+        """
         F = real(0.0)
         for i in range(lateral.shape[0]):
             F += lateral[i]
@@ -571,17 +638,20 @@ def kernels(real: Any) -> types.SimpleNamespace:
         rate = rate / (real(1.0) + dt * P[BLADE_DAMPING] / m)
         blade[1] = rate
         blade[0] = blade[0] + dt * rate
+        blade_sums[0] = blade_sums[0] + P[BLADE_DAMPING] * rate * rate * dt
+        blade_sums[1] = blade_sums[1] + P[BLADE_STIFFNESS] * blade[0] + P[BLADE_DAMPING] * rate
+        blade_sums[2] = blade_sums[2] + F
 
-    @wp.kernel(enable_backward=False)
+    @wp.kernel(enable_backward=False, module=module)
     def point_energy(
         x: wp.array(dtype=vec3),
         nodes: wp.array2d(dtype=wp.int32),
         weights: wp.array(dtype=vec2),
         area: wp.array(dtype=real),
         toughness: wp.array(dtype=real),
-        width: wp.array2d(dtype=real),
         fraction: wp.array2d(dtype=real),
-        widest: wp.array(dtype=real),
+        centroid: wp.array2d(dtype=real),
+        unloading: wp.array(dtype=real),
         reach: real,
         per_spacing: real,
         P: wp.array(dtype=real),
@@ -592,6 +662,7 @@ def kernels(real: Any) -> types.SimpleNamespace:
         blade: wp.array(dtype=real),
         passed: wp.array(dtype=real),
         parted: wp.array(dtype=real),
+        edge_force: wp.array(dtype=real),
         slip: wp.array2d(dtype=vec3),
         energy: wp.array(dtype=real),
     ):
@@ -617,15 +688,14 @@ def kernels(real: Any) -> types.SimpleNamespace:
         knife_x = vec3(R[0, 0], R[1, 0], R[2, 0])
         knife_z = vec3(R[0, 2], R[1, 2], R[2, 2])
         arm = real(0.5) * (xm + xp) - p_CK[k]
-        s = passed[i]
+        share = real(0.0)
+        rise = real(0.0)
         if wp.abs(wp.dot(arm, knife_x)) < knife[7]:
             s = -wp.dot(arm, knife_z)
-        above = wp.min(table(fraction, i, (s + reach) * per_spacing), D)
-        unloading = toughness[i] * widest[i] / P[UNLOADING_LENGTH]
-        if unloading > real(0.0):
-            q = toughness[i] * (real(1.0) - parted[i]) * table(width, i, u)
-            q = wp.max(q - unloading * wp.max(passed[i] - s, real(0.0)), real(0.0))
-            doubled += q * q / unloading
+            share = table(fraction, i, (s + reach) * per_spacing)
+            rise = table(centroid, i, (s + reach) * per_spacing)
+        q = edge_force[i]
+        doubled += q * q / wp.max(unloading[i], TINY)
         facing = real(1.0)
         if R[1, 1] < real(0.0):
             facing = real(-1.0)
@@ -635,12 +705,12 @@ def kernels(real: Any) -> types.SimpleNamespace:
             if side == 1:
                 p = xp
                 sign = facing
-            r = wp.transpose(R) * (p - p_CK[k])
-            if wp.abs(r[0]) < knife[7]:
+            r = wp.transpose(R) * (p - p_CK[k] + vec3(real(0.0), real(0.0), rise))
+            if share > real(0.0) and wp.abs(r[0]) < knife[7]:
                 phi, _n = wedge(sign * (r[1] - blade[0]), -r[2], knife)
                 if phi < real(0.0):
                     held = slip[i, side]
-                    doubled += P[FLANK_STIFFNESS] * A * above * (phi * phi + wp.dot(held, held))
+                    doubled += P[FLANK_STIFFNESS] * A * share * (phi * phi + wp.dot(held, held))
         energy[i] = real(0.5) * doubled
 
     return types.SimpleNamespace(
@@ -649,6 +719,10 @@ def kernels(real: Any) -> types.SimpleNamespace:
         vec3=vec3,
         mat33=mat33,
         lanes=lanes,
+        indices=indices,
+        strided=strided,
+        entries=entries,
+        look_ahead=look_ahead,
         elements=elements,
         element_energy=element_energy,
         points=points,

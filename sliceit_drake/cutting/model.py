@@ -17,6 +17,9 @@ __all__ = ["CuttingModel", "Numerics", "TimeStepError", "make_cutting_model"]
 
 GRAVITY = 9.81
 
+SLIVER = 0.1
+"""Share of a vertex's mass below which a node of one side does not set the step."""
+
 
 class TimeStepError(ValueError):
     """The time step is beyond the stability limit; the message names the limit and the fix."""
@@ -69,7 +72,7 @@ class CuttingModel:
         computed: Node of `split` for each computed node [N].
         moving: Computed nodes that are not held [K].
         nodes: Rest positions of computed nodes [N, 3].
-        blocks: Node indices of elements, eight an entry [B, 4 * LANES].
+        blocks: Node indices of elements, eight an entry [B, 4, LANES].
         shape: Inverse rest edges (row major) and minus the material volume [B, 10, LANES].
         element_count: Elements without padding.
         true_mass, mass: Lumped true mass and the mass that is stepped [N], kg.
@@ -77,11 +80,13 @@ class CuttingModel:
         tables: Edge tables of the cut points.
         point_nodes, point_weights: Embedding of cut points [P, 4] (minus ends, plus ends), [P, 2].
         toughness: Surface energy of each cut point [P], J/m^2.
+        unloading: Slope of the edge's force when it retreats [P], N/m.
         board_area: Area of food surface that may rest on the board, by node [N], m^2.
         board: Board plane n . x = d in C: (n, d) [4].
         parameters: Scalars by name, see `kernels.PARAMETERS`.
         element_size: Mean edge length of computed elements, metres.
-        critical_time_step: Stability limit with the true masses, including the margin, s.
+        critical_time_step: Stability limit with the true masses, including the margin, s. Slivers do
+            not count: nodes with less than `SLIVER` of their vertex's mass get what they need.
     """
 
     split: SplitMesh
@@ -103,6 +108,7 @@ class CuttingModel:
     point_nodes: np.ndarray
     point_weights: np.ndarray
     toughness: np.ndarray
+    unloading: np.ndarray
     board_area: np.ndarray
     board: np.ndarray
     parameters: dict[str, float]
@@ -211,6 +217,9 @@ def make_cutting_model(
 
     scale = material.youngs_modulus / element_size
     toughness = np.full(len(split.points), material.toughness)
+    # Never flatter than the rise of the force on the way in, so that nothing is gained by a retreat.
+    steepest = (np.diff(tables.width, axis=1) / tables.spacing).max(1)
+    unloading = toughness * np.maximum(tables.width.max(1) / numerics.unloading_length, steepest)
     bond = numerics.bond_stiffness * scale
     strength = min(material.strength, 0.5 * np.sqrt(2.0 * max(material.toughness, 1e-12) * bond))
     mu, lam = material.stable_neo_hookean()
@@ -243,27 +252,32 @@ def make_cutting_model(
     parameters["blade_mass"] = max(
         knife.lateral_mass(), blade_need * (numerics.time_step / numerics.stability_margin) ** 2
     )
-    need = _stiffness_bound(t, inverse, volume, material)
+    bulk = 0.25 * _stiffness_bound(t, inverse, volume, material)
     per_point = tables.area * (2.0 * bond + 2.0 * parameters["flank_stiffness"])
-    per_point += 0.5 * toughness * tables.width.max(1) / numerics.unloading_length
+    per_point += 0.5 * unloading
+    contact = 2.0 * parameters["board_stiffness"] * board_area
     for side in range(2):
         for end in range(2):
-            np.add.at(need, point_nodes[:, 2 * side + end], per_point * point_weights[:, end])
-    need += 2.0 * parameters["board_stiffness"] * board_area
-    need /= 4.0
-    undamped = numerics.stability_margin * np.sqrt(true_mass[moving] / need[moving])
-    critical = float(undamped.min())
-    mass = true_mass.copy()
-    if numerics.mass_scaling:
-        mass = np.maximum(mass, need * (numerics.time_step / numerics.stability_margin) ** 2)
-    elif numerics.time_step > critical:
-        worst = moving[int(undamped.argmin())]
+            np.add.at(contact, point_nodes[:, 2 * side + end], per_point * point_weights[:, end])
+    # A step dt = margin x is stable if stiff x^2 + viscous x <= mass (explicit damping counts twice).
+    stiff = bulk * (1.0 + 2.0 * numerics.numerical_damping) + 0.25 * contact
+    viscous = 2.0 * material.damping_time * bulk
+    limit = _largest_step(true_mass, stiff, viscous)
+    sliver = true_mass < SLIVER * _vertex_mass(split, material)[split.node_source[computed]]
+    setting = moving[~sliver[moving]] if not sliver[moving].all() else moving
+    worst = setting[int(limit[setting].argmin())]
+    critical = numerics.stability_margin * float(limit[worst])
+    step = numerics.time_step
+    if not numerics.mass_scaling and step > critical:
         raise TimeStepError(
-            f"numerics.time_step = {numerics.time_step:.3g} s is beyond the stability limit "
-            f"{critical:.3g} s, set by the node at {nodes[worst]} m of the cut frame (true mass "
-            f"{true_mass[worst]:.3g} kg, stiffness bound {4 * need[worst]:.3g} N/m). Give at most "
-            f"{critical:.2g}, a coarser mesh, or mass_scaling: true."
+            f"numerics.time_step = {step:.3g} s is beyond the stability limit {critical:.3g} s, set "
+            f"by the node at {nodes[worst]} m of the cut frame (true mass {true_mass[worst]:.3g} kg, "
+            f"stiffness bound {4.0 * stiff[worst]:.3g} N/m). Give at most {critical:.2g}, a coarser "
+            "mesh, or mass_scaling: true."
         )
+    x = (step if numerics.mass_scaling else critical) / numerics.stability_margin
+    scaled = np.ones(len(nodes), bool) if numerics.mass_scaling else sliver
+    mass = np.where(scaled, np.maximum(true_mass, (stiff * x + viscous) * x), true_mass)
 
     blocks, shape = _blocks(t, inverse, volume)
     return CuttingModel(
@@ -286,12 +300,27 @@ def make_cutting_model(
         point_nodes=point_nodes,
         point_weights=point_weights,
         toughness=toughness,
+        unloading=unloading,
         board_area=board_area,
         board=board,
         parameters=parameters,
         element_size=element_size,
         critical_time_step=critical,
     )
+
+
+def _largest_step(mass: np.ndarray, stiff: np.ndarray, viscous: np.ndarray) -> np.ndarray:
+    """Positive root x of stiff x^2 + viscous x = mass [N], s."""
+    return 2.0 * mass / (viscous + np.sqrt(viscous**2 + 4.0 * stiff * mass))
+
+
+def _vertex_mass(split: SplitMesh, material: Material) -> np.ndarray:
+    """Lumped mass of the vertices of the uncut mesh [V], kg."""
+    volume = TetrahedralMesh(split.vertex_position, split.source_tetrahedra).volumes()
+    mass = np.zeros(len(split.vertex_position))
+    share = 0.25 * material.density * volume[:, None]
+    np.add.at(mass, split.source_tetrahedra, np.repeat(share, 4, axis=1))
+    return mass
 
 
 def _downward_area(split: SplitMesh, up_C: np.ndarray) -> np.ndarray:
@@ -332,7 +361,7 @@ def _blocks(
     count = len(tetrahedra)
     padded = -(-count // LANES) * LANES
     fill = np.minimum(np.arange(padded), count - 1)
-    blocks = tetrahedra[fill].reshape(-1, LANES, 4).transpose(0, 2, 1).reshape(-1, 4 * LANES)
+    blocks = tetrahedra[fill].reshape(-1, LANES, 4).transpose(0, 2, 1)
     weight = np.where(np.arange(padded) < count, -volume[fill], 0.0)
     values = np.concatenate([inverse[fill].reshape(padded, 9), weight[:, None]], axis=1)
     return blocks, values.reshape(-1, LANES, 10).transpose(0, 2, 1)

@@ -32,8 +32,7 @@ class EnergyLedger:
     Attributes:
         work: Done by the knife on the food.
         gravity: Done by the food's weight.
-        edge, opening, friction, board_friction: Dissipated.
-        released: Taken up by the growth of the cut.
+        edge, opening, friction, board_friction, blade: Dissipated.
         internal: Done by the bulk's forces on the nodes.
     """
 
@@ -43,7 +42,7 @@ class EnergyLedger:
     opening: float = 0.0
     friction: float = 0.0
     board_friction: float = 0.0
-    released: float = 0.0
+    blade: float = 0.0
     internal: float = 0.0
 
     def add(self, step: Exchange) -> None:
@@ -54,7 +53,7 @@ class EnergyLedger:
         self.opening += step.opening_dissipation
         self.friction += step.friction_dissipation
         self.board_friction += step.board_dissipation
-        self.released += step.released
+        self.blade += step.blade_dissipation
         self.internal += step.internal_work
 
     def damping(self, energies: Energies) -> float:
@@ -64,7 +63,7 @@ class EnergyLedger:
     def imbalance(self, energies: Energies) -> float:
         """Work put in minus everything that it went into; 0 if the books close."""
         stored = energies.elastic + energies.interface + energies.kinetic
-        spent = self.edge + self.opening + self.friction + self.board_friction + self.released
+        spent = self.edge + self.opening + self.friction + self.board_friction + self.blade
         return self.work + self.gravity - stored - spent - self.damping(energies)
 
 
@@ -118,11 +117,31 @@ def check_clear(model: CuttingModel, X_CK: Pose) -> None:
         )
 
 
+def _check_ends(model: CuttingModel, X_CK: Pose, time: float) -> None:
+    """Refuses an end of the edge inside the section: the model cuts with the edge, not with an end.
+
+    Raises:
+        CuttingError: With the end and the remedy.
+    """
+    points = model.split.points
+    low, high = points[:, 0].min(), points[:, 0].max()
+    for end in (-0.5, 0.5):
+        x, _, z = X_CK.p + end * model.knife.length * X_CK.R[:, 0]
+        if low < x < high and z < model.top:
+            raise CuttingError(
+                f"at {time:.4g} s an end of the knife is over the cut, {1e3 * (x - low):.3g} mm from "
+                "its side: only the edge between the ends cuts. Use a longer knife "
+                f"(knife.length = {model.knife.length:.4g} m), a shorter draw, or start it nearer to "
+                "the other end."
+            )
+
+
 def check_in_plane(model: CuttingModel, X_CK: Pose, time: float) -> None:
     """Refuses a knife that left the plane that the model can cut.
 
     Raises:
-        CuttingError: The edge is in the food and the blade is off the plane or turned out of it.
+        CuttingError: The edge is in the food and the blade is off the plane, turned out of it, or
+            drawn so far that one of its ends is over the cut.
     """
     if X_CK.p[2] > model.top or X_CK.p[2] < model.bottom - model.knife.height:
         return
@@ -135,6 +154,7 @@ def check_in_plane(model: CuttingModel, X_CK: Pose, time: float) -> None:
             f"{1e3 * LATERAL_LIMIT:g} mm and {TILT_LIMIT:g} rad. Give the knife's path the plane "
             "of the cut."
         )
+    _check_ends(model, X_CK, time)
 
 
 def check_energies(
@@ -214,7 +234,10 @@ def simulate_slice(
         rows[k, 4:7], rows[k, 7:10] = R_FC @ step.wrench[:3], R_FC @ step.wrench[3:]
         if board is not None:
             v = R_FC @ (end.p - pose.p) / T
-            rows[k, 10:16] = board_wrench(board, model.knife, R_FC @ end.R, rows[k, 1:4], v, 0 * v)
+            dR = end.R @ pose.R.T
+            turn = np.array([dR[2, 1] - dR[1, 2], dR[0, 2] - dR[2, 0], dR[1, 0] - dR[0, 1]])
+            w = R_FC @ turn * (0.5 / T)
+            rows[k, 10:16] = board_wrench(board, model.knife, R_FC @ end.R, rows[k, 1:4], v, w)
         else:
             rows[k, 10:16] = 0.0
         for column, wrench in ((16, step.edge), (19, step.normal), (22, step.friction)):

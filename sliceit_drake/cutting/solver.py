@@ -3,13 +3,12 @@
 import dataclasses as dc
 import math
 import threading
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from sliceit_drake.cutting.kernels import ACCUMULATED, LANES, PARAMETERS, kernels
+from sliceit_drake.cutting.kernels import ACCUMULATED, GATHER, LANES, PARAMETERS, kernels
 from sliceit_drake.cutting.model import CuttingModel, TimeStepError
 from sliceit_drake.cutting.motion import Pose
 
@@ -30,8 +29,8 @@ class Exchange:
         edge, normal, friction: The same, by mechanism; they sum to `wrench`.
         work: Work done by the knife on the food, J.
         edge_dissipation, opening_dissipation, friction_dissipation: J, each never negative.
-        released: Energy of bonds and contacts taken up by the growth of the cut, J.
         internal_work: Work of the bulk's forces (elastic and damping) on the nodes, J.
+        blade_dissipation: In the bending blade, J.
         board_force: Mean force of the board on the food [3], N.
         board_dissipation: Friction of the food on the board, J.
         gravity_work: Work of the weight, J.
@@ -47,8 +46,8 @@ class Exchange:
     edge_dissipation: float
     opening_dissipation: float
     friction_dissipation: float
-    released: float
     internal_work: float
+    blade_dissipation: float
     board_force: np.ndarray
     board_dissipation: float
     gravity_work: float
@@ -122,6 +121,7 @@ class CuttingSolver:
             ("v", N, vec3, 3),
             ("passed", P, real, 1),
             ("parted", P, real, 1),
+            ("edge_force", P, real, 1),
             ("slip", 2 * P, vec3, 3),
             ("board_slip", N, vec3, 3),
             ("blade", 2, real, 1),
@@ -148,14 +148,23 @@ class CuttingSolver:
             start += n * width
 
         B = len(m.blocks)
-        self._force = wp.zeros(B * 12 * LANES, dtype=real, device=self._device)
+        # Padded with a row of zeros, which fills up the nodes' lists of entries.
+        self._force = wp.zeros((B * 12 + 3) * LANES, dtype=real, device=self._device)
         self._w["element_force"] = self._view(self._force, 0, k.lanes, B * 12).reshape((B, 12))
+        self._w["node_force"] = wp.array(
+            ptr=self._force.ptr,
+            dtype=k.strided,
+            shape=(B * 12 * LANES + 1,),
+            strides=(np.dtype(self.dtype).itemsize,),
+            device=self._device,
+        )
         # Sums over an exchange, contiguous so that one call clears and one call reads them.
         sums = [
             ("total", P * ACCUMULATED, real, 1),
             ("board_force", N, vec3, 3),
             ("board_loss", N, real, 1),
             ("internal_work", N, real, 1),
+            ("blade_sums", 3, real, 1),
         ]
         self._sums = wp.zeros(sum(c * w for _, c, _, w in sums), dtype=real, device=self._device)
         start = 0
@@ -166,6 +175,7 @@ class CuttingSolver:
             start += count * width
         self._w["total"] = self._w["total"].reshape((P, ACCUMULATED))
 
+        self._w["ahead"] = wp.zeros(N, dtype=vec3, device=self._device)
         self._w["point_force"] = wp.zeros((P, 2), dtype=vec3, device=self._device)
         self._w["lateral"] = wp.zeros(P, dtype=real, device=self._device)
         self._w["energy"] = wp.zeros((B, LANES), dtype=real, device=self._device)
@@ -177,10 +187,10 @@ class CuttingSolver:
         element_start, element_entry = _element_gather(m.blocks, m.element_count, N)
         point_start, point_entry, point_weight = _point_gather(m.point_nodes, m.point_weights, N)
         arrays: dict[str, tuple[np.ndarray, Any]] = {
-            "nodes": (m.blocks.astype(np.int32), wp.int32),
+            "nodes": (m.blocks.astype(np.int32), k.indices),
             "moving": (m.moving.astype(np.int32), wp.int32),
             "element_start": (element_start, wp.int32),
-            "element_entry": (element_entry, wp.int32),
+            "element_entry": (element_entry, k.entries),
             "point_start": (point_start, wp.int32),
             "point_entry": (point_entry, wp.int32),
             "point_weight": (point_weight, real),
@@ -194,7 +204,8 @@ class CuttingSolver:
             "toughness": (m.toughness, real),
             "width": (m.tables.width, real),
             "fraction": (m.tables.fraction, real),
-            "widest": (m.tables.width.max(1), real),
+            "centroid": (m.tables.rise, real),
+            "unloading": (m.unloading, real),
             "P": (np.array([m.parameters[name] for name in PARAMETERS]), real),
             "knife": (m.knife.parameters(), real),
         }
@@ -204,6 +215,7 @@ class CuttingSolver:
         self._w["shape"] = self._array(m.shape, k.lanes)
         self._centre = np.average(m.split.points, axis=0, weights=m.tables.area).tolist()
         self._weight = m.weight.ravel().astype(self.dtype)
+        self._ones = np.ones(N)
         self._share = np.arange(1, n + 1)[:, None] / n
 
     def _view(self, base: wp.array, start: int, dtype: Any, count: int) -> wp.array:
@@ -231,44 +243,78 @@ class CuttingSolver:
         return np.asarray(state[self._layout["v"]]).reshape(-1, 3)
 
     def field(self, state: np.ndarray, name: str) -> np.ndarray:
-        """A part of the state by name: x, v, passed, parted, slip, board_slip, blade, direction."""
+        """A part of the state by name: x, v, passed, parted, edge_force, slip,
+        board_slip, blade, direction."""
         return state[self._layout[name]]
 
     def _launch_substep(self, k: int) -> None:
         w, kern, m = self._w, self._kernels, self.model
         dt = self.real(self.exchange_period / self.substeps)
-        launch: Callable[..., None] = lambda kernel, dim, inputs: wp.launch(  # noqa: E731
-            kernel, dim=dim, inputs=inputs, device=self._device
-        )
-        launch(
-            kern.elements,
-            len(m.blocks),
-            [w["x"], w["v"], w["nodes"], w["shape"], w["P"], w["element_force"]],
-        )
-        launch(
-            kern.points,
-            len(m.point_nodes),
-            [w["x"], w["v"], w["point_nodes"], w["point_weights"], w["area"], w["toughness"]]
-            + [w["width"], w["fraction"], w["widest"], self.real(m.tables.reach)]
-            + [self.real(1.0 / m.tables.spacing), w["P"], w["knife"], k, dt]
-            + [w[name] for name in ("R_CK", "p_CK", "v_CK", "w_CK", "direction")]
-            + [w["blade"], w["passed"], w["parted"], w["slip"]]
-            + [w["point_force"], w["lateral"], w["total"]],
-        )
-        launch(
+        self._launch_elements()
+        self._launch_points(k, dt)
+        self._launch(
             kern.move_nodes,
             len(m.moving),
-            [w["x"], w["v"], w["moving"], self._force, w["element_start"], w["element_entry"]]
+            [w["x"], w["v"], w["moving"], w["node_force"], w["element_start"], w["element_entry"]]
             + [w["point_force"].flatten(), w["point_start"], w["point_entry"], w["point_weight"]]
             + [w["inverse_mass"], w["weight"], w["board_area"], w["board"], w["P"], dt]
             + [w["board_slip"], w["board_force"], w["board_loss"], w["internal_work"]]
-            + [w["x"], w["v"]],
+            + [w["x"], w["v"], w["ahead"]],
         )
-        launch(kern.bend_blade, 1, [w["lateral"], w["P"], dt, w["blade"]])
+        blade = [w["lateral"], w["P"], dt, w["blade"], w["blade_sums"]]
+        self._launch(kern.bend_blade, 1, blade)
+
+    def _launch(self, kernel: Any, dim: int | tuple[int, int], inputs: list[Any]) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, device=self._device)
+
+    def _launch_look_ahead(self) -> None:
+        w = self._w
+        inputs = [w["x"], w["v"], w["P"], w["ahead"]]
+        self._launch(self._kernels.look_ahead, len(self.model.nodes), inputs)
+
+    def _launch_elements(self) -> None:
+        w = self._w
+        inputs = [w["ahead"], w["nodes"], w["shape"], w["P"], w["element_force"]]
+        self._launch(self._kernels.elements, len(self.model.blocks), inputs)
+
+    def _launch_points(self, k: int, dt: Any) -> None:
+        w, tables = self._w, self.model.tables
+        self._launch(
+            self._kernels.points,
+            len(self.model.point_nodes),
+            [w["x"], w["v"], w["point_nodes"], w["point_weights"], w["area"], w["toughness"]]
+            + [w["width"], w["fraction"], w["centroid"], w["unloading"]]
+            + [self.real(tables.reach), self.real(1.0 / tables.spacing)]
+            + [w["P"], w["knife"], k, dt]
+            + [w[name] for name in ("R_CK", "p_CK", "v_CK", "w_CK", "direction")]
+            + [w["blade"], w["passed"], w["parted"], w["edge_force"], w["slip"]]
+            + [w["point_force"], w["lateral"], w["total"]],
+        )
+
+    def _load(self, state: np.ndarray) -> None:
+        """Copies a state into the workspace."""
+        self._write(self._state, state[: self._layout["direction"].start])
+
+    def _place(self, pose: Pose, state: np.ndarray) -> None:
+        """Puts the knife at rest at `pose` for launches with k = 0."""
+        n = self.substeps
+        motion = np.zeros(21 * n, self.dtype)
+        motion[:9] = pose.R.ravel()
+        motion[9 * n : 9 * n + 3] = pose.p
+        motion[18 * n : 18 * n + 3] = state[self._layout["direction"]]
+        self._write(self._motion, motion)
+
+    def _write(self, array: wp.array, values: np.ndarray) -> None:
+        if self._device.is_cpu:
+            # A view; `assign` would wrap the values in an array of its own first.
+            array.numpy()[:] = values
+        else:
+            array.assign(values.astype(self.dtype))
 
     def _capture(self) -> None:
         wp.load_module(self._kernels.elements.module, device=self._device)
         with wp.ScopedCapture(device=self._device) as capture:
+            self._launch_look_ahead()
             for k in range(self.substeps):
                 self._launch_substep(k)
         self._graph = capture.graph
@@ -289,8 +335,8 @@ class CuttingSolver:
         with self._lock:
             if self._graph is None:
                 self._capture()
-            self._state.assign(state[: self._layout["direction"].start].astype(self.dtype))
-            self._motion.assign(motion)
+            self._load(state)
+            self._write(self._motion, motion)
             self._sums.zero_()
             wp.capture_launch(self._graph)
             new = np.empty(self.state_size, self.dtype)
@@ -308,6 +354,13 @@ class CuttingSolver:
             np.concatenate([impulse[9 + 3 * i : 12 + 3 * i], impulse[3 * i : 3 * i + 3]])
             for i in range(3)
         ]
+        # The flanks push the blade, and the blade's spring and damper the knife's body. The difference
+        # acts at the middle of the buried flanks.
+        blade_loss, to_body, from_flanks = sums[self._sum_layout["blade_sums"]]
+        lateral = (to_body - from_flanks) / n * end.R[:, 1]
+        if total[22] > 0.0:
+            wrenches[1][:3] += np.cross(total[23:26] / total[22], lateral)
+        wrenches[1][3:] += lateral
         wrench = wrenches[0] + wrenches[1] + wrenches[2]
         # Moments are about Ko at each sub-step; the mean position of Ko is half a period back.
         work = -float(wrench[3:] @ v + wrench[:3] @ w) * T
@@ -322,12 +375,12 @@ class CuttingSolver:
             edge_dissipation=float(total[18]),
             opening_dissipation=float(total[19]),
             friction_dissipation=float(total[20]),
-            released=float(total[21]),
             internal_work=float(sums[self._sum_layout["internal_work"]].sum()),
-            board_force=sums[self._sum_layout["board_force"]].reshape(-1, 3).sum(0) / n,
+            blade_dissipation=float(blade_loss),
+            board_force=self._ones @ sums[self._sum_layout["board_force"]].reshape(-1, 3) / n,
             board_dissipation=float(sums[self._sum_layout["board_loss"]].sum()),
             gravity_work=float(self._weight @ (new[nodes] - state[nodes])),
-            cut=float(total[22]) / m.section_area,
+            cut=float(total[21]) / m.section_area,
         )
 
     def _interpolate(
@@ -400,27 +453,21 @@ class CuttingSolver:
         """Energies of `state` with the knife at `pose`."""
         w, kern, m = self._w, self._kernels, self.model
         with self._lock:
-            self._state.assign(state[: self._layout["direction"].start].astype(self.dtype))
-            motion = self._motion.numpy().copy()
-            n = self.substeps
-            motion[:9] = pose.R.ravel()
-            motion[9 * n : 9 * n + 3] = pose.p
-            self._motion.assign(motion)
-            wp.launch(
+            self._load(state)
+            self._place(pose, state)
+            self._launch(
                 kern.element_energy,
-                dim=(len(m.blocks), LANES),
-                inputs=[w["x"], w["nodes"], w["shape"], w["P"], w["energy"], w["volume_ratio"]],
-                device=self._device,
+                (len(m.blocks), LANES),
+                [w["x"], w["nodes"], w["shape"], w["P"], w["energy"], w["volume_ratio"]],
             )
-            wp.launch(
+            self._launch(
                 kern.point_energy,
-                dim=len(m.point_nodes),
-                inputs=[w["x"], w["point_nodes"], w["point_weights"], w["area"], w["toughness"]]
-                + [w["width"], w["fraction"], w["widest"], self.real(m.tables.reach)]
-                + [self.real(1.0 / m.tables.spacing), w["P"], w["knife"], w["R_CK"], w["p_CK"]]
-                + [0, w["blade"], w["passed"], w["parted"], w["slip"]]
-                + [w["point_energy"]],
-                device=self._device,
+                len(m.point_nodes),
+                [w["x"], w["point_nodes"], w["point_weights"], w["area"], w["toughness"]]
+                + [w["fraction"], w["centroid"], w["unloading"]]
+                + [self.real(m.tables.reach), self.real(1.0 / m.tables.spacing)]
+                + [w["P"], w["knife"], w["R_CK"], w["p_CK"], 0, w["blade"]]
+                + [w["passed"], w["parted"], w["edge_force"], w["slip"], w["point_energy"]],
             )
             elastic = w["energy"].numpy().astype(np.float64).sum()
             ratio = w["volume_ratio"].numpy().ravel()[: m.element_count]
@@ -444,42 +491,52 @@ class CuttingSolver:
             least_element=least,
         )
 
-    def held_reaction(self, state: np.ndarray) -> np.ndarray:
-        """Force of what holds the food on the food [3], N, in C, from the bulk's forces."""
+    def held_reaction(self, state: np.ndarray, pose: Pose) -> np.ndarray:
+        """Force of what holds the food on the food [3], N, in C, with the knife at `pose`."""
         w, m = self._w, self.model
         with self._lock:
-            self._state.assign(state[: self._layout["direction"].start].astype(self.dtype))
-            wp.launch(
-                self._kernels.elements,
-                dim=len(m.blocks),
-                inputs=[w["x"], w["v"], w["nodes"], w["shape"], w["P"], w["element_force"]],
-                device=self._device,
-            )
-            force = self._force.numpy().astype(np.float64).reshape(-1, 4, 3, LANES)
+            self._load(state)
+            self._place(pose, state)
+            self._launch_look_ahead()
+            self._launch_elements()
+            # A step of no duration changes no history; what it writes stays in the workspace.
+            self._launch_points(0, self.real(0.0))
+            forces = self._force.numpy()[: len(m.blocks) * 12 * LANES].astype(np.float64)
+            point_forces = w["point_force"].numpy().astype(np.float64)
         held = np.ones(len(m.nodes), bool)
         held[m.moving] = False
-        at_held = held[m.blocks.reshape(-1, 4, LANES)]
-        internal = (force * at_held[:, :, None, :]).sum((0, 1, 3))
-        return -internal - m.weight[held].sum(0)
+        at_held = held[m.blocks]
+        on_held = (forces.reshape(-1, 4, 3, LANES) * at_held[:, :, None, :]).sum((0, 1, 3))
+        share = (held[m.point_nodes].reshape(-1, 2, 2) * m.point_weights[:, None, :]).sum(2)
+        on_held += (point_forces * share[:, :, None]).sum((0, 1)) + m.weight[held].sum(0)
+        return -on_held
 
 
 def _element_gather(
     blocks: np.ndarray, count: int, node_count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """For each node, where its entries stand in the element forces (x; y and z follow)."""
+    """For each node, where its entries stand in the element forces, in rows of `GATHER`.
+
+    Returns:
+        First row of each node and the end [N + 1], and the rows [M, GATHER]; what is left of a row
+        points behind the forces.
+    """
     B = len(blocks)
-    nodes = blocks.reshape(B, 4, LANES)
     entry = (
         np.arange(B)[:, None, None] * 12 * LANES
         + np.arange(4)[None, :, None] * 3 * LANES
         + np.arange(LANES)[None, None, :]
     )
     real = (np.arange(B)[:, None, None] * LANES + np.arange(LANES)[None, None, :]) < count
-    real = np.broadcast_to(real, nodes.shape)
-    node, entry = nodes[real], entry[real]
+    real = np.broadcast_to(real, blocks.shape)
+    node, entry = blocks[real], entry[real]
     order = np.argsort(node, kind="stable")
-    start = np.concatenate([[0], np.cumsum(np.bincount(node, minlength=node_count))])
-    return start.astype(np.int32), entry[order].astype(np.int32)
+    number = np.bincount(node, minlength=node_count)
+    start = np.concatenate([[0], np.cumsum(-(-number // GATHER))])
+    rank = np.arange(len(node)) - np.repeat(np.cumsum(number) - number, number)
+    rows = np.full(start[-1] * GATHER, B * 12 * LANES)
+    rows[start[node[order]] * GATHER + rank] = entry[order]
+    return start.astype(np.int32), rows.reshape(-1, GATHER).astype(np.int32)
 
 
 def _point_gather(

@@ -317,7 +317,7 @@ def _cutting_summary(run: Run, record: Record) -> dict:
         "work_of_cutting_J": work,
         "work_by_mechanism_J": {
             name: float(record[f"energy_{name}"][-1])
-            for name in ("edge", "opening", "friction", "board_friction", "released")
+            for name in ("edge", "opening", "friction", "board_friction", "blade")
         },
         "work_per_area_J_m2": work / model.section_area,
         "energy_ratio": float(record["energy_largest_energy_ratio"][-1]),

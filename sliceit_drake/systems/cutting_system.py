@@ -23,7 +23,7 @@ LEDGER_NAMES = (
     "opening",
     "friction",
     "board_friction",
-    "released",
+    "blade",
     "internal",
 )
 ENERGY_NAMES = ("elastic", "interface", "kinetic", "largest_energy_ratio", "least_volume_ratio")
@@ -158,7 +158,7 @@ class CuttingSystem(KnifeForceSystem):
             step.opening_dissipation,
             step.friction_dissipation,
             step.board_dissipation,
-            step.released,
+            step.blade_dissipation,
             step.internal_work,
         ]
         ledger = context.get_discrete_state(self._ledger).value() + change
