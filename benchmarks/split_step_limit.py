@@ -124,7 +124,9 @@ def draw(relative: dict[str, dict[str, np.ndarray]], output: Path) -> None:
     styles = {"all": ("0.35", "all terms"), "bulk": ("#e69f00", "bulk alone")}
     for key, (colour, label) in styles.items():
         values = np.concatenate([body[key] for body in relative.values()])
-        axes.hist(values, bins=bins, color=colour, alpha=0.75, label=f"{label}, least {values.min():.2f}")
+        axes.hist(
+            values, bins=bins, color=colour, alpha=0.75, label=f"{label}, least {values.min():.2f}"
+        )
     axes.set_xscale("log")
     axes.set_xlabel("step limit / limit of the uncut body")
     axes.set_ylabel("planes")

@@ -60,6 +60,15 @@ class Knife:
                 field=f"{where}.edge_thickness",
                 fix="Give the thickness of the bevel's shoulder, as 8e-5.",
             )
+        # The distance is that of a convex section: the bevel must be blunter than the flank.
+        slender = self.edge_thickness * self.height / (self.spine_thickness - self.edge_thickness)
+        if self.tip_height > slender:
+            raise ConfigurationError(
+                f"= {self.tip_height} m makes the edge bevel more slender than the flanks; the "
+                "section must be convex",
+                field=f"{where}.tip_height",
+                fix=f"Give at most edge_thickness * height / (spine - edge thickness), {slender:.4g} m.",
+            )
         limit = 0.5 * min(self.edge_thickness, self.tip_height)
         if self.edge_radius > limit:
             raise ConfigurationError(
