@@ -1,4 +1,4 @@
-"""Step limit of cuts by random planes: how far slivers of the split lower it, and through which term.
+"""Step limit of cuts by random planes: how far the split lowers it, and through which term.
 
 Each plane through a box, a cylinder or an ellipsoid gives a cutting model; its limit with the true
 masses (`CuttingModel.critical_time_step`) is compared with that of the whole, uncut body. Terms are

@@ -38,8 +38,8 @@ def cut(mesh: TetrahedralMesh, plane: CutPlane) -> tuple[SplitMesh, EdgeTables]:
 def section_width(mesh: TetrahedralMesh, plane: CutPlane, heights: np.ndarray) -> np.ndarray:
     """Width of a convex body's section along Cx at heights in C, clipped from its own tetrahedra.
 
-    The line at a height runs through a tetrahedron where all four barycentric coordinates, which are
-    linear along it, are positive.
+    The line at a height runs through a tetrahedron where all four barycentric coordinates, linear
+    along it, are positive.
     """
     R = plane.rotation()
     corners = ((mesh.vertices - plane.point) @ R)[mesh.tetrahedra]

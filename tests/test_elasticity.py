@@ -90,7 +90,7 @@ def settle(solver: CuttingSolver, state: np.ndarray, exchanges: int) -> np.ndarr
 
 
 def pressed(solver: CuttingSolver, expected: np.ndarray) -> np.ndarray:
-    """At rest after the held nodes went from their rest positions to `expected` little by little."""
+    """At rest after the held nodes went from rest to `expected` little by little."""
     model = solver.model
     state = solver.initial_state()
     still = np.setdiff1d(np.arange(len(model.nodes)), model.moving)
@@ -207,8 +207,8 @@ def test_bar_pressed_between_its_held_ends_is_a_spring_in_series_with_its_uncut_
 
 
 def test_bar_standing_on_the_board_shrinks_under_its_weight_as_betti_says():
-    # For a bar on a frictionless base the mean shortening is rho g L^2 / 2E for any Poisson's ratio,
-    # exactly, also of linear elements: uniform compression is among their fields.
+    # On a frictionless base the mean shortening is rho g L^2 / 2E for any Poisson's ratio, exactly,
+    # also of linear elements: uniform compression is among their fields.
     length = 0.03
     mesh = box_mesh(np.linspace(-0.01, 0.01, 5), np.linspace(-0.008, 0.008, 4), length * UNEVEN)
     plane = CutPlane(np.zeros(3), np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))

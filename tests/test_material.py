@@ -24,7 +24,7 @@ def deformations(count: int, size: float, seed: int = 1) -> np.ndarray:
 
 
 def derivative(function, at: np.ndarray, step: float) -> np.ndarray:
-    """Central differences of `function` with respect to a matrix [3, 3]; leading axes from the result."""
+    """Central differences of `function` with respect to a matrix [3, 3]."""
     out = []
     for k in range(9):
         d = np.zeros(9)

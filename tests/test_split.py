@@ -1,4 +1,4 @@
-"""The split: volume, mass, section and bodies over 1,000 planes; planes through vertices and faces."""
+"""The split: volume, mass, section and bodies over 1,000 planes, and planes through vertices."""
 
 import functools
 

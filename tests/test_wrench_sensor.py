@@ -81,7 +81,7 @@ class Rig:
 
     def reading(self, simulator: Simulator) -> SpatialForce:
         context = self.sensor.GetMyContextFromRoot(simulator.get_context())
-        return self.sensor.get_output_port().Eval(context)
+        return self.sensor.GetOutputPort("sensor_wrench").Eval(context)
 
     def poses(self, simulator: Simulator) -> tuple[RigidTransform, RigidTransform]:
         """X_WS and X_WK."""
@@ -131,7 +131,7 @@ def make_rig(
     )
     builder.Connect(plant.get_reaction_forces_output_port(), system.get_input_port())
     reader = builder.AddSystem(Reader())
-    builder.Connect(system.get_output_port(), reader.get_input_port())
+    builder.Connect(system.GetOutputPort("sensor_wrench"), reader.get_input_port())
     return Rig(builder.Build(), plant, robot, system, reader)
 
 
@@ -289,7 +289,7 @@ def test_a_weld_with_an_offset_is_moved_to_the_sensors_frame():
     simulator = Simulator(builder.Build())
     simulator.AdvanceTo(0.01)
     assert slide.get_translation(plant.GetMyContextFromRoot(simulator.get_context())) == 0.0
-    reading = sensor.get_output_port().Eval(sensor.GetMyContextFromRoot(simulator.get_context()))
+    reading = sensor.GetOutputPort("sensor_wrench").Eval(sensor.GetMyContextFromRoot(simulator.get_context()))
     weight = mass * GRAVITY
     np.testing.assert_allclose(reading.translational(), weight, atol=1e-9)
     moment = np.cross(X_SJ @ p_ToolCentre, weight)

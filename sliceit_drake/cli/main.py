@@ -1,6 +1,7 @@
 """Entry point of `sliceit`: parses the command line and turns bad input into a message."""
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 
@@ -35,6 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         0 on success, 1 if a run stopped early, 2 for bad input, 130 for Ctrl-C outside a run.
     """
+    # The arrays are small; threads of the linear algebra library would only wait beside the run.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     options = make_parser().parse_args(arguments)
     try:
         return options.run(options)

@@ -1,14 +1,14 @@
 """Tables of the cut surface: how much of the blade's edge each cut point carries.
 
-The section is triangulated by the cut points with hat functions N_i. When the edge, a line along Cx,
-lies s below point i in the rest configuration, the point carries
+The section is triangulated by the cut points with hat functions N_i. When the edge, a line along
+Cx, lies s below point i in the rest configuration, the point carries
 
     T_i(s) = integral of N_i along the edge.
 
-The hats are a partition of unity, so the T_i of all points sum to the section's width at the edge for
-any mesh, and the integral of T_i over s is the point's area A_i. The traction that parts the surface
-is then toughness times T_i at the largest s so far: pressing through gives toughness times width with
-no ripple from the mesh, and R A_i of work at each point (docs/physics.md, "Edge").
+The hats are a partition of unity, so the T_i of all points sum to the section's width at the edge
+for any mesh, and the integral of T_i over s is the point's area A_i. The force that parts the
+surface is then toughness times T_i at the largest s so far: pressing through gives toughness times
+width with no ripple from the mesh, and R A_i of work at each point (docs/physics.md, "Edge").
 """
 
 import dataclasses as dc
@@ -84,8 +84,10 @@ def edge_tables(
         carried = (chord * 0.5 * hat).reshape(len(triangles), grid, oversampling).mean(-1)
         np.add.at(width, triangles[:, k], carried)
 
+    # A point between two lines carries all of its area at its own height, so that it too is cut.
+    width[~width.any(1), grid // 2] = 1.0
     total = 0.5 * spacing * (width[:, 1:] + width[:, :-1]).sum(1, keepdims=True)
-    width *= np.divide(area[:, None], total, out=np.zeros_like(total), where=total > 0.0)
+    width *= area[:, None] / total
     cut = _integral(width, spacing)
     # The centroid of the part that is cut lies the mean of s - s' above the edge, weight T_i(s').
     above_edge = np.divide(

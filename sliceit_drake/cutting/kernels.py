@@ -127,8 +127,9 @@ def kernels(real: Any) -> types.SimpleNamespace:
     ):
         """Nodal forces of eight elements: minus the gradient of the energy at x.
 
-        `x` is `ahead`: positions plus tau times velocities. Evaluating at x + tau v is Kelvin-Voigt damping with viscosity tau times the tangent stiffness;
-        invariant under translation, and under rotation to second order in tau times its rate.
+        `x` is `ahead`: positions plus tau times velocities. Evaluating at x + tau v is Kelvin-Voigt
+        damping with viscosity tau times the tangent stiffness; invariant under translation, and
+        under rotation to second order in tau times its rate.
         """
         block = wp.tid()
         mu = P[MU]
@@ -392,10 +393,11 @@ def kernels(real: Any) -> types.SimpleNamespace:
         """Edge, opening, self contact, flank contact and friction at each cut point.
 
         Advances the history: `passed`, the largest depth of the edge below the point; `parted`, the
-        share of the surface energy spent by opening; `edge_force`; `slip`, from the friction anchors. Adds to
-        `total`: forces on the knife by edge, flank pressure, friction [0:9], their moments about Ko
-        [9:18], and energies dissipated by the edge 18, by opening 19, by friction 20. Writes the
-        area that is cut 21, the part of it above the edge 22, and its moment about Ko [23:26].
+        share of the surface energy spent by opening; `edge_force`; `slip`, from the friction
+        anchors. Adds to `total`: forces on the knife by edge, flank pressure, friction [0:9], their
+        moments about Ko [9:18], and energies dissipated by the edge 18, by opening 19, by friction
+        20. Writes the area that is cut 21, the part of it above the edge 22, and its moment about
+        Ko [23:26].
         """
         i = wp.tid()
         w = weights[i]

@@ -67,7 +67,7 @@ class Knife:
                 f"= {self.tip_height} m makes the edge bevel more slender than the flanks; the "
                 "section must be convex",
                 field=f"{where}.tip_height",
-                fix=f"Give at most edge_thickness * height / (spine - edge thickness), {slender:.4g} m.",
+                fix=f"Give at most {slender:.4g} m, edge_thickness * height / (spine - edge).",
             )
         limit = 0.5 * min(self.edge_thickness, self.tip_height)
         if self.edge_radius > limit:

@@ -76,11 +76,18 @@ class TetrahedralMesh:
                 f"{where}: {len(bad)} degenerate tetrahedra, first {bad[0]} with vertices "
                 f"{t[bad[0]]} and volume {volume[bad[0]]:.3g} m^3. Remesh or merge its vertices."
             )
+        _, first = np.unique(np.sort(t, axis=1), axis=0, return_index=True)
+        if len(first) < len(t):
+            again = np.setdiff1d(np.arange(len(t)), first)[0]
+            raise MeshError(
+                f"{where}: {len(t) - len(first)} tetrahedra are repeated, such as {again} with "
+                f"vertices {t[again]}. Remove them."
+            )
         _, count = np.unique(np.sort(_faces(t), axis=1), axis=0, return_counts=True)
         if count.max() > 2:
             raise MeshError(
                 f"{where}: {np.count_nonzero(count > 2)} faces are shared by more than two "
-                "tetrahedra; elements overlap or are repeated."
+                "tetrahedra; elements overlap. Remesh."
             )
         unused = np.setdiff1d(np.arange(len(v)), t)
         if len(unused):

@@ -1,6 +1,7 @@
 """Everything about one cut that does not change: geometry, parameters, masses, tables."""
 
 import dataclasses as dc
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -27,7 +28,7 @@ class TimeStepError(ValueError):
 
 @dc.dataclass
 class Numerics:
-    """How the cut is computed. Stiffnesses of contacts and bonds scale with E over the edge length."""
+    """How the cut is computed. Contacts and bonds scale with E over the edge length h."""
 
     time_step: float = quantity(
         5e-4, "s", low=1e-7, high=5e-3, doc="Sub-step; must divide the exchange period."
@@ -85,8 +86,8 @@ class CuttingModel:
         board: Board plane n . x = d in C: (n, d) [4].
         parameters: Scalars by name, see `kernels.PARAMETERS`.
         element_size: Mean edge length of computed elements, metres.
-        critical_time_step: Stability limit with the true masses, including the margin, s. Slivers do
-            not count: nodes with less than `SLIVER` of their vertex's mass get what they need.
+        critical_time_step: Stability limit with the true masses, including the margin, s. Slivers
+            do not count: nodes with less than `SLIVER` of their vertex's mass get what they need.
     """
 
     split: SplitMesh
@@ -115,7 +116,7 @@ class CuttingModel:
     element_size: float
     critical_time_step: float
 
-    @property
+    @functools.cached_property
     def section_area(self) -> float:
         """Area of the cut, m^2."""
         return float(self.tables.area.sum())
@@ -125,15 +126,21 @@ class CuttingModel:
         """Stepped over true mass of the moving nodes."""
         return float(self.mass[self.moving].sum() / self.true_mass[self.moving].sum())
 
-    @property
+    @functools.cached_property
     def top(self) -> float:
         """Height of the highest cut point in C, metres."""
         return float(self.split.points[:, 2].max())
 
-    @property
+    @functools.cached_property
     def bottom(self) -> float:
         """Height of the lowest cut point in C, metres."""
         return float(self.split.points[:, 2].min())
+
+    @functools.cached_property
+    def span(self) -> tuple[float, float]:
+        """Least and greatest coordinate of the cut points along the edge, metres."""
+        x = self.split.points[:, 0]
+        return float(x.min()), float(x.max())
 
     def to_cut_frame(self, p_F: np.ndarray) -> np.ndarray:
         """Points [..., 3] from F to C."""
@@ -217,7 +224,7 @@ def make_cutting_model(
 
     scale = material.youngs_modulus / element_size
     toughness = np.full(len(split.points), material.toughness)
-    # Never flatter than the rise of the force on the way in, so that nothing is gained by a retreat.
+    # Never flatter than the rise of the force on the way in: a retreat must not gain anything.
     steepest = (np.diff(tables.width, axis=1) / tables.spacing).max(1)
     unloading = toughness * np.maximum(tables.width.max(1) / numerics.unloading_length, steepest)
     bond = numerics.bond_stiffness * scale
@@ -259,7 +266,7 @@ def make_cutting_model(
     for side in range(2):
         for end in range(2):
             np.add.at(contact, point_nodes[:, 2 * side + end], per_point * point_weights[:, end])
-    # A step dt = margin x is stable if stiff x^2 + viscous x <= mass (explicit damping counts twice).
+    # Step dt = margin x is stable if stiff x^2 + viscous x <= mass; explicit damping counts twice.
     stiff = bulk * (1.0 + 2.0 * numerics.numerical_damping) + 0.25 * contact
     viscous = 2.0 * material.damping_time * bulk
     limit = _largest_step(true_mass, stiff, viscous)
@@ -272,8 +279,8 @@ def make_cutting_model(
         raise TimeStepError(
             f"numerics.time_step = {step:.3g} s is beyond the stability limit {critical:.3g} s, set "
             f"by the node at {nodes[worst]} m of the cut frame (true mass {true_mass[worst]:.3g} kg, "
-            f"stiffness bound {4.0 * stiff[worst]:.3g} N/m). Give at most {critical:.2g}, a coarser "
-            "mesh, or mass_scaling: true."
+            f"stiffness bound {4.0 * stiff[worst]:.3g} N/m). Give at most {0.99 * critical:.3g}, a "
+            "coarser mesh, or mass_scaling: true."
         )
     x = (step if numerics.mass_scaling else critical) / numerics.stability_margin
     scaled = np.ones(len(nodes), bool) if numerics.mass_scaling else sliver
@@ -333,13 +340,17 @@ def _downward_area(split: SplitMesh, up_C: np.ndarray) -> np.ndarray:
     normal = 0.5 * np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
     down = -(normal @ up_C)
     horizontal = down > 0.2 * np.linalg.norm(normal, axis=1)
-    area = np.zeros(len(split.vertex_position))
-    np.add.at(area, faces[horizontal], np.repeat(down[horizontal, None] / 3.0, 3, axis=1))
-    node_area = np.where(split.node_is_material, area[split.node_source], 0.0)
-    copies = np.bincount(
-        split.node_source[split.node_is_material], minlength=len(split.vertex_position)
-    )
-    return node_area / np.maximum(copies[split.node_source], 1)
+    material = np.zeros((len(split.vertex_position), 2), bool)
+    material[split.node_source, split.node_side] = split.node_is_material
+    # Corners on the plane are of both sides, and a face that touches it there of one.
+    sides = material[faces] / material[faces].sum(2, keepdims=True)
+    whole = material[faces].all(1)
+    one = whole.sum(1) == 1
+    sides[one] = whole[one][:, None]
+    area = np.zeros(material.shape)
+    third = np.where(horizontal, down, 0.0)[:, None, None] / 3.0
+    np.add.at(area, faces, third * sides)
+    return area[split.node_source, split.node_side]
 
 
 def _stiffness_bound(

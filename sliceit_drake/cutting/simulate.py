@@ -123,10 +123,10 @@ def _check_ends(model: CuttingModel, X_CK: Pose, time: float) -> None:
     Raises:
         CuttingError: With the end and the remedy.
     """
-    points = model.split.points
-    low, high = points[:, 0].min(), points[:, 0].max()
-    for end in (-0.5, 0.5):
-        x, _, z = X_CK.p + end * model.knife.length * X_CK.R[:, 0]
+    low, high = model.span
+    px, _, pz = X_CK.p.tolist()
+    for end in (-0.5 * model.knife.length, 0.5 * model.knife.length):
+        x, z = px + end * X_CK.R[0, 0], pz + end * X_CK.R[2, 0]
         if low < x < high and z < model.top:
             raise CuttingError(
                 f"at {time:.4g} s an end of the knife is over the cut, {1e3 * (x - low):.3g} mm from "

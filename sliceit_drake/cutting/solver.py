@@ -78,9 +78,10 @@ class Energies:
 class CuttingSolver:
     """Steps the state of one `CuttingModel`.
 
-    The state is one contiguous array [state_size]: positions, velocities, history of the cut points,
-    friction anchors, blade deflection, direction of cutting. A call copies it into the workspace that
-    the captured graph is bound to and copies the result out; nothing is carried between calls.
+    The state is one contiguous array [state_size]: positions, velocities, history of the cut
+    points, friction anchors, blade deflection, direction of cutting. A call copies it into the
+    workspace that the captured graph is bound to and copies the result out; nothing is carried
+    between calls.
 
     Args:
         model: The cut.
@@ -106,6 +107,7 @@ class CuttingSolver:
         self._device = wp.get_device(model.numerics.device)
         self._lock = threading.Lock()
         self._graph: Any = None
+        self._views: dict[int, np.ndarray] = {}
         self._build()
 
     def _array(self, values: np.ndarray, dtype: Any) -> wp.array:
@@ -306,10 +308,18 @@ class CuttingSolver:
 
     def _write(self, array: wp.array, values: np.ndarray) -> None:
         if self._device.is_cpu:
-            # A view; `assign` would wrap the values in an array of its own first.
-            array.numpy()[:] = values
+            self._read(array)[:] = values
         else:
             array.assign(values.astype(self.dtype))
+
+    def _read(self, array: wp.array) -> np.ndarray:
+        """The workspace array in host memory; on the CPU a view, made once."""
+        if not self._device.is_cpu:
+            return array.numpy()
+        view = self._views.get(array.ptr)
+        if view is None:
+            view = self._views[array.ptr] = array.numpy()
+        return view
 
     def _capture(self) -> None:
         wp.load_module(self._kernels.elements.module, device=self._device)
@@ -340,8 +350,8 @@ class CuttingSolver:
             self._sums.zero_()
             wp.capture_launch(self._graph)
             new = np.empty(self.state_size, self.dtype)
-            new[: self._layout["direction"].start] = self._state.numpy()
-            sums = self._sums.numpy().astype(np.float64)
+            new[: self._layout["direction"].start] = self._read(self._state)
+            sums = self._read(self._sums).astype(np.float64)
         new[self._layout["direction"]] = direction
         total = sums[self._sum_layout["total"]].reshape(-1, ACCUMULATED).sum(0)
         if not np.isfinite(total).all():
@@ -354,12 +364,14 @@ class CuttingSolver:
             np.concatenate([impulse[9 + 3 * i : 12 + 3 * i], impulse[3 * i : 3 * i + 3]])
             for i in range(3)
         ]
-        # The flanks push the blade, and the blade's spring and damper the knife's body. The difference
-        # acts at the middle of the buried flanks.
+        # The flanks push the blade, and the blade's spring and damper the knife's body. The
+        # difference acts at the middle of the buried flanks.
         blade_loss, to_body, from_flanks = sums[self._sum_layout["blade_sums"]]
         lateral = (to_body - from_flanks) / n * end.R[:, 1]
         if total[22] > 0.0:
-            wrenches[1][:3] += np.cross(total[23:26] / total[22], lateral)
+            x, y, z = (total[23:26] / total[22]).tolist()
+            fx, fy, fz = lateral.tolist()
+            wrenches[1][:3] += (y * fz - z * fy, z * fx - x * fz, x * fy - y * fx)
         wrenches[1][3:] += lateral
         wrench = wrenches[0] + wrenches[1] + wrenches[2]
         # Moments are about Ko at each sub-step; the mean position of Ko is half a period back.
@@ -388,8 +400,8 @@ class CuttingSolver:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Knife poses at the ends of the sub-steps, constant velocity and rotation rate.
 
-        Rotation matrices are interpolated linearly: for a turn of angle a between exchanges they are
-        orthonormal to a^2 / 8, 1e-6 at 1 rad/s and 2 ms.
+        Rotation matrices are interpolated linearly: for a turn of angle a between exchanges they
+        are orthonormal to a^2 / 8, 1e-6 at 1 rad/s and 2 ms.
 
         Returns:
             The kernels' motion buffer, the direction of cutting at the end, velocity [3] of Ko and
@@ -415,8 +427,8 @@ class CuttingSolver:
     ) -> list[float]:
         """Direction of cutting in each sub-step [3 n].
 
-        It is the direction of the edge's velocity in the blade's plane, at the middle of the section,
-        followed over `direction_length` of travel, so that it exists at rest.
+        It is the direction of the edge's velocity in the blade's plane, at the middle of the
+        section, followed over `direction_length` of travel, so that it exists at rest.
         """
         n = self.substeps
         dx, dy, dz = state[self._layout["direction"]].tolist()

@@ -1,4 +1,8 @@
-"""The record of a run: a table at the exchange rate, from a log of the station's outputs."""
+"""The record of a run: a table at the exchange rate, from a log of the station's vectors.
+
+Logging runs at every exchange, so it takes only vectors that exist anyway, without a line of
+Python; poses and velocities follow afterwards from the joints by forward kinematics.
+"""
 
 import dataclasses as dc
 from collections.abc import Mapping
@@ -12,13 +16,15 @@ from pydrake.systems.primitives import (
     Multiplexer,
     VectorLogSink,
 )
+from scipy.spatial.transform import Rotation
 
+from sliceit_drake.cutting.motion import Motion
 from sliceit_drake.diagrams.station import SlicingStation
 from sliceit_drake.systems.cutting_system import ENERGY_NAMES, LEDGER_NAMES, CuttingSystem
-from sliceit_drake.systems.recorder import RowRecorder
 
 __all__ = ["Record", "Recorder", "add_recorder"]
 
+_AXES = ("x", "y", "z")
 _SIX = ("x", "y", "z", "rx", "ry", "rz")
 _COMMANDS = {
     "stiffness": [f"stiffness_{a}" for a in _SIX],
@@ -56,39 +62,106 @@ class Record:
         )
 
 
+@dc.dataclass
 class Recorder:
-    """Handle of the log in a diagram."""
+    """Handle of the log in a diagram.
 
-    def __init__(self, log: VectorLogSink, columns: list[str], typed: RowRecorder) -> None:
-        self._log = log
-        self._columns = columns
-        self._typed = typed
+    Attributes:
+        log: The log.
+        columns: Names of its rows.
+        station: What is logged.
+        motion: What the knife shall do.
+    """
+
+    log: VectorLogSink
+    columns: list[str]
+    station: SlicingStation
+    motion: Motion
 
     def record(self, root_context: Context) -> Record:
         """What has been logged so far in the context of the diagram."""
-        log = self._log.FindLog(root_context)
-        data = log.data().T
-        vectors, rows = data[:, : len(self._columns)], data[:, len(self._columns) :]
-        values = np.column_stack([log.sample_times(), vectors, self._typed.table(rows)])
-        return Record(["time", *self._columns, *self._typed.columns], values)
+        log = self.log.FindLog(root_context)
+        time = np.array(log.sample_times())
+        raw = Record(["time", *self.columns], np.column_stack([time, log.data().T]))
+        columns, parts = ["time"], [time[:, None]]
+
+        def add(names: list[str], values: np.ndarray) -> None:
+            columns.extend(names)
+            parts.append(values)
+
+        kept = [name for name in self.columns if not name.startswith("_")]
+        add(kept, np.column_stack([raw[name] for name in kept]))
+        joints = raw.vector("q", "123456")
+        for name, q in (
+            ("knife_pose", joints),
+            ("commanded_pose", raw.vector("q_command", "123456")),
+        ):
+            add(_pose_columns(name), self._knife_poses(q))
+        R, p, _, _ = self.motion.sample(time)
+        add(_pose_columns("target_pose"), np.column_stack([p, _quaternions(R)]))
+        names = [f"knife_velocity_{part}_{a}" for part in ("v", "w") for a in _AXES]
+        add(names, self._knife_velocities(joints, raw.vector("qd", "123456")))
+        for name in ("food_wrench", "board_wrench", "sensor_wrench"):
+            names = [f"{name}_{part}_{a}" for part in ("f", "m") for a in _AXES]
+            add(names, np.column_stack([raw[f"_{column}"] for column in names]))
+        return Record(columns, np.concatenate(parts, axis=1))
+
+    def _knife_poses(self, joints: np.ndarray) -> np.ndarray:
+        """Position and quaternion of the knife in W [n, 7] at joint positions [n, 6]."""
+        plant, context = self.station.plant, self.station.plant.CreateDefaultContext()
+        X = np.empty((len(joints), 3, 4))
+        for k, q in enumerate(joints):
+            plant.SetPositions(context, q)
+            X[k] = plant.EvalBodyPoseInWorld(context, self.station.robot.knife).GetAsMatrix34()
+        return np.column_stack([X[:, :, 3], _quaternions(X[:, :, :3])])
+
+    def _knife_velocities(self, joints: np.ndarray, rates: np.ndarray) -> np.ndarray:
+        """Velocity of Ko and angular velocity in W [n, 6] at joint positions and rates [n, 6]."""
+        plant, context = self.station.plant, self.station.plant.CreateDefaultContext()
+        V = np.empty((len(joints), 6))
+        for k, (q, qd) in enumerate(zip(joints, rates, strict=True)):
+            plant.SetPositionsAndVelocities(context, np.concatenate([q, qd]))
+            velocity = plant.EvalBodySpatialVelocityInWorld(context, self.station.robot.knife)
+            V[k, :3], V[k, 3:] = velocity.translational(), velocity.rotational()
+        return V
+
+
+def _pose_columns(name: str) -> list[str]:
+    return [f"{name}_p_{a}" for a in _AXES] + [f"{name}_quat_{a}" for a in "wxyz"]
+
+
+def _quaternions(R: np.ndarray) -> np.ndarray:
+    return Rotation.from_matrix(R).as_quat(canonical=True, scalar_first=True)
+
+
+def _wrench_columns(name: str) -> list[str]:
+    """Drake's order: moment, force. The underscore keeps them out of the table."""
+    return [f"_{name}_{part}_{a}" for part in ("m", "f") for a in _AXES]
 
 
 def add_recorder(
-    builder: DiagramBuilder, station: SlicingStation, sources: Mapping[str, OutputPort]
+    builder: DiagramBuilder,
+    station: SlicingStation,
+    motion: Motion,
+    sources: Mapping[str, OutputPort],
 ) -> Recorder:
     """Logs the station's outputs and commands once per exchange.
 
     Args:
         builder: Builder of the diagram that holds the station.
         station: The station.
-        sources: Output ports that drive the station's inputs, by input name, target_pose at least;
-            for the other commands the configured constants are recorded.
+        motion: What drives its target pose.
+        sources: Output ports that drive the station's vector inputs, by input name; for the others
+            the configured constants are recorded.
     """
     vectors = {
         "joint_positions": [f"q_{i}" for i in range(1, 7)],
         "joint_velocities": [f"qd_{i}" for i in range(1, 7)],
         "joint_positions_command": [f"q_command_{i}" for i in range(1, 7)],
         "cut_progress": ["cut_progress"],
+        "food_wrench_vector": _wrench_columns("food_wrench"),
+        "board_wrench_vector": _wrench_columns("board_wrench"),
+        "sensor_state": station.sensor.state_columns(_wrench_columns("sensor_wrench")),
         **_COMMANDS,
     }
     if isinstance(station.cutting, CuttingSystem):
@@ -97,32 +170,17 @@ def add_recorder(
         vectors["ledger"] = [f"energy_{name}" for name in LEDGER_NAMES]
         vectors["energy"] = [f"energy_{name}" for name in ENERGY_NAMES]
         vectors["coupling_work_error"] = ["coupling_work_error"]
-    typed = builder.AddNamedSystem(
-        "record_typed",
-        RowRecorder(
-            poses=["knife_pose", "commanded_pose", "target_pose"],
-            velocities=["knife_velocity"],
-            wrenches=["food_wrench", "board_wrench", "sensor_wrench"],
-        ),
-    )
-    for i in range(typed.num_input_ports()):
-        port = typed.get_input_port(i)
-        name = port.get_name()
-        source = sources["target_pose"] if name == "target_pose" else station.GetOutputPort(name)
-        builder.Connect(source, port)
-
     row = builder.AddNamedSystem(
-        "record_row", Multiplexer([*(len(columns) for columns in vectors.values()), typed.size])
+        "record_row", Multiplexer([len(columns) for columns in vectors.values()])
     )
     for i, name in enumerate(vectors):
         builder.Connect(_vector_source(builder, station, sources, name), row.get_input_port(i))
-    builder.Connect(typed.get_output_port(), row.get_input_port(len(vectors)))
     log = LogVectorOutput(
         row.get_output_port(), builder, publish_period=station.scenario.exchange_period
     )
     log.set_name("record")
     columns = [column for group in vectors.values() for column in group]
-    return Recorder(log, columns, typed)
+    return Recorder(log, columns, station, motion)
 
 
 def _vector_source(

@@ -32,7 +32,7 @@ class ScenarioDiagram(Diagram):
         self.motion: Motion = source.motion
         target_pose = source.GetOutputPort("target_pose")
         builder.Connect(target_pose, self.station.GetInputPort("target_pose"))
-        self._recorder: Recorder = add_recorder(builder, self.station, {"target_pose": target_pose})
+        self._recorder: Recorder = add_recorder(builder, self.station, self.motion, {})
         builder.BuildInto(self)
         self.set_name(scenario.name)
 

@@ -46,6 +46,7 @@ class SlicingStation(Diagram):
         plant: The arm with gripper and knife, and the board.
         cutting: The food: finite elements or analytic.
         controller: The compliance controller.
+        sensor: The wrench sensor.
         start_pose: X_WK at the start.
         start_joints: Joint positions there [6], rad.
         meshcat: The viewer, or None.
@@ -79,7 +80,7 @@ class SlicingStation(Diagram):
         self.controller = ComplianceController(
             scenario.controller, ur5e_chain(scenario.robot.X_TK()), X_WB=scenario.robot.X_WB()
         )
-        sensor = WrenchSensor(
+        self.sensor = sensor = WrenchSensor(
             self.plant, self.robot.sensor_weld, scenario.exchange_period, scenario.sensor
         )
         kinematics = KnifeKinematics(self.robot.knife.index())
@@ -149,6 +150,12 @@ class SlicingStation(Diagram):
         if isinstance(self.cutting, CuttingSystem):
             for name in ("force_components", "ledger", "energy", "coupling_work_error"):
                 builder.ExportOutput(self.cutting.GetOutputPort(name), name)
+        # For records: what the contract gives as typed values, as vectors.
+        builder.ExportOutput(self.cutting.GetOutputPort("food_wrench_vector"), "food_wrench_vector")
+        builder.ExportOutput(
+            board_contact.GetOutputPort("board_wrench_vector"), "board_wrench_vector"
+        )
+        builder.ExportOutput(sensor.GetOutputPort("state"), "sensor_state")
 
         self.visualizer: MeshcatVisualizer | None = None
         self.food_visualizer: FoodVisualizer | None = None

@@ -25,6 +25,7 @@ class KnifeForceSystem(LeafSystem):
 
     Output ports:
         food_wrench: SpatialForce F_K_W of the food on the knife, at Ko, in W.
+        food_wrench_vector: The same as moment and force [6].
         applied_force: The same as a list of one ExternallyAppliedSpatialForce for the plant.
         cut_progress: Share of the section that is cut [1].
         coupling_work_error: Work that the held wrench did on the knife minus work that the food did
@@ -59,6 +60,7 @@ class KnifeForceSystem(LeafSystem):
             self._calc_applied_force,
             {self.discrete_state_ticket(self._wrench)},
         )
+        self.DeclareStateOutputPort("food_wrench_vector", self._wrench)
         self.DeclareStateOutputPort("cut_progress", self._progress)
         self.DeclareStateOutputPort("coupling_work_error", self._coupling)
         self.DeclareInitializationUnrestrictedUpdateEvent(self._initialize)

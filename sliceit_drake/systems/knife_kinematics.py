@@ -6,7 +6,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce, SpatialVelocity
 from pydrake.multibody.plant import ContactResults
 from pydrake.multibody.tree import BodyIndex
-from pydrake.systems.framework import Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 __all__ = ["BoardContact", "KnifeKinematics"]
 
@@ -62,6 +62,7 @@ class BoardContact(LeafSystem):
 
     Output ports:
         board_wrench: SpatialForce F_K_W of the board on the knife, at Ko, in W.
+        board_wrench_vector: The same as moment and force [6].
 
     The plant computes contact results by solving its step once more, so they are asked for only
     when the edge is near the board.
@@ -85,8 +86,21 @@ class BoardContact(LeafSystem):
             self._calc_wrench,
             {self._results.ticket(), self._pose.ticket()},
         )
+        self.DeclareVectorOutputPort(
+            "board_wrench_vector",
+            6,
+            self._calc_vector,
+            {self._results.ticket(), self._pose.ticket()},
+        )
 
     def _calc_wrench(self, context: Context, output: Value) -> None:
+        wrench = self._wrench(context)
+        output.set_value(SpatialForce(wrench[:3], wrench[3:]))
+
+    def _calc_vector(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._wrench(context))
+
+    def _wrench(self, context: Context) -> np.ndarray:
         X_WK = self._pose.Eval(context).GetAsMatrix34()
         lowest = X_WK[2, 3] - abs(X_WK[2, 0]) * self._half_length
         moment, force = np.zeros(3), np.zeros(3)
@@ -103,4 +117,4 @@ class BoardContact(LeafSystem):
                     continue
                 force += f
                 moment += np.cross(info.contact_point() - X_WK[:, 3], f)
-        output.set_value(SpatialForce(moment, force))
+        return np.concatenate([moment, force])

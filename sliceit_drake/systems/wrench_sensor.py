@@ -3,6 +3,7 @@
 import dataclasses as dc
 import functools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
@@ -134,14 +135,22 @@ class WrenchSensor(LeafSystem):
             "reaction_forces", Value[list[SpatialForce]]()
         ).get_index()
         self._seed = self.DeclareNumericParameter(BasicVector([float(config.seed)]))
-        self.DeclareDiscreteState(np.zeros(_STATE_SIZE))
+        state = self.DeclareDiscreteState(np.zeros(_STATE_SIZE))
         self.DeclareAbstractOutputPort(
             "sensor_wrench",
             lambda: Value(SpatialForce.Zero()),
             self._calc_sensor_wrench,
             {self.xd_ticket()},
         )
+        self.DeclareStateOutputPort("state", state)
         self.DeclarePeriodicDiscreteUpdateEvent(step, 0.0, self._update)
+
+    @staticmethod
+    def state_columns(reading: Sequence[str]) -> list[str]:
+        """Names for the port `state`: `reading` [6] for the moment and force, others private."""
+        names = [f"_sensor_{k}" for k in range(_STATE_SIZE)]
+        names[_READING] = reading
+        return names
 
     def randomize_context(self, context: Context, rng: np.random.Generator) -> None:
         """Draws a new seed of the noise."""

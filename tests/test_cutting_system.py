@@ -1,0 +1,298 @@
+"""The cutting system in Drake: contexts, order of events, ports, books of the coupling."""
+
+import concurrent.futures
+
+import numpy as np
+import pytest
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.math import SpatialForce, SpatialVelocity
+from pydrake.multibody.tree import BodyIndex
+from pydrake.systems.analysis import InitializeParams, Simulator
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
+
+from sliceit_drake.cutting.food import Box, Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.model import Numerics
+from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.systems.cutting_system import CuttingSystem
+from sliceit_drake.systems.knife_force import KnifeForceSystem
+
+PERIOD = 2e-3
+KNIFE_BODY = BodyIndex(7)
+FOODS = (
+    Food(shape=Cylinder(rings=2, layers=[0.0, 0.006, 0.0125])),
+    Food(shape=Box(size=[0.02, 0.06, 0.022], divisions=[3, 3], layers=[0.0, 4e-3, 12e-3])),
+)
+DOWN = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
+
+
+class KnifePath(LeafSystem):
+    """Pose and velocity of a knife that presses and draws at constant speed from a start."""
+
+    def __init__(self, start: np.ndarray) -> None:
+        super().__init__()
+        self._start = start
+        self._velocity = self.DeclareNumericParameter(BasicVector([0.0, 0.0, -0.05]))
+        self.DeclareAbstractOutputPort("knife_pose", lambda: Value(RigidTransform()), self._pose)
+        self.DeclareAbstractOutputPort(
+            "knife_velocity", lambda: Value(SpatialVelocity.Zero()), self._rate
+        )
+
+    def set_velocity(self, context: Context, velocity: list[float]) -> None:
+        context.get_mutable_numeric_parameter(self._velocity).SetFromVector(velocity)
+
+    def _v(self, context: Context) -> np.ndarray:
+        return context.get_numeric_parameter(self._velocity).value()
+
+    def _pose(self, context: Context, output: Value) -> None:
+        output.set_value(RigidTransform(DOWN, self._start + self._v(context) * context.get_time()))
+
+    def _rate(self, context: Context, output: Value) -> None:
+        output.set_value(SpatialVelocity(np.zeros(3), self._v(context)))
+
+
+class WrenchReader(LeafSystem):
+    """Notes, in a discrete update each exchange, the wrench that it sees."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._wrench = self.DeclareAbstractInputPort("food_wrench", Value(SpatialForce.Zero()))
+        self.seen = self.DeclareDiscreteState(1)
+        self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, PERIOD, self._note)
+
+    def _note(self, context: Context, state) -> None:
+        force = self._wrench.Eval(context).translational()[2]
+        state.get_mutable_vector(self.seen).SetFromVector([force])
+
+
+@pytest.fixture(scope="module")
+def solvers() -> tuple[CuttingSolver, ...]:
+    return tuple(
+        CuttingSolver(make_food_model(food, Knife(), Numerics()), PERIOD) for food in FOODS
+    )
+
+
+def build(solvers, system: KnifeForceSystem | None = None) -> Diagram:
+    """A knife that starts 1 mm above the higher food, the cutting system, a reader."""
+    top = max(start_pose(solver.model, 1e-3).p[2] for solver in solvers)
+    builder = DiagramBuilder()
+    path = builder.AddNamedSystem("path", KnifePath(np.array([0.0, 0.0, top])))
+    cutting = system or CuttingSystem(solvers, RigidTransform(), KNIFE_BODY)
+    builder.AddNamedSystem("cutting", cutting)
+    reader = builder.AddNamedSystem("reader", WrenchReader())
+    for name in ("knife_pose", "knife_velocity"):
+        builder.Connect(path.GetOutputPort(name), cutting.GetInputPort(name))
+    builder.Connect(cutting.GetOutputPort("food_wrench"), reader.GetInputPort("food_wrench"))
+    return builder.Build()
+
+
+@pytest.fixture(scope="module")
+def diagram(solvers) -> Diagram:
+    return build(solvers)
+
+
+class Slice:
+    """One context of the diagram and its run."""
+
+    def __init__(self, diagram: Diagram, food: int = 0, velocity=(0.0, 0.0, -0.05)) -> None:
+        self.diagram = diagram
+        self.cutting = diagram.GetSubsystemByName("cutting")
+        self.simulator = Simulator(diagram)
+        root = self.simulator.get_mutable_context()
+        path = diagram.GetSubsystemByName("path")
+        path.set_velocity(path.GetMyMutableContextFromRoot(root), velocity)
+        self.cutting.SetFood(self.cutting.GetMyMutableContextFromRoot(root), food)
+        self.simulator.Initialize()
+        self.wrenches: list[np.ndarray] = []
+
+    @property
+    def context(self) -> Context:
+        return self.cutting.GetMyContextFromRoot(self.simulator.get_context())
+
+    def advance(self, exchanges: int) -> "Slice":
+        for _ in range(exchanges):
+            # Half way between exchanges no update is due, whatever the rounding of the time.
+            done = int(self.simulator.get_context().get_time() / PERIOD)
+            self.simulator.AdvanceTo((done + 1.5) * PERIOD)
+            self.wrenches.append(self.cutting.wrench(self.context).copy())
+        return self
+
+    def result(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.array(self.wrenches), self.cutting.food_state(self.context).copy()
+
+
+def same(a, b) -> None:
+    for first, second in zip(a, b, strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+MOTIONS = ((0, (0.0, 0.0, -0.05)), (0, (0.04, 0.0, -0.08)))
+LENGTH = 80
+
+
+@pytest.fixture(scope="module")
+def alone(solvers):
+    """Each motion on a diagram and solvers of its own."""
+    results = []
+    for food, velocity in MOTIONS:
+        own = [CuttingSolver(solver.model, PERIOD) for solver in solvers]
+        results.append(Slice(build(own), food, velocity).advance(LENGTH).result())
+    assert all(np.abs(wrenches[:, 5]).max() > 1.0 for wrenches, _ in results)
+    assert not np.array_equal(results[0][0], results[1][0])
+    return results
+
+
+def test_the_same_input_gives_the_same_force_bit_for_bit(diagram, alone):
+    for (food, velocity), expected in zip(MOTIONS, alone, strict=True):
+        same(Slice(diagram, food, velocity).advance(LENGTH).result(), expected)
+
+
+def test_two_contexts_of_one_diagram_do_not_disturb_each_other(diagram, alone):
+    first, second = (Slice(diagram, food, velocity) for food, velocity in MOTIONS)
+    for _ in range(LENGTH):
+        first.advance(1)
+        second.advance(1)
+    same(first.result(), alone[0])
+    same(second.result(), alone[1])
+
+
+def test_two_threads_do_not_disturb_each_other(diagram, alone):
+    runs = [Slice(diagram, food, velocity) for food, velocity in MOTIONS]
+    with concurrent.futures.ThreadPoolExecutor(2) as pool:
+        results = list(pool.map(lambda run: run.advance(LENGTH).result(), runs))
+    same(results[0], alone[0])
+    same(results[1], alone[1])
+
+
+def test_a_context_cloned_in_the_middle_of_a_cut_goes_on_identically(diagram, alone):
+    half = LENGTH // 2
+    original = Slice(diagram, *MOTIONS[1]).advance(half)
+    copy = Slice.__new__(Slice)
+    copy.diagram, copy.cutting = diagram, original.cutting
+    copy.simulator = Simulator(diagram, original.simulator.get_context().Clone())
+    copy.simulator.Initialize(InitializeParams(suppress_initialization_events=True))
+    copy.wrenches = list(original.wrenches)
+    original.advance(LENGTH - half)
+    same(copy.advance(LENGTH - half).result(), alone[1])
+    same(original.result(), alone[1])
+
+
+def test_foods_of_different_meshes_take_turns_in_one_context(diagram, solvers):
+    assert solvers[0].state_size != solvers[1].state_size
+    box = Slice(diagram, 1).advance(LENGTH).result()
+    assert len(box[1]) == solvers[1].state_size
+    assert np.abs(box[0][:, 5]).max() > 1.0
+    own = build([CuttingSolver(solvers[1].model, PERIOD), solvers[0]])
+    top_is_the_same = Slice(own, 0).advance(LENGTH).result()
+    same(box, top_is_the_same)
+    cylinder = Slice(diagram, 0).advance(LENGTH).result()
+    again = Slice(diagram, 0)
+    context = again.cutting.GetMyMutableContextFromRoot(again.simulator.get_mutable_context())
+    again.cutting.SetFood(context, 1)
+    again.cutting.SetFood(context, 0)
+    same(again.advance(LENGTH).result(), cylinder)
+    with pytest.raises(IndexError, match="food 2: 2 foods are prepared"):
+        again.cutting.SetFood(context, 2)
+
+
+def test_randomization_draws_every_food_and_the_same_for_the_same_seed(diagram):
+    system = diagram.GetSubsystemByName("cutting")
+    context = system.CreateDefaultContext()
+
+    def draw(seed: int) -> list[int]:
+        rng, drawn = np.random.default_rng(seed), []
+        for _ in range(20):
+            system.randomize_context(context, rng)
+            index = system.food_index(context)
+            np.testing.assert_array_equal(
+                system.food_state(context), system.solver(context).initial_state()
+            )
+            assert system.GetOutputPort("food_index").Eval(context)[0] == index
+            drawn.append(index)
+        return drawn
+
+    assert set(draw(1)) == {0, 1}
+    assert draw(1) == draw(1) != draw(2)
+
+
+def test_a_discrete_system_sees_the_wrench_of_the_same_instant_and_it_is_held(diagram):
+    run = Slice(diagram, 0)
+    reader = diagram.GetSubsystemByName("reader")
+    previous = 0.0
+    for _ in range(60):
+        run.advance(1)
+        root = run.simulator.get_context()
+        seen = reader.GetMyContextFromRoot(root).get_discrete_state(reader.seen).value()[0]
+        now = run.wrenches[-1][5]
+        assert seen == now
+        time = root.get_time()
+        assert time % PERIOD == pytest.approx(0.5 * PERIOD)
+        run.simulator.AdvanceTo(time + 0.45 * PERIOD)
+        assert run.cutting.wrench(run.context)[5] == now
+        previous = max(previous, now)
+    assert previous > 1.0
+
+
+def test_applied_force_is_the_food_wrench_at_the_knifes_origin(diagram):
+    run = Slice(diagram, 0, (0.04, 0.0, -0.08)).advance(LENGTH)
+    wrench = run.cutting.GetOutputPort("food_wrench").Eval(run.context)
+    (force,) = run.cutting.GetOutputPort("applied_force").Eval(run.context)
+    assert force.body_index == KNIFE_BODY
+    np.testing.assert_array_equal(force.p_BoBq_B, np.zeros(3))
+    np.testing.assert_array_equal(force.F_Bq_W.get_coeffs(), wrench.get_coeffs())
+    np.testing.assert_array_equal(wrench.get_coeffs(), run.wrenches[-1])
+    assert abs(wrench.translational()[0]) > 0.1 and wrench.translational()[2] > 1.0
+
+
+def test_force_turns_with_the_food(solvers):
+    turn = RigidTransform(RollPitchYaw(0.0, 0.0, 0.7), [0.3, -0.2, 0.05])
+    plain = build(solvers)
+    here = Slice(plain, 0).advance(60)
+
+    class Turned(KnifePath):
+        def _pose(self, context, output):
+            X = RigidTransform(DOWN, self._start + self._v(context) * context.get_time())
+            output.set_value(turn @ X)
+
+    top = max(start_pose(solver.model, 1e-3).p[2] for solver in solvers)
+    builder = DiagramBuilder()
+    path = builder.AddNamedSystem("path", Turned(np.array([0.0, 0.0, top])))
+    cutting = builder.AddNamedSystem("cutting", CuttingSystem(solvers, turn, KNIFE_BODY))
+    for name in ("knife_pose", "knife_velocity"):
+        builder.Connect(path.GetOutputPort(name), cutting.GetInputPort(name))
+    there = Slice(builder.Build(), 0).advance(60)
+    R = turn.rotation().matrix()
+    expected = np.concatenate([R @ here.wrenches[-1][:3], R @ here.wrenches[-1][3:]])
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(there.wrenches[-1], expected, atol=1e-3 * scale)
+
+
+class Spring(KnifeForceSystem):
+    """A food that pushes up in proportion to the depth below z = 1."""
+
+    STIFFNESS = 1000.0
+
+    def advance(self, context, state, X_WK, V_WK):
+        depth = max(0.0, 1.0 - X_WK.translation()[2])
+        return np.array([0.0, 0.0, 0.0, 0.0, 0.0, self.STIFFNESS * depth]), depth
+
+
+def test_coupling_work_error_is_what_the_delay_costs():
+    spring = Spring(KNIFE_BODY, PERIOD)
+    builder = DiagramBuilder()
+    path = builder.AddNamedSystem("path", KnifePath(np.array([0.0, 0.0, 1.0])))
+    builder.AddNamedSystem("cutting", spring)
+    for name in ("knife_pose", "knife_velocity"):
+        builder.Connect(path.GetOutputPort(name), spring.GetInputPort(name))
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    simulator.AdvanceTo(0.1 + 0.5 * PERIOD)
+    context = spring.GetMyContextFromRoot(simulator.get_context())
+    # Each exchange the held force is one step d = v T of depth too small, and the knife moves -d:
+    # n exchanges leave n k d^2 of work that the food did and the knife did not feel.
+    step = 0.05 * PERIOD
+    expected = 50 * Spring.STIFFNESS * step * step
+    assert spring.GetOutputPort("coupling_work_error").Eval(context)[0] == pytest.approx(expected)
+    assert spring.wrench(context)[5] == pytest.approx(Spring.STIFFNESS * 0.05 * 0.1)
+    assert spring.GetOutputPort("cut_progress").Eval(context)[0] == pytest.approx(0.005)
