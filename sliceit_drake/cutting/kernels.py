@@ -29,7 +29,6 @@ PARAMETERS = (
     "friction",
     "static_friction",
     "stribeck_velocity",
-    "unloading_length",
     "board_stiffness",
     "board_friction",
     "blade_stiffness",
@@ -67,7 +66,6 @@ def kernels(real: Any) -> types.SimpleNamespace:
     FRICTION = wp.constant(_INDEX["friction"])
     STATIC_FRICTION = wp.constant(_INDEX["static_friction"])
     STRIBECK_VELOCITY = wp.constant(_INDEX["stribeck_velocity"])
-    UNLOADING_LENGTH = wp.constant(_INDEX["unloading_length"])
     BOARD_STIFFNESS = wp.constant(_INDEX["board_stiffness"])
     BOARD_FRICTION = wp.constant(_INDEX["board_friction"])
     BLADE_STIFFNESS = wp.constant(_INDEX["blade_stiffness"])
@@ -603,9 +601,7 @@ def kernels(real: Any) -> types.SimpleNamespace:
             lost = real(0.5) * stiffness * wp.dot(old, old)
             if depth > real(0.0):
                 sliding = (vi - wp.dot(vi, n) * n) * dt
-                slip = slide(
-                    old, sliding, stiffness, P[BOARD_FRICTION] * stiffness * depth
-                )
+                slip = slide(old, sliding, stiffness, P[BOARD_FRICTION] * stiffness * depth)
                 on_food = stiffness * (depth * n - slip)
                 f += on_food
                 board_force[i] = board_force[i] + on_food

@@ -56,7 +56,7 @@ class Knife:
     def check(self, where: str) -> None:
         if self.edge_thickness >= self.spine_thickness:
             raise ConfigurationError(
-                f"= {self.edge_thickness} m is not below spine_thickness = {self.spine_thickness} m",
+                f"= {self.edge_thickness} m is not below spine_thickness, {self.spine_thickness} m",
                 field=f"{where}.edge_thickness",
                 fix="Give the thickness of the bevel's shoulder, as 8e-5.",
             )

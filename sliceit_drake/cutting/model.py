@@ -241,7 +241,6 @@ def make_cutting_model(
         "friction": material.friction,
         "static_friction": material.static_friction,
         "stribeck_velocity": material.stribeck_velocity,
-        "unloading_length": numerics.unloading_length,
         "board_stiffness": numerics.board_stiffness * scale,
         "board_friction": numerics.board_friction,
         "blade_stiffness": knife.lateral_stiffness,
@@ -277,10 +276,10 @@ def make_cutting_model(
     step = numerics.time_step
     if not numerics.mass_scaling and step > critical:
         raise TimeStepError(
-            f"numerics.time_step = {step:.3g} s is beyond the stability limit {critical:.3g} s, set "
-            f"by the node at {nodes[worst]} m of the cut frame (true mass {true_mass[worst]:.3g} kg, "
-            f"stiffness bound {4.0 * stiff[worst]:.3g} N/m). Give at most {0.99 * critical:.3g}, a "
-            "coarser mesh, or mass_scaling: true."
+            f"numerics.time_step = {step:.3g} s is beyond the stability limit {critical:.3g} s "
+            f"that the node at {nodes[worst]} m of the cut frame sets (true mass "
+            f"{true_mass[worst]:.3g} kg, stiffness bound {4.0 * stiff[worst]:.3g} N/m). Give at "
+            f"most {0.99 * critical:.3g}, a coarser mesh, or mass_scaling: true."
         )
     x = (step if numerics.mass_scaling else critical) / numerics.stability_margin
     scaled = np.ones(len(nodes), bool) if numerics.mass_scaling else sliver

@@ -129,10 +129,10 @@ def _check_ends(model: CuttingModel, X_CK: Pose, time: float) -> None:
         x, z = px + end * X_CK.R[0, 0], pz + end * X_CK.R[2, 0]
         if low < x < high and z < model.top:
             raise CuttingError(
-                f"at {time:.4g} s an end of the knife is over the cut, {1e3 * (x - low):.3g} mm from "
-                "its side: only the edge between the ends cuts. Use a longer knife "
-                f"(knife.length = {model.knife.length:.4g} m), a shorter draw, or start it nearer to "
-                "the other end."
+                f"at {time:.4g} s an end of the knife is over the cut, {1e3 * (x - low):.3g} mm "
+                "from its side: only the edge between the ends cuts. Use a longer knife "
+                f"(knife.length = {model.knife.length:.4g} m), a shorter draw, or start it nearer "
+                "to the other end."
             )
 
 
@@ -150,7 +150,7 @@ def check_in_plane(model: CuttingModel, X_CK: Pose, time: float) -> None:
     if offset > LATERAL_LIMIT or lean > TILT_LIMIT or turn > TILT_LIMIT:
         raise CuttingError(
             f"at {time:.4g} s the blade is {1e3 * offset:.3g} mm off the cut plane, leans "
-            f"{lean:.3g} rad and is turned {turn:.3g} rad about the vertical; the model holds up to "
+            f"{lean:.3g} rad and is turned {turn:.3g} rad about the vertical; the model holds to "
             f"{1e3 * LATERAL_LIMIT:g} mm and {TILT_LIMIT:g} rad. Give the knife's path the plane "
             "of the cut."
         )
