@@ -77,8 +77,7 @@ def test_knife_work_in_the_log_less_every_other_mechanism_is_toughness_times_are
     damping = -record["energy_internal"][-1] - record["energy_elastic"][-1]
     stored = sum(record[f"energy_{name}"][-1] for name in ("elastic", "interface", "kinetic"))
     other = sum(
-        record[f"energy_{name}"][-1]
-        for name in ("opening", "friction", "board_friction", "blade")
+        record[f"energy_{name}"][-1] for name in ("opening", "friction", "board_friction", "blade")
     )
     through = run.scenario.food.material.toughness * model.section_area
     assert work + record["energy_gravity"][-1] - stored - other - damping == pytest.approx(

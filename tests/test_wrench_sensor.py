@@ -289,7 +289,9 @@ def test_a_weld_with_an_offset_is_moved_to_the_sensors_frame():
     simulator = Simulator(builder.Build())
     simulator.AdvanceTo(0.01)
     assert slide.get_translation(plant.GetMyContextFromRoot(simulator.get_context())) == 0.0
-    reading = sensor.GetOutputPort("sensor_wrench").Eval(sensor.GetMyContextFromRoot(simulator.get_context()))
+    reading = sensor.GetOutputPort("sensor_wrench").Eval(
+        sensor.GetMyContextFromRoot(simulator.get_context())
+    )
     weight = mass * GRAVITY
     np.testing.assert_allclose(reading.translational(), weight, atol=1e-9)
     moment = np.cross(X_SJ @ p_ToolCentre, weight)

@@ -279,14 +279,18 @@ def kernels(real: Any) -> types.SimpleNamespace:
         """Coulomb friction with an elastic anchor, returned to the limit.
 
         Args: slip from the anchor so far, its increment, tangential stiffness, largest force.
-        Returns: new slip.
+        Returns: new slip, energy lost by sliding.
         """
         trial = slip + step
         length = wp.length(trial)
         reach = limit / wp.max(stiffness, TINY)
+        new_slip = trial
+        lost = real(0.0)
         if length > reach:
-            trial = trial * (reach / length)
-        return trial
+            new_slip = trial * (reach / length)
+            change = new_slip - slip
+            lost = wp.dot(new_slip, trial - new_slip) + real(0.5) * wp.dot(change, change)
+        return new_slip, stiffness * lost
 
     @wp.func
     def flank_contact(
@@ -325,7 +329,7 @@ def kernels(real: Any) -> types.SimpleNamespace:
         normal_force = vec3()
         friction_force = vec3()
         new_slip = vec3()
-        # What the anchor stored and what is done on it, less what it stores then.
+        # What the anchor stored, less what it stores when the part in contact has changed.
         lost = real(0.5) * stiffness * old_area * wp.dot(slip, slip)
         if area > real(0.0) and wp.abs(r[0]) < knife[7]:
             # Ky points to the minus side when the knife hangs upside down in C.
@@ -340,7 +344,7 @@ def kernels(real: Any) -> types.SimpleNamespace:
                 knife_z = vec3(R[0, 2], R[1, 2], R[2, 2])
                 N = -stiffness * area * phi
                 # The part grows at the edge, where the flank is thinner than at the centroid.
-                at_edge = stiffness * growth * phi * (real(0.5) * phi - n2[1] * height)
+                at_edge = stiffness * growth * phi * (real(0.5) * phi - n[2] * height)
                 normal_force = N * n + at_edge * knife_z
                 relative = v - velocity - wp.cross(rotation_rate, arm) - bend_rate * knife_y
                 sliding = relative - wp.dot(relative, n) * n
@@ -350,10 +354,9 @@ def kernels(real: Any) -> types.SimpleNamespace:
                     mu += extra * wp.exp(-wp.length(sliding) / P[STRIBECK_VELOCITY])
                 old = slip * wp.min(old_area / area, real(1.0))
                 old = old - wp.dot(old, n) * n
-                new_slip = slide(old, sliding * dt, stiffness * area, mu * N)
+                new_slip, slid = slide(old, sliding * dt, stiffness * area, mu * N)
                 friction_force = -stiffness * area * new_slip
-                lost -= wp.dot(friction_force, sliding) * dt
-                lost -= real(0.5) * stiffness * area * wp.dot(new_slip, new_slip)
+                lost += slid - real(0.5) * stiffness * area * wp.dot(old, old)
         return normal_force, friction_force, new_slip, lost
 
     @wp.kernel(enable_backward=False, module=module)
@@ -378,11 +381,10 @@ def kernels(real: Any) -> types.SimpleNamespace:
         p_CK: wp.array(dtype=vec3),
         v_CK: wp.array(dtype=vec3),
         w_CK: wp.array(dtype=vec3),
-        direction: wp.array(dtype=vec3),
         blade: wp.array(dtype=real),
         passed: wp.array(dtype=real),
         parted: wp.array(dtype=real),
-        edge_force: wp.array(dtype=real),
+        edge_force: wp.array(dtype=vec3),
         slip: wp.array2d(dtype=vec3),
         force: wp.array2d(dtype=vec3),
         lateral: wp.array(dtype=real),
@@ -391,11 +393,11 @@ def kernels(real: Any) -> types.SimpleNamespace:
         """Edge, opening, self contact, flank contact and friction at each cut point.
 
         Advances the history: `passed`, the largest depth of the edge below the point; `parted`, the
-        share of the surface energy spent by opening; `edge_force`; `slip`, from the friction
-        anchors. Adds to `total`: forces on the knife by edge, flank pressure, friction [0:9], their
-        moments about Ko [9:18], and energies dissipated by the edge 18, by opening 19, by friction
-        20. Writes the area that is cut 21, the part of it above the edge 22, and its moment about
-        Ko [23:26].
+        share of the surface energy spent by opening; `edge_force` on the food; `slip`, from the
+        friction anchors. Adds to `total`: forces on the knife by edge, flank pressure, friction
+        [0:9], their moments about Ko [9:18], and energies dissipated by the edge 18, by opening 19,
+        by friction 20. Writes the area that is cut 21, the part of it above the edge 22, and its
+        moment about Ko [23:26].
         """
         i = wp.tid()
         w = weights[i]
@@ -421,7 +423,8 @@ def kernels(real: Any) -> types.SimpleNamespace:
         old_share = real(0.0)
         growth = real(0.0)
         rise = real(0.0)
-        if wp.abs(wp.dot(arm, knife_x)) < knife[7]:
+        beyond = wp.abs(wp.dot(arm, knife_x)) >= knife[7]
+        if not beyond:
             s = -wp.dot(arm, knife_z)
             s0 = s - wp.dot(motion, knife_z)
             u = (s + reach) * per_spacing
@@ -455,25 +458,27 @@ def kernels(real: Any) -> types.SimpleNamespace:
         pull = stiffness * opening + vec3(real(0.0), closing, real(0.0))
         opening_loss = toughness_i * A * (real(1.0) - D0) * (new_parted - old_parted)
 
-        # Edge: elastic up to the toughness that opening left, less what the bonds that it cuts give
-        # up, times the width carried; less where the edge has retreated.
+        # Edge: a spring in the blade's plane that gives way at R T (d . n) in its direction d. R is
+        # the toughness that opening left, less what the bonds that the edge cuts give up; a retreat
+        # slackens the spring. Where the edge moves on, d turns to the direction of its motion.
         bonded = real(0.5) * bond * intact * length * length
         left = wp.max(toughness_i * (real(1.0) - new_parted) - bonded, real(0.0))
-        slope = unloading[i]
-        limit = left * table(width, i, u1) - slope * (new_passed - s)
-        q0 = edge_force[i]
-        q = wp.max(wp.min(q0 + slope * (s - s0), limit), real(0.0))
-        edge_force[i] = q
-        d = direction[k]
-        edge = q * wp.max(wp.dot(d, knife_z), real(0.0)) * d
-        stored = real(0.5) * (q * q - q0 * q0) / wp.max(slope, TINY)
-        done = wp.dot(edge, motion)
-        if done < real(0.0):
-            # The direction lags behind a turn; no more may come back than was stored.
-            back = wp.clamp(stored / done, real(0.0), real(1.0))
-            edge = edge * back
-            done = done * back
-        edge_loss = done - stored + bonded * A * (D - D0)
+        spring = wp.max(unloading[i], TINY)
+        limit = wp.max(left * table(width, i, u1) - spring * (new_passed - s), real(0.0))
+        old_edge = edge_force[i]
+        trial = old_edge + spring * motion
+        trial = trial - wp.dot(trial, knife_y) * knife_y
+        down = wp.max(wp.dot(trial, knife_z), real(0.0))
+        size2 = wp.dot(trial, trial)
+        edge = trial
+        edge_loss = bonded * A * (D - D0)
+        if limit * down < size2 or beyond:
+            edge = vec3()
+            if not beyond:
+                edge = trial * (limit * down / size2)
+            change = edge - old_edge
+            edge_loss += (wp.dot(edge, trial - edge) + real(0.5) * wp.dot(change, change)) / spring
+        edge_force[i] = edge
 
         # Flanks on the part that is cut.
         normal_m, friction_m, slip_m, loss_m = flank_contact(
@@ -601,11 +606,10 @@ def kernels(real: Any) -> types.SimpleNamespace:
             lost = real(0.5) * stiffness * wp.dot(old, old)
             if depth > real(0.0):
                 sliding = (vi - wp.dot(vi, n) * n) * dt
-                slip = slide(old, sliding, stiffness, P[BOARD_FRICTION] * stiffness * depth)
+                slip, lost = slide(old, sliding, stiffness, P[BOARD_FRICTION] * stiffness * depth)
                 on_food = stiffness * (depth * n - slip)
                 f += on_food
                 board_force[i] = board_force[i] + on_food
-                lost += stiffness * (wp.dot(slip, sliding) - real(0.5) * wp.dot(slip, slip))
             board_loss[i] = board_loss[i] + lost
             board_slip[i] = slip
         v1 = vi + f * (inverse_mass[i] * dt)
@@ -660,7 +664,7 @@ def kernels(real: Any) -> types.SimpleNamespace:
         blade: wp.array(dtype=real),
         passed: wp.array(dtype=real),
         parted: wp.array(dtype=real),
-        edge_force: wp.array(dtype=real),
+        edge_force: wp.array(dtype=vec3),
         slip: wp.array2d(dtype=vec3),
         energy: wp.array(dtype=real),
     ):
@@ -692,8 +696,7 @@ def kernels(real: Any) -> types.SimpleNamespace:
             s = -wp.dot(arm, knife_z)
             share = table(fraction, i, (s + reach) * per_spacing)
             rise = table(centroid, i, (s + reach) * per_spacing)
-        q = edge_force[i]
-        doubled += q * q / wp.max(unloading[i], TINY)
+        doubled += wp.dot(edge_force[i], edge_force[i]) / wp.max(unloading[i], TINY)
         facing = real(1.0)
         if R[1, 1] < real(0.0):
             facing = real(-1.0)

@@ -53,9 +53,6 @@ class Numerics:
     unloading_length: float = quantity(
         1e-4, "m", low=1e-6, high=1e-2, doc="Retreat of the edge over which its force vanishes."
     )
-    direction_length: float = quantity(
-        2e-4, "m", low=1e-7, high=1e-2, doc="Travel over which the direction of cutting follows."
-    )
     precision: str = choice("float32", ("float32", "float64"), doc="Arithmetic of the kernels.")
     device: str = "cpu"
 
@@ -276,8 +273,8 @@ def make_cutting_model(
     step = numerics.time_step
     if not numerics.mass_scaling and step > critical:
         raise TimeStepError(
-            f"numerics.time_step = {step:.3g} s is beyond the stability limit {critical:.3g} s "
-            f"that the node at {nodes[worst]} m of the cut frame sets (true mass "
+            f"numerics.time_step = {step:.3g} s is beyond the stability limit {critical:.3g} s, "
+            f"set by the node at {nodes[worst]} m of the cut frame (true mass "
             f"{true_mass[worst]:.3g} kg, stiffness bound {4.0 * stiff[worst]:.3g} N/m). Give at "
             f"most {0.99 * critical:.3g}, a coarser mesh, or mass_scaling: true."
         )

@@ -150,9 +150,9 @@ def check_in_plane(model: CuttingModel, X_CK: Pose, time: float) -> None:
     if offset > LATERAL_LIMIT or lean > TILT_LIMIT or turn > TILT_LIMIT:
         raise CuttingError(
             f"at {time:.4g} s the blade is {1e3 * offset:.3g} mm off the cut plane, leans "
-            f"{lean:.3g} rad and is turned {turn:.3g} rad about the vertical; the model holds to "
-            f"{1e3 * LATERAL_LIMIT:g} mm and {TILT_LIMIT:g} rad. Give the knife's path the plane "
-            "of the cut."
+            f"{lean:.3g} rad and is turned {turn:.3g} rad about the vertical; the model holds "
+            f"up to {1e3 * LATERAL_LIMIT:g} mm and {TILT_LIMIT:g} rad. Give the knife's path the "
+            "plane of the cut."
         )
     _check_ends(model, X_CK, time)
 

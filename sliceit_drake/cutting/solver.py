@@ -1,7 +1,6 @@
 """Advances the food through one exchange: captured Warp graphs on a workspace, state in NumPy."""
 
 import dataclasses as dc
-import math
 import threading
 from typing import Any
 
@@ -79,9 +78,8 @@ class CuttingSolver:
     """Steps the state of one `CuttingModel`.
 
     The state is one contiguous array [state_size]: positions, velocities, history of the cut
-    points, friction anchors, blade deflection, direction of cutting. A call copies it into the
-    workspace that the captured graph is bound to and copies the result out; nothing is carried
-    between calls.
+    points, friction anchors, blade deflection. A call copies it into the workspace that the
+    captured graph is bound to and copies the result out; nothing is carried between calls.
 
     Args:
         model: The cut.
@@ -123,7 +121,7 @@ class CuttingSolver:
             ("v", N, vec3, 3),
             ("passed", P, real, 1),
             ("parted", P, real, 1),
-            ("edge_force", P, real, 1),
+            ("edge_force", P, vec3, 3),
             ("slip", 2 * P, vec3, 3),
             ("board_slip", N, vec3, 3),
             ("blade", 2, real, 1),
@@ -132,8 +130,7 @@ class CuttingSolver:
         for name, count, _, width in fields:
             self._layout[name] = slice(offset, offset + count * width)
             offset += count * width
-        self._layout["direction"] = slice(offset, offset + 3)
-        self.state_size = offset + 3
+        self.state_size = offset
         self._state = wp.zeros(offset, dtype=real, device=self._device)
         self._w = {
             name: self._view(self._state, self._layout[name].start, dtype, count)
@@ -142,7 +139,6 @@ class CuttingSolver:
         self._w["slip"] = self._w["slip"].reshape((P, 2))
 
         motion = [("R_CK", k.mat33, 9), ("p_CK", vec3, 3), ("v_CK", vec3, 3), ("w_CK", vec3, 3)]
-        motion.append(("direction", vec3, 3))
         self._motion = wp.zeros(n * sum(w for _, _, w in motion), dtype=real, device=self._device)
         start = 0
         for name, dtype, width in motion:
@@ -215,7 +211,6 @@ class CuttingSolver:
             self._w[name] = self._array(values, dtype)
         # Rows of `shape` are eight-wide vectors.
         self._w["shape"] = self._array(m.shape, k.lanes)
-        self._centre = np.average(m.split.points, axis=0, weights=m.tables.area).tolist()
         self._weight = m.weight.ravel().astype(self.dtype)
         self._ones = np.ones(N)
         self._share = np.arange(1, n + 1)[:, None] / n
@@ -229,11 +224,10 @@ class CuttingSolver:
         )
 
     def initial_state(self) -> np.ndarray:
-        """The food at rest [state_size]; the direction of cutting points down."""
+        """The food at rest [state_size]."""
         state = np.zeros(self.state_size, self.dtype)
         state[self._layout["x"]] = self.model.nodes.ravel()
         state[self._layout["passed"]] = -self.model.tables.reach
-        state[self._layout["direction"]] = (0.0, 0.0, -1.0)
         return state
 
     def positions(self, state: np.ndarray) -> np.ndarray:
@@ -246,7 +240,7 @@ class CuttingSolver:
 
     def field(self, state: np.ndarray, name: str) -> np.ndarray:
         """A part of the state by name: x, v, passed, parted, edge_force, slip,
-        board_slip, blade, direction."""
+        board_slip, blade."""
         return state[self._layout[name]]
 
     def _launch_substep(self, k: int) -> None:
@@ -288,22 +282,17 @@ class CuttingSolver:
             + [w["width"], w["fraction"], w["centroid"], w["unloading"]]
             + [self.real(tables.reach), self.real(1.0 / tables.spacing)]
             + [w["P"], w["knife"], k, dt]
-            + [w[name] for name in ("R_CK", "p_CK", "v_CK", "w_CK", "direction")]
+            + [w[name] for name in ("R_CK", "p_CK", "v_CK", "w_CK")]
             + [w["blade"], w["passed"], w["parted"], w["edge_force"], w["slip"]]
             + [w["point_force"], w["lateral"], w["total"]],
         )
 
-    def _load(self, state: np.ndarray) -> None:
-        """Copies a state into the workspace."""
-        self._write(self._state, state[: self._layout["direction"].start])
-
-    def _place(self, pose: Pose, state: np.ndarray) -> None:
+    def _place(self, pose: Pose) -> None:
         """Puts the knife at rest at `pose` for launches with k = 0."""
         n = self.substeps
-        motion = np.zeros(21 * n, self.dtype)
+        motion = np.zeros(18 * n, self.dtype)
         motion[:9] = pose.R.ravel()
         motion[9 * n : 9 * n + 3] = pose.p
-        motion[18 * n : 18 * n + 3] = state[self._layout["direction"]]
         self._write(self._motion, motion)
 
     def _write(self, array: wp.array, values: np.ndarray) -> None:
@@ -341,18 +330,16 @@ class CuttingSolver:
             CuttingError: A force is not finite, or the knife left the region that is modelled.
         """
         m, n, T = self.model, self.substeps, self.exchange_period
-        motion, direction, v, w = self._interpolate(state, start, end)
+        motion, v, w = self._interpolate(start, end)
         with self._lock:
             if self._graph is None:
                 self._capture()
-            self._load(state)
+            self._write(self._state, state)
             self._write(self._motion, motion)
             self._sums.zero_()
             wp.capture_launch(self._graph)
-            new = np.empty(self.state_size, self.dtype)
-            new[: self._layout["direction"].start] = self._read(self._state)
+            new = self._read(self._state).copy()
             sums = self._read(self._sums).astype(np.float64)
-        new[self._layout["direction"]] = direction
         total = sums[self._sum_layout["total"]].reshape(-1, ACCUMULATED).sum(0)
         if not np.isfinite(total).all():
             raise CuttingError(
@@ -395,78 +382,34 @@ class CuttingSolver:
             cut=float(total[21]) / m.section_area,
         )
 
-    def _interpolate(
-        self, state: np.ndarray, start: Pose, end: Pose
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def _interpolate(self, start: Pose, end: Pose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Knife poses at the ends of the sub-steps, constant velocity and rotation rate.
 
         Rotation matrices are interpolated linearly: for a turn of angle a between exchanges they
         are orthonormal to a^2 / 8, 1e-6 at 1 rad/s and 2 ms.
 
         Returns:
-            The kernels' motion buffer, the direction of cutting at the end, velocity [3] of Ko and
-            rotation rate [3].
+            The kernels' motion buffer, velocity [3] of Ko and rotation rate [3].
         """
         n, T = self.substeps, self.exchange_period
         v = (end.p - start.p) / T
         R0, R1 = start.R, end.R
         dR = R1 @ R0.T
         w = np.array([dR[2, 1] - dR[1, 2], dR[0, 2] - dR[2, 0], dR[1, 0] - dR[0, 1]]) * (0.5 / T)
-        motion = np.empty(21 * n, self.dtype)
+        motion = np.empty(18 * n, self.dtype)
         share = self._share
         motion[: 9 * n].reshape(n, 9)[:] = R0.ravel() + share * (R1 - R0).ravel()
         motion[9 * n : 12 * n].reshape(n, 3)[:] = start.p + share * (v * T)
         motion[12 * n : 15 * n].reshape(n, 3)[:] = v
         motion[15 * n : 18 * n].reshape(n, 3)[:] = w
-        directions = self._directions(state, end, v.tolist(), w.tolist())
-        motion[18 * n :] = directions
-        return motion, np.array(directions[-3:]), v, w
-
-    def _directions(
-        self, state: np.ndarray, end: Pose, v: list[float], w: list[float]
-    ) -> list[float]:
-        """Direction of cutting in each sub-step [3 n].
-
-        It is the direction of the edge's velocity in the blade's plane, at the middle of the
-        section, followed over `direction_length` of travel, so that it exists at rest.
-        """
-        n = self.substeps
-        dx, dy, dz = state[self._layout["direction"]].tolist()
-        (xx, yx, _), (xy, yy, _), (xz, yz, _) = end.R.tolist()
-        px, py, pz = end.p.tolist()
-        cx, cy, cz = self._centre
-        along = (cx - px) * xx + (cy - py) * xy + (cz - pz) * xz
-        ax, ay, az = along * xx, along * xy, along * xz
-        ux = v[0] + w[1] * az - w[2] * ay
-        uy = v[1] + w[2] * ax - w[0] * az
-        uz = v[2] + w[0] * ay - w[1] * ax
-        out_of_plane = ux * yx + uy * yy + uz * yz
-        ux, uy, uz = ux - out_of_plane * yx, uy - out_of_plane * yy, uz - out_of_plane * yz
-        speed = math.sqrt(ux * ux + uy * uy + uz * uz)
-        if speed == 0.0:
-            return [dx, dy, dz] * n
-        ux, uy, uz = ux / speed, uy / speed, uz / speed
-        keep = math.exp(-speed * self.exchange_period / n / self.model.numerics.direction_length)
-        directions: list[float] = []
-        for _ in range(n):
-            ex, ey, ez = (
-                keep * dx + (1.0 - keep) * ux,
-                keep * dy + (1.0 - keep) * uy,
-                keep * dz + (1.0 - keep) * uz,
-            )
-            size = math.sqrt(ex * ex + ey * ey + ez * ez)
-            # A reversal passes through zero; there the old direction holds for one more sub-step.
-            if size > 1e-9:
-                dx, dy, dz = ex / size, ey / size, ez / size
-            directions += (dx, dy, dz)
-        return directions
+        return motion, v, w
 
     def energies(self, state: np.ndarray, pose: Pose) -> Energies:
         """Energies of `state` with the knife at `pose`."""
         w, kern, m = self._w, self._kernels, self.model
         with self._lock:
-            self._load(state)
-            self._place(pose, state)
+            self._write(self._state, state)
+            self._place(pose)
             self._launch(
                 kern.element_energy,
                 (len(m.blocks), LANES),
@@ -507,8 +450,8 @@ class CuttingSolver:
         """Force of what holds the food on the food [3], N, in C, with the knife at `pose`."""
         w, m = self._w, self.model
         with self._lock:
-            self._load(state)
-            self._place(pose, state)
+            self._write(self._state, state)
+            self._place(pose)
             self._launch_look_ahead()
             self._launch_elements()
             # A step of no duration changes no history; what it writes stays in the workspace.

@@ -1,5 +1,7 @@
 """The simulated slicing station: a Scenario becomes a Diagram."""
 
+from collections.abc import Callable
+
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
 from pydrake.math import RigidTransform, RotationMatrix
@@ -52,7 +54,12 @@ class SlicingStation(Diagram):
         meshcat: The viewer, or None.
     """
 
-    def __init__(self, scenario: Scenario, meshcat: Meshcat | None = None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        meshcat: Meshcat | None = None,
+        make_cutting: Callable[[RigidBody], KnifeForceSystem] | None = None,
+    ) -> None:
         super().__init__()
         self.scenario = scenario
         self.meshcat = meshcat
@@ -67,6 +74,8 @@ class SlicingStation(Diagram):
 
         self.cutting: KnifeForceSystem
         self.cutting, X_FK = _make_cutting(scenario, model, self.robot.knife)
+        if make_cutting is not None:
+            self.cutting = make_cutting(self.robot.knife)
         self.start_pose = scenario.X_WF() @ X_FK
         self.start_joints = solve_start_joints(
             self.plant,
@@ -187,17 +196,23 @@ class SlicingStation(Diagram):
         set_joint_positions(root_context, self.plant, self.robot, self._arm, self.start_joints)
 
 
-def MakeSlicingStation(scenario: Scenario, meshcat: Meshcat | None = None) -> SlicingStation:
+def MakeSlicingStation(
+    scenario: Scenario,
+    meshcat: Meshcat | None = None,
+    make_cutting: Callable[[RigidBody], KnifeForceSystem] | None = None,
+) -> SlicingStation:
     """The simulated station of a scenario; connect a source of targets to its input ports.
 
     Args:
         scenario: What to simulate.
         meshcat: Viewer to draw in, or None.
+        make_cutting: Makes a cutting system of your own, given the knife's body; None for that of
+            the scenario's food, which still says where the knife starts.
 
     Raises:
         ConfigurationError, MeshError, TimeStepError: The scenario cannot be built.
     """
-    return SlicingStation(scenario, meshcat)
+    return SlicingStation(scenario, meshcat, make_cutting)
 
 
 def _food_model(scenario: Scenario) -> CuttingModel | None:
