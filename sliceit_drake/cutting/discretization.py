@@ -37,10 +37,14 @@ def estimate_discretization_error(
     exchange_period: float,
     motion: Motion,
     board: Board | None,
-    refinement: float = 0.75,
-    order: float = 1.0,
+    refinement: float = 0.5,
+    order: float = 1.5,
 ) -> DiscretizationError:
     """Richardson's estimate from the given mesh and a coarser one, on a prescribed motion.
+
+    The order that is assumed, 1.5, lies below the 1.6 to 1.9 seen with cucumbers between the meshes
+    of half and of full fineness: flanks and bonds, whose stiffness goes with E/h, are of first
+    order, the bulk of second. The step's error is not in it; it is under 0.2 % at the default.
 
     Args:
         food, knife, numerics, exchange_period: The cut.
@@ -48,6 +52,9 @@ def estimate_discretization_error(
         board: Board under the knife, or None.
         refinement: Elements along an edge of the coarse mesh, relative to the given one.
         order: Order p of convergence: the error is the difference over refinement^-p - 1.
+
+    Raises:
+        MeshError, CuttingError: The food cannot be meshed or cut at the coarser refinement.
     """
 
     def force(scale: float) -> tuple[SliceResult, int]:
@@ -59,7 +66,9 @@ def estimate_discretization_error(
     given, count = force(1.0)
     norms = [np.linalg.norm(r.food_wrench[:, 3:], axis=1) for r in (coarse, given)]
     contact = norms[1] > 0.05
+    if not contact.any():
+        return DiscretizationError(0.0, order, [coarse_count, count])
     difference = np.sqrt(np.mean((norms[0] - norms[1])[contact] ** 2))
     scale = np.sqrt(np.mean(norms[1][contact] ** 2))
-    error = float(difference / scale / (refinement**-order - 1.0)) if contact.any() else 0.0
+    error = float(difference / scale / (refinement**-order - 1.0))
     return DiscretizationError(error, order, [coarse_count, count])

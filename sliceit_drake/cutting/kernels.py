@@ -29,6 +29,8 @@ PARAMETERS = (
     "friction",
     "static_friction",
     "stribeck_velocity",
+    "unloading_length",
+    "direction_length",
     "board_stiffness",
     "board_friction",
     "blade_stiffness",
@@ -66,6 +68,8 @@ def kernels(real: Any) -> types.SimpleNamespace:
     FRICTION = wp.constant(_INDEX["friction"])
     STATIC_FRICTION = wp.constant(_INDEX["static_friction"])
     STRIBECK_VELOCITY = wp.constant(_INDEX["stribeck_velocity"])
+    UNLOADING_LENGTH = wp.constant(_INDEX["unloading_length"])
+    DIRECTION_LENGTH = wp.constant(_INDEX["direction_length"])
     BOARD_STIFFNESS = wp.constant(_INDEX["board_stiffness"])
     BOARD_FRICTION = wp.constant(_INDEX["board_friction"])
     BLADE_STIFFNESS = wp.constant(_INDEX["blade_stiffness"])
@@ -384,7 +388,8 @@ def kernels(real: Any) -> types.SimpleNamespace:
         blade: wp.array(dtype=real),
         passed: wp.array(dtype=real),
         parted: wp.array(dtype=real),
-        edge_force: wp.array(dtype=vec3),
+        edge_force: wp.array(dtype=real),
+        heading: wp.array(dtype=vec3),
         slip: wp.array2d(dtype=vec3),
         force: wp.array2d(dtype=vec3),
         lateral: wp.array(dtype=real),
@@ -393,11 +398,11 @@ def kernels(real: Any) -> types.SimpleNamespace:
         """Edge, opening, self contact, flank contact and friction at each cut point.
 
         Advances the history: `passed`, the largest depth of the edge below the point; `parted`, the
-        share of the surface energy spent by opening; `edge_force` on the food; `slip`, from the
-        friction anchors. Adds to `total`: forces on the knife by edge, flank pressure, friction
-        [0:9], their moments about Ko [9:18], and energies dissipated by the edge 18, by opening 19,
-        by friction 20. Writes the area that is cut 21, the part of it above the edge 22, and its
-        moment about Ko [23:26].
+        share of the surface energy spent by opening; `edge_force` on the food and its direction
+        `heading`; `slip`, from the friction anchors. Adds to `total`: forces on the knife by edge,
+        flank pressure, friction [0:9], their moments about Ko [9:18], and energies dissipated by
+        the edge 18, by opening 19, by friction 20. Writes the area that is cut 21, the part of it
+        above the edge 22, and its moment about Ko [23:26].
         """
         i = wp.tid()
         w = weights[i]
@@ -458,27 +463,34 @@ def kernels(real: Any) -> types.SimpleNamespace:
         pull = stiffness * opening + vec3(real(0.0), closing, real(0.0))
         opening_loss = toughness_i * A * (real(1.0) - D0) * (new_parted - old_parted)
 
-        # Edge: a spring in the blade's plane that gives way at R T (d . n) in its direction d. R is
-        # the toughness that opening left, less what the bonds that the edge cuts give up; a retreat
-        # slackens the spring. Where the edge moves on, d turns to the direction of its motion.
+        # Edge: a force against the edge's direction d, elastic up to R T (d . n), where R is the
+        # toughness that opening left less what the bonds that the edge cuts give up. d follows the
+        # knife's own motion: with the food's in it, a drawn edge would feel less force the faster
+        # the food moves, and chatter. Behind the deepest point there is a slack and then nothing.
+        along = v_CK[k] + wp.cross(w_CK[k], arm)
+        along = along - wp.dot(along, knife_y) * knife_y
+        travel = wp.length(along) * dt
+        d = heading[i]
+        if travel > real(0.0):
+            keep = wp.exp(-travel / P[DIRECTION_LENGTH])
+            d = keep * d + ((real(1.0) - keep) * dt / travel) * along
+        d = d - wp.dot(d, knife_y) * knife_y
+        size = wp.length(d)
+        d = wp.where(size > real(1.0e-6), d / wp.max(size, real(1.0e-6)), heading[i])
+        heading[i] = d
         bonded = real(0.5) * bond * intact * length * length
         left = wp.max(toughness_i * (real(1.0) - new_parted) - bonded, real(0.0))
         spring = wp.max(unloading[i], TINY)
-        limit = wp.max(left * table(width, i, u1) - spring * (new_passed - s), real(0.0))
-        old_edge = edge_force[i]
-        trial = old_edge + spring * motion
-        trial = trial - wp.dot(trial, knife_y) * knife_y
-        down = wp.max(wp.dot(trial, knife_z), real(0.0))
-        size2 = wp.dot(trial, trial)
-        edge = trial
-        edge_loss = bonded * A * (D - D0)
-        if limit * down < size2 or beyond:
-            edge = vec3()
-            if not beyond:
-                edge = trial * (limit * down / size2)
-            change = edge - old_edge
-            edge_loss += (wp.dot(edge, trial - edge) + real(0.5) * wp.dot(change, change)) / spring
-        edge_force[i] = edge
+        limit = left * table(width, i, u1) * wp.max(wp.dot(d, knife_z), real(0.0))
+        limit -= spring * wp.max(new_passed - s - P[UNLOADING_LENGTH], real(0.0))
+        if beyond:
+            limit = real(0.0)
+        q0 = edge_force[i]
+        step = wp.dot(d, motion)
+        q = wp.clamp(q0 + spring * step, real(0.0), wp.max(limit, real(0.0)))
+        edge_force[i] = q
+        edge = q * d
+        edge_loss = q * step - real(0.5) * (q * q - q0 * q0) / spring + bonded * A * (D - D0)
 
         # Flanks on the part that is cut.
         normal_m, friction_m, slip_m, loss_m = flank_contact(
@@ -664,7 +676,7 @@ def kernels(real: Any) -> types.SimpleNamespace:
         blade: wp.array(dtype=real),
         passed: wp.array(dtype=real),
         parted: wp.array(dtype=real),
-        edge_force: wp.array(dtype=vec3),
+        edge_force: wp.array(dtype=real),
         slip: wp.array2d(dtype=vec3),
         energy: wp.array(dtype=real),
     ):
@@ -696,7 +708,7 @@ def kernels(real: Any) -> types.SimpleNamespace:
             s = -wp.dot(arm, knife_z)
             share = table(fraction, i, (s + reach) * per_spacing)
             rise = table(centroid, i, (s + reach) * per_spacing)
-        doubled += wp.dot(edge_force[i], edge_force[i]) / wp.max(unloading[i], TINY)
+        doubled += edge_force[i] * edge_force[i] / wp.max(unloading[i], TINY)
         facing = real(1.0)
         if R[1, 1] < real(0.0):
             facing = real(-1.0)

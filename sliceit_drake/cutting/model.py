@@ -21,6 +21,14 @@ GRAVITY = 9.81
 SLIVER = 0.1
 """Share of a vertex's mass below which a node of one side does not set the step."""
 
+LEAST_SHARE = 0.05
+"""Least share of a split element's stiffness that a copy gets; the other gets the rest.
+
+A corner of material that is much smaller than its element would be held by a share of the stiffness
+that vanishes as its size cubed, but pushed by the edge in proportion to its size: it would invert.
+Volume, mass and weight keep their true shares, and the two copies together their stiffness.
+"""
+
 
 class TimeStepError(ValueError):
     """The time step is beyond the stability limit; the message names the limit and the fix."""
@@ -53,6 +61,9 @@ class Numerics:
     unloading_length: float = quantity(
         1e-4, "m", low=1e-6, high=1e-2, doc="Retreat of the edge over which its force vanishes."
     )
+    direction_length: float = quantity(
+        2e-4, "m", low=1e-7, high=1e-2, doc="Travel over which the edge's direction follows."
+    )
     precision: str = choice("float32", ("float32", "float64"), doc="Arithmetic of the kernels.")
     device: str = "cpu"
 
@@ -71,7 +82,7 @@ class CuttingModel:
         moving: Computed nodes that are not held [K].
         nodes: Rest positions of computed nodes [N, 3].
         blocks: Node indices of elements, eight an entry [B, 4, LANES].
-        shape: Inverse rest edges (row major) and minus the material volume [B, 10, LANES].
+        shape: Inverse rest edges (row major) and minus the volume that is stiff [B, 10, LANES].
         element_count: Elements without padding.
         true_mass, mass: Lumped true mass and the mass that is stepped [N], kg.
         weight: Gravity force on each node [N, 3], N, by the true mass.
@@ -198,6 +209,8 @@ def make_cutting_model(
     edges = np.stack([nodes[t[:, k]] - nodes[t[:, 0]] for k in (1, 2, 3)], axis=-1)
     whole = np.linalg.det(edges) / 6.0
     volume = whole * fraction
+    # Both copies of a split element share its stiffness; see `LEAST_SHARE`.
+    stiff_volume = whole * _stiffness_share(fraction)
     inverse = np.linalg.inv(edges)
     element_size = TetrahedralMesh(nodes, t).mean_edge_length()
 
@@ -238,6 +251,8 @@ def make_cutting_model(
         "friction": material.friction,
         "static_friction": material.static_friction,
         "stribeck_velocity": material.stribeck_velocity,
+        "unloading_length": numerics.unloading_length,
+        "direction_length": numerics.direction_length,
         "board_stiffness": numerics.board_stiffness * scale,
         "board_friction": numerics.board_friction,
         "blade_stiffness": knife.lateral_stiffness,
@@ -255,7 +270,7 @@ def make_cutting_model(
     parameters["blade_mass"] = max(
         knife.lateral_mass(), blade_need * (numerics.time_step / numerics.stability_margin) ** 2
     )
-    bulk = 0.25 * _stiffness_bound(t, inverse, volume, material)
+    bulk = 0.25 * _stiffness_bound(t, inverse, stiff_volume, material)
     per_point = tables.area * (2.0 * bond + 2.0 * parameters["flank_stiffness"])
     per_point += 0.5 * unloading
     contact = 2.0 * parameters["board_stiffness"] * board_area
@@ -282,7 +297,7 @@ def make_cutting_model(
     scaled = np.ones(len(nodes), bool) if numerics.mass_scaling else sliver
     mass = np.where(scaled, np.maximum(true_mass, (stiff * x + viscous) * x), true_mass)
 
-    blocks, shape = _blocks(t, inverse, volume)
+    blocks, shape = _blocks(t, inverse, stiff_volume)
     return CuttingModel(
         split=split,
         material=material,
@@ -310,6 +325,10 @@ def make_cutting_model(
         element_size=element_size,
         critical_time_step=critical,
     )
+
+
+def _stiffness_share(fraction: np.ndarray) -> np.ndarray:
+    return np.where(fraction < 1.0, np.clip(fraction, LEAST_SHARE, 1.0 - LEAST_SHARE), 1.0)
 
 
 def _largest_step(mass: np.ndarray, stiff: np.ndarray, viscous: np.ndarray) -> np.ndarray:

@@ -121,7 +121,8 @@ class CuttingSolver:
             ("v", N, vec3, 3),
             ("passed", P, real, 1),
             ("parted", P, real, 1),
-            ("edge_force", P, vec3, 3),
+            ("edge_force", P, real, 1),
+            ("heading", P, vec3, 3),
             ("slip", 2 * P, vec3, 3),
             ("board_slip", N, vec3, 3),
             ("blade", 2, real, 1),
@@ -224,10 +225,11 @@ class CuttingSolver:
         )
 
     def initial_state(self) -> np.ndarray:
-        """The food at rest [state_size]."""
+        """The food at rest, to be cut downwards [state_size]."""
         state = np.zeros(self.state_size, self.dtype)
         state[self._layout["x"]] = self.model.nodes.ravel()
         state[self._layout["passed"]] = -self.model.tables.reach
+        state[self._layout["heading"]].reshape(-1, 3)[:, 2] = -1.0
         return state
 
     def positions(self, state: np.ndarray) -> np.ndarray:
@@ -239,8 +241,8 @@ class CuttingSolver:
         return np.asarray(state[self._layout["v"]]).reshape(-1, 3)
 
     def field(self, state: np.ndarray, name: str) -> np.ndarray:
-        """A part of the state by name: x, v, passed, parted, edge_force, slip,
-        board_slip, blade."""
+        """A part of the state by name: x, v, passed, parted, edge_force, heading, slip, board_slip,
+        blade."""
         return state[self._layout[name]]
 
     def _launch_substep(self, k: int) -> None:
@@ -283,7 +285,7 @@ class CuttingSolver:
             + [self.real(tables.reach), self.real(1.0 / tables.spacing)]
             + [w["P"], w["knife"], k, dt]
             + [w[name] for name in ("R_CK", "p_CK", "v_CK", "w_CK")]
-            + [w["blade"], w["passed"], w["parted"], w["edge_force"], w["slip"]]
+            + [w["blade"], w["passed"], w["parted"], w["edge_force"], w["heading"], w["slip"]]
             + [w["point_force"], w["lateral"], w["total"]],
         )
 

@@ -3,9 +3,10 @@
 Each tetrahedron with material on one side of the plane gets a copy for that side, which refers to
 that side's copies of its vertices and holds the share of the volume on its side (Molino, Bao and
 Fedkiw 2004; Sifakis, Der and Fedkiw 2007). Nothing is moved, so volume, mass and section are
-conserved for any plane. A vertex within `snap` of the plane counts as on it. Slivers need no
-merging: a copy's stiffness and its lumped mass shrink by the same share, so no copy is stiffer for
-its mass than its parent (docs/physics.md has the step limit over 1,000 random planes).
+conserved for any plane. A vertex within `snap` of the plane counts as on it. No sliver is merged:
+its bulk stiffness and its mass shrink alike, but the stiffness of bonds, flanks and edge at its
+surface does not, nor does the force of the edge on it; `model.SLIVER` and `model.LEAST_SHARE` say
+what becomes of it, benchmarks/split_step_limit.py what that leaves of the step limit.
 """
 
 import dataclasses as dc

@@ -1,0 +1,115 @@
+"""Energy books of a cut: what the knife puts in is stored or goes somewhere."""
+
+import numpy as np
+import pytest
+
+from sliceit_drake.cutting.food import Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.material import Material
+from sliceit_drake.cutting.model import Numerics
+from sliceit_drake.cutting.motion import (
+    ConstantSpeed,
+    Hold,
+    Motion,
+    MotionPlan,
+    PressAndDraw,
+    Retract,
+)
+from sliceit_drake.cutting.simulate import simulate_slice
+from sliceit_drake.cutting.solver import CuttingSolver
+
+SHAPE = Cylinder(rings=3, layers=[0.0, 0.004, 0.012])
+
+PRESS = [ConstantSpeed(distance=0.0275, speed=0.02, acceleration=None)]
+MOTIONS = {
+    "press": PRESS,
+    "press, hold, retract": [
+        *PRESS,
+        Hold(duration=0.1),
+        Retract(distance=0.04, speed=0.05, acceleration=0.5),
+    ],
+    "draw to and fro": [
+        PressAndDraw(distance=0.0275, press_speed=0.02, amplitude=0.01, frequency=2.0)
+    ],
+    "two passes": [
+        ConstantSpeed(distance=0.015, speed=0.03, acceleration=0.5),
+        Retract(distance=0.01, speed=0.03, acceleration=0.5),
+        ConstantSpeed(distance=0.0225, speed=0.03, acceleration=0.5),
+    ],
+}
+
+
+def run(segments, exchange_period=2e-3, **material):
+    food = Food(shape=SHAPE, material=Material(**{"toughness": 400.0, "friction": 0.1} | material))
+    model = make_food_model(food, Knife(), Numerics())
+    solver = CuttingSolver(model, exchange_period)
+    motion = Motion(MotionPlan(list(segments)), start_pose(model, clearance=5e-4))
+    return model, solver, motion
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_books_close(name):
+    model, solver, motion = run(MOTIONS[name])
+    result = simulate_slice(solver, motion)
+    assert abs(result.ledger.imbalance(result.energies)) < 0.01 * result.ledger.work
+
+
+def test_knife_work_less_everything_else_is_toughness_times_area():
+    model, solver, motion = run(PRESS)
+    result = simulate_slice(solver, motion)
+    ledger, energies = result.ledger, result.energies
+    # The knife's work from forces and path alone.
+    moved = np.diff(np.vstack([motion.pose(0.0).p, result.position]), axis=0)
+    work = -float((result.food_wrench[:, 3:] * moved).sum())
+    stored = energies.elastic + energies.interface + energies.kinetic
+    elsewhere = ledger.opening + ledger.friction + ledger.board_friction + ledger.blade
+    net = work + ledger.gravity - stored - elsewhere - ledger.damping(energies)
+    assert net == pytest.approx(400.0 * model.section_area, rel=0.03)
+
+
+@pytest.mark.parametrize("name", ["press, hold, retract", "draw to and fro"])
+def test_no_mechanism_gives_energy_back_in_any_sub_step(name):
+    _, solver, motion = run(MOTIONS[name], exchange_period=5e-4, static_friction=0.15)
+    assert solver.substeps == 1
+    model, T = solver.model, solver.exchange_period
+    R = model.X_FC_rotation
+
+    def pose(t):
+        X = motion.pose(t)
+        return X._replace(R=R.T @ X.R, p=model.to_cut_frame(X.p))
+
+    state, last = solver.initial_state(), pose(0.0)
+    losses = []
+    for k in range(round(motion.duration / T)):
+        now = pose((k + 1) * T)
+        step = solver.exchange(state, last, now)
+        state, last = step.state, now
+        losses.append(
+            (
+                step.edge_dissipation,
+                step.opening_dissipation,
+                step.friction_dissipation,
+                step.board_dissipation,
+                step.blade_dissipation,
+            )
+        )
+    losses = np.array(losses)
+    # Below zero only by the rounding of single precision.
+    assert losses.min() > -1e-7 * losses.sum()
+    assert losses[:, 0].sum() == pytest.approx(400.0 * model.section_area, rel=0.03)
+    assert losses[:, 2].sum() > 0.01 * losses[:, 0].sum()
+
+
+def test_a_second_pass_through_the_open_cut_does_no_work_of_cutting():
+    _, solver, motion = run(
+        [
+            ConstantSpeed(distance=0.0275, speed=0.03, acceleration=0.5),
+            Retract(distance=0.03, speed=0.05, acceleration=0.5),
+            ConstantSpeed(distance=0.03, speed=0.03, acceleration=0.5),
+        ],
+        friction=0.0,
+    )
+    result = simulate_slice(solver, motion)
+    again = (result.time > 1.75) & (result.position[:, 2] > 0.003)
+    assert np.count_nonzero(again) > 100
+    assert np.abs(result.edge[again, 2]).max() < 0.02 * result.edge[:, 2].max()
