@@ -29,7 +29,7 @@ from sliceit_drake.diagrams.snapshot import Snapshot, take_snapshot
 from sliceit_drake.diagrams.station import SlicingStation
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.resources import resource_path
-from sliceit_drake.systems.cutting_system import CuttingSystem
+from sliceit_drake.systems.cutting_system import ENERGY_NAMES, LEDGER_NAMES, CuttingSystem
 
 __all__ = ["Run", "prepare_run", "simulate", "write_outputs"]
 
@@ -304,6 +304,15 @@ def _summary(run: Run, record: Record, comparison: Comparison | None) -> dict:
     return summary
 
 
+def _imbalance(record: Record) -> float:
+    """Work put into the food less everything that it went into, at the end of the record, J."""
+    last = {name: float(record[f"energy_{name}"][-1]) for name in (*LEDGER_NAMES, *ENERGY_NAMES)}
+    stored = last["elastic"] + last["interface"] + last["kinetic"]
+    damping = -last["internal"] - last["elastic"]
+    spent = sum(last[name] for name in ("edge", "opening", "friction", "board_friction", "blade"))
+    return last["work"] + last["gravity"] - stored - spent - damping
+
+
 def _cutting_summary(run: Run, record: Record) -> dict:
     """Numbers of the finite-element food."""
     scenario, station = run.scenario, run.station
@@ -326,6 +335,7 @@ def _cutting_summary(run: Run, record: Record) -> dict:
             for name in ("edge", "opening", "friction", "board_friction", "blade")
         },
         "work_per_area_J_m2": work / model.section_area,
+        "energy_imbalance_J": _imbalance(record),
         "energy_ratio": float(record["energy_largest_energy_ratio"][-1]),
         "least_volume_ratio": float(record["energy_least_volume_ratio"][-1]),
         "coupling_work_error_J": float(record["coupling_work_error"][-1]),
