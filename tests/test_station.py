@@ -2,6 +2,9 @@
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan, Retract
@@ -12,6 +15,10 @@ from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.station import MakeSlicingStation
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
+from sliceit_drake.systems.knife_force import KnifeForceSystem
+
+# World height of the edge at the start over an analytic food: board, diameter, clearance.
+START_HEIGHT = 0.05 + 0.027 + 0.010
 
 SMALL_FOOD = "{food: {shape: !Cylinder {rings: 3, layers: [0.0, 0.004, 0.012]}}}"
 
@@ -37,7 +44,6 @@ def test_station_keeps_the_port_contract(food):
 
 
 def test_contract_check_names_what_is_missing():
-    from pydrake.systems.framework import DiagramBuilder
     from pydrake.systems.primitives import ConstantVectorSource
 
     builder = DiagramBuilder()
@@ -124,6 +130,41 @@ def test_analytic_food_gives_toughness_times_width():
     np.testing.assert_allclose(
         record["food_wrench_f_z"][inside], 300.0 * width[inside], rtol=0.0, atol=0.1
     )
+
+
+class Spring(KnifeForceSystem):
+    """A user's cutting system: a spring below the start."""
+
+    def advance(self, context, state, X_WK, V_WK):
+        depth = max(0.0, START_HEIGHT - 0.005 - X_WK.translation()[2])
+        return np.array([0.0, 0.0, 0.0, 0.0, 0.0, 2000.0 * depth]), 0.0
+
+
+def test_station_takes_a_cutting_system_of_the_users_own():
+    scenario = cucumber()
+    scenario.food = AnalyticFood()
+    builder = DiagramBuilder()
+    station = builder.AddNamedSystem(
+        "station",
+        MakeSlicingStation(
+            scenario, make_cutting=lambda knife: Spring(knife.index(), scenario.exchange_period)
+        ),
+    )
+    check_station_ports(station)
+    assert station.start_pose.translation()[2] == pytest.approx(START_HEIGHT)
+    builder.ExportInput(station.GetInputPort("target_pose"), "target_pose")
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    context = simulator.get_mutable_context()
+    station.SetStart(context)
+    target = RigidTransform([0.0, 0.0, -0.010]) @ station.start_pose
+    diagram.GetInputPort("target_pose").FixValue(context, target)
+    simulator.AdvanceTo(1.5)
+    force = station.GetOutputPort("food_wrench").Eval(station.GetMyContextFromRoot(context))
+    height = station.GetOutputPort("knife_pose").Eval(station.GetMyContextFromRoot(context))
+    depth = START_HEIGHT - 0.005 - height.translation()[2]
+    assert depth > 0.003
+    assert force.translational()[2] == pytest.approx(2000.0 * depth, rel=1e-2)
 
 
 def test_knife_that_presses_on_the_bare_board_feels_the_boards_stiffness():
