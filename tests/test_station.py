@@ -125,7 +125,7 @@ def test_analytic_food_gives_toughness_times_width():
     record = run.record()
     height = record["knife_pose_p_z"] - scenario.board.height
     inside = (height > 0.003) & (height < 0.024)
-    width = 2.0 * np.sqrt(height * (0.027 - height))
+    width = 2.0 * np.sqrt(np.clip(height * (0.027 - height), 0.0, None))
     # The wrench is held over the exchange after the pose that it was computed from.
     np.testing.assert_allclose(
         record["food_wrench_f_z"][inside], 300.0 * width[inside], rtol=0.0, atol=0.1
