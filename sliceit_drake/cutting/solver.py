@@ -312,7 +312,17 @@ class CuttingSolver:
             view = self._views[array.ptr] = array.numpy()
         return view
 
+    def compile(self) -> None:
+        """Compiles the kernels, once a machine, and captures an exchange as a graph.
+
+        `exchange` does so at its first call; call this before to keep it out of a measured time.
+        """
+        with self._lock:
+            self._capture()
+
     def _capture(self) -> None:
+        if self._graph is not None:
+            return
         wp.load_module(self._kernels.elements.module, device=self._device)
         with wp.ScopedCapture(device=self._device) as capture:
             self._launch_look_ahead()
@@ -334,8 +344,7 @@ class CuttingSolver:
         m, n, T = self.model, self.substeps, self.exchange_period
         motion, v, w = self._interpolate(start, end)
         with self._lock:
-            if self._graph is None:
-                self._capture()
+            self._capture()
             self._write(self._state, state)
             self._write(self._motion, motion)
             self._sums.zero_()

@@ -130,6 +130,7 @@ class CuttingSystem(KnifeForceSystem):
 
     def start(self, context: Context, state: State, X_WK: RigidTransform) -> None:
         index = self.food_index(context)
+        self._solvers[index].compile()
         check_clear(self._solvers[index].model, self._in_cut_frame(index, X_WK))
 
     def advance(
