@@ -64,7 +64,9 @@ class CuttingSystem(KnifeForceSystem):
         frames = [Pose(s.model.X_FC_rotation, s.model.X_FC_position) for s in self._solvers]
         X_WF_R, X_WF_p = X_WF.rotation().matrix(), X_WF.translation()
         self._R_CW = [(X_WF_R @ X_FC.R).T for X_FC in frames]
-        self._p_WC = [X_WF_R @ X_FC.p + X_WF_p for X_FC in frames]
+        self._offset = [
+            R_CW @ (X_WF_R @ X_FC.p + X_WF_p) for R_CW, X_FC in zip(self._R_CW, frames, strict=True)
+        ]
         self._check_every = max(1, round(check_period / self.exchange_period))
         size = max(s.state_size for s in self._solvers)
         self._food = self.DeclareDiscreteState(self._padded(self._solvers[0].initial_state(), size))
@@ -72,7 +74,6 @@ class CuttingSystem(KnifeForceSystem):
         self._components = self.DeclareDiscreteState(9)
         self._ledger = self.DeclareDiscreteState(len(LEDGER_NAMES))
         self._energy = self.DeclareDiscreteState([0.0, 0.0, 0.0, 0.0, 1.0])
-        self._count = self.DeclareDiscreteState(1)
         self.DeclareStateOutputPort("force_components", self._components)
         self.DeclareStateOutputPort("ledger", self._ledger)
         self.DeclareStateOutputPort("energy", self._energy)
@@ -124,14 +125,15 @@ class CuttingSystem(KnifeForceSystem):
         """Puts an uncut food, drawn from the prepared ones, into the context."""
         self.SetFood(context, int(rng.integers(len(self._solvers))))
 
-    def _in_cut_frame(self, index: int, X_WK: RigidTransform) -> Pose:
-        R = self._R_CW[index]
-        return Pose(R @ X_WK.rotation().matrix(), R @ (X_WK.translation() - self._p_WC[index]))
+    def _in_cut_frame(self, index: int, X_WK: np.ndarray) -> Pose:
+        """X_CK from X_WK [3, 4]."""
+        X_CK = self._R_CW[index] @ X_WK
+        return Pose(X_CK[:, :3], X_CK[:, 3] - self._offset[index])
 
     def start(self, context: Context, state: State, X_WK: RigidTransform) -> None:
         index = self.food_index(context)
         self._solvers[index].compile()
-        check_clear(self._solvers[index].model, self._in_cut_frame(index, X_WK))
+        check_clear(self._solvers[index].model, self._in_cut_frame(index, X_WK.GetAsMatrix34()))
 
     def advance(
         self, context: Context, state: State, X_WK: RigidTransform, V_WK: SpatialVelocity
@@ -140,7 +142,7 @@ class CuttingSystem(KnifeForceSystem):
         solver, time = self._solvers[index], context.get_time()
         old = self.food_state(context)
         last = self._in_cut_frame(index, self.last_pose(context))
-        pose = self._in_cut_frame(index, X_WK)
+        pose = self._in_cut_frame(index, X_WK.GetAsMatrix34())
         check_in_plane(solver.model, pose, time)
         try:
             step = solver.exchange(old, last, pose)
@@ -148,10 +150,8 @@ class CuttingSystem(KnifeForceSystem):
             raise CuttingError(f"at {time:.4g} s {error}") from error
         state.get_mutable_discrete_state(self._food).get_mutable_value()[: len(old)] = step.state
         R_WC = self._R_CW[index].T
-        forces = np.concatenate(
-            [R_WC @ part[3:] for part in (step.edge, step.normal, step.friction)]
-        )
-        self._set(state, self._components, forces)
+        forces = np.array([step.edge[3:], step.normal[3:], step.friction[3:]]) @ R_WC.T
+        self._set(state, self._components, forces.ravel())
         change = [
             step.work,
             step.gravity_work,
@@ -164,9 +164,7 @@ class CuttingSystem(KnifeForceSystem):
         ]
         ledger = context.get_discrete_state(self._ledger).value() + change
         self._set(state, self._ledger, ledger)
-        count = int(context.get_discrete_state(self._count).value()[0]) + 1
-        self._set(state, self._count, [count])
-        if count % self._check_every == 0:
+        if round(time / self.exchange_period) % self._check_every == 0:
             energies = solver.energies(step.state, pose)
             ratio = check_energies(energies, float(ledger[2:5].sum()), solver.model, time)
             old_energy = context.get_discrete_state(self._energy).value()
@@ -181,8 +179,7 @@ class CuttingSystem(KnifeForceSystem):
                     min(energies.least_volume_ratio, old_energy[4]),
                 ],
             )
-        wrench = np.concatenate([R_WC @ step.wrench[:3], R_WC @ step.wrench[3:]])
-        return wrench, step.cut
+        return (step.wrench.reshape(2, 3) @ R_WC.T).ravel(), step.cut
 
     def _calc_surface(self, context: Context, output: BasicVector) -> None:
         index = self.food_index(context)

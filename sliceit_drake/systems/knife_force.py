@@ -85,10 +85,9 @@ class KnifeForceSystem(LeafSystem):
         """
         raise NotImplementedError
 
-    def last_pose(self, context: Context) -> RigidTransform:
-        """X_WK at the previous exchange."""
-        value = context.get_discrete_state(self._last_pose).value()
-        return RigidTransform(value.reshape(3, 4))
+    def last_pose(self, context: Context) -> np.ndarray:
+        """X_WK at the previous exchange, as [3, 4]."""
+        return context.get_discrete_state(self._last_pose).value().reshape(3, 4)
 
     def wrench(self, context: Context) -> np.ndarray:
         """The held wrench F_K_W, moment and force [6]."""
@@ -104,7 +103,7 @@ class KnifeForceSystem(LeafSystem):
         X_WK = self._pose_input.Eval(context)
         V_WK = self._velocity_input.Eval(context)
         wrench, progress = self.advance(context, state, X_WK, V_WK)
-        last = context.get_discrete_state(self._last_pose).value().reshape(3, 4)
+        last = self.last_pose(context)
         now = X_WK.GetAsMatrix34()
         dR = now[:, :3] @ last[:, :3].T
         turn = 0.5 * np.array([dR[2, 1] - dR[1, 2], dR[0, 2] - dR[2, 0], dR[1, 0] - dR[0, 1]])
