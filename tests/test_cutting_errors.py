@@ -1,7 +1,5 @@
 """What cannot be cut is refused with what is wrong, where, and what to do."""
 
-import dataclasses as dc
-
 import numpy as np
 import pytest
 
@@ -236,10 +234,10 @@ def test_very_soft_food_stops_with_time_element_and_cause():
 
 
 def test_a_slice_too_fast_for_its_mass_scaling_is_refused():
-    soft = dc.replace(Material(), youngs_modulus=1e5, toughness=20.0, strength=3e4)
-    solver = cut(Numerics(time_step=2e-3), material=soft)
+    # The edge meets the flat top all at once.
+    solver = cut()
     motion = Motion(
-        MotionPlan([ConstantSpeed(distance=0.025, speed=1.0)]), start_pose(solver.model, 1e-3)
+        MotionPlan([ConstantSpeed(distance=0.025, speed=0.2)]), start_pose(solver.model, 1e-3)
     )
     with pytest.raises(
         CuttingError, match=r"kinetic energy is .* % of the internal.*smaller numerics\.time_step"

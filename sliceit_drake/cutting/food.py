@@ -38,15 +38,8 @@ class Cylinder:
 
     def mesh(self, refinement: float = 1.0) -> TetrahedralMesh:
         """The mesh in F, with `refinement` times as many elements along each edge, rounded."""
-        half = 0.5 * self.length
-        near = _refined([d for d in self.layers if d < half - 1e-6], refinement)
-        layers = np.concatenate([near, [half]])
-        both = (
-            np.concatenate([-layers[:0:-1], layers])
-            if layers[0] == 0.0
-            else (np.concatenate([-layers[::-1], layers]))
-        )
-        return cylinder_mesh(self.diameter, both, max(2, round(self.rings * refinement)))
+        layers = _both_sides(self.layers, 0.5 * self.length, refinement)
+        return cylinder_mesh(self.diameter, layers, max(2, round(self.rings * refinement)))
 
 
 @dc.dataclass
@@ -68,16 +61,10 @@ class Box:
     def mesh(self, refinement: float = 1.0) -> TetrahedralMesh:
         """The mesh in F, with `refinement` times as many elements along each edge, rounded."""
         half = 0.5 * np.array(self.size)
-        near = _refined([d for d in self.layers if d < half[1] - 1e-6], refinement)
-        layers = np.concatenate([near, [half[1]]])
-        both = (
-            np.concatenate([-layers[:0:-1], layers])
-            if layers[0] == 0.0
-            else (np.concatenate([-layers[::-1], layers]))
-        )
+        layers = _both_sides(self.layers, half[1], refinement)
         nx, nz = (max(1, round(n * refinement)) for n in self.divisions)
         return box_mesh(
-            np.linspace(-half[0], half[0], nx + 1), both, np.linspace(0.0, self.size[2], nz + 1)
+            np.linspace(-half[0], half[0], nx + 1), layers, np.linspace(0.0, self.size[2], nz + 1)
         )
 
 
@@ -130,6 +117,13 @@ class MeshFile:
         if len(cells) == 0:
             raise MeshError(f"{self.path}: holds no linear tetrahedra; export a volume mesh.")
         return TetrahedralMesh(self.scale * np.asarray(content.points, float)[:, :3], cells)
+
+
+def _both_sides(distances: list[float], half: float, refinement: float) -> np.ndarray:
+    """Layer coordinates from -half to half, mirrored in 0, with the given grading near it."""
+    near = _refined([d for d in distances if d < half - 1e-6], refinement)
+    one_side = np.concatenate([near, [half]])
+    return np.unique(np.concatenate([-one_side, one_side]))
 
 
 def _refined(distances: list[float], refinement: float) -> np.ndarray:

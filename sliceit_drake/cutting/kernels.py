@@ -33,6 +33,7 @@ PARAMETERS = (
     "direction_length",
     "board_stiffness",
     "board_friction",
+    "board_damping_time",
     "blade_stiffness",
     "blade_damping",
     "blade_mass",
@@ -72,6 +73,7 @@ def kernels(real: Any) -> types.SimpleNamespace:
     DIRECTION_LENGTH = wp.constant(_INDEX["direction_length"])
     BOARD_STIFFNESS = wp.constant(_INDEX["board_stiffness"])
     BOARD_FRICTION = wp.constant(_INDEX["board_friction"])
+    BOARD_DAMPING_TIME = wp.constant(_INDEX["board_damping_time"])
     BLADE_STIFFNESS = wp.constant(_INDEX["blade_stiffness"])
     BLADE_DAMPING = wp.constant(_INDEX["blade_damping"])
     BLADE_MASS = wp.constant(_INDEX["blade_mass"])
@@ -609,6 +611,7 @@ def kernels(real: Any) -> types.SimpleNamespace:
             f += point_force[point_entry[e]] * point_weight[e]
         xi = x[i]
         vi = v[i]
+        pressed = real(0.0)
         if board_area[i] > real(0.0):
             n = vec3(board[0], board[1], board[2])
             depth = board[3] - wp.dot(n, xi)
@@ -619,12 +622,26 @@ def kernels(real: Any) -> types.SimpleNamespace:
             if depth > real(0.0):
                 sliding = (vi - wp.dot(vi, n) * n) * dt
                 slip, lost = slide(old, sliding, stiffness, P[BOARD_FRICTION] * stiffness * depth)
-                on_food = stiffness * (depth * n - slip)
+                pressed = stiffness * depth
+                on_food = pressed * n - stiffness * slip
                 f += on_food
                 board_force[i] = board_force[i] + on_food
             board_loss[i] = board_loss[i] + lost
             board_slip[i] = slip
         v1 = vi + f * (inverse_mass[i] * dt)
+        if pressed > real(0.0):
+            # The board damps the normal motion, implicitly, and does not pull.
+            n = vec3(board[0], board[1], board[2])
+            per_force = inverse_mass[i] * dt
+            damping = P[BOARD_STIFFNESS] * board_area[i] * P[BOARD_DAMPING_TIME]
+            normal = wp.dot(v1, n)
+            damped = normal / (real(1.0) + damping * per_force)
+            damped = wp.max(damped, normal - pressed * per_force)
+            v1 += (damped - normal) * n
+            force = (damped - normal) / per_force
+            board_force[i] = board_force[i] + force * n
+            moved = real(0.5) * (wp.dot(vi, n) + damped) * dt
+            board_loss[i] = board_loss[i] + wp.max(-force * moved, real(0.0))
         # Trapezoidal rule for the work along the path, summed by parts.
         internal_work[i] = internal_work[i] + real(0.5) * wp.dot(internal, vi + v1) * dt
         v_next[i] = v1

@@ -58,6 +58,9 @@ class Numerics:
         1.0, "E/h", low=0.01, high=1e3, doc="Contact stiffness of the food on the board."
     )
     board_friction: float = quantity(0.3, "", low=0.0, high=2.0, doc="Friction of food on board.")
+    board_damping_time: float = quantity(
+        5e-3, "s", low=0.0, high=1.0, doc="Damping over stiffness of the food on the board."
+    )
     unloading_length: float = quantity(
         1e-4, "m", low=1e-6, high=1e-2, doc="Retreat of the edge over which its force vanishes."
     )
@@ -255,6 +258,7 @@ def make_cutting_model(
         "direction_length": numerics.direction_length,
         "board_stiffness": numerics.board_stiffness * scale,
         "board_friction": numerics.board_friction,
+        "board_damping_time": numerics.board_damping_time,
         "blade_stiffness": knife.lateral_stiffness,
         "blade_damping": knife.lateral_stiffness * knife.lateral_relaxation_time,
     }

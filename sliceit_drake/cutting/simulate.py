@@ -23,6 +23,7 @@ ENERGY_RATIO_LIMIT = 0.05
 LATERAL_LIMIT = 3e-3
 TILT_LIMIT = 0.15
 LEAST_VOLUME_RATIO = 0.0
+CHECK_TRAVEL = 1e-3
 
 
 @dc.dataclass
@@ -201,7 +202,8 @@ def simulate_slice(
         solver: The cut and its exchange period.
         motion: Poses X_FK of the knife.
         board: Board under the knife, its height in F; None for none.
-        check_period: Interval of the energy and inversion checks, s.
+        check_period: Interval of the energy and inversion checks, s; shorter where the knife moves
+            more than `CHECK_TRAVEL` in it.
 
     Raises:
         CuttingError: The knife starts in the food, or the cut became unphysical.
@@ -219,7 +221,7 @@ def simulate_slice(
     check_clear(model, pose)
     ledger = EnergyLedger()
     rows = np.full((count, 26), np.nan)
-    ratio = 0.0
+    ratio = travel = 0.0
     for k in range(count):
         end = in_cut_frame((k + 1) * T)
         check_in_plane(model, end, (k + 1) * T)
@@ -243,8 +245,10 @@ def simulate_slice(
         for column, wrench in ((16, step.edge), (19, step.normal), (22, step.friction)):
             rows[k, column : column + 3] = R_FC @ wrench[3:]
         rows[k, 25] = step.cut
+        travel += float(np.linalg.norm(end.p - pose.p))
         pose = end
-        if (k + 1) % every == 0 or k + 1 == count:
+        if (k + 1) % every == 0 or travel > CHECK_TRAVEL or k + 1 == count:
+            travel = 0.0
             energies = solver.energies(state, pose)
             spent = ledger.edge + ledger.opening + ledger.friction
             ratio = max(ratio, check_energies(energies, spent, model, rows[k, 0]))

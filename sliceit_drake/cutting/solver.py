@@ -31,7 +31,7 @@ class Exchange:
         internal_work: Work of the bulk's forces (elastic and damping) on the nodes, J.
         blade_dissipation: In the bending blade, J.
         board_force: Mean force of the board on the food [3], N.
-        board_dissipation: Friction of the food on the board, J.
+        board_dissipation: Friction and damping of the food on the board, J.
         gravity_work: Work of the weight, J.
         cut: Share of the section that the edge has passed.
     """

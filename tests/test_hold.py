@@ -1,0 +1,95 @@
+"""A knife at rest in the food, and food at rest on the board: nothing moves, nothing relaxes."""
+
+import numpy as np
+import pytest
+
+from sliceit_drake.cutting.food import Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.model import Numerics
+from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan, Pose, Retract
+from sliceit_drake.cutting.solver import CuttingSolver, Exchange
+
+PERIOD = 2e-3
+SHAPE = Cylinder(rings=3, layers=[0.0, 0.004, 0.012])
+
+
+def follow(
+    segments: list, food: Food, time_step: float, **numerics
+) -> tuple[CuttingSolver, list[Exchange], np.ndarray, list[Pose]]:
+    """The exchanges along a path, the positions of the nodes after each, and the poses in C."""
+    model = make_food_model(food, Knife(), Numerics(time_step=time_step, **numerics))
+    solver = CuttingSolver(model, PERIOD)
+    motion = Motion(MotionPlan(segments), start_pose(model, clearance=5e-4))
+    R = model.X_FC_rotation.T
+    times = PERIOD * np.arange(round(motion.duration / PERIOD) + 1)
+    poses = [Pose(R @ X.R, model.to_cut_frame(X.p)) for X in map(motion.pose, times)]
+    state = solver.initial_state()
+    exchanges, positions = [], []
+    for start, end in zip(poses[:-1], poses[1:], strict=True):
+        exchanges.append(solver.exchange(state, start, end))
+        state = exchanges[-1].state
+        positions.append(solver.positions(state).astype(float))
+    return solver, exchanges, np.array(positions), poses
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.1])
+@pytest.mark.parametrize("time_step", [2e-4, 5e-5])
+def test_a_hold_after_a_press_neither_creeps_nor_relaxes(friction, time_step):
+    food = Food(shape=SHAPE)
+    food.material.friction = friction
+    hold = 0.3
+    press = ConstantSpeed(distance=0.012, speed=0.02)
+    solver, exchanges, positions, poses = follow([press, Hold(duration=hold)], food, time_step)
+
+    vertical = np.array([step.wrench[5] for step in exchanges])
+    resting = round(hold / PERIOD)
+    at_stop, late, end = vertical[-resting], vertical[-resting // 2], vertical[-1]
+    assert at_stop > 5.0
+    assert late == pytest.approx(at_stop, rel=0.01)
+    assert end == pytest.approx(late, rel=1e-3)
+    creep = np.abs(positions[-1] - positions[-resting // 2]).max() / (0.5 * hold)
+    assert creep < 1e-6
+
+    # Nothing feeds a vibration: what rings at the sudden stop dies away.
+    kinetic = [solver.energies(exchanges[k].state, poses[-1]).kinetic for k in (-resting, -1)]
+    assert kinetic[1] < 0.1 * kinetic[0]
+
+
+def test_halves_that_are_not_held_come_to_rest_on_the_board_with_their_weight():
+    segments = [
+        ConstantSpeed(distance=0.0278, speed=0.02, acceleration=0.5),
+        Retract(distance=0.03, speed=0.05, acceleration=0.5),
+        Hold(duration=1.0),
+    ]
+    food = Food(shape=SHAPE, held_sides="none")
+    solver, exchanges, positions, _ = follow(segments, food, 2e-4)
+    weight = -solver.model.weight[solver.model.moving].sum(0)[2]
+    on_board = np.mean([step.board_force[2] for step in exchanges[-100:]])
+    assert exchanges[-1].cut == pytest.approx(1.0, abs=0.01)
+    assert weight == pytest.approx(950.0 * 9.81 * np.pi * 0.0135**2 * 0.12, rel=1e-3)
+    assert on_board == pytest.approx(weight, rel=0.03)
+    # The halves stand apart, neither sunk into the board nor lifted off it; they may roll.
+    rise = positions[-1, :, 2] - positions[0, :, 2]
+    side = solver.model.split.node_side[solver.model.computed]
+    assert max(abs(rise[side == half].mean()) for half in (0, 1)) < 5e-4
+    nodes = solver.model.point_nodes
+    gap = positions[-1, nodes[:, 2], 1] - positions[-1, nodes[:, 0], 1]
+    assert gap.mean() > 0.0
+
+
+def test_the_force_on_the_way_out_pulls_the_knife_back_and_ends_outside():
+    segments = [
+        ConstantSpeed(distance=0.015, speed=0.02, acceleration=0.5),
+        Retract(distance=0.02, speed=0.02, acceleration=0.5),
+        Hold(duration=0.05),
+    ]
+    _, exchanges, _, poses = follow(segments, Food(shape=SHAPE), 5e-4)
+    height = np.array([pose.p[2] for pose in poses[1:]])
+    vertical = np.array([step.wrench[5] for step in exchanges])
+    edge = np.array([step.edge[5] for step in exchanges])
+    deepest = int(height.argmin())
+    inside = np.arange(len(height)) > deepest
+    inside &= (height > height.min() + 1e-3) & (height < height.min() + 8e-3)
+    assert vertical[inside].max() < 0.0
+    assert np.abs(edge[inside]).max() == 0.0
+    assert np.abs(vertical[-5:]).max() == 0.0

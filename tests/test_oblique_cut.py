@@ -1,0 +1,106 @@
+"""Cuts through elements against cuts along their faces, in the same body, held alike."""
+
+import numpy as np
+import pytest
+
+from sliceit_drake.cutting.food import Cylinder, Food, start_pose
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.mesh import TetrahedralMesh
+from sliceit_drake.cutting.model import CuttingModel, Numerics, make_cutting_model
+from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
+from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
+from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.cutting.split import CutPlane
+
+HOLD = 0.012
+PLANES = {
+    "between layers": ([0.0, 1.0, 0.0], [0.0, 0.3e-3, 0.0]),
+    "tilted": ([0.1, 1.0, 0.06], [0.0, 0.0, 0.0]),
+    "turned and off the layer": ([0.2, 1.0, 0.0], [0.0, 1e-3, 0.0]),
+}
+
+
+def meshes(
+    normal: list[float], point: list[float], refinement: float
+) -> tuple[TetrahedralMesh, TetrahedralMesh, np.ndarray]:
+    """A cylinder, the same with its middle layer bent onto the plane, and what is held of both."""
+    mesh = Cylinder().mesh(refinement)
+    v = mesh.vertices
+    slope = np.array(normal) / normal[1]
+    onto_plane = np.dot(slope, point) - slope[0] * v[:, 0] - slope[2] * v[:, 2]
+    share = np.clip(1.0 - np.abs(v[:, 1]) / HOLD, 0.0, 1.0)
+    bent = v + np.outer(onto_plane * share, [0.0, 1.0, 0.0])
+    held = np.abs(v[:, 1]) > HOLD - 1e-5
+    return mesh, TetrahedralMesh(bent, mesh.tetrahedra), held
+
+
+def press(
+    mesh: TetrahedralMesh,
+    held: np.ndarray,
+    normal: list[float],
+    point: list[float],
+    distance: float,
+    numerics: Numerics | None = None,
+) -> tuple[CuttingModel, SliceResult]:
+    model = make_cutting_model(
+        mesh,
+        CutPlane(np.array(point), np.array(normal), np.array([0.0, 0.0, 1.0])),
+        held,
+        Food().material,
+        Knife(),
+        numerics or Numerics(),
+    )
+    plan = MotionPlan([ConstantSpeed(distance=distance, speed=0.02)])
+    motion = Motion(plan, start_pose(model, clearance=5e-4))
+    return model, simulate_slice(CuttingSolver(model, 2e-3), motion)
+
+
+def norms(result: SliceResult) -> np.ndarray:
+    return np.linalg.norm(result.food_wrench[:, 3:], axis=1)
+
+
+def relative_rms(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.sqrt(np.mean((a - b) ** 2) / np.mean(b**2)))
+
+
+@pytest.mark.parametrize("name", PLANES)
+def test_a_cut_through_elements_needs_the_force_of_a_cut_along_faces(name):
+    normal, point = PLANES[name]
+    across, along, held = meshes(normal, point, 1.0)
+    through, virtual = press(across, held, normal, point, 0.027)
+    between, aligned = press(along, held, normal, point, 0.027)
+    assert len(through.point_nodes) > 2 * len(between.point_nodes)
+    assert through.section_area == pytest.approx(between.section_area, rel=1e-6)
+    # The discretization error of either mesh is about 1 %.
+    assert relative_rms(norms(virtual), norms(aligned)) < 0.02
+
+
+def test_corners_of_material_far_smaller_than_their_elements_do_not_invert():
+    normal, point = [0.0, 1.0, 0.15], [0.0, -1e-3, 0.0]
+    across, _, held = meshes(normal, point, 1.5)
+    model, result = press(across, held, normal, point, 0.006)
+    assert model.split.fraction.min() < 1e-4
+    assert result.energies.least_volume_ratio > 0.5
+    assert result.cut[-1] > 0.1
+
+
+def test_true_masses_are_stable_at_the_limit_however_the_plane_cuts():
+    normal, point = PLANES["tilted"]
+    mesh, _, held = meshes(normal, point, 0.5)
+    limit = make_cutting_model(
+        mesh,
+        CutPlane(np.array(point), np.array(normal), np.array([0.0, 0.0, 1.0])),
+        held,
+        Food().material,
+        Knife(),
+        Numerics(),
+    ).critical_time_step
+    step = 2e-3 / np.ceil(2e-3 / limit)
+    model, true = press(
+        mesh, held, normal, point, 0.004, Numerics(time_step=step, mass_scaling=False)
+    )
+    _, scaled = press(mesh, held, normal, point, 0.004)
+    # Only slivers are made heavier.
+    assert model.mass_ratio < 1.01
+    assert true.energy_ratio < 1e-3
+    assert relative_rms(norms(scaled), norms(true)) < 0.02
