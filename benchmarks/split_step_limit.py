@@ -123,18 +123,17 @@ def draw(relative: dict[str, dict[str, np.ndarray]], output: Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
-    bins = np.geomspace(0.01, 1.5, 60)
+    bins = np.linspace(0.3, 1.1, 41)
     styles = {"all": ("0.35", "all terms"), "bulk": ("#e69f00", "bulk alone")}
     for key, (colour, label) in styles.items():
         values = np.concatenate([body[key] for body in relative.values()])
         axes.hist(
             values, bins=bins, color=colour, alpha=0.75, label=f"{label}, least {values.min():.2f}"
         )
-    axes.set_xscale("log")
     axes.set_xlabel("step limit / limit of the uncut body")
     axes.set_ylabel("planes")
     count = sum(len(body["all"]) for body in relative.values())
-    axes.set_title(f"Step limit of {count} random cuts, true masses")
+    axes.set_title(f"Step limit of {count} random cuts, relative to the uncut body")
     axes.legend(loc="upper left")
     output.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(output, dpi=160)
