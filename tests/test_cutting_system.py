@@ -196,6 +196,25 @@ def test_foods_of_different_meshes_take_turns_in_one_context(diagram, solvers):
         again.cutting.SetFood(context, 2)
 
 
+def test_a_new_food_has_no_past():
+    from sliceit_drake.diagrams.scenario import load_scenario
+    from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
+    from sliceit_drake.resources import resource_path
+
+    small = "{food: {shape: !Cylinder {rings: 2, layers: [0.0, 0.004, 0.012]}}}"
+    diagram = MakeScenarioDiagram(load_scenario(resource_path("scenarios/cucumber.yaml"), small))
+    simulator = Simulator(diagram)
+    diagram.SetStart(simulator.get_mutable_context())
+    simulator.AdvanceTo(0.8)
+    cutting = diagram.station.cutting
+    context = cutting.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    names = ("ledger", "cut_progress", "coupling_work_error", "force_components")
+    assert all(cutting.GetOutputPort(name).Eval(context).any() for name in names)
+    cutting.SetFood(context, 0)
+    assert not any(cutting.GetOutputPort(name).Eval(context).any() for name in names)
+    assert not cutting.wrench(context).any()
+
+
 def test_randomization_draws_every_food_and_the_same_for_the_same_seed(diagram):
     system = diagram.GetSubsystemByName("cutting")
     context = system.CreateDefaultContext()

@@ -176,10 +176,13 @@ def check_energies(
         CuttingError: With time, element and cause.
     """
     if energies.least_volume_ratio <= LEAST_VOLUME_RATIO:
+        stiffness = model.material.youngs_modulus * model.element_size
+        softness = model.material.toughness / stiffness
         raise CuttingError(
             f"at {time:.4g} s element {energies.least_element} is inverted (volume ratio "
             f"{energies.least_volume_ratio:.3g}): the edge deforms the food more than its mesh can "
-            "follow. Use a finer mesh near the cut or a stiffer, less tough food."
+            f"follow. Toughness / (E h) is {softness:.2g}; above about 0.5 elements at the edge "
+            "invert. Use a stiffer or less tough food; a finer mesh alone rarely helps."
         )
     through = float(model.toughness @ model.tables.area)
     internal = max(energies.elastic + energies.interface + dissipated, 0.01 * through, 1e-9)

@@ -28,6 +28,8 @@ LEDGER_NAMES = (
 )
 ENERGY_NAMES = ("elastic", "interface", "kinetic", "largest_energy_ratio", "least_volume_ratio")
 
+NO_ENERGY = (0.0, 0.0, 0.0, 0.0, 1.0)
+
 
 class CuttingSystem(KnifeForceSystem):
     """Advances a finite-element food by its own sub-steps once per exchange.
@@ -73,7 +75,7 @@ class CuttingSystem(KnifeForceSystem):
         self._food_index = self.DeclareDiscreteState(1)
         self._components = self.DeclareDiscreteState(9)
         self._ledger = self.DeclareDiscreteState(len(LEDGER_NAMES))
-        self._energy = self.DeclareDiscreteState([0.0, 0.0, 0.0, 0.0, 1.0])
+        self._energy = self.DeclareDiscreteState(NO_ENERGY)
         self.DeclareStateOutputPort("force_components", self._components)
         self.DeclareStateOutputPort("ledger", self._ledger)
         self.DeclareStateOutputPort("energy", self._energy)
@@ -120,6 +122,16 @@ class CuttingSystem(KnifeForceSystem):
         state = self._padded(self._solvers[index].initial_state(), size)
         context.SetDiscreteState(self._food, state)
         context.SetDiscreteState(self._food_index, [index])
+        # A new food has given no force and cost no work yet.
+        for part, value in (
+            (self._wrench, np.zeros(6)),
+            (self._progress, np.zeros(1)),
+            (self._coupling, np.zeros(1)),
+            (self._components, np.zeros(9)),
+            (self._ledger, np.zeros(len(LEDGER_NAMES))),
+            (self._energy, np.array(NO_ENERGY)),
+        ):
+            context.SetDiscreteState(part, value)
 
     def randomize_context(self, context: Context, rng: np.random.Generator) -> None:
         """Puts an uncut food, drawn from the prepared ones, into the context."""
