@@ -25,20 +25,17 @@ def bar(strength, toughness=TOUGHNESS, **numerics):
 
 
 def pull_apart(model, solver, state, distance, exchanges=400):
-    """Moves the held plus side away from the cut and sums what opening dissipates and the force."""
+    """Moves the held plus side away from the cut: what opening dissipates, and the state."""
     held = np.ones(len(model.nodes), bool)
     held[model.moving] = False
     plus = held & (model.split.node_side[model.computed] == 1)
-    lost, widest, force = 0.0, 0.0, []
+    lost = 0.0
     for _ in range(exchanges):
         x = solver.field(state, "x").reshape(-1, 3)
         x[plus, 1] += distance / exchanges
         step = solver.exchange(state, FAR, FAR)
         state = step.state
         lost += step.opening_dissipation
-        bottom = solver.held_reaction(state, FAR)
-        force.append(bottom)
-        widest = max(widest, step.opening_dissipation)
     return lost, state
 
 

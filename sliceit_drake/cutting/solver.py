@@ -61,7 +61,6 @@ class Energies:
         elastic: Of the bulk.
         interface: Of bonds, contacts, friction anchors and the edge's unloading.
         kinetic: Of the stepped (scaled) mass.
-        true_kinetic: Of the true mass.
         least_volume_ratio: Smallest J of all elements.
         least_element: Its element.
     """
@@ -69,7 +68,6 @@ class Energies:
     elastic: float
     interface: float
     kinetic: float
-    true_kinetic: float
     least_volume_ratio: float
     least_element: int
 
@@ -452,7 +450,6 @@ class CuttingSolver:
             elastic=float(elastic),
             interface=float(interface),
             kinetic=float(0.5 * m.mass[m.moving] @ v2),
-            true_kinetic=float(0.5 * m.true_mass[m.moving] @ v2),
             least_volume_ratio=least_ratio,
             least_element=least,
         )

@@ -322,7 +322,9 @@ def _cutting_summary(run: Run, record: Record) -> dict:
     )
     model = solver.model
     work = float(record["energy_work"][-1])
-    motion = Motion(scenario.motion, start_pose(model, scenario.start.clearance))
+    motion = Motion(
+        scenario.motion, start_pose(model, scenario.start.clearance, scenario.start.offset)
+    )
     summary = {
         "elements": model.element_count,
         "cut_points": len(model.point_nodes),
