@@ -15,7 +15,7 @@ import dataclasses as dc
 
 import numpy as np
 
-__all__ = ["EdgeTables", "edge_tables"]
+__all__ = ["EdgeTables", "depth_below", "distance_inside", "edge_tables"]
 
 
 @dc.dataclass
@@ -27,6 +27,8 @@ class EdgeTables:
         width: T_i on the grid [P, G], metres.
         fraction: Cut fraction on the grid [P, G]: the integral of T_i up to s over A_i.
         rise: Height of the centroid of the part that is cut above the point [P, G], metres.
+        outline: The same as `width` for the section's outline instead of its area: length of
+            outline per height that the point carries [P, G].
         area: Areas A_i [P], m^2.
     """
 
@@ -34,6 +36,7 @@ class EdgeTables:
     width: np.ndarray
     fraction: np.ndarray
     rise: np.ndarray
+    outline: np.ndarray
     area: np.ndarray
 
     @property
@@ -95,7 +98,58 @@ def edge_tables(
     )
     grid_s = np.linspace(-reach, reach, grid)
     fraction = np.divide(cut, area[:, None], out=np.zeros_like(cut), where=area[:, None] > 0.0)
-    return EdgeTables(reach, width, fraction, above_edge - grid_s, area)
+    outline = _outline_tables(points, triangles, grid_s)
+    return EdgeTables(reach, width, fraction, above_edge - grid_s, outline, area)
+
+
+def outline(triangles: np.ndarray) -> np.ndarray:
+    """Edges of the section's outline, as pairs of points [E, 2]."""
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    unique, count = np.unique(edges, axis=0, return_counts=True)
+    return unique[count == 1]
+
+
+def depth_below(points: np.ndarray, triangles: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Depth of positions [M, 2] below the upper outline of the section [M], metres."""
+    a, b = (points[outline(triangles)[:, k]] for k in (0, 1))
+    x = positions[:, 0, None]
+    across = b[:, 0] - a[:, 0]
+    w = (x - a[:, 0]) / np.where(across == 0.0, 1.0, across)
+    inside = (w >= -1e-9) & (w <= 1.0 + 1e-9) & (across != 0.0)
+    top = np.where(inside, a[:, 1] + w * (b[:, 1] - a[:, 1]), -np.inf).max(1)
+    return np.maximum(np.where(np.isfinite(top), top, positions[:, 1]) - positions[:, 1], 0.0)
+
+
+def distance_inside(points: np.ndarray, triangles: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Distance of positions [M, 2] from the outline of the section [M], metres."""
+    a, b = (points[outline(triangles)[:, k]] for k in (0, 1))
+    along = b - a
+    from_a = positions[:, None] - a
+    w = np.clip((from_a * along).sum(-1) / (along**2).sum(-1), 0.0, 1.0)
+    return np.linalg.norm(from_a - w[..., None] * along, axis=-1).min(1)
+
+
+def _outline_tables(points: np.ndarray, triangles: np.ndarray, grid_s: np.ndarray) -> np.ndarray:
+    """Length of outline per height that each point carries, on the grid [P, G].
+
+    Short pieces of the outline are shared between the two grid points beside them, so that the
+    integral of a row is the length that belongs to the point.
+    """
+    spacing = grid_s[1] - grid_s[0]
+    edges = outline(triangles)
+    pieces = 256
+    w = (np.arange(pieces) + 0.5) / pieces
+    a, b = points[edges[:, 0]], points[edges[:, 1]]
+    height = a[:, 1, None] + w * (b - a)[:, 1, None]
+    length = np.broadcast_to(np.linalg.norm(b - a, axis=1)[:, None] / pieces, height.shape)
+    table = np.zeros((len(points), len(grid_s)))
+    for end, share in ((0, 1.0 - w), (1, w)):
+        node = np.broadcast_to(edges[:, end, None], height.shape)
+        u = (points[edges[:, end], 1][:, None] - height - grid_s[0]) / spacing
+        k = np.clip(np.floor(u).astype(int), 0, len(grid_s) - 2)
+        np.add.at(table, (node, k), share * length * (1.0 - (u - k)) / spacing)
+        np.add.at(table, (node, k + 1), share * length * (u - k) / spacing)
+    return table
 
 
 def _integral(values: np.ndarray, spacing: float) -> np.ndarray:

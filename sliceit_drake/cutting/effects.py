@@ -1,0 +1,174 @@
+"""What the base model leaves out: parameter groups whose default changes nothing.
+
+Forms and their signatures in measured forces are those of docs/physics.md, "Effects".
+"""
+
+import dataclasses as dc
+
+import numpy as np
+
+from sliceit_drake.configuration import ConfigurationError, quantity
+
+__all__ = [
+    "Adhesion",
+    "Bluntness",
+    "Compliance",
+    "Core",
+    "Effects",
+    "Relaxation",
+    "Skin",
+    "SlicePush",
+    "Slip",
+    "ToughnessRate",
+]
+
+
+@dc.dataclass
+class ToughnessRate:
+    """Toughness that grows with the speed v of the edge: R (v / reference_speed)^exponent."""
+
+    exponent: float = quantity(0.0, "", low=-1.0, high=1.0, doc="0 for none.")
+    reference_speed: float = quantity(
+        0.02, "m/s", low=1e-4, high=1.0, doc="Speed at which the toughness is the material's."
+    )
+
+
+@dc.dataclass
+class Relaxation:
+    """Viscoelastic bulk: Maxwell branches in parallel with a spring (Prony series).
+
+    E is the instantaneous modulus; a share of it relaxes with each time.
+    """
+
+    shares: list[float] = dc.field(default_factory=list)
+    """Of E, one a branch; empty for none."""
+    times: list[float] = dc.field(default_factory=list)
+    """Relaxation times, s."""
+
+    def check(self, where: str) -> None:
+        if len(self.shares) != len(self.times):
+            raise ConfigurationError(
+                f"has {len(self.shares)} shares and {len(self.times)} times",
+                field=f"{where}.times",
+                fix="Give one time for each share.",
+            )
+        shares, times = np.array(self.shares), np.array(self.times)
+        if not (np.isfinite(shares).all() and (shares >= 0.0).all() and shares.sum() < 0.99):
+            raise ConfigurationError(
+                f"= {self.shares} is no split of the modulus",
+                field=f"{where}.shares",
+                fix="Give shares of at least 0 that sum to less than 0.99.",
+            )
+        if not (np.isfinite(times).all() and (times > 0.0).all()):
+            raise ConfigurationError(
+                f"= {self.times} s holds a time that is not positive",
+                field=f"{where}.times",
+                fix="Give times above 0 s.",
+            )
+
+
+@dc.dataclass
+class Skin:
+    """A skin around the section, cut on the way in and on the way out."""
+
+    toughness: float = quantity(
+        0.0, "J/m", low=0.0, high=100.0, doc="Energy per length of skin: its toughness x thickness."
+    )
+
+
+@dc.dataclass
+class Core:
+    """An inner part of another toughness and stiffness, as of seeds or gel."""
+
+    rind: float = quantity(
+        5e-3, "m", low=0.0, high=0.1, doc="Distance from the outside at which the core begins."
+    )
+    transition: float = quantity(1e-3, "m", low=1e-5, high=0.05, doc="Width of the transition.")
+    toughness_ratio: float = quantity(1.0, "", low=0.0, high=10.0, doc="Core over rind.")
+    stiffness_ratio: float = quantity(1.0, "", low=0.01, high=10.0, doc="Core over rind.")
+
+    def share(self, distance: np.ndarray) -> np.ndarray:
+        """How much of the core is at a distance from the outside: 0 outside, 1 inside."""
+        ramp = (np.asarray(distance) - self.rind) / self.transition
+        return 0.5 * (1.0 + np.tanh(2.0 * ramp))
+
+
+@dc.dataclass
+class Bluntness:
+    """A blunt edge needs more to begin a cut: an excess over R that decays with depth.
+
+    After n slices the excess is `initiation` + `dulling` n^`dulling_exponent`.
+    """
+
+    initiation: float = quantity(
+        0.0, "J/m2", low=0.0, high=1e5, doc="Excess over R where the edge enters the food."
+    )
+    depth: float = quantity(
+        2e-3, "m", low=1e-4, high=0.05, doc="Depth over which the excess falls to 1/e."
+    )
+    dulling: float = quantity(0.0, "J/m2", low=0.0, high=1e5, doc="Growth of the excess, a slice.")
+    dulling_exponent: float = quantity(1.0, "", low=0.1, high=3.0, doc="Of the slice number.")
+    slices: int = quantity(0, "", low=0, high=100000, doc="Slices cut since sharpening.")
+
+    def excess(self, depth: np.ndarray) -> np.ndarray:
+        """Excess over R at depths below the outside, J/m^2."""
+        grown = self.dulling * float(self.slices) ** self.dulling_exponent
+        return (self.initiation + grown) * np.exp(-np.asarray(depth) / self.depth)
+
+
+@dc.dataclass
+class Adhesion:
+    """Shear of food that sticks to the flanks, with or without pressure between them."""
+
+    stress: float = quantity(0.0, "Pa", low=0.0, high=1e6, doc="At any speed, where in contact.")
+    viscosity: float = quantity(0.0, "Pa s/m", low=0.0, high=1e7, doc="Stress per sliding speed.")
+
+
+@dc.dataclass
+class SlicePush:
+    """How much a draw helps: the vertical force is R w / (1 + xi^2)^exponent; Atkins: 1."""
+
+    exponent: float = quantity(1.0, "", low=0.5, high=3.0, doc="1 for Atkins' law.")
+
+
+@dc.dataclass
+class Compliance:
+    """Elasticity of what holds knife and food, on a prescribed motion without a robot."""
+
+    arm: float = quantity(0.0, "m/N", low=0.0, high=1e-3, doc="Vertical, between motion and knife.")
+    holder: float = quantity(0.0, "m/N", low=0.0, high=1e-3, doc="Vertical, of the food's holder.")
+
+
+@dc.dataclass
+class Slip:
+    """The food slips down in its holder when the knife pushes harder than `resistance`.
+
+    Once it slips, `remaining` of the resistance is left until the knife stops pushing it. Needs
+    `Compliance.holder` > 0, which holds it before.
+    """
+
+    resistance: float | None = quantity(None, "N", low=0.0, high=1e4, doc="null: never slips.")
+    remaining: float = quantity(0.5, "", low=0.0, high=1.0, doc="Of the resistance, slipping.")
+
+
+@dc.dataclass
+class Effects:
+    """All groups; the defaults are the base model."""
+
+    toughness_rate: ToughnessRate = dc.field(default_factory=ToughnessRate)
+    relaxation: Relaxation = dc.field(default_factory=Relaxation)
+    skin: Skin = dc.field(default_factory=Skin)
+    core: Core = dc.field(default_factory=Core)
+    bluntness: Bluntness = dc.field(default_factory=Bluntness)
+    adhesion: Adhesion = dc.field(default_factory=Adhesion)
+    slice_push: SlicePush = dc.field(default_factory=SlicePush)
+    compliance: Compliance = dc.field(default_factory=Compliance)
+    slip: Slip = dc.field(default_factory=Slip)
+
+    def check(self, where: str) -> None:
+        if self.slip.resistance is not None and self.compliance.holder == 0.0:
+            raise ConfigurationError(
+                "needs a holder that gives before the food slips",
+                field=f"{where}.slip.resistance",
+                fix=f"Give {where}.compliance.holder, as 2e-5 m/N.",
+            )

@@ -1,0 +1,218 @@
+"""Gradients of a slice: of any function of the force by parameters, motion and initial state.
+
+Reverse mode. The forward run keeps the food's state at each exchange; going back, an exchange is
+computed once more with the state of each sub-step kept, and its sub-steps are gone through in
+reverse by the kernels' adjoints. Memory is that of one exchange and of one state per exchange.
+"""
+
+import dataclasses as dc
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from sliceit_drake.cutting.kernel_types import PARAMETERS
+from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.cutting.motion import Pose
+from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError, knife_wrenches
+from sliceit_drake.cutting.workspace import Workspace, interpolate_motion
+
+__all__ = ["SliceAdjoint", "SliceGradient"]
+
+
+@dc.dataclass
+class SliceGradient:
+    """Derivatives of a function of the wrenches of a slice.
+
+    Attributes:
+        row: By what the kernels read, in the order of `Workspace.parameter_layout`.
+        position: By the position of Ko at each exchange [E + 1, 3], 1/m.
+        rotation: By the entries of its rotation matrix [E + 1, 3, 3].
+        state: By the initial state of the food [state_size].
+        layout: Where each array stands in `row`.
+    """
+
+    row: np.ndarray
+    position: np.ndarray
+    rotation: np.ndarray
+    state: np.ndarray
+    layout: dict[str, slice]
+
+    def by(self, name: str) -> np.ndarray:
+        """By an array of the kernels, as "toughness" [P] or "P" (see `PARAMETERS`)."""
+        return self.row[self.layout[name]]
+
+
+class SliceAdjoint:
+    """Force of a slice on a prescribed motion in C, and its gradients.
+
+    Args:
+        model: The cut.
+        exchange_period: s.
+    """
+
+    def __init__(self, model: CuttingModel, exchange_period: float) -> None:
+        self.model = model
+        self.exchange_period = exchange_period
+        self._w = Workspace([model], exchange_period, gradients=True)
+        self._checkpoints: list[np.ndarray] = []
+        self._R = np.zeros((0, 3, 3))
+        self._p = np.zeros((0, 3))
+        self._backward: Any = None
+        ws, B, P = self._w, len(model.blocks), len(model.point_nodes)
+        self._adj_mu = wp.zeros((1, B), dtype=ws.real, device=ws.device)
+        self._adj_lam = wp.zeros((1, B), dtype=ws.real, device=ws.device)
+        self._adj_force = ws.w["point_force"].grad
+        assert self._adj_force.shape == (1, P, 2)
+
+    def set_model(self, model: CuttingModel) -> None:
+        """Takes the parameters of another cut of the same mesh."""
+        self.model = model
+        self._w.set_models([model])
+
+    def forward(self, poses: Sequence[Pose], state: np.ndarray | None = None) -> np.ndarray:
+        """Mean wrench of each exchange on the knife, moment about Ko and force in C [E, 6].
+
+        Args:
+            poses: X_CK at the ends of the exchanges [E + 1].
+            state: The food before, at rest by default.
+
+        Raises:
+            CuttingError: A force is not finite.
+        """
+        ws, n = self._w, self._w.substeps
+        self._R = np.array([pose.R for pose in poses])
+        self._p = np.array([pose.p for pose in poses])
+        state = ws.initial_state() if state is None else np.asarray(state, ws.dtype)
+        count = len(poses) - 1
+        self._checkpoints = [state]
+        wrenches = np.empty((count, 6))
+        for e in range(count):
+            ws.advance(self._checkpoints[e][None], self._motion(e))
+            total = ws.sum("total")[0, 0].sum(0)
+            if not np.isfinite(total).all():
+                raise CuttingError(f"at {(e + 1) * self.exchange_period:.4g} s {NOT_FINITE}")
+            blade, buried = ws.sum("blade_sums")[0, 0], ws.sum("buried")[0, 0].sum(0)
+            parts, _ = knife_wrenches(total, blade, buried, self._R[e + 1], n)
+            wrenches[e] = parts.sum(0)
+            self._checkpoints.append(ws.read(ws.states[-1])[0].copy())
+        return wrenches
+
+    def _motion(self, e: int) -> np.ndarray:
+        at = slice(e, e + 2)
+        ws = self._w
+        return interpolate_motion(self._R[None, at], self._p[None, at], ws.substeps, ws.exchange_period)
+
+    def backward(self, weights: np.ndarray) -> SliceGradient:
+        """Gradient of sum(weights * wrenches) of the last `forward`.
+
+        Args:
+            weights: Adjoints of the wrenches [E, 6].
+        """
+        ws, n, T = self._w, self._w.substeps, self.exchange_period
+        count = len(self._checkpoints) - 1
+        ws.parameters.grad.zero_()
+        self._adj_mu.zero_()
+        self._adj_lam.zero_()
+        adj_state = np.zeros(ws.state_size)
+        adj_p, adj_R = np.zeros_like(self._p), np.zeros_like(self._R)
+        share = np.arange(1, n + 1) / n
+        for e in reversed(range(count)):
+            ws.advance(self._checkpoints[e][None], self._motion(e))
+            adj_sums, adj_y = self._adjoint_of_sums(weights[e], self._R[e + 1])
+            adj_R[e + 1, :, 1] += adj_y
+            self._capture_backward()
+            ws.write(ws.states[-1].grad, adj_state[None])
+            ws.write(ws.sums.grad, adj_sums[None])
+            wp.capture_launch(self._backward)
+            adj_state = ws.read(ws.states[0].grad)[0].astype(np.float64)
+            motion = ws.read(ws.motion.grad)[0].astype(np.float64)
+            by = {name: motion[where].reshape(n, -1) for name, where in ws.motion_layout.items()}
+            of_velocity = by["v_CK"].sum(0) / T
+            adj_p[e + 1] += share @ by["p_CK"] + of_velocity
+            adj_p[e] += (1.0 - share) @ by["p_CK"] - of_velocity
+            a, b, c = by["w_CK"].sum(0) * (0.5 / T)
+            of_turn = np.array([[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]])
+            adj_R[e + 1] += (share @ by["R_CK"]).reshape(3, 3) + of_turn @ self._R[e]
+            adj_R[e] += ((1.0 - share) @ by["R_CK"]).reshape(3, 3) + of_turn.T @ self._R[e + 1]
+        row = ws.read(ws.parameters.grad)[0].astype(np.float64)
+        scalars = ws.parameter_layout["P"].start
+        for name, adjoint in (("mu", self._adj_mu), ("lam", self._adj_lam)):
+            row[scalars + PARAMETERS.index(name)] += adjoint.numpy().astype(np.float64).sum()
+        return SliceGradient(row, adj_p, adj_R, adj_state, ws.parameter_layout)
+
+    def _adjoint_of_sums(self, weights: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Adjoint of `knife_wrenches`: of the sums as the workspace holds them, and of Ky."""
+        ws, n = self._w, self._w.substeps
+        of_moment, of_force = weights[:3], weights[3:]
+        blade, buried = ws.sum("blade_sums")[0, 0], ws.sum("buried")[0, 0].sum(0)
+        lateral = (blade[1] - blade[2]) / n * R[:, 1]
+        middle = buried[:3] / buried[3] if buried[3] > 0.0 else np.zeros(3)
+        of_lateral = of_force + np.cross(of_moment, middle)
+        of_middle = np.cross(lateral, of_moment)
+        adjoint = np.zeros(ws.sums.shape[1])
+        total = np.zeros(22)
+        total[:9], total[9:18] = np.tile(of_force, 3) / n, np.tile(of_moment, 3) / n
+        points = len(self.model.point_nodes)
+        adjoint[ws.sum_layout["total"]] = np.tile(total, points)
+        along = float(of_lateral @ R[:, 1]) / n
+        adjoint[ws.sum_layout["blade_sums"]] = [0.0, along, -along]
+        if buried[3] > 0.0:
+            of_buried = np.concatenate([of_middle, [-(of_middle @ middle)]]) / buried[3]
+            adjoint[ws.sum_layout["buried"]] = np.tile(of_buried, points)
+        return adjoint, of_lateral * (blade[1] - blade[2]) / n
+
+    def _capture_backward(self) -> None:
+        if self._backward is not None:
+            return
+        ws = self._w
+        with wp.ScopedCapture(device=ws.device) as capture:
+            for slot in ws.states[:-1]:
+                slot.grad.zero_()
+            for ahead in ws.ahead:
+                ahead.grad.zero_()
+            ws.motion.grad.zero_()
+            for k in reversed(range(ws.steps)):
+                self._launch_substep_adjoint(k)
+            nodes = len(self.model.nodes)
+            self._launch_adjoint(ws.kernels.look_ahead, (1, nodes), ws.look_ahead_arguments())
+        self._backward = capture.graph
+
+    def _launch_adjoint(self, kernel: Any, dim: Any, arguments: list[Any]) -> None:
+        adjoints = [a.grad if isinstance(a, wp.array) else None for a in arguments]
+        wp.launch(
+            kernel,
+            dim=dim,
+            inputs=arguments,
+            adj_inputs=adjoints,
+            adjoint=True,
+            device=self._w.device,
+        )
+
+    def _launch_substep_adjoint(self, k: int) -> None:
+        ws, m = self._w, self.model
+        w, kern, points = ws.w, ws.kernels, len(m.point_nodes)
+        w["lateral"].grad.zero_()
+        for passed_on in (ws.push, ws.from_elements, ws.from_bulk, ws.from_points):
+            passed_on[k].grad.zero_()
+        self._launch_adjoint(kern.bend_blade, 1, ws.blade_arguments(k))
+        self._launch_adjoint(kern.push_blade, 1, [w["lateral"], ws.push[k]])
+        self._launch_adjoint(kern.step_nodes, (1, len(m.moving)), ws.step_arguments(k))
+        self._launch_adjoint(kern.relax_nodes, (1, len(m.moving)), ws.relax_arguments(k))
+        spread = [w["point_nodes"], w["point_weights"], ws.from_points[k].grad, self._adj_force]
+        ws.launch(kern.spread_adjoint, points, spread)
+        arguments = ws.point_arguments(k, ws.substep_time())
+        self._launch_adjoint(kern.points, (1, points), arguments)
+        ws.launch(
+            kern.elements_adjoint,
+            len(m.blocks),
+            [ws.ahead[k], ws.from_elements[k].grad, w["nodes"], w["shape"], w["stiff_volume"]]
+            + [w["P"], w["element_force"], w["stiff_volume"].grad, self._adj_mu, self._adj_lam],
+        )
+        ws.launch(
+            kern.gather_adjoint,
+            len(m.moving),
+            [w["moving"], w["node_force"], w["element_start"], w["element_entry"]]
+            + [ws.ahead[k].grad],
+        )

@@ -1,0 +1,179 @@
+"""Physical parameters of a cut by name: read, set, and derivatives of a slice by them."""
+
+import copy
+import dataclasses as dc
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from sliceit_drake.cutting.gradient import SliceGradient
+from sliceit_drake.cutting.kernel_types import PARAMETERS
+from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.cutting.workspace import parameter_row
+
+__all__ = [
+    "POINT_PARAMETERS",
+    "get_parameter",
+    "parameter_names",
+    "pull_back",
+    "with_parameters",
+]
+
+GROUPS = ("material", "effects", "knife", "numerics")
+
+POINT_PARAMETERS = (
+    "point_scales.toughness",
+    "point_scales.friction",
+    "point_scales.flank_stiffness",
+)
+"""Parameters with a value for each cut point."""
+
+# How the cut is computed, not what is cut; and a number of slices.
+NUMERICAL = ("time_step", "stability_margin", "slices")
+# Act outside of the finite elements, in `Mounting`.
+OUTSIDE = ("compliance", "slip")
+
+
+def parameter_names(model: CuttingModel) -> list[str]:
+    """Names of all shared real parameters, as "material.toughness" or
+    "effects.relaxation.shares.0"."""
+    return [name for group in GROUPS for name in _leaves(getattr(model, group), group)]
+
+
+def _leaves(value: object, path: str) -> Iterable[str]:
+    if dc.is_dataclass(value):
+        for field in dc.fields(value):
+            if field.name not in (*NUMERICAL, *OUTSIDE):
+                yield from _leaves(getattr(value, field.name), f"{path}.{field.name}")
+    elif isinstance(value, list):
+        for k, item in enumerate(value):
+            yield from _leaves(item, f"{path}.{k}")
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield path
+
+
+def get_parameter(model: CuttingModel, name: str) -> float | np.ndarray:
+    """Value of a parameter; an array [P] for `POINT_PARAMETERS`.
+
+    Raises:
+        KeyError: There is no such parameter.
+    """
+    value: object = model
+    for part in name.split("."):
+        value = _child(value, part, name)
+    if not isinstance(value, int | float | np.ndarray):
+        raise KeyError(f"{name} is no single parameter")
+    return value
+
+
+def _child(value: object, part: str, name: str) -> object:
+    if isinstance(value, list):
+        if part.isdigit() and int(part) < len(value):
+            return value[int(part)]
+    elif dc.is_dataclass(value) and part in {f.name for f in dc.fields(value)}:
+        return getattr(value, part)
+    raise KeyError(f"{name}: there is no {part}")
+
+
+def with_parameters(
+    model: CuttingModel, values: Mapping[str, float | np.ndarray]
+) -> CuttingModel:
+    """The same cut with other values of parameters.
+
+    Raises:
+        KeyError: There is no such parameter.
+        TimeStepError: The step is beyond the limit and masses are not scaled.
+    """
+    changed = {}
+    for name, new in values.items():
+        get_parameter(model, name)
+        group, *path, last = name.split(".")
+        if group not in changed:
+            changed[group] = copy.deepcopy(getattr(model, group))
+        owner = changed[group]
+        for part in path:
+            owner = _child(owner, part, name)
+        if isinstance(owner, list):
+            owner[int(last)] = float(new)
+        else:
+            setattr(owner, last, new if isinstance(new, np.ndarray) else float(new))
+    return model.derive(**changed)
+
+
+def pull_back(
+    model: CuttingModel, gradient: SliceGradient, names: Iterable[str]
+) -> dict[str, float | np.ndarray]:
+    """Derivatives by named parameters, from those by what the kernels read.
+
+    What the kernels read is an explicit, smooth function of each shared parameter, which takes a
+    millisecond: its derivative is taken by central differences in double precision. Factors by cut
+    point are differentiated in closed form. The scaled masses follow the parameters.
+
+    Args:
+        model: The cut at which `gradient` was taken.
+        gradient: Of `SliceAdjoint.backward`.
+        names: Parameters.
+    """
+    out: dict[str, float | np.ndarray] = {}
+    for name in names:
+        if name in POINT_PARAMETERS:
+            out[name] = _by_point(model, gradient, name)
+            continue
+        value = get_parameter(model, name)
+        step = 1e-5 * max(abs(float(value)), SMALL.get(name.split(".")[-1], 1e-3))
+        rows = [
+            parameter_row(with_parameters(model, {name: float(value) + sign * step}))
+            for sign in (1.0, -1.0)
+        ]
+        out[name] = float(gradient.row @ (rows[0] - rows[1])) / (2.0 * step)
+    return out
+
+
+SMALL = {
+    "initiation": 10.0,
+    "toughness": 0.1,
+    "stress": 100.0,
+    "viscosity": 1e3,
+    "dulling": 10.0,
+    "damping_time": 1e-5,
+}
+"""Sizes by which a parameter is varied that may be zero."""
+
+
+def _by_point(model: CuttingModel, gradient: SliceGradient, name: str) -> np.ndarray:
+    kind = name.split(".")[1]
+    scales, area = model.point_scales, model.tables.area
+    direct = {"toughness": "toughness", "friction": "friction_scale"}.get(kind, "flank_scale")
+    adjoint = gradient.by(direct).copy()
+    if kind == "friction":
+        return adjoint
+    # A node's stepped mass holds the stiffness of its points, by their weights.
+    step = model.numerics.time_step / model.numerics.stability_margin
+    by_mass = -gradient.by("inverse_mass") / model.mass**2
+    by_mass = np.where(model.mass > model.true_mass, by_mass, 0.0)
+    ends = np.tile(model.point_weights, (1, 2))
+    by_stiffness = 0.25 * step**2 * (by_mass[model.point_nodes] * ends).sum(1)
+    if kind == "toughness":
+        by_scale = model.toughness / scales.toughness
+        adjoint *= by_scale
+        force = (model.toughness + model.excess)[:, None] * model.tables.width
+        force = force + model.effects.skin.toughness * model.tables.outline
+        rise = np.diff(force, axis=1) / model.tables.spacing
+        highest, steepest = force.argmax(1), rise.argmax(1)
+        points = np.arange(len(force))
+        length = model.numerics.unloading_length
+        flat = force[points, highest] / length >= rise[points, steepest]
+        width = model.tables.width
+        slope = np.where(
+            flat,
+            width[points, highest] / length,
+            (np.diff(width, axis=1) / model.tables.spacing)[points, steepest],
+        )
+        by_unloading = gradient.by("unloading") + 0.5 * by_stiffness
+        return adjoint + by_unloading * slope * by_scale
+    flank = model.parameters["flank_stiffness"]
+    adjoint += by_stiffness * 2.0 * flank * area
+    if model.parameters["blade_mass"] > model.knife.lateral_mass():
+        by_blade = float(gradient.by("P")[PARAMETERS.index("blade_mass")])
+        adjoint += by_blade * step**2 * flank * area
+    return adjoint

@@ -1,0 +1,546 @@
+"""Device arrays of one or many cuts of one mesh, and the launches that advance them."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from sliceit_drake.cutting.kernel_types import ACCUMULATED, GATHER, LANES, PARAMETERS
+from sliceit_drake.cutting.kernels import kernels
+from sliceit_drake.cutting.model import CuttingModel, TimeStepError
+
+__all__ = ["Workspace", "interpolate_motion", "parameter_row"]
+
+PER_POINT = ("toughness", "excess", "flank_scale", "friction_scale", "unloading")
+"""Parameters that each cut point has for itself, in the order of the kernels' arguments."""
+
+
+class Workspace:
+    """Advances cuts that share a mesh by `exchanges` exchanges a launch.
+
+    Each cut C has parameters, motion and state of its own. A state is one row of `state_size`
+    numbers: positions, velocities, history of the cut points, friction anchors, relaxation, blade.
+
+    Args:
+        models: The cuts; all derived from one model.
+        exchange_period: s; the time step must divide it.
+        exchanges: Exchanges that one launch advances.
+        gradients: Whether each sub-step keeps its state, for an adjoint.
+
+    Raises:
+        TimeStepError: The time step does not divide the exchange period.
+    """
+
+    def __init__(
+        self,
+        models: Sequence[CuttingModel],
+        exchange_period: float,
+        exchanges: int = 1,
+        gradients: bool = False,
+    ) -> None:
+        model = models[0]
+        dt = model.numerics.time_step
+        self.cuts, self.exchanges = len(models), exchanges
+        self.exchange_period = exchange_period
+        self.substeps = max(1, round(exchange_period / dt))
+        if abs(self.substeps * dt - exchange_period) > 1e-6 * exchange_period:
+            raise TimeStepError(
+                f"numerics.time_step = {dt:g} s does not divide the exchange period "
+                f"{exchange_period:g} s. Give {exchange_period / self.substeps:g}."
+            )
+        self.steps = self.substeps * exchanges
+        single = model.numerics.precision == "float32"
+        self.real: Any = wp.float32 if single else wp.float64
+        self.dtype: Any = np.float32 if single else np.float64
+        self.kernels = kernels(self.real, gradients)
+        self.device = wp.get_device(model.numerics.device)
+        self.model = model
+        self._gradients = gradients
+        self._graph: Any = None
+        self._views: dict[int, np.ndarray] = {}
+        self._make_arrays()
+        self.set_models(models)
+
+    def array(self, shape: int | tuple[int, ...]) -> wp.array:
+        """Zeros on the device, with room for their adjoint if gradients are kept."""
+        return wp.zeros(
+            shape, dtype=self.real, device=self.device, requires_grad=self._gradients
+        )
+
+    def _constant(self, values: np.ndarray, dtype: Any) -> wp.array:
+        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
+
+    def _rows(
+        self, base: wp.array, fields: Sequence[tuple[str, tuple[int, ...], Any, int]]
+    ) -> tuple[dict[str, wp.array], dict[str, slice]]:
+        """Splits rows of numbers [C, size] into named arrays [C, ...] of vectors.
+
+        Args:
+            base: Array [C, size].
+            fields: Name, shape without the first axis, type and numbers in one of that type.
+
+        Returns:
+            The arrays, and where each stands in a row.
+        """
+        item = np.dtype(self.dtype).itemsize
+        arrays, layout, start = {}, {}, 0
+        for name, shape, dtype, width in fields:
+            strides = [width * item]
+            for extent in shape[:0:-1]:
+                strides.insert(0, strides[0] * extent)
+
+            def view(values: wp.array, grad: wp.array | None) -> wp.array:
+                return wp.array(
+                    ptr=values.ptr + start * item,  # noqa: B023
+                    dtype=dtype,  # noqa: B023
+                    shape=(self.cuts, *shape),  # noqa: B023
+                    strides=(values.strides[0], *strides),  # noqa: B023
+                    device=self.device,
+                    grad=grad,
+                )
+
+            arrays[name] = view(base, None if base.grad is None else view(base.grad, None))
+            size = int(np.prod(shape)) * width
+            layout[name] = slice(start, start + size)
+            start += size
+        assert start == base.shape[1]
+        return arrays, layout
+
+    def _make_arrays(self) -> None:
+        m, k, C, K = self.model, self.kernels, self.cuts, self.steps
+        N, P, B, E = len(m.nodes), len(m.point_nodes), len(m.blocks), self.exchanges
+        M = len(m.relaxing)
+        real, vec3 = self.real, k.vec3
+
+        fields = [
+            ("x", (N,), vec3, 3),
+            ("v", (N,), vec3, 3),
+            ("passed", (P,), real, 1),
+            ("parted", (P,), real, 1),
+            ("edge_force", (P,), real, 1),
+            ("heading", (P,), vec3, 3),
+            ("slip", (P, 2), vec3, 3),
+            ("board_slip", (N,), vec3, 3),
+            ("lag", (M, N), vec3, 3),
+            ("blade", (2,), real, 1),
+        ]
+        self.state_size = sum(int(np.prod(shape)) * width for _, shape, _, width in fields)
+        # With gradients, sub-step k reads slot k and writes slot k + 1; otherwise all are one.
+        slots = K + 1 if self._gradients else 1
+        self.states = [self.array((C, self.state_size)) for _ in range(slots)]
+        split = [self._rows(state, fields) for state in self.states]
+        self.slots = [arrays for arrays, _ in split]
+        self.layout = split[0][1]
+        kept = K + 1 if self._gradients else 1
+        self.ahead = [self._vectors(N) for _ in range(kept)]
+        # What each sub-step's nodes got from elements, bulk (elements after relaxation) and points.
+        self.from_elements, self.from_bulk, self.from_points = (
+            [self._vectors(N) for _ in range(K if self._gradients else 0)] for _ in range(3)
+        )
+
+        self.motion = self.array((C, 18 * K))
+        motion = [("R_CK", k.mat33, 9), ("p_CK", vec3, 3), ("v_CK", vec3, 3), ("w_CK", vec3, 3)]
+        self.w, self.motion_layout = self._rows(
+            self.motion, [(name, (K,), dtype, width) for name, dtype, width in motion]
+        )
+        # Padded with a row of zeros, which fills up the nodes' lists of entries.
+        self.force = wp.zeros((C, (B * 12 + 3) * LANES), dtype=real, device=self.device)
+        item = np.dtype(self.dtype).itemsize
+        row = self.force.strides[0]
+        self.w["element_force"] = wp.array(
+            ptr=self.force.ptr,
+            dtype=k.lanes,
+            shape=(C, B, 12),
+            strides=(row, 12 * LANES * item, LANES * item),
+            device=self.device,
+        )
+        self.w["node_force"] = wp.array(
+            ptr=self.force.ptr,
+            dtype=k.strided,
+            shape=(C, B * 12 * LANES + 1),
+            strides=(row, item),
+            device=self.device,
+        )
+        sums = [
+            ("total", (E, P, ACCUMULATED), real, 1),
+            ("buried", (E, P), k.vec4, 4),
+            ("blade_sums", (E, 3), real, 1),
+            ("board_force", (N,), vec3, 3),
+            ("board_loss", (N,), real, 1),
+            ("internal_work", (N,), real, 1),
+        ]
+        size = sum(int(np.prod(shape)) * width for _, shape, _, width in sums)
+        self.sums = self.array((C, size))
+        arrays, self.sum_layout = self._rows(self.sums, sums)
+        self._sum_shapes = {
+            name: (*shape, width) if width > 1 else shape for name, shape, _, width in sums
+        }
+        self.w |= arrays
+        self.w["point_force"] = wp.zeros(
+            (C, P, 2), dtype=vec3, device=self.device, requires_grad=self._gradients
+        )
+        # The same as one list, two entries a point.
+        self.w["listed_force"] = self.w["point_force"].reshape((C, 2 * P))
+        self.w["lateral"] = self.array((C, P))
+        self.push = [self.array(C) for _ in range(K if self._gradients else 1)]
+        self.w["energy"] = wp.zeros((C, B, LANES), dtype=real, device=self.device)
+        self.w["volume_ratio"] = wp.zeros((C, B, LANES), dtype=real, device=self.device)
+        self.w["point_energy"] = wp.zeros((C, P), dtype=real, device=self.device)
+
+        element_start, element_entry = _element_gather(m.blocks, m.element_count, N)
+        point_start, point_entry, point_weight = _point_gather(m.point_nodes, m.point_weights, N)
+        constants: dict[str, tuple[np.ndarray, Any]] = {
+            "nodes": (m.blocks.astype(np.int32), k.indices),
+            "shape": (m.shape, k.lanes),
+            "moving": (m.moving.astype(np.int32), wp.int32),
+            "element_start": (element_start, wp.int32),
+            "element_entry": (element_entry, k.entries),
+            "point_start": (point_start, wp.int32),
+            "point_entry": (point_entry, wp.int32),
+            "point_weight": (point_weight, real),
+            "board_area": (m.board_area, real),
+            "board": (m.board, real),
+            "point_nodes": (m.point_nodes.astype(np.int32), wp.int32),
+            "point_weights": (m.point_weights, k.vec2),
+            "area": (m.tables.area, real),
+            "width": (m.tables.width, real),
+            "fraction": (m.tables.fraction, real),
+            "centroid": (m.tables.rise, real),
+            "outline": (m.tables.outline, real),
+        }
+        for name, (values, dtype) in constants.items():
+            self.w[name] = self._constant(values, dtype)
+        parameters = [
+            ("P", (len(PARAMETERS),), real, 1),
+            ("knife", (8,), real, 1),
+            *((name, (P,), real, 1) for name in PER_POINT),
+            ("inverse_mass", (N,), real, 1),
+            ("weight", (N,), vec3, 3),
+            ("relaxing", (M,), real, 1),
+            ("keep", (M,), real, 1),
+            ("stiff_volume", (B,), k.lanes, LANES),
+        ]
+        size = sum(int(np.prod(shape)) * width for _, shape, _, width in parameters)
+        self.parameters = self.array((C, size))
+        arrays, self.parameter_layout = self._rows(self.parameters, parameters)
+        self.w |= arrays
+
+    def _vectors(self, count: int) -> wp.array:
+        return wp.zeros(
+            (self.cuts, count),
+            dtype=self.kernels.vec3,
+            device=self.device,
+            requires_grad=self._gradients,
+        )
+
+    def set_models(self, models: Sequence[CuttingModel]) -> None:
+        """Takes the parameters of other cuts of the same mesh, one for each row."""
+        if len(models) != self.cuts:
+            raise ValueError(f"{len(models)} models for {self.cuts} cuts")
+        for model in models:
+            if model.split is not self.model.split or len(model.relaxing) != len(
+                self.model.relaxing
+            ):
+                raise ValueError(
+                    "the cuts must be derived from one model and have as many relaxation times"
+                )
+        self.models = tuple(models)
+        self.write(self.parameters, np.array([parameter_row(m) for m in models]))
+
+    def initial_state(self) -> np.ndarray:
+        """The food at rest, to be cut downwards [state_size]."""
+        state = np.zeros(self.state_size, self.dtype)
+        state[self.layout["x"]] = self.model.nodes.ravel()
+        state[self.layout["passed"]] = -self.model.tables.reach
+        state[self.layout["heading"]].reshape(-1, 3)[:, 2] = -1.0
+        return state
+
+    def sum(self, name: str) -> np.ndarray:
+        """Sums of the last launch by name [C, ...], double precision."""
+        values = self.read(self.sums)[:, self.sum_layout[name]]
+        return values.reshape(self.cuts, *self._sum_shapes[name]).astype(np.float64)
+
+    def write(self, array: wp.array, values: np.ndarray) -> None:
+        """Sets an array from host memory."""
+        if self.device.is_cpu:
+            self.read(array)[...] = values
+        else:
+            array.assign(values.astype(self.dtype))
+
+    def read(self, array: wp.array) -> np.ndarray:
+        """An array in host memory; on the CPU a view, made once."""
+        if not self.device.is_cpu:
+            return array.numpy()
+        view = self._views.get(array.ptr)
+        if view is None:
+            view = self._views[array.ptr] = array.numpy()
+        return view
+
+    def launch(self, kernel: Any, dim: int, inputs: list[Any]) -> None:
+        """Launches `kernel` over cuts and `dim` entries of each."""
+        wp.launch(kernel, dim=(self.cuts, dim), inputs=inputs, device=self.device)
+
+    def substep_time(self) -> Any:
+        """The sub-step as the kernels take it, s."""
+        return self.real(self.exchange_period / self.substeps)
+
+    def look_ahead_arguments(self, k: int = 0) -> list[Any]:
+        """Arguments of `look_ahead` from the first sub-step to the k-th."""
+        return [self.slots[0]["x"], self.slots[0]["v"], self.w["P"], self.ahead[k]]
+
+    def launch_elements(self, k: int) -> None:
+        """Forces of the elements at the beginning of sub-step k."""
+        w, ahead = self.w, self.ahead[k if self._gradients else 0]
+        inputs = [ahead, w["nodes"], w["shape"], w["stiff_volume"], w["P"], w["element_force"]]
+        self.launch(self.kernels.elements, len(self.model.blocks), inputs)
+
+    def point_arguments(self, k: int, dt: Any) -> list[Any]:
+        """Arguments of `points` in sub-step k."""
+        w, tables = self.w, self.model.tables
+        now, after = self._slots(k)
+        history = ("passed", "parted", "edge_force", "heading", "slip")
+        return (
+            [now["x"], now["v"], w["point_nodes"], w["point_weights"]]
+            + [w[name] for name in ("area", "width", "fraction", "centroid", "outline")]
+            + [self.real(tables.reach), self.real(1.0 / tables.spacing)]
+            + [w[name] for name in PER_POINT]
+            + [w["P"], w["knife"], k, k // self.substeps, dt]
+            + [w[name] for name in ("R_CK", "p_CK", "v_CK", "w_CK")]
+            + [now["blade"], *(now[name] for name in history)]
+            + [after[name] for name in history]
+            + [w["point_force"], w["lateral"], w["buried"], w["total"]]
+        )
+
+    def _slots(self, k: int) -> tuple[dict[str, wp.array], dict[str, wp.array]]:
+        return (self.slots[k], self.slots[k + 1]) if self._gradients else (self.slots[0],) * 2
+
+    def _push(self, k: int) -> wp.array:
+        return self.push[k if self._gradients else 0]
+
+    def relax_arguments(self, k: int) -> list[Any]:
+        """Arguments of `relax_nodes` in sub-step k."""
+        w = self.w
+        now, after = self._slots(k)
+        head = [w["moving"], self.from_elements[k], w["relaxing"], w["keep"]]
+        return [*head, now["lag"], after["lag"], self.from_bulk[k]]
+
+    def step_arguments(self, k: int) -> list[Any]:
+        """Arguments of `step_nodes` in sub-step k."""
+        w = self.w
+        now, after = self._slots(k)
+        return (
+            [now["x"], now["v"], w["moving"], self.from_bulk[k], self.from_points[k]]
+            + [w["inverse_mass"], w["weight"], w["board_area"], w["board"], w["P"]]
+            + [self.substep_time(), now["board_slip"], after["board_slip"]]
+            + [w["board_force"], w["board_loss"], w["internal_work"]]
+            + [after["x"], after["v"], self.ahead[k + 1]]
+        )
+
+    def blade_arguments(self, k: int) -> list[Any]:
+        """Arguments of `bend_blade` in sub-step k."""
+        w = self.w
+        now, after = self._slots(k)
+        head = [self._push(k), w["P"], k // self.substeps, self.substep_time()]
+        return [*head, now["blade"], after["blade"], w["blade_sums"]]
+
+    def launch_substep(self, k: int) -> None:
+        """One sub-step."""
+        w, kern, m, C = self.w, self.kernels, self.model, self.cuts
+        self.launch_elements(k)
+        self.launch(kern.points, len(m.point_nodes), self.point_arguments(k, self.substep_time()))
+        gathered = [w["node_force"], w["element_start"], w["element_entry"], w["listed_force"]]
+        gathered += [w["point_start"], w["point_entry"], w["point_weight"]]
+        if self._gradients:
+            outputs = [self.from_elements[k], self.from_points[k]]
+            self.launch(kern.gather, len(m.moving), [w["moving"], *gathered, *outputs])
+            self.launch(kern.relax_nodes, len(m.moving), self.relax_arguments(k))
+            self.launch(kern.step_nodes, len(m.moving), self.step_arguments(k))
+        else:
+            now = self.slots[0]
+            self.launch(
+                kern.move_nodes,
+                len(m.moving),
+                [now["x"], now["v"], w["moving"], *gathered]
+                + [w["inverse_mass"], w["weight"], w["relaxing"], w["keep"]]
+                + [w["board_area"], w["board"], w["P"], self.substep_time()]
+                + [now["lag"], now["board_slip"]]
+                + [w["board_force"], w["board_loss"], w["internal_work"], self.ahead[0]],
+            )
+        for kernel, arguments in (
+            (kern.push_blade, [w["lateral"], self._push(k)]),
+            (kern.bend_blade, self.blade_arguments(k)),
+        ):
+            wp.launch(kernel, dim=C, inputs=arguments, device=self.device)
+
+    def capture(self) -> None:
+        """Compiles the kernels, once a machine, and captures a launch as a graph."""
+        if self._graph is not None:
+            return
+        wp.load_module(self.kernels.module, device=self.device)
+        with wp.ScopedCapture(device=self.device) as capture:
+            self.sums.zero_()
+            # Later sub-steps need it for held nodes only, which never move.
+            for k in range(len(self.ahead)):
+                arguments = self.look_ahead_arguments(k)
+                self.launch(self.kernels.look_ahead, len(self.model.nodes), arguments)
+            for k in range(self.steps):
+                self.launch_substep(k)
+        self._graph = capture.graph
+
+    def advance(self, states: np.ndarray, motion: np.ndarray) -> None:
+        """Advances `states` [C, state_size] along `motion` [C, 18 K] (`interpolate_motion`).
+
+        The new states are in `states[-1]`, the sums in `sum`.
+        """
+        self.capture()
+        # Held nodes are never written, so every slot needs them.
+        for state in self.states:
+            self.write(state, states)
+        self.write(self.motion, motion)
+        wp.capture_launch(self._graph)
+
+    def stored_energies(self) -> tuple[float, np.ndarray, float]:
+        """Of the first cut: elastic energy, volume ratios [T], energy of the cut points, J."""
+        w, now, tables, C = self.w, self.slots[0], self.model.tables, self.cuts
+        B, P = len(self.model.blocks), len(self.model.point_nodes)
+        elements = [now["x"], w["nodes"], w["shape"], w["stiff_volume"], w["P"]]
+        wp.launch(
+            self.kernels.element_energy,
+            dim=(C, B, LANES),
+            inputs=[*elements, w["energy"], w["volume_ratio"]],
+            device=self.device,
+        )
+        self.launch(
+            self.kernels.point_energy,
+            P,
+            [now["x"], w["point_nodes"], w["point_weights"], w["area"], w["fraction"]]
+            + [w["centroid"], self.real(tables.reach), self.real(1.0 / tables.spacing)]
+            + [w["toughness"], w["flank_scale"], w["unloading"], w["P"], w["knife"]]
+            + [w["R_CK"], w["p_CK"], 0, now["blade"]]
+            + [now[name] for name in ("passed", "parted", "edge_force", "slip")]
+            + [w["point_energy"]],
+        )
+        elastic = w["energy"].numpy()[0].astype(np.float64).sum()
+        ratio = w["volume_ratio"].numpy()[0].ravel()[: self.model.element_count]
+        return float(elastic), ratio, float(w["point_energy"].numpy()[0].astype(np.float64).sum())
+
+    def present_forces(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of the first cut: forces of elements [B, 12, LANES] and of cut points [P, 2, 3], N."""
+        look_ahead = self.kernels.look_ahead
+        self.launch(look_ahead, len(self.model.nodes), self.look_ahead_arguments())
+        self.launch_elements(0)
+        # A step of no duration changes no history that another call reads.
+        points = self.point_arguments(0, self.real(0.0))
+        self.launch(self.kernels.points, len(self.model.point_nodes), points)
+        B = len(self.model.blocks)
+        forces = self.force.numpy()[0, : B * 12 * LANES].astype(np.float64)
+        point_forces = self.w["point_force"].numpy()[0].astype(np.float64)
+        return forces.reshape(B, 12, LANES), point_forces
+
+
+def parameter_row(model: CuttingModel) -> np.ndarray:
+    """What a model gives the kernels, in the order of `Workspace.parameter_layout`, double precision."""
+    inverse_mass = np.zeros(len(model.nodes))
+    inverse_mass[model.moving] = 1.0 / model.mass[model.moving]
+    volume = model.in_blocks(model.element_volume).reshape(-1)
+    volume = np.where(np.arange(len(volume)) < model.element_count, volume, 0.0)
+    scales = model.point_scales
+    return np.concatenate(
+        [
+            [model.parameters[name] for name in PARAMETERS],
+            model.knife.parameters(),
+            model.toughness,
+            model.excess,
+            scales.flank_stiffness,
+            scales.friction,
+            model.unloading,
+            inverse_mass,
+            model.weight.ravel(),
+            model.relaxing,
+            model.keep,
+            volume,
+        ]
+    )
+
+
+def interpolate_motion(R: np.ndarray, p: np.ndarray, substeps: int, period: float) -> np.ndarray:
+    """Knife poses at the ends of the sub-steps, constant velocity and rotation rate in an exchange.
+
+    Rotation matrices are interpolated linearly: for a turn of angle a between exchanges they are
+    orthonormal to a^2 / 8, 1e-6 at 1 rad/s and 2 ms.
+
+    Args:
+        R: Rotations at the exchanges [C, E + 1, 3, 3].
+        p: Positions of Ko [C, E + 1, 3], metres.
+        substeps: Sub-steps of an exchange.
+        period: Duration of an exchange, s.
+
+    Returns:
+        The workspace's motion [C, 18 E substeps]: rotations, positions, velocities, rates.
+    """
+    C, E = R.shape[0], R.shape[1] - 1
+    share = (np.arange(1, substeps + 1) / substeps)[:, None]
+    R0, dp = R[:, :-1].reshape(C, E, 1, 9), np.diff(p, axis=1)[:, :, None]
+    dR = np.diff(R, axis=1).reshape(C, E, 1, 9)
+    turn = R[:, 1:] @ R[:, :-1].transpose(0, 1, 3, 2)
+    w = np.stack(
+        [
+            turn[..., 2, 1] - turn[..., 1, 2],
+            turn[..., 0, 2] - turn[..., 2, 0],
+            turn[..., 1, 0] - turn[..., 0, 1],
+        ],
+        axis=-1,
+    )
+    w *= 0.5 / period
+    shape = (C, E, substeps, 3)
+    return np.concatenate(
+        [
+            (R0 + share * dR).reshape(C, -1),
+            (p[:, :-1, None] + share * dp).reshape(C, -1),
+            np.broadcast_to(dp / period, shape).reshape(C, -1),
+            np.broadcast_to(w[:, :, None], shape).reshape(C, -1),
+        ],
+        axis=1,
+    )
+
+
+def _element_gather(
+    blocks: np.ndarray, count: int, node_count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """For each node, where its entries stand in the element forces, in rows of `GATHER`.
+
+    Returns:
+        First row of each node and the end [N + 1], and the rows [M, GATHER]; what is left of a row
+        points behind the forces.
+    """
+    B = len(blocks)
+    entry = (
+        np.arange(B)[:, None, None] * 12 * LANES
+        + np.arange(4)[None, :, None] * 3 * LANES
+        + np.arange(LANES)[None, None, :]
+    )
+    real = (np.arange(B)[:, None, None] * LANES + np.arange(LANES)[None, None, :]) < count
+    real = np.broadcast_to(real, blocks.shape)
+    node, entry = blocks[real], entry[real]
+    order = np.argsort(node, kind="stable")
+    number = np.bincount(node, minlength=node_count)
+    start = np.concatenate([[0], np.cumsum(-(-number // GATHER))])
+    rank = np.arange(len(node)) - np.repeat(np.cumsum(number) - number, number)
+    rows = np.full(start[-1] * GATHER, B * 12 * LANES)
+    rows[start[node[order]] * GATHER + rank] = entry[order]
+    return start.astype(np.int32), rows.reshape(-1, GATHER).astype(np.int32)
+
+
+def _point_gather(
+    point_nodes: np.ndarray, weights: np.ndarray, node_count: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For each node, the cut-point forces (2 point + side) that act on it and their weights."""
+    P = len(point_nodes)
+    entry = 2 * np.arange(P)[:, None] + np.array([0, 0, 1, 1])
+    weight = np.tile(weights, (1, 2))
+    use = weight > 0.0
+    node, entry, weight = point_nodes[use], entry[use], weight[use]
+    order = np.argsort(node, kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(node, minlength=node_count))])
+    return start.astype(np.int32), entry[order].astype(np.int32), weight[order]
