@@ -135,15 +135,15 @@ class SlicePush:
 class Compliance:
     """Elasticity of what holds knife and food, on a prescribed motion without a robot."""
 
-    arm: float = quantity(0.0, "m/N", low=0.0, high=1e-3, doc="Vertical, between motion and knife.")
-    holder: float = quantity(0.0, "m/N", low=0.0, high=1e-3, doc="Vertical, of the food's holder.")
+    arm: float = quantity(0.0, "m/N", low=0.0, high=1e-3, doc="Of the knife's holder, vertical.")
+    holder: float = quantity(0.0, "m/N", low=0.0, high=1e-3, doc="Of the food's, along the edge.")
 
 
 @dc.dataclass
 class Slip:
-    """The food slips down in its holder when the knife pushes harder than `resistance`.
+    """The food slips along the edge when the knife draws it harder than its holder resists.
 
-    Once it slips, `remaining` of the resistance is left until the knife stops pushing it. Needs
+    While it slips, `remaining` of the resistance is left, until the draw asks for less. Needs
     `Compliance.holder` > 0, which holds it before.
     """
 
@@ -168,7 +168,7 @@ class Effects:
     def check(self, where: str) -> None:
         if self.slip.resistance is not None and self.compliance.holder == 0.0:
             raise ConfigurationError(
-                "needs a holder that gives before the food slips",
+                "needs a holder that is elastic before the food slips",
                 field=f"{where}.slip.resistance",
                 fix=f"Give {where}.compliance.holder, as 2e-5 m/N.",
             )

@@ -150,9 +150,7 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
         cut, block = wp.tid()
         mu = P[cut, MU]
         lam = P[cut, LAM]
-        f00, f10, f20, f01, f11, f21, f02, f12, f22 = gradient8(
-            x, cut, nodes, block, shape
-        )
+        f00, f10, f20, f01, f11, f21, f02, f12, f22 = gradient8(x, cut, nodes, block, shape)
         d00, d10, d20 = cross8(f01, f11, f21, f02, f12, f22)
         d01, d11, d21 = cross8(f02, f12, f22, f00, f10, f20)
         d02, d12, d22 = cross8(f00, f10, f20, f01, f11, f21)
@@ -176,6 +174,56 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
         p12 = wp.cw_mul(s, f12) + wp.cw_mul(p, d12)
         p22 = wp.cw_mul(s, f22) + wp.cw_mul(p, d22)
         store8(p00, p10, p20, p01, p11, p21, p02, p12, p22, cut, block, shape, force)
+
+    @wp.kernel(enable_backward=gradients, module=module)
+    def look_ahead(
+        x: wp.array2d(dtype=vec3),
+        v: wp.array2d(dtype=vec3),
+        P: wp.array2d(dtype=real),
+        ahead: wp.array2d(dtype=vec3),
+    ):
+        """Positions at which the elements are evaluated."""
+        cut, i = wp.tid()
+        ahead[cut, i] = x[cut, i] + P[cut, DAMPING_TIME] * v[cut, i]
+
+    @wp.kernel(enable_backward=False, module=module)
+    def element_energy(
+        x: wp.array2d(dtype=vec3),
+        nodes: wp.array2d(dtype=indices),
+        shape: wp.array2d(dtype=lanes),
+        stiff_volume: wp.array2d(dtype=lanes),
+        P: wp.array2d(dtype=real),
+        energy: wp.array3d(dtype=real),
+        volume_ratio: wp.array3d(dtype=real),
+    ):
+        """Elastic energy and volume ratio J of each element."""
+        cut, block, lane = wp.tid()
+        mu = P[cut, MU]
+        lam = P[cut, LAM]
+        o = x[cut, nodes[block, 0][lane]]
+        a = x[cut, nodes[block, 1][lane]] - o
+        b = x[cut, nodes[block, 2][lane]] - o
+        c = x[cut, nodes[block, 3][lane]] - o
+        M = mat33()
+        for k in range(9):
+            M[k // 3, k % 3] = shape[block, k][lane]
+        F = wp.matrix_from_cols(a, b, c) * M
+        Ic = wp.ddot(F, F)
+        J = wp.determinant(F)
+        alpha = real(1.0) + real(0.75) * mu / lam
+        psi = real(0.5) * (
+            mu * (Ic - real(3.0))
+            + lam * ((J - alpha) * (J - alpha) - (real(1.0) - alpha) * (real(1.0) - alpha))
+            - mu * wp.log(real(0.25) * (Ic + real(1.0)))
+        )
+        energy[cut, block, lane] = stiff_volume[cut, block][lane] * psi
+        volume_ratio[cut, block, lane] = J
+
+    out = types.SimpleNamespace(
+        elements=elements, look_ahead=look_ahead, element_energy=element_energy
+    )
+    if not gradients:
+        return out
 
     @wp.func
     def sum8(a: lanes):
@@ -206,12 +254,8 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
         cut, block = wp.tid()
         mu = P[cut, MU]
         lam = P[cut, LAM]
-        f00, f10, f20, f01, f11, f21, f02, f12, f22 = gradient8(
-            x, cut, nodes, block, shape
-        )
-        e00, e10, e20, e01, e11, e21, e02, e12, e22 = gradient8(
-            direction, cut, nodes, block, shape
-        )
+        f00, f10, f20, f01, f11, f21, f02, f12, f22 = gradient8(x, cut, nodes, block, shape)
+        e00, e10, e20, e01, e11, e21, e02, e12, e22 = gradient8(direction, cut, nodes, block, shape)
         d00, d10, d20 = cross8(f01, f11, f21, f02, f12, f22)
         d01, d11, d21 = cross8(f02, f12, f22, f00, f10, f20)
         d02, d12, d22 = cross8(f00, f10, f20, f01, f11, f21)
@@ -270,53 +314,5 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
         p22 = wp.cw_mul(s, e22) + wp.cw_mul(ds, f22) + wp.cw_mul(p, b22) + wp.cw_mul(dp, d22)
         store8(p00, p10, p20, p01, p11, p21, p02, p12, p22, cut, block, shape, change)
 
-    @wp.kernel(enable_backward=gradients, module=module)
-    def look_ahead(
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        P: wp.array2d(dtype=real),
-        ahead: wp.array2d(dtype=vec3),
-    ):
-        """Positions at which the elements are evaluated."""
-        cut, i = wp.tid()
-        ahead[cut, i] = x[cut, i] + P[cut, DAMPING_TIME] * v[cut, i]
-
-    @wp.kernel(enable_backward=False, module=module)
-    def element_energy(
-        x: wp.array2d(dtype=vec3),
-        nodes: wp.array2d(dtype=indices),
-        shape: wp.array2d(dtype=lanes),
-        stiff_volume: wp.array2d(dtype=lanes),
-        P: wp.array2d(dtype=real),
-        energy: wp.array3d(dtype=real),
-        volume_ratio: wp.array3d(dtype=real),
-    ):
-        """Elastic energy and volume ratio J of each element."""
-        cut, block, lane = wp.tid()
-        mu = P[cut, MU]
-        lam = P[cut, LAM]
-        o = x[cut, nodes[block, 0][lane]]
-        a = x[cut, nodes[block, 1][lane]] - o
-        b = x[cut, nodes[block, 2][lane]] - o
-        c = x[cut, nodes[block, 3][lane]] - o
-        M = mat33()
-        for k in range(9):
-            M[k // 3, k % 3] = shape[block, k][lane]
-        F = wp.matrix_from_cols(a, b, c) * M
-        Ic = wp.ddot(F, F)
-        J = wp.determinant(F)
-        alpha = real(1.0) + real(0.75) * mu / lam
-        psi = real(0.5) * (
-            mu * (Ic - real(3.0))
-            + lam * ((J - alpha) * (J - alpha) - (real(1.0) - alpha) * (real(1.0) - alpha))
-            - mu * wp.log(real(0.25) * (Ic + real(1.0)))
-        )
-        energy[cut, block, lane] = stiff_volume[cut, block][lane] * psi
-        volume_ratio[cut, block, lane] = J
-
-    return types.SimpleNamespace(
-        elements=elements,
-        elements_adjoint=elements_adjoint,
-        look_ahead=look_ahead,
-        element_energy=element_energy,
-    )
+    out.elements_adjoint = elements_adjoint
+    return out

@@ -5,6 +5,7 @@ import dataclasses as dc
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError, choice, quantity
+from sliceit_drake.cutting.effects import Effects
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.material import Material
 from sliceit_drake.cutting.mesh import (
@@ -145,6 +146,7 @@ class Food:
     name: str = "cucumber"
     shape: Cylinder | Box | Ellipsoid | MeshFile = dc.field(default_factory=Cylinder)
     material: Material = dc.field(default_factory=Material)
+    effects: Effects = dc.field(default_factory=Effects)
     cut_point: list[float] = quantity(
         [0.0, 0.0, 0.0], "m", low=-0.5, high=0.5, size=3, doc="A point of the cut plane."
     )
@@ -195,7 +197,14 @@ def make_food_model(
     mesh = food.shape.mesh(refinement)
     mesh.check(f"food.shape of {food.name}")
     return make_cutting_model(
-        mesh, food.plane(), food.held(mesh), food.material, knife, numerics, board_height=0.0
+        mesh,
+        food.plane(),
+        food.held(mesh),
+        food.material,
+        knife,
+        numerics,
+        food.effects,
+        board_height=0.0,
     )
 
 

@@ -233,9 +233,7 @@ def make_cut_geometry(
         node_volume=node_volume,
         weight_volume=weight_volume,
         vertex_volume=_vertex_volume(split)[split.node_source[computed]],
-        element_distance=distance_inside(
-            section, split.triangles, nodes[t].mean(1)[:, [0, 2]]
-        ),
+        element_distance=distance_inside(section, split.triangles, nodes[t].mean(1)[:, [0, 2]]),
         tables=edge_tables(section, split.triangles),
         point_nodes=point_nodes,
         point_weights=split.point_weights,

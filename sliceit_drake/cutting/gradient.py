@@ -16,7 +16,7 @@ from sliceit_drake.cutting.kernel_types import PARAMETERS
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError, knife_wrenches
-from sliceit_drake.cutting.workspace import Workspace, interpolate_motion
+from sliceit_drake.cutting.workspace import DIRECT, Workspace, interpolate_motion
 
 __all__ = ["SliceAdjoint", "SliceGradient"]
 
@@ -27,9 +27,10 @@ class SliceGradient:
 
     Attributes:
         row: By what the kernels read, in the order of `Workspace.parameter_layout`.
-        position: By the position of Ko at each exchange [E + 1, 3], 1/m.
+        position: By the commanded position of Ko at each exchange [E + 1, 3], 1/m.
         rotation: By the entries of its rotation matrix [E + 1, 3, 3].
         state: By the initial state of the food [state_size].
+        compliance: By the compliances of arm and holder [2], N/m.
         layout: Where each array stands in `row`.
     """
 
@@ -37,10 +38,11 @@ class SliceGradient:
     position: np.ndarray
     rotation: np.ndarray
     state: np.ndarray
+    compliance: np.ndarray
     layout: dict[str, slice]
 
     def by(self, name: str) -> np.ndarray:
-        """By an array of the kernels, as "toughness" [P] or "P" (see `PARAMETERS`)."""
+        """By an array that the kernels read, as "toughness" [P] or "P" (see `PARAMETERS`)."""
         return self.row[self.layout[name]]
 
 
@@ -59,6 +61,7 @@ class SliceAdjoint:
         self._checkpoints: list[np.ndarray] = []
         self._R = np.zeros((0, 3, 3))
         self._p = np.zeros((0, 3))
+        self._wrenches = np.zeros((0, 6))
         self._backward: Any = None
         ws, B, P = self._w, len(model.blocks), len(model.point_nodes)
         self._adj_mu = wp.zeros((1, B), dtype=ws.real, device=ws.device)
@@ -88,7 +91,10 @@ class SliceAdjoint:
         count = len(poses) - 1
         self._checkpoints = [state]
         wrenches = np.empty((count, 6))
+        give = self._give()
         for e in range(count):
+            if e > 0:
+                self._p[e + 1] += give * wrenches[e - 1, 3:]
             ws.advance(self._checkpoints[e][None], self._motion(e))
             total = ws.sum("total")[0, 0].sum(0)
             if not np.isfinite(total).all():
@@ -97,12 +103,26 @@ class SliceAdjoint:
             parts, _ = knife_wrenches(total, blade, buried, self._R[e + 1], n)
             wrenches[e] = parts.sum(0)
             self._checkpoints.append(ws.read(ws.states[-1])[0].copy())
+        self._wrenches = wrenches
         return wrenches
+
+    def _give(self) -> np.ndarray:
+        """Displacement of the knife relative to the food per force on it [3], m/N; see `Mounting`.
+
+        Raises:
+            ValueError: The food may slip.
+        """
+        effects = self.model.effects
+        if effects.slip.resistance is not None:
+            raise ValueError("effects.slip has no gradient: slipping is an event. Set it to null.")
+        return np.array([effects.compliance.holder, 0.0, effects.compliance.arm])
 
     def _motion(self, e: int) -> np.ndarray:
         at = slice(e, e + 2)
         ws = self._w
-        return interpolate_motion(self._R[None, at], self._p[None, at], ws.substeps, ws.exchange_period)
+        return interpolate_motion(
+            self._R[None, at], self._p[None, at], ws.substeps, ws.exchange_period
+        )
 
     def backward(self, weights: np.ndarray) -> SliceGradient:
         """Gradient of sum(weights * wrenches) of the last `forward`.
@@ -118,7 +138,12 @@ class SliceAdjoint:
         adj_state = np.zeros(ws.state_size)
         adj_p, adj_R = np.zeros_like(self._p), np.zeros_like(self._R)
         share = np.arange(1, n + 1) / n
+        give, of_give = self._give(), np.zeros(3)
+        weights = np.array(weights, float)
         for e in reversed(range(count)):
+            if e + 2 <= count:
+                weights[e, 3:] += give * adj_p[e + 2]
+                of_give += self._wrenches[e, 3:] * adj_p[e + 2]
             ws.advance(self._checkpoints[e][None], self._motion(e))
             adj_sums, adj_y = self._adjoint_of_sums(weights[e], self._R[e + 1])
             adj_R[e + 1, :, 1] += adj_y
@@ -140,7 +165,7 @@ class SliceAdjoint:
         scalars = ws.parameter_layout["P"].start
         for name, adjoint in (("mu", self._adj_mu), ("lam", self._adj_lam)):
             row[scalars + PARAMETERS.index(name)] += adjoint.numpy().astype(np.float64).sum()
-        return SliceGradient(row, adj_p, adj_R, adj_state, ws.parameter_layout)
+        return SliceGradient(row, adj_p, adj_R, adj_state, of_give[[2, 0]], ws.parameter_layout)
 
     def _adjoint_of_sums(self, weights: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Adjoint of `knife_wrenches`: of the sums as the workspace holds them, and of Ky."""
@@ -167,7 +192,7 @@ class SliceAdjoint:
         if self._backward is not None:
             return
         ws = self._w
-        with wp.ScopedCapture(device=ws.device) as capture:
+        with DIRECT, wp.ScopedCapture(device=ws.device) as capture:
             for slot in ws.states[:-1]:
                 slot.grad.zero_()
             for ahead in ws.ahead:

@@ -2,7 +2,8 @@
 
 One source for CPU and GPU, single and double precision, with and without adjoints. The first index
 of a launch is the cut: many cuts of one mesh, with parameters, motions and states of their own, run
-side by side. All vectors are in the frame C of the cut: x along the edge, y normal to the cut, z up.
+side by side. All vectors are in the frame C of the cut: x along the edge, y normal to the cut, z
+up.
 """
 
 import functools

@@ -202,6 +202,48 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         x[cut, i] = x1
         ahead[cut, i] = x1 + P[cut, DAMPING_TIME] * v1
 
+    # Sums in loops have kernels of their own: an adjoint would not know their value after the loop.
+    @wp.kernel(enable_backward=gradients, module=module)
+    def push_blade(lateral: wp.array2d(dtype=real), push: wp.array(dtype=real)):
+        """Force of the flanks on the blade."""
+        cut = wp.tid()
+        F = real(0.0)
+        for i in range(lateral.shape[1]):
+            F += lateral[cut, i]
+        push[cut] = F
+
+    @wp.kernel(enable_backward=gradients, module=module)
+    def bend_blade(
+        push: wp.array(dtype=real),
+        P: wp.array2d(dtype=real),
+        exchange: wp.int32,
+        dt: real,
+        blade: wp.array2d(dtype=real),
+        blade_next: wp.array2d(dtype=real),
+        blade_sums: wp.array3d(dtype=real),
+    ):
+        """Steps the blade's lateral deflection and its rate, pushed by the flanks.
+
+        Adds to `blade_sums`: energy lost, force that reaches the knife's body, force of the flanks.
+        """
+        cut = wp.tid()
+        F = push[cut]
+        m = P[cut, BLADE_MASS]
+        c = P[cut, BLADE_DAMPING]
+        k = P[cut, BLADE_STIFFNESS]
+        pushed = blade[cut, 1] + dt * (F - k * blade[cut, 0]) / m
+        rate = pushed / (real(1.0) + dt * c / m)
+        deflection = blade[cut, 0] + dt * rate
+        blade_next[cut, 1] = rate
+        blade_next[cut, 0] = deflection
+        blade_sums[cut, exchange, 0] += c * rate * rate * dt
+        blade_sums[cut, exchange, 1] += k * deflection + c * rate
+        blade_sums[cut, exchange, 2] += F
+
+    out = types.SimpleNamespace(move_nodes=move_nodes, push_blade=push_blade, bend_blade=bend_blade)
+    if not gradients:
+        return out
+
     @wp.kernel(enable_backward=False, module=module)
     def gather(
         moving: wp.array(dtype=wp.int32),
@@ -218,9 +260,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         """Gathers the forces of each moving node, for `step_nodes`."""
         cut, entry = wp.tid()
         i = moving[entry]
-        from_elements[cut, i] = gather_elements(
-            cut, i, element_force, element_start, element_entry
-        )
+        from_elements[cut, i] = gather_elements(cut, i, element_force, element_start, element_entry)
         from_points[cut, i] = gather_points(
             cut, i, point_force, point_start, point_entry, point_weight
         )
@@ -323,51 +363,6 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
                 + adj_from_points[cut, nodes[i, 2 * side + 1]] * w[1]
             )
 
-    # Sums in loops have kernels of their own: an adjoint would not know their value after the loop.
-    @wp.kernel(enable_backward=gradients, module=module)
-    def push_blade(lateral: wp.array2d(dtype=real), push: wp.array(dtype=real)):
-        """Force of the flanks on the blade."""
-        cut = wp.tid()
-        F = real(0.0)
-        for i in range(lateral.shape[1]):
-            F += lateral[cut, i]
-        push[cut] = F
-
-    @wp.kernel(enable_backward=gradients, module=module)
-    def bend_blade(
-        push: wp.array(dtype=real),
-        P: wp.array2d(dtype=real),
-        exchange: wp.int32,
-        dt: real,
-        blade: wp.array2d(dtype=real),
-        blade_next: wp.array2d(dtype=real),
-        blade_sums: wp.array3d(dtype=real),
-    ):
-        """Steps the blade's lateral deflection and its rate, pushed by the flanks.
-
-        Adds to `blade_sums`: energy lost, force that reaches the knife's body, force of the flanks.
-        """
-        cut = wp.tid()
-        F = push[cut]
-        m = P[cut, BLADE_MASS]
-        c = P[cut, BLADE_DAMPING]
-        k = P[cut, BLADE_STIFFNESS]
-        pushed = blade[cut, 1] + dt * (F - k * blade[cut, 0]) / m
-        rate = pushed / (real(1.0) + dt * c / m)
-        deflection = blade[cut, 0] + dt * rate
-        blade_next[cut, 1] = rate
-        blade_next[cut, 0] = deflection
-        blade_sums[cut, exchange, 0] += c * rate * rate * dt
-        blade_sums[cut, exchange, 1] += k * deflection + c * rate
-        blade_sums[cut, exchange, 2] += F
-
-    return types.SimpleNamespace(
-        move_nodes=move_nodes,
-        gather=gather,
-        relax_nodes=relax_nodes,
-        step_nodes=step_nodes,
-        gather_adjoint=gather_adjoint,
-        spread_adjoint=spread_adjoint,
-        push_blade=push_blade,
-        bend_blade=bend_blade,
-    )
+    out.gather, out.relax_nodes, out.step_nodes = gather, relax_nodes, step_nodes
+    out.gather_adjoint, out.spread_adjoint = gather_adjoint, spread_adjoint
+    return out

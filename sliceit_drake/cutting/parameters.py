@@ -28,10 +28,9 @@ POINT_PARAMETERS = (
 )
 """Parameters with a value for each cut point."""
 
-# How the cut is computed, not what is cut; and a number of slices.
-NUMERICAL = ("time_step", "stability_margin", "slices")
-# Act outside of the finite elements, in `Mounting`.
-OUTSIDE = ("compliance", "slip")
+# How the cut is computed, not what is cut; a number of slices; an event.
+NUMERICAL = ("time_step", "stability_margin", "slices", "slip")
+COMPLIANCES = ("effects.compliance.arm", "effects.compliance.holder")
 
 
 def parameter_names(model: CuttingModel) -> list[str]:
@@ -43,7 +42,7 @@ def parameter_names(model: CuttingModel) -> list[str]:
 def _leaves(value: object, path: str) -> Iterable[str]:
     if dc.is_dataclass(value):
         for field in dc.fields(value):
-            if field.name not in (*NUMERICAL, *OUTSIDE):
+            if field.name not in NUMERICAL:
                 yield from _leaves(getattr(value, field.name), f"{path}.{field.name}")
     elif isinstance(value, list):
         for k, item in enumerate(value):
@@ -75,9 +74,7 @@ def _child(value: object, part: str, name: str) -> object:
     raise KeyError(f"{name}: there is no {part}")
 
 
-def with_parameters(
-    model: CuttingModel, values: Mapping[str, float | np.ndarray]
-) -> CuttingModel:
+def with_parameters(model: CuttingModel, values: Mapping[str, float | np.ndarray]) -> CuttingModel:
     """The same cut with other values of parameters.
 
     Raises:
@@ -118,6 +115,9 @@ def pull_back(
     for name in names:
         if name in POINT_PARAMETERS:
             out[name] = _by_point(model, gradient, name)
+            continue
+        if name in COMPLIANCES:
+            out[name] = float(gradient.compliance[COMPLIANCES.index(name)])
             continue
         value = get_parameter(model, name)
         step = 1e-5 * max(abs(float(value)), SMALL.get(name.split(".")[-1], 1e-3))

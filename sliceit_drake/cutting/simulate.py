@@ -5,14 +5,17 @@ import dataclasses as dc
 import numpy as np
 
 from sliceit_drake.cutting.board import Board, board_wrench
-from sliceit_drake.cutting.knife import signed_distance
+from sliceit_drake.cutting.knife import Knife, signed_distance
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Motion, Pose
-from sliceit_drake.cutting.solver import CuttingError, CuttingSolver, Energies, Exchange
+from sliceit_drake.cutting.mounting import Mounting
+from sliceit_drake.cutting.solver import CuttingError, CuttingSolver, Energies, Exchanges
 
 __all__ = [
     "EnergyLedger",
+    "KnifePath",
     "SliceResult",
+    "board_wrenches",
     "check_clear",
     "check_energies",
     "check_in_plane",
@@ -24,6 +27,7 @@ LATERAL_LIMIT = 3e-3
 TILT_LIMIT = 0.15
 LEAST_VOLUME_RATIO = 0.0
 CHECK_TRAVEL = 1e-3
+BLOCK = 10
 
 
 @dc.dataclass
@@ -46,15 +50,16 @@ class EnergyLedger:
     blade: float = 0.0
     internal: float = 0.0
 
-    def add(self, step: Exchange) -> None:
-        """Adds one exchange."""
-        self.work += step.work
+    def add(self, step: Exchanges) -> None:
+        """Adds exchanges."""
+        edge, opening, friction, blade, board = step.dissipation.tolist()
+        self.work += float(step.work.sum())
         self.gravity += step.gravity_work
-        self.edge += step.edge_dissipation
-        self.opening += step.opening_dissipation
-        self.friction += step.friction_dissipation
-        self.board_friction += step.board_dissipation
-        self.blade += step.blade_dissipation
+        self.edge += edge
+        self.opening += opening
+        self.friction += friction
+        self.board_friction += board
+        self.blade += blade
         self.internal += step.internal_work
 
     def damping(self, energies: Energies) -> float:
@@ -196,6 +201,44 @@ def check_energies(
     return ratio
 
 
+class KnifePath:
+    """Poses of the knife at the exchanges, in F and relative to the food in C.
+
+    Attributes:
+        exchanges: Their number E.
+        R_FK, p_FK: [E + 1, 3, 3] and [E + 1, 3].
+        R_CK, p_CK: The same in C; where the mounting gives, relative to the food.
+    """
+
+    def __init__(self, model: CuttingModel, motion: Motion, period: float) -> None:
+        self.exchanges = max(1, round(motion.duration / period))
+        poses = [motion.pose(k * period) for k in range(self.exchanges + 1)]
+        self.R_FK = np.array([X_FK.R for X_FK in poses])
+        self.p_FK = np.array([X_FK.p for X_FK in poses])
+        self._model = model
+        self.R_CK = model.X_FC_rotation.T @ self.R_FK
+        self.p_CK = model.to_cut_frame(self.p_FK)
+        self._mounting = Mounting.of(model.effects)
+
+    def pose(self, k: int) -> Pose:
+        """X_CK after k exchanges."""
+        return Pose(self.R_CK[k], self.p_CK[k])
+
+    def block(self, k: int) -> int:
+        """How many exchanges from the k-th can be advanced at once."""
+        return BLOCK if self._mounting.rigid and k + BLOCK <= self.exchanges else 1
+
+    def give(self, k: int, force: np.ndarray, board: Board | None) -> None:
+        """Lets arm and holder give under the force on the knife [3], N, in C, after k exchanges."""
+        if self._mounting.rigid or k >= self.exchanges:
+            return
+        self._mounting.advance(force)
+        R_FC = self._model.X_FC_rotation
+        self.p_FK[k + 1] = self._mounting.knife(self.p_FK[k + 1], R_FC @ force, board)
+        self.p_CK[k + 1] = self._model.to_cut_frame(self.p_FK[k + 1])
+        self.p_CK[k + 1, 0] -= self._mounting.food(force)
+
+
 def simulate_slice(
     solver: CuttingSolver, motion: Motion, board: Board | None = None, check_period: float = 0.02
 ) -> SliceResult:
@@ -212,49 +255,42 @@ def simulate_slice(
         CuttingError: The knife starts in the food, or the cut became unphysical.
     """
     model, T = solver.model, solver.exchange_period
-    R_FC = model.X_FC_rotation
-
-    def in_cut_frame(t: float) -> Pose:
-        X_FK = motion.pose(t)
-        return Pose(R_FC.T @ X_FK.R, model.to_cut_frame(X_FK.p))
-
-    count = max(1, round(motion.duration / T))
+    path = KnifePath(model, motion, T)
+    count, R_FC = path.exchanges, model.X_FC_rotation
     every = max(1, round(check_period / T))
-    state, pose = solver.initial_state(), in_cut_frame(0.0)
-    check_clear(model, pose)
+    state = solver.initial_state()
+    check_clear(model, path.pose(0))
     ledger = EnergyLedger()
-    rows = np.full((count, 26), np.nan)
+    rows = np.zeros((count, 26))
     ratio = travel = 0.0
-    for k in range(count):
-        end = in_cut_frame((k + 1) * T)
-        check_in_plane(model, end, (k + 1) * T)
+    k = last_check = 0
+    while k < count:
+        block = path.block(k)
+        at, ends = slice(k, k + block), slice(k, k + block + 1)
+        for m in range(k + 1, k + block + 1):
+            check_in_plane(model, path.pose(m), m * T)
         try:
-            step = solver.exchange(state, pose, end)
+            step = solver.exchanges(state, path.R_CK[ends], path.p_CK[ends])
         except CuttingError as error:
             raise CuttingError(f"at {(k + 1) * T:.4g} s {error}") from error
         state = step.state
         ledger.add(step)
-        rows[k, 0] = (k + 1) * T
-        rows[k, 1:4] = R_FC @ end.p + model.X_FC_position
-        rows[k, 4:7], rows[k, 7:10] = R_FC @ step.wrench[:3], R_FC @ step.wrench[3:]
-        if board is not None:
-            v = R_FC @ (end.p - pose.p) / T
-            dR = end.R @ pose.R.T
-            turn = np.array([dR[2, 1] - dR[1, 2], dR[0, 2] - dR[2, 0], dR[1, 0] - dR[0, 1]])
-            w = R_FC @ turn * (0.5 / T)
-            rows[k, 10:16] = board_wrench(board, model.knife, R_FC @ end.R, rows[k, 1:4], v, w)
-        else:
-            rows[k, 10:16] = 0.0
-        for column, wrench in ((16, step.edge), (19, step.normal), (22, step.friction)):
-            rows[k, column : column + 3] = R_FC @ wrench[3:]
-        rows[k, 25] = step.cut
-        travel += float(np.linalg.norm(end.p - pose.p))
-        pose = end
-        if (k + 1) % every == 0 or travel > CHECK_TRAVEL or k + 1 == count:
-            travel = 0.0
-            energies = solver.energies(state, pose)
+        path.give(k + block, step.wrenches[-1].sum(0)[3:], board)
+        parts = step.wrenches.reshape(block, 3, 2, 3) @ R_FC.T
+        rows[at, 4:10] = parts.sum(1).reshape(block, 6)
+        rows[at, 16:25] = parts[:, :, 1].reshape(block, 9)
+        rows[at, 25] = step.cut
+        travel += float(np.linalg.norm(np.diff(path.p_FK[ends], axis=0), axis=1).sum())
+        k += block
+        if k - last_check >= every or travel > CHECK_TRAVEL or k == count:
+            travel, last_check = 0.0, k
+            energies = solver.energies(state, path.pose(k))
             spent = ledger.edge + ledger.opening + ledger.friction
-            ratio = max(ratio, check_energies(energies, spent, model, rows[k, 0]))
+            ratio = max(ratio, check_energies(energies, spent, model, k * T))
+    rows[:, 0] = np.arange(1, count + 1) * T
+    rows[:, 1:4] = path.p_FK[1:]
+    if board is not None:
+        rows[:, 10:16] = board_wrenches(board, model.knife, path.R_FK, path.p_FK, T)
     return SliceResult(
         time=rows[:, 0],
         position=rows[:, 1:4],
@@ -265,8 +301,30 @@ def simulate_slice(
         friction=rows[:, 22:25],
         cut=rows[:, 25],
         state=state,
-        pose=pose,
+        pose=path.pose(count),
         ledger=ledger,
         energies=energies,
         energy_ratio=ratio,
     )
+
+
+def board_wrenches(
+    board: Board, knife: Knife, R: np.ndarray, p: np.ndarray, period: float
+) -> np.ndarray:
+    """Wrench of the board on the knife at the end of each exchange [E, 6], in F.
+
+    Args:
+        board: Its height in F.
+        knife: The knife.
+        R: Rotations of the knife in F at the ends of the exchanges [E + 1, 3, 3].
+        p: Positions of Ko in F there [E + 1, 3], metres.
+        period: Of an exchange, s.
+    """
+    wrenches = np.zeros((len(p) - 1, 6))
+    reach = 0.5 * knife.length * np.abs(R[1:, 2, 0])
+    for k in np.flatnonzero(p[1:, 2] - reach < board.height):
+        v = (p[k + 1] - p[k]) / period
+        dR = R[k + 1] @ R[k].T
+        turn = np.array([dR[2, 1] - dR[1, 2], dR[0, 2] - dR[2, 0], dR[1, 0] - dR[0, 1]])
+        wrenches[k] = board_wrench(board, knife, R[k + 1], p[k + 1], v, turn * (0.5 / period))
+    return wrenches

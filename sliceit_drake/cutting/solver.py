@@ -10,7 +10,7 @@ from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.workspace import Workspace, interpolate_motion
 
-__all__ = ["CuttingError", "CuttingSolver", "Energies", "Exchange", "knife_wrenches"]
+__all__ = ["CuttingError", "CuttingSolver", "Energies", "Exchange", "Exchanges", "knife_wrenches"]
 
 
 class CuttingError(RuntimeError):
@@ -50,6 +50,28 @@ class Exchange:
     board_dissipation: float
     gravity_work: float
     cut: float
+
+
+@dc.dataclass
+class Exchanges:
+    """What E exchanges in a row give; see `Exchange`.
+
+    Attributes:
+        state: The food's new state.
+        wrenches: By mechanism (edge, flank pressure, friction) [E, 3, 6].
+        work: [E], J.
+        dissipation: By edge, opening, friction, blade, board over all exchanges [5], J.
+        internal_work, gravity_work: Over all exchanges, J.
+        cut: Share of the section that the edge has passed [E].
+    """
+
+    state: np.ndarray
+    wrenches: np.ndarray
+    work: np.ndarray
+    dissipation: np.ndarray
+    internal_work: float
+    gravity_work: float
+    cut: np.ndarray
 
 
 @dc.dataclass
@@ -108,6 +130,50 @@ def knife_wrenches(
     return wrenches, lateral
 
 
+def run_exchanges(
+    ws: Workspace, states: np.ndarray, R: np.ndarray, p: np.ndarray
+) -> list[Exchanges]:
+    """Advances all cuts of a workspace by its exchanges.
+
+    Args:
+        ws: Workspace of C cuts and E exchanges.
+        states: [C, state_size].
+        R: Rotations of the knives in C at the ends of the exchanges [C, E + 1, 3, 3].
+        p: Positions of Ko there [C, E + 1, 3], metres.
+
+    Returns:
+        One result a cut; what is not finite is left so.
+    """
+    n, T = ws.substeps, ws.exchange_period
+    motion = interpolate_motion(R, p, n, T)
+    ws.advance(states, motion)
+    new = ws.read(ws.states[0]).copy()
+    total, blade = ws.sum("total").sum(2), ws.sum("blade_sums")
+    wrenches, _ = knife_wrenches(total, blade, ws.sum("buried").sum(2), R[:, 1:], n)
+    both = wrenches.sum(2)
+    K = ws.steps
+    v, w = (
+        motion[:, a * K : (a + 3) * K].reshape(ws.cuts, ws.exchanges, n, 3)[:, :, 0]
+        for a in (12, 15)
+    )
+    # Moments are about Ko at each sub-step; its mean position is half a period back.
+    work = -((both[..., 3:] * v).sum(-1) + (both[..., :3] * w).sum(-1)) * T
+    internal, board = ws.sum("internal_work").sum(1), ws.sum("board_loss").sum(1)
+    nodes = ws.layout["x"]
+    return [
+        Exchanges(
+            state=new[c],
+            wrenches=wrenches[c],
+            work=work[c],
+            dissipation=np.array([*total[c, :, 18:21].sum(0), blade[c, :, 0].sum(), board[c]]),
+            internal_work=float(internal[c]),
+            gravity_work=float(model.weight.ravel() @ (new[c, nodes] - states[c, nodes])),
+            cut=total[c, :, 21] / model.section_area,
+        )
+        for c, model in enumerate(ws.models)
+    ]
+
+
 class CuttingSolver:
     """Steps the state of one `CuttingModel`.
 
@@ -131,6 +197,7 @@ class CuttingSolver:
         self.state_size = self._workspace.state_size
         self.dtype = self._workspace.dtype
         self._lock = threading.Lock()
+        self._long: Workspace | None = None
 
     def initial_state(self) -> np.ndarray:
         """The food at rest, to be cut downwards [state_size]."""
@@ -203,6 +270,31 @@ class CuttingSolver:
             gravity_work=float(m.weight.ravel() @ (new[nodes] - state[nodes])),
             cut=float(total[21]) / m.section_area,
         )
+
+    def exchanges(self, state: np.ndarray, R: np.ndarray, p: np.ndarray) -> Exchanges:
+        """Advances the food through several exchanges at once, on a motion that is known.
+
+        Args:
+            state: The food's state [state_size]; not changed.
+            R: Rotations of the knife in C at the ends of the exchanges [E + 1, 3, 3].
+            p: Positions of Ko in C there [E + 1, 3], metres.
+
+        Raises:
+            CuttingError: A force is not finite.
+        """
+        with self._lock:
+            ws = self._workspace_for(len(p) - 1)
+            result = run_exchanges(ws, state[None], R[None], p[None])
+        if not np.isfinite(result[0].wrenches).all():
+            raise CuttingError(NOT_FINITE)
+        return result[0]
+
+    def _workspace_for(self, exchanges: int) -> Workspace:
+        if exchanges == 1:
+            return self._workspace
+        if self._long is None or self._long.exchanges != exchanges:
+            self._long = Workspace([self.model], self.exchange_period, exchanges)
+        return self._long
 
     def _place(self, state: np.ndarray, pose: Pose) -> None:
         """Puts food and knife, at rest at `pose`, into the workspace for launches with k = 0."""

@@ -1,5 +1,6 @@
 """Device arrays of one or many cuts of one mesh, and the launches that advance them."""
 
+import threading
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,7 +11,10 @@ from sliceit_drake.cutting.kernel_types import ACCUMULATED, GATHER, LANES, PARAM
 from sliceit_drake.cutting.kernels import kernels
 from sliceit_drake.cutting.model import CuttingModel, TimeStepError
 
-__all__ = ["Workspace", "interpolate_motion", "parameter_row"]
+__all__ = ["DIRECT", "Workspace", "interpolate_motion", "parameter_row"]
+
+DIRECT = threading.RLock()
+"""Held in a capture, which takes in the launches of all threads, and in launches outside of one."""
 
 PER_POINT = ("toughness", "excess", "flank_scale", "friction_scale", "unloading")
 """Parameters that each cut point has for itself, in the order of the kernels' arguments."""
@@ -64,9 +68,7 @@ class Workspace:
 
     def array(self, shape: int | tuple[int, ...]) -> wp.array:
         """Zeros on the device, with room for their adjoint if gradients are kept."""
-        return wp.zeros(
-            shape, dtype=self.real, device=self.device, requires_grad=self._gradients
-        )
+        return wp.zeros(shape, dtype=self.real, device=self.device, requires_grad=self._gradients)
 
     def _constant(self, values: np.ndarray, dtype: Any) -> wp.array:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
@@ -377,6 +379,10 @@ class Workspace:
         """Compiles the kernels, once a machine, and captures a launch as a graph."""
         if self._graph is not None:
             return
+        with DIRECT:
+            self._graph = self._captured()
+
+    def _captured(self) -> Any:
         wp.load_module(self.kernels.module, device=self.device)
         with wp.ScopedCapture(device=self.device) as capture:
             self.sums.zero_()
@@ -386,7 +392,7 @@ class Workspace:
                 self.launch(self.kernels.look_ahead, len(self.model.nodes), arguments)
             for k in range(self.steps):
                 self.launch_substep(k)
-        self._graph = capture.graph
+        return capture.graph
 
     def advance(self, states: np.ndarray, motion: np.ndarray) -> None:
         """Advances `states` [C, state_size] along `motion` [C, 18 K] (`interpolate_motion`).
@@ -405,22 +411,19 @@ class Workspace:
         w, now, tables, C = self.w, self.slots[0], self.model.tables, self.cuts
         B, P = len(self.model.blocks), len(self.model.point_nodes)
         elements = [now["x"], w["nodes"], w["shape"], w["stiff_volume"], w["P"]]
-        wp.launch(
-            self.kernels.element_energy,
-            dim=(C, B, LANES),
-            inputs=[*elements, w["energy"], w["volume_ratio"]],
-            device=self.device,
-        )
-        self.launch(
-            self.kernels.point_energy,
-            P,
+        elements += [w["energy"], w["volume_ratio"]]
+        points = (
             [now["x"], w["point_nodes"], w["point_weights"], w["area"], w["fraction"]]
             + [w["centroid"], self.real(tables.reach), self.real(1.0 / tables.spacing)]
             + [w["toughness"], w["flank_scale"], w["unloading"], w["P"], w["knife"]]
             + [w["R_CK"], w["p_CK"], 0, now["blade"]]
             + [now[name] for name in ("passed", "parted", "edge_force", "slip")]
-            + [w["point_energy"]],
+            + [w["point_energy"]]
         )
+        energy, device = self.kernels.element_energy, self.device
+        with DIRECT:
+            wp.launch(energy, dim=(C, B, LANES), inputs=elements, device=device)
+            self.launch(self.kernels.point_energy, P, points)
         elastic = w["energy"].numpy()[0].astype(np.float64).sum()
         ratio = w["volume_ratio"].numpy()[0].ravel()[: self.model.element_count]
         return float(elastic), ratio, float(w["point_energy"].numpy()[0].astype(np.float64).sum())
@@ -428,11 +431,12 @@ class Workspace:
     def present_forces(self) -> tuple[np.ndarray, np.ndarray]:
         """Of the first cut: forces of elements [B, 12, LANES] and of cut points [P, 2, 3], N."""
         look_ahead = self.kernels.look_ahead
-        self.launch(look_ahead, len(self.model.nodes), self.look_ahead_arguments())
-        self.launch_elements(0)
         # A step of no duration changes no history that another call reads.
         points = self.point_arguments(0, self.real(0.0))
-        self.launch(self.kernels.points, len(self.model.point_nodes), points)
+        with DIRECT:
+            self.launch(look_ahead, len(self.model.nodes), self.look_ahead_arguments())
+            self.launch_elements(0)
+            self.launch(self.kernels.points, len(self.model.point_nodes), points)
         B = len(self.model.blocks)
         forces = self.force.numpy()[0, : B * 12 * LANES].astype(np.float64)
         point_forces = self.w["point_force"].numpy()[0].astype(np.float64)
@@ -440,7 +444,7 @@ class Workspace:
 
 
 def parameter_row(model: CuttingModel) -> np.ndarray:
-    """What a model gives the kernels, in the order of `Workspace.parameter_layout`, double precision."""
+    """What a model gives the kernels, in the order of `Workspace.parameter_layout`."""
     inverse_mass = np.zeros(len(model.nodes))
     inverse_mass[model.moving] = 1.0 / model.mass[model.moving]
     volume = model.in_blocks(model.element_volume).reshape(-1)
