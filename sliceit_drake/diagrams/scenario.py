@@ -15,6 +15,7 @@ from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.diagrams.robot import RobotConfig
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
+from sliceit_drake.systems.spring_food import SpringFood
 from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig
 
 __all__ = ["Measurement", "Placement", "Scenario", "Start", "load_scenario"]
@@ -74,7 +75,7 @@ class Scenario:
     controller: ComplianceControllerConfig = dc.field(default_factory=ComplianceControllerConfig)
     knife: Knife = dc.field(default_factory=Knife)
     board: Board = dc.field(default_factory=Board)
-    food: Food | AnalyticFood = dc.field(default_factory=Food)
+    food: Food | AnalyticFood | SpringFood = dc.field(default_factory=Food)
     numerics: Numerics = dc.field(default_factory=Numerics)
     placement: Placement = dc.field(default_factory=Placement)
     start: Start = dc.field(default_factory=Start)

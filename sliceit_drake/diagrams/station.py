@@ -32,6 +32,8 @@ from sliceit_drake.systems.food_visualizer import FoodVisualizer
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 from sliceit_drake.systems.knife_kinematics import BoardContact, KnifeKinematics
 from sliceit_drake.systems.servo import JOINTS
+from sliceit_drake.systems.spring_food import SpringCutter, SpringFood
+from sliceit_drake.systems.spring_visualizer import SpringVisualizer
 from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
 from sliceit_drake.systems.wrench_sensor import WrenchSensor
 
@@ -46,7 +48,7 @@ class SlicingStation(Diagram):
     Attributes:
         scenario: What it was made from.
         plant: The arm with gripper and knife, and the board.
-        cutting: The food: finite elements or analytic.
+        cutting: The food: finite elements, analytic, or the spring of the baseline.
         controller: The compliance controller.
         sensor: The wrench sensor.
         start_pose: X_WK at the start.
@@ -190,6 +192,16 @@ class SlicingStation(Diagram):
                 builder.Connect(
                     self.cutting.GetOutputPort(name), self.food_visualizer.GetInputPort(name)
                 )
+        elif isinstance(self.cutting, SpringCutter):
+            plates = builder.AddNamedSystem(
+                "spring_visualizer",
+                SpringVisualizer(
+                    self.cutting.food, self.scenario.X_WF(), meshcat, 1.0 / FRAMES_PER_SECOND
+                ),
+            )
+            builder.Connect(
+                self.cutting.GetOutputPort("compression"), plates.GetInputPort("compression")
+            )
 
     def SetStart(self, root_context: Context) -> None:
         """Puts arm and controller at rest at the start, in the context of the whole diagram."""
@@ -216,7 +228,7 @@ def MakeSlicingStation(
 
 
 def _food_model(scenario: Scenario) -> CuttingModel | None:
-    """The prepared cut, or None for an analytic food."""
+    """The prepared cut, or None for a food without elements."""
     if not isinstance(scenario.food, Food):
         return None
     return make_food_model(scenario.food, scenario.knife, scenario.numerics)
@@ -231,10 +243,17 @@ def _make_cutting(
         pose = start_pose(model, start.clearance, start.offset)
         cutting = CuttingSystem([CuttingSolver(model, period)], scenario.X_WF(), knife.index())
         return cutting, RigidTransform(RotationMatrix(pose.R), pose.p)
-    assert isinstance(scenario.food, AnalyticFood)
-    p_FK = [start.offset, 0.0, scenario.food.diameter + start.clearance]
-    X_FK = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), p_FK)
-    return AnalyticCutter(scenario.food, scenario.board.height, knife.index(), period), X_FK
+    food, index = scenario.food, knife.index()
+    assert isinstance(food, AnalyticFood | SpringFood)
+    cutter: KnifeForceSystem
+    if isinstance(food, SpringFood):
+        height = food.height
+        cutter = SpringCutter(food, scenario.knife, scenario.X_WF(), index, period)
+    else:
+        height = food.diameter
+        cutter = AnalyticCutter(food, scenario.board.height, index, period)
+    p_FK = [start.offset, 0.0, height + start.clearance]
+    return cutter, RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), p_FK)
 
 
 def _add_holder(plant: MultibodyPlant, scenario: Scenario, model: CuttingModel | None) -> None:
