@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
-from pydrake.systems.analysis import Simulator
+from pydrake.systems.analysis import Simulator, SimulatorStatus
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.discretization import estimate_discretization_error
@@ -21,6 +21,7 @@ from sliceit_drake.cutting.mesh import MeshError
 from sliceit_drake.cutting.motion import Motion
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.comparison import Comparison, can_compare, compare_with_measurement
+from sliceit_drake.diagrams.contact_margin import ContactMargin, check_contact_margin
 from sliceit_drake.diagrams.figures import CONTACT_THRESHOLD, plot_force
 from sliceit_drake.diagrams.record import Record
 from sliceit_drake.diagrams.scenario import Scenario
@@ -46,6 +47,7 @@ class Run:
         diagram: Station, motion and record.
         simulator: Initialized.
         profile: The measured force to compare with, or None.
+        contact_margin: How far the contact is from instability.
         wall_time: Seconds spent in the simulator.
         stopped: Why the run ended early, or None.
         snapshot: Knife and food when half of the section was cut, or None.
@@ -55,6 +57,7 @@ class Run:
     diagram: ScenarioDiagram
     simulator: Simulator
     profile: ForceProfile | None
+    contact_margin: ContactMargin
     wall_time: float = 0.0
     stopped: str | None = None
     snapshot: Snapshot | None = None
@@ -83,6 +86,7 @@ def prepare_run(scenario: Scenario, meshcat: Meshcat | None = None) -> Run:
     profile = _measured_profile(scenario)
     diagram = MakeScenarioDiagram(scenario, meshcat)
     station = diagram.station
+    margin = check_contact_margin(station)
     simulator = Simulator(diagram)
     diagram.SetStart(simulator.get_mutable_context())
     if meshcat is not None:
@@ -91,7 +95,7 @@ def prepare_run(scenario: Scenario, meshcat: Meshcat | None = None) -> Run:
         if station.food_visualizer is not None:
             station.food_visualizer.StartRecording()
     simulator.Initialize()
-    return Run(scenario, diagram, simulator, profile)
+    return Run(scenario, diagram, simulator, profile, margin)
 
 
 def simulate(
@@ -111,12 +115,15 @@ def simulate(
     begin = clock.perf_counter()
     try:
         while (now := run.simulator.get_context().get_time()) < end - 1e-9:
-            run.simulator.AdvanceTo(min(now + CHUNK, end))
+            status = run.simulator.AdvanceTo(min(now + CHUNK, end))
             if run.snapshot is None and _cut_progress(run) > SNAPSHOT_PROGRESS:
                 run.snapshot = take_snapshot(run.station, run.simulator.get_context())
             run.wall_time = clock.perf_counter() - begin
             if progress is not None:
                 progress(run.simulator.get_context().get_time(), run.wall_time)
+            if status.reason() == SimulatorStatus.ReturnReason.kReachedTerminationCondition:
+                run.stopped = status.message()
+                break
     except CuttingError as error:
         run.stopped = str(error)
     except KeyboardInterrupt:
@@ -265,6 +272,7 @@ def _summary(run: Run, record: Record, comparison: Comparison | None) -> dict:
     summary: dict = {
         "scenario": scenario.name,
         "stopped": run.stopped,
+        "contact_margin": dc.asdict(run.contact_margin),
         "simulated_time_s": float(time[-1]),
         "wall_time_s": run.wall_time,
         "real_time_factor": float(time[-1] / run.wall_time) if run.wall_time else None,

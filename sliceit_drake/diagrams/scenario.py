@@ -15,6 +15,7 @@ from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.diagrams.robot import RobotConfig
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
+from sliceit_drake.systems.contact_monitor import ContactMonitorConfig
 from sliceit_drake.systems.spring_food import SpringFood
 from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig
 
@@ -73,6 +74,7 @@ class Scenario:
     robot: RobotConfig = dc.field(default_factory=RobotConfig)
     sensor: WrenchSensorConfig = dc.field(default_factory=WrenchSensorConfig)
     controller: ComplianceControllerConfig = dc.field(default_factory=ComplianceControllerConfig)
+    monitor: ContactMonitorConfig = dc.field(default_factory=ContactMonitorConfig)
     knife: Knife = dc.field(default_factory=Knife)
     board: Board = dc.field(default_factory=Board)
     food: Food | AnalyticFood | SpringFood = dc.field(default_factory=Food)

@@ -27,6 +27,7 @@ from sliceit_drake.diagrams.start import solve_start_joints
 from sliceit_drake.diagrams.workspace import add_board, add_holder, add_table
 from sliceit_drake.systems.analytic_cutter import AnalyticCutter, AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceController
+from sliceit_drake.systems.contact_monitor import ContactMonitor
 from sliceit_drake.systems.cutting_system import CuttingSystem
 from sliceit_drake.systems.food_visualizer import FoodVisualizer
 from sliceit_drake.systems.knife_force import KnifeForceSystem
@@ -98,12 +99,14 @@ class SlicingStation(Diagram):
         board_contact = BoardContact(
             self.robot.knife.index(), scenario.knife.length, scenario.board.height
         )
+        monitor = ContactMonitor(scenario.monitor, scenario.exchange_period)
         named = {
             "cutting": self.cutting,
             "controller": self.controller,
             "sensor": sensor,
             "kinematics": kinematics,
             "board_contact": board_contact,
+            "contact_monitor": monitor,
         }
         for name, system in named.items():
             builder.AddNamedSystem(name, system)
@@ -131,6 +134,7 @@ class SlicingStation(Diagram):
             (kinematics.GetOutputPort("knife_pose"), board_contact.GetInputPort("knife_pose")),
             (plant.get_reaction_forces_output_port(), sensor.GetInputPort("reaction_forces")),
             (sensor.GetOutputPort("sensor_wrench"), self.controller.GetInputPort("sensor_wrench")),
+            (sensor.GetOutputPort("sensor_wrench"), monitor.GetInputPort("sensor_wrench")),
             (
                 self.controller.GetOutputPort("joint_positions_command"),
                 self._arm.GetInputPort("joint_positions_command"),
@@ -167,6 +171,7 @@ class SlicingStation(Diagram):
             board_contact.GetOutputPort("board_wrench_vector"), "board_wrench_vector"
         )
         builder.ExportOutput(sensor.GetOutputPort("state"), "sensor_state")
+        builder.ExportOutput(monitor.GetOutputPort("unstable_gains"), "unstable_gains")
 
         self.visualizer: MeshcatVisualizer | None = None
         self.food_visualizer: FoodVisualizer | None = None
