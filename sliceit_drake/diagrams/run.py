@@ -23,11 +23,12 @@ from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.comparison import Comparison, can_compare, compare_with_measurement
 from sliceit_drake.diagrams.contact_margin import ContactMargin, check_contact_margin
 from sliceit_drake.diagrams.figures import CONTACT_THRESHOLD, plot_force
+from sliceit_drake.diagrams.live_view import LiveControls
 from sliceit_drake.diagrams.record import Record
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram, ScenarioDiagram
 from sliceit_drake.diagrams.snapshot import Snapshot, take_snapshot
-from sliceit_drake.diagrams.station import SlicingStation
+from sliceit_drake.diagrams.station import CAMERA_OFFSET, SlicingStation
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.cutting_system import ENERGY_NAMES, LEDGER_NAMES, CuttingSystem
@@ -51,6 +52,7 @@ class Run:
         wall_time: Seconds spent in the simulator.
         stopped: Why the run ended early, or None.
         snapshot: Knife and food when half of the section was cut, or None.
+        controls: Speed and stop in a live viewer, or None.
     """
 
     scenario: Scenario
@@ -61,6 +63,7 @@ class Run:
     wall_time: float = 0.0
     stopped: str | None = None
     snapshot: Snapshot | None = None
+    controls: LiveControls | None = None
 
     def record(self) -> Record:
         """The record so far."""
@@ -115,6 +118,9 @@ def simulate(
     begin = clock.perf_counter()
     try:
         while (now := run.simulator.get_context().get_time()) < end - 1e-9:
+            if run.controls is not None and not run.controls.apply(run.simulator):
+                run.stopped = "stopped in the viewer"
+                break
             status = run.simulator.AdvanceTo(min(now + CHUNK, end))
             if run.snapshot is None and _cut_progress(run) > SNAPSHOT_PROGRESS:
                 run.snapshot = take_snapshot(run.station, run.simulator.get_context())
@@ -174,8 +180,8 @@ def make_meshcat() -> Meshcat:
 
 
 def _set_scene(meshcat: Meshcat, X_WK: RigidTransform) -> None:
-    target = X_WK.translation() + [0.0, 0.0, 0.03]
-    meshcat.SetCameraPose(target + [0.16, 0.22, 0.16], target)
+    target = X_WK.translation() + [0.0, 0.0, 0.05]
+    meshcat.SetCameraPose(target + CAMERA_OFFSET, target)
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
     meshcat.SetProperty("/Background/<object>", "top_color", [0.92, 0.94, 0.96])

@@ -30,6 +30,7 @@ from sliceit_drake.systems.compliance_controller import ComplianceController
 from sliceit_drake.systems.contact_monitor import ContactMonitor
 from sliceit_drake.systems.cutting_system import CuttingSystem
 from sliceit_drake.systems.food_visualizer import FoodVisualizer
+from sliceit_drake.systems.frame_visualizer import FrameVisualizer
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 from sliceit_drake.systems.knife_kinematics import BoardContact, KnifeKinematics
 from sliceit_drake.systems.servo import JOINTS
@@ -37,10 +38,12 @@ from sliceit_drake.systems.spring_food import SpringCutter, SpringFood
 from sliceit_drake.systems.spring_visualizer import SpringVisualizer
 from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
 from sliceit_drake.systems.wrench_sensor import WrenchSensor
+from sliceit_drake.systems.wrench_visualizer import WrenchVisualizer
 
 __all__ = ["MakeSlicingStation", "SlicingStation"]
 
 FRAMES_PER_SECOND = 32.0
+CAMERA_OFFSET = np.array([0.17, 0.23, 0.17])
 
 
 class SlicingStation(Diagram):
@@ -193,7 +196,7 @@ class SlicingStation(Diagram):
             self.food_visualizer = builder.AddNamedSystem(
                 "food_visualizer", FoodVisualizer(self.cutting, meshcat, 1.0 / FRAMES_PER_SECOND)
             )
-            for name in ("surface_vertices", "food_index"):
+            for name in ("surface_vertices", "surface_damage", "food_index"):
                 builder.Connect(
                     self.cutting.GetOutputPort(name), self.food_visualizer.GetInputPort(name)
                 )
@@ -207,6 +210,34 @@ class SlicingStation(Diagram):
             builder.Connect(
                 self.cutting.GetOutputPort("compression"), plates.GetInputPort("compression")
             )
+        self._add_arrows_and_frames(builder, meshcat)
+
+    def _add_arrows_and_frames(self, builder: DiagramBuilder, meshcat: Meshcat) -> None:
+        """Wrenches on knife and sensor as arrows; triads of W, B, F, S, K."""
+        period = 1.0 / FRAMES_PER_SECOND
+        knife, frame_S = self.robot.knife, self.robot.sensor_weld.frame_on_parent()
+        # Rigid, so the same in any context.
+        X_KS = frame_S.CalcPose(self.plant.CreateDefaultContext(), knife.body_frame())
+        knife_pose = builder.GetSubsystemByName("kinematics").GetOutputPort("knife_pose")
+        arrows = builder.AddNamedSystem(
+            "wrench_visualizer", WrenchVisualizer(meshcat, X_KS, period)
+        )
+        for output in (
+            knife_pose,
+            self.cutting.GetOutputPort("food_wrench"),
+            builder.GetSubsystemByName("board_contact").GetOutputPort("board_wrench"),
+            self.sensor.GetOutputPort("sensor_wrench"),
+        ):
+            builder.Connect(output, arrows.GetInputPort(output.get_name()))
+        fixed = {
+            "W": (RigidTransform(), 0.15),
+            "B": (self.scenario.robot.X_WB(), 0.15),
+            "F": (self.scenario.X_WF(), 0.035),
+        }
+        carried = {"K": (RigidTransform(), 0.035), "S": (X_KS, 0.06)}
+        frames = FrameVisualizer(meshcat, fixed, carried, self.start_pose, CAMERA_OFFSET, period)
+        builder.AddNamedSystem("frame_visualizer", frames)
+        builder.Connect(knife_pose, frames.GetInputPort("knife_pose"))
 
     def SetStart(self, root_context: Context) -> None:
         """Puts arm and controller at rest at the start, in the context of the whole diagram."""

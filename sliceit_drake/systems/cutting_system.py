@@ -44,6 +44,7 @@ class CuttingSystem(KnifeForceSystem):
         food_index: Which of the prepared foods is cut [1].
         energy: At the last check [5], see `ENERGY_NAMES`, J.
         surface_vertices: Corners of the food's surface [3 V], metres, in W, padded with zeros.
+        surface_damage: Share of the toughness that is spent there [V], padded with zeros.
 
     Args:
         solvers: Prepared foods with one exchange period.
@@ -80,12 +81,13 @@ class CuttingSystem(KnifeForceSystem):
         self.DeclareStateOutputPort("ledger", self._ledger)
         self.DeclareStateOutputPort("energy", self._energy)
         self.DeclareStateOutputPort("food_index", self._food_index)
-        self.DeclareVectorOutputPort(
-            "surface_vertices",
-            3 * max(len(surface.ends) for surface in self.surfaces),
-            self._calc_surface,
-            {self.discrete_state_ticket(self._food), self.discrete_state_ticket(self._food_index)},
-        )
+        corners = max(len(surface.ends) for surface in self.surfaces)
+        state = {
+            self.discrete_state_ticket(self._food),
+            self.discrete_state_ticket(self._food_index),
+        }
+        self.DeclareVectorOutputPort("surface_vertices", 3 * corners, self._calc_surface, state)
+        self.DeclareVectorOutputPort("surface_damage", corners, self._calc_damage, state)
 
     @staticmethod
     def _padded(values: np.ndarray, size: int) -> np.ndarray:
@@ -202,3 +204,10 @@ class CuttingSystem(KnifeForceSystem):
         values = np.zeros(output.size())
         values[: p_W.size] = p_W.ravel()
         output.SetFromVector(values)
+
+    def _calc_damage(self, context: Context, output: BasicVector) -> None:
+        index, state = self.food_index(context), self.food_state(context)
+        solver = self._solvers[index]
+        passed, parted = solver.field(state, "passed"), solver.field(state, "parted")
+        damage = self.surfaces[index].damage(solver.model, passed, parted)
+        output.SetFromVector(self._padded(damage, output.size()))
