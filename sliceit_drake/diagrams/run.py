@@ -27,6 +27,7 @@ from sliceit_drake.diagrams.live_view import LiveControls
 from sliceit_drake.diagrams.record import Record
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram, ScenarioDiagram
+from sliceit_drake.diagrams.sequence_report import plot_sequence, slice_reports
 from sliceit_drake.diagrams.snapshot import Snapshot, take_snapshot
 from sliceit_drake.diagrams.station import CAMERA_OFFSET, SlicingStation
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
@@ -156,15 +157,13 @@ def write_outputs(run: Run, directory: Path, meshcat: Meshcat | None) -> dict:
     comparison = _comparison(run, record)
     summary = _summary(run, record, comparison)
     (directory / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
-    plot_force(
-        record,
-        directory / "force.png",
-        _title(run.scenario),
-        _top_height(run),
-        comparison,
-        _caption(run, comparison, summary),
-        run.snapshot,
-    )
+    title, caption = _title(run), _caption(run, comparison, summary)
+    figure, cutting = directory / "force.png", run.station.cutting
+    if run.scenario.sequence is not None and isinstance(cutting, CuttingSystem):
+        board = run.scenario.board.height
+        plot_sequence(record, cutting, figure, title, board, caption, run.snapshot)
+    else:
+        plot_force(record, figure, title, _top_height(run), comparison, caption, run.snapshot)
     if meshcat is not None:
         if run.station.food_visualizer is not None:
             run.station.food_visualizer.PublishRecording()
@@ -234,10 +233,14 @@ def _comparison(run: Run, record: Record) -> Comparison | None:
     return compare_with_measurement(run.profile, measurement, depth, force)
 
 
-def _title(scenario: Scenario) -> str:
-    speeds = [getattr(s, "speed", None) for s in scenario.motion.segments]
+def _title(run: Run) -> str:
+    scenario, segments = run.scenario, run.station.motion_plan.segments
+    speeds = [getattr(s, "speed", None) for s in segments]
     speed = next((s for s in speeds if s), None)
     at = f" at {1e3 * speed:.3g} mm/s" if speed else ""
+    if scenario.sequence is not None:
+        count, thickness = scenario.sequence.count, 1e3 * scenario.sequence.thickness
+        return f"A UR5e cuts {count} slices of {thickness:.3g} mm, {scenario.name}{at}"
     return f"A UR5e slices {scenario.name}{at}"
 
 
@@ -285,12 +288,11 @@ def _summary(run: Run, record: Record, comparison: Comparison | None) -> dict:
         "peak_force_N": float(norm.max()),
         "mean_contact_force_N": float(contact.mean()) if len(contact) else 0.0,
         "board_peak_N": float(np.linalg.norm(board, axis=1).max()),
-        "board_peak_loss_of_an_impact": station.board_peak_loss,
         "cut_progress": float(record["cut_progress"][-1]),
         "phase_times_s": {
             "food": _phase_times(on_food, time),
             "board": _phase_times(on_board, time),
-            "motion": {label: [a, b] for label, a, b in run.motion.phases},
+            "motion": _motion_times(run.motion),
         },
         "settings": {
             "exchange_period_s": scenario.exchange_period,
@@ -320,48 +322,66 @@ def _summary(run: Run, record: Record, comparison: Comparison | None) -> dict:
 
 
 def _imbalance(record: Record) -> float:
-    """Work put into the food less everything that it went into, at the end of the record, J."""
-    last = {name: float(record[f"energy_{name}"][-1]) for name in (*LEDGER_NAMES, *ENERGY_NAMES)}
-    stored = last["elastic"] + last["interface"] + last["kinetic"]
-    damping = -last["internal"] - last["elastic"]
+    """Work put into the food less everything that it went into, at the end of the record, J.
+
+    What a food holds when the next takes its place stays in it.
+    """
+    last = {name: float(record[f"energy_{name}"][-1]) for name in LEDGER_NAMES}
+    ends = np.append(np.flatnonzero(np.diff(record["food_index"])), -1)
+    elastic, interface, kinetic = (
+        float(record[f"energy_{name}"][ends].sum()) for name in ENERGY_NAMES[:3]
+    )
+    damping = -last["internal"] - elastic
     spent = sum(last[name] for name in ("edge", "opening", "friction", "board_friction", "blade"))
-    return last["work"] + last["gravity"] - stored - spent - damping
+    return last["work"] + last["gravity"] - elastic - interface - kinetic - spent - damping
+
+
+def _motion_times(motion: Motion) -> dict[str, list]:
+    """Begin and end of each phase, s; of a phase that occurs again, a list of them."""
+    times: dict[str, list] = {}
+    for label, begin, end in motion.phases:
+        times.setdefault(label, []).append([begin, end])
+    return {label: spans[0] if len(spans) == 1 else spans for label, spans in times.items()}
 
 
 def _cutting_summary(run: Run, record: Record) -> dict:
     """Numbers of the finite-element food."""
     scenario, station = run.scenario, run.station
     assert isinstance(station.cutting, CuttingSystem) and isinstance(scenario.food, Food)
-    solver = station.cutting.solver(
-        station.cutting.GetMyContextFromRoot(run.simulator.get_context())
-    )
-    model = solver.model
+    models = [solver.model for solver in station.cutting.solvers]
+    # Of a sequence, its middle slice stands for all.
+    middle, food, plan = len(models) // 2, scenario.food, scenario.motion
+    model = models[middle]
+    if scenario.sequence is not None:
+        food = scenario.sequence.foods(food)[middle]
+        plan = scenario.sequence.motion([model.top], scenario.start.clearance)
     work = float(record["energy_work"][-1])
-    motion = Motion(
-        scenario.motion, start_pose(model, scenario.start.clearance, scenario.start.offset)
-    )
+    area = sum(m.section_area for m in models[: int(record["food_index"][-1]) + 1])
+    motion = Motion(plan, start_pose(model, scenario.start.clearance, scenario.start.offset))
     summary = {
         "elements": model.element_count,
         "cut_points": len(model.point_nodes),
         "sub_step_s": scenario.numerics.time_step,
         "mass_ratio": model.mass_ratio,
-        "section_area_mm2": 1e6 * model.section_area,
+        "section_area_mm2": 1e6 * area,
         "work_of_cutting_J": work,
         "work_by_mechanism_J": {
             name: float(record[f"energy_{name}"][-1])
             for name in ("edge", "opening", "friction", "board_friction", "blade")
         },
-        "work_per_area_J_m2": work / model.section_area,
+        "work_per_area_J_m2": work / area,
         "energy_imbalance_J": _imbalance(record),
-        "energy_ratio": float(record["energy_largest_energy_ratio"][-1]),
-        "least_volume_ratio": float(record["energy_least_volume_ratio"][-1]),
+        "energy_ratio": float(record["energy_largest_energy_ratio"].max()),
+        "least_volume_ratio": float(record["energy_least_volume_ratio"].min()),
         "coupling_work_error_J": float(record["coupling_work_error"][-1]),
     }
+    if scenario.sequence is not None:
+        summary["slices"] = [dc.asdict(r) for r in slice_reports(record, station.cutting)]
     summary["discretization_error"] = None
     if run.stopped is None:
         try:
             error = estimate_discretization_error(
-                scenario.food,
+                food,
                 scenario.knife,
                 scenario.numerics,
                 scenario.exchange_period,

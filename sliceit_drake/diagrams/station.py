@@ -11,9 +11,8 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer
 
 from sliceit_drake.cutting.food import Food, make_food_model, start_pose
-from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.cutting.solver import CuttingSolver
-from sliceit_drake.diagrams.knife_body import check_plant_step, effective_mass
 from sliceit_drake.diagrams.ports import STATION_PORTS
 from sliceit_drake.diagrams.robot import (
     ArmController,
@@ -56,10 +55,9 @@ class SlicingStation(Diagram):
         cutting: The food: finite elements, analytic, or the spring of the baseline.
         controller: The compliance controller.
         sensor: The wrench sensor.
+        motion_plan: The scenario's segments, or those of its sequence.
         start_pose: X_WK at the start.
         start_joints: Joint positions there [6], rad.
-        board_peak_loss: Estimated share of an impact's peak force on the board that the plant's
-            steps take, see `check_plant_step`.
         meshcat: The viewer, or None.
     """
 
@@ -72,29 +70,25 @@ class SlicingStation(Diagram):
         super().__init__()
         self.scenario = scenario
         self.meshcat = meshcat
-        model = _food_model(scenario)
+        solvers = _food_solvers(scenario)
+        self.motion_plan: MotionPlan = _motion_plan(scenario, solvers)
         builder = DiagramBuilder()
         self.plant, scene_graph = add_plant(builder, scenario.robot)
         self.robot: Robot = add_robot(self.plant, scenario.robot, scenario.knife, scenario.board)
         add_table(self.plant, (0.1, -0.3))
         add_board(self.plant, scenario.board, scenario.X_WF())
-        _add_holder(self.plant, scenario, model)
+        _add_holder(self.plant, scenario, solvers)
         self.plant.Finalize()
 
         self.cutting: KnifeForceSystem
-        self.cutting, X_FK = _make_cutting(scenario, model, self.robot.knife)
+        self.cutting, self.start_pose = _make_cutting(scenario, solvers, self.robot.knife)
         if make_cutting is not None:
             self.cutting = make_cutting(self.robot.knife)
-        self.start_pose = scenario.X_WF() @ X_FK
         self.start_joints = solve_start_joints(
             self.plant,
             self.robot.knife,
             self.start_pose,
             np.array(scenario.robot.joint_positions),
-        )
-        mass = effective_mass(self.plant, self.robot.knife, self.start_joints)
-        self.board_peak_loss = check_plant_step(
-            scenario.board, mass, scenario.robot.plant_time_step, scenario.exchange_period
         )
         self._arm: ArmController = connect_arm_controller(
             builder, self.plant, self.robot, scenario.robot
@@ -173,7 +167,13 @@ class SlicingStation(Diagram):
             else:
                 builder.ExportOutput(outputs[port.name], port.name)
         if isinstance(self.cutting, CuttingSystem):
-            for name in ("force_components", "ledger", "energy", "coupling_work_error"):
+            for name in (
+                "force_components",
+                "ledger",
+                "energy",
+                "coupling_work_error",
+                "food_index",
+            ):
                 builder.ExportOutput(self.cutting.GetOutputPort(name), name)
         # For records: what the contract gives as typed values, as vectors.
         builder.ExportOutput(self.cutting.GetOutputPort("food_wrench_vector"), "food_wrench_vector")
@@ -270,22 +270,40 @@ def MakeSlicingStation(
     return SlicingStation(scenario, meshcat, make_cutting)
 
 
-def _food_model(scenario: Scenario) -> CuttingModel | None:
-    """The prepared cut, or None for a food without elements."""
-    if not isinstance(scenario.food, Food):
-        return None
-    return make_food_model(scenario.food, scenario.knife, scenario.numerics)
+def _food_solvers(scenario: Scenario) -> list[CuttingSolver]:
+    """The prepared cuts: one, or those of a sequence; none for a food without elements."""
+    food, sequence = scenario.food, scenario.sequence
+    if not isinstance(food, Food):
+        return []
+    return [
+        CuttingSolver(
+            make_food_model(each, scenario.knife, scenario.numerics), scenario.exchange_period
+        )
+        for each in (sequence.foods(food) if sequence else [food])
+    ]
+
+
+def _motion_plan(scenario: Scenario, solvers: list[CuttingSolver]) -> MotionPlan:
+    if scenario.sequence is None:
+        return scenario.motion
+    tops = [solver.model.top for solver in solvers]
+    return scenario.sequence.motion(tops, scenario.start.clearance)
 
 
 def _make_cutting(
-    scenario: Scenario, model: CuttingModel | None, knife: RigidBody
+    scenario: Scenario, solvers: list[CuttingSolver], knife: RigidBody
 ) -> tuple[KnifeForceSystem, RigidTransform]:
-    """The cutting system of a scenario and X_FK at the start."""
-    period, start = scenario.exchange_period, scenario.start
-    if model is not None:
-        pose = start_pose(model, start.clearance, start.offset)
-        cutting = CuttingSystem([CuttingSolver(model, period)], scenario.X_WF(), knife.index())
-        return cutting, RigidTransform(RotationMatrix(pose.R), pose.p)
+    """The cutting system of a scenario and X_WK at the start."""
+    period, start, X_WF = scenario.exchange_period, scenario.start, scenario.X_WF()
+    if solvers:
+        assert isinstance(scenario.food, Food)
+        poses = [X_WF]
+        if scenario.sequence is not None:
+            poses = scenario.sequence.poses(scenario.food, X_WF)
+        in_sequence = scenario.sequence is not None
+        pose = start_pose(solvers[0].model, start.clearance, start.offset)
+        cutting = CuttingSystem(solvers, poses, knife.index(), in_sequence=in_sequence)
+        return cutting, poses[0] @ RigidTransform(RotationMatrix(pose.R), pose.p)
     food, index = scenario.food, knife.index()
     assert isinstance(food, AnalyticFood | SpringFood)
     cutter: KnifeForceSystem
@@ -296,14 +314,17 @@ def _make_cutting(
         height = food.diameter
         cutter = AnalyticCutter(food, scenario.board.height, index, period)
     p_FK = [start.offset, 0.0, height + start.clearance]
-    return cutter, RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), p_FK)
+    return cutter, X_WF @ RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), p_FK)
 
 
-def _add_holder(plant: MultibodyPlant, scenario: Scenario, model: CuttingModel | None) -> None:
-    """Draws the clamp where the food is held."""
+def _add_holder(plant: MultibodyPlant, scenario: Scenario, solvers: list[CuttingSolver]) -> None:
+    """Draws the clamp where the food is held, in a sequence behind the last cut."""
     food = scenario.food
-    if model is None or not isinstance(food, Food) or food.held_sides not in ("both", "plus"):
+    if not isinstance(food, Food) or food.held_sides not in ("both", "plus"):
         return
+    model, distance = solvers[0].model, food.hold_distance + 0.005
+    if scenario.sequence is not None:
+        distance += scenario.sequence.positions(food)[-1]
     size = np.ptp(model.split.vertex_position @ model.X_FC_rotation.T, axis=0)
     add_holder(
         plant,
@@ -311,5 +332,5 @@ def _add_holder(plant: MultibodyPlant, scenario: Scenario, model: CuttingModel |
         scenario.X_WF(),
         food_width=float(size[0]),
         food_height=float(size[2]),
-        distance=food.hold_distance + 0.005,
+        distance=distance,
     )

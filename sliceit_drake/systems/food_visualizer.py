@@ -38,6 +38,9 @@ class FoodVisualizer(LeafSystem):
     each frame is a mesh of its own that is visible for one frame. An I/O system: what is drawn lies
     in the Meshcat instance.
 
+    Where one food follows another, the slice that was cut off, the minus half of the last food,
+    stays as it was last seen; not where the next food comes to its place.
+
     Input ports:
         surface_vertices: Of the `CuttingSystem` [3 V], metres, in W.
         surface_damage: Of the `CuttingSystem` [V].
@@ -63,13 +66,16 @@ class FoodVisualizer(LeafSystem):
         self._food_index = self.DeclareVectorInputPort("food_index", 1)
         self._recording = False
         self._frames: list[float] = []
+        self._foods: list[int] = []
+        first, last = cutting.food_poses[0], cutting.food_poses[-1]
+        self._slices_stay = not first.IsExactlyEqualTo(last)
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
         self.DeclareForcedPublishEvent(self._publish)
 
     def StartRecording(self) -> None:
         """Keeps every frame from now on, for `Meshcat.StaticHtml`."""
         self._recording = True
-        self._frames = []
+        self._frames, self._foods = [], []
         self._meshcat.Delete(self._path)
 
     def PublishRecording(self) -> None:
@@ -81,7 +87,7 @@ class FoodVisualizer(LeafSystem):
                 path = self._frame_path(half, k)
                 animation.SetProperty(0, path, "visible", k == 0)
                 animation.SetProperty(frame, path, "visible", True)
-                if k + 1 < len(self._frames):
+                if k + 1 < len(self._frames) and not self._stays(half, k):
                     end = animation.frame(self._frames[k + 1])
                     animation.SetProperty(end, path, "visible", False)
         self._recording = False
@@ -89,24 +95,34 @@ class FoodVisualizer(LeafSystem):
     def _frame_path(self, half: str, k: int) -> str:
         return f"{self._path}/{half}/frame_{k:04d}"
 
+    def _live_path(self, half: str, food: int) -> str:
+        slices = half == "minus" and self._slices_stay
+        return f"{self._path}/{half}" + (f"/slice_{food + 1:02d}" if slices else "")
+
+    def _stays(self, half: str, k: int) -> bool:
+        """Whether frame `k` shows a slice that has been cut off by frame k + 1."""
+        return half == "minus" and self._slices_stay and self._foods[k + 1] > self._foods[k]
+
     def _publish(self, context: Context) -> EventStatus:
         vertices = self._vertices.Eval(context).reshape(-1, 3)
-        surface = self._cutting.surfaces[int(self._food_index.Eval(context)[0])]
+        food = int(self._food_index.Eval(context)[0])
+        surface = self._cutting.surfaces[food]
         damage = self._damage.Eval(context)[: len(surface.ends)]
         skin = np.array(SKIN)[:, None]
         colours = np.where(surface.is_cut_face, damage_colours(damage), skin)
         k = len(self._frames)
+        if self._recording:
+            self._frames.append(context.get_time())
+            self._foods.append(food)
         for half, (corners, triangles) in zip(HALVES, surface.halves, strict=True):
-            path = self._frame_path(half, k) if self._recording else f"{self._path}/{half}"
+            path = self._frame_path(half, k) if self._recording else self._live_path(half, food)
             self._meshcat.SetTriangleColorMesh(
                 path,
                 np.asfortranarray(vertices[corners].T),
                 np.asfortranarray(triangles.T, dtype=np.int32),
                 np.asfortranarray(colours[:, corners]),
             )
-            if self._recording and k > 0:
+            if self._recording and k > 0 and not self._stays(half, k - 1):
                 # A live viewer shows the newest frame alone.
                 self._meshcat.SetProperty(self._frame_path(half, k - 1), "visible", False)
-        if self._recording:
-            self._frames.append(context.get_time())
         return EventStatus.Succeeded()
