@@ -43,6 +43,11 @@ NEUTRAL = 1e-6
 GREATEST_STIFFNESS = 1e7
 GREATEST_MARGIN = 20.0
 
+# The state: q, v, q_d, v_d, integral, command, virtual velocity, error, reading, food's wrench;
+# then past poses and targets on their way.
+_PARTS = 10
+_POSITIONS = (0, 2, 5)
+
 
 @dc.dataclass(frozen=True)
 class Mode:
@@ -170,6 +175,16 @@ class ContactLoop:
         frequency = abs(np.angle(last)) / (2.0 * np.pi * self.period)
         return Mode(float(np.abs(last)), float(frequency))
 
+    def displaced(self, direction: Sequence[float]) -> np.ndarray:
+        """The loop's state at rest, without food, a unit away from the target along `direction`."""
+        joints = np.linalg.solve(self._J, np.asarray(direction, float))
+        rest = [joints if part in _POSITIONS else 0.0 * joints for part in range(_PARTS)]
+        return np.concatenate([*rest, *[joints] * self._delay_steps])
+
+    def displacement(self, state: np.ndarray) -> np.ndarray:
+        """How far the knife is from the target in a state [6]."""
+        return self._J @ state[:JOINTS]
+
     def margin(self, response: np.ndarray | None = None, board: np.ndarray | None = None) -> float:
         """Factor on both contacts at which the loop becomes unstable.
 
@@ -227,12 +242,12 @@ class ContactLoop:
         G = np.zeros((1, 6, 6)) if response is None else np.reshape(response, (-1, 6, 6))
         config, h, J = self._config, self._step, self._J
         history, delay = len(G) - 1, self._delay_steps
-        parts = 10 + history + delay
+        parts = _PARTS + history + delay
         size = parts * JOINTS
         # Rows of the identity: each part as a linear function of the state at the cycle's start.
         state = np.eye(size).reshape(parts, JOINTS, size)
-        q, v, q_d, v_d, torque, command, v_c, error, reading, wrench = state[:10]
-        poses, targets = list(state[10 : 10 + history]), list(state[10 + history :])
+        q, v, q_d, v_d, torque, command, v_c, error, reading, wrench = state[:_PARTS]
+        poses, targets = list(state[_PARTS : _PARTS + history]), list(state[_PARTS + history :])
 
         total = 0.0 * reading  # A cycle ends with an exchange.
         mass = self._M

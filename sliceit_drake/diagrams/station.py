@@ -103,7 +103,9 @@ class SlicingStation(Diagram):
         board_contact = BoardContact(
             self.robot.knife.index(), scenario.knife.length, scenario.board.height
         )
-        monitor = ContactMonitor(scenario.monitor, scenario.exchange_period)
+        monitor = ContactMonitor(
+            scenario.monitor, scenario.exchange_period, scenario.sensor
+        )
         named = {
             "cutting": self.cutting,
             "controller": self.controller,

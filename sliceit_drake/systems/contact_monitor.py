@@ -8,6 +8,7 @@ from pydrake.multibody.math import SpatialForce
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, LeafSystem
 
 from sliceit_drake.configuration import quantity
+from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig
 
 __all__ = ["UNSTABLE_GAINS", "ContactMonitor", "ContactMonitorConfig"]
 
@@ -27,6 +28,8 @@ _LASTING = 0.9
 _FORGETTING = 0.97
 # Swings that suffice above the force limit: an impact alone has two.
 _FEW = 3
+# The readings of a minute of normal noise span less than this many standard deviations.
+_NOISE_SWING = 9.0
 
 
 @dc.dataclass
@@ -82,12 +85,19 @@ class ContactMonitor(LeafSystem):
     Args:
         config: Thresholds.
         period: Of the wrench's readings, s.
+        sensor: What measures the wrench; swings that its noise alone makes do not count.
     """
 
-    def __init__(self, config: ContactMonitorConfig, period: float) -> None:
+    def __init__(
+        self, config: ContactMonitorConfig, period: float, sensor: WrenchSensorConfig
+    ) -> None:
         super().__init__()
         self._config = config
-        self._scale = 1.0 / np.repeat([config.moment_swing, config.force_swing], 3)
+        least = [
+            max(config.moment_swing, _NOISE_SWING * sensor.moment_noise),
+            max(config.force_swing, _NOISE_SWING * sensor.force_noise),
+        ]
+        self._scale = 1.0 / np.repeat(least, 3)
         self._wrench = self.DeclareAbstractInputPort("sensor_wrench", Value(SpatialForce.Zero()))
         initial = np.zeros(_STATE_SIZE)
         initial[:_AXES] = 1.0
