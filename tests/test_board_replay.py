@@ -1,5 +1,7 @@
 """The board's law on a replayed knife motion, and the steps that a station needs for it."""
 
+import dataclasses as dc
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -7,8 +9,6 @@ from scipy.spatial.transform import Rotation
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.board import impact_peak_loss
 from sliceit_drake.cutting.food import Cylinder, Food, make_food_model
-from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan, Recorded, Retract
 from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
@@ -39,8 +39,8 @@ def analytic(stiffness: float, time_step: float = 1e-3, speed: float = 0.05) -> 
     return scenario
 
 
-def replay(scenario: Scenario, record: Record, file) -> SliceResult:
-    """Drives the knife along the record's poses in F, through a small food above the same board."""
+def replay(scenario: Scenario, record: Record, food: Food, file) -> SliceResult:
+    """Drives the knife along the record's poses in F, through a food on the same board."""
     X_FW = scenario.X_WF().inverse()
     R_FW = Rotation.from_matrix(X_FW.rotation().matrix())
     R_WK = Rotation.from_quat(record.vector("knife_pose_quat", "wxyz"), scalar_first=True)
@@ -51,10 +51,8 @@ def replay(scenario: Scenario, record: Record, file) -> SliceResult:
     np.savetxt(file, rows, delimiter=",", header=header, comments="", fmt="%.9g")
     plan = MotionPlan([Recorded(file=str(file), placement="world")])
     motion = Motion(plan, plan.segments[0].first_pose())
-    food = Food(shape=Cylinder(diameter=DIAMETER, rings=2, layers=[0.0, 0.004, 0.012]))
-    model = make_food_model(food, Knife(), Numerics(time_step=1e-4))
-    board = scenario.board
-    board.height = 0.0
+    model = make_food_model(food, scenario.knife, scenario.numerics)
+    board = dc.replace(scenario.board, height=0.0)
     return simulate_slice(CuttingSolver(model, scenario.exchange_period), motion, board)
 
 
@@ -68,7 +66,9 @@ def test_a_replayed_station_record_has_the_stations_board_force(
     run = prepare_run(scenario)
     simulate(run)
     record = run.record()
-    result = replay(scenario, record, tmp_path / "knife.csv")
+    scenario.numerics.time_step = 1e-4
+    food = Food(shape=Cylinder(diameter=DIAMETER, rings=2, layers=[0.0, 0.004, 0.012]))
+    result = replay(scenario, record, food, tmp_path / "knife.csv")
     # Result k is at the end of exchange k, record row k at its begin.
     np.testing.assert_allclose(result.time, record["time"][1:], atol=1e-9)
     station, replayed = record["board_wrench_f_z"][1:], result.board_wrench[:, 5]
@@ -78,6 +78,24 @@ def test_a_replayed_station_record_has_the_stations_board_force(
     assert replayed.max() == pytest.approx(peak, rel=0.02)
     assert replayed.sum() == pytest.approx(station.sum(), rel=0.01)
     assert np.sqrt(np.mean((replayed - station)[touching] ** 2)) < 0.05 * peak
+
+
+def test_a_replayed_station_record_has_the_foods_force_as_well(tmp_path):
+    overrides = "{food: {shape: !Cylinder {rings: 3, layers: [0.0, 0.004, 0.012]}}}"
+    scenario = load_scenario(resource_path("scenarios/cucumber.yaml"), overrides)
+    scenario.start.clearance = 0.002
+    scenario.motion = MotionPlan([ConstantSpeed(distance=0.030, speed=0.05, acceleration=2.0)])
+    run = prepare_run(scenario)
+    simulate(run)
+    record = run.record()
+    result = replay(scenario, record, scenario.food, tmp_path / "knife.csv")
+    # The station holds the mean over an exchange through the next, and logs before it updates.
+    station, replayed = record["food_wrench_f_z"][2:], result.food_wrench[:-1, 5]
+    assert station.max() > 10.0
+    np.testing.assert_allclose(replayed, station, atol=0.01)
+    board, again = record["board_wrench_f_z"][1:], result.board_wrench[:, 5]
+    assert again.max() == pytest.approx(board.max(), rel=0.02)
+    assert again.sum() == pytest.approx(board.sum(), rel=0.02)
 
 
 # Steps ------------------------------------------------------------------------------------------

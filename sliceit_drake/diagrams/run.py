@@ -288,6 +288,7 @@ def _summary(run: Run, record: Record, comparison: Comparison | None) -> dict:
         "peak_force_N": float(norm.max()),
         "mean_contact_force_N": float(contact.mean()) if len(contact) else 0.0,
         "board_peak_N": float(np.linalg.norm(board, axis=1).max()),
+        "board_peak_loss_of_an_impact": station.board_peak_loss,
         "cut_progress": float(record["cut_progress"][-1]),
         "phase_times_s": {
             "food": _phase_times(on_food, time),

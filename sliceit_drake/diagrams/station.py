@@ -13,6 +13,7 @@ from pydrake.systems.primitives import Demultiplexer
 from sliceit_drake.cutting.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.diagrams.knife_body import check_plant_step, effective_mass
 from sliceit_drake.diagrams.ports import STATION_PORTS
 from sliceit_drake.diagrams.robot import (
     ArmController,
@@ -58,6 +59,8 @@ class SlicingStation(Diagram):
         motion_plan: The scenario's segments, or those of its sequence.
         start_pose: X_WK at the start.
         start_joints: Joint positions there [6], rad.
+        board_peak_loss: Estimated share of an impact's peak force on the board that the plant's
+            steps take, see `check_plant_step`.
         meshcat: The viewer, or None.
     """
 
@@ -89,6 +92,10 @@ class SlicingStation(Diagram):
             self.robot.knife,
             self.start_pose,
             np.array(scenario.robot.joint_positions),
+        )
+        mass = effective_mass(self.plant, self.robot.knife, self.start_joints)
+        self.board_peak_loss = check_plant_step(
+            scenario.board, mass, scenario.robot.plant_time_step, scenario.exchange_period
         )
         self._arm: ArmController = connect_arm_controller(
             builder, self.plant, self.robot, scenario.robot
