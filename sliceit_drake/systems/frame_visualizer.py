@@ -77,10 +77,10 @@ class FrameVisualizer(LeafSystem):
         return EventStatus.Succeeded()
 
 
-def draw_over_everything(meshcat: Meshcat, path: str) -> None:
-    """Makes the object at a path visible also from inside and behind others."""
+def draw_over_everything(meshcat: Meshcat, path: str, order: int = 1) -> None:
+    """Makes the object at a path visible also from inside and behind others of lower order."""
     meshcat.SetProperty(f"{path}/<object>", "material.depthTest", False)
-    meshcat.SetProperty(f"{path}/<object>", "renderOrder", 1.0)
+    meshcat.SetProperty(f"{path}/<object>", "renderOrder", float(order))
 
 
 def _draw_triad(meshcat: Meshcat, path: str, length: float) -> None:

@@ -61,24 +61,30 @@ class _Arrow:
         path: In Meshcat's tree.
         colour: Red, green, blue.
         heads: 1, or 2 for a moment.
+        order: Drawn over arrows of lower order.
     """
 
     def __init__(
-        self, meshcat: Meshcat, path: str, colour: tuple[float, float, float], heads: int
+        self,
+        meshcat: Meshcat,
+        path: str,
+        colour: tuple[float, float, float],
+        heads: int,
+        order: int,
     ) -> None:
         self._meshcat = meshcat
         self._path = path
         self._heads = [f"{path}/head_{k}" for k in range(heads)]
         rgba = Rgba(*colour)
         meshcat.SetObject(f"{path}/shaft", Cylinder(SHAFT_RADIUS, 1.0), rgba)
-        draw_over_everything(meshcat, f"{path}/shaft")
+        draw_over_everything(meshcat, f"{path}/shaft", order)
         cone = MeshcatCone(HEAD_LENGTH, HEAD_RADIUS, HEAD_RADIUS)
         upside_down = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
         for head in self._heads:
             # Meshcat's cones stand on their tips.
             meshcat.SetObject(f"{head}/cone", cone, rgba)
             meshcat.SetTransform(f"{head}/cone", RigidTransform(upside_down))
-            draw_over_everything(meshcat, f"{head}/cone")
+            draw_over_everything(meshcat, f"{head}/cone", order)
         meshcat.SetProperty(path, "visible", False)
 
     def set(self, point: np.ndarray, vector: np.ndarray, least: float, time: float) -> None:
@@ -141,11 +147,12 @@ class WrenchVisualizer(LeafSystem):
             for name in COLOURS
         }
         self._arrows = {}
-        for name, colour in COLOURS.items():
+        # The arrow of the board over the food's, which is longer and starts where it does.
+        for order, (name, colour) in enumerate(COLOURS.items(), start=2):
             light = (0.5 + 0.5 * colour[0], 0.5 + 0.5 * colour[1], 0.5 + 0.5 * colour[2])
             self._arrows[name] = (
-                _Arrow(meshcat, f"{path}/{name}/force", colour, 1),
-                _Arrow(meshcat, f"{path}/{name}/moment", light, 2),
+                _Arrow(meshcat, f"{path}/{name}/force", colour, 1, order),
+                _Arrow(meshcat, f"{path}/{name}/moment", light, 2, order),
             )
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
         self.DeclareForcedPublishEvent(self._publish)
