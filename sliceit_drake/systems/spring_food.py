@@ -197,28 +197,30 @@ class SpringCutter(KnifeForceSystem):
                 reached = edge
             new_rate = (reached - compression) / h
             if pushed:
-                force = stiffness * reached + damping * new_rate + mass * (new_rate - rate) / h
-                impulse += force * h
+                push = stiffness * reached + damping * new_rate + mass * (new_rate - rate) / h
+                impulse += push * h
             # The stop at the top takes the button's momentum.
             compression, rate = reached, new_rate if reached > 0.0 else 0.0
             deepest = max(deepest, compression / self.food.height)
         self._set(state, self._button, [compression, rate])
-        force_W = np.array([0.0, 0.0, impulse / self.exchange_period])
-        return np.concatenate([np.cross(arm, force_W), force_W]), min(deepest, 1.0)
+        force = impulse / self.exchange_period
+        moment_x, moment_y = arm[1] * force, -arm[0] * force
+        return np.array([moment_x, moment_y, 0.0, 0.0, 0.0, force]), min(deepest, 1.0)
 
-    def _contact(self, X_WK: np.ndarray) -> tuple[float, np.ndarray]:
+    def _contact(self, X_WK: np.ndarray) -> tuple[float, tuple[float, float]]:
         """Depth of the edge below the button's released top, metres, and the arm from Ko to it.
 
         Args:
             X_WK: As [3, 4].
 
         Returns:
-            Depth, -inf where the edge passes beside the button, and the arm in W [3].
+            Depth, -inf where the edge passes beside the button, and the arm along Wx and Wy.
         """
-        along, offset = X_WK[:, 0], self._p_WT - X_WK[:, 3]
-        level = along[0] ** 2 + along[1] ** 2
-        s = (along[0] * offset[0] + along[1] * offset[1]) / level if level > 0.0 else 0.0
-        arm = min(max(s, -self._half_edge), self._half_edge) * along
-        if math.hypot(offset[0] - arm[0], offset[1] - arm[1]) > 0.5 * self.food.diameter:
-            return -math.inf, arm
-        return float(offset[2] - arm[2]), arm
+        ax, ay, az = X_WK[:, 0].tolist()
+        dx, dy, dz = (self._p_WT - X_WK[:, 3]).tolist()
+        level = ax * ax + ay * ay
+        s = (ax * dx + ay * dy) / level if level > 0.0 else 0.0
+        s = min(max(s, -self._half_edge), self._half_edge)
+        if math.hypot(dx - s * ax, dy - s * ay) > 0.5 * self.food.diameter:
+            return -math.inf, (s * ax, s * ay)
+        return dz - s * az, (s * ax, s * ay)
