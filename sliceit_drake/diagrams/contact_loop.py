@@ -11,7 +11,8 @@ down one cycle of it in the order in which the station's events run, with the sa
   integral of ``reset P (q_d - q)``, one symplectic step;
 - board: a spring in the plant's own step, ``f_b = -K_b J (q + h v_next)``, as the plant's contact
   solver has it;
-- sensor: mean of ``f + f_b + tilt of the tool's weight - M_tool J a`` over the exchange, filtered.
+- sensor: mean of ``f + f_b + tilt of the tool's weight - M_tool J a`` over the exchange,
+  filtered, sampled and late.
 
 The loop is stable if the matrix of a cycle has no eigenvalue outside the unit circle.
 
@@ -44,7 +45,7 @@ GREATEST_STIFFNESS = 1e7
 GREATEST_MARGIN = 20.0
 
 # The state: q, v, q_d, v_d, integral, command, virtual velocity, error, reading, food's wrench;
-# then past poses and targets on their way.
+# then past poses, targets and readings on their way.
 _PARTS = 10
 _POSITIONS = (0, 2, 5)
 
@@ -128,9 +129,15 @@ class ContactLoop:
         self._reset = control.reset_rate
         self._exchange_steps = round(scenario.exchange_period / h)
         self._control_steps = round(self._config.period / h)
-        self._cycle_steps = math.lcm(self._exchange_steps, self._control_steps)
+        sensor = scenario.sensor
+        self._reading_steps = max(self._exchange_steps, round(sensor.sample_period / h))
+        self._cycle_steps = math.lcm(self._reading_steps, self._control_steps)
         self.period = self._cycle_steps * h
-        turn = 2.0 * math.pi * scenario.sensor.cutoff_frequency * scenario.exchange_period
+        self._readings_late = sensor.delay / scenario.exchange_period
+        self._line = math.ceil(round(self._readings_late, 9)) + 1
+        if self._line == 1 and self._reading_steps == self._exchange_steps:
+            self._line = 0
+        turn = 2.0 * math.pi * sensor.cutoff_frequency * scenario.exchange_period
         self._filter_share = -math.expm1(-turn) if turn > 0.0 else 1.0
 
     def _linearise_controller(self, scenario: Scenario, q: np.ndarray, R_WK: np.ndarray) -> None:
@@ -179,7 +186,8 @@ class ContactLoop:
         """The loop's state at rest, without food, a unit away from the target along `direction`."""
         joints = np.linalg.solve(self._J, np.asarray(direction, float))
         rest = [joints if part in _POSITIONS else 0.0 * joints for part in range(_PARTS)]
-        return np.concatenate([*rest, *[joints] * self._delay_steps])
+        line = np.zeros(self._line * JOINTS)
+        return np.concatenate([*rest, *[joints] * self._delay_steps, line])
 
     def displacement(self, state: np.ndarray) -> np.ndarray:
         """How far the knife is from the target in a state [6]."""
@@ -242,12 +250,14 @@ class ContactLoop:
         G = np.zeros((1, 6, 6)) if response is None else np.reshape(response, (-1, 6, 6))
         config, h, J = self._config, self._step, self._J
         history, delay = len(G) - 1, self._delay_steps
-        parts = _PARTS + history + delay
+        parts = _PARTS + history + delay + self._line
         size = parts * JOINTS
         # Rows of the identity: each part as a linear function of the state at the cycle's start.
         state = np.eye(size).reshape(parts, JOINTS, size)
         q, v, q_d, v_d, torque, command, v_c, error, reading, wrench = state[:_PARTS]
-        poses, targets = list(state[_PARTS : _PARTS + history]), list(state[_PARTS + history :])
+        queues = list(state[_PARTS:])
+        poses, targets = queues[:history], queues[history : history + delay]
+        line = queues[history + delay :]
 
         total = 0.0 * reading  # A cycle ends with an exchange.
         mass = self._M
@@ -283,17 +293,26 @@ class ContactLoop:
                 felt = wrench + self._tilt @ (J @ q) - self._tool @ (J @ ((v_next - v) / h))
                 if board is not None:
                     felt = felt - board @ (J @ q_next)
-            total_next, reading_next = total + felt, reading
+            shown, total_next, reading_next = self._shown(reading, line), total + felt, reading
             if i % self._exchange_steps == self._exchange_steps - 1:
                 mean = total_next / self._exchange_steps
                 reading_next = reading + self._filter_share * (mean - reading)
+                is_new = (i + 1) % self._reading_steps == 0
+                line = [reading_next if is_new else line[0], *line[:-1]] if line else []
                 total_next = 0.0 * total
             if i % self._control_steps == 0:
-                command, v_c, error = self._control(config, q, command, v_c, error, reading)
+                command, v_c, error = self._control(config, q, command, v_c, error, shown)
             q, v, q_d, v_d, torque = q_next, v_next, q_d_next, v_d_next, torque_next
             total, reading = total_next, reading_next
         parts_after = [q, v, q_d, v_d, torque, command, v_c, error, reading, wrench]
-        return np.concatenate([*parts_after, *poses, *targets])
+        return np.concatenate([*parts_after, *poses, *targets, *line])
+
+    def _shown(self, reading: np.ndarray, line: list[np.ndarray]) -> np.ndarray:
+        """What the controller reads: the sensor's reading, sampled and late."""
+        if not line:
+            return reading
+        part = round(self._readings_late, 9) % 1.0
+        return line[-1] if part == 0.0 else line[-2] + part * (line[-1] - line[-2])
 
     def _control(
         self,

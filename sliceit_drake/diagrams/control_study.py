@@ -79,7 +79,7 @@ def study_scenario(mode: str, scaled_gain: float) -> Scenario:
 
 
 def stability_limits(
-    mode: str, gains: Sequence[float], lag: float, *, on_board: bool = False
+    mode: str, gains: Sequence[float] | np.ndarray, lag: float, *, on_board: bool = False
 ) -> np.ndarray:
     """Greatest stable vertical contact stiffness [n], N/m.
 
@@ -235,7 +235,7 @@ class BoxRun:
 
 
 def run_in_contact(
-    gains: AgentGains, factor: float, contact: str, duration: float = 0.6, lag: float = 0.03
+    gains: AgentGains, factor: float, contact: str, duration: float = 0.3, lag: float = 0.03
 ) -> BoxRun:
     """Presses the knife through the analytic food, or onto the board, with gains of the agent.
 
