@@ -42,7 +42,7 @@ def test_simulate_writes_replay_figure_record_and_summary(tmp_path):
     np.testing.assert_allclose(np.diff(time), 0.002, atol=1e-9)
     html = (tmp_path / "replay.html").read_text()
     scene = b"".join(base64.b64decode(d) for d in re.findall(r"base64,([A-Za-z0-9+/=]+)", html))
-    assert all(f"food/frame_{k:04d}".encode() in scene for k in (0, 50, 98))
+    assert all(f"food/minus/frame_{k:04d}".encode() in scene for k in (0, 50, 98))
     assert not re.search(r'<(script|link)[^>]*(src|href)="https?:', html)
     # What was simulated can be simulated again from what was written.
     assert (

@@ -10,7 +10,8 @@ from pydrake.systems.primitives import LogVectorOutput, TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
 from sliceit_drake.configuration import ConfigurationError, validate
-from sliceit_drake.systems.servo import JOINTS, Servo, ServoConfig
+from sliceit_drake.diagrams.servo_study import servo_study
+from sliceit_drake.systems.servo import JOINTS, Servo, ServoConfig, ServoLaw
 
 PERIOD = 1e-3
 START = np.array([0.4, -1.2, 1.5, -1.8, -1.6, 0.3])
@@ -108,6 +109,35 @@ def test_a_delay_moves_the_response_in_time_and_changes_nothing_else():
     np.testing.assert_allclose(late[:6], np.tile(START, (6, 1)), atol=1e-12)
 
 
+@pytest.mark.parametrize("delay", [0.0, 0.006])
+def test_the_law_alone_at_the_controllers_cycle_is_the_servo_at_the_plants_step(delay):
+    cycle, config = 2e-3, ServoConfig(lookahead_time=0.05, gain=700.0, delay=delay)
+    rng = np.random.default_rng(0)
+    goals = START + 0.01 * np.cumsum(rng.standard_normal((100, JOINTS)), axis=0)
+    breaks = cycle * np.arange(101)
+    held = PiecewisePolynomial.ZeroOrderHold(breaks, np.vstack([goals, goals[-1:]]).T)
+    # Half a step late, so that no rounding decides which target a cycle has.
+    held.shiftRight(-0.5 * PERIOD)
+    _, q, v, _ = respond(config, held, 0.199)
+    law = ServoLaw(config, cycle)
+    state = law.state_at_rest(START)
+    for k, goal in enumerate(goals):
+        np.testing.assert_allclose(state[0], q[2 * k], atol=1e-12)
+        np.testing.assert_allclose(state[1], v[2 * k], atol=1e-10)
+        state = law.step(state, goal)
+
+
+@pytest.mark.parametrize(("lookahead", "gain"), [(0.03, 100.0), (0.2, 100.0), (0.2, 2000.0)])
+def test_at_the_ends_of_the_real_commands_ranges_lag_and_overshoot_are_as_stated(lookahead, gain):
+    config = ServoConfig(lookahead_time=lookahead, gain=gain)
+    _, q, _, _ = respond(config, ramp(0.5, 4.0), 4.0)
+    assert 4.0 - (q[-1, 0] - START[0]) / 0.5 == pytest.approx(lookahead, abs=PERIOD)
+    _, q, _, _ = respond(config, step(0.01, 4.0), 4.0)
+    zeta = config.damping_ratio
+    overshoot = math.exp(-math.pi * zeta / math.sqrt(1 - zeta**2)) if zeta < 1 else 0.0
+    assert ((q - START) / 0.01).max() - 1.0 == pytest.approx(overshoot, abs=1e-3)
+
+
 @pytest.mark.parametrize("delay", [0.0, 0.004])
 def test_it_stays_at_rest_where_it_is_put(delay):
     servo = Servo(ServoConfig(delay=delay), PERIOD, START)
@@ -130,3 +160,12 @@ def test_a_delay_between_steps_is_refused():
 def test_a_lookahead_in_milliseconds_is_recognised():
     with pytest.raises(ConfigurationError, match=r"servo.lookahead_time: 30 s .*Write 0.03"):
         validate(ServoConfig(lookahead_time=30.0), "servo")
+
+
+def test_the_arm_in_the_plant_adds_no_lag_and_no_overshoot_to_the_servo():
+    (case,) = servo_study([ServoConfig()])
+    assert case.ramp_lag == pytest.approx(0.03, abs=PERIOD)
+    assert case.arm_lag < 1e-4
+    assert case.overshoot == pytest.approx(0.058, abs=2e-3)
+    assert case.rise_time == pytest.approx(0.058, abs=2e-3)
+    assert case.settling_time == pytest.approx(0.136, abs=3e-3)

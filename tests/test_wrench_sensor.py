@@ -4,6 +4,7 @@ import dataclasses as dc
 
 import numpy as np
 import pytest
+import scipy.signal
 from pydrake.common.value import AbstractValue, Value
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.math import SpatialForce
@@ -11,7 +12,11 @@ from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlan
 from pydrake.multibody.tree import PrismaticJoint, SpatialInertia, WeldJoint
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus, LeafSystem
-from pydrake.systems.primitives import ConstantVectorSource, TrajectorySource
+from pydrake.systems.primitives import (
+    ConstantVectorSource,
+    LogVectorOutput,
+    TrajectorySource,
+)
 from pydrake.trajectories import PiecewisePolynomial
 
 from sliceit_drake.configuration import ConfigurationError, validate
@@ -372,6 +377,249 @@ def test_two_contexts_of_one_diagram_do_not_disturb_each_other():
     np.testing.assert_array_equal(readings[: len(alone)], alone)
 
 
+# Spectra, drift and delay, of the sensor alone ---------------------------------------------------
+
+
+class Reactions(LeafSystem):
+    """Gives the sensor the wrenches [N, 6] of the environment, one an exchange."""
+
+    def __init__(self, wrenches: np.ndarray):
+        super().__init__()
+        self._wrenches = wrenches
+        self.DeclareAbstractOutputPort(
+            "reaction_forces", lambda: AbstractValue.Make([SpatialForce.Zero()]), self._calc
+        )
+
+    def _calc(self, context: Context, output: AbstractValue) -> None:
+        wrench = -self._wrenches[round(context.get_time() / EXCHANGE)]
+        output.set_value([SpatialForce(wrench[:3], wrench[3:])])
+
+
+@dc.dataclass
+class Bench:
+    """A sensor that is driven by given wrenches, without a plant that moves."""
+
+    sensor: WrenchSensor
+    simulator: Simulator
+    log: object
+    exchanges: int
+
+    def context(self) -> Context:
+        return self.sensor.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
+
+    def readings(self) -> np.ndarray:
+        """Readings [N, 6], moment first, from the first."""
+        self.simulator.AdvanceTo((self.exchanges - 0.5) * EXCHANGE)
+        names = self.sensor.state_columns(list("abcdef"))
+        rows = [names.index(name) for name in "abcdef"]
+        # The log shows at each exchange what was read in the one before.
+        return self.log.FindLog(self.simulator.get_context()).data()[rows, 1:].T
+
+
+def make_bench(config: WrenchSensorConfig, wrenches: np.ndarray) -> Bench:
+    plant = MultibodyPlant(EXCHANGE)
+    plant.SetUseSampledOutputPorts(False)
+    tool = plant.AddRigidBody("tool", SpatialInertia.SolidSphereWithMass(1.0, 0.05))
+    weld = plant.AddJoint(WeldJoint("w", plant.world_frame(), tool.body_frame(), RigidTransform()))
+    plant.Finalize()
+    builder = DiagramBuilder()
+    source = builder.AddSystem(Reactions(wrenches))
+    sensor = builder.AddSystem(WrenchSensor(plant, weld, EXCHANGE, config))
+    builder.Connect(source.get_output_port(), sensor.get_input_port())
+    log = LogVectorOutput(sensor.GetOutputPort("state"), builder, EXCHANGE)
+    return Bench(sensor, Simulator(builder.Build()), log, len(wrenches))
+
+
+def read(config: WrenchSensorConfig, wrenches: np.ndarray) -> np.ndarray:
+    return make_bench(config, wrenches).readings()
+
+
+def nothing(exchanges: int) -> np.ndarray:
+    return np.zeros((exchanges, 6))
+
+
+def density(readings: np.ndarray, segment: int) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies [M], Hz, without 0 and Nyquist; one-sided densities [M, 6]."""
+    f, S = scipy.signal.welch(
+        readings, 1.0 / EXCHANGE, nperseg=segment, detrend="linear", axis=0, scaling="density"
+    )
+    return f[1:-1], S[1:-1]
+
+
+# A Welch estimate from K independent values scatters by 1/sqrt(K). 2^15 readings in segments of 256
+# that overlap by half give some 130 in each of 127 bins; averaged over eight bins and three axes,
+# with the window's correlation of neighbours, 2 to 3 %. The bounds below are four of these and the
+# seeds are fixed: a wrong factor of two, slope or cutoff fails, another generator does not.
+LONG, SEGMENT = 2**15, 256
+
+
+def octave_means(f: np.ndarray, ratio: np.ndarray) -> np.ndarray:
+    """Means over bands of eight bins and the three axes of force and of moment [B, 2]."""
+    usable = len(f) // 8 * 8
+    return ratio[:usable].reshape(-1, 8, 2, 3).mean(axis=(1, 3))
+
+
+def test_noise_is_white_with_the_density_of_its_standard_deviation():
+    config = WrenchSensorConfig(force_noise=0.5, moment_noise=0.02, seed=1)
+    f, S = density(read(config, nothing(LONG)), SEGMENT)
+    expected = 2.0 * np.repeat([0.02, 0.5], 3) ** 2 * EXCHANGE
+    np.testing.assert_allclose(octave_means(f, S / expected), 1.0, atol=0.10)
+    np.testing.assert_allclose((S / expected).mean(), 1.0, atol=0.02)
+
+
+def test_a_white_force_is_shown_with_the_density_of_the_low_pass_filter():
+    cutoff, size = 20.0, 3.0
+    wrenches = size * np.random.default_rng(2).standard_normal((LONG, 6))
+    f, S = density(read(WrenchSensorConfig(cutoff_frequency=cutoff), wrenches), SEGMENT)
+    pole = np.exp(-2 * np.pi * cutoff * EXCHANGE)
+    gain = ((1 - pole) / np.abs(1 - pole * np.exp(-2j * np.pi * f * EXCHANGE))) ** 2
+    assert np.interp(cutoff, f, gain) == pytest.approx(
+        0.5, abs=0.03
+    )  # As a filter in continuous time.
+    ratio = S / (2.0 * size**2 * EXCHANGE * gain)[:, None]
+    np.testing.assert_allclose(octave_means(f, ratio), 1.0, atol=0.10)
+    np.testing.assert_allclose(ratio.mean(), 1.0, atol=0.02)
+
+
+def test_drift_is_a_random_walk_with_the_density_of_its_spread():
+    config = WrenchSensorConfig(force_drift=0.2, moment_drift=0.01, seed=3)
+    f, S = density(read(config, nothing(LONG)), SEGMENT)
+    spread = np.repeat([0.01, 0.2], 3)
+    band = slice(3, 35)  # Above the window's first lobes, below where the steps show.
+    expected = spread**2 / (2.0 * np.pi**2 * f[band, None] ** 2)
+    steps = (np.sin(np.pi * f[band] * EXCHANGE) / (np.pi * f[band] * EXCHANGE)) ** -2
+    np.testing.assert_allclose(
+        octave_means(f[band], S[band] / (expected * steps[:, None])), 1.0, atol=0.12
+    )
+    slope = np.polyfit(np.log(f[band]), np.log((S[band] / steps[:, None]).mean(axis=1)), 1)[0]
+    assert slope == pytest.approx(-2.0, abs=0.06)
+
+
+def test_drift_spreads_with_the_square_root_of_time_and_has_no_direction():
+    # 200 sensors of 6 axes, a tenth of a second each.
+    ends = np.concatenate(
+        [
+            read(WrenchSensorConfig(force_drift=0.3, moment_drift=0.3, seed=seed), nothing(52))[-1]
+            for seed in range(200)
+        ]
+    )
+    expected = 0.3 * np.sqrt(50 * EXCHANGE)
+    assert ends.std() == pytest.approx(expected, rel=4 / np.sqrt(2 * ends.size))
+    assert abs(ends.mean()) < 4 * expected / np.sqrt(ends.size)
+
+
+def test_taring_takes_away_force_and_drift_and_leaves_bias():
+    wrenches = np.tile([0.1, 0.2, 0.3, 1.0, 2.0, -12.0], (200, 1))
+    wrenches[0] = 0.0
+    config = WrenchSensorConfig(
+        force_drift=0.5, force_drift_rate=[0.0, 0.0, 1.0], force_bias=[0.0, 0.0, 0.25]
+    )
+    bench = make_bench(config, wrenches)
+    bench.simulator.AdvanceTo(100.5 * EXCHANGE)
+    before = bench.sensor.GetOutputPort("sensor_wrench").Eval(bench.context()).get_coeffs()
+    assert np.abs(before - wrenches[-1] - [0, 0, 0, 0, 0, 0.25])[3:].max() > 0.1
+    bench.sensor.tare(bench.context())
+    bench.simulator.AdvanceTo(101.5 * EXCHANGE)
+    after = bench.sensor.GetOutputPort("sensor_wrench").Eval(bench.context()).get_coeffs()
+    step = 0.5 * np.sqrt(EXCHANGE)
+    np.testing.assert_allclose(after, [0, 0, 0, 0, 0, 0.25], atol=5 * step)
+    np.testing.assert_allclose(after[:3], 0.0, atol=1e-12)
+
+
+def test_a_steady_drift_grows_from_the_first_reading_on():
+    config = WrenchSensorConfig(
+        force_drift_rate=[0.0, 0.5, -1.0], moment_drift_rate=[0.1, 0.0, 0.0]
+    )
+    readings = read(config, nothing(100))
+    times = EXCHANGE * np.arange(len(readings))
+    expected = times[:, None] * [0.1, 0.0, 0.0, 0.0, 0.5, -1.0]
+    np.testing.assert_allclose(readings, expected, atol=1e-12)
+
+
+WRENCHES = np.random.default_rng(5).standard_normal((60, 6))
+
+
+def test_a_delay_of_whole_exchanges_moves_the_readings_and_changes_nothing_else():
+    prompt = read(WrenchSensorConfig(force_noise=0.1), WRENCHES)
+    late = read(WrenchSensorConfig(force_noise=0.1, delay=3 * EXCHANGE), WRENCHES)
+    np.testing.assert_array_equal(late[3:], prompt[:-3])
+    # As if the first wrench had always been there.
+    np.testing.assert_array_equal(late[:3], np.tile(prompt[0], (3, 1)))
+
+
+def test_a_delay_between_exchanges_is_interpolated():
+    prompt = read(WrenchSensorConfig(), WRENCHES)
+    late = read(WrenchSensorConfig(delay=1.25 * EXCHANGE), WRENCHES)
+    np.testing.assert_allclose(late[2:], 0.75 * prompt[1:-1] + 0.25 * prompt[:-2], atol=1e-12)
+    ramp = np.outer(np.arange(60), np.ones(6))
+    late = read(WrenchSensorConfig(delay=1.25 * EXCHANGE, tare_at_start=False), ramp)
+    np.testing.assert_allclose(late[2:], ramp[2:-1] - 1.25, atol=1e-12)
+
+
+def test_readings_are_multiples_of_the_resolution_next_to_the_wrench():
+    config = WrenchSensorConfig(force_resolution=0.1, tare_at_start=False)
+    readings = read(config, WRENCHES)
+    steps = readings[:, 3:] / 0.1
+    np.testing.assert_allclose(steps, np.rint(steps), atol=1e-9)
+    assert np.abs(readings - WRENCHES[:-1])[:, 3:].max() == pytest.approx(0.05, abs=2e-3)
+    np.testing.assert_allclose(readings[:, :3], WRENCHES[:-1, :3], atol=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0.0, 2 * EXCHANGE])
+def test_a_slow_sensor_holds_each_reading_for_its_sample_period(delay):
+    prompt = read(WrenchSensorConfig(delay=delay), WRENCHES)
+    slow = read(WrenchSensorConfig(delay=delay, sample_period=5 * EXCHANGE), WRENCHES)
+    lag = round(delay / EXCHANGE)
+    held = lag + (np.arange(lag, len(prompt)) - lag) // 5 * 5
+    np.testing.assert_array_equal(slow[lag:], prompt[held])
+
+
+ALL = WrenchSensorConfig(
+    force_noise=0.5,
+    moment_noise=0.02,
+    cutoff_frequency=50.0,
+    force_drift=0.3,
+    moment_drift=0.01,
+    force_drift_rate=[0.1, 0.0, 0.0],
+    force_resolution=0.01,
+    sample_period=2 * EXCHANGE,
+    delay=1.5 * EXCHANGE,
+    seed=7,
+)
+
+
+def test_every_imperfection_follows_from_the_seed_and_differs_with_it():
+    first = read(ALL, WRENCHES)
+    np.testing.assert_array_equal(first, read(ALL, WRENCHES))
+    assert np.abs(first - read(dc.replace(ALL, seed=8), WRENCHES)).max() > 0.1
+    walk = WrenchSensorConfig(force_drift=0.3, moment_drift=0.3, seed=7)
+    noise = WrenchSensorConfig(force_noise=0.3, moment_noise=0.3, seed=7)
+    steps = np.diff(read(walk, nothing(400)), axis=0).ravel()
+    assert abs(np.corrcoef(steps, read(noise, nothing(400))[1:].ravel())[0, 1]) < 0.1
+
+
+def test_two_contexts_with_every_imperfection_do_not_disturb_each_other():
+    alone = read(ALL, WRENCHES)
+    bench = make_bench(ALL, WRENCHES)
+    diagram = bench.simulator.get_system()
+    a, b = Simulator(diagram), Simulator(diagram)
+    port = bench.sensor.GetOutputPort("sensor_wrench")
+    for k in range(40):
+        a.AdvanceTo((k + 0.5) * EXCHANGE)
+        b.AdvanceTo((k + 15.5) * EXCHANGE)
+        context = bench.sensor.GetMyContextFromRoot(a.get_context())
+        np.testing.assert_array_equal(port.Eval(context).get_coeffs(), alone[k])
+
+
+def test_an_ideal_sensor_keeps_no_drift_and_no_delay_line():
+    plain = make_bench(WrenchSensorConfig(), nothing(2)).sensor
+    late = make_bench(WrenchSensorConfig(delay=2.5 * EXCHANGE), nothing(2)).sensor
+    walking = make_bench(WrenchSensorConfig(force_drift=0.1), nothing(2)).sensor
+    size = plain.GetOutputPort("state").size()
+    assert late.GetOutputPort("state").size() == size + 4 * 6
+    assert walking.GetOutputPort("state").size() == size + 6
+
+
 # Refusals ---------------------------------------------------------------------------------------
 
 
@@ -395,3 +643,8 @@ def test_a_plant_with_sampled_ports_is_refused():
 def test_negative_noise_is_refused():
     with pytest.raises(ConfigurationError, match=r"sensor.force_noise: -1 N is not within"):
         validate(WrenchSensorConfig(force_noise=-1.0), "sensor")
+
+
+def test_a_sample_period_between_exchanges_is_refused():
+    with pytest.raises(ConfigurationError, match=r"sensor.sample_period: 0.005 s .*Write 0.004"):
+        make_bench(WrenchSensorConfig(sample_period=5e-3), nothing(2))

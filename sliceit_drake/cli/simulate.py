@@ -8,6 +8,8 @@ from sliceit_drake.cli.scenario_argument import add_scenario_arguments, scenario
 
 __all__ = ["add_parser"]
 
+WAIT_FOR_BROWSER = 60.0
+
 DESCRIPTION = """\
 Simulate a scenario: the arm moves the knife through the food under compliance control.
 
@@ -17,6 +19,16 @@ Writes to DIR:
   record.csv     joints, poses, wrenches, energies at every exchange (500 Hz), SI units
   summary.json   peak and mean force, work by mechanism, real-time factor, discretisation error, ...
   scenario.yaml  what was simulated, complete
+
+In the replay and in the live view (--meshcat) you see:
+  blue arrow     force of the food on the knife, at the middle of the edge, 200 N a metre
+  orange arrow   force of the board on the knife
+  purple arrow   force that the wrist sensor measures, at the flange
+  two heads      moments, 20 Nm a metre, in lighter colours
+  cut faces      plum where the food is intact, orange half cut, pale green where it is cut
+"Open Controls" > Scene is a tree of what is shown. Untick drake > food > minus (or plus) to look at
+the cut face of the other half, wrench for no arrows; tick frames (or give --frames) for the
+coordinate frames W world, B robot base, S sensor, K knife, F food.
 """
 
 
@@ -36,7 +48,13 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument(
         "--meshcat",
         action="store_true",
-        help="show the run live in a browser, not faster than real time; print its address",
+        help="show the run live in a browser, with a slider for its speed and a stop button; says "
+        "how to see it by ssh or without a display",
+    )
+    parser.add_argument(
+        "--frames",
+        action="store_true",
+        help="show coordinate frames at first, live and in the replay",
     )
     parser.add_argument("--no-replay", action="store_true", help="do not write replay.html")
     parser.set_defaults(run=run)
@@ -48,9 +66,14 @@ def run(options: argparse.Namespace) -> int:
 
     from tqdm import tqdm
 
-    if not options.meshcat:
-        logging.getLogger("drake").setLevel(logging.WARNING)
+    logging.getLogger("drake").setLevel(logging.WARNING)
 
+    from sliceit_drake.diagrams.live_view import (
+        FASTEST,
+        LiveControls,
+        viewing_instructions,
+        wait_for_browser,
+    )
     from sliceit_drake.diagrams.run import make_meshcat, prepare_run, simulate, write_outputs
 
     if options.duration is not None and not options.duration > 0.0:
@@ -62,12 +85,17 @@ def run(options: argparse.Namespace) -> int:
     meshcat = None if options.no_replay and not options.meshcat else make_meshcat()
     print("Preparing (the first run on a machine compiles the kernels, about 5 s)", flush=True)
     prepared = prepare_run(scenario, meshcat)
+    if options.frames and meshcat is not None:
+        meshcat.SetProperty("/frames", "visible", True)
     if options.meshcat and meshcat is not None:
+        prepared.controls = LiveControls(meshcat)
+        print(viewing_instructions(meshcat.port()))
         print(
-            f"Watch at {meshcat.web_url()} . Without a display on this machine, forward its port "
-            f"(ssh -L {meshcat.port()}:localhost:{meshcat.port()} HOST) or open replay.html later."
+            f'"Open Controls" has the speed, times real time ({FASTEST:g}: no limit), and stop. '
+            f"The run starts when a browser shows it, or in {WAIT_FOR_BROWSER:.0f} s.",
+            flush=True,
         )
-        prepared.simulator.set_target_realtime_rate(1.0)
+        wait_for_browser(meshcat, WAIT_FOR_BROWSER)
     duration = options.duration or prepared.motion.duration
     with tqdm(
         total=duration,
@@ -84,6 +112,8 @@ def run(options: argparse.Namespace) -> int:
     directory = options.output or Path("output") / scenario.name
     summary = write_outputs(prepared, directory, None if options.no_replay else meshcat)
     _report(summary, directory)
+    if meshcat is not None:
+        meshcat.Flush()  # A browser that watched keeps the replay.
     return 1 if prepared.stopped else 0
 
 

@@ -15,6 +15,11 @@ Force and path errors are RMS while the food is cut; the path's is relative to t
 # Exchange period and plant step, s; the last is the reference.
 COMBINATIONS = ((4e-3, 1e-3), (2e-3, 1e-3), (1e-3, 1e-3), (5e-4, 5e-4), (2.5e-4, 2.5e-4))
 
+SERVO = """\
+Move the arm by a ramp and by a step for several parameters of servoj and print lag and overshoot.
+"""
+LOOKAHEAD_TIMES, GAINS = (0.03, 0.1, 0.2), (100.0, 300.0, 2000.0)
+
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Adds the command."""
@@ -29,6 +34,14 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     add_scenario_arguments(coupling)
     coupling.add_argument("--output", metavar="FILE", type=Path, help="also write the table there")
     coupling.set_defaults(run=run_coupling)
+    servo = studies.add_parser(
+        "servo",
+        help="lag and step response of the arm against servoj's parameters",
+        description=SERVO,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    servo.add_argument("--output", metavar="FILE", type=Path, help="also write the table there")
+    servo.set_defaults(run=run_servo)
 
 
 def run_coupling(options: argparse.Namespace) -> int:
@@ -42,6 +55,26 @@ def run_coupling(options: argparse.Namespace) -> int:
     with tqdm(total=len(COMBINATIONS), desc="runs") as bar:
         cases = coupling_study(scenario, COMBINATIONS, lambda done, _: bar.update(done - bar.n))
     table = coupling_table(cases)
+    print(table)
+    if options.output is not None:
+        options.output.parent.mkdir(parents=True, exist_ok=True)
+        options.output.write_text(table + "\n", encoding="utf-8")
+    return 0
+
+
+def run_servo(options: argparse.Namespace) -> int:
+    """Runs the study of the servo."""
+    from tqdm import tqdm
+
+    from sliceit_drake.diagrams.servo_study import servo_study, servo_table
+    from sliceit_drake.systems.servo import ServoConfig
+
+    configs = [
+        ServoConfig(lookahead_time=time, gain=gain) for time in LOOKAHEAD_TIMES for gain in GAINS
+    ]
+    with tqdm(total=2 * len(configs), desc="runs") as bar:
+        cases = servo_study(configs, lambda done, _: bar.update(done - bar.n))
+    table = servo_table(cases)
     print(table)
     if options.output is not None:
         options.output.parent.mkdir(parents=True, exist_ok=True)

@@ -19,7 +19,24 @@ from sliceit_drake.cutting.model import CuttingModel, Numerics, make_cutting_mod
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.split import CutPlane
 
-__all__ = ["Box", "Cylinder", "Ellipsoid", "Food", "MeshFile", "make_food_model", "start_pose"]
+__all__ = [
+    "Box",
+    "Cylinder",
+    "Ellipsoid",
+    "Food",
+    "MeshFile",
+    "Remainder",
+    "make_food_model",
+    "start_pose",
+]
+
+LEAST_END_RADIUS = 0.3
+"""Least radius of a sliced ellipsoid's flat end over its greatest: towards the pole the elements of
+a layer shrink to nothing."""
+
+LEAST_LAYER = 0.2
+"""Least thickness of a slice's element layer over the edge length in the section: stiffness across
+the layer, and with it the scaled mass, grow with the inverse square."""
 
 
 @dc.dataclass
@@ -39,8 +56,21 @@ class Cylinder:
 
     def mesh(self, refinement: float = 1.0) -> TetrahedralMesh:
         """The mesh in F, with `refinement` times as many elements along each edge, rounded."""
-        layers = _both_sides(self.layers, 0.5 * self.length, refinement)
-        return cylinder_mesh(self.diameter, layers, max(2, round(self.rings * refinement)))
+        return self.between(_both_sides(self.layers, 0.5 * self.length, refinement), refinement)
+
+    def between(self, y: np.ndarray, refinement: float) -> TetrahedralMesh:
+        """The part between the first and the last of the mesh layers `y` [L], metres."""
+        return cylinder_mesh(self.diameter, y, max(2, round(self.rings * refinement)))
+
+    @property
+    def reach(self) -> float:
+        """Greatest y of a section that can be meshed, metres."""
+        return 0.5 * self.length
+
+    @property
+    def section_edge(self) -> float:
+        """Edge length of the elements in the section, metres."""
+        return 0.5 * self.diameter / self.rings
 
 
 @dc.dataclass
@@ -61,12 +91,23 @@ class Box:
 
     def mesh(self, refinement: float = 1.0) -> TetrahedralMesh:
         """The mesh in F, with `refinement` times as many elements along each edge, rounded."""
-        half = 0.5 * np.array(self.size)
-        layers = _both_sides(self.layers, half[1], refinement)
+        return self.between(_both_sides(self.layers, self.reach, refinement), refinement)
+
+    def between(self, y: np.ndarray, refinement: float) -> TetrahedralMesh:
+        """The part between the first and the last of the mesh layers `y` [L], metres."""
+        half, height = 0.5 * self.size[0], self.size[2]
         nx, nz = (max(1, round(n * refinement)) for n in self.divisions)
-        return box_mesh(
-            np.linspace(-half[0], half[0], nx + 1), layers, np.linspace(0.0, self.size[2], nz + 1)
-        )
+        return box_mesh(np.linspace(-half, half, nx + 1), y, np.linspace(0.0, height, nz + 1))
+
+    @property
+    def reach(self) -> float:
+        """Greatest y of a section that can be meshed, metres."""
+        return 0.5 * self.size[1]
+
+    @property
+    def section_edge(self) -> float:
+        """Edge length of the elements in the section, metres."""
+        return max(self.size[0] / self.divisions[0], self.size[2] / self.divisions[1])
 
 
 @dc.dataclass
@@ -85,6 +126,27 @@ class Ellipsoid:
         steps = self.refinements + round(np.log2(refinement))
         x, y, z = self.diameters
         return ellipsoid_mesh((x, y, z), max(0, steps))
+
+    def between(self, y: np.ndarray, refinement: float) -> TetrahedralMesh:
+        """The part between the first and the last of the mesh layers `y` [L], metres.
+
+        Sections of 2^refinements rings of elements, each scaled to the ellipsoid's.
+        """
+        half_x, half_y, half_z = 0.5 * np.array(self.diameters)
+        unit = cylinder_mesh(2.0, y, max(2, round(2**self.refinements * refinement)))
+        p = unit.vertices - [0.0, 0.0, 1.0]
+        p[:, [0, 2]] *= np.sqrt(1.0 - (p[:, 1:2] / half_y) ** 2) * [half_x, half_z]
+        return TetrahedralMesh(p + [0.0, 0.0, half_z], unit.tetrahedra)
+
+    @property
+    def reach(self) -> float:
+        """Greatest y of a section that can be meshed, metres: see `LEAST_END_RADIUS`."""
+        return 0.5 * self.diameters[1] * float(np.sqrt(1.0 - LEAST_END_RADIUS**2))
+
+    @property
+    def section_edge(self) -> float:
+        """Edge length of the elements in the greatest section, metres."""
+        return 0.5 * max(self.diameters[0], self.diameters[2]) / max(2, 2**self.refinements)
 
 
 @dc.dataclass
@@ -120,6 +182,62 @@ class MeshFile:
         return TetrahedralMesh(self.scale * np.asarray(content.points, float)[:, :3], cells)
 
 
+@dc.dataclass
+class Remainder:
+    """What slices have left of a body, from its free end over the next cut to its far end.
+
+    Its frame F has the axes of the body's and its origin on the board under the next cut, so that
+    the cut is the plane y = 0 and the next slice lies on the side y < 0.
+    """
+
+    body: Cylinder | Box | Ellipsoid = dc.field(default_factory=Cylinder)
+    position: float = quantity(
+        0.0, "m", low=-0.5, high=0.5, doc="Of the next cut, y in the frame of the whole body."
+    )
+    thickness: float = quantity(
+        5e-3, "m", low=5e-4, high=0.5, doc="Of the next slice, from the free end to the cut."
+    )
+    slice_layers: int = quantity(2, "", low=1, high=20, doc="Layers of elements in the slice.")
+    layers: list[float] = quantity(
+        [2.8e-3, 6.4e-3, 12e-3],
+        "m",
+        low=1e-4,
+        high=0.5,
+        doc="Distances of the element layers behind the cut; takes the place of the body's own.",
+    )
+
+    def check(self, where: str) -> None:
+        reach = self.body.reach
+        if self.position >= reach or self.position - self.thickness < -reach - 1e-9:
+            raise ConfigurationError(
+                f"the slice from {1e3 * (self.position - self.thickness):.4g} to "
+                f"{1e3 * self.position:.4g} mm does not lie in the body, which can be sliced from "
+                f"{-1e3 * reach:.4g} to {1e3 * reach:.4g} mm of its middle",
+                field=f"{where}.position",
+                fix="Move the cut, or make the slice thinner.",
+            )
+        least = LEAST_LAYER * self.body.section_edge * self.slice_layers
+        if self.thickness < least:
+            raise ConfigurationError(
+                f"{1e3 * self.thickness:.4g} mm in {self.slice_layers} layers is too thin for "
+                f"elements of {1e3 * self.body.section_edge:.4g} mm in the section, which hold at "
+                f"least {1e3 * least:.4g} mm",
+                field=f"{where}.thickness",
+                fix="Give a thicker slice, fewer slice_layers, or a finer section of the body.",
+            )
+
+    def mesh(self, refinement: float = 1.0) -> TetrahedralMesh:
+        """The mesh in F, with `refinement` times as many elements along each edge, rounded."""
+        far = self.body.reach - self.position
+        slab = np.linspace(-self.thickness, 0.0, max(1, round(self.slice_layers * refinement)) + 1)
+        near = _refined([0.0, *(d for d in self.layers if d < far - 1e-6)], refinement)
+        # The rest is held and only drawn: one layer where it is straight.
+        rest = np.linspace(near[-1], far, 7 if isinstance(self.body, Ellipsoid) else 2)
+        y = np.unique(np.concatenate([slab, near, rest]))
+        mesh = self.body.between(self.position + y, refinement)
+        return TetrahedralMesh(mesh.vertices - [0.0, self.position, 0.0], mesh.tetrahedra)
+
+
 def _both_sides(distances: list[float], half: float, refinement: float) -> np.ndarray:
     """Layer coordinates from -half to half, mirrored in 0, with the given grading near it."""
     near = _refined([d for d in distances if d < half - 1e-6], refinement)
@@ -144,7 +262,7 @@ class Food:
     """
 
     name: str = "cucumber"
-    shape: Cylinder | Box | Ellipsoid | MeshFile = dc.field(default_factory=Cylinder)
+    shape: Cylinder | Box | Ellipsoid | MeshFile | Remainder = dc.field(default_factory=Cylinder)
     material: Material = dc.field(default_factory=Material)
     effects: Effects = dc.field(default_factory=Effects)
     cut_point: list[float] = quantity(

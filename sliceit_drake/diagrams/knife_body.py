@@ -14,12 +14,23 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
-from pydrake.multibody.tree import CalcSpatialInertia, Frame, RigidBody
+from pydrake.multibody.tree import CalcSpatialInertia, Frame, JacobianWrtVariable, RigidBody
 
-from sliceit_drake.cutting.board import Board, edge_contact_positions
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.board import Board, edge_contact_positions, impact_peak_loss
 from sliceit_drake.cutting.knife import Knife
 
-__all__ = ["add_knife", "blade_surface", "contact_properties"]
+__all__ = [
+    "add_knife",
+    "blade_surface",
+    "check_plant_step",
+    "contact_properties",
+    "effective_mass",
+]
+
+# Above it a station is refused. The default board and step have 8 %, measured 6 %, less than any
+# assumed dissipation does; an estimate of 5 % would take steps of 0.6 ms.
+PEAK_LOSS_LIMIT = 0.10
 
 STEEL_DENSITY = 7800.0
 # Polyoxymethylene, the usual plastic of kitchen knives' handles.
@@ -47,9 +58,8 @@ def add_knife(
     from spine to edge. Mass and inertia are those of the steel prism and of a plastic handle behind
     it. The edge is a row of small spheres that touch the edge line from inside and share the
     board's contact law equally (`edge_contact_positions`, the points of `board_wrench`): several
-    points hold a blade steadily where one box would flip between its ends. With a plant step of
-    1 ms the peak of an impact is within 1 % of that with 0.1 ms up to 3e5 N/m (measured at 50 and
-    100 mm/s); at 1e6 N/m it is 17 % low.
+    points hold a blade steadily where one box would flip between its ends. Steps of the plant take
+    from an impact's peak: see `check_plant_step`.
 
     Args:
         plant: Plant, not finalized, registered with a scene graph.
@@ -75,6 +85,58 @@ def add_knife(
             body, X_KS, Sphere(EDGE_SPHERE_RADIUS), f"edge_{i}", properties
         )
     return body
+
+
+def effective_mass(plant: MultibodyPlant, knife: RigidBody, joints: np.ndarray) -> float:
+    """Mass that a vertical blow on the edge's middle meets, rotors included, kg.
+
+    Args:
+        plant: Finalized.
+        knife: Body ``knife``.
+        joints: Positions of the plant, rad.
+    """
+    context, world = plant.CreateDefaultContext(), plant.world_frame()
+    plant.SetPositions(context, joints)
+    J = plant.CalcJacobianTranslationalVelocity(
+        context, JacobianWrtVariable.kV, knife.body_frame(), np.zeros(3), world, world
+    )[2]
+    return float(1.0 / (J @ np.linalg.solve(plant.CalcMassMatrix(context), J)))
+
+
+def check_plant_step(board: Board, mass: float, time_step: float, exchange_period: float) -> float:
+    """Refuses a board too stiff for the plant's step.
+
+    The estimate is that of a free mass (`impact_peak_loss`) and bounds what the arm does. Measured
+    at 50 and 100 mm/s against steps of 25 us (tests/test_robot.py repeats some), the peak is 6 %
+    low at 1e5 N/m with 1 ms, where the estimate is 8 %, and 3 % (4 %) with 0.5 ms; at 3e5 N/m 11 to
+    12 % (14 %) and 6 % (7 %); at 1e6 N/m 17 to 18 % (23 %) and 11 % (13 %), and 5 to 6 % (7 %) with
+    0.25 ms. Forces at rest do not depend on the step.
+
+    Args:
+        board: Of the station.
+        mass: `effective_mass`, kg.
+        time_step: Of the plant, s.
+        exchange_period: Whole number of such steps, s.
+
+    Returns:
+        Estimated share of an impact's peak force that the steps take.
+
+    Raises:
+        ConfigurationError: It is above `PEAK_LOSS_LIMIT`.
+    """
+    loss = impact_peak_loss(board.stiffness, mass, time_step)
+    if loss > PEAK_LOSS_LIMIT:
+        x = 4.0 / np.pi * PEAK_LOSS_LIMIT
+        stiffness = mass * (x / time_step) ** 2
+        steps = np.ceil(exchange_period / (x * np.sqrt(mass / board.stiffness)))
+        raise ConfigurationError(
+            f"{board.stiffness:.4g} N/m is too stiff for a plant step of {time_step:.4g} s: the "
+            f"peak force of an impact would be about {100.0 * loss:.0f} % low",
+            field="scenario.board.stiffness",
+            fix=f"Give robot.plant_time_step {exchange_period / steps:.6g} s or less, or at most "
+            f"{stiffness:.2g} N/m.",
+        )
+    return loss
 
 
 def contact_properties(board: Board, contacts: int) -> GeometryProperties:

@@ -170,6 +170,7 @@ def add_recorder(
         vectors["ledger"] = [f"energy_{name}" for name in LEDGER_NAMES]
         vectors["energy"] = [f"energy_{name}" for name in ENERGY_NAMES]
         vectors["coupling_work_error"] = ["coupling_work_error"]
+        vectors["food_index"] = ["food_index"]
     row = builder.AddNamedSystem(
         "record_row", Multiplexer([len(columns) for columns in vectors.values()])
     )

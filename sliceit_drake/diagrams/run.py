@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
-from pydrake.systems.analysis import Simulator
+from pydrake.systems.analysis import Simulator, SimulatorStatus
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.discretization import estimate_discretization_error
@@ -21,12 +21,15 @@ from sliceit_drake.cutting.mesh import MeshError
 from sliceit_drake.cutting.motion import Motion
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.comparison import Comparison, can_compare, compare_with_measurement
+from sliceit_drake.diagrams.contact_margin import ContactMargin, check_contact_margin
 from sliceit_drake.diagrams.figures import CONTACT_THRESHOLD, plot_force
+from sliceit_drake.diagrams.live_view import LiveControls
 from sliceit_drake.diagrams.record import Record
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram, ScenarioDiagram
+from sliceit_drake.diagrams.sequence_report import plot_sequence, slice_reports
 from sliceit_drake.diagrams.snapshot import Snapshot, take_snapshot
-from sliceit_drake.diagrams.station import SlicingStation
+from sliceit_drake.diagrams.station import CAMERA_OFFSET, SlicingStation
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.cutting_system import ENERGY_NAMES, LEDGER_NAMES, CuttingSystem
@@ -46,18 +49,22 @@ class Run:
         diagram: Station, motion and record.
         simulator: Initialized.
         profile: The measured force to compare with, or None.
+        contact_margin: How far the contact is from instability.
         wall_time: Seconds spent in the simulator.
         stopped: Why the run ended early, or None.
         snapshot: Knife and food when half of the section was cut, or None.
+        controls: Speed and stop in a live viewer, or None.
     """
 
     scenario: Scenario
     diagram: ScenarioDiagram
     simulator: Simulator
     profile: ForceProfile | None
+    contact_margin: ContactMargin
     wall_time: float = 0.0
     stopped: str | None = None
     snapshot: Snapshot | None = None
+    controls: LiveControls | None = None
 
     def record(self) -> Record:
         """The record so far."""
@@ -83,6 +90,7 @@ def prepare_run(scenario: Scenario, meshcat: Meshcat | None = None) -> Run:
     profile = _measured_profile(scenario)
     diagram = MakeScenarioDiagram(scenario, meshcat)
     station = diagram.station
+    margin = check_contact_margin(station)
     simulator = Simulator(diagram)
     diagram.SetStart(simulator.get_mutable_context())
     if meshcat is not None:
@@ -91,7 +99,7 @@ def prepare_run(scenario: Scenario, meshcat: Meshcat | None = None) -> Run:
         if station.food_visualizer is not None:
             station.food_visualizer.StartRecording()
     simulator.Initialize()
-    return Run(scenario, diagram, simulator, profile)
+    return Run(scenario, diagram, simulator, profile, margin)
 
 
 def simulate(
@@ -111,12 +119,18 @@ def simulate(
     begin = clock.perf_counter()
     try:
         while (now := run.simulator.get_context().get_time()) < end - 1e-9:
-            run.simulator.AdvanceTo(min(now + CHUNK, end))
+            if run.controls is not None and not run.controls.apply(run.simulator):
+                run.stopped = "stopped in the viewer"
+                break
+            status = run.simulator.AdvanceTo(min(now + CHUNK, end))
             if run.snapshot is None and _cut_progress(run) > SNAPSHOT_PROGRESS:
                 run.snapshot = take_snapshot(run.station, run.simulator.get_context())
             run.wall_time = clock.perf_counter() - begin
             if progress is not None:
                 progress(run.simulator.get_context().get_time(), run.wall_time)
+            if status.reason() == SimulatorStatus.ReturnReason.kReachedTerminationCondition:
+                run.stopped = status.message()
+                break
     except CuttingError as error:
         run.stopped = str(error)
     except KeyboardInterrupt:
@@ -143,15 +157,13 @@ def write_outputs(run: Run, directory: Path, meshcat: Meshcat | None) -> dict:
     comparison = _comparison(run, record)
     summary = _summary(run, record, comparison)
     (directory / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
-    plot_force(
-        record,
-        directory / "force.png",
-        _title(run.scenario),
-        _top_height(run),
-        comparison,
-        _caption(run, comparison, summary),
-        run.snapshot,
-    )
+    title, caption = _title(run), _caption(run, comparison, summary)
+    figure, cutting = directory / "force.png", run.station.cutting
+    if run.scenario.sequence is not None and isinstance(cutting, CuttingSystem):
+        board = run.scenario.board.height
+        plot_sequence(record, cutting, figure, title, board, caption, run.snapshot)
+    else:
+        plot_force(record, figure, title, _top_height(run), comparison, caption, run.snapshot)
     if meshcat is not None:
         if run.station.food_visualizer is not None:
             run.station.food_visualizer.PublishRecording()
@@ -167,8 +179,8 @@ def make_meshcat() -> Meshcat:
 
 
 def _set_scene(meshcat: Meshcat, X_WK: RigidTransform) -> None:
-    target = X_WK.translation() + [0.0, 0.0, 0.03]
-    meshcat.SetCameraPose(target + [0.16, 0.22, 0.16], target)
+    target = X_WK.translation() + [0.0, 0.0, 0.05]
+    meshcat.SetCameraPose(target + CAMERA_OFFSET, target)
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
     meshcat.SetProperty("/Background/<object>", "top_color", [0.92, 0.94, 0.96])
@@ -221,10 +233,14 @@ def _comparison(run: Run, record: Record) -> Comparison | None:
     return compare_with_measurement(run.profile, measurement, depth, force)
 
 
-def _title(scenario: Scenario) -> str:
-    speeds = [getattr(s, "speed", None) for s in scenario.motion.segments]
+def _title(run: Run) -> str:
+    scenario, segments = run.scenario, run.station.motion_plan.segments
+    speeds = [getattr(s, "speed", None) for s in segments]
     speed = next((s for s in speeds if s), None)
     at = f" at {1e3 * speed:.3g} mm/s" if speed else ""
+    if scenario.sequence is not None:
+        count, thickness = scenario.sequence.count, 1e3 * scenario.sequence.thickness
+        return f"A UR5e cuts {count} slices of {thickness:.3g} mm, {scenario.name}{at}"
     return f"A UR5e slices {scenario.name}{at}"
 
 
@@ -265,17 +281,19 @@ def _summary(run: Run, record: Record, comparison: Comparison | None) -> dict:
     summary: dict = {
         "scenario": scenario.name,
         "stopped": run.stopped,
+        "contact_margin": dc.asdict(run.contact_margin),
         "simulated_time_s": float(time[-1]),
         "wall_time_s": run.wall_time,
         "real_time_factor": float(time[-1] / run.wall_time) if run.wall_time else None,
         "peak_force_N": float(norm.max()),
         "mean_contact_force_N": float(contact.mean()) if len(contact) else 0.0,
         "board_peak_N": float(np.linalg.norm(board, axis=1).max()),
+        "board_peak_loss_of_an_impact": station.board_peak_loss,
         "cut_progress": float(record["cut_progress"][-1]),
         "phase_times_s": {
             "food": _phase_times(on_food, time),
             "board": _phase_times(on_board, time),
-            "motion": {label: [a, b] for label, a, b in run.motion.phases},
+            "motion": _motion_times(run.motion),
         },
         "settings": {
             "exchange_period_s": scenario.exchange_period,
@@ -305,48 +323,66 @@ def _summary(run: Run, record: Record, comparison: Comparison | None) -> dict:
 
 
 def _imbalance(record: Record) -> float:
-    """Work put into the food less everything that it went into, at the end of the record, J."""
-    last = {name: float(record[f"energy_{name}"][-1]) for name in (*LEDGER_NAMES, *ENERGY_NAMES)}
-    stored = last["elastic"] + last["interface"] + last["kinetic"]
-    damping = -last["internal"] - last["elastic"]
+    """Work put into the food less everything that it went into, at the end of the record, J.
+
+    What a food holds when the next takes its place stays in it.
+    """
+    last = {name: float(record[f"energy_{name}"][-1]) for name in LEDGER_NAMES}
+    ends = np.append(np.flatnonzero(np.diff(record["food_index"])), -1)
+    elastic, interface, kinetic = (
+        float(record[f"energy_{name}"][ends].sum()) for name in ENERGY_NAMES[:3]
+    )
+    damping = -last["internal"] - elastic
     spent = sum(last[name] for name in ("edge", "opening", "friction", "board_friction", "blade"))
-    return last["work"] + last["gravity"] - stored - spent - damping
+    return last["work"] + last["gravity"] - elastic - interface - kinetic - spent - damping
+
+
+def _motion_times(motion: Motion) -> dict[str, list]:
+    """Begin and end of each phase, s; of a phase that occurs again, a list of them."""
+    times: dict[str, list] = {}
+    for label, begin, end in motion.phases:
+        times.setdefault(label, []).append([begin, end])
+    return {label: spans[0] if len(spans) == 1 else spans for label, spans in times.items()}
 
 
 def _cutting_summary(run: Run, record: Record) -> dict:
     """Numbers of the finite-element food."""
     scenario, station = run.scenario, run.station
     assert isinstance(station.cutting, CuttingSystem) and isinstance(scenario.food, Food)
-    solver = station.cutting.solver(
-        station.cutting.GetMyContextFromRoot(run.simulator.get_context())
-    )
-    model = solver.model
+    models = [solver.model for solver in station.cutting.solvers]
+    # Of a sequence, its middle slice stands for all.
+    middle, food, plan = len(models) // 2, scenario.food, scenario.motion
+    model = models[middle]
+    if scenario.sequence is not None:
+        food = scenario.sequence.foods(food)[middle]
+        plan = scenario.sequence.motion([model.top], scenario.start.clearance)
     work = float(record["energy_work"][-1])
-    motion = Motion(
-        scenario.motion, start_pose(model, scenario.start.clearance, scenario.start.offset)
-    )
+    area = sum(m.section_area for m in models[: int(record["food_index"][-1]) + 1])
+    motion = Motion(plan, start_pose(model, scenario.start.clearance, scenario.start.offset))
     summary = {
         "elements": model.element_count,
         "cut_points": len(model.point_nodes),
         "sub_step_s": scenario.numerics.time_step,
         "mass_ratio": model.mass_ratio,
-        "section_area_mm2": 1e6 * model.section_area,
+        "section_area_mm2": 1e6 * area,
         "work_of_cutting_J": work,
         "work_by_mechanism_J": {
             name: float(record[f"energy_{name}"][-1])
             for name in ("edge", "opening", "friction", "board_friction", "blade")
         },
-        "work_per_area_J_m2": work / model.section_area,
+        "work_per_area_J_m2": work / area,
         "energy_imbalance_J": _imbalance(record),
-        "energy_ratio": float(record["energy_largest_energy_ratio"][-1]),
-        "least_volume_ratio": float(record["energy_least_volume_ratio"][-1]),
+        "energy_ratio": float(record["energy_largest_energy_ratio"].max()),
+        "least_volume_ratio": float(record["energy_least_volume_ratio"].min()),
         "coupling_work_error_J": float(record["coupling_work_error"][-1]),
     }
+    if scenario.sequence is not None:
+        summary["slices"] = [dc.asdict(r) for r in slice_reports(record, station.cutting)]
     summary["discretization_error"] = None
     if run.stopped is None:
         try:
             error = estimate_discretization_error(
-                scenario.food,
+                food,
                 scenario.knife,
                 scenario.numerics,
                 scenario.exchange_period,

@@ -6,18 +6,24 @@ from pathlib import Path
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from sliceit_drake.configuration import load_yaml, quantity, validate
+from sliceit_drake.configuration import ConfigurationError, load_yaml, quantity, validate
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.food import Food
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.diagrams.robot import RobotConfig
+from sliceit_drake.diagrams.sequence import SliceSequence
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
+from sliceit_drake.systems.contact_monitor import ContactMonitorConfig
+from sliceit_drake.systems.spring_food import SpringFood
 from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig
 
 __all__ = ["Measurement", "Placement", "Scenario", "Start", "load_scenario"]
+
+CLEAR_OF_FOOD = 1e-3
+"""Least height of the knife over the food while it goes from one slice to the next, metres."""
 
 
 @dc.dataclass
@@ -72,14 +78,35 @@ class Scenario:
     robot: RobotConfig = dc.field(default_factory=RobotConfig)
     sensor: WrenchSensorConfig = dc.field(default_factory=WrenchSensorConfig)
     controller: ComplianceControllerConfig = dc.field(default_factory=ComplianceControllerConfig)
+    monitor: ContactMonitorConfig = dc.field(default_factory=ContactMonitorConfig)
     knife: Knife = dc.field(default_factory=Knife)
     board: Board = dc.field(default_factory=Board)
-    food: Food | AnalyticFood = dc.field(default_factory=Food)
+    food: Food | AnalyticFood | SpringFood = dc.field(default_factory=Food)
     numerics: Numerics = dc.field(default_factory=Numerics)
     placement: Placement = dc.field(default_factory=Placement)
     start: Start = dc.field(default_factory=Start)
     motion: MotionPlan = dc.field(default_factory=MotionPlan)
     measurement: Measurement | None = None
+    sequence: SliceSequence | None = None
+    """Slices in a row; it places the cuts and makes the motion."""
+
+    def check(self, where: str) -> None:
+        if self.sequence is None:
+            return
+        self.sequence.check_food(self.food, where)
+        if self.start.clearance < CLEAR_OF_FOOD:
+            raise ConfigurationError(
+                f"{self.start.clearance:.4g} m does not clear the food between two slices",
+                field=f"{where}.start.clearance",
+                fix=f"Give at least {CLEAR_OF_FOOD:g} m.",
+            )
+        for name, default in (("motion", MotionPlan()), ("measurement", None)):
+            if getattr(self, name) != default:
+                raise ConfigurationError(
+                    "is of one slice and cannot stand beside a sequence",
+                    field=f"{where}.{name}",
+                    fix=f"Leave out one of {name} and sequence.",
+                )
 
     def X_WF(self) -> RigidTransform:
         """Pose of the food frame: on the board's top surface."""

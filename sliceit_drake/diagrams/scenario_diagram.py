@@ -27,7 +27,7 @@ class ScenarioDiagram(Diagram):
             "station", MakeSlicingStation(scenario, meshcat)
         )
         source = builder.AddNamedSystem(
-            "motion", MotionSource(scenario.motion, self.station.start_pose)
+            "motion", MotionSource(self.station.motion_plan, self.station.start_pose)
         )
         self.motion: Motion = source.motion
         target_pose = source.GetOutputPort("target_pose")

@@ -45,7 +45,7 @@ def take_snapshot(station: SlicingStation, root_context: Context) -> Snapshot | 
     context = cutting.GetMyContextFromRoot(root_context)
     surface = cutting.surfaces[cutting.food_index(context)]
     values = cutting.GetOutputPort("surface_vertices").Eval(context).reshape(-1, 3)
-    X_FW = station.scenario.X_WF().inverse()
+    X_FW = cutting.X_WF(context).inverse()
     vertices = X_FW.multiply(values[: len(surface.ends)].T).T
     X_WK = station.GetOutputPort("knife_pose").Eval(station.GetMyContextFromRoot(root_context))
     X_FK = X_FW @ X_WK

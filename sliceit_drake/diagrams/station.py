@@ -11,8 +11,9 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer
 
 from sliceit_drake.cutting.food import Food, make_food_model, start_pose
-from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.diagrams.knife_body import check_plant_step, effective_mass
 from sliceit_drake.diagrams.ports import STATION_PORTS
 from sliceit_drake.diagrams.robot import (
     ArmController,
@@ -27,17 +28,23 @@ from sliceit_drake.diagrams.start import solve_start_joints
 from sliceit_drake.diagrams.workspace import add_board, add_holder, add_table
 from sliceit_drake.systems.analytic_cutter import AnalyticCutter, AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceController
+from sliceit_drake.systems.contact_monitor import ContactMonitor
 from sliceit_drake.systems.cutting_system import CuttingSystem
 from sliceit_drake.systems.food_visualizer import FoodVisualizer
+from sliceit_drake.systems.frame_visualizer import FrameVisualizer
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 from sliceit_drake.systems.knife_kinematics import BoardContact, KnifeKinematics
 from sliceit_drake.systems.servo import JOINTS
+from sliceit_drake.systems.spring_food import SpringCutter, SpringFood
+from sliceit_drake.systems.spring_visualizer import SpringVisualizer
 from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
 from sliceit_drake.systems.wrench_sensor import WrenchSensor
+from sliceit_drake.systems.wrench_visualizer import WrenchVisualizer
 
 __all__ = ["MakeSlicingStation", "SlicingStation"]
 
 FRAMES_PER_SECOND = 32.0
+CAMERA_OFFSET = np.array([0.17, 0.23, 0.17])
 
 
 class SlicingStation(Diagram):
@@ -46,11 +53,14 @@ class SlicingStation(Diagram):
     Attributes:
         scenario: What it was made from.
         plant: The arm with gripper and knife, and the board.
-        cutting: The food: finite elements or analytic.
+        cutting: The food: finite elements, analytic, or the spring of the baseline.
         controller: The compliance controller.
         sensor: The wrench sensor.
+        motion_plan: The scenario's segments, or those of its sequence.
         start_pose: X_WK at the start.
         start_joints: Joint positions there [6], rad.
+        board_peak_loss: Estimated share of an impact's peak force on the board that the plant's
+            steps take, see `check_plant_step`.
         meshcat: The viewer, or None.
     """
 
@@ -63,25 +73,29 @@ class SlicingStation(Diagram):
         super().__init__()
         self.scenario = scenario
         self.meshcat = meshcat
-        model = _food_model(scenario)
+        solvers = _food_solvers(scenario)
+        self.motion_plan: MotionPlan = _motion_plan(scenario, solvers)
         builder = DiagramBuilder()
         self.plant, scene_graph = add_plant(builder, scenario.robot)
         self.robot: Robot = add_robot(self.plant, scenario.robot, scenario.knife, scenario.board)
         add_table(self.plant, (0.1, -0.3))
         add_board(self.plant, scenario.board, scenario.X_WF())
-        _add_holder(self.plant, scenario, model)
+        _add_holder(self.plant, scenario, solvers)
         self.plant.Finalize()
 
         self.cutting: KnifeForceSystem
-        self.cutting, X_FK = _make_cutting(scenario, model, self.robot.knife)
+        self.cutting, self.start_pose = _make_cutting(scenario, solvers, self.robot.knife)
         if make_cutting is not None:
             self.cutting = make_cutting(self.robot.knife)
-        self.start_pose = scenario.X_WF() @ X_FK
         self.start_joints = solve_start_joints(
             self.plant,
             self.robot.knife,
             self.start_pose,
             np.array(scenario.robot.joint_positions),
+        )
+        mass = effective_mass(self.plant, self.robot.knife, self.start_joints)
+        self.board_peak_loss = check_plant_step(
+            scenario.board, mass, scenario.robot.plant_time_step, scenario.exchange_period
         )
         self._arm: ArmController = connect_arm_controller(
             builder, self.plant, self.robot, scenario.robot
@@ -96,12 +110,16 @@ class SlicingStation(Diagram):
         board_contact = BoardContact(
             self.robot.knife.index(), scenario.knife.length, scenario.board.height
         )
+        monitor = ContactMonitor(
+            scenario.monitor, scenario.exchange_period, scenario.sensor
+        )
         named = {
             "cutting": self.cutting,
             "controller": self.controller,
             "sensor": sensor,
             "kinematics": kinematics,
             "board_contact": board_contact,
+            "contact_monitor": monitor,
         }
         for name, system in named.items():
             builder.AddNamedSystem(name, system)
@@ -129,6 +147,7 @@ class SlicingStation(Diagram):
             (kinematics.GetOutputPort("knife_pose"), board_contact.GetInputPort("knife_pose")),
             (plant.get_reaction_forces_output_port(), sensor.GetInputPort("reaction_forces")),
             (sensor.GetOutputPort("sensor_wrench"), self.controller.GetInputPort("sensor_wrench")),
+            (sensor.GetOutputPort("sensor_wrench"), monitor.GetInputPort("sensor_wrench")),
             (
                 self.controller.GetOutputPort("joint_positions_command"),
                 self._arm.GetInputPort("joint_positions_command"),
@@ -157,7 +176,13 @@ class SlicingStation(Diagram):
             else:
                 builder.ExportOutput(outputs[port.name], port.name)
         if isinstance(self.cutting, CuttingSystem):
-            for name in ("force_components", "ledger", "energy", "coupling_work_error"):
+            for name in (
+                "force_components",
+                "ledger",
+                "energy",
+                "coupling_work_error",
+                "food_index",
+            ):
                 builder.ExportOutput(self.cutting.GetOutputPort(name), name)
         # For records: what the contract gives as typed values, as vectors.
         builder.ExportOutput(self.cutting.GetOutputPort("food_wrench_vector"), "food_wrench_vector")
@@ -165,6 +190,7 @@ class SlicingStation(Diagram):
             board_contact.GetOutputPort("board_wrench_vector"), "board_wrench_vector"
         )
         builder.ExportOutput(sensor.GetOutputPort("state"), "sensor_state")
+        builder.ExportOutput(monitor.GetOutputPort("unstable_gains"), "unstable_gains")
 
         self.visualizer: MeshcatVisualizer | None = None
         self.food_visualizer: FoodVisualizer | None = None
@@ -186,10 +212,48 @@ class SlicingStation(Diagram):
             self.food_visualizer = builder.AddNamedSystem(
                 "food_visualizer", FoodVisualizer(self.cutting, meshcat, 1.0 / FRAMES_PER_SECOND)
             )
-            for name in ("surface_vertices", "food_index"):
+            for name in ("surface_vertices", "surface_damage", "food_index"):
                 builder.Connect(
                     self.cutting.GetOutputPort(name), self.food_visualizer.GetInputPort(name)
                 )
+        elif isinstance(self.cutting, SpringCutter):
+            plates = builder.AddNamedSystem(
+                "spring_visualizer",
+                SpringVisualizer(
+                    self.cutting.food, self.scenario.X_WF(), meshcat, 1.0 / FRAMES_PER_SECOND
+                ),
+            )
+            builder.Connect(
+                self.cutting.GetOutputPort("compression"), plates.GetInputPort("compression")
+            )
+        self._add_arrows_and_frames(builder, meshcat)
+
+    def _add_arrows_and_frames(self, builder: DiagramBuilder, meshcat: Meshcat) -> None:
+        """Wrenches on knife and sensor as arrows; triads of W, B, F, S, K."""
+        period = 1.0 / FRAMES_PER_SECOND
+        knife, frame_S = self.robot.knife, self.robot.sensor_weld.frame_on_parent()
+        # Rigid, so the same in any context.
+        X_KS = frame_S.CalcPose(self.plant.CreateDefaultContext(), knife.body_frame())
+        knife_pose = builder.GetSubsystemByName("kinematics").GetOutputPort("knife_pose")
+        arrows = builder.AddNamedSystem(
+            "wrench_visualizer", WrenchVisualizer(meshcat, X_KS, period)
+        )
+        for output in (
+            knife_pose,
+            self.cutting.GetOutputPort("food_wrench"),
+            builder.GetSubsystemByName("board_contact").GetOutputPort("board_wrench"),
+            self.sensor.GetOutputPort("sensor_wrench"),
+        ):
+            builder.Connect(output, arrows.GetInputPort(output.get_name()))
+        fixed = {
+            "W": (RigidTransform(), 0.15),
+            "B": (self.scenario.robot.X_WB(), 0.15),
+            "F": (self.scenario.X_WF(), 0.035),
+        }
+        carried = {"K": (RigidTransform(), 0.035), "S": (X_KS, 0.06)}
+        frames = FrameVisualizer(meshcat, fixed, carried, self.start_pose, CAMERA_OFFSET, period)
+        builder.AddNamedSystem("frame_visualizer", frames)
+        builder.Connect(knife_pose, frames.GetInputPort("knife_pose"))
 
     def SetStart(self, root_context: Context) -> None:
         """Puts arm and controller at rest at the start, in the context of the whole diagram."""
@@ -215,33 +279,61 @@ def MakeSlicingStation(
     return SlicingStation(scenario, meshcat, make_cutting)
 
 
-def _food_model(scenario: Scenario) -> CuttingModel | None:
-    """The prepared cut, or None for an analytic food."""
-    if not isinstance(scenario.food, Food):
-        return None
-    return make_food_model(scenario.food, scenario.knife, scenario.numerics)
+def _food_solvers(scenario: Scenario) -> list[CuttingSolver]:
+    """The prepared cuts: one, or those of a sequence; none for a food without elements."""
+    food, sequence = scenario.food, scenario.sequence
+    if not isinstance(food, Food):
+        return []
+    return [
+        CuttingSolver(
+            make_food_model(each, scenario.knife, scenario.numerics), scenario.exchange_period
+        )
+        for each in (sequence.foods(food) if sequence else [food])
+    ]
+
+
+def _motion_plan(scenario: Scenario, solvers: list[CuttingSolver]) -> MotionPlan:
+    if scenario.sequence is None:
+        return scenario.motion
+    tops = [solver.model.top for solver in solvers]
+    return scenario.sequence.motion(tops, scenario.start.clearance)
 
 
 def _make_cutting(
-    scenario: Scenario, model: CuttingModel | None, knife: RigidBody
+    scenario: Scenario, solvers: list[CuttingSolver], knife: RigidBody
 ) -> tuple[KnifeForceSystem, RigidTransform]:
-    """The cutting system of a scenario and X_FK at the start."""
-    period, start = scenario.exchange_period, scenario.start
-    if model is not None:
-        pose = start_pose(model, start.clearance, start.offset)
-        cutting = CuttingSystem([CuttingSolver(model, period)], scenario.X_WF(), knife.index())
-        return cutting, RigidTransform(RotationMatrix(pose.R), pose.p)
-    assert isinstance(scenario.food, AnalyticFood)
-    p_FK = [start.offset, 0.0, scenario.food.diameter + start.clearance]
-    X_FK = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), p_FK)
-    return AnalyticCutter(scenario.food, scenario.board.height, knife.index(), period), X_FK
+    """The cutting system of a scenario and X_WK at the start."""
+    period, start, X_WF = scenario.exchange_period, scenario.start, scenario.X_WF()
+    if solvers:
+        assert isinstance(scenario.food, Food)
+        poses = [X_WF]
+        if scenario.sequence is not None:
+            poses = scenario.sequence.poses(scenario.food, X_WF)
+        in_sequence = scenario.sequence is not None
+        pose = start_pose(solvers[0].model, start.clearance, start.offset)
+        cutting = CuttingSystem(solvers, poses, knife.index(), in_sequence=in_sequence)
+        return cutting, poses[0] @ RigidTransform(RotationMatrix(pose.R), pose.p)
+    food, index = scenario.food, knife.index()
+    assert isinstance(food, AnalyticFood | SpringFood)
+    cutter: KnifeForceSystem
+    if isinstance(food, SpringFood):
+        height = food.height
+        cutter = SpringCutter(food, scenario.knife, scenario.X_WF(), index, period)
+    else:
+        height = food.diameter
+        cutter = AnalyticCutter(food, scenario.board.height, index, period)
+    p_FK = [start.offset, 0.0, height + start.clearance]
+    return cutter, X_WF @ RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), p_FK)
 
 
-def _add_holder(plant: MultibodyPlant, scenario: Scenario, model: CuttingModel | None) -> None:
-    """Draws the clamp where the food is held."""
+def _add_holder(plant: MultibodyPlant, scenario: Scenario, solvers: list[CuttingSolver]) -> None:
+    """Draws the clamp where the food is held, in a sequence behind the last cut."""
     food = scenario.food
-    if model is None or not isinstance(food, Food) or food.held_sides not in ("both", "plus"):
+    if not isinstance(food, Food) or food.held_sides not in ("both", "plus"):
         return
+    model, distance = solvers[0].model, food.hold_distance + 0.005
+    if scenario.sequence is not None:
+        distance += scenario.sequence.positions(food)[-1]
     size = np.ptp(model.split.vertex_position @ model.X_FC_rotation.T, axis=0)
     add_holder(
         plant,
@@ -249,5 +341,5 @@ def _add_holder(plant: MultibodyPlant, scenario: Scenario, model: CuttingModel |
         scenario.X_WF(),
         food_width=float(size[0]),
         food_height=float(size[2]),
-        distance=food.hold_distance + 0.005,
+        distance=distance,
     )

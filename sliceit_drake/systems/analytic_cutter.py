@@ -16,14 +16,24 @@ __all__ = ["AnalyticCutter", "AnalyticFood"]
 
 @dc.dataclass
 class AnalyticFood:
-    """A cylinder that resists with toughness times the width at the edge (Atkins, pressing)."""
+    """A cylinder that resists with toughness times the width at the edge (Atkins, pressing).
+
+    Below that force it is a spring, so that a knife may rest on it.
+    """
 
     diameter: float = quantity(0.027, "m", low=5e-3, high=0.3, doc="Diameter.")
     toughness: float = quantity(350.0, "J/m2", low=0.0, high=1e5, doc="Energy per cut area.")
+    stiffness: float = quantity(
+        5e3, "N/m", low=1.0, high=1e7, doc="Force over indentation, as a vegetable's."
+    )
 
 
 class AnalyticCutter(KnifeForceSystem):
-    """Vertical force toughness * width(depth) while the knife goes down; see `KnifeForceSystem`."""
+    """Vertical force toughness * width(depth) once the knife cuts; see `KnifeForceSystem`.
+
+    The food's surface under the edge is the state: the knife indents it elastically and takes it
+    along when the force reaches that of cutting.
+    """
 
     def __init__(
         self, food: AnalyticFood, board_height: float, knife_body: BodyIndex, exchange_period: float
@@ -31,13 +41,19 @@ class AnalyticCutter(KnifeForceSystem):
         super().__init__(knife_body, exchange_period)
         self._food = food
         self._board_height = board_height
+        self._surface = self.DeclareDiscreteState(1)
+
+    def start(self, context: Context, state: State, X_WK: RigidTransform) -> None:
+        self._set(state, self._surface, [X_WK.translation()[2]])
 
     def advance(
         self, context: Context, state: State, X_WK: RigidTransform, V_WK: SpatialVelocity
     ) -> tuple[np.ndarray, float]:
         diameter = self._food.diameter
-        height = np.clip(X_WK.translation()[2] - self._board_height, 0.0, diameter)
-        width = 2.0 * np.sqrt(height * (diameter - height))
-        descending = V_WK.translational()[2] < 0.0
-        force = self._food.toughness * width if descending else 0.0
+        z = X_WK.translation()[2]
+        height = np.clip(z - self._board_height, 0.0, diameter)
+        cutting = self._food.toughness * 2.0 * np.sqrt(height * (diameter - height))
+        k, surface = self._food.stiffness, context.get_discrete_state(self._surface).value()[0]
+        force = np.clip(k * (surface - z), 0.0, cutting)
+        self._set(state, self._surface, [min(surface, z + force / k)])
         return np.array([0.0, 0.0, 0.0, 0.0, 0.0, force]), 1.0 - height / diameter

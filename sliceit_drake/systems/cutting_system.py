@@ -14,7 +14,7 @@ from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
 from sliceit_drake.cutting.surface import FoodSurface, food_surface
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 
-__all__ = ["ENERGY_NAMES", "LEDGER_NAMES", "CuttingSystem"]
+__all__ = ["COMPLETE", "ENERGY_NAMES", "LEDGER_NAMES", "CuttingSystem"]
 
 LEDGER_NAMES = (
     "work",
@@ -30,6 +30,14 @@ ENERGY_NAMES = ("elastic", "interface", "kinetic", "largest_energy_ratio", "leas
 
 NO_ENERGY = (0.0, 0.0, 0.0, 0.0, 1.0)
 
+SPENT = slice(LEDGER_NAMES.index("edge"), LEDGER_NAMES.index("friction") + 1)
+
+COMPLETE = 0.999
+"""Share of a section from which a slice counts as cut off."""
+
+INDEXED = 5e-4
+"""Distance of the blade from the next cut plane at which the knife counts as indexed, metres."""
+
 
 class CuttingSystem(KnifeForceSystem):
     """Advances a finite-element food by its own sub-steps once per exchange.
@@ -38,37 +46,45 @@ class CuttingSystem(KnifeForceSystem):
     is cut as an index into the prepared foods. The solvers hold only workspaces that each update
     fills and empties, so contexts do not disturb each other.
 
+    In a sequence the prepared foods are what successive slices leave of one body. The next is taken
+    into the Context, at rest and undeformed, at the first exchange where the section of the last is
+    cut, the whole edge is above the next section, and the blade is in its plane. Wrench, progress
+    and energy are then the new food's; ledger and coupling error run on over the slices.
+
     Further output ports:
         force_components: Forces on the knife by edge, flank pressure, friction [9], N, in W.
         ledger: Cumulative work and dissipation [8], J, see `LEDGER_NAMES`.
         food_index: Which of the prepared foods is cut [1].
-        energy: At the last check [5], see `ENERGY_NAMES`, J.
+        energy: Of this food at the last check [5], see `ENERGY_NAMES`, J.
         surface_vertices: Corners of the food's surface [3 V], metres, in W, padded with zeros.
+        surface_damage: Share of the toughness that is spent there [V], padded with zeros.
 
     Args:
         solvers: Prepared foods with one exchange period.
-        X_WF: Pose of the food frame.
+        X_WF: Pose of the food frame, or one for each of the foods.
         knife_body: Index of the knife's body.
         check_period: Interval of the energy and inversion checks, s.
+        in_sequence: Whether each food follows the one before it once that is cut.
     """
 
     def __init__(
         self,
         solvers: Sequence[CuttingSolver],
-        X_WF: RigidTransform,
+        X_WF: RigidTransform | Sequence[RigidTransform],
         knife_body: BodyIndex,
         check_period: float = 0.05,
+        in_sequence: bool = False,
     ) -> None:
         super().__init__(knife_body, solvers[0].exchange_period)
         self._solvers = tuple(solvers)
         self.surfaces: tuple[FoodSurface, ...] = tuple(food_surface(s.model) for s in solvers)
-        self._X_WF = X_WF
-        frames = [Pose(s.model.X_FC_rotation, s.model.X_FC_position) for s in self._solvers]
-        X_WF_R, X_WF_p = X_WF.rotation().matrix(), X_WF.translation()
-        self._R_CW = [(X_WF_R @ X_FC.R).T for X_FC in frames]
-        self._offset = [
-            R_CW @ (X_WF_R @ X_FC.p + X_WF_p) for R_CW, X_FC in zip(self._R_CW, frames, strict=True)
-        ]
+        self._in_sequence = in_sequence
+        self._X_WF = (X_WF,) * len(solvers) if isinstance(X_WF, RigidTransform) else tuple(X_WF)
+        self._R_CW, self._offset = [], []
+        for solver, X in zip(self._solvers, self._X_WF, strict=True):
+            R_WC = X.rotation().matrix() @ solver.model.X_FC_rotation
+            self._R_CW.append(R_WC.T)
+            self._offset.append(R_WC.T @ X.multiply(solver.model.X_FC_position))
         self._check_every = max(1, round(check_period / self.exchange_period))
         size = max(s.state_size for s in self._solvers)
         self._food = self.DeclareDiscreteState(self._padded(self._solvers[0].initial_state(), size))
@@ -76,16 +92,19 @@ class CuttingSystem(KnifeForceSystem):
         self._components = self.DeclareDiscreteState(9)
         self._ledger = self.DeclareDiscreteState(len(LEDGER_NAMES))
         self._energy = self.DeclareDiscreteState(NO_ENERGY)
+        # Dissipated when this food was taken, J.
+        self._spent_before = self.DeclareDiscreteState(1)
         self.DeclareStateOutputPort("force_components", self._components)
         self.DeclareStateOutputPort("ledger", self._ledger)
         self.DeclareStateOutputPort("energy", self._energy)
         self.DeclareStateOutputPort("food_index", self._food_index)
-        self.DeclareVectorOutputPort(
-            "surface_vertices",
-            3 * max(len(surface.ends) for surface in self.surfaces),
-            self._calc_surface,
-            {self.discrete_state_ticket(self._food), self.discrete_state_ticket(self._food_index)},
-        )
+        corners = max(len(surface.ends) for surface in self.surfaces)
+        state = {
+            self.discrete_state_ticket(self._food),
+            self.discrete_state_ticket(self._food_index),
+        }
+        self.DeclareVectorOutputPort("surface_vertices", 3 * corners, self._calc_surface, state)
+        self.DeclareVectorOutputPort("surface_damage", corners, self._calc_damage, state)
 
     @staticmethod
     def _padded(values: np.ndarray, size: int) -> np.ndarray:
@@ -105,6 +124,20 @@ class CuttingSystem(KnifeForceSystem):
     def solver(self, context: Context) -> CuttingSolver:
         """Solver of the food that this context cuts."""
         return self._solvers[self.food_index(context)]
+
+    def X_WF(self, context: Context) -> RigidTransform:
+        """Pose of the frame of the food that this context cuts."""
+        return self._X_WF[self.food_index(context)]
+
+    @property
+    def solvers(self) -> tuple[CuttingSolver, ...]:
+        """Those of the prepared foods."""
+        return self._solvers
+
+    @property
+    def food_poses(self) -> tuple[RigidTransform, ...]:
+        """X_WF of each of the prepared foods."""
+        return self._X_WF
 
     def SetFood(self, context: Context, index: int) -> None:
         """Puts an uncut food into the context.
@@ -130,6 +163,7 @@ class CuttingSystem(KnifeForceSystem):
             (self._components, np.zeros(9)),
             (self._ledger, np.zeros(len(LEDGER_NAMES))),
             (self._energy, np.array(NO_ENERGY)),
+            (self._spent_before, np.zeros(1)),
         ):
             context.SetDiscreteState(part, value)
 
@@ -142,6 +176,34 @@ class CuttingSystem(KnifeForceSystem):
         X_CK = self._R_CW[index] @ X_WK
         return Pose(X_CK[:, :3], X_CK[:, 3] - self._offset[index])
 
+    def _index_to_cut(self, context: Context, X_WK: RigidTransform) -> int:
+        """The food that the next exchange cuts: the one after this, if the knife is ready for it.
+
+        Raises:
+            CuttingError: The knife is in the next plane and has not cut the last section through.
+        """
+        index = self.food_index(context)
+        if not self._in_sequence or index + 1 == len(self._solvers):
+            return index
+        model = self._solvers[index + 1].model
+        # The exchange goes from the last pose to this one; tables blur by one spacing.
+        clear = model.top + model.tables.spacing
+        poses = (self.last_pose(context), X_WK.GetAsMatrix34())
+        for following in (self._in_cut_frame(index + 1, X) for X in poses):
+            lowest = following.p[2] - 0.5 * model.knife.length * abs(following.R[2, 0])
+            if lowest <= clear or abs(following.p[1]) > INDEXED:
+                return index
+        progress = float(context.get_discrete_state(self._progress).value()[0])
+        if progress >= COMPLETE:
+            return index + 1
+        if abs(self._in_cut_frame(index, poses[1]).p[1]) > INDEXED:
+            raise CuttingError(
+                f"at {context.get_time():.4g} s the knife is over the next slice, but the cut of "
+                f"slice {index + 1} has parted {100 * progress:.2f} % of its section. Cut deeper "
+                "(sequence.overtravel), or wait at the board (sequence.hold)."
+            )
+        return index
+
     def start(self, context: Context, state: State, X_WK: RigidTransform) -> None:
         index = self.food_index(context)
         self._solvers[index].compile()
@@ -150,9 +212,17 @@ class CuttingSystem(KnifeForceSystem):
     def advance(
         self, context: Context, state: State, X_WK: RigidTransform, V_WK: SpatialVelocity
     ) -> tuple[np.ndarray, float]:
-        index = self.food_index(context)
+        index = self._index_to_cut(context, X_WK)
         solver, time = self._solvers[index], context.get_time()
-        old = self.food_state(context)
+        old, old_energy = self.food_state(context), context.get_discrete_state(self._energy).value()
+        old_ledger = context.get_discrete_state(self._ledger).value()
+        spent_before = float(context.get_discrete_state(self._spent_before).value()[0])
+        if index != self.food_index(context):
+            old, old_energy = solver.initial_state(), np.array(NO_ENERGY)
+            spent_before = float(old_ledger[SPENT].sum())
+            self._set(state, self._food_index, [index])
+            self._set(state, self._energy, old_energy)
+            self._set(state, self._spent_before, [spent_before])
         last = self._in_cut_frame(index, self.last_pose(context))
         pose = self._in_cut_frame(index, X_WK.GetAsMatrix34())
         check_in_plane(solver.model, pose, time)
@@ -160,7 +230,8 @@ class CuttingSystem(KnifeForceSystem):
             step = solver.exchange(old, last, pose)
         except CuttingError as error:
             raise CuttingError(f"at {time:.4g} s {error}") from error
-        state.get_mutable_discrete_state(self._food).get_mutable_value()[: len(old)] = step.state
+        food = state.get_mutable_discrete_state(self._food).get_mutable_value()
+        food[: len(old)] = step.state
         R_WC = self._R_CW[index].T
         forces = np.array([step.edge[3:], step.normal[3:], step.friction[3:]]) @ R_WC.T
         self._set(state, self._components, forces.ravel())
@@ -174,12 +245,12 @@ class CuttingSystem(KnifeForceSystem):
             step.blade_dissipation,
             step.internal_work,
         ]
-        ledger = context.get_discrete_state(self._ledger).value() + change
+        ledger = old_ledger + change
         self._set(state, self._ledger, ledger)
         if round(time / self.exchange_period) % self._check_every == 0:
             energies = solver.energies(step.state, pose)
-            ratio = check_energies(energies, float(ledger[2:5].sum()), solver.model, time)
-            old_energy = context.get_discrete_state(self._energy).value()
+            spent = float(ledger[SPENT].sum()) - spent_before
+            ratio = check_energies(energies, spent, solver.model, time)
             self._set(
                 state,
                 self._energy,
@@ -198,7 +269,15 @@ class CuttingSystem(KnifeForceSystem):
         solver = self._solvers[index]
         nodes = solver.positions(self.food_state(context))
         corners = self.surfaces[index].positions(solver.model, nodes)
-        p_W = corners @ self._X_WF.rotation().matrix().T + self._X_WF.translation()
+        X_WF = self._X_WF[index]
+        p_W = corners @ X_WF.rotation().matrix().T + X_WF.translation()
         values = np.zeros(output.size())
         values[: p_W.size] = p_W.ravel()
         output.SetFromVector(values)
+
+    def _calc_damage(self, context: Context, output: BasicVector) -> None:
+        index, state = self.food_index(context), self.food_state(context)
+        solver = self._solvers[index]
+        passed, parted = solver.field(state, "passed"), solver.field(state, "parted")
+        damage = self.surfaces[index].damage(solver.model, passed, parted)
+        output.SetFromVector(self._padded(damage, output.size()))

@@ -48,6 +48,7 @@ class KnifeForceSystem(LeafSystem):
         self._progress = self.DeclareDiscreteState(1)
         self._coupling = self.DeclareDiscreteState(1)
         self._last_pose = self.DeclareDiscreteState(12)
+        self._start_time = self.DeclareDiscreteState(1)
         self.DeclareAbstractOutputPort(
             "food_wrench",
             lambda: Value(SpatialForce.Zero()),
@@ -64,7 +65,9 @@ class KnifeForceSystem(LeafSystem):
         self.DeclareStateOutputPort("cut_progress", self._progress)
         self.DeclareStateOutputPort("coupling_work_error", self._coupling)
         self.DeclareInitializationUnrestrictedUpdateEvent(self._initialize)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(exchange_period, exchange_period, self._update)
+        # An offset of one period would round k + 1 periods otherwise than the plant's steps do, and
+        # so see the plant a step ahead at some exchanges.
+        self.DeclarePeriodicUnrestrictedUpdateEvent(exchange_period, 0.0, self._update)
 
     def start(self, context: Context, state: State, X_WK: RigidTransform) -> None:
         """Called once at initialization; a subclass may check the start and set its state."""
@@ -96,10 +99,13 @@ class KnifeForceSystem(LeafSystem):
     def _initialize(self, context: Context, state: State) -> EventStatus:
         X_WK = self._pose_input.Eval(context)
         self._set(state, self._last_pose, X_WK.GetAsMatrix34().ravel())
+        self._set(state, self._start_time, [context.get_time()])
         self.start(context, state, X_WK)
         return EventStatus.Succeeded()
 
     def _update(self, context: Context, state: State) -> EventStatus:
+        if context.get_time() <= context.get_discrete_state(self._start_time).value()[0]:
+            return EventStatus.DidNothing()
         X_WK = self._pose_input.Eval(context)
         V_WK = self._velocity_input.Eval(context)
         wrench, progress = self.advance(context, state, X_WK, V_WK)

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 from sliceit_drake.configuration import ConfigurationError, quantity
 
-__all__ = ["JOINTS", "Servo", "ServoConfig"]
+__all__ = ["JOINTS", "Servo", "ServoConfig", "ServoLaw"]
 
 JOINTS = 6
 
@@ -46,6 +46,57 @@ class ServoConfig:
         return 0.5 * self.lookahead_time * math.sqrt(self.gain)
 
 
+class ServoLaw:
+    """The law of ``servoj``, integrated over periods in which the targets are held. No Drake in it.
+
+    The state [2 + n, J] of J joints is their positions, their velocities, and the targets of the
+    last n periods, the oldest first, which are still on their way.
+
+    Attributes:
+        A: Matrix [2 + n, 2 + n] from the state to the next, the same for each joint.
+        B: Matrix [2 + n, 1] from the targets to the next state.
+    """
+
+    def __init__(self, config: ServoConfig, period: float) -> None:
+        """Integrates the law exactly.
+
+        Args:
+            config: Its parameters.
+            period: Time between states, seconds: a plant's time step, or a controller's cycle.
+
+        Raises:
+            ConfigurationError: If the delay is not a whole number of periods.
+        """
+        n = round(config.delay / period)
+        if abs(n * period - config.delay) > 1e-6 * period:
+            raise ConfigurationError(
+                f"{config.delay:.6g} s is not a whole number of plant steps of {period:.6g} s",
+                field="servo.delay",
+                fix=f"Write {n * period:.6g}.",
+            )
+        g, t = config.gain, config.lookahead_time
+        step = expm(period * np.array([[0.0, 1.0, 0.0], [-g, -g * t, g], [0.0, 0.0, 0.0]]))
+        motion, push = step[:2, :2], step[:2, 2:]
+        self.A = np.zeros((2 + n, 2 + n))
+        self.B = np.zeros((2 + n, 1))
+        self.A[:2, :2] = motion
+        if n == 0:
+            self.B[:2] = push
+        else:
+            self.A[:2, 2:3] = push
+            self.A[2:-1, 3:] = np.eye(n - 1)
+            self.B[-1] = 1.0
+
+    def state_at_rest(self, positions: ArrayLike) -> np.ndarray:
+        """State [2 + n, J] of joints at rest at `positions` [J], rad, their targets there too."""
+        q = np.asarray(positions, float)
+        return np.vstack([q, np.zeros_like(q), np.tile(q, (len(self.A) - 2, 1))])
+
+    def step(self, state: np.ndarray, targets: ArrayLike) -> np.ndarray:
+        """State [2 + n, J] a period later, with `targets` [J], rad, held meanwhile."""
+        return self.A @ state + self.B * np.asarray(targets, float)
+
+
 class Servo(Diagram):
     """Second-order tracking of the joint targets, each joint alone.
 
@@ -63,10 +114,11 @@ class Servo(Diagram):
     trails by 35 ms (Universal_Robots_ROS2_Driver issue 1311). The law itself, and that the gain is
     in 1/s2, are our reading; Universal Robots publish no equation.
 
-    The law is integrated exactly between the plant's steps. The motion it asks for carries its
-    velocity and acceleration, so that the arm's own controller adds no lag to it. Measured here
-    (tests): lag behind a ramp `ServoConfig.lag` within a plant step; a step at the defaults
-    overshoots by 5.8 % and stays within 2 % after 0.14 s. Speed and acceleration are not limited.
+    The law (`ServoLaw`) is integrated exactly between the plant's steps. The motion it asks for
+    carries its velocity and acceleration, so that the arm's own controller adds no lag to it, as
+    on a real UR. Measured here (tests; docs/servo.md has a table): lag behind a ramp
+    `ServoConfig.lag` within a plant step; a step at the defaults overshoots by 5.8 % and stays
+    within 2 % after 0.14 s. Speed and acceleration are not limited.
 
     Inputs:
         joint_positions_command: Targets [6], rad; held between the controller's cycles.
@@ -89,20 +141,15 @@ class Servo(Diagram):
             ConfigurationError: If the delay is not a whole number of periods.
         """
         super().__init__()
-        self._delay_steps = round(config.delay / period)
-        if abs(self._delay_steps * period - config.delay) > 1e-6 * period:
-            raise ConfigurationError(
-                f"{config.delay:.6g} s is not a whole number of plant steps of {period:.6g} s",
-                field="servo.delay",
-                fix=f"Write {self._delay_steps * period:.6g}.",
-            )
-        A, B = self._matrices(config, period)
+        self._law = ServoLaw(config, period)
+        # Each joint alone; Drake's state is the law's, row by row.
+        A, B = np.kron(self._law.A, np.eye(JOINTS)), np.kron(self._law.B, np.eye(JOINTS))
         velocity = np.kron(np.eye(2, A.shape[0] // JOINTS)[1:], np.eye(JOINTS))
         C = np.vstack([np.eye(2 * JOINTS, A.shape[0]), velocity @ (A - np.eye(len(A))) / period])
         D = np.vstack([np.zeros((2 * JOINTS, JOINTS)), velocity @ B / period])
         builder = DiagramBuilder()
         self._tracking = builder.AddNamedSystem("tracking", LinearSystem(A, B, C, D, period))
-        self._tracking.configure_default_state(self._state_at_rest(initial_positions))
+        self._tracking.configure_default_state(self._law.state_at_rest(initial_positions).ravel())
         outputs = builder.AddNamedSystem("outputs", Demultiplexer([2 * JOINTS, JOINTS]))
         builder.Connect(self._tracking.get_output_port(), outputs.get_input_port())
         builder.ExportInput(self._tracking.get_input_port(), "joint_positions_command")
@@ -113,25 +160,4 @@ class Servo(Diagram):
     def set_positions(self, context: Context, positions: ArrayLike) -> None:
         """Sets targets and motion at rest at `positions` [6], rad, in the root context."""
         state = self._tracking.GetMyMutableContextFromRoot(context)
-        state.SetDiscreteState(self._state_at_rest(positions))
-
-    def _state_at_rest(self, positions: ArrayLike) -> np.ndarray:
-        q = np.asarray(positions, float)
-        return np.concatenate([q, np.zeros(JOINTS), np.tile(q, self._delay_steps)])
-
-    def _matrices(self, config: ServoConfig, period: float) -> tuple[np.ndarray, np.ndarray]:
-        """State q, v, and the targets still on their way, the oldest first."""
-        g, t = config.gain, config.lookahead_time
-        step = expm(period * np.array([[0.0, 1.0, 0.0], [-g, -g * t, g], [0.0, 0.0, 0.0]]))
-        motion, push = step[:2, :2], step[:2, 2:]
-        n = self._delay_steps
-        A = np.zeros((2 + n, 2 + n))
-        B = np.zeros((2 + n, 1))
-        A[:2, :2] = motion
-        if n == 0:
-            B[:2] = push
-        else:
-            A[:2, 2:3] = push
-            A[2:-1, 3:] = np.eye(n - 1)
-            B[-1] = 1.0
-        return np.kron(A, np.eye(JOINTS)), np.kron(B, np.eye(JOINTS))
+        state.SetDiscreteState(self._law.state_at_rest(positions).ravel())

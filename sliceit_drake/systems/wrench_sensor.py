@@ -29,14 +29,30 @@ _READING = slice(7, 13)
 _FILTERED = slice(13, 19)  # Wrench behind the low-pass filter.
 _ZERO = slice(19, 25)  # What is subtracted: the tare less the bias.
 _READINGS = 25  # How many there have been.
-_STATE_SIZE = 26
+_STATE_SIZE = 26  # Without drift (6 more) and delay (6 more for each reading on its way).
 
 _NOISE_BLOCK = 1024  # Readings whose noise is drawn at once.
+_READOUT, _WALK = 0, 1  # Independent streams of random numbers.
 
 
 @dc.dataclass
 class WrenchSensorConfig:
     """What the sensor adds to the true wrench. The defaults are an ideal sensor.
+
+    What makers publish gives sizes, not spectra, so there are no named sensors here:
+
+    * UR5e, built in (Universal Robots' technical specifications): range 50 N and 10 Nm, precision
+      3.5 N and 0.2 Nm, accuracy 4.0 N and 0.3 Nm, at the 500 Hz of its controller. Precision and
+      accuracy are not defined further; an accuracy is a bound of bias and drift together.
+    * Robotiq FT 300-S (roboticscenter.ai, "Force/Torque Sensor Selection Guide"): 300 N, resolution
+      0.1 N, 100 readings a second, hence `sample_period` 0.01.
+    * UR5 without a sensor of its own, from the joints' currents (forum.universal-robots.com, topic
+      229): +-10 N and 5 Nm; ten weighings of one mass spread by 3.6 N, an FT 300's by 0.6 N.
+
+    None of them states a noise density or a drift with time. Both are quickly measured on the tool
+    at rest: the standard deviation of the readings is `force_noise`; with D(t) the differences of
+    readings t seconds apart, averaged so that the noise is small, `force_drift` is std(D) / sqrt(t)
+    and `force_drift_rate` mean(D) / t.
 
     Attributes:
         tare_at_start: Whether the first reading is subtracted from all, as zeroing a UR's sensor
@@ -59,7 +75,31 @@ class WrenchSensorConfig:
     cutoff_frequency: float = quantity(
         0.0, "Hz", low=0.0, high=1e4, doc="First-order low-pass filter; 0 for none."
     )
-    seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Seed of the noise.")
+    force_drift: float = quantity(
+        0.0, "N/s^0.5", low=0.0, high=10.0, doc="Random walk since taring: its spread after 1 s."
+    )
+    moment_drift: float = quantity(
+        0.0, "Nm/s^0.5", low=0.0, high=1.0, doc="Random walk since taring: its spread after 1 s."
+    )
+    force_drift_rate: list[float] = quantity(
+        [0.0, 0.0, 0.0], "N/s", low=-1.0, high=1.0, size=3, doc="Steady drift since taring."
+    )
+    moment_drift_rate: list[float] = quantity(
+        [0.0, 0.0, 0.0], "Nm/s", low=-0.1, high=0.1, size=3, doc="Steady drift since taring."
+    )
+    force_resolution: float = quantity(
+        0.0, "N", low=0.0, high=10.0, doc="Step of the shown forces; 0 for none."
+    )
+    moment_resolution: float = quantity(
+        0.0, "Nm", low=0.0, high=1.0, doc="Step of the shown moments; 0 for none."
+    )
+    sample_period: float = quantity(
+        0.0, "s", low=0.0, high=1.0, doc="Time between new readings; 0 for the exchange period."
+    )
+    delay: float = quantity(
+        0.0, "s", low=0.0, high=0.2, doc="Time a reading takes to arrive; parts are interpolated."
+    )
+    seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Seed of noise and random walk.")
 
 
 class WrenchSensor(LeafSystem):
@@ -73,8 +113,12 @@ class WrenchSensor(LeafSystem):
     subtracted from all; what appears of the weight when the tool is then tilted is not compensated.
 
     A reading is the mean over the exchange before it, the plant's impulse divided by the period.
-    It is then filtered, tared, and given bias and noise, and held until the next exchange. It is
-    zero until the end of the first exchange. Like the plant's own state at the end of a step, it is
+    It is then filtered, tared, given bias, drift and noise, rounded, sampled and delayed, in this
+    order, and held until the next exchange. It is zero until the end of the first exchange; filter
+    and delay start as if the first wrench had always been there. Noise of standard deviation sigma
+    at the period h has the one-sided density 2 sigma^2 h up to 1/(2 h); it is not filtered, and
+    stands for what is left behind the filter. A random walk of spread s has the density
+    s^2 / (2 pi^2 f^2) far below 1/h. Like the plant's own state at the end of a step, it is
     set by the discrete update at the beginning of the exchange's last plant step: whatever reads
     it at the exchange, in an unrestricted or a discrete update, finds it.
 
@@ -85,7 +129,7 @@ class WrenchSensor(LeafSystem):
         sensor_wrench: SpatialForce at So, in S; held over each exchange. No direct feedthrough.
 
     Parameters:
-        0: Seed of the noise [1].
+        0: Seed of noise and random walk [1].
     """
 
     def __init__(
@@ -107,6 +151,16 @@ class WrenchSensor(LeafSystem):
             ConfigurationError: If the periods do not fit, or the plant's ports are sampled.
         """
         super().__init__()
+        self._hold = max(1, round(config.sample_period / exchange_period))
+        if config.sample_period > 0.0 and (
+            abs(self._hold * exchange_period - config.sample_period) > 1e-9
+        ):
+            raise ConfigurationError(
+                f"{config.sample_period:.6g} s is not a whole number of exchange periods of "
+                f"{exchange_period:.6g} s",
+                field="sensor.sample_period",
+                fix=f"Write {self._hold * exchange_period:.6g}.",
+            )
         step = plant.time_step()
         steps = round(exchange_period / step) if step > 0.0 else 0
         if steps < 1 or abs(steps * step - exchange_period) > 1e-9:
@@ -127,6 +181,28 @@ class WrenchSensor(LeafSystem):
         self._bias = np.concatenate([config.moment_bias, config.force_bias])
         self._noise = np.repeat([config.moment_noise, config.force_noise], 3)
         self._is_noisy = bool(self._noise.any())
+        self._walk = np.repeat([config.moment_drift, config.force_drift], 3)
+        self._walk *= math.sqrt(exchange_period)
+        self._is_walking = bool(self._walk.any())
+        rate = np.concatenate([config.moment_drift_rate, config.force_drift_rate])
+        self._drift_step = rate * exchange_period
+        self._resolution = np.repeat([config.moment_resolution, config.force_resolution], 3)
+        self._is_coarse = bool(self._resolution.any())
+        # Behind the rest of the state, if they are wanted: the drift; the readings on their way,
+        # the newest first.
+        size = _STATE_SIZE
+        self._drift = slice(size, size)
+        if self._is_walking or rate.any():
+            self._drift = slice(size, size + 6)
+            size += 6
+        # A part of a period too small to matter is rounding of the quotient.
+        on_the_way = round(config.delay / exchange_period, 9)
+        self._late_part = on_the_way % 1.0
+        self._line = slice(size, size + 6 * (math.ceil(on_the_way) + 1) if on_the_way else size)
+        self._size = self._line.stop
+        self._is_imperfect = (
+            self._is_noisy or self._is_coarse or self._hold > 1 or self._size > _STATE_SIZE
+        )
         self._tare_at_start = config.tare_at_start
         turn = 2.0 * math.pi * config.cutoff_frequency * exchange_period
         self._filter_share = -math.expm1(-turn) if turn > 0.0 else 1.0
@@ -135,7 +211,7 @@ class WrenchSensor(LeafSystem):
             "reaction_forces", Value[list[SpatialForce]]()
         ).get_index()
         self._seed = self.DeclareNumericParameter(BasicVector([float(config.seed)]))
-        state = self.DeclareDiscreteState(np.zeros(_STATE_SIZE))
+        state = self.DeclareDiscreteState(np.zeros(self._size))
         self.DeclareAbstractOutputPort(
             "sensor_wrench",
             lambda: Value(SpatialForce.Zero()),
@@ -145,16 +221,29 @@ class WrenchSensor(LeafSystem):
         self.DeclareStateOutputPort("state", state)
         self.DeclarePeriodicDiscreteUpdateEvent(step, 0.0, self._update)
 
-    @staticmethod
-    def state_columns(reading: Sequence[str]) -> list[str]:
+    def state_columns(self, reading: Sequence[str]) -> list[str]:
         """Names for the port `state`: `reading` [6] for the moment and force, others private."""
-        names = [f"_sensor_{k}" for k in range(_STATE_SIZE)]
+        names = [f"_sensor_{k}" for k in range(self._size)]
         names[_READING] = reading
         return names
 
     def randomize_context(self, context: Context, rng: np.random.Generator) -> None:
-        """Draws a new seed of the noise."""
+        """Draws a new seed of noise and random walk."""
         context.get_mutable_numeric_parameter(self._seed).SetAtIndex(0, rng.integers(2**31))
+
+    def tare(self, context: Context) -> None:
+        """Zeroes the sensor: what it senses now, drift included, is subtracted from now on.
+
+        The bias stays, and readings on their way arrive as they are. Without effect on a sensor
+        that has not read yet.
+
+        Args:
+            context: The sensor's own context.
+        """
+        x = context.get_mutable_discrete_state_vector().get_mutable_value()
+        if x[_READINGS] > 0.0:
+            x[_ZERO] = x[_FILTERED] - self._bias
+            x[self._drift] = 0.0
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         # The whole list crosses into Python for the one wrench wanted; no port gives less.
@@ -170,17 +259,48 @@ class WrenchSensor(LeafSystem):
         wrench = self._on_arm.dot(x[_SUM])
         x[: _COUNT + 1] = 0.0
         x[_READINGS] += 1.0
-        if x[_READINGS] == 1.0:
-            x[_FILTERED] = wrench
+        is_first = x[_READINGS] == 1.0
+        if is_first:
             x[_ZERO] = wrench * self._tare_at_start - self._bias
         elif self._filter_share < 1.0:
             wrench = x[_FILTERED] + self._filter_share * (wrench - x[_FILTERED])
-            x[_FILTERED] = wrench
-        x[_READING] = wrench - x[_ZERO]
+        x[_FILTERED] = wrench
+        shown = wrench - x[_ZERO]
+        if self._is_imperfect:
+            shown = self._spoil(context, x, shown, is_first)
+        x[_READING] = shown
+
+    def _spoil(
+        self, context: Context, x: np.ndarray, shown: np.ndarray, is_first: bool
+    ) -> np.ndarray:
+        """Adds drift and noise to the tared wrench [6], rounds, samples and delays it."""
+        readings = int(x[_READINGS])
+        seed = int(context.get_numeric_parameter(self._seed)[0])
+        block, row = divmod(readings, _NOISE_BLOCK)
+        drift = x[self._drift]
+        if drift.size:
+            if not is_first:
+                drift += self._drift_step
+                if self._is_walking:
+                    drift += self._walk * _standard_noise(seed, block, _WALK)[row]
+            shown = shown + drift
         if self._is_noisy:
-            seed = int(context.get_numeric_parameter(self._seed)[0])
-            block, row = divmod(int(x[_READINGS]), _NOISE_BLOCK)
-            x[_READING] += self._noise * _standard_noise(seed, block)[row]
+            shown = shown + self._noise * _standard_noise(seed, block, _READOUT)[row]
+        if self._is_coarse:
+            step = self._resolution
+            shown = np.where(step > 0.0, np.rint(shown / np.where(step, step, 1.0)) * step, shown)
+        line = x[self._line]
+        if (readings - 1) % self._hold:
+            shown = (line[:6] if line.size else x[_READING]).copy()
+        if line.size:
+            line[6:] = line[:-6].copy()
+            line[:6] = shown
+            if is_first:
+                line[:] = np.tile(shown, line.size // 6)
+            if self._late_part:
+                return line[-12:-6] + self._late_part * (line[-6:] - line[-12:-6])
+            return line[-6:]
+        return shown
 
     def _calc_sensor_wrench(self, context: Context, output: AbstractValue) -> None:
         reading = context.get_discrete_state_vector().value()[_READING]
@@ -188,12 +308,12 @@ class WrenchSensor(LeafSystem):
 
 
 @functools.lru_cache(maxsize=16)
-def _standard_noise(seed: int, block: int) -> np.ndarray:
-    """Standard normal numbers [_NOISE_BLOCK, 6] that follow from seed and block alone.
+def _standard_noise(seed: int, block: int, stream: int) -> np.ndarray:
+    """Standard normal numbers [_NOISE_BLOCK, 6] that follow from the arguments alone.
 
     A counter-based generator needs no state in the Context; making one is slow, hence blocks.
     """
-    generator = np.random.Generator(np.random.Philox(key=seed, counter=[0, block, 0, 0]))
+    generator = np.random.Generator(np.random.Philox(key=seed, counter=[0, block, stream, 0]))
     return generator.standard_normal((_NOISE_BLOCK, 6))
 
 

@@ -1,0 +1,82 @@
+"""What a person does with a run in a browser: find it, wait for it, change its speed, stop it."""
+
+import getpass
+import os
+import sys
+import time
+from collections.abc import Mapping
+
+from pydrake.geometry import Meshcat
+from pydrake.systems.analysis import Simulator
+
+__all__ = ["LiveControls", "viewing_instructions", "wait_for_browser"]
+
+SPEED = "speed"
+STOP = "stop"
+FASTEST = 2.0
+
+
+class LiveControls:
+    """A slider for the speed of a run and a button that ends it, in Meshcat's control panel.
+
+    They change when a step is computed, never its result. The slider's right end sets no limit.
+
+    Args:
+        meshcat: Viewer.
+    """
+
+    def __init__(self, meshcat: Meshcat) -> None:
+        self._meshcat = meshcat
+        meshcat.AddSlider(SPEED, min=0.1, max=FASTEST, step=0.1, value=1.0)
+        meshcat.AddButton(STOP)
+
+    def apply(self, simulator: Simulator) -> bool:
+        """Sets the simulator's target rate by the slider; returns whether the run shall go on."""
+        speed = self._meshcat.GetSliderValue(SPEED)
+        rate = 0.0 if speed >= FASTEST else speed  # Drake: 0 is as fast as possible.
+        if rate != simulator.get_target_realtime_rate():
+            simulator.set_target_realtime_rate(rate)
+            # Or else the new rate would count from the start of the run and be made up for.
+            simulator.ResetStatistics()
+        return self._meshcat.GetButtonClicks(STOP) == 0
+
+
+def wait_for_browser(meshcat: Meshcat, timeout: float) -> bool:
+    """Waits until a browser shows the viewer; returns whether one came within `timeout`, s."""
+    end = time.monotonic() + timeout
+    while meshcat.GetNumActiveConnections() == 0:
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.05)
+    return True
+
+
+def viewing_instructions(
+    port: int, environment: Mapping[str, str] = os.environ, platform: str = sys.platform
+) -> str:
+    """How to see a viewer on this machine, which may have no display.
+
+    Args:
+        port: Of the viewer, on the loopback interface.
+        environment: Variables that tell of ssh and of a display.
+        platform: As `sys.platform`.
+    """
+    url = f"http://localhost:{port}"
+    tunnel = f"ssh -N -L {port}:localhost:{port}"
+    connection = environment.get("SSH_CONNECTION", "").split()
+    if len(connection) == 4:
+        host, ssh_port = connection[2:]
+        option = "" if ssh_port == "22" else f" -p {ssh_port}"
+        return (
+            f"You are here by ssh. Run this on the machine in front of you and leave it running:\n"
+            f"    {tunnel}{option} {getpass.getuser()}@{host}\n"
+            f"then open {url} there."
+        )
+    displays = ("DISPLAY", "WAYLAND_DISPLAY")
+    if platform == "linux" and not any(environment.get(name) for name in displays):
+        return (
+            f"This machine has no display. On one that has, run this and leave it running:\n"
+            f"    {tunnel} USER@HOST    (HOST is this machine's name)\n"
+            f"then open {url} there. Without ssh: leave out --meshcat and open replay.html."
+        )
+    return f"Open {url} in a browser."

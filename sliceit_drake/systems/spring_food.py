@@ -1,0 +1,226 @@
+"""The spring-only baseline of SliceIt!: the food is a button on a spring, and nothing is cut."""
+
+import dataclasses as dc
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from pydrake.math import RigidTransform
+from pydrake.multibody.math import SpatialVelocity
+from pydrake.multibody.tree import BodyIndex
+from pydrake.systems.framework import BasicVector, Context, State
+
+from sliceit_drake.configuration import ConfigurationError, quantity
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.systems.knife_force import KnifeForceSystem
+
+__all__ = ["SpringCutter", "SpringFood", "calibrate_spring"]
+
+# Gazebo's and ODE's default error reduction parameter.
+DEFAULT_ERP = 0.2
+
+
+@dc.dataclass
+class SpringFood:
+    """A button that the knife's edge pushes down against a spring and a damper to the board.
+
+    Its top is `height` above the board, which is also its travel. Gravity on the button is part of
+    the spring's rest length. Defaults: a spring that reaches 16.6 N, the largest measured force on
+    the cucumber, at full compression, with ODE's default ERP at a step of 1 ms.
+    """
+
+    height: float = quantity(0.027, "m", low=5e-3, high=0.3, doc="Height of the food: the travel.")
+    diameter: float = quantity(0.027, "m", low=1e-3, high=0.3, doc="Diameter of the button.")
+    stiffness: float = quantity(613.0, "N/m", low=1.0, high=1e6, doc="Force per compression.")
+    damping: float = quantity(2.45, "Ns/m", low=0.0, high=1e4, doc="Force per compression rate.")
+    mass: float = quantity(0.01, "kg", low=1e-6, high=10.0, doc="Mass of the button.")
+    time_step: float = quantity(
+        1e-3,
+        "s",
+        low=1e-6,
+        high=0.02,
+        doc="Longest inner step; also ODE's step, for which erp() and cfm() hold.",
+    )
+    erp_noise: float = quantity(
+        0.0,
+        "",
+        low=0.0,
+        high=0.99,
+        doc="Half width of the uniform relative noise on ERP at constant CFM; 0.3 in SliceIt!.",
+    )
+
+    def check(self, where: str) -> None:
+        if self.erp_noise > 0.0 and (1.0 + self.erp_noise) * self.erp() > 1.0:
+            raise ConfigurationError(
+                f"= {self.erp_noise} takes ERP, {self.erp():.3g}, beyond 1",
+                field=f"{where}.erp_noise",
+                fix=f"Give at most {1.0 / self.erp() - 1.0:.3g}, or more damping.",
+            )
+
+    def erp(self) -> float:
+        """ODE's error reduction parameter of spring and damper, h k / (h k + c).
+
+        ODE solves J v' + CFM f = -(ERP / h) x for the force f and the velocity v' after the step h:
+        backward Euler for a spring and damper (Smith, Open Dynamics Engine user guide, "How to use
+        ERP and CFM"). f is a force here, as in that guide; ODE divides CFM by h once more inside.
+        """
+        return self.time_step * self.stiffness * self.cfm()
+
+    def cfm(self) -> float:
+        """ODE's constraint force mixing of spring and damper, 1 / (h k + c), m/(Ns)."""
+        return 1.0 / (self.time_step * self.stiffness + self.damping)
+
+    def with_erp_cfm(self, erp: float, cfm: float) -> "SpringFood":
+        """The same button with k = ERP / (h CFM) and c = (1 - ERP) / CFM.
+
+        Raises:
+            ConfigurationError: ERP is not within (0, 1] or CFM not above 0.
+        """
+        if not 0.0 < erp <= 1.0:
+            raise ConfigurationError(f"{erp} is not within (0, 1]", field="erp", fix="Give 0.2.")
+        if not cfm > 0.0:
+            raise ConfigurationError(f"{cfm} is not above 0", field="cfm", fix="Give 0.3.")
+        return dc.replace(self, stiffness=erp / (self.time_step * cfm), damping=(1.0 - erp) / cfm)
+
+
+def calibrate_spring(
+    force: Sequence[float] | np.ndarray,
+    height: float,
+    erp: float = DEFAULT_ERP,
+    food: SpringFood | None = None,
+) -> SpringFood:
+    """The spring whose force at full compression is the largest of a measured profile, as SliceIt!.
+
+    Args:
+        force: Measured force over one slice [n], N.
+        height: Of the food, metres: the spring's travel.
+        erp: ODE's ERP at the food's `time_step`, which gives the damping.
+        food: Other values; None for the defaults.
+
+    Raises:
+        ConfigurationError: The profile has no force, or ERP is not within (0, 1].
+    """
+    largest = float(np.max(force))
+    if not (math.isfinite(largest) and largest > 0.0):
+        raise ConfigurationError(
+            f"the largest force is {largest} N", field="force", fix="Give a profile of a slice."
+        )
+    food = dc.replace(food or SpringFood(), height=height)
+    stiffness = largest / height
+    return food.with_erp_cfm(erp, erp / (food.time_step * stiffness))
+
+
+class SpringCutter(KnifeForceSystem):
+    """The knife on the button; see `KnifeForceSystem` and `SpringFood`.
+
+    The edge pushes at its point nearest to the button's axis, as far as the button reaches, and
+    never pulls; a rising knife leaves the button behind, which follows at the spring's own pace.
+    Within an exchange the edge goes straight from its last pose to this one in steps of at most
+    `time_step`, and the button by backward Euler as in ODE, its contact solved exactly: stable at
+    any stiffness, with half a step times the stiffness of damping on top. An impact is without
+    rebound: the button's momentum goes into one step.
+    `cut_progress` is the largest compression so far over the travel.
+
+    Further output port:
+        compression: Of the button, m, and its rate, m/s [2].
+
+    Args:
+        food: The spring.
+        knife: Whose edge pushes.
+        X_WF: Pose of the food frame: the button's axis is Fz, the board is at its origin.
+        knife_body: Index of the knife's body.
+        exchange_period: s.
+    """
+
+    def __init__(
+        self,
+        food: SpringFood,
+        knife: Knife,
+        X_WF: RigidTransform,
+        knife_body: BodyIndex,
+        exchange_period: float,
+    ) -> None:
+        super().__init__(knife_body, exchange_period)
+        self.food = food
+        self._half_edge = 0.5 * knife.length
+        self._p_WT = X_WF.translation() + [0.0, 0.0, food.height]
+        self._steps = math.ceil(exchange_period / food.time_step - 1e-9)
+        self._button = self.DeclareDiscreteState(2)
+        self._spring = self.DeclareNumericParameter(BasicVector([food.stiffness, food.damping]))
+        self.DeclareStateOutputPort("compression", self._button)
+
+    def spring(self, context: Context) -> tuple[float, float]:
+        """Stiffness, N/m, and damping, Ns/m, in this context."""
+        stiffness, damping = context.get_numeric_parameter(self._spring).value().tolist()
+        return stiffness, damping
+
+    def SetSpring(self, context: Context, stiffness: float, damping: float) -> None:
+        """Puts a released button with another spring into the context; N/m and Ns/m."""
+        context.get_mutable_numeric_parameter(self._spring).SetFromVector([stiffness, damping])
+        for part in (self._button, self._wrench, self._progress, self._coupling):
+            context.SetDiscreteState(part, np.zeros(context.get_discrete_state(part).size()))
+
+    def randomize_context(self, context: Context, rng: np.random.Generator) -> None:
+        """Puts a released button into the context, ERP drawn within `erp_noise` at constant CFM.
+
+        A relative noise: ODE's default ERP of 0.2 less an absolute 0.3 would be no spring.
+        """
+        food = self.food
+        erp = food.erp() * (1.0 + food.erp_noise * rng.uniform(-1.0, 1.0))
+        drawn = food.with_erp_cfm(erp, food.cfm())
+        self.SetSpring(context, drawn.stiffness, drawn.damping)
+
+    def start(self, context: Context, state: State, X_WK: RigidTransform) -> None:
+        depth, _ = self._contact(X_WK.GetAsMatrix34())
+        self._set(state, self._button, [max(depth, 0.0), 0.0])
+
+    def advance(
+        self, context: Context, state: State, X_WK: RigidTransform, V_WK: SpatialVelocity
+    ) -> tuple[np.ndarray, float]:
+        stiffness, damping = self.spring(context)
+        mass, h = self.food.mass, self.exchange_period / self._steps
+        compression, rate = context.get_discrete_state(self._button).value().tolist()
+        begin, _ = self._contact(self.last_pose(context))
+        end, arm = self._contact(X_WK.GetAsMatrix34())
+        impulse = 0.0
+        deepest = float(context.get_discrete_state(self._progress).value()[0])
+        for k in range(1, self._steps + 1):
+            # An edge that was beside the button has no depth to come from.
+            edge = end if begin == -math.inf else begin + (end - begin) * k / self._steps
+            edge = min(edge, self.food.height)
+            free = (mass * rate - h * stiffness * compression) / (
+                mass + h * damping + h * h * stiffness
+            )
+            reached = max(compression + h * free, 0.0)
+            pushed = edge > reached
+            if pushed:
+                reached = edge
+            new_rate = (reached - compression) / h
+            if pushed:
+                push = stiffness * reached + damping * new_rate + mass * (new_rate - rate) / h
+                impulse += push * h
+            # The stop at the top takes the button's momentum.
+            compression, rate = reached, new_rate if reached > 0.0 else 0.0
+            deepest = max(deepest, compression / self.food.height)
+        self._set(state, self._button, [compression, rate])
+        force = impulse / self.exchange_period
+        moment_x, moment_y = arm[1] * force, -arm[0] * force
+        return np.array([moment_x, moment_y, 0.0, 0.0, 0.0, force]), min(deepest, 1.0)
+
+    def _contact(self, X_WK: np.ndarray) -> tuple[float, tuple[float, float]]:
+        """Depth of the edge below the button's released top, metres, and the arm from Ko to it.
+
+        Args:
+            X_WK: As [3, 4].
+
+        Returns:
+            Depth, -inf where the edge passes beside the button, and the arm along Wx and Wy.
+        """
+        ax, ay, az = X_WK[:, 0].tolist()
+        dx, dy, dz = (self._p_WT - X_WK[:, 3]).tolist()
+        level = ax * ax + ay * ay
+        s = (ax * dx + ay * dy) / level if level > 0.0 else 0.0
+        s = min(max(s, -self._half_edge), self._half_edge)
+        if math.hypot(dx - s * ax, dy - s * ay) > 0.5 * self.food.diameter:
+            return -math.inf, (s * ax, s * ay)
+        return dz - s * az, (s * ax, s * ay)
