@@ -225,8 +225,11 @@ class KnifePath:
         return Pose(self.R_CK[k], self.p_CK[k])
 
     def block(self, k: int) -> int:
-        """How many exchanges from the k-th can be advanced at once."""
-        return BLOCK if self._mounting.rigid and k + BLOCK <= self.exchanges else 1
+        """How many exchanges from the k-th can be advanced at once, without a check."""
+        if not self._mounting.rigid or k + BLOCK > self.exchanges:
+            return 1
+        steps = np.diff(self.p_FK[k : k + BLOCK + 1], axis=0)
+        return BLOCK if float(np.linalg.norm(steps, axis=1).sum()) < CHECK_TRAVEL else 1
 
     def give(self, k: int, force: np.ndarray, board: Board | None) -> None:
         """Lets arm and holder give under the force on the knife [3], N, in C, after k exchanges."""
