@@ -8,6 +8,7 @@ from pydrake.systems.analysis import InitializeParams, Simulator
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.food import Ellipsoid, Remainder
+from sliceit_drake.diagrams.holder_arm import FINGERTIPS, HoldingArm
 from sliceit_drake.diagrams.run import _imbalance, prepare_run, simulate
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
@@ -194,3 +195,23 @@ def test_remainder_has_its_next_cut_at_y_0_and_all_of_the_body_behind_it():
     assert y.min() == pytest.approx(-0.004) and (y == 0.0).any()
     assert y.max() == pytest.approx(body.reach + 0.005)
     assert mesh.volumes().min() > 0.0
+
+
+def test_holding_arm_grips_the_food_and_adds_no_joints_to_the_plant():
+    held = scenario()
+    held.holder = "arm"
+    station = MakeScenarioDiagram(held).station
+    assert station.plant.num_velocities() == 6
+    X_WF, grip = held.X_WF(), np.array([0.0, 0.02, 0.008])
+    arm = HoldingArm(X_WF, grip)
+    context = arm.plant.CreateDefaultContext()
+    arm.plant.SetPositions(context, arm.joints)
+    X_FG = X_WF.inverse() @ arm.plant.EvalBodyPoseInWorld(
+        context, arm.plant.GetBodyByName("gripper")
+    )
+    np.testing.assert_allclose(X_FG.multiply([0.0, 0.0, FINGERTIPS]), grip, atol=1e-4)
+    # Finger to finger is along Fx, and the hand leans away from the knife.
+    np.testing.assert_allclose(X_FG.rotation().matrix()[:, 1], [1.0, 0.0, 0.0], atol=1e-4)
+    assert X_FG.translation()[1] > grip[1] + 0.05
+    with pytest.raises(ConfigurationError, match=r"scenario\.holder.*cannot grip"):
+        HoldingArm(X_WF, np.array([0.0, 0.0, 1.5]))

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from sliceit_drake.configuration import ConfigurationError, load_yaml, quantity, validate
+from sliceit_drake.configuration import ConfigurationError, choice, load_yaml, quantity, validate
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.food import Food
 from sliceit_drake.cutting.knife import Knife
@@ -83,6 +83,11 @@ class Scenario:
     board: Board = dc.field(default_factory=Board)
     food: Food | AnalyticFood | SpringFood = dc.field(default_factory=Food)
     numerics: Numerics = dc.field(default_factory=Numerics)
+    holder: str = choice(
+        "clamp",
+        ("clamp", "arm"),
+        doc="What is drawn where the food is held; arm: a second UR5e that stands still.",
+    )
     placement: Placement = dc.field(default_factory=Placement)
     start: Start = dc.field(default_factory=Start)
     motion: MotionPlan = dc.field(default_factory=MotionPlan)

@@ -42,13 +42,6 @@ class SliceSequence:
         2e-4, "m", low=0.0, high=5e-3, doc="Depth of the knife's target below the board's top."
     )
     hold: float = quantity(0.1, "s", low=1e-3, high=60.0, doc="Rest at the board.")
-    settle: float = quantity(
-        0.1,
-        "s",
-        low=1e-3,
-        high=60.0,
-        doc="Rest of the target after retracting and after indexing: the arm lags behind it.",
-    )
     slice_layers: int = quantity(2, "", low=1, high=20, doc="Layers of elements in a slice.")
     layers: list[float] = quantity(
         [2.8e-3, 6.4e-3, 12e-3],
@@ -101,11 +94,9 @@ class SliceSequence:
             following = tops[k + 1] if k + 1 < len(tops) else top
             lower = max(top - following, 0.0)
             up = down + max(following - top, 0.0)
-            segments += [
-                Retract(up, speed, acceleration, label="retract"),
-                Hold(self.settle, label="settle"),
-            ]
+            segments.append(Retract(up, speed, acceleration, label="retract"))
             if k + 1 == len(tops):
+                segments.append(Hold(self.hold, label="end"))
                 break
             if self.indexing == "knife":
                 # The knife's y is opposite to the body's: its edge points down.
@@ -120,7 +111,6 @@ class SliceSequence:
                 )
             else:
                 segments.append(Hold(self.thickness / speed + speed / acceleration, label="index"))
-            segments.append(Hold(self.settle, label="settle"))
             if lower > 1e-6:
                 segments.append(
                     ConstantSpeed(

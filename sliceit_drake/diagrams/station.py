@@ -13,6 +13,7 @@ from pydrake.systems.primitives import Demultiplexer
 from sliceit_drake.cutting.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.diagrams.holder_arm import add_holding_arm
 from sliceit_drake.diagrams.knife_body import check_plant_step, effective_mass
 from sliceit_drake.diagrams.ports import STATION_PORTS
 from sliceit_drake.diagrams.robot import (
@@ -44,6 +45,8 @@ from sliceit_drake.systems.wrench_visualizer import WrenchVisualizer
 __all__ = ["MakeSlicingStation", "SlicingStation"]
 
 FRAMES_PER_SECOND = 32.0
+FINGER = 0.015
+"""Half the breadth of the holding arm's fingers along the food, metres."""
 CAMERA_OFFSET = np.array([0.17, 0.23, 0.17])
 
 
@@ -78,7 +81,7 @@ class SlicingStation(Diagram):
         builder = DiagramBuilder()
         self.plant, scene_graph = add_plant(builder, scenario.robot)
         self.robot: Robot = add_robot(self.plant, scenario.robot, scenario.knife, scenario.board)
-        add_table(self.plant, (0.1, -0.3))
+        add_table(self.plant, (0.1 if scenario.holder == "clamp" else -0.15, -0.3))
         add_board(self.plant, scenario.board, scenario.X_WF())
         _add_holder(self.plant, scenario, solvers)
         self.plant.Finalize()
@@ -110,9 +113,7 @@ class SlicingStation(Diagram):
         board_contact = BoardContact(
             self.robot.knife.index(), scenario.knife.length, scenario.board.height
         )
-        monitor = ContactMonitor(
-            scenario.monitor, scenario.exchange_period, scenario.sensor
-        )
+        monitor = ContactMonitor(scenario.monitor, scenario.exchange_period, scenario.sensor)
         named = {
             "cutting": self.cutting,
             "controller": self.controller,
@@ -327,7 +328,7 @@ def _make_cutting(
 
 
 def _add_holder(plant: MultibodyPlant, scenario: Scenario, solvers: list[CuttingSolver]) -> None:
-    """Draws the clamp where the food is held, in a sequence behind the last cut."""
+    """Draws the holder where the food is held, in a sequence behind the last cut."""
     food = scenario.food
     if not isinstance(food, Food) or food.held_sides not in ("both", "plus"):
         return
@@ -335,6 +336,10 @@ def _add_holder(plant: MultibodyPlant, scenario: Scenario, solvers: list[Cutting
     if scenario.sequence is not None:
         distance += scenario.sequence.positions(food)[-1]
     size = np.ptp(model.split.vertex_position @ model.X_FC_rotation.T, axis=0)
+    if scenario.holder == "arm":
+        grip = np.array([0.0, distance + FINGER, 0.5 * size[2]])
+        add_holding_arm(plant, scenario.X_WF(), grip)
+        return
     add_holder(
         plant,
         scenario.board,
