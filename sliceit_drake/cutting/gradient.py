@@ -6,7 +6,6 @@ reverse by the kernels' adjoints. Memory is that of one exchange and of one stat
 """
 
 import dataclasses as dc
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,11 +13,10 @@ import warp as wp
 
 from sliceit_drake.cutting.kernel_types import PARAMETERS
 from sliceit_drake.cutting.model import CuttingModel
-from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError, knife_wrenches
 from sliceit_drake.cutting.workspace import DIRECT, Workspace, interpolate_motion
 
-__all__ = ["SliceAdjoint", "SliceGradient"]
+__all__ = ["SliceAdjoint", "SliceGradient", "SliceRun"]
 
 
 @dc.dataclass
@@ -46,11 +44,32 @@ class SliceGradient:
         return self.row[self.layout[name]]
 
 
+@dc.dataclass
+class SliceRun:
+    """A slice with what its gradient needs.
+
+    Attributes:
+        model: The cut.
+        wrenches: Mean of each exchange on the knife, moment about Ko and force in C [E, 6].
+        states: The food at the ends of the exchanges [E + 1] of [state_size].
+        R, p: Poses of the knife in C there [E + 1, 3, 3] and [E + 1, 3], metres; where arm and
+            holder give, relative to the food.
+    """
+
+    model: CuttingModel
+    wrenches: np.ndarray
+    states: list[np.ndarray]
+    R: np.ndarray
+    p: np.ndarray
+
+
 class SliceAdjoint:
-    """Force of a slice on a prescribed motion in C, and its gradients.
+    """Forces of slices on prescribed motions, and their gradients.
+
+    Nothing but the device's arrays is kept between calls.
 
     Args:
-        model: The cut.
+        model: The cut, or one that others are derived from.
         exchange_period: s.
     """
 
@@ -58,94 +77,78 @@ class SliceAdjoint:
         self.model = model
         self.exchange_period = exchange_period
         self._w = Workspace([model], exchange_period, gradients=True)
-        self._checkpoints: list[np.ndarray] = []
-        self._R = np.zeros((0, 3, 3))
-        self._p = np.zeros((0, 3))
-        self._wrenches = np.zeros((0, 6))
         self._backward: Any = None
-        ws, B, P = self._w, len(model.blocks), len(model.point_nodes)
+        ws, B = self._w, len(model.blocks)
         self._adj_mu = wp.zeros((1, B), dtype=ws.real, device=ws.device)
         self._adj_lam = wp.zeros((1, B), dtype=ws.real, device=ws.device)
-        self._adj_force = ws.w["point_force"].grad
-        assert self._adj_force.shape == (1, P, 2)
 
-    def set_model(self, model: CuttingModel) -> None:
-        """Takes the parameters of another cut of the same mesh."""
-        self.model = model
-        self._w.set_models([model])
-
-    def forward(self, poses: Sequence[Pose], state: np.ndarray | None = None) -> np.ndarray:
-        """Mean wrench of each exchange on the knife, moment about Ko and force in C [E, 6].
+    def run(
+        self,
+        R: np.ndarray,
+        p: np.ndarray,
+        model: CuttingModel | None = None,
+        state: np.ndarray | None = None,
+    ) -> SliceRun:
+        """Simulates a slice.
 
         Args:
-            poses: X_CK at the ends of the exchanges [E + 1].
-            state: The food before, at rest by default.
+            R: Rotations of the knife in C at the ends of the exchanges [E + 1, 3, 3].
+            p: Positions of Ko in C there [E + 1, 3], metres.
+            model: A cut derived from that of the constructor; None for that.
+            state: The food before; None for at rest.
 
         Raises:
             CuttingError: A force is not finite.
+            ValueError: The food may slip, which has no gradient.
         """
         ws, n = self._w, self._w.substeps
-        self._R = np.array([pose.R for pose in poses])
-        self._p = np.array([pose.p for pose in poses])
+        model = model or self.model
+        ws.set_models([model])
+        give = _give(model)
         state = ws.initial_state() if state is None else np.asarray(state, ws.dtype)
-        count = len(poses) - 1
-        self._checkpoints = [state]
-        wrenches = np.empty((count, 6))
-        give = self._give()
+        count = len(p) - 1
+        run = SliceRun(model, np.empty((count, 6)), [state], np.array(R), np.array(p))
         for e in range(count):
             if e > 0:
-                self._p[e + 1] += give * wrenches[e - 1, 3:]
-            ws.advance(self._checkpoints[e][None], self._motion(e))
+                run.p[e + 1] += give * run.wrenches[e - 1, 3:]
+            ws.advance(run.states[e][None], self._motion(run, e))
             total = ws.sum("total")[0, 0].sum(0)
             if not np.isfinite(total).all():
                 raise CuttingError(f"at {(e + 1) * self.exchange_period:.4g} s {NOT_FINITE}")
             blade, buried = ws.sum("blade_sums")[0, 0], ws.sum("buried")[0, 0].sum(0)
-            parts, _ = knife_wrenches(total, blade, buried, self._R[e + 1], n)
-            wrenches[e] = parts.sum(0)
-            self._checkpoints.append(ws.read(ws.states[-1])[0].copy())
-        self._wrenches = wrenches
-        return wrenches
+            parts, _ = knife_wrenches(total, blade, buried, run.R[e + 1], n)
+            run.wrenches[e] = parts.sum(0)
+            run.states.append(ws.read(ws.states[-1])[0].copy())
+        return run
 
-    def _give(self) -> np.ndarray:
-        """Displacement of the knife relative to the food per force on it [3], m/N; see `Mounting`.
+    def _motion(self, run: SliceRun, e: int) -> np.ndarray:
+        at, ws = slice(e, e + 2), self._w
+        return interpolate_motion(run.R[None, at], run.p[None, at], ws.substeps, ws.exchange_period)
 
-        Raises:
-            ValueError: The food may slip.
-        """
-        effects = self.model.effects
-        if effects.slip.resistance is not None:
-            raise ValueError("effects.slip has no gradient: slipping is an event. Set it to null.")
-        return np.array([effects.compliance.holder, 0.0, effects.compliance.arm])
-
-    def _motion(self, e: int) -> np.ndarray:
-        at = slice(e, e + 2)
-        ws = self._w
-        return interpolate_motion(
-            self._R[None, at], self._p[None, at], ws.substeps, ws.exchange_period
-        )
-
-    def backward(self, weights: np.ndarray) -> SliceGradient:
-        """Gradient of sum(weights * wrenches) of the last `forward`.
+    def gradient(self, run: SliceRun, weights: np.ndarray) -> SliceGradient:
+        """Gradient of sum(weights * wrenches).
 
         Args:
+            run: What `run` returned.
             weights: Adjoints of the wrenches [E, 6].
         """
         ws, n, T = self._w, self._w.substeps, self.exchange_period
-        count = len(self._checkpoints) - 1
+        ws.set_models([run.model])
+        count, give = len(run.wrenches), _give(run.model)
         ws.parameters.grad.zero_()
         self._adj_mu.zero_()
         self._adj_lam.zero_()
         adj_state = np.zeros(ws.state_size)
-        adj_p, adj_R = np.zeros_like(self._p), np.zeros_like(self._R)
+        adj_p, adj_R = np.zeros_like(run.p), np.zeros_like(run.R)
         share = np.arange(1, n + 1) / n
-        give, of_give = self._give(), np.zeros(3)
+        of_give = np.zeros(3)
         weights = np.array(weights, float)
         for e in reversed(range(count)):
             if e + 2 <= count:
                 weights[e, 3:] += give * adj_p[e + 2]
-                of_give += self._wrenches[e, 3:] * adj_p[e + 2]
-            ws.advance(self._checkpoints[e][None], self._motion(e))
-            adj_sums, adj_y = self._adjoint_of_sums(weights[e], self._R[e + 1])
+                of_give += run.wrenches[e, 3:] * adj_p[e + 2]
+            ws.advance(run.states[e][None], self._motion(run, e))
+            adj_sums, adj_y = self._adjoint_of_sums(weights[e], run.R[e + 1])
             adj_R[e + 1, :, 1] += adj_y
             self._capture_backward()
             ws.write(ws.states[-1].grad, adj_state[None])
@@ -159,8 +162,8 @@ class SliceAdjoint:
             adj_p[e] += (1.0 - share) @ by["p_CK"] - of_velocity
             a, b, c = by["w_CK"].sum(0) * (0.5 / T)
             of_turn = np.array([[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]])
-            adj_R[e + 1] += (share @ by["R_CK"]).reshape(3, 3) + of_turn @ self._R[e]
-            adj_R[e] += ((1.0 - share) @ by["R_CK"]).reshape(3, 3) + of_turn.T @ self._R[e + 1]
+            adj_R[e + 1] += (share @ by["R_CK"]).reshape(3, 3) + of_turn @ run.R[e]
+            adj_R[e] += ((1.0 - share) @ by["R_CK"]).reshape(3, 3) + of_turn.T @ run.R[e + 1]
         row = ws.read(ws.parameters.grad)[0].astype(np.float64)
         scalars = ws.parameter_layout["P"].start
         for name, adjoint in (("mu", self._adj_mu), ("lam", self._adj_lam)):
@@ -225,7 +228,8 @@ class SliceAdjoint:
         self._launch_adjoint(kern.push_blade, 1, [w["lateral"], ws.push[k]])
         self._launch_adjoint(kern.step_nodes, (1, len(m.moving)), ws.step_arguments(k))
         self._launch_adjoint(kern.relax_nodes, (1, len(m.moving)), ws.relax_arguments(k))
-        spread = [w["point_nodes"], w["point_weights"], ws.from_points[k].grad, self._adj_force]
+        spread = [w["point_nodes"], w["point_weights"], ws.from_points[k].grad]
+        spread.append(w["point_force"].grad)
         ws.launch(kern.spread_adjoint, points, spread)
         arguments = ws.point_arguments(k, ws.substep_time())
         self._launch_adjoint(kern.points, (1, points), arguments)
@@ -241,3 +245,15 @@ class SliceAdjoint:
             [w["moving"], w["node_force"], w["element_start"], w["element_entry"]]
             + [ws.ahead[k].grad],
         )
+
+
+def _give(model: CuttingModel) -> np.ndarray:
+    """Displacement of the knife relative to the food per force on it [3], m/N; see `Mounting`.
+
+    Raises:
+        ValueError: The food may slip.
+    """
+    effects = model.effects
+    if effects.slip.resistance is not None:
+        raise ValueError("effects.slip has no gradient: slipping is an event. Set it to null.")
+    return np.array([effects.compliance.holder, 0.0, effects.compliance.arm])

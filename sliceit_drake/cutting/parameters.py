@@ -15,6 +15,7 @@ __all__ = [
     "POINT_PARAMETERS",
     "get_parameter",
     "parameter_names",
+    "parameter_step",
     "pull_back",
     "with_parameters",
 ]
@@ -97,6 +98,31 @@ def with_parameters(model: CuttingModel, values: Mapping[str, float | np.ndarray
     return model.derive(**changed)
 
 
+SCALES = {
+    "effects.skin.toughness": 0.1,
+    "effects.bluntness.initiation": 10.0,
+    "effects.bluntness.dulling": 10.0,
+    "effects.adhesion.stress": 100.0,
+    "effects.adhesion.viscosity": 1e3,
+    "effects.compliance.arm": 1e-6,
+    "effects.compliance.holder": 1e-6,
+    "material.static_friction": 0.1,
+    "material.damping_time": 1e-5,
+    "knife.edge_radius": 1e-5,
+}
+"""Sizes that matter of parameters that may be zero."""
+
+
+def parameter_step(model: CuttingModel, name: str) -> float:
+    """A size of the parameter that matters: its value, or where it may be zero a scale.
+
+    Raises:
+        KeyError: There is no such parameter.
+    """
+    value = get_parameter(model, name)
+    return max(abs(float(value)), SCALES.get(name, 1e-3))
+
+
 def pull_back(
     model: CuttingModel, gradient: SliceGradient, names: Iterable[str]
 ) -> dict[str, float | np.ndarray]:
@@ -120,24 +146,13 @@ def pull_back(
             out[name] = float(gradient.compliance[COMPLIANCES.index(name)])
             continue
         value = get_parameter(model, name)
-        step = 1e-5 * max(abs(float(value)), SMALL.get(name.split(".")[-1], 1e-3))
+        step = 1e-5 * parameter_step(model, name)
         rows = [
             parameter_row(with_parameters(model, {name: float(value) + sign * step}))
             for sign in (1.0, -1.0)
         ]
         out[name] = float(gradient.row @ (rows[0] - rows[1])) / (2.0 * step)
     return out
-
-
-SMALL = {
-    "initiation": 10.0,
-    "toughness": 0.1,
-    "stress": 100.0,
-    "viscosity": 1e3,
-    "dulling": 10.0,
-    "damping_time": 1e-5,
-}
-"""Sizes by which a parameter is varied that may be zero."""
 
 
 def _by_point(model: CuttingModel, gradient: SliceGradient, name: str) -> np.ndarray:

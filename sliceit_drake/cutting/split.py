@@ -5,8 +5,8 @@ that side's copies of its vertices and holds the share of the volume on its side
 Fedkiw 2004; Sifakis, Der and Fedkiw 2007). Nothing is moved, so volume, mass and section are
 conserved for any plane. A vertex within `snap` of the plane counts as on it. No sliver is merged:
 its bulk stiffness and its mass shrink alike, but the stiffness of bonds, flanks and edge at its
-surface does not, nor does the force of the edge on it; `model.SLIVER` and `geometry.LEAST_SHARE` say
-what becomes of it, benchmarks/split_step_limit.py what that leaves of the step limit.
+surface does not, nor does the force of the edge on it; `model.SLIVER` and `geometry.LEAST_SHARE`
+say what becomes of it, benchmarks/split_step_limit.py what that leaves of the step limit.
 """
 
 import dataclasses as dc

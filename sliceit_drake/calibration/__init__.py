@@ -1,0 +1,1 @@
+"""Fitting of the simulation's parameters to records of slices."""
