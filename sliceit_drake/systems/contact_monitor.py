@@ -17,16 +17,15 @@ UNSTABLE_GAINS = "unstable gains"
 
 _AXES = 6
 # Parts of the state; the first six are vectors of six, moment first.
-_PARTS = ("direction", "extreme", "turning_value", "turning_time", "count", "record")
+_PARTS = ("direction", "reach", "turning_value", "turning_time", "count", "record")
 _ALARM = _AXES * len(_PARTS)
-_LARGEST = _ALARM + 1
-_STATE_SIZE = _LARGEST + 1
+_STATE_SIZE = _ALARM + 1
 
 # A swing of at least this share of the greatest before it, which itself is forgotten by this factor
 # a swing, does not die out: oscillations with a damping ratio above about 1 % do.
 _LASTING = 0.9
 _FORGETTING = 0.97
-# Swings that suffice above the force limit: an impact alone has two.
+# Swings that suffice if the last is above the force limit: an impact has one or two.
 _FEW = 3
 # The readings of a minute of normal noise span less than this many standard deviations.
 _NOISE_SWING = 9.0
@@ -53,8 +52,8 @@ class ContactMonitorConfig:
         "N",
         low=1.0,
         high=1e5,
-        doc="Above it three swings make an alarm; UR arms let a user limit the force to about 100 "
-        "to 250 N.",
+        doc="A swing above it makes an alarm with two others before it; UR arms let a user limit "
+        "the force to about 100 to 250 N.",
     )
 
 
@@ -69,7 +68,7 @@ class ContactMonitor(LeafSystem):
 
     - `swings` in a row, none longer than `longest_swing`, the last of which is not smaller than
       those before it, or
-    - three such swings while the force exceeds `force_limit`.
+    - three such swings of a force, the last above `force_limit`.
 
     The update that raises the alarm and each one after it return ``ReachedTermination`` with a
     message that begins with `UNSTABLE_GAINS`, which `Simulator.AdvanceTo` reports in its status
@@ -111,35 +110,34 @@ class ContactMonitor(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         x = discrete_state.get_mutable_vector(self._state).get_mutable_value()
         if not x[_ALARM]:
-            wrench = self._wrench.Eval(context).get_coeffs()
-            x[_LARGEST] = max(x[_LARGEST] * 0.99, float(np.sqrt(wrench[3:].dot(wrench[3:]))))
-            s = wrench * self._scale
-            direction, extreme = x[:_AXES], x[_AXES : 2 * _AXES]
-            # Upwards and downwards alike: how far the signal has gone in its direction.
-            reach = np.maximum(direction * extreme, direction * s)
-            extreme[:] = direction * reach
-            turned = reach - direction * s > 1.0
-            if turned.any():
-                for axis in np.flatnonzero(turned):
+            # Upwards and downwards alike: how far each signal is, and has been, in its direction.
+            s = self._wrench.Eval(context).get_coeffs() * self._scale
+            reach = x[_AXES : 2 * _AXES]
+            s *= x[:_AXES]
+            np.maximum(reach, s, out=reach)
+            back = reach - s
+            if back.max() > 1.0:
+                for axis in np.flatnonzero(back > 1.0):
                     self._turn(x, int(axis), s[axis], context.get_time())
         if x[_ALARM]:
             return EventStatus.ReachedTermination(self, self._message(x))
         return EventStatus.Succeeded()
 
     def _turn(self, x: np.ndarray, axis: int, value: float, time: float) -> None:
-        """Takes the extreme of a component as a turning point."""
+        """Takes the reach of a component as a turning point; `value` is in its old direction."""
         config = self._config
         parts = x[:_ALARM].reshape(len(_PARTS), _AXES)[:, axis]
-        direction, extreme, turning_value, turning_time, count, record = parts
+        direction, reach, turning_value, turning_time, count, record = parts
+        extreme = direction * reach
         swing = abs(extreme - turning_value)
         if time - turning_time > config.longest_swing:
             count, record = 0.0, 0.0
         count += 1.0
         lasts = swing >= _LASTING * record
-        enough = config.swings if x[_LARGEST] < config.force_limit else _FEW
-        if lasts and count >= enough:
+        is_great = axis >= 3 and swing > config.force_limit * self._scale[axis]
+        if lasts and count >= (_FEW if is_great else config.swings):
             x[_ALARM] = time
-        parts[:] = -direction, value, extreme, time, count, max(swing, _FORGETTING * record)
+        parts[:] = -direction, -value, extreme, time, count, max(swing, _FORGETTING * record)
 
     def _message(self, x: np.ndarray) -> str:
         parts = x[:_ALARM].reshape(len(_PARTS), _AXES)
