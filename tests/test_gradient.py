@@ -278,7 +278,7 @@ def test_torch_differentiates_a_slice_by_parameters_and_path(everything):
     }
     values["point_scales.friction"].requires_grad_()
     height = torch.tensor(0.0, dtype=torch.float64, requires_grad=True)
-    p = torch.from_numpy(everything.p) + height * torch.tensor([0.0, 0.0, 1.0])
+    p = torch.from_numpy(everything.p) + height * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     force = slice_force(everything.adjoint, torch.from_numpy(everything.R), p, values)
     (force * torch.from_numpy(everything.weights)).sum().backward()
     expected = pull_back(everything.model, everything.gradient, list(values))
