@@ -112,11 +112,11 @@ class SliceAdjoint:
             if e > 0:
                 run.p[e + 1] += give * run.wrenches[e - 1, 3:]
             ws.advance(run.states[e][None], self._motion(run, e))
-            total = ws.sum("total")[0, 0].sum(0)
+            total, buried = ws.sum("total", 2)[0, 0], ws.sum("buried", 2)[0, 0]
             if not np.isfinite(total).all():
                 raise CuttingError(f"at {(e + 1) * self.exchange_period:.4g} s {NOT_FINITE}")
-            blade, buried = ws.sum("blade_sums")[0, 0], ws.sum("buried")[0, 0].sum(0)
-            parts, _ = knife_wrenches(total, blade, buried, run.R[e + 1], n)
+            blade = ws.sum("blade_sums")[0, 0]
+            parts = knife_wrenches(total, blade, buried, run.R[e + 1], n)
             run.wrenches[e] = parts.sum(0)
             run.states.append(ws.read(ws.states[-1])[0].copy())
         return run
@@ -174,7 +174,7 @@ class SliceAdjoint:
         """Adjoint of `knife_wrenches`: of the sums as the workspace holds them, and of Ky."""
         ws, n = self._w, self._w.substeps
         of_moment, of_force = weights[:3], weights[3:]
-        blade, buried = ws.sum("blade_sums")[0, 0], ws.sum("buried")[0, 0].sum(0)
+        blade, buried = ws.sum("blade_sums")[0, 0], ws.sum("buried", 2)[0, 0]
         lateral = (blade[1] - blade[2]) / n * R[:, 1]
         middle = buried[:3] / buried[3] if buried[3] > 0.0 else np.zeros(3)
         of_lateral = of_force + np.cross(of_moment, middle)

@@ -47,7 +47,7 @@ ACCUMULATED = 22
 
 @functools.cache
 def kernel_types(real: Any) -> types.SimpleNamespace:
-    """Types for `real` = wp.float32 or wp.float64, and `slide` and `table`."""
+    """Types for `real` = wp.float32 or wp.float64, and `slide`, `place` and `table`."""
     vec3 = wp.types.vector(3, real)
     tiny = wp.constant(real(1.0e-20))
 
@@ -70,10 +70,14 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         return new_slip, stiffness * lost
 
     @wp.func
-    def table(values: wp.array2d(dtype=real), row: wp.int32, u: real):
-        last = values.shape[1] - 2
-        k = wp.clamp(wp.int32(wp.floor(u)), 0, last)
-        w = wp.clamp(u - real(k), real(0.0), real(1.0))
+    def place(s: real, reach: real, per_spacing: real, size: wp.int32):
+        """Interval of a table with `size` entries over [-reach, reach] and the share of its end."""
+        u = (s + reach) * per_spacing
+        k = wp.clamp(wp.int32(wp.floor(u)), 0, size - 2)
+        return k, wp.clamp(u - real(k), real(0.0), real(1.0))
+
+    @wp.func
+    def table(values: wp.array2d(dtype=real), row: wp.int32, k: wp.int32, w: real):
         return values[row, k] * (real(1.0) - w) + values[row, k + 1] * w
 
     return types.SimpleNamespace(
@@ -89,6 +93,7 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         entries=wp.types.vector(GATHER, wp.int32),
         TINY=tiny,
         slide=slide,
+        place=place,
         table=table,
         **{name.upper(): wp.constant(k) for k, name in enumerate(PARAMETERS)},
     )

@@ -14,7 +14,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
     """The kernels for scalars `real`, in the Warp module `module`, with adjoints if `gradients`."""
     t = kernel_types(real)
     vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
-    table, slide, TINY = t.table, t.slide, t.TINY
+    table, place, slide, TINY = t.table, t.place, t.slide, t.TINY
     BOND_STIFFNESS, STRENGTH = t.BOND_STIFFNESS, t.STRENGTH
     FLANK_STIFFNESS, FRICTION = t.FLANK_STIFFNESS, t.FRICTION
     STATIC_FRICTION, STRIBECK_VELOCITY = t.STATIC_FRICTION, t.STRIBECK_VELOCITY
@@ -197,6 +197,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         motion = (velocity + wp.cross(rotation_rate, arm) - real(0.5) * (vm + vp)) * dt
         A = area[i]
         toughness_i = toughness[cut, i]
+        grid = fraction.shape[1]
         # s: depth of the edge below the point. Nothing happens beyond the ends of the blade.
         old_passed = passed[cut, i]
         s = old_passed
@@ -208,18 +209,19 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         if not beyond:
             depth = -wp.dot(arm, knife_z)
             s0 = depth - wp.dot(motion, knife_z)
-            u = (depth + reach) * per_spacing
+            k_now, w_now = place(depth, reach, per_spacing, grid)
+            k_old, w_old = place(s0, reach, per_spacing, grid)
             s = depth
-            share = table(fraction, i, u)
-            growth = table(width, i, u)
-            old_share = table(fraction, i, (s0 + reach) * per_spacing)
-            rise = table(centroid, i, u)
+            share = table(fraction, i, k_now, w_now)
+            growth = table(width, i, k_now, w_now)
+            old_share = table(fraction, i, k_old, w_old)
+            rise = table(centroid, i, k_now, w_now)
         new_passed = wp.max(old_passed, s)
         passed_next[cut, i] = new_passed
-        u0 = (old_passed + reach) * per_spacing
-        u1 = (new_passed + reach) * per_spacing
-        D0 = table(fraction, i, u0)
-        D = table(fraction, i, u1)
+        k0, w0 = place(old_passed, reach, per_spacing, grid)
+        k1, w1 = place(new_passed, reach, per_spacing, grid)
+        D0 = table(fraction, i, k0, w0)
+        D = table(fraction, i, k1, w1)
 
         # Bonds of the part that is not cut; its faces may also press on each other.
         gap = xp - xm
@@ -270,9 +272,9 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         if ALL or P[cut, RATE_EXPONENT] != real(0.0):
             relative_speed = wp.max(speed / P[cut, REFERENCE_SPEED], real(1.0e-3))
             effect = effect * wp.pow(relative_speed, P[cut, RATE_EXPONENT])
-        resistance = (left + excess[cut, i]) * table(width, i, u1)
+        resistance = (left + excess[cut, i]) * table(width, i, k1, w1)
         if ALL or P[cut, SKIN_TOUGHNESS] > real(0.0):
-            resistance = resistance + P[cut, SKIN_TOUGHNESS] * table(outline, i, u1)
+            resistance = resistance + P[cut, SKIN_TOUGHNESS] * table(outline, i, k1, w1)
         spring = wp.max(unloading[cut, i], TINY)
         slack = wp.max(new_passed - s - P[cut, UNLOADING_LENGTH], real(0.0))
         limit = wp.max(resistance * effect - spring * slack, real(0.0))
@@ -390,8 +392,9 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         xp = x[cut, nodes[i, 2]] * w[0] + x[cut, nodes[i, 3]] * w[1]
         R = R_CK[cut, k]
         A = area[i]
-        u = (passed[cut, i] + reach) * per_spacing
-        D = table(fraction, i, u)
+        grid = fraction.shape[1]
+        k0, w0 = place(passed[cut, i], reach, per_spacing, grid)
+        D = table(fraction, i, k0, w0)
         gap = xp - xm
         bond = P[cut, BOND_STIFFNESS]
         onset = P[cut, STRENGTH] / bond
@@ -409,8 +412,9 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         rise = real(0.0)
         if wp.abs(wp.dot(arm, knife_x)) < knife[cut, 7]:
             s = -wp.dot(arm, knife_z)
-            share = table(fraction, i, (s + reach) * per_spacing)
-            rise = table(centroid, i, (s + reach) * per_spacing)
+            k1, w1 = place(s, reach, per_spacing, grid)
+            share = table(fraction, i, k1, w1)
+            rise = table(centroid, i, k1, w1)
         doubled += edge_force[cut, i] * edge_force[cut, i] / wp.max(unloading[cut, i], TINY)
         facing = real(1.0)
         if R[1, 1] < real(0.0):

@@ -101,7 +101,7 @@ NOT_FINITE = (
 
 def knife_wrenches(
     total: np.ndarray, blade: np.ndarray, buried: np.ndarray, R: np.ndarray, substeps: int
-) -> tuple[np.ndarray, np.ndarray]:
+) -> np.ndarray:
     """Mean wrenches on the knife from the sums of an exchange.
 
     Args:
@@ -112,8 +112,8 @@ def knife_wrenches(
         substeps: Of the exchange.
 
     Returns:
-        Moment about Ko and force by mechanism [..., 3, 6] (edge, flank pressure, friction), and the
-        part of the second that stands for the blade's bending, a force [..., 3].
+        Moment about Ko and force by mechanism [..., 3, 6]: edge, flank pressure with the blade's
+        bending, friction.
     """
     impulse = total[..., :18] / substeps
     parts = impulse.shape[:-1]
@@ -125,9 +125,13 @@ def knife_wrenches(
     lateral = ((blade[..., 1] - blade[..., 2]) / substeps)[..., None] * R[..., :, 1]
     area = buried[..., 3:]
     middle = np.divide(buried[..., :3], area, out=np.zeros_like(lateral), where=area > 0.0)
-    wrenches[..., 1, :3] += np.cross(middle, lateral)
+    x, y, z = middle[..., 0], middle[..., 1], middle[..., 2]
+    fx, fy, fz = lateral[..., 0], lateral[..., 1], lateral[..., 2]
+    wrenches[..., 1, 0] += y * fz - z * fy
+    wrenches[..., 1, 1] += z * fx - x * fz
+    wrenches[..., 1, 2] += x * fy - y * fx
     wrenches[..., 1, 3:] += lateral
-    return wrenches, lateral
+    return wrenches
 
 
 def run_exchanges(
@@ -148,8 +152,8 @@ def run_exchanges(
     motion = interpolate_motion(R, p, n, T)
     ws.advance(states, motion)
     new = ws.read(ws.states[0]).copy()
-    total, blade = ws.sum("total").sum(2), ws.sum("blade_sums")
-    wrenches, _ = knife_wrenches(total, blade, ws.sum("buried").sum(2), R[:, 1:], n)
+    total, blade = ws.sum("total", 2), ws.sum("blade_sums")
+    wrenches = knife_wrenches(total, blade, ws.sum("buried", 2), R[:, 1:], n)
     both = wrenches.sum(2)
     K = ws.steps
     v, w = (
@@ -158,7 +162,7 @@ def run_exchanges(
     )
     # Moments are about Ko at each sub-step; its mean position is half a period back.
     work = -((both[..., 3:] * v).sum(-1) + (both[..., :3] * w).sum(-1)) * T
-    internal, board = ws.sum("internal_work").sum(1), ws.sum("board_loss").sum(1)
+    internal, board = ws.sum("internal_work", 1), ws.sum("board_loss", 1)
     nodes = ws.layout["x"]
     return [
         Exchanges(
@@ -242,14 +246,14 @@ class CuttingSolver:
         with self._lock:
             ws.advance(state[None], motion)
             new = ws.read(ws.states[0])[0].copy()
-            total = ws.sum("total")[0, 0].sum(0)
-            blade, buried = ws.sum("blade_sums")[0, 0], ws.sum("buried")[0, 0].sum(0)
-            board_force = ws.sum("board_force")[0].sum(0)
-            board_loss = float(ws.sum("board_loss").sum())
-            internal_work = float(ws.sum("internal_work").sum())
+            total, buried = ws.sum("total", 2)[0, 0], ws.sum("buried", 2)[0, 0]
+            blade = ws.sum("blade_sums")[0, 0]
+            board_force = ws.sum("board_force", 1)[0]
+            board_loss = float(ws.sum("board_loss", 1)[0])
+            internal_work = float(ws.sum("internal_work", 1)[0])
         if not np.isfinite(total).all():
             raise CuttingError(NOT_FINITE)
-        wrenches, _ = knife_wrenches(total, blade, buried, end.R, n)
+        wrenches = knife_wrenches(total, blade, buried, end.R, n)
         wrench = wrenches.sum(0)
         nodes = ws.layout["x"]
         return Exchange(

@@ -258,10 +258,13 @@ class Workspace:
         state[self.layout["heading"]].reshape(-1, 3)[:, 2] = -1.0
         return state
 
-    def sum(self, name: str) -> np.ndarray:
-        """Sums of the last launch by name [C, ...], double precision."""
+    def sum(self, name: str, axis: int | None = None) -> np.ndarray:
+        """Sums of the last launch by name [C, ...], added up along an axis, double precision."""
         values = self.read(self.sums)[:, self.sum_layout[name]]
-        return values.reshape(self.cuts, *self._sum_shapes[name]).astype(np.float64)
+        values = values.reshape(self.cuts, *self._sum_shapes[name])
+        if axis is None:
+            return values.astype(np.float64)
+        return values.sum(axis, dtype=np.float64)
 
     def write(self, array: wp.array, values: np.ndarray) -> None:
         """Sets an array from host memory."""
@@ -483,30 +486,22 @@ def interpolate_motion(R: np.ndarray, p: np.ndarray, substeps: int, period: floa
     Returns:
         The workspace's motion [C, 18 E substeps]: rotations, positions, velocities, rates.
     """
-    C, E = R.shape[0], R.shape[1] - 1
-    share = (np.arange(1, substeps + 1) / substeps)[:, None]
-    R0, dp = R[:, :-1].reshape(C, E, 1, 9), np.diff(p, axis=1)[:, :, None]
-    dR = np.diff(R, axis=1).reshape(C, E, 1, 9)
-    turn = R[:, 1:] @ R[:, :-1].transpose(0, 1, 3, 2)
-    w = np.stack(
-        [
-            turn[..., 2, 1] - turn[..., 1, 2],
-            turn[..., 0, 2] - turn[..., 2, 0],
-            turn[..., 1, 0] - turn[..., 0, 1],
-        ],
-        axis=-1,
+    C, E, n = R.shape[0], R.shape[1] - 1, substeps
+    out = np.empty((C, 18 * E * n))
+    rotation, position, velocity, rate = (
+        out[:, a * E * n : b * E * n].reshape(C, E, n, b - a)
+        for a, b in ((0, 9), (9, 12), (12, 15), (15, 18))
     )
-    w *= 0.5 / period
-    shape = (C, E, substeps, 3)
-    return np.concatenate(
-        [
-            (R0 + share * dR).reshape(C, -1),
-            (p[:, :-1, None] + share * dp).reshape(C, -1),
-            np.broadcast_to(dp / period, shape).reshape(C, -1),
-            np.broadcast_to(w[:, :, None], shape).reshape(C, -1),
-        ],
-        axis=1,
-    )
+    share = (np.arange(1, n + 1) / n)[:, None]
+    R0, R1 = R[:, :-1], R[:, 1:]
+    rotation[:] = R0.reshape(C, E, 1, 9) + share * (R1 - R0).reshape(C, E, 1, 9)
+    dp = (p[:, 1:] - p[:, :-1])[:, :, None]
+    position[:] = p[:, :-1, None] + share * dp
+    velocity[:] = dp * (1.0 / period)
+    turn = R1 @ R0.transpose(0, 1, 3, 2)
+    for k, (a, b) in enumerate(((2, 1), (0, 2), (1, 0))):
+        rate[..., k] = ((turn[..., a, b] - turn[..., b, a]) * (0.5 / period))[..., None]
+    return out
 
 
 def _element_gather(
