@@ -140,40 +140,42 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
         stiff_volume: wp.array2d(dtype=lanes),
         P: wp.array2d(dtype=real),
         force: wp.array3d(dtype=lanes),
+        per_thread: wp.int32,
     ):
-        """Nodal forces of eight elements: minus the gradient of the energy at x.
+        """Nodal forces of the elements, eight at a time: minus the gradient of the energy at x.
 
         `x` is `ahead`: positions plus tau times velocities. Evaluating at x + tau v is Kelvin-Voigt
         damping with viscosity tau times the tangent stiffness; invariant under translation, and
         under rotation to second order in tau times its rate.
         """
-        cut, block = wp.tid()
+        cut, chunk = wp.tid()
         mu = P[cut, MU]
         lam = P[cut, LAM]
-        f00, f10, f20, f01, f11, f21, f02, f12, f22 = gradient8(x, cut, nodes, block, shape)
-        d00, d10, d20 = cross8(f01, f11, f21, f02, f12, f22)
-        d01, d11, d21 = cross8(f02, f12, f22, f00, f10, f20)
-        d02, d12, d22 = cross8(f00, f10, f20, f01, f11, f21)
-        J = dot8(f00, f10, f20, d00, d10, d20)
-        Ic = (
-            dot8(f00, f10, f20, f00, f10, f20)
-            + dot8(f01, f11, f21, f01, f11, f21)
-            + dot8(f02, f12, f22, f02, f12, f22)
-        )
-        one = lanes(real(1.0))
-        weight = -stiff_volume[cut, block]
-        s = wp.cw_mul(weight, (one - wp.cw_div(one, Ic + one)) * mu)
-        p = wp.cw_mul(weight, J * lam - one * (lam + real(0.75) * mu))
-        p00 = wp.cw_mul(s, f00) + wp.cw_mul(p, d00)
-        p10 = wp.cw_mul(s, f10) + wp.cw_mul(p, d10)
-        p20 = wp.cw_mul(s, f20) + wp.cw_mul(p, d20)
-        p01 = wp.cw_mul(s, f01) + wp.cw_mul(p, d01)
-        p11 = wp.cw_mul(s, f11) + wp.cw_mul(p, d11)
-        p21 = wp.cw_mul(s, f21) + wp.cw_mul(p, d21)
-        p02 = wp.cw_mul(s, f02) + wp.cw_mul(p, d02)
-        p12 = wp.cw_mul(s, f12) + wp.cw_mul(p, d12)
-        p22 = wp.cw_mul(s, f22) + wp.cw_mul(p, d22)
-        store8(p00, p10, p20, p01, p11, p21, p02, p12, p22, cut, block, shape, force)
+        for block in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, nodes.shape[0])):
+            f00, f10, f20, f01, f11, f21, f02, f12, f22 = gradient8(x, cut, nodes, block, shape)
+            d00, d10, d20 = cross8(f01, f11, f21, f02, f12, f22)
+            d01, d11, d21 = cross8(f02, f12, f22, f00, f10, f20)
+            d02, d12, d22 = cross8(f00, f10, f20, f01, f11, f21)
+            J = dot8(f00, f10, f20, d00, d10, d20)
+            Ic = (
+                dot8(f00, f10, f20, f00, f10, f20)
+                + dot8(f01, f11, f21, f01, f11, f21)
+                + dot8(f02, f12, f22, f02, f12, f22)
+            )
+            one = lanes(real(1.0))
+            weight = -stiff_volume[cut, block]
+            s = wp.cw_mul(weight, (one - wp.cw_div(one, Ic + one)) * mu)
+            p = wp.cw_mul(weight, J * lam - one * (lam + real(0.75) * mu))
+            p00 = wp.cw_mul(s, f00) + wp.cw_mul(p, d00)
+            p10 = wp.cw_mul(s, f10) + wp.cw_mul(p, d10)
+            p20 = wp.cw_mul(s, f20) + wp.cw_mul(p, d20)
+            p01 = wp.cw_mul(s, f01) + wp.cw_mul(p, d01)
+            p11 = wp.cw_mul(s, f11) + wp.cw_mul(p, d11)
+            p21 = wp.cw_mul(s, f21) + wp.cw_mul(p, d21)
+            p02 = wp.cw_mul(s, f02) + wp.cw_mul(p, d02)
+            p12 = wp.cw_mul(s, f12) + wp.cw_mul(p, d12)
+            p22 = wp.cw_mul(s, f22) + wp.cw_mul(p, d22)
+            store8(p00, p10, p20, p01, p11, p21, p02, p12, p22, cut, block, shape, force)
 
     @wp.kernel(enable_backward=gradients, module=module)
     def look_ahead(

@@ -169,38 +169,40 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         board_loss: wp.array2d(dtype=real),
         internal_work: wp.array2d(dtype=real),
         ahead: wp.array2d(dtype=vec3),
+        per_thread: wp.int32,
     ):
         """Gathers the forces of each moving node and steps it in place, semi-implicit Euler."""
-        cut, entry = wp.tid()
-        i = moving[entry]
-        force = gather_elements(cut, i, element_force, element_start, element_entry)
-        internal = relax(cut, i, force, relaxing, keep, lag, lag)
-        external = weight[cut, i] + gather_points(
-            cut, i, point_force, point_start, point_entry, point_weight
-        )
-        xi = x[cut, i]
-        v1 = step_node(
-            cut,
-            i,
-            internal,
-            external,
-            xi,
-            v[cut, i],
-            inverse_mass[cut, i],
-            board_area[i],
-            board,
-            P,
-            dt,
-            board_slip,
-            board_slip,
-            board_force,
-            board_loss,
-            internal_work,
-        )
-        x1 = xi + v1 * dt
-        v[cut, i] = v1
-        x[cut, i] = x1
-        ahead[cut, i] = x1 + P[cut, DAMPING_TIME] * v1
+        cut, chunk = wp.tid()
+        for entry in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, moving.shape[0])):
+            i = moving[entry]
+            force = gather_elements(cut, i, element_force, element_start, element_entry)
+            internal = relax(cut, i, force, relaxing, keep, lag, lag)
+            external = weight[cut, i] + gather_points(
+                cut, i, point_force, point_start, point_entry, point_weight
+            )
+            xi = x[cut, i]
+            v1 = step_node(
+                cut,
+                i,
+                internal,
+                external,
+                xi,
+                v[cut, i],
+                inverse_mass[cut, i],
+                board_area[i],
+                board,
+                P,
+                dt,
+                board_slip,
+                board_slip,
+                board_force,
+                board_loss,
+                internal_work,
+            )
+            x1 = xi + v1 * dt
+            v[cut, i] = v1
+            x[cut, i] = x1
+            ahead[cut, i] = x1 + P[cut, DAMPING_TIME] * v1
 
     # Sums in loops have kernels of their own: an adjoint would not know their value after the loop.
     @wp.kernel(enable_backward=gradients, module=module)

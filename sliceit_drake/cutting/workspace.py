@@ -286,6 +286,14 @@ class Workspace:
         """Launches `kernel` over cuts and `dim` entries of each."""
         wp.launch(kernel, dim=(self.cuts, dim), inputs=inputs, device=self.device)
 
+    def _launch_many(self, kernel: Any, count: int, inputs: list[Any]) -> None:
+        """Launches `kernel` over cuts and `count` entries: on a CPU all in one thread.
+
+        A thread's start, which copies the kernel's arguments, costs a CPU more than a node does.
+        """
+        per_thread = count if self.device.is_cpu else 1
+        self.launch(kernel, -(-count // per_thread), [*inputs, per_thread])
+
     def substep_time(self) -> Any:
         """The sub-step as the kernels take it, s."""
         return self.real(self.exchange_period / self.substeps)
@@ -298,7 +306,7 @@ class Workspace:
         """Forces of the elements at the beginning of sub-step k."""
         w, ahead = self.w, self.ahead[k if self._gradients else 0]
         inputs = [ahead, w["nodes"], w["shape"], w["stiff_volume"], w["P"], w["element_force"]]
-        self.launch(self.kernels.elements, len(self.model.blocks), inputs)
+        self._launch_many(self.kernels.elements, len(self.model.blocks), inputs)
 
     def point_arguments(self, k: int, dt: Any) -> list[Any]:
         """Arguments of `points` in sub-step k."""
@@ -353,7 +361,11 @@ class Workspace:
         """One sub-step."""
         w, kern, m, C = self.w, self.kernels, self.model, self.cuts
         self.launch_elements(k)
-        self.launch(kern.points, len(m.point_nodes), self.point_arguments(k, self.substep_time()))
+        points = self.point_arguments(k, self.substep_time())
+        if self._gradients:
+            self.launch(kern.points, len(m.point_nodes), points)
+        else:
+            self._launch_many(kern.many_points, len(m.point_nodes), points)
         gathered = [w["node_force"], w["element_start"], w["element_entry"], w["listed_force"]]
         gathered += [w["point_start"], w["point_entry"], w["point_weight"]]
         if self._gradients:
@@ -363,7 +375,7 @@ class Workspace:
             self.launch(kern.step_nodes, len(m.moving), self.step_arguments(k))
         else:
             now = self.slots[0]
-            self.launch(
+            self._launch_many(
                 kern.move_nodes,
                 len(m.moving),
                 [now["x"], now["v"], w["moving"], *gathered]
