@@ -337,6 +337,18 @@ def test_the_plants_steps_take_of_an_impacts_peak_what_is_estimated(stiffness, s
     assert 0.03 < estimate < 0.10
 
 
+@pytest.mark.parametrize("speed", [0.05, 0.1])
+def test_an_impact_on_the_default_board_peaks_alike_at_steps_of_1_and_of_a_tenth_ms(speed):
+    coarse, fine = (
+        press(
+            RobotConfig(plant_time_step=step), lambda z: Board(height=z), 0.003, 3e-4, speed, 0.12
+        )[3][:, 5].max()
+        for step in (1e-3, 1e-4)
+    )
+    assert fine > 5.0
+    assert coarse == pytest.approx(fine, rel=0.05)
+
+
 def test_the_effective_mass_is_what_a_blow_on_the_edge_moves():
     cell = make_cell()
     plant, context = cell.plant, cell.plant.CreateDefaultContext()

@@ -1,6 +1,7 @@
 """`sliceit study`: studies whose tables the documentation quotes."""
 
 import argparse
+import dataclasses as dc
 import itertools
 from pathlib import Path
 
@@ -44,6 +45,17 @@ FACTORS = (0.01, 0.03, 0.1, 0.3, 1.0)
 TRACKING = ((0.03, "ideal"), (0.005, "arm"), (0.03, "arm"), (0.03, "servo"))
 BOX_FACTORS, INTERIOR = (0.1, 1.0), 8
 
+STEPPING = """\
+How far the force depends on the food's sub-step, and what the step costs.
+
+Presses, draws and holds in three foods at two speeds with steps of 1e-5 to 1e-3 s: scaled masses
+against true ones where the cut is fast, against the finest step where it is slow; then the cucumber
+scenario in the station. Takes a quarter of an hour, --quick ten seconds. docs/stepping.md explains
+what comes out.
+"""
+STEPPING_FOODS = ("cucumber", "potato_sequence", "tomato_sequence")
+STATION_STEPS = (5e-5, 1e-4, 2e-4, 5e-4, 1e-3)
+
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Adds the command."""
@@ -76,6 +88,24 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         "--output", metavar="FOLDER", type=Path, help="also write control.png and control.md there"
     )
     control.set_defaults(run=run_control)
+    stepping = studies.add_parser(
+        "stepping",
+        help="error of the force against sub-step and cost",
+        description=STEPPING,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    stepping.add_argument(
+        "--output",
+        metavar="FOLDER",
+        type=Path,
+        help="also write stepping.md, stepping.csv and stepping.png there",
+    )
+    stepping.add_argument(
+        "--quick",
+        action="store_true",
+        help="cucumber at 100 mm/s against scaled masses at 1e-4 s, without the station",
+    )
+    stepping.set_defaults(run=run_stepping)
 
 
 def run_coupling(options: argparse.Namespace) -> int:
@@ -147,4 +177,64 @@ def run_control(options: argparse.Namespace) -> int:
     if options.output is not None:
         study.plot_stability_map(gains, limits, checks, options.output / "control.png")
         (options.output / "control.md").write_text(text, encoding="utf-8")
+    return 0
+
+
+def run_stepping(options: argparse.Namespace) -> int:
+    """Runs the study of the sub-step."""
+    from collections.abc import Callable
+
+    from tqdm import tqdm
+
+    from sliceit_drake.cutting import stepping_study as study
+    from sliceit_drake.diagrams import stepping_report as report
+    from sliceit_drake.diagrams.scenario import load_scenario
+    from sliceit_drake.resources import resource_path
+
+    def progress(bar: "tqdm[None]") -> Callable[[float], None]:
+        return lambda share: (bar.update(100.0 * share - bar.n), None)[1]
+
+    def bar(name: str) -> "tqdm[None]":
+        return tqdm(total=100.0, desc=name, bar_format="{l_bar}{bar}| {elapsed}<{remaining}")
+
+    scenarios = [
+        load_scenario(resource_path(f"scenarios/{name}.yaml"))
+        for name in (STEPPING_FOODS[:1] if options.quick else STEPPING_FOODS)
+    ]
+    foods = [report.sliced_food(scenario) for scenario in scenarios]
+    steps = study.STEPS[3:] if options.quick else study.STEPS
+    cases = study.stepping_cases(foods, (0.1,) if options.quick else (0.02, 0.1))
+    if options.quick:
+        cases = [dc.replace(case, true_masses=False) for case in cases]
+    with bar("cuts") as running:
+        results = study.stepping_study(cases, steps, progress=progress(running))
+    with bar("costs") as running:
+        costs = study.step_costs(foods, steps, progress=progress(running))
+    tables = [
+        study.error_table(results),
+        study.largest_table(results),
+        study.inertia_table(results),
+        study.hold_table(results),
+        study.mass_table(results),
+        study.cost_table(costs),
+    ]
+    if not options.quick:
+        cut = scenarios[0]
+        stations = []
+        for name, scenario in (
+            (cut.name, cut),
+            (f"{cut.name}, held half way", report.held_half_way(cut)),
+        ):
+            with bar(f"station, {name}") as running:
+                stations.append(
+                    (name, report.station_steps(scenario, STATION_STEPS, progress(running)))
+                )
+        tables.append(report.station_table(stations))
+    text = "\n\n".join(tables) + "\n"
+    print(text)
+    if options.output is not None:
+        options.output.mkdir(parents=True, exist_ok=True)
+        (options.output / "stepping.md").write_text(text, encoding="utf-8")
+        report.write_stepping(results, costs, options.output / "stepping.csv")
+        report.plot_stepping(results, costs, options.output / "stepping.png")
     return 0

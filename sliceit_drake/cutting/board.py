@@ -20,7 +20,7 @@ class Board:
     Stiffness and dissipation are those of the whole edge lying on the board, with all that gives
     under it, down to the table. Both are declared free: no measurement of the paper's board is
     published, nor did we find one of a blade on any board. The force of an impact measures what is
-    assumed here (docs/physics.md).
+    assumed here; the default is as stiff as steps of 1 ms resolve (docs/physics.md).
     """
 
     height: float = quantity(0.05, "m", low=-1.0, high=2.0, doc="Top surface in the world frame.")
@@ -28,7 +28,7 @@ class Board:
         [0.30, 0.20, 0.02], "m", low=1e-3, high=2.0, doc="Extent along x, y and thickness."
     )
     stiffness: float = quantity(
-        1e5, "N/m", low=1e2, high=1e8, doc="Force over penetration of the whole edge."
+        3e4, "N/m", low=1e2, high=1e8, doc="Force over penetration of the whole edge."
     )
     dissipation: float = quantity(
         1.0, "s/m", low=0.0, high=100.0, doc="Hunt-Crossley dissipation: F = k d (1 + D d')."

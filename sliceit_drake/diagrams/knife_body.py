@@ -28,9 +28,8 @@ __all__ = [
     "effective_mass",
 ]
 
-# Above it a station is refused. The default board and step have 8 %, measured 6 %, less than any
-# assumed dissipation does; an estimate of 5 % would take steps of 0.6 ms.
-PEAK_LOSS_LIMIT = 0.10
+# Above it a station is refused. The default board and step have 4.6 %, measured 2.2 to 3.8 %.
+PEAK_LOSS_LIMIT = 0.05
 
 STEEL_DENSITY = 7800.0
 # Polyoxymethylene, the usual plastic of kitchen knives' handles.
@@ -107,10 +106,10 @@ def check_plant_step(board: Board, mass: float, time_step: float, exchange_perio
     """Refuses a board too stiff for the plant's step.
 
     The estimate is that of a free mass (`impact_peak_loss`) and bounds what the arm does. Measured
-    at 50 and 100 mm/s against steps of 25 us (tests/test_robot.py repeats some), the peak is 6 %
-    low at 1e5 N/m with 1 ms, where the estimate is 8 %, and 3 % (4 %) with 0.5 ms; at 3e5 N/m 11 to
-    12 % (14 %) and 6 % (7 %); at 1e6 N/m 17 to 18 % (23 %) and 11 % (13 %), and 5 to 6 % (7 %) with
-    0.25 ms. Forces at rest do not depend on the step.
+    at 50 and 100 mm/s against steps of 0.1 ms (tests/test_robot.py repeats some), the peak is
+    2 to 4 % low at 3e4 N/m with 1 ms, where the estimate is 4.6 %; at 1e5 N/m 5 to 6 % (8 %), and
+    3 % (4 %) with 0.5 ms; at 4.5e5 N/m 12 to 13 % (16 %) and 6 % (9 %). Forces at rest do not
+    depend on the step.
 
     Args:
         board: Of the station.
