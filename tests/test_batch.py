@@ -1,0 +1,96 @@
+"""Many slices in one call are the slices one by one."""
+
+import dataclasses as dc
+
+import numpy as np
+import pytest
+
+from sliceit_drake.cutting.batch import BatchSlice, _Runner, simulate_batch
+from sliceit_drake.cutting.board import Board
+from sliceit_drake.cutting.effects import Compliance, Effects, Relaxation
+from sliceit_drake.cutting.food import Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.material import Material
+from sliceit_drake.cutting.model import CuttingModel, Numerics
+from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan, PressAndDraw
+from sliceit_drake.cutting.parameters import with_parameters
+from sliceit_drake.cutting.simulate import simulate_slice
+from sliceit_drake.cutting.solver import CuttingSolver
+
+PERIOD = 2e-3
+BOARD = Board(height=1e-3, stiffness=1e4)
+
+
+@pytest.fixture(scope="module")
+def models() -> list[CuttingModel]:
+    food = Food(shape=Cylinder(rings=2, layers=[0.0, 4e-3, 12e-3]), material=Material(friction=0.1))
+    base = make_food_model(food, Knife(), Numerics())
+    return [
+        base,
+        with_parameters(base, {"material.youngs_modulus": 1.5e6, "material.friction": 0.3}),
+        base.derive(effects=Effects(relaxation=Relaxation([0.3], [0.05]))),
+        base.derive(effects=Effects(compliance=Compliance(arm=1e-5))),
+    ]
+
+
+@pytest.fixture(scope="module")
+def motions(models) -> list[Motion]:
+    start = start_pose(models[0], 1e-3)
+    press = MotionPlan([ConstantSpeed(distance=0.028, speed=0.1)])
+    draw = MotionPlan([PressAndDraw(press_speed=0.05, distance=0.01, draw_ratio=1.0)])
+    return [Motion(plan, start) for plan in (press, draw, press, press)]
+
+
+@pytest.fixture(scope="module")
+def one_by_one(models, motions) -> list[np.ndarray]:
+    out = []
+    for model, motion in zip(models, motions, strict=True):
+        result = simulate_slice(CuttingSolver(model, PERIOD), motion, BOARD)
+        out.append(np.hstack([result.position, result.food_wrench, result.board_wrench]))
+    return out
+
+
+def table(result: BatchSlice) -> np.ndarray:
+    return np.hstack([result.position, result.food_wrench, result.board_wrench])
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_each_slice_of_a_batch_is_the_slice_alone(models, motions, one_by_one, workers):
+    done = []
+    results = simulate_batch(models, motions, PERIOD, BOARD, workers, done.append)
+    for result, alone in zip(results, one_by_one, strict=True):
+        np.testing.assert_array_equal(table(result), alone)
+        assert result.failure is None
+    assert results[0].board_wrench[:, 5].max() > 1.0
+    assert done == sorted(done) and done[-1] == len(models)
+
+
+def test_cuts_side_by_side_are_the_cuts_alone(models, motions, one_by_one):
+    # As on a GPU; the second motion is shorter.
+    results = _Runner(PERIOD, BOARD).run([models[0], models[1]], [motions[0], motions[1]])
+    for result, alone in zip(results, one_by_one, strict=False):
+        np.testing.assert_array_equal(table(result), alone)
+
+
+def test_a_slice_that_breaks_down_is_reported_and_disturbs_no_other(models, motions, one_by_one):
+    # Ten times the critical step: quietly unstable masses.
+    broken = dc.replace(models[0], mass=models[0].mass * 1e-3)
+    results = simulate_batch([broken, models[0]], motions[:1], PERIOD, BOARD)
+    assert results[0].failure is not None
+    assert "not finite" in results[0].failure
+    assert np.isnan(results[0].food_wrench[-1]).all()
+    np.testing.assert_array_equal(table(results[1]), one_by_one[0])
+    together = _Runner(PERIOD, BOARD).run([broken, models[0]], [motions[0]] * 2)
+    assert together[0].failure == results[0].failure
+    np.testing.assert_array_equal(table(together[1]), one_by_one[0])
+
+
+def test_numbers_of_models_and_motions_must_agree(models, motions):
+    with pytest.raises(ValueError, match="4 models and 2 motions"):
+        simulate_batch(models, motions[:2], PERIOD)
+
+
+def test_a_workspace_refuses_cuts_of_another_mesh(models):
+    other = make_food_model(Food(shape=Cylinder(rings=3)), Knife(), Numerics())
+    with pytest.raises(ValueError, match="derived from one model"):
+        _Runner(PERIOD, None)._workspace([models[0], other], 1)
