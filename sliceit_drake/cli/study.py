@@ -6,6 +6,7 @@ import itertools
 from pathlib import Path
 
 from sliceit_drake.cli.scenario_argument import add_scenario_arguments, scenario_of
+from sliceit_drake.cli.verification import add_verification
 
 __all__ = ["add_parser"]
 
@@ -106,6 +107,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         help="cucumber at 100 mm/s against scaled masses at 1e-4 s, without the station",
     )
     stepping.set_defaults(run=run_stepping)
+    add_verification(studies)
 
 
 def run_coupling(options: argparse.Namespace) -> int:
