@@ -53,7 +53,7 @@ def run_verification(options: argparse.Namespace) -> int:
     foods = curves.load_measured_foods(file)
     if options.fit:
         for k, case in enumerate(foods.foods):
-            with tqdm(total=curves.FIT_CUTS, desc=f"fit of {case.food.name}") as bar:
+            with tqdm(total=len(curves.STARTS), desc=f"fit of {case.food.name}") as bar:
                 foods.foods[k] = curves.fit_measured_food(case, progress=bar.update)
         curves.save_measured_foods(foods, file, "sliceit study verification --fit")
     with tqdm(total=verification.CHECKS + len(foods.foods), desc="checks") as bar:

@@ -12,6 +12,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml, load_yaml, quantity
 from sliceit_drake.cutting.food import Cylinder, Food, make_food_model, start_pose
@@ -27,7 +28,7 @@ from sliceit_drake.resources import resource_path
 
 __all__ = [
     "FITTED",
-    "FIT_CUTS",
+    "STARTS",
     "MeasuredCut",
     "MeasuredFood",
     "MeasuredFoods",
@@ -49,11 +50,13 @@ FITTED = {
 """Parameters of the fit and their bounds, searched in their logarithm; the time of first contact is
 the fifth."""
 
-FIRST, ROUND, ROUNDS, KEPT = 40, 10, 4, 4
-LEAST_SPREAD = 0.02
-FIT_CUTS = FIRST + ROUNDS * ROUND
-"""The search: candidates at first, in each round of refinement, rounds, the best that a round is
-drawn around, and the least spread of a round, relative to the bounds."""
+STARTS = ((2e6, 0.05), (5e5, 0.3))
+"""Young's modulus and friction from which the fit starts: stiff with little friction, and soft with
+more, between which one press cut hardly tells."""
+STEPS = 5
+"""Most steps from each start."""
+STEP = 0.02
+"""Of the differences, relative to the logarithm of the bounds."""
 
 
 @dc.dataclass
@@ -166,52 +169,26 @@ def cut_measured_food(case: MeasuredFood, refinement: float = 1.0) -> MeasuredCu
 
 
 def fit_measured_food(
-    case: MeasuredFood, seed: int = 0, progress: Callable[[int], None] | None = None
+    case: MeasuredFood, progress: Callable[[int], object] | None = None
 ) -> MeasuredFood:
-    """Fits `FITTED` to the record: a Latin hypercube, then rounds drawn around the best.
-
-    Candidates that cannot be cut (elements invert, or the food snaps faster than scaled masses may)
-    are passed over, and the best that can be cut on the full mesh is taken.
+    """Fits `FITTED` to the record, by least squares from each of `STARTS`.
 
     Args:
         case: Food and record.
-        seed: Of the search.
-        progress: Called with 1 after each cut.
+        progress: Called with 1 after each start.
 
     Raises:
-        CuttingError: No candidate could be cut.
+        CuttingError: The food cannot be cut with what was found.
     """
-    rng = np.random.default_rng(seed)
-    low, high = np.log(np.array(list(FITTED.values()))).T
-
-    def cases(candidates: np.ndarray) -> list[MeasuredFood]:
-        values = np.exp(low + candidates * (high - low))
-        return [_with_values(case, row) for row in values.tolist()]
-
-    def misfits(candidates: np.ndarray) -> np.ndarray:
-        rms = []
-        for found in pool.map(_misfit, cases(candidates)):
-            rms.append(found)
-            if progress is not None:
-                progress(1)
-        return np.array(rms)
-
-    count = len(FITTED)
-    strata = np.argsort(rng.random((count, FIRST)), axis=1).T
-    candidates = (strata + rng.random((FIRST, count))) / FIRST
+    found = []
     # Processes, for what a cut spends in Python.
     with ProcessPoolExecutor(os.cpu_count(), multiprocessing.get_context("spawn")) as pool:
-        rms = misfits(candidates)
-        for _ in range(ROUNDS):
-            best = candidates[np.argsort(rms)[:KEPT]]
-            spread = np.maximum(best.std(0), LEAST_SPREAD)
-            drawn = best[rng.integers(KEPT, size=ROUND)] + spread * rng.normal(size=(ROUND, count))
-            drawn = np.clip(drawn, 0.0, 1.0)
-            candidates = np.concatenate([candidates, drawn])
-            rms = np.concatenate([rms, misfits(drawn)])
-    failure = CuttingError(f"{case.food.name}: no candidate of the fit could be cut")
-    for k in np.argsort(rms)[: 4 * KEPT]:
-        (fitted,) = cases(candidates[k : k + 1])
+        for result in pool.map(_fit_from, [case] * len(STARTS), STARTS):
+            found.append(result)
+            if progress is not None:
+                progress(1)
+    failure = CuttingError(f"{case.food.name}: no start of the fit could be cut")
+    for _, fitted in sorted(found, key=lambda result: result[0]):
         try:
             cut_measured_food(fitted)
         except CuttingError as error:
@@ -221,12 +198,38 @@ def fit_measured_food(
     raise failure
 
 
-def _misfit(case: MeasuredFood) -> float:
-    """RMS error on the mesh of the fit, N; infinite if it cannot be cut."""
-    try:
-        return cut_measured_food(case, case.fit_refinement).comparison.rms
-    except CuttingError:
-        return float("inf")
+def _fit_from(case: MeasuredFood, start: tuple[float, float]) -> tuple[float, MeasuredFood]:
+    """RMS error on the mesh of the fit [N] and the food, from a start."""
+    low, high = np.log(np.array(list(FITTED.values()))).T
+    profile = case.profile()
+    travel = case.measurement.speed * float(np.trapezoid(profile.force, profile.time))
+    best = (np.inf, case)
+
+    def at(x: np.ndarray) -> MeasuredFood:
+        return _with_values(case, np.exp(low + x * (high - low)).tolist())
+
+    def difference(x: np.ndarray) -> np.ndarray:
+        nonlocal best
+        candidate = at(x)
+        try:
+            comparison = cut_measured_food(candidate, case.fit_refinement).comparison
+        except CuttingError:
+            # Worse than no force at all: the search turns back.
+            return 2.0 * profile.force
+        if comparison.rms < best[0]:
+            best = (comparison.rms, candidate)
+        return comparison.simulated - profile.force
+
+    # Of the apparent work, friction takes some.
+    given = np.log([0.8 * travel / case.section, *start, 1e-2])
+    least_squares(
+        difference,
+        np.clip((given - low) / (high - low), 0.02, 0.98),
+        bounds=(0.0, 1.0),
+        diff_step=STEP,
+        max_nfev=STEPS,
+    )
+    return best
 
 
 def _with_values(case: MeasuredFood, values: list[float]) -> MeasuredFood:

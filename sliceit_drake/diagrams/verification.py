@@ -18,6 +18,7 @@ __all__ = [
     "FRICTION_CASES",
     "Limit",
     "REFERENCES",
+    "check_physics",
     "cucumber",
     "food_numbers",
     "limits",
@@ -36,7 +37,7 @@ COARSE = 0.5
 """Refinement of the first food's cut that a test repeats."""
 REFERENCES = {"DiSECt": "the authors' calibrated DiSECt", "spring": "the authors' spring"}
 
-CHECKS = 2 + len(EDGE_CASES) + len(FRICTION_CASES) + 2 + len(REFINEMENTS) + len(DIVISORS)
+CHECKS = 4 + len(EDGE_CASES) + len(FRICTION_CASES) + len(REFINEMENTS) + len(DIVISORS)
 """How often `run_verification` reports progress, besides once a food."""
 
 
@@ -61,6 +62,20 @@ def run_verification(
     Raises:
         CuttingError: A food cannot be cut.
     """
+    results = check_physics(progress)
+    results["coarse"] = food_numbers(foods[0], cut_measured_food(foods[0], COARSE))
+    results["foods"] = []
+    cuts = []
+    for case in foods:
+        cut = cut_measured_food(case)
+        results["foods"].append(food_numbers(case, cut))
+        cuts.append(cut)
+        progress()
+    return results, cuts
+
+
+def check_physics(progress: Callable[[], None] = lambda: None) -> dict[str, Any]:
+    """The results that need no measured food; see `run_verification`."""
 
     def done(result: Any) -> Any:
         progress()
@@ -68,7 +83,7 @@ def run_verification(
             return [dc.asdict(r) for r in result]
         return dc.asdict(result)
 
-    results: dict[str, Any] = {
+    results = {
         "patch": done(bulk.check_patch()),
         "beam": done(bulk.check_beam(BEAM)),
         "edge": [done(verification_contact.check_edge(*case)) for case in EDGE_CASES],
@@ -77,18 +92,10 @@ def run_verification(
         "gradient": done(verification_contact.check_gradient()),
         "mesh": dc.asdict(convergence.refine_mesh(cucumber(), DEPTH, REFINEMENTS, progress)),
         "step": dc.asdict(convergence.refine_step(cucumber(), DEPTH, DIVISORS, progress)),
-        "coarse": food_numbers(foods[0], cut_measured_food(foods[0], COARSE)),
-        "foods": [],
     }
-    cuts = []
-    for case in foods:
-        cut = cut_measured_food(case)
-        results["foods"].append(food_numbers(case, cut))
-        cuts.append(cut)
-        progress()
     rounded = _rounded(results)
     assert isinstance(rounded, dict)
-    return rounded, cuts
+    return rounded
 
 
 def food_numbers(case: MeasuredFood, cut: MeasuredCut) -> dict[str, Any]:

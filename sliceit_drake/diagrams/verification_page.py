@@ -141,10 +141,10 @@ friction, and fits that differ in both are as good: no fitted value is a materia
 **Where it fails.** The measured tomato has two peaks, 12 and 23 mm below the top, with a third
 less force between them. Ours is one homogeneous flesh with a skin that costs energy per length,
 and has no such shape. With the configured E of 0.04 MPa and the measured apparent work as R the
-food yields by more than two elements, R / (E h) = 2.4, before it parts: the run is refused, as
-elements invert above about 0.5, and with R = 200 J/m2 already because the food snaps and the
-kinetic energy passes 5 %. So the fit must go to a flesh that is far stiffer, and draws a smooth
-curve through the peaks.
+food yields by about two elements (R / (E h) = 2.4 with elements of 4 mm in the section) before it
+parts: the run is refused, as elements invert above about 0.5, and with R = 200 J/m2 already
+because the food snaps and the kinetic energy passes 5 %. So the fit must go to a stiffer flesh,
+and a coarse mesh, and draws a smooth curve through the peaks.
 
 ## Where the work goes
 
