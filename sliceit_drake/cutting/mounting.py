@@ -13,10 +13,6 @@ ATTEMPTS = 40
 """Most evaluations of an exchange; what is left is made up for by the next, which starts anew."""
 
 
-SAME = 1e-14
-"""Displacements that are told apart, metres."""
-
-
 @dc.dataclass
 class Mounting:
     """Displacements of knife and food, in balance with the mean force of each exchange.
@@ -25,7 +21,7 @@ class Mounting:
     the spring makes any scheme unstable that takes the force of the exchange before; a cut does, by
     friction on its flanks up to 1e6 N/m. So each exchange is computed until its force and the
     springs' agree: a quasi-Newton search for the displacements (rise of the knife, displacement of
-    the food along Cx), held between displacements known to be too small and too large.
+    the food along Cx); one alone is held between what is known to be too small and too large.
 
     Attributes:
         arm, holder: Compliances of knife (vertical) and food (along the edge), m/N.
@@ -100,14 +96,11 @@ class Mounting:
         if np.linalg.det(total) < 1e-3 * np.diag(total).prod():
             total = np.diag(np.diag(total))
         after = self.given + np.linalg.solve(total, excess)
-        for axis in np.flatnonzero(gives):
-            if high[axis] - low[axis] < SAME:
-                # The other axis has moved what is too small and too large for this one.
-                low[axis], high[axis] = -np.inf, np.inf
+        if not gives.all():
+            # Where both give, each moves what is too small or too large for the other.
+            axis = int(gives.argmax())
             if not low[axis] < after[axis] < high[axis]:
                 after[axis] = 0.5 * (low[axis] + high[axis])
-            if not np.isfinite(after[axis]):
-                after[axis] = self.given[axis] + excess[axis] / total[axis, axis]
         self.given = after
         return False
 
