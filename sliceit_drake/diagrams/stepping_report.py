@@ -176,6 +176,7 @@ def plot_stepping(results: Sequence[StepResult], costs: Sequence[StepCost], file
     """Draws the error over the cost of a simulated second, a panel for each food, scaled masses."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter
 
     cost = {(c.food, c.time_step): c.seconds for c in costs}
     foods = list(dict.fromkeys(r.case.food.name for r in results))
@@ -204,7 +205,7 @@ def plot_stepping(results: Sequence[StepResult], costs: Sequence[StepCost], file
             axes.plot([], [], line, marker=marker, color=colour, label=label)
         axes.axhline(2.0, color="0.3", lw=1.0, ls=":")
         axes.text(0.02, 2.1, "2 %", transform=axes.get_yaxis_transform(), fontsize=8)
-        for step in sorted({r.time_step for r in of_food}):
+        for step in sorted({r.time_step for r in of_food if r.rms_error > 0.0}):
             axes.annotate(
                 f"{step:g} s",
                 (cost[food, step], 0.0),
@@ -218,6 +219,8 @@ def plot_stepping(results: Sequence[StepResult], costs: Sequence[StepCost], file
                 color="0.35",
             )
         axes.set_title(food)
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.set_ylim(bottom=1e-3)
         axes.set_xlabel("wall time per simulated second [s]")
         axes.grid(alpha=0.25, which="major")
     panels[0].set_ylabel("RMS error of the force [%]")
