@@ -64,7 +64,13 @@ def cut(effects: Effects | None = None, precision: str = "float64") -> CuttingMo
     """A coarse cucumber; its bonds part ahead of the edge, so that damage is spent by both."""
     food = Food(
         shape=Cylinder(rings=2, layers=[0.0, 4e-3, 12e-3]),
-        material=Material(friction=0.1, static_friction=0.2, strength=1e5, damping_time=1e-5),
+        material=Material(
+            friction=0.1,
+            static_friction=0.2,
+            stribeck_velocity=0.1,
+            strength=1e5,
+            damping_time=1e-5,
+        ),
         effects=effects or Effects(),
     )
     return make_food_model(food, Knife(), Numerics(precision=precision))

@@ -22,9 +22,16 @@ from sliceit_drake.diagrams.live_view import (
 )
 from sliceit_drake.diagrams.run import Run, make_meshcat, prepare_run, simulate
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
+from sliceit_drake.diagrams.station import FRAMES_PER_SECOND, REPLAY_SIZE, MakeSlicingStation
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.cutting_system import CuttingSystem
-from sliceit_drake.systems.food_visualizer import FLESH, INTACT, SKIN, damage_colours
+from sliceit_drake.systems.food_visualizer import (
+    FLESH,
+    INTACT,
+    SKIN,
+    damage_colours,
+    frame_size,
+)
 from sliceit_drake.systems.frame_visualizer import FrameVisualizer
 from sliceit_drake.systems.wrench_visualizer import ArrowScale, WrenchVisualizer, arrow_rotation
 
@@ -219,6 +226,18 @@ def test_each_half_is_drawn_with_its_damage_and_skin_colours():
     # Live, only the newest frame of each half is seen.
     assert fake.properties["/drake/food/plus/frame_0005", "visible"] is False
     assert ("/drake/food/plus/frame_0006", "visible") not in fake.properties
+
+
+def test_a_long_run_is_drawn_with_fewer_frames_in_about_as_many_bytes():
+    scenario = fast_slice()
+    stations = {}
+    for hold in (0.1, 100.0, 200.0):
+        scenario.motion = MotionPlan([Hold(hold)])
+        stations[hold] = MakeSlicingStation(scenario)
+    assert stations[0.1].frame_period == 1.0 / FRAMES_PER_SECOND
+    size = frame_size(stations[0.1].cutting)
+    for hold in (100.0, 200.0):
+        assert 0.5 * REPLAY_SIZE < size * hold / stations[hold].frame_period < REPLAY_SIZE
 
 
 def test_halves_are_all_of_the_surface():

@@ -14,12 +14,16 @@ DEFAULT = "scenarios/cucumber.yaml"
 
 def add_scenario_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds SCENARIO and --set."""
+    from sliceit_drake.resources import resource_path
+
+    shipped = ", ".join(sorted(file.stem for file in resource_path("scenarios").glob("*.yaml")))
     parser.add_argument(
         "scenario",
         nargs="?",
         default=DEFAULT,
         metavar="SCENARIO",
-        help=f"YAML file, or the path of one that ships with the package (default: {DEFAULT})",
+        help=f"YAML file, or one that ships with the package, as {DEFAULT} (the default); there "
+        f"are {shipped}",
     )
     parser.add_argument(
         "--set",

@@ -12,7 +12,7 @@ from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Motion
 from sliceit_drake.cutting.simulate import KnifePath, board_wrenches
-from sliceit_drake.cutting.solver import NOT_FINITE, run_exchanges
+from sliceit_drake.cutting.solver import NOT_FINITE, Exchanges, run_exchanges
 from sliceit_drake.cutting.workspace import Workspace
 
 __all__ = ["BatchSlice", "simulate_batch"]
@@ -70,7 +70,7 @@ def simulate_batch(
         raise ValueError(f"{len(models)} models and {len(motions)} motions")
     groups: dict[tuple, list[int]] = {}
     for c, model in enumerate(models):
-        key = (id(model.split), len(model.relaxing), *dc.astuple(model.numerics))
+        key = (id(model.split), model.layout, *dc.astuple(model.numerics))
         groups.setdefault(key, []).append(c)
     results: list[BatchSlice | None] = [None] * len(models)
     done = 0
@@ -111,7 +111,7 @@ class _Runner:
         ws = self._workspaces.get(exchanges)
         if ws is None:
             ws = self._workspaces[exchanges] = Workspace(models, self._period, exchanges)
-        elif ws.models != tuple(models):
+        elif any(old is not new for old, new in zip(ws.models, models, strict=True)):
             ws.set_models(models)
         return ws
 
@@ -129,13 +129,27 @@ class _Runner:
             # A knife whose motion is over rests at its end.
             ends = [np.minimum(np.arange(k, k + block + 1), path.exchanges) for path in paths]
             R = np.array([path.R_CK[e] for path, e in zip(paths, ends, strict=True)])
-            p = np.array([path.p_CK[e] for path, e in zip(paths, ends, strict=True)])
-            steps = run_exchanges(self._workspace(models, block), states, R, p)
-            for c, step in enumerate(steps):
+            ws = self._workspace(models, block)
+            steps: dict[int, Exchanges] = {}
+            unbalanced = list(range(len(models)))
+            while unbalanced:
+                p = np.array([path.p_CK[e] for path, e in zip(paths, ends, strict=True)])
+                tried = run_exchanges(ws, states, R, p)
+                steps |= {c: tried[c] for c in unbalanced}
+                unbalanced = [
+                    c
+                    for c in unbalanced
+                    if not paths[c].balanced(
+                        k + block, tried[c].wrenches[-1].sum(0)[3:], self._board
+                    )
+                ]
+            for c, step in steps.items():
                 states[c] = step.state
                 wrenches[c, k : k + block] = step.wrenches.sum(1)
+                # Limits on forces can hide a state that is not finite.
+                if not np.isfinite(step.state).all():
+                    wrenches[c, k : k + block] = np.nan
                 cut[c, k : k + block] = step.cut
-                paths[c].give(k + block, step.wrenches[-1].sum(0)[3:], self._board)
             k += block
             if not np.isfinite(wrenches[:, k - 1]).any():
                 break

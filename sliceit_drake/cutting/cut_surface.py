@@ -27,8 +27,8 @@ class EdgeTables:
         width: T_i on the grid [P, G], metres.
         fraction: Cut fraction on the grid [P, G]: the integral of T_i up to s over A_i.
         rise: Height of the centroid of the part that is cut above the point [P, G], metres.
-        outline: The same as `width` for the section's outline instead of its area: length of
-            outline per height that the point carries [P, G].
+        outline: Length of the section's outline that the point carries, up to a grid point: of the
+            upper outline and of the lower [2, P, G], metres.
         area: Areas A_i [P], m^2.
     """
 
@@ -43,6 +43,19 @@ class EdgeTables:
     def spacing(self) -> float:
         """Grid spacing, metres."""
         return 2.0 * self.reach / (self.width.shape[1] - 1)
+
+    def skin(self, thickness: float) -> np.ndarray:
+        """Length of a skin per height that each point carries, as `width` [P, G].
+
+        Each piece of the outline counts over `thickness` of depth below (the upper) or above (the
+        lower outline) it: a level one would else ask for all of its work at once.
+        """
+        grid = np.linspace(-self.reach, self.reach, self.width.shape[1])
+        upper, lower = (
+            np.array([np.interp(grid + shift, grid, row) for row in rows])
+            for rows, shift in zip(self.outline, (-thickness, thickness), strict=True)
+        )
+        return np.asarray(self.outline[0] - upper + lower - self.outline[1]) / thickness
 
 
 def edge_tables(
@@ -103,10 +116,12 @@ def edge_tables(
 
 
 def outline(triangles: np.ndarray) -> np.ndarray:
-    """Edges of the section's outline, as pairs of points [E, 2]."""
-    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    unique, count = np.unique(edges, axis=0, return_counts=True)
-    return unique[count == 1]
+    """Edges of the section's outline, as pairs of points, and the point inside of each [E, 3]."""
+    corners = triangles[:, [[0, 1, 2], [1, 2, 0], [2, 0, 1]]].reshape(-1, 3)
+    edges = np.sort(corners[:, :2], axis=1)
+    _, first, count = np.unique(edges, axis=0, return_index=True, return_counts=True)
+    once = first[count == 1]
+    return np.column_stack([edges[once], corners[once, 2]])
 
 
 def depth_below(points: np.ndarray, triangles: np.ndarray, positions: np.ndarray) -> np.ndarray:
@@ -130,26 +145,25 @@ def distance_inside(points: np.ndarray, triangles: np.ndarray, positions: np.nda
 
 
 def _outline_tables(points: np.ndarray, triangles: np.ndarray, grid_s: np.ndarray) -> np.ndarray:
-    """Length of outline per height that each point carries, on the grid [P, G].
-
-    Short pieces of the outline are shared between the two grid points beside them, so that the
-    integral of a row is the length that belongs to the point.
-    """
-    spacing = grid_s[1] - grid_s[0]
+    """Length of outline that each point carries up to the grid points [2, P, G]: upper, lower."""
     edges = outline(triangles)
+    along = points[edges[:, 1]] - points[edges[:, 0]]
+    inwards = points[edges[:, 2]] - points[edges[:, 0]]
+    # Height of the point inside over the edge's line, times the edge's run along x.
+    side = inwards[:, 1] * along[:, 0] - inwards[:, 0] * along[:, 1]
+    below = side * along[:, 0] <= 0.0
     pieces = 256
     w = (np.arange(pieces) + 0.5) / pieces
     a, b = points[edges[:, 0]], points[edges[:, 1]]
     height = a[:, 1, None] + w * (b - a)[:, 1, None]
     length = np.broadcast_to(np.linalg.norm(b - a, axis=1)[:, None] / pieces, height.shape)
-    table = np.zeros((len(points), len(grid_s)))
+    table = np.zeros((2, len(points), len(grid_s) + 1))
+    part = np.broadcast_to(np.where(below, 0, 1)[:, None], height.shape)
     for end, share in ((0, 1.0 - w), (1, w)):
         node = np.broadcast_to(edges[:, end, None], height.shape)
-        u = (points[edges[:, end], 1][:, None] - height - grid_s[0]) / spacing
-        k = np.clip(np.floor(u).astype(int), 0, len(grid_s) - 2)
-        np.add.at(table, (node, k), share * length * (1.0 - (u - k)) / spacing)
-        np.add.at(table, (node, k + 1), share * length * (u - k) / spacing)
-    return table
+        s = points[edges[:, end], 1][:, None] - height
+        np.add.at(table, (part, node, np.searchsorted(grid_s, s - 1e-12)), share * length)
+    return np.cumsum(table, axis=2)[..., :-1]
 
 
 def _integral(values: np.ndarray, spacing: float) -> np.ndarray:

@@ -25,7 +25,10 @@ __all__ = [
 
 @dc.dataclass
 class ToughnessRate:
-    """Toughness that grows with the speed v of the edge: R (v / reference_speed)^exponent."""
+    """Toughness that goes with the speed v of the edge: R (v / reference_speed)^exponent.
+
+    v is not taken below a thousandth of the reference: an edge at rest has a force left.
+    """
 
     exponent: float = quantity(0.0, "", low=-1.0, high=1.0, doc="0 for none.")
     reference_speed: float = quantity(
@@ -74,6 +77,9 @@ class Skin:
     toughness: float = quantity(
         0.0, "J/m", low=0.0, high=100.0, doc="Energy per length of skin: its toughness x thickness."
     )
+    thickness: float = quantity(
+        3e-4, "m", low=5e-5, high=5e-3, doc="Depth over which a level skin is cut."
+    )
 
 
 @dc.dataclass
@@ -84,7 +90,7 @@ class Core:
         5e-3, "m", low=0.0, high=0.1, doc="Distance from the outside at which the core begins."
     )
     transition: float = quantity(1e-3, "m", low=1e-5, high=0.05, doc="Width of the transition.")
-    toughness_ratio: float = quantity(1.0, "", low=0.0, high=10.0, doc="Core over rind.")
+    toughness_ratio: float = quantity(1.0, "", low=0.01, high=10.0, doc="Core over rind.")
     stiffness_ratio: float = quantity(1.0, "", low=0.01, high=10.0, doc="Core over rind.")
 
     def share(self, distance: np.ndarray) -> np.ndarray:
@@ -95,9 +101,9 @@ class Core:
 
 @dc.dataclass
 class Bluntness:
-    """A blunt edge needs more to begin a cut: an excess over R that decays with depth.
+    """A blunt edge needs more to begin a cut: an excess over R that decays with the edge's depth.
 
-    After n slices the excess is `initiation` + `dulling` n^`dulling_exponent`.
+    After n slices the excess at the surface is `initiation` + `dulling` n^`dulling_exponent`.
     """
 
     initiation: float = quantity(
@@ -110,17 +116,24 @@ class Bluntness:
     dulling_exponent: float = quantity(1.0, "", low=0.1, high=3.0, doc="Of the slice number.")
     slices: int = quantity(0, "", low=0, high=100000, doc="Slices cut since sharpening.")
 
+    @property
+    def grown(self) -> float:
+        """Excess at the surface by now, J/m^2."""
+        return self.initiation + self.dulling * float(self.slices) ** self.dulling_exponent
+
     def excess(self, depth: np.ndarray) -> np.ndarray:
         """Excess over R at depths below the outside, J/m^2."""
-        grown = self.dulling * float(self.slices) ** self.dulling_exponent
-        return (self.initiation + grown) * np.exp(-np.asarray(depth) / self.depth)
+        return self.grown * np.exp(-np.asarray(depth) / self.depth)
 
 
 @dc.dataclass
 class Adhesion:
-    """Shear of food that sticks to the flanks, with or without pressure between them."""
+    """Shear of food that sticks to the flanks where it touches them, however light the pressure.
 
-    stress: float = quantity(0.0, "Pa", low=0.0, high=1e6, doc="At any speed, where in contact.")
+    It holds like friction up to `stress`, then slides; `viscosity` adds to it while it slides.
+    """
+
+    stress: float = quantity(0.0, "Pa", low=0.0, high=1e6, doc="Shear at which it slides.")
     viscosity: float = quantity(0.0, "Pa s/m", low=0.0, high=1e7, doc="Stress per sliding speed.")
 
 

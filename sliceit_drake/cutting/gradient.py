@@ -6,6 +6,7 @@ reverse by the kernels' adjoints. Memory is that of one exchange and of one stat
 """
 
 import dataclasses as dc
+import typing
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import warp as wp
 
 from sliceit_drake.cutting.kernel_types import PARAMETERS
 from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.cutting.mounting import Mounting
 from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError, knife_wrenches
 from sliceit_drake.cutting.workspace import DIRECT, Workspace, interpolate_motion
 
@@ -63,6 +65,16 @@ class SliceRun:
     p: np.ndarray
 
 
+class _Back(typing.NamedTuple):
+    """Adjoints of the state before an exchange, of Ko's positions and the knife's rotations at its
+    ends [2, 3] and [2, 3, 3], and of what the kernels read."""
+
+    state: np.ndarray
+    p: np.ndarray
+    R: np.ndarray
+    row: np.ndarray
+
+
 class SliceAdjoint:
     """Forces of slices on prescribed motions, and their gradients.
 
@@ -101,23 +113,28 @@ class SliceAdjoint:
             CuttingError: A force is not finite.
             ValueError: The food may slip, which has no gradient.
         """
+        _give(model or self.model)
         ws, n = self._w, self._w.substeps
         model = model or self.model
         ws.set_models([model])
-        give = _give(model)
+        mounting = Mounting.of(model.effects, tolerance=1e-12)
         state = ws.initial_state() if state is None else np.asarray(state, ws.dtype)
         count = len(p) - 1
         run = SliceRun(model, np.empty((count, 6)), [state], np.array(R), np.array(p))
         for e in range(count):
-            if e > 0:
-                run.p[e + 1] += give * run.wrenches[e - 1, 3:]
-            ws.advance(run.states[e][None], self._motion(run, e))
-            total, buried = ws.sum("total", 2)[0, 0], ws.sum("buried", 2)[0, 0]
-            if not np.isfinite(total).all():
-                raise CuttingError(f"at {(e + 1) * self.exchange_period:.4g} s {NOT_FINITE}")
-            blade = ws.sum("blade_sums")[0, 0]
-            parts = knife_wrenches(total, blade, buried, run.R[e + 1], n)
-            run.wrenches[e] = parts.sum(0)
+            balanced = False
+            while not balanced:
+                rise, shift = mounting.given.tolist()
+                run.p[e + 1] = p[e + 1] + [-shift, 0.0, rise]
+                ws.advance(run.states[e][None], self._motion(run, e))
+                total, buried = ws.sum("total", 2)[0, 0], ws.sum("buried", 2)[0, 0]
+                if not np.isfinite(total).all():
+                    raise CuttingError(f"at {(e + 1) * self.exchange_period:.4g} s {NOT_FINITE}")
+                blade = ws.sum("blade_sums")[0, 0]
+                parts = knife_wrenches(total, blade, buried, run.R[e + 1], n)
+                run.wrenches[e] = parts.sum(0)
+                draw, _, rise = (-run.wrenches[e, 3:]).tolist()
+                balanced = mounting.rigid or mounting.balanced(-rise, draw, 0.0, None)
             run.states.append(ws.read(ws.states[-1])[0].copy())
         return run
 
@@ -132,43 +149,68 @@ class SliceAdjoint:
             run: What `run` returned.
             weights: Adjoints of the wrenches [E, 6].
         """
-        ws, n, T = self._w, self._w.substeps, self.exchange_period
+        ws, count, give = self._w, len(run.wrenches), _give(run.model)
         ws.set_models([run.model])
-        count, give = len(run.wrenches), _give(run.model)
-        ws.parameters.grad.zero_()
-        self._adj_mu.zero_()
-        self._adj_lam.zero_()
-        adj_state = np.zeros(ws.state_size)
+        adj_state, row = np.zeros(ws.state_size), np.zeros(ws.parameters.shape[1])
         adj_p, adj_R = np.zeros_like(run.p), np.zeros_like(run.R)
-        share = np.arange(1, n + 1) / n
-        of_give = np.zeros(3)
-        weights = np.array(weights, float)
+        of_give, axes = np.zeros(3), np.flatnonzero(give)
         for e in reversed(range(count)):
-            if e + 2 <= count:
-                weights[e, 3:] += give * adj_p[e + 2]
-                of_give += run.wrenches[e, 3:] * adj_p[e + 2]
             ws.advance(run.states[e][None], self._motion(run, e))
-            adj_sums, adj_y = self._adjoint_of_sums(weights[e], run.R[e + 1])
-            adj_R[e + 1, :, 1] += adj_y
-            self._capture_backward()
-            ws.write(ws.states[-1].grad, adj_state[None])
-            ws.write(ws.sums.grad, adj_sums[None])
-            wp.capture_launch(self._backward)
-            adj_state = ws.read(ws.states[0].grad)[0].astype(np.float64)
-            motion = ws.read(ws.motion.grad)[0].astype(np.float64)
-            by = {name: motion[where].reshape(n, -1) for name, where in ws.motion_layout.items()}
-            of_velocity = by["v_CK"].sum(0) / T
-            adj_p[e + 1] += share @ by["p_CK"] + of_velocity
-            adj_p[e] += (1.0 - share) @ by["p_CK"] - of_velocity
-            a, b, c = by["w_CK"].sum(0) * (0.5 / T)
-            of_turn = np.array([[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]])
-            adj_R[e + 1] += (share @ by["R_CK"]).reshape(3, 3) + of_turn @ run.R[e]
-            adj_R[e] += ((1.0 - share) @ by["R_CK"]).reshape(3, 3) + of_turn.T @ run.R[e + 1]
+            back = self._adjoint_of_exchange(run, e, weights[e], adj_state)
+            if len(axes):
+                # Ko's position p holds the force F(p) that it gives: p = command + give F(p). With
+                # b the adjoint of p at constant give F, that of the command is b + (dF/dp)' give
+                # times itself.
+                force = np.zeros((len(axes), 6))
+                force[np.arange(len(axes)), 3 + axes] = 1.0
+                slopes = [self._adjoint_of_exchange(run, e, w, 0.0 * adj_state) for w in force]
+                b = (adj_p[e + 1] + back.p[1])[axes]
+                dF = np.array([slope.p[1, axes] for slope in slopes])
+                command = np.linalg.solve(np.eye(len(axes)) - dF.T * give[axes], b)
+                of_give[axes] += run.wrenches[e, 3 + axes] * command
+                for slope, share in zip(slopes, give[axes] * command, strict=True):
+                    back = _Back(*(a + share * c for a, c in zip(back, slope, strict=True)))
+            adj_state = back.state
+            adj_p[e : e + 2] += back.p
+            adj_R[e : e + 2] += back.R
+            row += back.row
+        return SliceGradient(row, adj_p, adj_R, adj_state, of_give[[2, 0]], ws.parameter_layout)
+
+    def _adjoint_of_exchange(
+        self, run: SliceRun, e: int, weights: np.ndarray, adj_state: np.ndarray
+    ) -> "_Back":
+        """Back through exchange e, whose sub-steps the workspace holds.
+
+        Args:
+            run: The slice.
+            e: The exchange.
+            weights: Adjoint of its wrench [6].
+            adj_state: Of the state at its end.
+        """
+        ws, n, T = self._w, self._w.substeps, self.exchange_period
+        share = np.arange(1, n + 1) / n
+        adj_p, adj_R = np.zeros((2, 3)), np.zeros((2, 3, 3))
+        adj_sums, adj_R[1, :, 1] = self._adjoint_of_sums(weights, run.R[e + 1])
+        self._capture_backward()
+        for array in (ws.parameters.grad, self._adj_mu, self._adj_lam):
+            array.zero_()
+        ws.write(ws.states[-1].grad, adj_state[None])
+        ws.write(ws.sums.grad, adj_sums[None])
+        wp.capture_launch(self._backward)
+        motion = ws.read(ws.motion.grad)[0].astype(np.float64)
+        by = {name: motion[where].reshape(n, -1) for name, where in ws.motion_layout.items()}
+        of_velocity = by["v_CK"].sum(0) / T
+        adj_p[1] = share @ by["p_CK"] + of_velocity
+        adj_p[0] = (1.0 - share) @ by["p_CK"] - of_velocity
+        a, b, c = by["w_CK"].sum(0) * (0.5 / T)
+        of_turn = np.array([[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]])
+        adj_R[1] += (share @ by["R_CK"]).reshape(3, 3) + of_turn @ run.R[e]
+        adj_R[0] = ((1.0 - share) @ by["R_CK"]).reshape(3, 3) + of_turn.T @ run.R[e + 1]
         row = ws.read(ws.parameters.grad)[0].astype(np.float64)
         scalars = ws.parameter_layout["P"].start
         for name, adjoint in (("mu", self._adj_mu), ("lam", self._adj_lam)):
             row[scalars + PARAMETERS.index(name)] += adjoint.numpy().astype(np.float64).sum()
-        return SliceGradient(row, adj_p, adj_R, adj_state, of_give[[2, 0]], ws.parameter_layout)
+        return _Back(ws.read(ws.states[0].grad)[0].astype(np.float64), adj_p, adj_R, row)
 
     def _adjoint_of_sums(self, weights: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Adjoint of `knife_wrenches`: of the sums as the workspace holds them, and of Ky."""

@@ -38,6 +38,8 @@ PARAMETERS = (
     "skin_toughness",
     "adhesion",
     "flank_viscosity",
+    "initiation",
+    "initiation_depth",
 )
 """Scalars of a cut that the kernels read, in the order of their array."""
 

@@ -89,7 +89,7 @@ class CuttingModel(CutGeometry):
         true_mass, mass: Lumped true mass and the mass that is stepped [N], kg.
         weight: Gravity force on each node [N, 3], N, by the true mass.
         toughness: Surface energy of each cut point [P], J/m^2.
-        excess: Further work of the edge there [P], J/m^2.
+        outline: Length of skin per height that the edge cuts, as `EdgeTables.width` [P, G].
         unloading: Slope of the edge's force when it retreats [P], N/m.
         element_volume: Stiff volume of the elements times their modulus over the material's [T].
         relaxing: Shares of the modulus that relax [M].
@@ -108,7 +108,7 @@ class CuttingModel(CutGeometry):
     mass: np.ndarray
     weight: np.ndarray
     toughness: np.ndarray
-    excess: np.ndarray
+    outline: np.ndarray
     unloading: np.ndarray
     element_volume: np.ndarray
     relaxing: np.ndarray
@@ -120,6 +120,15 @@ class CuttingModel(CutGeometry):
     def mass_ratio(self) -> float:
         """Stepped over true mass of the moving nodes."""
         return float(self.mass[self.moving].sum() / self.true_mass[self.moving].sum())
+
+    @property
+    def layout(self) -> tuple[int, float]:
+        """What cuts that share device arrays have in common: relaxation times, skin's thickness."""
+        return len(self.relaxing), self.effects.skin.thickness
+
+    def edge_forces(self) -> np.ndarray:
+        """Greatest force of the edge at each cut point on the grid of its tables [P, G], N."""
+        return _edge_forces(self, self.effects, self.toughness, self.outline)
 
     def derive(self, **changes: Any) -> Self:
         """The same cut with another material, effects, knife, numerics or point_scales.
@@ -201,17 +210,18 @@ def _derived(
     inside = core.share(g.point_distance)
     toughness = material.toughness * point_scales.toughness
     toughness = toughness * (1.0 + (core.toughness_ratio - 1.0) * inside)
-    excess = effects.bluntness.excess(g.point_depth)
     inside = core.share(g.element_distance)
     element_volume = g.stiff_volume * (1.0 + (core.stiffness_ratio - 1.0) * inside)
 
     scale = material.youngs_modulus / g.element_size
     # Never flatter than the rise of the force on the way in: a retreat must not gain anything.
-    force = (toughness + excess)[:, None] * tables.width + effects.skin.toughness * tables.outline
+    outline = tables.skin(effects.skin.thickness)
+    force = _edge_forces(g, effects, toughness, outline)
     steepest = (np.diff(force, axis=1) / tables.spacing).max(1)
     unloading = np.maximum(force.max(1) / numerics.unloading_length, steepest)
     bond = numerics.bond_stiffness * scale
-    strength = min(material.strength, 0.5 * np.sqrt(2.0 * max(material.toughness, 1e-12) * bond))
+    weakest = max(material.toughness * min(1.0, core.toughness_ratio), 1e-12)
+    strength = min(material.strength, 0.5 * np.sqrt(2.0 * weakest * bond))
     mu, lam = material.stable_neo_hookean()
     parameters = dict.fromkeys(PARAMETERS, 0.0) | {
         "mu": mu,
@@ -236,6 +246,8 @@ def _derived(
         "skin_toughness": effects.skin.toughness,
         "adhesion": effects.adhesion.stress,
         "flank_viscosity": effects.adhesion.viscosity,
+        "initiation": effects.bluntness.grown,
+        "initiation_depth": effects.bluntness.depth,
     }
 
     flank = parameters["flank_stiffness"] * point_scales.flank_stiffness
@@ -276,7 +288,7 @@ def _derived(
         "mass": mass,
         "weight": weight,
         "toughness": toughness,
-        "excess": excess,
+        "outline": outline,
         "unloading": unloading,
         "element_volume": element_volume,
         "relaxing": np.array(effects.relaxation.shares, float),
@@ -284,6 +296,17 @@ def _derived(
         "parameters": parameters,
         "critical_time_step": critical,
     }
+
+
+def _edge_forces(
+    geometry: CutGeometry, effects: Effects, toughness: np.ndarray, outline: np.ndarray
+) -> np.ndarray:
+    """See `CuttingModel.edge_forces`; pressing, at the speed of reference."""
+    tables = geometry.tables
+    grid = np.linspace(-tables.reach, tables.reach, tables.width.shape[1])
+    below = np.maximum(geometry.point_depth[:, None] + grid, 0.0)
+    work = toughness[:, None] + effects.bluntness.excess(below)
+    return np.asarray(work * tables.width + effects.skin.toughness * outline)
 
 
 def _largest_step(mass: np.ndarray, stiff: np.ndarray, viscous: np.ndarray) -> np.ndarray:

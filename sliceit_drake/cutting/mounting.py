@@ -9,15 +9,26 @@ from sliceit_drake.cutting.effects import Effects
 
 __all__ = ["Mounting"]
 
+ATTEMPTS = 40
+"""Most evaluations of an exchange; what is left is made up for by the next, which starts anew."""
+
 
 @dc.dataclass
 class Mounting:
-    """Displacements of knife and food by the force between them, one exchange late.
+    """Displacements of knife and food, in balance with the mean force of each exchange.
+
+    Arm and holder are springs without mass. A force that answers a displacement more stiffly than
+    the spring makes any scheme unstable that takes the force of the exchange before; a cut does, by
+    friction on its flanks up to 1e6 N/m. So each exchange is computed until its force and the
+    springs' agree: a quasi-Newton search for the displacements (rise of the knife, displacement of
+    the food along Cx); one alone is held between what is known to be too small and too large.
 
     Attributes:
         arm, holder: Compliances of knife (vertical) and food (along the edge), m/N.
         resistance: Force along the edge at which the food slips, N; None for never.
         remaining: Share of the resistance that is left while it slips.
+        tolerance: Of the balance of forces, relative to 1 N and the force.
+        given: Rise of the knife and displacement of the food, metres [2].
         slipped: How far the food has slipped along Cx, metres.
         slipping: Whether it slips.
     """
@@ -26,42 +37,102 @@ class Mounting:
     holder: float
     resistance: float | None
     remaining: float
+    tolerance: float = 1e-4
+    given: np.ndarray = dc.field(default_factory=lambda: np.zeros(2))
     slipped: float = 0.0
     slipping: bool = False
+    _slope: np.ndarray = dc.field(default_factory=lambda: np.zeros((2, 2)))
+    _tried: tuple[np.ndarray, np.ndarray] | None = None
+    _between: np.ndarray = dc.field(default_factory=lambda: np.array([[-np.inf] * 2, [np.inf] * 2]))
+    _attempts: int = 0
 
     @classmethod
-    def of(cls, effects: Effects) -> "Mounting":
+    def of(cls, effects: Effects, tolerance: float = 1e-4) -> "Mounting":
         """The mounting of a cut at its start."""
         slip, compliance = effects.slip, effects.compliance
-        return cls(compliance.arm, compliance.holder, slip.resistance, slip.remaining)
+        return cls(
+            compliance.arm, compliance.holder, slip.resistance, slip.remaining, tolerance=tolerance
+        )
 
     @property
     def rigid(self) -> bool:
         """Whether nothing gives."""
         return self.arm == 0.0 and self.holder == 0.0
 
-    def advance(self, force: np.ndarray) -> None:
-        """Lets the food slip under the force of the food on the knife [3], N, in C."""
-        if self.resistance is None:
-            return
-        draw = -float(force[0])
-        held = self.remaining * self.resistance
-        self.slipping = abs(draw) > (held if self.slipping else self.resistance)
-        if self.slipping:
-            # The holder's spring gives up what it carried beyond the rest.
-            self.slipped += self.holder * (draw - np.sign(draw) * held)
+    def balanced(self, rise: float, draw: float, height: float, board: Board | None) -> bool:
+        """Whether the springs hold the forces that an exchange with `given` has answered.
 
-    def knife(self, command: np.ndarray, force: np.ndarray, board: Board | None) -> np.ndarray:
-        """Position of Ko [3], in frames with z up, when the food pushes the knife with `force`.
+        If not, `given` is the next try; if so, the food has slipped as it does, and `given` is what
+        the next exchange begins with.
 
-        The board's spring, much stiffer than the food's, is in balance with the arm's at once.
+        Args:
+            rise: Upward force of the food on the knife, N.
+            draw: Force of the knife on the food along Cx, N.
+            height: Of the knife without the arm's spring, z in F, metres.
+            board: Board under the knife, its height in F; None for none.
         """
-        height = command[2] + self.arm * float(force[2])
-        if board is not None and height < board.height:
-            stiffness = self.arm * board.stiffness
-            height = (height + stiffness * board.height) / (1.0 + stiffness)
-        return np.array([command[0], command[1], height])
+        force = np.array([rise, draw])
+        held, stiffness = self._held(height, board)
+        gives = np.array([self.arm > 0.0, self.holder > 0.0])
+        excess = np.where(gives, force - held, 0.0)
+        self._attempts += 1
+        small = self.tolerance * np.maximum(1.0, np.abs(force))
+        # Where the cut broke down there is nothing to balance.
+        over = self._attempts >= ATTEMPTS or not np.isfinite(force).all()
+        if over or (np.abs(excess) <= small).all():
+            self._settle()
+            return True
+        if self._tried is not None:
+            moved, change = self.given - self._tried[0], force - self._tried[1]
+            missed = np.where(gives, -change - self._slope @ moved, 0.0)
+            self._slope = self._slope + np.outer(missed, moved) / max(float(moved @ moved), 1e-30)
+            # A cut that gives way as it is pushed back is no slope to rely on.
+            np.fill_diagonal(self._slope, np.maximum(np.diag(self._slope), 0.0))
+        self._tried = self.given.copy(), force
+        low, high = self._between
+        low[excess > 0.0] = self.given[excess > 0.0]
+        high[excess < 0.0] = self.given[excess < 0.0]
+        total = self._slope + np.diag(stiffness)
+        if np.linalg.det(total) < 1e-3 * np.diag(total).prod():
+            total = np.diag(np.diag(total))
+        after = self.given + np.linalg.solve(total, excess)
+        if not gives.all():
+            # Where both give, each moves what is too small or too large for the other.
+            axis = int(gives.argmax())
+            if not low[axis] < after[axis] < high[axis]:
+                after[axis] = 0.5 * (low[axis] + high[axis])
+        self.given = after
+        return False
 
-    def food(self, force: np.ndarray) -> float:
-        """Displacement of the food along Cx under the force of the food on the knife, metres."""
-        return self.slipped - self.holder * float(force[0])
+    def _held(self, height: float, board: Board | None) -> tuple[np.ndarray, np.ndarray]:
+        """Forces that arm (with the board) and holder hold at `given`, and their slopes [2]."""
+        rise, shift = self.given.tolist()
+        held, stiffness = np.zeros(2), np.ones(2)
+        if self.arm > 0.0:
+            held[0], stiffness[0] = rise / self.arm, 1.0 / self.arm
+            if board is not None and height + rise < board.height:
+                held[0] -= board.stiffness * (board.height - height - rise)
+                stiffness[0] += board.stiffness
+        if self.holder > 0.0:
+            held[1], stiffness[1] = (shift - self.slipped) / self.holder, 1.0 / self.holder
+            if abs(held[1]) > self._limit():
+                held[1] = np.sign(held[1]) * self._limit()
+                # Not zero, so that the search has a slope where the cut has none.
+                stiffness[1] *= 1e-3
+        return held, stiffness
+
+    def _limit(self) -> float:
+        if self.resistance is None:
+            return np.inf
+        return self.resistance * (self.remaining if self.slipping else 1.0)
+
+    def _settle(self) -> None:
+        """Takes what was found: the food slips, or holds again."""
+        if self.holder > 0.0:
+            shift, limit = float(self.given[1]), self._limit()
+            pull = (shift - self.slipped) / self.holder
+            self.slipping = abs(pull) >= limit
+            if self.slipping:
+                self.slipped = shift - self.holder * float(np.sign(pull)) * limit
+        self._tried, self._attempts = None, 0
+        self._between = np.array([[-np.inf] * 2, [np.inf] * 2])

@@ -30,7 +30,7 @@ POINT_PARAMETERS = (
 """Parameters with a value for each cut point."""
 
 # How the cut is computed, not what is cut; a number of slices; an event.
-NUMERICAL = ("time_step", "stability_margin", "slices", "slip")
+NUMERICAL = ("time_step", "stability_margin", "slices", "slip", "thickness")
 COMPLIANCES = ("effects.compliance.arm", "effects.compliance.holder")
 
 
@@ -171,8 +171,7 @@ def _by_point(model: CuttingModel, gradient: SliceGradient, name: str) -> np.nda
     if kind == "toughness":
         by_scale = model.toughness / scales.toughness
         adjoint *= by_scale
-        force = (model.toughness + model.excess)[:, None] * model.tables.width
-        force = force + model.effects.skin.toughness * model.tables.outline
+        force = model.edge_forces()
         rise = np.diff(force, axis=1) / model.tables.spacing
         highest, steepest = force.argmax(1), rise.argmax(1)
         points = np.arange(len(force))

@@ -22,6 +22,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
     RATE_EXPONENT, REFERENCE_SPEED = t.RATE_EXPONENT, t.REFERENCE_SPEED
     SLICE_PUSH_EXPONENT, SKIN_TOUGHNESS = t.SLICE_PUSH_EXPONENT, t.SKIN_TOUGHNESS
     ADHESION, FLANK_VISCOSITY = t.ADHESION, t.FLANK_VISCOSITY
+    INITIATION, INITIATION_DEPTH = t.INITIATION, t.INITIATION_DEPTH
     # Without gradients, an effect that is off costs nothing; with them its derivative is wanted.
     ALL = wp.constant(gradients)
 
@@ -140,10 +141,10 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         fraction: wp.array2d(dtype=real),
         centroid: wp.array2d(dtype=real),
         outline: wp.array2d(dtype=real),
+        surface: wp.array(dtype=real),
         reach: real,
         per_spacing: real,
         toughness: wp.array2d(dtype=real),
-        excess: wp.array2d(dtype=real),
         flank_scale: wp.array2d(dtype=real),
         friction_scale: wp.array2d(dtype=real),
         unloading: wp.array2d(dtype=real),
@@ -260,12 +261,16 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         across = wp.max(wp.dot(d, knife_z), real(0.0))
         effect = across
         if ALL or P[cut, SLICE_PUSH_EXPONENT] != real(1.0):
-            exponent = real(2.0) * P[cut, SLICE_PUSH_EXPONENT] - real(1.0)
-            effect = wp.pow(wp.max(across, real(1.0e-3)), exponent)
+            # Nothing on the way out, where nothing is across, whatever the exponent.
+            exponent = real(2.0) * P[cut, SLICE_PUSH_EXPONENT] - real(2.0)
+            effect = across * wp.pow(wp.max(across, real(1.0e-3)), exponent)
         if ALL or P[cut, RATE_EXPONENT] != real(0.0):
             relative_speed = wp.max(speed / P[cut, REFERENCE_SPEED], real(1.0e-3))
             effect = effect * wp.pow(relative_speed, P[cut, RATE_EXPONENT])
-        resistance = (left + excess[cut, i]) * table(width, i, k1, w1)
+        if ALL or P[cut, INITIATION] > real(0.0):
+            below = wp.max(surface[i] + new_passed, real(0.0))
+            left = left + P[cut, INITIATION] * wp.exp(-below / P[cut, INITIATION_DEPTH])
+        resistance = left * table(width, i, k1, w1)
         if ALL or P[cut, SKIN_TOUGHNESS] > real(0.0):
             resistance = resistance + P[cut, SKIN_TOUGHNESS] * table(outline, i, k1, w1)
         spring = wp.max(unloading[cut, i], TINY)
@@ -364,10 +369,10 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         fraction: wp.array2d(dtype=real),
         centroid: wp.array2d(dtype=real),
         outline: wp.array2d(dtype=real),
+        surface: wp.array(dtype=real),
         reach: real,
         per_spacing: real,
         toughness: wp.array2d(dtype=real),
-        excess: wp.array2d(dtype=real),
         flank_scale: wp.array2d(dtype=real),
         friction_scale: wp.array2d(dtype=real),
         unloading: wp.array2d(dtype=real),
@@ -418,10 +423,10 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
             fraction,
             centroid,
             outline,
+            surface,
             reach,
             per_spacing,
             toughness,
-            excess,
             flank_scale,
             friction_scale,
             unloading,
@@ -462,10 +467,10 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         fraction: wp.array2d(dtype=real),
         centroid: wp.array2d(dtype=real),
         outline: wp.array2d(dtype=real),
+        surface: wp.array(dtype=real),
         reach: real,
         per_spacing: real,
         toughness: wp.array2d(dtype=real),
-        excess: wp.array2d(dtype=real),
         flank_scale: wp.array2d(dtype=real),
         friction_scale: wp.array2d(dtype=real),
         unloading: wp.array2d(dtype=real),
@@ -510,10 +515,10 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
                 fraction,
                 centroid,
                 outline,
+                surface,
                 reach,
                 per_spacing,
                 toughness,
-                excess,
                 flank_scale,
                 friction_scale,
                 unloading,

@@ -215,6 +215,7 @@ class KnifePath:
         poses = [motion.pose(k * period) for k in range(self.exchanges + 1)]
         self.R_FK = np.array([X_FK.R for X_FK in poses])
         self.p_FK = np.array([X_FK.p for X_FK in poses])
+        self._commands = self.p_FK.copy()
         self._model = model
         self.R_CK = model.X_FC_rotation.T @ self.R_FK
         self.p_CK = model.to_cut_frame(self.p_FK)
@@ -231,15 +232,23 @@ class KnifePath:
         steps = np.diff(self.p_FK[k : k + BLOCK + 1], axis=0)
         return BLOCK if float(np.linalg.norm(steps, axis=1).sum()) < CHECK_TRAVEL else 1
 
-    def give(self, k: int, force: np.ndarray, board: Board | None) -> None:
-        """Lets arm and holder give under the force on the knife [3], N, in C, after k exchanges."""
-        if self._mounting.rigid or k >= self.exchanges:
-            return
-        self._mounting.advance(force)
-        R_FC = self._model.X_FC_rotation
-        self.p_FK[k + 1] = self._mounting.knife(self.p_FK[k + 1], R_FC @ force, board)
-        self.p_CK[k + 1] = self._model.to_cut_frame(self.p_FK[k + 1])
-        self.p_CK[k + 1, 0] -= self._mounting.food(force)
+    def balanced(self, k: int, force: np.ndarray, board: Board | None) -> bool:
+        """Whether arm and holder hold the force on the knife [3], N, in C, of the k-th exchange.
+
+        If not, they have given, and the exchange that ends at the k-th pose is to be repeated.
+        """
+        if self._mounting.rigid or k > self.exchanges:
+            return True
+        rise = float((self._model.X_FC_rotation @ force)[2])
+        height = float(self._commands[k, 2])
+        done = self._mounting.balanced(rise, -float(force[0]), height, board)
+        at = k + 1 if done else k
+        if at <= self.exchanges:
+            rise, shift = self._mounting.given.tolist()
+            self.p_FK[at] = self._commands[at] + [0.0, 0.0, rise]
+            self.p_CK[at] = self._model.to_cut_frame(self.p_FK[at])
+            self.p_CK[at, 0] -= shift
+        return done
 
 
 def simulate_slice(
@@ -272,13 +281,15 @@ def simulate_slice(
         at, ends = slice(k, k + block), slice(k, k + block + 1)
         for m in range(k + 1, k + block + 1):
             check_in_plane(model, path.pose(m), m * T)
-        try:
-            step = solver.exchanges(state, path.R_CK[ends], path.p_CK[ends])
-        except CuttingError as error:
-            raise CuttingError(f"at {(k + 1) * T:.4g} s {error}") from error
+        balanced = False
+        while not balanced:
+            try:
+                step = solver.exchanges(state, path.R_CK[ends], path.p_CK[ends])
+            except CuttingError as error:
+                raise CuttingError(f"at {(k + 1) * T:.4g} s {error}") from error
+            balanced = path.balanced(k + block, step.wrenches[-1].sum(0)[3:], board)
         state = step.state
         ledger.add(step)
-        path.give(k + block, step.wrenches[-1].sum(0)[3:], board)
         parts = step.wrenches.reshape(block, 3, 2, 3) @ R_FC.T
         rows[at, 4:10] = parts.sum(1).reshape(block, 6)
         rows[at, 16:25] = parts[:, :, 1].reshape(block, 9)

@@ -14,9 +14,10 @@ from sliceit_drake.cutting.model import CuttingModel, TimeStepError
 __all__ = ["DIRECT", "Workspace", "interpolate_motion", "parameter_row"]
 
 DIRECT = threading.RLock()
-"""Held in a capture, which takes in the launches of all threads, and in launches outside of one."""
+"""Held while kernels are made, in a capture, which takes in the launches of all threads, and in
+launches outside of one."""
 
-PER_POINT = ("toughness", "excess", "flank_scale", "friction_scale", "unloading")
+PER_POINT = ("toughness", "flank_scale", "friction_scale", "unloading")
 """Parameters that each cut point has for itself, in the order of the kernels' arguments."""
 
 
@@ -57,7 +58,8 @@ class Workspace:
         single = model.numerics.precision == "float32"
         self.real: Any = wp.float32 if single else wp.float64
         self.dtype: Any = np.float32 if single else np.float64
-        self.kernels = kernels(self.real, gradients)
+        with DIRECT:
+            self.kernels = kernels(self.real, gradients)
         self.device = wp.get_device(model.numerics.device)
         self.model = model
         self._gradients = gradients
@@ -209,7 +211,8 @@ class Workspace:
             "width": (m.tables.width, real),
             "fraction": (m.tables.fraction, real),
             "centroid": (m.tables.rise, real),
-            "outline": (m.tables.outline, real),
+            "outline": (m.outline, real),
+            "surface": (m.point_depth, real),
         }
         for name, (values, dtype) in constants.items():
             self.w[name] = self._constant(values, dtype)
@@ -241,11 +244,10 @@ class Workspace:
         if len(models) != self.cuts:
             raise ValueError(f"{len(models)} models for {self.cuts} cuts")
         for model in models:
-            if model.split is not self.model.split or len(model.relaxing) != len(
-                self.model.relaxing
-            ):
+            if model.split is not self.model.split or model.layout != self.model.layout:
                 raise ValueError(
-                    "the cuts must be derived from one model and have as many relaxation times"
+                    "the cuts must be derived from one model and have as many relaxation times and "
+                    "the same thickness of skin"
                 )
         self.models = tuple(models)
         self.write(self.parameters, np.array([parameter_row(m) for m in models]))
@@ -315,7 +317,7 @@ class Workspace:
         history = ("passed", "parted", "edge_force", "heading", "slip")
         return (
             [now["x"], now["v"], w["point_nodes"], w["point_weights"]]
-            + [w[name] for name in ("area", "width", "fraction", "centroid", "outline")]
+            + [w[name] for name in ("area", "width", "fraction", "centroid", "outline", "surface")]
             + [self.real(tables.reach), self.real(1.0 / tables.spacing)]
             + [w[name] for name in PER_POINT]
             + [w["P"], w["knife"], k, k // self.substeps, dt]
@@ -470,7 +472,6 @@ def parameter_row(model: CuttingModel) -> np.ndarray:
             [model.parameters[name] for name in PARAMETERS],
             model.knife.parameters(),
             model.toughness,
-            model.excess,
             scales.flank_stiffness,
             scales.friction,
             model.unloading,

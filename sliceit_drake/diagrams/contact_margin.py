@@ -88,15 +88,17 @@ def check_contact_margin(station: SlicingStation) -> ContactMargin:
 
 
 def contact_margin(station: SlicingStation) -> ContactMargin:
-    """The margins of a station at its start posture, with the configured gains."""
+    """The margins of a station at its start posture, with the configured gains.
+
+    Of the foods of a sequence the one with the largest section counts.
+    """
     loop = ContactLoop(station)
     scenario = station.scenario
     R_WK = station.start_pose.rotation().matrix()
     board = loop.margin(board=board_stiffness(scenario.board, scenario.knife, R_WK))
     if not isinstance(station.cutting, CuttingSystem):
         return ContactMargin(None, board, ())
-    cutting = station.cutting
-    solver = cutting.solver(cutting.CreateDefaultContext())
+    solver = max(station.cutting.solvers, key=lambda each: each.model.section_area)
     turn = np.kron(np.eye(2), R_WK)
     responses = _bearable_response(solver, scenario.start.offset)
     if responses is None:

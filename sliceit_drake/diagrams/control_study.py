@@ -383,7 +383,7 @@ def check_table(checks: Sequence[Check]) -> str:
     for c in checks:
         lines.append(
             f"| {c.mode} | {1e3 * c.lag:g} | {c.gain:g} | {1e-3 * c.limit:.3g} | "
-            f"{c.stiffness / c.limit:.2g} | {np.log(c.growth) / 2e-3:+.3g} | "
+            f"{c.stiffness / c.limit:.3g} | {np.log(c.growth) / 2e-3:+.3g} | "
             f"{'yes' if c.agrees else 'NO'} |"
         )
     return "\n".join(lines)

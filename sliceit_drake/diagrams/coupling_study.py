@@ -88,7 +88,7 @@ def _compare(
     bins = np.arange(0.0, reference["time"][-1], BIN)
 
     def binned(source: Record, values: np.ndarray) -> np.ndarray:
-        # A row holds the mean over the exchange that ends at its time.
+        # A row holds what acted over the exchange that ends at its time.
         index = np.maximum(np.searchsorted(bins, source["time"] - 1e-9) - 1, 0)
         total = np.zeros((len(bins), values.shape[1]))
         np.add.at(total, index, values)

@@ -28,7 +28,7 @@ __all__ = [
     "effective_mass",
 ]
 
-# Above it a station is refused. The default board and step have 4.6 %, measured 2.2 to 3.8 %.
+# Above it a station is refused. The default board and step have 4.5 %, measured 2 to 4 %.
 PEAK_LOSS_LIMIT = 0.05
 
 STEEL_DENSITY = 7800.0

@@ -239,9 +239,10 @@ def _title(run: Run) -> str:
     speed = next((s for s in speeds if s), None)
     at = f" at {1e3 * speed:.3g} mm/s" if speed else ""
     if scenario.sequence is not None:
+        name = scenario.food.name if isinstance(scenario.food, Food) else scenario.name
         count, thickness = scenario.sequence.count, 1e3 * scenario.sequence.thickness
-        return f"A UR5e cuts {count} slices of {thickness:.3g} mm, {scenario.name}{at}"
-    return f"A UR5e slices {scenario.name}{at}"
+        return f"A UR5e cuts {count} slices of {thickness:.3g} mm of {name}{at}"
+    return f"A UR5e slices {scenario.name.replace('_', ' ')}{at}"
 
 
 def _caption(run: Run, comparison: Comparison | None, summary: dict) -> str:

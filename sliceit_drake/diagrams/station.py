@@ -1,5 +1,6 @@
 """The simulated slicing station: a Scenario becomes a Diagram."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -11,7 +12,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer
 
 from sliceit_drake.cutting.food import Food, make_food_model, start_pose
-from sliceit_drake.cutting.motion import MotionPlan
+from sliceit_drake.cutting.motion import Motion, MotionPlan, Pose
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.holder_arm import add_holding_arm
 from sliceit_drake.diagrams.knife_body import check_plant_step, effective_mass
@@ -31,7 +32,7 @@ from sliceit_drake.systems.analytic_cutter import AnalyticCutter, AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceController
 from sliceit_drake.systems.contact_monitor import ContactMonitor
 from sliceit_drake.systems.cutting_system import CuttingSystem
-from sliceit_drake.systems.food_visualizer import FoodVisualizer
+from sliceit_drake.systems.food_visualizer import FoodVisualizer, frame_size
 from sliceit_drake.systems.frame_visualizer import FrameVisualizer
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 from sliceit_drake.systems.knife_kinematics import BoardContact, KnifeKinematics
@@ -44,7 +45,11 @@ from sliceit_drake.systems.wrench_visualizer import WrenchVisualizer
 
 __all__ = ["MakeSlicingStation", "SlicingStation"]
 
-FRAMES_PER_SECOND = 32.0
+FRAMES_PER_SECOND = 32
+# A browser opens no more than 20 MB with ease: 3 MB are the arm, the rest is for frames. What is
+# drawn beside the food takes this much a frame.
+REPLAY_SIZE = 16e6
+SCENE_FRAME_SIZE = 4e3
 FINGER = 0.015
 """Half the breadth of the holding arm's fingers along the food, metres."""
 CAMERA_OFFSET = np.array([0.17, 0.23, 0.17])
@@ -65,6 +70,8 @@ class SlicingStation(Diagram):
         board_peak_loss: Estimated share of an impact's peak force on the board that the plant's
             steps take, see `check_plant_step`.
         meshcat: The viewer, or None.
+        frame_period: Time between the frames that are drawn, s: longer where the run's replay
+            would be too large.
     """
 
     def __init__(
@@ -193,6 +200,7 @@ class SlicingStation(Diagram):
         builder.ExportOutput(sensor.GetOutputPort("state"), "sensor_state")
         builder.ExportOutput(monitor.GetOutputPort("unstable_gains"), "unstable_gains")
 
+        self.frame_period = self._frame_period()
         self.visualizer: MeshcatVisualizer | None = None
         self.food_visualizer: FoodVisualizer | None = None
         if meshcat is not None:
@@ -203,15 +211,13 @@ class SlicingStation(Diagram):
     def _add_visualization(
         self, builder: DiagramBuilder, scene_graph: SceneGraph, meshcat: Meshcat
     ) -> None:
+        period = self.frame_period
         self.visualizer = MeshcatVisualizer.AddToBuilder(
-            builder,
-            scene_graph,
-            meshcat,
-            MeshcatVisualizerParams(publish_period=1.0 / FRAMES_PER_SECOND),
+            builder, scene_graph, meshcat, MeshcatVisualizerParams(publish_period=period)
         )
         if isinstance(self.cutting, CuttingSystem):
             self.food_visualizer = builder.AddNamedSystem(
-                "food_visualizer", FoodVisualizer(self.cutting, meshcat, 1.0 / FRAMES_PER_SECOND)
+                "food_visualizer", FoodVisualizer(self.cutting, meshcat, period)
             )
             for name in ("surface_vertices", "surface_damage", "food_index"):
                 builder.Connect(
@@ -220,18 +226,25 @@ class SlicingStation(Diagram):
         elif isinstance(self.cutting, SpringCutter):
             plates = builder.AddNamedSystem(
                 "spring_visualizer",
-                SpringVisualizer(
-                    self.cutting.food, self.scenario.X_WF(), meshcat, 1.0 / FRAMES_PER_SECOND
-                ),
+                SpringVisualizer(self.cutting.food, self.scenario.X_WF(), meshcat, period),
             )
             builder.Connect(
                 self.cutting.GetOutputPort("compression"), plates.GetInputPort("compression")
             )
         self._add_arrows_and_frames(builder, meshcat)
 
+    def _frame_period(self) -> float:
+        size = SCENE_FRAME_SIZE
+        if isinstance(self.cutting, CuttingSystem):
+            size += frame_size(self.cutting)
+        X_WK = self.start_pose
+        start = Pose(X_WK.rotation().matrix(), X_WK.translation())
+        frames = FRAMES_PER_SECOND * Motion(self.motion_plan, start).duration
+        return math.ceil(frames * size / REPLAY_SIZE) / FRAMES_PER_SECOND
+
     def _add_arrows_and_frames(self, builder: DiagramBuilder, meshcat: Meshcat) -> None:
         """Wrenches on knife and sensor as arrows; triads of W, B, F, S, K."""
-        period = 1.0 / FRAMES_PER_SECOND
+        period = self.frame_period
         knife, frame_S = self.robot.knife, self.robot.sensor_weld.frame_on_parent()
         # Rigid, so the same in any context.
         X_KS = frame_S.CalcPose(self.plant.CreateDefaultContext(), knife.body_frame())

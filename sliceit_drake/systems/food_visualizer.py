@@ -6,7 +6,7 @@ from pydrake.systems.framework import Context, EventStatus, LeafSystem
 
 from sliceit_drake.systems.cutting_system import CuttingSystem
 
-__all__ = ["FLESH", "INTACT", "SKIN", "FoodVisualizer", "damage_colours"]
+__all__ = ["FLESH", "INTACT", "SKIN", "FoodVisualizer", "damage_colours", "frame_size"]
 
 SKIN = (0.24, 0.52, 0.20)
 FLESH = (0.84, 0.91, 0.68)
@@ -26,6 +26,15 @@ def damage_colours(damage: np.ndarray) -> np.ndarray:
     """
     stops = np.array([INTACT, HALF_CUT, FLESH])
     return np.array([np.interp(damage, (0.0, 0.5, 1.0), channel) for channel in stops.T])
+
+
+def frame_size(cutting: CuttingSystem) -> float:
+    """Bytes that one frame of the food takes in a replay."""
+    # Positions and colours of vertices and corners of triangles, 4 bytes each, in base 64.
+    return max(
+        sum(24 * len(corners) + 12 * len(triangles) for corners, triangles in surface.halves)
+        for surface in cutting.surfaces
+    ) * (4.0 / 3.0)
 
 
 class FoodVisualizer(LeafSystem):

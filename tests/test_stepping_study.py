@@ -1,0 +1,154 @@
+"""The study of the sub-step, and what it has found for the default."""
+
+import csv
+import dataclasses as dc
+import itertools
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sliceit_drake.cli.main import main
+from sliceit_drake.cutting.food import Cylinder, Food
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.material import Material
+from sliceit_drake.cutting.model import Numerics
+from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
+from sliceit_drake.cutting.simulate import check_energies
+from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.cutting.stepping_study import (
+    STEPS,
+    SteppingCase,
+    energy_ratio,
+    error_table,
+    hold_table,
+    stepping_cases,
+    stepping_study,
+    true_step,
+)
+from sliceit_drake.diagrams.scenario import load_scenario
+from sliceit_drake.diagrams.stepping_report import held_half_way, sliced_food
+from sliceit_drake.resources import resource_path
+
+SMALL = Food(
+    shape=Cylinder(rings=3, layers=[0.0, 0.004, 0.012]),
+    material=Material(toughness=400.0, friction=0.05),
+)
+FAST = SteppingCase(SMALL, Knife(), Numerics(), 0.1, depth=0.2)
+LIMIT = 0.02
+DOCS = Path(__file__).resolve().parent.parent / "docs" / "stepping.md"
+
+
+def cells(table):
+    """Columns' heads, and the numbers of a Markdown table by row's head."""
+    head, _, *rows = ([c.strip() for c in row.strip("| ").split("|")] for row in table.split("\n"))
+    return head, {row[0]: row[1:] for row in rows}
+
+
+def committed_tables():
+    text = DOCS.read_text(encoding="utf-8")
+    blocks = text.split("\n\n")
+    return {b.split("|")[1].strip(): b.strip() for b in blocks if b.startswith("| ")}
+
+
+def test_the_error_grows_with_the_step_and_the_reference_against_itself_is_zero():
+    results = stepping_study([FAST], (1e-4, 2e-4, 1e-3))
+    errors = [r.rms_error for r in results]
+    assert results[0].reference
+    assert errors[0] == 0.0 and results[0].largest_difference == 0.0
+    assert 1e-5 < errors[1] < errors[2] < 0.1
+    assert results[0].energy_ratio < results[1].energy_ratio < results[2].energy_ratio
+    assert results[0].mass_ratio < results[2].mass_ratio
+
+
+def test_true_masses_are_refused_beyond_their_limit_and_said_so_in_the_table():
+    # So soft that true masses bear 4e-5 s.
+    soft = dc.replace(SMALL, material=Material(youngs_modulus=4e4, toughness=10.0, density=470.0))
+    case = dc.replace(FAST, food=soft, depth=0.1, true_masses=True)
+    results = stepping_study([case], (4e-5, 1e-3))
+    limit = case.model(1e-3, True).critical_time_step
+    reference, refused, *scaled = results
+    assert reference.reference and not reference.scaled and reference.refusal is None
+    assert reference.time_step == true_step(case, 4e-5) == pytest.approx(4e-5)
+    assert not refused.scaled and f"stability limit {limit:.3g} s" in refused.refusal
+    assert np.isnan(refused.rms_error)
+    # Below the limit there is nothing to scale.
+    assert [r.scaled for r in scaled] == [True, True]
+    assert scaled[0].rms_error < 1e-4 < scaled[1].rms_error
+    _, rows = cells(error_table(results))
+    assert rows[f"{case.label}, true masses"] == ["0.00", "unstable"]
+
+
+def test_results_do_not_depend_on_the_number_of_threads():
+    one, two = (stepping_study([FAST], (2e-4, 1e-3), workers) for workers in (1, 2))
+    assert [r.rms_error for r in one] == [r.rms_error for r in two]
+
+
+def test_a_hold_shows_what_scaled_masses_ring():
+    # The edge unloads over 0.1 mm while the heavy food comes to rest.
+    case = dc.replace(FAST, hold=0.06)
+    fine, coarse = stepping_study([case], (1e-4, 1e-3))
+    assert abs(fine.creep) < 0.01 * fine.peak < abs(coarse.creep)
+    assert coarse.rms_error > LIMIT
+    press = stepping_study([FAST], (1e-3,))[0]
+    assert np.isnan(press.force_drop)
+    _, rows = cells(hold_table([fine, coarse, dc.replace(press, reference=True)]))
+    assert len(rows) == 1
+
+
+def test_energy_ratio_is_the_one_that_a_simulation_checks():
+    model = FAST.model(5e-4, True)
+    solver = CuttingSolver(model, 2e-3)
+    plan = MotionPlan([ConstantSpeed(distance=0.004, speed=0.1, acceleration=None)])
+    motion = Motion(plan, FAST.motion(model).pose(0.0))
+    state = solver.initial_state()
+    for k in range(20):
+        end = motion.pose(2e-3 * (k + 1))
+        state = solver.exchange(state, motion.pose(2e-3 * k), end).state
+    energies = solver.energies(state, end)
+    ratio = energy_ratio(energies, 1e-3, model)
+    assert ratio > 0.0
+    assert ratio == check_energies(energies, 1e-3, model, 0.0)
+
+
+def test_foods_are_those_that_the_scenarios_cut():
+    whole = sliced_food(load_scenario(resource_path("scenarios/cucumber.yaml")))[0]
+    middle = sliced_food(load_scenario(resource_path("scenarios/potato_sequence.yaml")))[0]
+    assert whole.held_sides == "both" and isinstance(whole.shape, Cylinder)
+    assert middle.shape.thickness == 3e-3
+    labels = [c.label for c in stepping_cases([(whole, Knife(), Numerics())])]
+    assert len(set(labels)) == len(labels) == 7
+
+
+def test_a_scenario_held_half_way_goes_as_far_as_before():
+    scenario = load_scenario(resource_path("scenarios/cucumber.yaml"))
+    plans = [scenario.motion, held_half_way(scenario).motion]
+    ends = [Motion(p, FAST.motion(FAST.model(5e-4, True)).pose(0.0)) for p in plans]
+    assert np.allclose(ends[0].pose(1e3).p, ends[1].pose(1e3).p)
+    assert ends[1].duration > ends[0].duration + 0.3
+
+
+def test_quick_study_writes_the_kinds_of_tables_that_are_committed(tmp_path, capsys):
+    assert main(["study", "stepping", "--quick", "--output", str(tmp_path)]) == 0
+    text = (tmp_path / "stepping.md").read_text(encoding="utf-8")
+    assert text.strip() in capsys.readouterr().out
+    quick = {t.split("|")[1].strip() for t in text.split("\n\n")}
+    committed = {re.sub("to [0-9e.-]+ s", "to 0.0001 s", name) for name in committed_tables()}
+    assert quick == committed - {"in the station"}
+    with (tmp_path / "stepping.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 4 * 4
+    assert all(float(row["wall_per_simulated"]) > 0.0 for row in rows)
+    assert (tmp_path / "stepping.png").stat().st_size > 1e4
+
+
+def test_in_the_committed_table_the_default_step_errs_at_most_two_percent_while_the_knife_moves():
+    head, rows = cells(committed_tables()["RMS error [%]"])
+    assert head[1:] == [f"{step:g} s" for step in STEPS][-len(head) + 1 :]
+    column = head.index(f"{Numerics().time_step:g} s") - 1
+    foods, speeds = ("cucumber", "potato", "tomato"), (20, 100)
+    for food, motion, speed in itertools.product(foods, ("press", "draw"), speeds):
+        cell = rows[f"{food}, {motion}, {speed} mm/s"][column]
+        # A star marks what a simulation refuses.
+        assert cell.endswith("*") or float(cell) <= 100.0 * LIMIT
