@@ -236,7 +236,7 @@ def test_single_precision_gradients_are_within_one_percent(everything):
 
 def test_the_slice_with_gradients_is_the_slice_without(everything):
     solver = CuttingSolver(everything.model, PERIOD)
-    result = solver.exchanges(everything.run.states[0], everything.R[:2], everything.p[:2])
+    result = solver.exchanges(everything.run.states[0], everything.run.R[:2], everything.run.p[:2])
     np.testing.assert_array_equal(result.wrenches[0].sum(0), everything.run.wrenches[0])
     state = everything.run.states[60]
     result = solver.exchanges(state, everything.run.R[60:62], everything.run.p[60:62])

@@ -16,7 +16,14 @@ Run a scenario at several exchange periods and plant steps and print the differe
 Force and path errors are RMS while the food is cut; the path's is relative to the tracking error.
 """
 # Exchange period and plant step, s; the last is the reference.
-COMBINATIONS = ((4e-3, 1e-3), (2e-3, 1e-3), (1e-3, 1e-3), (5e-4, 5e-4), (2.5e-4, 2.5e-4))
+COMBINATIONS = (
+    (4e-3, 1e-3),
+    (2e-3, 1e-3),
+    (2e-3, 2.5e-4),
+    (1e-3, 1e-3),
+    (5e-4, 5e-4),
+    (2.5e-4, 2.5e-4),
+)
 
 SERVO = """\
 Move the arm by a ramp and by a step for several parameters of servoj and print lag and overshoot.

@@ -148,11 +148,12 @@ and a coarse mesh, and draws a smooth curve through the peaks.
 
 ## Where the work goes
 
-The knife's work on the food in these cuts, and what it went into, per area that the edge passed.
-*Cut* is the share of the section; *rest* is the friction of food on board and the blade's
-damping; *stored* is elastic, in bonds and contacts, and kinetic, at the end of the record, with
-the knife still in the food. The imbalance is the work (with that of the food's weight) less
-everything it went into.
+The knife's work on the food, and what it went into, per area that the edge passed. These cuts go
+as deep as the record would if it began at contact, so 1 to 3 mm beyond the end of the curves
+above. *Cut* is the share of the section; *rest* is the friction of food on board and the blade's
+damping; *stored* is elastic, in bonds and contacts, and kinetic, at the end, with the knife still
+in the food. The imbalance is the work (with that of the food's weight) less everything it went
+into.
 
 | food | cut | work | edge | opening | friction | damping | rest | stored | imbalance |
 |---|---|---|---|---|---|---|---|---|---|
@@ -162,12 +163,13 @@ everything it went into.
 **Apparent work of cutting.** The measured force over its travel and the whole round section gives
 the {measured_work} J/m2 of the table before. It is no toughness: friction on the flanks is in it,
 and the strain of what is clamped beside the cut. The part of the section that is left when the
-record ends is counted as if it were cut. The board is not in ours, as the edge ends above it at
-the fitted depths. Per area that was cut, ours splits into the columns here: of the knife's work,
-the edge takes {edge_shares}. Published values for toughness itself: potato 1,230 and 1,350 J/m2
-(two cultivars), from compression until tubers crack (Schoorl and Holt 1983, J. Texture Stud.),
-which is more than the whole work of the measured cut; we know of none for cucumber or tomato
-flesh.
+record ends is counted as if it were cut. The board is not in ours: at the fitted depths the edge
+ends above it. Per area that was cut, ours splits into the columns here: of the knife's work, the
+edge takes {edge_shares}.
+
+Published values for toughness itself: potato 1,230 and 1,350 J/m2 (two cultivars), from
+compression until tubers crack (Schoorl and Holt 1983, J. Texture Stud.), which is more than the
+whole work of the measured cut; we know of none for cucumber or tomato flesh.
 """
 
 
@@ -351,6 +353,7 @@ def plot_convergence(results: Mapping[str, Any], file: Path) -> None:
         guide = error[0] * (size / size[0]) ** slope
         axes.loglog(size, guide, "--", color="0.5", label=f"order {slope:g}")
         axes.set_xticks(size, [f"{x:.3g}" for x in size])
+        axes.set_yticks(error, [f"{e:.2g}" for e in error])
         axes.minorticks_off()
         axes.set_xlabel(label)
         axes.set_title(title, loc="left", fontsize=11)
