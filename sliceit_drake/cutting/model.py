@@ -32,7 +32,7 @@ class Numerics:
     """How the cut is computed. Contacts and bonds scale with E over the edge length h."""
 
     time_step: float = quantity(
-        5e-4, "s", low=1e-7, high=5e-3, doc="Sub-step; must divide the exchange period."
+        2.5e-4, "s", low=1e-7, high=5e-3, doc="Sub-step; must divide the exchange period."
     )
     mass_scaling: bool = True
     stability_margin: float = quantity(
@@ -40,6 +40,13 @@ class Numerics:
     )
     numerical_damping: float = quantity(
         0.2, "", low=0.0, high=0.5, doc="Viscosity added to the material's, in steps."
+    )
+    local_damping: float = quantity(
+        0.5,
+        "",
+        low=0.0,
+        high=0.9,
+        doc="Share of the unbalanced force that opposes the motion of nodes with scaled masses.",
     )
     bond_stiffness: float = quantity(
         4.0, "E/h", low=0.1, high=1e3, doc="Stiffness of the uncut faces and of their self contact."
@@ -87,6 +94,7 @@ class CuttingModel(CutGeometry):
         material, effects, knife, numerics: What the user gave.
         point_scales: Factors by cut point.
         true_mass, mass: Lumped true mass and the mass that is stepped [N], kg.
+        local_damping: Share of the unbalanced force that opposes a node's motion [N].
         weight: Gravity force on each node [N, 3], N, by the true mass.
         toughness: Surface energy of each cut point [P], J/m^2.
         outline: Length of skin per height that the edge cuts, as `EdgeTables.width` [P, G].
@@ -106,6 +114,7 @@ class CuttingModel(CutGeometry):
     point_scales: PointScales
     true_mass: np.ndarray
     mass: np.ndarray
+    local_damping: np.ndarray
     weight: np.ndarray
     toughness: np.ndarray
     outline: np.ndarray
@@ -286,6 +295,7 @@ def _derived(
     return {
         "true_mass": true_mass,
         "mass": mass,
+        "local_damping": np.where(mass > true_mass, numerics.local_damping, 0.0),
         "weight": weight,
         "toughness": toughness,
         "outline": outline,

@@ -18,6 +18,9 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
     BOARD_FRICTION, BOARD_DAMPING_TIME = t.BOARD_FRICTION, t.BOARD_DAMPING_TIME
     BLADE_STIFFNESS, BLADE_DAMPING, BLADE_MASS = t.BLADE_STIFFNESS, t.BLADE_DAMPING, t.BLADE_MASS
 
+    # Nodes slower than this, in m/s, count as at rest.
+    REST = wp.constant(real(1.0e-5))
+
     @wp.func
     def gather_elements(
         cut: wp.int32,
@@ -91,6 +94,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         xi: vec3,
         vi: vec3,
         inverse_mass: real,
+        local_damping: real,
         board_area: real,
         board: wp.array(dtype=real),
         P: wp.array2d(dtype=real),
@@ -101,7 +105,11 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         board_loss: wp.array2d(dtype=real),
         internal_work: wp.array2d(dtype=real),
     ):
-        """Velocity after the sub-step; board contact, sums over the launch."""
+        """Velocity after the sub-step; board contact, sums over the launch.
+
+        A share of the unbalanced force opposes the node's motion (Cundall's local damping): none in
+        equilibrium, however fast the motion, and the more the larger the inertia.
+        """
         f = internal + external
         pressed = real(0.0)
         on_food = vec3()
@@ -122,7 +130,12 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
                 pressed = stiffness * depth
                 on_food = pressed * n - stiffness * anchored
             board_slip_next[cut, i] = new_slip
-        v1 = vi + (f + on_food) * (inverse_mass * dt)
+        resultant = f + on_food
+        speed = wp.length(vi)
+        drag = vec3()
+        if speed > real(0.0):
+            drag = vi * (-local_damping * wp.length(resultant) / (speed + REST))
+        v1 = vi + (resultant + drag) * (inverse_mass * dt)
         if pressed > real(0.0):
             # The board damps the normal motion, implicitly, and does not pull.
             per_force = inverse_mass * dt
@@ -140,7 +153,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
             board_force[cut, i] += on_food
             board_loss[cut, i] += loss
         # Trapezoidal rule for the work along the path, summed by parts.
-        internal_work[cut, i] += real(0.5) * wp.dot(internal, vi + v1) * dt
+        internal_work[cut, i] += real(0.5) * wp.dot(internal + drag, vi + v1) * dt
         return v1
 
     @wp.kernel(enable_backward=False, module=module)
@@ -156,6 +169,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         point_entry: wp.array(dtype=wp.int32),
         point_weight: wp.array(dtype=real),
         inverse_mass: wp.array2d(dtype=real),
+        local_damping: wp.array2d(dtype=real),
         weight: wp.array2d(dtype=vec3),
         relaxing: wp.array2d(dtype=real),
         keep: wp.array2d(dtype=real),
@@ -189,6 +203,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
                 xi,
                 v[cut, i],
                 inverse_mass[cut, i],
+                local_damping[cut, i],
                 board_area[i],
                 board,
                 P,
@@ -291,6 +306,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         from_bulk: wp.array2d(dtype=vec3),
         from_points: wp.array2d(dtype=vec3),
         inverse_mass: wp.array2d(dtype=real),
+        local_damping: wp.array2d(dtype=real),
         weight: wp.array2d(dtype=vec3),
         board_area: wp.array(dtype=real),
         board: wp.array(dtype=real),
@@ -319,6 +335,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
             xi,
             v[cut, i],
             inverse_mass[cut, i],
+            local_damping[cut, i],
             board_area[i],
             board,
             P,

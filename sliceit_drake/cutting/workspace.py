@@ -221,6 +221,7 @@ class Workspace:
             ("knife", (8,), real, 1),
             *((name, (P,), real, 1) for name in PER_POINT),
             ("inverse_mass", (N,), real, 1),
+            ("local_damping", (N,), real, 1),
             ("weight", (N,), vec3, 3),
             ("relaxing", (M,), real, 1),
             ("keep", (M,), real, 1),
@@ -346,7 +347,14 @@ class Workspace:
         now, after = self._slots(k)
         return (
             [now["x"], now["v"], w["moving"], self.from_bulk[k], self.from_points[k]]
-            + [w["inverse_mass"], w["weight"], w["board_area"], w["board"], w["P"]]
+            + [
+                w["inverse_mass"],
+                w["local_damping"],
+                w["weight"],
+                w["board_area"],
+                w["board"],
+                w["P"],
+            ]
             + [self.substep_time(), now["board_slip"], after["board_slip"]]
             + [w["board_force"], w["board_loss"], w["internal_work"]]
             + [after["x"], after["v"], self.ahead[k + 1]]
@@ -381,7 +389,7 @@ class Workspace:
                 kern.move_nodes,
                 len(m.moving),
                 [now["x"], now["v"], w["moving"], *gathered]
-                + [w["inverse_mass"], w["weight"], w["relaxing"], w["keep"]]
+                + [w["inverse_mass"], w["local_damping"], w["weight"], w["relaxing"], w["keep"]]
                 + [w["board_area"], w["board"], w["P"], self.substep_time()]
                 + [now["lag"], now["board_slip"]]
                 + [w["board_force"], w["board_loss"], w["internal_work"], self.ahead[0]],
@@ -476,6 +484,7 @@ def parameter_row(model: CuttingModel) -> np.ndarray:
             scales.friction,
             model.unloading,
             inverse_mass,
+            model.local_damping,
             model.weight.ravel(),
             model.relaxing,
             model.keep,
