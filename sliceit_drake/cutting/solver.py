@@ -343,7 +343,7 @@ class CuttingSolver:
         at_held = held[m.blocks]
         on_held = (forces.reshape(-1, 4, 3, LANES) * at_held[:, :, None, :]).sum((0, 1, 3))
         # Forces of the bulk sum to zero, so that those on held nodes relax as those on the others.
-        lag = self.field(state, "lag").reshape(len(m.relaxing), -1, 3)[:, m.moving]
+        lag = self.field(state, "lag").reshape(len(m.relaxing), len(m.nodes), 3)[:, m.moving]
         on_held += m.relaxing @ lag.sum(1, dtype=float)
         share = (held[m.point_nodes].reshape(-1, 2, 2) * m.point_weights[:, None, :]).sum(2)
         on_held += (point_forces * share[:, :, None]).sum((0, 1)) + m.weight[held].sum(0)
