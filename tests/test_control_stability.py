@@ -42,6 +42,10 @@ CONTROL_DOC = Path(__file__).parents[1] / "docs/control.md"
 SMALL_FOOD = "food: {shape: !Cylinder {rings: 3, layers: [0.0, 0.004, 0.012]}}, "
 
 
+# Clamped on both sides and four times as stiff as a cucumber.
+STIFF_FOOD = "food: {material: {youngs_modulus: 1.0e+7}}, "
+
+
 def cucumber(overrides: str = "", food: str = SMALL_FOOD) -> Scenario:
     scenario = load_scenario(resource_path("scenarios/cucumber.yaml"), f"{{{food}{overrides}}}")
     scenario.measurement = None
@@ -106,14 +110,14 @@ def test_default_cut_has_a_margin_far_above_two():
 
 
 def test_a_clamped_blade_that_cannot_bend_is_refused():
-    scenario = cucumber("knife: {lateral_stiffness: 1.0e+8}")
+    scenario = cucumber("knife: {lateral_stiffness: 1.0e+8}", food=STIFF_FOOD)
     with pytest.raises(ConfigurationError, match=r"knife\.lateral_stiffness") as refused:
         prepare_run(scenario)
     assert "exchange_period" in str(refused.value)
 
 
 def test_that_blade_would_shake_and_the_run_ends_by_name(monkeypatch):
-    scenario = cucumber("knife: {lateral_stiffness: 1.0e+8}", food="")
+    scenario = cucumber("knife: {lateral_stiffness: 1.0e+8}", food=STIFF_FOOD)
     scenario.motion = MotionPlan(
         [ConstantSpeed(distance=0.0345, speed=0.1, acceleration=2.0), Hold(duration=0.2)]
     )

@@ -69,7 +69,7 @@ def test_knife_work_less_everything_else_is_toughness_times_area():
 
 @pytest.mark.parametrize("name", ["press, hold, retract", "draw to and fro"])
 def test_no_mechanism_gives_energy_back_in_any_sub_step(name):
-    _, solver, motion = run(MOTIONS[name], exchange_period=5e-4, static_friction=0.15)
+    _, solver, motion = run(MOTIONS[name], exchange_period=2.5e-4, static_friction=0.15)
     assert solver.substeps == 1
     model, T = solver.model, solver.exchange_period
     R = model.X_FC_rotation

@@ -150,7 +150,7 @@ def test_holding_everything_at_the_cut_is_refused(distance):
 
 def test_a_step_beyond_the_limit_names_the_limit_and_the_ways_out():
     with pytest.raises(
-        TimeStepError, match=r"time_step = 0\.0005 s.*limit.*mass_scaling: true"
+        TimeStepError, match=r"time_step = 0\.00025 s.*limit.*mass_scaling: true"
     ) as e:
         cut(Numerics(mass_scaling=False))
     advised = float(str(e.value).split("Give at most ")[1].split(",")[0])

@@ -43,7 +43,8 @@ def prepare(
     substeps: int = 1,
     **numerics,
 ) -> CuttingSolver:
-    numerics = {"precision": "float64", "numerical_damping": 0.0, "board_friction": 0.0} | numerics
+    undamped = {"numerical_damping": 0.0, "local_damping": 0.0, "board_friction": 0.0}
+    numerics = {"precision": "float64"} | undamped | numerics
     held = np.zeros(len(mesh.vertices), bool) if held is None else held
     model = make_cutting_model(
         mesh, plane, held, material, Knife(), Numerics(**numerics), up=up, board_height=board_height

@@ -50,9 +50,9 @@ def test_a_hold_after_a_press_neither_creeps_nor_relaxes(friction, time_step):
     creep = np.abs(positions[-1] - positions[-resting // 2]).max() / (0.5 * hold)
     assert creep < 1e-6
 
-    # Nothing feeds a vibration: what rings at the sudden stop dies away.
-    kinetic = [solver.energies(exchanges[k].state, poses[-1]).kinetic for k in (-resting, -1)]
-    assert kinetic[1] < 0.1 * kinetic[0]
+    # Nothing feeds a vibration: what rings at the sudden stop dies away, down to rounding.
+    after, rest = (solver.energies(exchanges[k].state, poses[-1]) for k in (-resting, -1))
+    assert rest.kinetic < max(0.1 * after.kinetic, 1e-9 * rest.elastic)
 
 
 def test_halves_that_are_not_held_come_to_rest_on_the_board_with_their_weight():
