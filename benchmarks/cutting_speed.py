@@ -30,14 +30,15 @@ from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.resources import resource_path
 
 PERIOD = 2e-3
+CLEARANCE = 6e-4
 REFINEMENTS = (0.5, 0.75, 1.0, 1.5, 2.0)
 BATCHES = (1, 2, 4, 8, 16)
 
 
 def through(model: CuttingModel, depth: float) -> Motion:
-    """A press cut at 20 mm/s from the surface to the board."""
-    plan = MotionPlan([ConstantSpeed(distance=depth, speed=0.02)])
-    return Motion(plan, start_pose(model, 1e-5))
+    """A press cut at 20 mm/s to the board, from above the top of the finest mesh."""
+    plan = MotionPlan([ConstantSpeed(distance=depth + CLEARANCE, speed=0.02)])
+    return Motion(plan, start_pose(model, CLEARANCE))
 
 
 def least_times(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
