@@ -91,6 +91,8 @@ class SliceAdjoint:
         self._w = Workspace([model], exchange_period, gradients=True)
         self._backward: Any = None
         ws, B = self._w, len(model.blocks)
+        self._forward = Workspace([model], exchange_period)
+        self._strain = wp.zeros((1, B, 22), dtype=ws.kernels.lanes, device=ws.device)
         self._adj_mu = wp.zeros((1, B), dtype=ws.real, device=ws.device)
         self._adj_lam = wp.zeros((1, B), dtype=ws.real, device=ws.device)
 
@@ -114,7 +116,7 @@ class SliceAdjoint:
             ValueError: The food may slip, which has no gradient.
         """
         _give(model or self.model)
-        ws, n = self._w, self._w.substeps
+        ws, n = self._forward, self._forward.substeps
         model = model or self.model
         ws.set_models([model])
         mounting = Mounting.of(model.effects, tolerance=1e-12)
@@ -269,24 +271,23 @@ class SliceAdjoint:
         self._launch_adjoint(kern.bend_blade, 1, ws.blade_arguments(k))
         self._launch_adjoint(kern.push_blade, 1, [w["lateral"], ws.push[k]])
         self._launch_adjoint(kern.step_nodes, (1, len(m.moving)), ws.step_arguments(k))
-        self._launch_adjoint(kern.relax_nodes, (1, len(m.moving)), ws.relax_arguments(k))
+        if len(m.relaxing):
+            self._launch_adjoint(kern.relax_nodes, (1, len(m.moving)), ws.relax_arguments(k))
         spread = [w["point_nodes"], w["point_weights"], ws.from_points[k].grad]
         spread.append(w["point_force"].grad)
         ws.launch(kern.spread_adjoint, points, spread)
         arguments = ws.point_arguments(k, ws.substep_time())
         self._launch_adjoint(kern.points, (1, points), arguments)
-        ws.launch(
-            kern.elements_adjoint,
-            len(m.blocks),
-            [ws.ahead[k], ws.from_elements[k].grad, w["nodes"], w["shape"], w["stiff_volume"]]
-            + [w["P"], w["element_force"], w["stiff_volume"].grad, self._adj_mu, self._adj_lam],
-        )
-        ws.launch(
-            kern.gather_adjoint,
-            len(m.moving),
-            [w["moving"], w["node_force"], w["element_start"], w["element_entry"]]
-            + [ws.ahead[k].grad],
-        )
+        strain, direction = self._strain, ws.from_elements[k].grad
+        adjoints = [w["stiff_volume"].grad, self._adj_mu, self._adj_lam]
+        for kernel, arguments in (
+            (kern.strains, [ws.ahead[k], direction, w["nodes"], w["shape"], strain]),
+            (kern.stresses, [w["stiff_volume"], w["P"], strain, *adjoints]),
+            (kern.elements_adjoint, [w["shape"], strain, w["element_force"]]),
+        ):
+            ws.launch(kernel, len(m.blocks), arguments)
+        gathered = [w["moving"], w["node_force"], w["element_start"], w["element_entry"]]
+        ws.launch_many(kern.gather_adjoint, len(m.moving), [*gathered, ws.ahead[k].grad])
 
 
 def _give(model: CuttingModel) -> np.ndarray:

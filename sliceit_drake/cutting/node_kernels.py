@@ -273,14 +273,18 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         point_weight: wp.array(dtype=real),
         from_elements: wp.array2d(dtype=vec3),
         from_points: wp.array2d(dtype=vec3),
+        per_thread: wp.int32,
     ):
         """Gathers the forces of each moving node, for `step_nodes`."""
-        cut, entry = wp.tid()
-        i = moving[entry]
-        from_elements[cut, i] = gather_elements(cut, i, element_force, element_start, element_entry)
-        from_points[cut, i] = gather_points(
-            cut, i, point_force, point_start, point_entry, point_weight
-        )
+        cut, chunk = wp.tid()
+        for entry in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, moving.shape[0])):
+            i = moving[entry]
+            from_elements[cut, i] = gather_elements(
+                cut, i, element_force, element_start, element_entry
+            )
+            from_points[cut, i] = gather_points(
+                cut, i, point_force, point_start, point_entry, point_weight
+            )
 
     @wp.kernel(enable_backward=gradients, module=module)
     def relax_nodes(
@@ -358,13 +362,15 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         element_start: wp.array(dtype=wp.int32),
         element_entry: wp.array(dtype=entries),
         adj_ahead: wp.array2d(dtype=vec3),
+        per_thread: wp.int32,
     ):
         """Adds the elements' adjoints of `ahead` to those of moving nodes."""
-        cut, entry = wp.tid()
-        i = moving[entry]
-        adj_ahead[cut, i] = adj_ahead[cut, i] + gather_elements(
-            cut, i, change, element_start, element_entry
-        )
+        cut, chunk = wp.tid()
+        for entry in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, moving.shape[0])):
+            i = moving[entry]
+            adj_ahead[cut, i] = adj_ahead[cut, i] + gather_elements(
+                cut, i, change, element_start, element_entry
+            )
 
     @wp.kernel(enable_backward=False, module=module)
     def spread_adjoint(

@@ -143,6 +143,9 @@ class Workspace:
             [self._vectors(N) for _ in range(K if self._gradients else 0)] for _ in range(3)
         )
 
+        if M == 0:
+            self.from_bulk = self.from_elements
+
         self.motion = self.array((C, 18 * K))
         motion = [("R_CK", k.mat33, 9), ("p_CK", vec3, 3), ("v_CK", vec3, 3), ("w_CK", vec3, 3)]
         self.w, self.motion_layout = self._rows(
@@ -289,7 +292,7 @@ class Workspace:
         """Launches `kernel` over cuts and `dim` entries of each."""
         wp.launch(kernel, dim=(self.cuts, dim), inputs=inputs, device=self.device)
 
-    def _launch_many(self, kernel: Any, count: int, inputs: list[Any]) -> None:
+    def launch_many(self, kernel: Any, count: int, inputs: list[Any]) -> None:
         """Launches `kernel` over cuts and `count` entries: on a CPU all in one thread.
 
         A thread's start, which copies the kernel's arguments, costs a CPU more than a node does.
@@ -309,7 +312,7 @@ class Workspace:
         """Forces of the elements at the beginning of sub-step k."""
         w, ahead = self.w, self.ahead[k if self._gradients else 0]
         inputs = [ahead, w["nodes"], w["shape"], w["stiff_volume"], w["P"], w["element_force"]]
-        self._launch_many(self.kernels.elements, len(self.model.blocks), inputs)
+        self.launch_many(self.kernels.elements, len(self.model.blocks), inputs)
 
     def point_arguments(self, k: int, dt: Any) -> list[Any]:
         """Arguments of `points` in sub-step k."""
@@ -372,20 +375,18 @@ class Workspace:
         w, kern, m, C = self.w, self.kernels, self.model, self.cuts
         self.launch_elements(k)
         points = self.point_arguments(k, self.substep_time())
-        if self._gradients:
-            self.launch(kern.points, len(m.point_nodes), points)
-        else:
-            self._launch_many(kern.many_points, len(m.point_nodes), points)
+        self.launch_many(kern.many_points, len(m.point_nodes), points)
         gathered = [w["node_force"], w["element_start"], w["element_entry"], w["listed_force"]]
         gathered += [w["point_start"], w["point_entry"], w["point_weight"]]
         if self._gradients:
             outputs = [self.from_elements[k], self.from_points[k]]
-            self.launch(kern.gather, len(m.moving), [w["moving"], *gathered, *outputs])
-            self.launch(kern.relax_nodes, len(m.moving), self.relax_arguments(k))
+            self.launch_many(kern.gather, len(m.moving), [w["moving"], *gathered, *outputs])
+            if len(m.relaxing):
+                self.launch(kern.relax_nodes, len(m.moving), self.relax_arguments(k))
             self.launch(kern.step_nodes, len(m.moving), self.step_arguments(k))
         else:
             now = self.slots[0]
-            self._launch_many(
+            self.launch_many(
                 kern.move_nodes,
                 len(m.moving),
                 [now["x"], now["v"], w["moving"], *gathered]
