@@ -192,3 +192,12 @@ def test_unreachable_food_is_refused_with_its_place():
     scenario.placement.position = [1.5, -1.5]
     with pytest.raises(ConfigurationError, match=r"scenario\.placement.*cannot put the knife"):
         MakeSlicingStation(scenario)
+
+
+@pytest.mark.parametrize("group", ["compliance: {arm: 1.0e-5}", "slip: {remaining: 0.2}"])
+def test_a_station_refuses_effects_that_are_for_a_prescribed_motion(group):
+    with pytest.raises(ConfigurationError, match="prescribed motion") as error:
+        load_scenario(
+            resource_path("scenarios/cucumber.yaml"), f"{{food: {{effects: {{{group}}}}}}}"
+        )
+    assert "food.effects." in (error.value.field or "")

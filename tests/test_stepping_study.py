@@ -2,7 +2,6 @@
 
 import csv
 import dataclasses as dc
-import itertools
 import re
 from pathlib import Path
 
@@ -143,12 +142,12 @@ def test_quick_study_writes_the_kinds_of_tables_that_are_committed(tmp_path, cap
     assert (tmp_path / "stepping.png").stat().st_size > 1e4
 
 
-def test_in_the_committed_table_the_default_step_errs_at_most_two_percent_while_the_knife_moves():
-    head, rows = cells(committed_tables()["RMS error [%]"])
+def test_in_the_committed_tables_the_default_step_errs_at_most_two_percent():
+    tables = committed_tables()
+    head, rows = cells(tables["RMS error [%]"])
     assert head[1:] == [f"{step:g} s" for step in STEPS][-len(head) + 1 :]
     column = head.index(f"{Numerics().time_step:g} s") - 1
-    foods, speeds = ("cucumber", "potato", "tomato"), (20, 100)
-    for food, motion, speed in itertools.product(foods, ("press", "draw"), speeds):
-        cell = rows[f"{food}, {motion}, {speed} mm/s"][column]
-        # A star marks what a simulation refuses.
-        assert cell.endswith("*") or float(cell) <= 100.0 * LIMIT
+    assert {name.split(",")[0] for name in rows} == {"cucumber", "potato", "tomato"}
+    for row in rows.values():
+        # A star would mark what a simulation refuses.
+        assert float(row[column]) <= 100.0 * LIMIT

@@ -62,7 +62,7 @@ scenario in the station. Takes a quarter of an hour, --quick ten seconds. docs/s
 what comes out.
 """
 STEPPING_FOODS = ("cucumber", "potato_sequence", "tomato_sequence")
-STATION_STEPS = (5e-5, 1e-4, 2e-4, 5e-4, 1e-3)
+STATION_STEPS = (5e-5, 1e-4, 2.5e-4, 5e-4, 1e-3)
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:

@@ -44,7 +44,7 @@ def estimate_discretization_error(
 
     The order that is assumed, 1.5, lies below the 1.6 to 1.9 seen with cucumbers between the meshes
     of half and of full fineness: flanks and bonds, whose stiffness goes with E/h, are of first
-    order, the bulk of second. The step's error is not in it; it is under 0.2 % at the default.
+    order, the bulk of second. The step's error is not in it (docs/stepping.md).
 
     Args:
         food, knife, numerics, exchange_period: The cut.

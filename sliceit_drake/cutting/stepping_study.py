@@ -33,7 +33,7 @@ __all__ = [
     "true_step",
 ]
 
-STEPS = (1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3)
+STEPS = (1e-5, 2e-5, 5e-5, 1e-4, 2.5e-4, 5e-4, 1e-3)
 """Sub-steps, s. They divide the exchange period."""
 
 EXCHANGE = 2e-3

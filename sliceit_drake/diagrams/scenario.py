@@ -8,6 +8,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from sliceit_drake.configuration import ConfigurationError, choice, load_yaml, quantity, validate
 from sliceit_drake.cutting.board import Board
+from sliceit_drake.cutting.effects import Effects
 from sliceit_drake.cutting.food import Food
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
@@ -96,6 +97,16 @@ class Scenario:
     """Slices in a row; it places the cuts and makes the motion."""
 
     def check(self, where: str) -> None:
+        if isinstance(self.food, Food):
+            effects, rigid = self.food.effects, Effects()
+            for name in ("compliance", "slip"):
+                if getattr(effects, name) != getattr(rigid, name):
+                    raise ConfigurationError(
+                        "is for a prescribed motion; in a station the robot gives by itself and "
+                        "the food's holder is rigid",
+                        field=f"{where}.food.effects.{name}",
+                        fix="Leave it out.",
+                    )
         if self.sequence is None:
             return
         self.sequence.check_food(self.food, where)
