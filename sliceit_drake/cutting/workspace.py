@@ -522,8 +522,8 @@ def interpolate_motion(R: np.ndarray, p: np.ndarray, substeps: int, period: floa
     position[:] = p[:, :-1, None] + share * dp
     velocity[:] = dp * (1.0 / period)
     turn = R1 @ R0.transpose(0, 1, 3, 2)
-    for k, (a, b) in enumerate(((2, 1), (0, 2), (1, 0))):
-        rate[..., k] = ((turn[..., a, b] - turn[..., b, a]) * (0.5 / period))[..., None]
+    turn = turn - turn.transpose(0, 1, 3, 2)
+    rate[:] = (turn[..., (2, 0, 1), (1, 2, 0)] * (0.5 / period))[:, :, None]
     return out
 
 
