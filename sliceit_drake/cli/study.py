@@ -58,7 +58,7 @@ How far the force depends on the food's sub-step, and what the step costs.
 
 Presses, draws and holds in three foods at two speeds with steps of 1e-5 to 1e-3 s: scaled masses
 against true ones where the cut is fast, against the finest step where it is slow; then the cucumber
-scenario in the station. Takes a quarter of an hour, --quick ten seconds. docs/stepping.md explains
+scenario in the station. Takes some minutes, --quick ten seconds. docs/stepping.md explains
 what comes out.
 """
 STEPPING_FOODS = ("cucumber", "potato_sequence", "tomato_sequence")
