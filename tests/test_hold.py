@@ -93,3 +93,19 @@ def test_the_force_on_the_way_out_pulls_the_knife_back_and_ends_outside():
     assert vertical[inside].max() < 0.0
     assert np.abs(edge[inside]).max() == 0.0
     assert np.abs(vertical[-5:]).max() == 0.0
+
+
+def test_local_damping_keeps_scaled_masses_from_swinging_on_after_a_sudden_stop():
+    segments = [ConstantSpeed(distance=0.012, speed=0.1), Hold(duration=0.06)]
+    held = round(0.06 / PERIOD)
+
+    def force(time_step: float, **numerics) -> np.ndarray:
+        _, exchanges, _, _ = follow(segments, Food(shape=SHAPE), time_step, **numerics)
+        return np.array([step.wrench[5] for step in exchanges[-held:]])
+
+    reference = force(5e-5)
+    errors = [
+        np.sqrt(np.mean((force(2.5e-4, local_damping=share) - reference) ** 2)) / reference.mean()
+        for share in (0.5, 0.0)
+    ]
+    assert errors[0] < 0.01 < errors[1]

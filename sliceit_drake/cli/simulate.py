@@ -83,7 +83,7 @@ def run(options: argparse.Namespace) -> int:
             f"{options.duration} s is not a duration", field="--duration", fix="Give seconds > 0."
         )
     meshcat = None if options.no_replay and not options.meshcat else make_meshcat()
-    print("Preparing (the first run on a machine compiles the kernels, about 5 s)", flush=True)
+    print("Preparing (the first run on a machine compiles the kernels, about 8 s)", flush=True)
     prepared = prepare_run(scenario, meshcat)
     if options.frames and meshcat is not None:
         meshcat.SetProperty("/frames", "visible", True)
