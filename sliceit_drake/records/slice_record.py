@@ -1,0 +1,388 @@
+"""The slice record: one slice as series over time and what is known about it (docs/records.md).
+
+On disk a record is a pair NAME.csv and NAME.yaml. `SliceTable` is that pair as it stands in the
+files; `SliceRecord` is what the rest of the project works with: poses as matrices, velocities, and
+the wrench on the knife about Ko in W, whatever frame, sign and point the files have.
+`sliceit_drake.records.validation.load_record` reads and checks.
+"""
+
+import copy
+import csv
+import dataclasses as dc
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sliceit_drake.configuration import ConfigurationError, dump_yaml, load_yaml
+from sliceit_drake.records.metadata import ProcessingStep, SliceMetadata
+
+__all__ = [
+    "COLUMNS",
+    "SliceRecord",
+    "SliceTable",
+    "read_table",
+    "record_from_table",
+    "sensor_rotation",
+    "velocities",
+    "write_record",
+]
+
+TIME = "time"
+POSITION = ("p_WK_x", "p_WK_y", "p_WK_z")
+QUATERNION = ("quat_WK_w", "quat_WK_x", "quat_WK_y", "quat_WK_z")
+VELOCITY = ("v_WK_x", "v_WK_y", "v_WK_z")
+ANGULAR_VELOCITY = ("w_WK_x", "w_WK_y", "w_WK_z")
+FORCE = ("force_x", "force_y", "force_z")
+TORQUE = ("torque_x", "torque_y", "torque_z")
+FORCE_NORM = "force_norm"
+JOINTS = ("q_1", "q_2", "q_3", "q_4", "q_5", "q_6")
+
+COLUMNS = (
+    TIME,
+    *POSITION,
+    *QUATERNION,
+    *VELOCITY,
+    *ANGULAR_VELOCITY,
+    *FORCE,
+    *TORQUE,
+    FORCE_NORM,
+    *JOINTS,
+)
+"""Columns of the CSV file, in the order in which they are written. Others are refused."""
+
+
+@dc.dataclass
+class SliceTable:
+    """A record as its files have it.
+
+    Attributes:
+        metadata: The YAML file.
+        columns: Columns of the CSV file [n] by name; NaN where a cell is empty.
+        file: The CSV file, or a name for errors if there is none.
+        lines: Line of the file that each row stands on, int array [n].
+    """
+
+    metadata: SliceMetadata
+    columns: dict[str, np.ndarray]
+    file: str
+    lines: np.ndarray
+
+    def has(self, names: tuple[str, ...]) -> bool:
+        """Whether all these columns are there."""
+        return all(name in self.columns for name in names)
+
+    def stack(self, names: tuple[str, ...]) -> np.ndarray:
+        """These columns side by side [n, len(names)]."""
+        return np.column_stack([self.columns[name] for name in names])
+
+
+@dc.dataclass
+class SliceRecord:
+    """A slice over time, SI units, all vectors in the world W.
+
+    Attributes:
+        metadata: What is known besides the series; `metadata.wrench` describes `force` and
+            `torque` as they are here: on the knife, in W, about Ko.
+        time: Increasing times [n], s.
+        position: p_WK, positions of Ko, the middle of the edge [n, 3], m.
+        rotation: R_WK [n, 3, 3].
+        velocity: v_WK of Ko [n, 3], m/s.
+        angular_velocity: w_WK [n, 3], rad/s.
+        force: Force on the knife [n, 3], N; None if only its norm is known.
+        torque: Torque on the knife about Ko [n, 3], Nm; None if not known.
+        force_norm: Norm of the force [n], N, where the components are not known; None otherwise.
+        joints: Joint angles [n, 6], rad; None if not known.
+        file: The CSV file that it was read from, or a name for errors.
+    """
+
+    metadata: SliceMetadata
+    time: np.ndarray
+    position: np.ndarray
+    rotation: np.ndarray
+    velocity: np.ndarray
+    angular_velocity: np.ndarray
+    force: np.ndarray | None = None
+    torque: np.ndarray | None = None
+    force_norm: np.ndarray | None = None
+    joints: np.ndarray | None = None
+    file: str = ""
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def name(self) -> str:
+        """The record's name."""
+        return self.metadata.name
+
+    @property
+    def force_magnitude(self) -> np.ndarray:
+        """Norm of the force [n], N, from the components where they are known."""
+        if self.force is not None:
+            return np.linalg.norm(self.force, axis=1)
+        assert self.force_norm is not None, "a record has force or force_norm"
+        return self.force_norm
+
+    @property
+    def wrench(self) -> np.ndarray:
+        """Torque about Ko and force on the knife in W [n, 6], in Drake's order; Nm, N.
+
+        Raises:
+            ConfigurationError: If the record lacks components or torque.
+        """
+        if self.force is None or self.torque is None:
+            raise ConfigurationError(
+                "has no torque" if self.force is not None else "has the norm of the force alone",
+                source=self.file or self.name,
+                fix="Use a record with the columns force_x..z and torque_x..z.",
+            )
+        return np.column_stack([self.torque, self.force])
+
+    def phase(self, *labels: str) -> np.ndarray:
+        """Bool mask [n] of the rows in phases with any of these labels."""
+        mask = np.zeros(len(self), bool)
+        for phase in self.metadata.motion.phases:
+            if phase.label in labels:
+                last = (self.time == phase.end) & (phase.end >= self.time[-1])
+                mask |= (self.time >= phase.start) & (self.time < phase.end) | last
+        return mask
+
+    def rows(self, select: np.ndarray | slice) -> "SliceRecord":
+        """The rows that a mask [n], indices or a slice selects; metadata are copied."""
+        chosen = dc.replace(self, metadata=copy.deepcopy(self.metadata))
+        for field in dc.fields(self):
+            series = getattr(self, field.name)
+            if isinstance(series, np.ndarray):
+                setattr(chosen, field.name, series[select])
+        return chosen
+
+    def between(self, start: float, end: float) -> "SliceRecord":
+        """The rows with start <= time <= end, s."""
+        return self.rows((self.time >= start) & (self.time <= end))
+
+    def table(self) -> SliceTable:
+        """The record as columns of the file format."""
+        quaternion = Rotation.from_matrix(self.rotation).as_quat(canonical=True, scalar_first=True)
+        columns = {TIME: self.time}
+        for names, values in (
+            (POSITION, self.position),
+            (QUATERNION, quaternion),
+            (VELOCITY, self.velocity),
+            (ANGULAR_VELOCITY, self.angular_velocity),
+            (FORCE, self.force),
+            (TORQUE, self.torque),
+            (JOINTS, self.joints),
+        ):
+            if values is not None:
+                columns.update(zip(names, values.T, strict=True))
+        if self.force_norm is not None:
+            columns[FORCE_NORM] = self.force_norm
+        lines = np.arange(2, len(self) + 2)
+        return SliceTable(self.metadata, columns, self.file or self.name, lines)
+
+
+def read_table(file: str | Path) -> SliceTable:
+    """Reads the two files of a record as they are.
+
+    Args:
+        file: NAME.csv, NAME.yaml or NAME.
+
+    Returns:
+        The table; not checked but for cells that are no numbers and columns that are not known.
+
+    Raises:
+        ConfigurationError: If a file is missing or unreadable, a field or column is unknown, or a
+            cell holds text.
+    """
+    path = Path(file)
+    base = path.with_suffix("") if path.suffix in (".csv", ".yaml", ".yml") else path
+    table = base.with_name(f"{base.name}.csv")
+    metadata = load_yaml(SliceMetadata, base.with_name(f"{base.name}.yaml"))
+    metadata.name = metadata.name or base.name
+    columns, lines = _read_csv(table)
+    return SliceTable(metadata, columns, str(table), lines)
+
+
+def _read_csv(file: Path) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    try:
+        with open(file, newline="", encoding="utf-8") as stream:
+            rows = [(number, row) for number, row in enumerate(csv.reader(stream), 1) if row]
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigurationError(
+            f"the table cannot be read ({error})", source=str(file), fix="Check the path."
+        ) from error
+    if len(rows) < 2:
+        raise ConfigurationError(
+            "the table has no rows", source=str(file), fix="Add rows of numbers under the names."
+        )
+    header = [name.strip() for name in rows[0][1]]
+    for name in header:
+        if name not in COLUMNS or header.count(name) > 1:
+            problem = "is there twice" if name in COLUMNS else "is not a column of a slice record"
+            raise ConfigurationError(
+                problem,
+                source=f"{file}, line {rows[0][0]}",
+                field=name,
+                fix=f"Columns: {', '.join(COLUMNS)}.",
+            )
+    values = np.full((len(rows) - 1, len(header)), np.nan)
+    for k, (number, row) in enumerate(rows[1:]):
+        if len(row) != len(header):
+            raise ConfigurationError(
+                f"has {len(row)} cells under {len(header)} names",
+                source=f"{file}, line {number}",
+                fix="Give one cell for each column; leave a cell empty where there is no reading.",
+            )
+        for j, text in enumerate(row):
+            if text.strip():
+                try:
+                    values[k, j] = float(text)
+                except ValueError:
+                    raise ConfigurationError(
+                        f"is {text.strip()!r}, which is not a number",
+                        source=f"{file}, line {number}",
+                        field=header[j],
+                        fix="Write a decimal point, no unit, no thousands separator.",
+                    ) from None
+    lines = np.array([number for number, _ in rows[1:]])
+    return dict(zip(header, values.T, strict=True)), lines
+
+
+def sensor_rotation(metadata: SliceMetadata) -> np.ndarray | None:
+    """R_KS, axes of the sensor in the knife frame [3, 3]; None if not known."""
+    angles = metadata.sensor.rotation
+    return None if angles is None else Rotation.from_euler("xyz", angles).as_matrix()
+
+
+def record_from_table(table: SliceTable) -> SliceRecord:
+    """Turns the columns of the files into series in W.
+
+    The wrench becomes that on the knife, in W, about Ko; a torque about an unknown point is
+    dropped. Velocities that are not there are derived from the poses.
+
+    Args:
+        table: A table that `validation.check_table` has found no errors in.
+
+    Returns:
+        The record. If sign, frame or point changed, its metadata say so in `processing`.
+
+    Raises:
+        ConfigurationError: If the frame or the point of the wrench needs a fact that is not given.
+    """
+    metadata = copy.deepcopy(table.metadata)
+    time, position = table.columns[TIME], table.stack(POSITION)
+    rotation = Rotation.from_quat(table.stack(QUATERNION), scalar_first=True).as_matrix()
+    v, w = velocities(time, position, rotation)
+    if table.has(VELOCITY):
+        v = table.stack(VELOCITY)
+    if table.has(ANGULAR_VELOCITY):
+        w = table.stack(ANGULAR_VELOCITY)
+    force = table.stack(FORCE) if table.has(FORCE) else None
+    torque = table.stack(TORQUE) if force is not None and table.has(TORQUE) else None
+    if force is not None:
+        force, torque = _wrench_on_knife(table, rotation, force, torque)
+        facts, was = metadata.wrench, copy.deepcopy(metadata.wrench)
+        facts.sign, facts.frame, facts.point = "on_knife", "W", "Ko"
+        if facts != was:
+            note = f"from {was.sign} in {was.frame} about {was.point} to on_knife in W about Ko"
+            metadata.processing.append(ProcessingStep("express_wrench", note=note))
+    return SliceRecord(
+        metadata=metadata,
+        time=time,
+        position=position,
+        rotation=rotation,
+        velocity=v,
+        angular_velocity=w,
+        force=force,
+        torque=torque,
+        force_norm=table.columns.get(FORCE_NORM) if force is None else None,
+        joints=table.stack(JOINTS) if table.has(JOINTS) else None,
+        file=table.file,
+    )
+
+
+def velocities(
+    time: np.ndarray, position: np.ndarray, rotation: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Velocities by central differences of poses, one-sided at the ends.
+
+    Args:
+        time: Increasing times [n], s, n >= 2.
+        position: p_WK [n, 3], m.
+        rotation: R_WK [n, 3, 3].
+
+    Returns:
+        v_WK of the origin [n, 3], m/s, and w_WK [n, 3], rad/s, in W.
+    """
+    before = np.maximum(np.arange(len(time)) - 1, 0)
+    after = np.minimum(np.arange(len(time)) + 1, len(time) - 1)
+    span = (time[after] - time[before])[:, None]
+    turn = Rotation.from_matrix(rotation[after] @ rotation[before].transpose(0, 2, 1))
+    return (position[after] - position[before]) / span, turn.as_rotvec() / span
+
+
+def _wrench_on_knife(
+    table: SliceTable, R_WK: np.ndarray, force: np.ndarray, torque: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Force and torque about Ko on the knife in W."""
+    facts, sensor = table.metadata.wrench, table.metadata.sensor
+    where = f"{Path(table.file).with_suffix('.yaml')}"
+    if facts.sign == "by_knife":
+        force, torque = -force, None if torque is None else -torque
+    if facts.frame == "K":
+        R_WE = R_WK
+    elif facts.frame == "S":
+        R_KS = sensor_rotation(table.metadata)
+        if R_KS is None:
+            raise _missing_fact(where, "sensor.rotation", "wrench.frame is S", "its axes in K")
+        R_WE = R_WK @ R_KS
+    elif facts.frame == "F":
+        if table.metadata.food.yaw is None:
+            raise _missing_fact(where, "food.yaw", "wrench.frame is F", "its turn in W")
+        R_WE = Rotation.from_euler("z", table.metadata.food.yaw).as_matrix()[None]
+    else:
+        R_WE = np.eye(3)[None]
+    force = (R_WE @ force[:, :, None])[:, :, 0]
+    if torque is None or facts.point == "unknown":
+        return force, None
+    torque = (R_WE @ torque[:, :, None])[:, :, 0]
+    if facts.point == "So":
+        if sensor.position is None:
+            raise _missing_fact(where, "sensor.position", "wrench.point is So", "p_KoSo_K in m")
+        torque = torque + np.cross(R_WK @ np.array(sensor.position), force)
+    return force, torque
+
+
+def _missing_fact(file: str, field: str, why: str, what: str) -> ConfigurationError:
+    return ConfigurationError(
+        f"is not given, but {why}", source=file, field=field, fix=f"Give {what}."
+    )
+
+
+def write_record(record: SliceRecord, file: str | Path) -> Path:
+    """Writes a record as NAME.csv and NAME.yaml; `read_table` reads them back.
+
+    Args:
+        record: The record.
+        file: NAME, NAME.csv or NAME.yaml; the folder is made if it is not there.
+
+    Returns:
+        The CSV file.
+    """
+    path = Path(file)
+    base = path.with_suffix("") if path.suffix in (".csv", ".yaml", ".yml") else path
+    base.parent.mkdir(parents=True, exist_ok=True)
+    table = record.table()
+    output = base.with_name(f"{base.name}.csv")
+    names = [name for name in COLUMNS if name in table.columns]
+    np.savetxt(
+        output,
+        np.column_stack([table.columns[name] for name in names]),
+        fmt="%.10g",
+        delimiter=",",
+        header=",".join(names),
+        comments="",
+    )
+    dump_yaml(record.metadata, base.with_name(f"{base.name}.yaml"))
+    return output
