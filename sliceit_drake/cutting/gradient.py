@@ -221,11 +221,11 @@ class SliceAdjoint:
         blade, buried = ws.sum("blade_sums")[0, 0], ws.sum("buried", 2)[0, 0]
         lateral = (blade[1] - blade[2]) / n * R[:, 1]
         middle = buried[:3] / buried[3] if buried[3] > 0.0 else np.zeros(3)
-        of_lateral = of_force + np.cross(of_moment, middle)
-        of_middle = np.cross(lateral, of_moment)
+        of_lateral = of_force + _cross(of_moment, middle)
+        of_middle = _cross(lateral, of_moment)
         adjoint = np.zeros(ws.sums.shape[1])
         total = np.zeros(22)
-        total[:9], total[9:18] = np.tile(of_force, 3) / n, np.tile(of_moment, 3) / n
+        total[:9], total[9:18] = [*of_force / n] * 3, [*of_moment / n] * 3
         points = len(self.model.point_nodes)
         adjoint[ws.sum_layout["total"]] = np.tile(total, points)
         along = float(of_lateral @ R[:, 1]) / n
@@ -262,6 +262,11 @@ class SliceAdjoint:
             device=self._w.device,
         )
 
+    def _launch_adjoint_many(self, kernel: Any, count: int, arguments: list[Any]) -> None:
+        """Adjoint of `Workspace.launch_many`."""
+        threads, per_thread = self._w.threads(count)
+        self._launch_adjoint(kernel, (1, threads), [*arguments, per_thread])
+
     def _launch_substep_adjoint(self, k: int) -> None:
         ws, m = self._w, self.model
         w, kern, points = ws.w, ws.kernels, len(m.point_nodes)
@@ -270,14 +275,14 @@ class SliceAdjoint:
             passed_on[k].grad.zero_()
         self._launch_adjoint(kern.bend_blade, 1, ws.blade_arguments(k))
         self._launch_adjoint(kern.push_blade, 1, [w["lateral"], ws.push[k]])
-        self._launch_adjoint(kern.step_nodes, (1, len(m.moving)), ws.step_arguments(k))
+        self._launch_adjoint_many(kern.step_nodes, len(m.moving), ws.step_arguments(k))
         if len(m.relaxing):
-            self._launch_adjoint(kern.relax_nodes, (1, len(m.moving)), ws.relax_arguments(k))
+            self._launch_adjoint_many(kern.relax_nodes, len(m.moving), ws.relax_arguments(k))
         spread = [w["point_nodes"], w["point_weights"], ws.from_points[k].grad]
         spread.append(w["point_force"].grad)
         ws.launch(kern.spread_adjoint, points, spread)
         arguments = ws.point_arguments(k, ws.substep_time())
-        self._launch_adjoint(kern.points, (1, points), arguments)
+        self._launch_adjoint_many(kern.points, points, arguments)
         strain, direction = self._strain, ws.from_elements[k].grad
         adjoints = [w["stiff_volume"].grad, self._adj_mu, self._adj_lam]
         for kernel, arguments in (
@@ -288,6 +293,12 @@ class SliceAdjoint:
             ws.launch(kernel, len(m.blocks), arguments)
         gathered = [w["moving"], w["node_force"], w["element_start"], w["element_entry"]]
         ws.launch_many(kern.gather_adjoint, len(m.moving), [*gathered, ws.ahead[k].grad])
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cross product of two vectors [3], without NumPy's overhead for stacks of them."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def _give(model: CuttingModel) -> np.ndarray:

@@ -295,12 +295,14 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         lag: wp.array3d(dtype=vec3),
         lag_next: wp.array3d(dtype=vec3),
         internal: wp.array2d(dtype=vec3),
+        per_thread: wp.int32,
     ):
         """Force of the bulk on each moving node after relaxation, for `step_nodes`."""
-        cut, entry = wp.tid()
-        i = moving[entry]
-        force = from_elements[cut, i]
-        internal[cut, i] = relax(cut, i, force, relaxing, keep, lag, lag_next)
+        cut, chunk = wp.tid()
+        for entry in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, moving.shape[0])):
+            i = moving[entry]
+            force = from_elements[cut, i]
+            internal[cut, i] = relax(cut, i, force, relaxing, keep, lag, lag_next)
 
     @wp.kernel(enable_backward=gradients, module=module)
     def step_nodes(
@@ -324,36 +326,38 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         x_next: wp.array2d(dtype=vec3),
         v_next: wp.array2d(dtype=vec3),
         ahead_next: wp.array2d(dtype=vec3),
+        per_thread: wp.int32,
     ):
         """What `move_nodes` does with the forces, into other arrays, so that it has an adjoint."""
-        cut, entry = wp.tid()
-        i = moving[entry]
-        internal = from_bulk[cut, i]
-        external = weight[cut, i] + from_points[cut, i]
-        xi = x[cut, i]
-        v1 = step_node(
-            cut,
-            i,
-            internal,
-            external,
-            xi,
-            v[cut, i],
-            inverse_mass[cut, i],
-            local_damping[cut, i],
-            board_area[i],
-            board,
-            P,
-            dt,
-            board_slip,
-            board_slip_next,
-            board_force,
-            board_loss,
-            internal_work,
-        )
-        x1 = xi + v1 * dt
-        v_next[cut, i] = v1
-        x_next[cut, i] = x1
-        ahead_next[cut, i] = x1 + P[cut, DAMPING_TIME] * v1
+        cut, chunk = wp.tid()
+        for entry in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, moving.shape[0])):
+            i = moving[entry]
+            internal = from_bulk[cut, i]
+            external = weight[cut, i] + from_points[cut, i]
+            xi = x[cut, i]
+            v1 = step_node(
+                cut,
+                i,
+                internal,
+                external,
+                xi,
+                v[cut, i],
+                inverse_mass[cut, i],
+                local_damping[cut, i],
+                board_area[i],
+                board,
+                P,
+                dt,
+                board_slip,
+                board_slip_next,
+                board_force,
+                board_loss,
+                internal_work,
+            )
+            x1 = xi + v1 * dt
+            v_next[cut, i] = v1
+            x_next[cut, i] = x1
+            ahead_next[cut, i] = x1 + P[cut, DAMPING_TIME] * v1
 
     @wp.kernel(enable_backward=False, module=module)
     def gather_adjoint(

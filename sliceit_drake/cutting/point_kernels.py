@@ -400,6 +400,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         lateral: wp.array2d(dtype=real),
         buried: wp.array3d(dtype=vec4),
         total: wp.array4d(dtype=real),
+        per_thread: wp.int32,
     ):
         """Edge, opening, self contact, flank contact and friction at each cut point.
 
@@ -410,97 +411,6 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         the edge 18, by opening 19, by friction 20. Writes the area that is cut, 21, and to `buried`
         the moment about Ko of the part of it above the edge, and that part.
         """
-        cut, i = wp.tid()
-        advance_point(
-            cut,
-            i,
-            x,
-            v,
-            nodes,
-            weights,
-            area,
-            width,
-            fraction,
-            centroid,
-            outline,
-            surface,
-            reach,
-            per_spacing,
-            toughness,
-            flank_scale,
-            friction_scale,
-            unloading,
-            P,
-            knife,
-            k,
-            exchange,
-            dt,
-            R_CK,
-            p_CK,
-            v_CK,
-            w_CK,
-            blade,
-            passed,
-            parted,
-            edge_force,
-            heading,
-            slip,
-            passed_next,
-            parted_next,
-            edge_force_next,
-            heading_next,
-            slip_next,
-            force,
-            lateral,
-            buried,
-            total,
-        )
-
-    @wp.kernel(enable_backward=False, module=module)
-    def many_points(
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        nodes: wp.array2d(dtype=wp.int32),
-        weights: wp.array(dtype=vec2),
-        area: wp.array(dtype=real),
-        width: wp.array2d(dtype=real),
-        fraction: wp.array2d(dtype=real),
-        centroid: wp.array2d(dtype=real),
-        outline: wp.array2d(dtype=real),
-        surface: wp.array(dtype=real),
-        reach: real,
-        per_spacing: real,
-        toughness: wp.array2d(dtype=real),
-        flank_scale: wp.array2d(dtype=real),
-        friction_scale: wp.array2d(dtype=real),
-        unloading: wp.array2d(dtype=real),
-        P: wp.array2d(dtype=real),
-        knife: wp.array2d(dtype=real),
-        k: wp.int32,
-        exchange: wp.int32,
-        dt: real,
-        R_CK: wp.array2d(dtype=mat33),
-        p_CK: wp.array2d(dtype=vec3),
-        v_CK: wp.array2d(dtype=vec3),
-        w_CK: wp.array2d(dtype=vec3),
-        blade: wp.array2d(dtype=real),
-        passed: wp.array2d(dtype=real),
-        parted: wp.array2d(dtype=real),
-        edge_force: wp.array2d(dtype=real),
-        heading: wp.array2d(dtype=vec3),
-        slip: wp.array3d(dtype=vec3),
-        passed_next: wp.array2d(dtype=real),
-        parted_next: wp.array2d(dtype=real),
-        edge_force_next: wp.array2d(dtype=real),
-        heading_next: wp.array2d(dtype=vec3),
-        slip_next: wp.array3d(dtype=vec3),
-        force: wp.array3d(dtype=vec3),
-        lateral: wp.array2d(dtype=real),
-        buried: wp.array3d(dtype=vec4),
-        total: wp.array4d(dtype=real),
-        per_thread: wp.int32,
-    ):
-        """`points`, several in a thread, which an adjoint does not allow."""
         cut, chunk = wp.tid()
         for i in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, area.shape[0])):
             advance_point(
@@ -622,4 +532,4 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
                     doubled += flank * A * share * (phi * phi + wp.dot(held, held))
         energy[cut, i] = real(0.5) * doubled
 
-    return types.SimpleNamespace(points=points, many_points=many_points, point_energy=point_energy)
+    return types.SimpleNamespace(points=points, point_energy=point_energy)

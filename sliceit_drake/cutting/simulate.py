@@ -252,7 +252,7 @@ class KnifePath:
 
 
 def simulate_slice(
-    solver: CuttingSolver, motion: Motion, board: Board | None = None, check_period: float = 0.02
+    solver: CuttingSolver, motion: Motion, board: Board | None = None, check_period: float = 0.05
 ) -> SliceResult:
     """Drives the knife along `motion` through the food.
 

@@ -64,6 +64,7 @@ class Workspace:
         self.model = model
         self._gradients = gradients
         self._graph: Any = None
+        self._energy_graph: Any = None
         self._views: dict[int, np.ndarray] = {}
         self._make_arrays()
         self.set_models(models)
@@ -297,8 +298,12 @@ class Workspace:
 
         A thread's start, which copies the kernel's arguments, costs a CPU more than a node does.
         """
-        per_thread = count if self.device.is_cpu else 1
-        self.launch(kernel, -(-count // per_thread), [*inputs, per_thread])
+        threads, per_thread = self.threads(count)
+        self.launch(kernel, threads, [*inputs, per_thread])
+
+    def threads(self, count: int) -> tuple[int, int]:
+        """Threads for `count` entries, and entries of each."""
+        return (1, count) if self.device.is_cpu else (count, 1)
 
     def substep_time(self) -> Any:
         """The sub-step as the kernels take it, s."""
@@ -375,15 +380,15 @@ class Workspace:
         w, kern, m, C = self.w, self.kernels, self.model, self.cuts
         self.launch_elements(k)
         points = self.point_arguments(k, self.substep_time())
-        self.launch_many(kern.many_points, len(m.point_nodes), points)
+        self.launch_many(kern.points, len(m.point_nodes), points)
         gathered = [w["node_force"], w["element_start"], w["element_entry"], w["listed_force"]]
         gathered += [w["point_start"], w["point_entry"], w["point_weight"]]
         if self._gradients:
             outputs = [self.from_elements[k], self.from_points[k]]
             self.launch_many(kern.gather, len(m.moving), [w["moving"], *gathered, *outputs])
             if len(m.relaxing):
-                self.launch(kern.relax_nodes, len(m.moving), self.relax_arguments(k))
-            self.launch(kern.step_nodes, len(m.moving), self.step_arguments(k))
+                self.launch_many(kern.relax_nodes, len(m.moving), self.relax_arguments(k))
+            self.launch_many(kern.step_nodes, len(m.moving), self.step_arguments(k))
         else:
             now = self.slots[0]
             self.launch_many(
@@ -434,6 +439,16 @@ class Workspace:
 
     def stored_energies(self) -> tuple[float, np.ndarray, float]:
         """Of the first cut: elastic energy, volume ratios [T], energy of the cut points, J."""
+        if self._energy_graph is None:
+            with DIRECT:
+                self._energy_graph = self._captured_energies()
+        wp.capture_launch(self._energy_graph)
+        elastic = self.read(self.w["energy"])[0].sum(dtype=np.float64)
+        ratio = self.read(self.w["volume_ratio"])[0].ravel()[: self.model.element_count].copy()
+        interface = self.read(self.w["point_energy"])[0].sum(dtype=np.float64)
+        return float(elastic), ratio, float(interface)
+
+    def _captured_energies(self) -> Any:
         w, now, tables, C = self.w, self.slots[0], self.model.tables, self.cuts
         B, P = len(self.model.blocks), len(self.model.point_nodes)
         elements = [now["x"], w["nodes"], w["shape"], w["stiff_volume"], w["P"]]
@@ -447,12 +462,11 @@ class Workspace:
             + [w["point_energy"]]
         )
         energy, device = self.kernels.element_energy, self.device
-        with DIRECT:
+        wp.load_module(self.kernels.module, device=device)
+        with wp.ScopedCapture(device=device) as capture:
             wp.launch(energy, dim=(C, B, LANES), inputs=elements, device=device)
             self.launch(self.kernels.point_energy, P, points)
-        elastic = w["energy"].numpy()[0].astype(np.float64).sum()
-        ratio = w["volume_ratio"].numpy()[0].ravel()[: self.model.element_count]
-        return float(elastic), ratio, float(w["point_energy"].numpy()[0].astype(np.float64).sum())
+        return capture.graph
 
     def present_forces(self) -> tuple[np.ndarray, np.ndarray]:
         """Of the first cut: forces of elements [B, 12, LANES] and of cut points [P, 2, 3], N."""
@@ -462,7 +476,7 @@ class Workspace:
         with DIRECT:
             self.launch(look_ahead, len(self.model.nodes), self.look_ahead_arguments())
             self.launch_elements(0)
-            self.launch(self.kernels.points, len(self.model.point_nodes), points)
+            self.launch_many(self.kernels.points, len(self.model.point_nodes), points)
         B = len(self.model.blocks)
         forces = self.force.numpy()[0, : B * 12 * LANES].astype(np.float64)
         point_forces = self.w["point_force"].numpy()[0].astype(np.float64)
