@@ -13,6 +13,7 @@ from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.effects import (
     Adhesion,
     Bluntness,
+    Centre,
     Compliance,
     Core,
     Effects,
@@ -82,6 +83,7 @@ NULLS = {
     "relaxation": Effects(relaxation=Relaxation([0.0, 0.0], [0.01, 3.0])),
     "skin": Effects(skin=Skin(0.0, 2e-3)),
     "core": Effects(core=Core(2e-3, 5e-4)),
+    "centre": Effects(centre=Centre(2e-3, 5e-4)),
     "bluntness": Effects(bluntness=Bluntness(0.0, 7e-3, 0.0, 2.0, 100)),
     "a sharpened knife": Effects(bluntness=Bluntness(dulling=200.0, dulling_exponent=0.5)),
     "adhesion": Effects(adhesion=Adhesion(0.0, 0.0)),
@@ -200,6 +202,21 @@ def test_a_core_changes_the_force_where_the_edge_is_in_it():
     assert ratio[inside].mean() == pytest.approx(1.0 - 0.5 * core, rel=0.03)
     outside = (depth > 3e-4) & (depth < 6e-4)
     assert ratio[outside].mean() > 0.93
+
+
+def test_a_centre_changes_the_force_on_top_of_the_core_around_it():
+    core = Core(rind=3e-3, transition=1e-4, toughness_ratio=0.5)
+    base, other = (
+        simulate(bar(), Effects(core=core, centre=centre), press(0.015))
+        for centre in (Centre(), Centre(distance=3e-3, transition=1e-4, toughness_ratio=2.0))
+    )
+    homogeneous = simulate(bar(), Effects(), press(0.015))
+    depth = depth_of(base)
+    inside = (depth > 9e-3) & (depth < 11.5e-3)
+    # Where the centre is as large as the core, one undoes the other.
+    relative = other.edge[inside, 2].mean() / homogeneous.edge[inside, 2].mean()
+    assert relative == pytest.approx(1.0, rel=0.03)
+    assert base.edge[inside, 2].mean() < 0.8 * other.edge[inside, 2].mean()
 
 
 def test_a_blunt_edge_asks_for_more_where_it_enters_and_a_draw_relieves_it():
@@ -361,6 +378,7 @@ ALL = Effects(
     relaxation=Relaxation([0.2, 0.1], [0.02, 0.06]),
     skin=Skin(0.1),
     core=Core(4e-3, 1e-3, 0.7, 0.8),
+    centre=Centre(5e-3, 1e-3, 1.3),
     bluntness=Bluntness(100.0, 2e-3, 10.0, 1.0, 5),
     adhesion=Adhesion(500.0, 1e4),
     slice_push=SlicePush(0.8),
@@ -401,6 +419,7 @@ SHOWN = {
     "relaxation": Effects(relaxation=Relaxation([0.6], [0.15])),
     "skin": Effects(skin=Skin(0.2)),
     "core": Effects(core=Core(3e-3, 1e-4, 0.8)),
+    "centre": Effects(centre=Centre(4e-3, 1e-3, 1.2)),
     "bluntness": Effects(bluntness=Bluntness(600.0)),
     "adhesion": Effects(adhesion=Adhesion(6000.0, 1e5)),
     "slice_push": Effects(slice_push=SlicePush(1.5)),

@@ -8,6 +8,7 @@ import pytest
 from sliceit_drake.cutting.effects import (
     Adhesion,
     Bluntness,
+    Centre,
     Compliance,
     Core,
     Effects,
@@ -40,6 +41,7 @@ STEPS = (3e-4, 1e-4, 3e-5, 1e-5, 3e-6)
 NOT_RESOLVED = {
     "material.density",
     "effects.bluntness.dulling_exponent",
+    "effects.centre.transition",
     "effects.core.transition",
     "knife.length",
     "numerics.board_damping_time",
@@ -55,6 +57,7 @@ EFFECTS = Effects(
     relaxation=Relaxation([0.2, 0.1], [0.02, 0.3]),
     skin=Skin(0.5),
     core=Core(4e-3, 1e-3, 0.7, 0.8),
+    centre=Centre(8e-3, 2e-3, 1.5),
     bluntness=Bluntness(50.0, 2e-3),
     adhesion=Adhesion(300.0, 3000.0),
     slice_push=SlicePush(0.8),

@@ -12,6 +12,7 @@ from sliceit_drake.configuration import ConfigurationError, quantity
 __all__ = [
     "Adhesion",
     "Bluntness",
+    "Centre",
     "Compliance",
     "Core",
     "Effects",
@@ -95,8 +96,28 @@ class Core:
 
     def share(self, distance: np.ndarray) -> np.ndarray:
         """How much of the core is at a distance from the outside: 0 outside, 1 inside."""
-        ramp = (np.asarray(distance) - self.rind) / self.transition
-        return 0.5 * (1.0 + np.tanh(2.0 * ramp))
+        return _inside(distance, self.rind, self.transition)
+
+
+@dc.dataclass
+class Centre:
+    """A middle of another toughness, as of the columella between a tomato's chambers."""
+
+    distance: float = quantity(
+        0.018, "m", low=0.0, high=0.1, doc="From the outside to where the middle begins."
+    )
+    transition: float = quantity(1e-3, "m", low=1e-5, high=0.05, doc="Width of the transition.")
+    toughness_ratio: float = quantity(
+        1.0, "", low=0.01, high=100.0, doc="Middle over what is around it."
+    )
+
+    def share(self, distance: np.ndarray) -> np.ndarray:
+        """How much of the middle is at a distance from the outside: 0 outside, 1 inside."""
+        return _inside(distance, self.distance, self.transition)
+
+
+def _inside(distance: np.ndarray, start: float, width: float) -> np.ndarray:
+    return 0.5 * (1.0 + np.tanh(2.0 * (np.asarray(distance) - start) / width))
 
 
 @dc.dataclass
@@ -172,6 +193,7 @@ class Effects:
     relaxation: Relaxation = dc.field(default_factory=Relaxation)
     skin: Skin = dc.field(default_factory=Skin)
     core: Core = dc.field(default_factory=Core)
+    centre: Centre = dc.field(default_factory=Centre)
     bluntness: Bluntness = dc.field(default_factory=Bluntness)
     adhesion: Adhesion = dc.field(default_factory=Adhesion)
     slice_push: SlicePush = dc.field(default_factory=SlicePush)

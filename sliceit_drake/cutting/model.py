@@ -219,6 +219,9 @@ def _derived(
     inside = core.share(g.point_distance)
     toughness = material.toughness * point_scales.toughness
     toughness = toughness * (1.0 + (core.toughness_ratio - 1.0) * inside)
+    centre = effects.centre
+    inside = centre.share(g.point_distance)
+    toughness = toughness * (1.0 + (centre.toughness_ratio - 1.0) * inside)
     inside = core.share(g.element_distance)
     element_volume = g.stiff_volume * (1.0 + (core.stiffness_ratio - 1.0) * inside)
 
@@ -229,7 +232,8 @@ def _derived(
     steepest = (np.diff(force, axis=1) / tables.spacing).max(1)
     unloading = np.maximum(force.max(1) / numerics.unloading_length, steepest)
     bond = numerics.bond_stiffness * scale
-    weakest = max(material.toughness * min(1.0, core.toughness_ratio), 1e-12)
+    weakest = min(1.0, core.toughness_ratio) * min(1.0, centre.toughness_ratio)
+    weakest = max(material.toughness * weakest, 1e-12)
     strength = min(material.strength, 0.5 * np.sqrt(2.0 * weakest * bond))
     mu, lam = material.stable_neo_hookean()
     parameters = dict.fromkeys(PARAMETERS, 0.0) | {
