@@ -1,50 +1,41 @@
 """Checks of slice records: what is wrong, in which file, column and rows, and what to do."""
 
 import dataclasses as dc
+import difflib
+import functools
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.records import slice_record as fmt
+from sliceit_drake.records.findings import Finding, Findings, runs
+from sliceit_drake.records.force_checks import check_force
+from sliceit_drake.records.metadata import SliceMetadata
+from sliceit_drake.records.motion_checks import check_motion
 from sliceit_drake.records.slice_record import SliceRecord, SliceTable
 
 __all__ = ["Finding", "check_record", "check_table", "load_record", "load_records"]
 
+LEAST_ROWS = 10
 
-@dc.dataclass(frozen=True)
-class Finding:
-    """Something about a record that a user should know.
-
-    Attributes:
-        severity: "error" if the record cannot be used, "warning" if with care.
-        kind: Short name of what was found, such as "millimetres".
-        file: The file.
-        column: The column or field, or "".
-        lines: First and last line of the file concerned, or None for the file as a whole.
-        problem: What is wrong and what was expected.
-        fix: What to do.
-    """
-
-    severity: str
-    kind: str
-    file: str
-    column: str
-    lines: tuple[int, int] | None
-    problem: str
-    fix: str
-
-    @property
-    def place(self) -> str:
-        """File and lines."""
-        if self.lines is None:
-            return self.file
-        first, last = self.lines
-        return f"{self.file}, " + (f"line {first}" if first == last else f"lines {first} to {last}")
-
-    def __str__(self) -> str:
-        parts = [self.place, self.column, self.problem.rstrip(".")]
-        return f"{self.severity}: {': '.join(part for part in parts if part)}. {self.fix}"
+KEY_FACTS = (
+    "date",
+    "provenance",
+    "food.name",
+    "food.shape",
+    "food.size",
+    "food.support",
+    "food.slice_thickness",
+    "food.position",
+    "food.yaw",
+    "board_height",
+    "knife.spine_thickness",
+    "motion.speed",
+    "sensor.rate",
+)
+"""What a comparison with a simulation needs: given, or listed as unknown."""
 
 
 def load_record(file: str | Path) -> SliceRecord:
@@ -97,73 +88,131 @@ def check_record(record: SliceRecord) -> list[Finding]:
 def check_table(table: SliceTable) -> list[Finding]:
     """What is wrong with a record as its files have it.
 
+    Args:
+        table: From `read_table`, or of a record in memory.
+
     Returns:
-        Errors and warnings; if the series cannot be read as series, only those errors.
+        Errors and warnings. If the columns cannot be read as series, only the errors that say so.
     """
-    return _check_structure(table)
+    findings = Findings(table)
+    _check_structure(table, findings)
+    if findings.found:
+        return findings.found
+    try:
+        record = fmt.record_from_table(table)
+    except ConfigurationError as error:
+        findings.fact("error", "missing fact", error.field or "", error.problem, error.fix or "")
+        return findings.found
+    _check_facts(table, findings)
+    check_motion(table, record, findings)
+    # Work and power need metres and seconds.
+    if not findings.has("millimetres", "milliseconds"):
+        check_force(table, record, findings)
+    return findings.found
 
 
-def _check_structure(table: SliceTable) -> list[Finding]:
+def _check_structure(table: SliceTable, findings: Findings) -> None:
     """Missing columns, gaps, time that does not increase, quaternions that are none."""
-    found: list[Finding] = []
-
-    def error(kind: str, column: str, rows: tuple[int, int] | None, text: str, fix: str) -> None:
-        lines = None if rows is None else (int(table.lines[rows[0]]), int(table.lines[rows[1]]))
-        found.append(Finding("error", kind, table.file, column, lines, text, fix))
-
     for name in (fmt.TIME, *fmt.POSITION, *fmt.QUATERNION):
         if name not in table.columns:
-            error("missing column", name, None, "the column is missing", "Add it.")
+            findings.error("missing column", name, "the column is missing", "Add it.")
     if not (table.has(fmt.FORCE) or fmt.FORCE_NORM in table.columns):
-        names = ", ".join(fmt.FORCE)
-        fix = f"Add {names}, or force_norm if only the norm is known."
-        error("missing column", "force_x", None, "there is no force", fix)
+        fix = f"Add {', '.join(fmt.FORCE)}, or force_norm if only the norm is known."
+        findings.error("missing column", fmt.FORCE[0], "there is no force", fix)
     for group in (fmt.FORCE, fmt.TORQUE, fmt.VELOCITY, fmt.ANGULAR_VELOCITY, fmt.JOINTS):
-        there = [name for name in group if name in table.columns]
-        if there and len(there) < len(group):
-            absent = next(name for name in group if name not in there)
-            error("missing column", absent, None, f"is missing beside {there[0]}", "Add it.")
+        absent = [name for name in group if name not in table.columns]
+        if 0 < len(absent) < len(group):
+            beside = next(name for name in group if name in table.columns)
+            text = f"the column is missing beside {beside}"
+            findings.error("missing column", absent[0], text, "Add it.")
     for name, values in table.columns.items():
-        for first, last in _runs(~np.isfinite(values)):
-            count = last - first + 1
-            error(
+        for first, last in runs(~np.isfinite(values)):
+            findings.error(
                 "gap",
                 name,
-                (first, last),
-                f"{count} of {len(values)} rows have no finite number",
+                f"{last - first + 1} of {len(values)} rows have no finite number",
                 "Remove these rows, or cut the record off before them.",
+                (first, last),
             )
-    if found:
-        return found
+    if findings.found:
+        return
     time = table.columns[fmt.TIME]
-    if len(time) < 10:
-        error("short", fmt.TIME, None, f"{len(time)} rows", "Give at least 10 rows.")
-        return found
+    if len(time) < LEAST_ROWS:
+        fix = f"Give at least {LEAST_ROWS} rows."
+        findings.error("short", fmt.TIME, f"the table has {len(time)} rows", fix)
+        return
     wrong = np.flatnonzero(np.diff(time) <= 0.0) + 1
     if wrong.size:
         k = int(wrong[0])
         how = "repeats" if time[k] == time[k - 1] else "goes back from"
         more = f" ({wrong.size} such rows)" if wrong.size > 1 else ""
-        error(
+        findings.error(
             "time",
             fmt.TIME,
-            (k, k),
             f"{time[k]:.9g} s {how} {time[k - 1]:.9g} s{more}; time must increase",
             "Remove repeated rows; split the record where the clock was set back.",
+            (k, k),
         )
     length = np.linalg.norm(table.stack(fmt.QUATERNION), axis=1)
-    for first, last in _runs(np.abs(length - 1.0) > 1e-3):
-        error(
+    for first, last in runs(np.abs(length - 1.0) > 1e-3):
+        findings.error(
             "quaternion",
             fmt.QUATERNION[0],
-            (first, last),
             f"the quaternion has length {length[first]:.4g}, expected 1",
             "Write a unit quaternion, w first.",
+            (first, last),
         )
-    return found
 
 
-def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
-    """First and last index of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
-    return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
+def _check_facts(table: SliceTable, findings: Findings) -> None:
+    """Facts that were forgotten, unknowns that name nothing, phases beside the record."""
+    metadata = table.metadata
+    names = _field_names(metadata)
+    for name in metadata.unknown:
+        if name not in names and name not in fmt.COLUMNS:
+            close = difflib.get_close_matches(name, [*names, *fmt.COLUMNS], n=1)
+            fix = f'Did you mean "{close[0]}"?' if close else "Name a field, as food.size."
+            text = f"{name!r} is no field and no column"
+            findings.fact("warning", "unknown name", "unknown", text, fix)
+    forgotten = [
+        name
+        for name in KEY_FACTS
+        if _value(metadata, name) in (None, "", "unknown") and name not in metadata.unknown
+    ]
+    if forgotten:
+        findings.fact(
+            "warning",
+            "missing fact",
+            ", ".join(forgotten),
+            "is not given" if len(forgotten) == 1 else "are not given",
+            "Give them, or list them under unknown.",
+        )
+    if table.has(fmt.TORQUE) and metadata.wrench.point == "unknown":
+        text = "is unknown, so that the torque is not used"
+        findings.fact("warning", "missing fact", "wrench.point", text, "Give Ko or So.")
+    time, phases = table.columns[fmt.TIME], metadata.motion.phases
+    if not any(phase.label == "slice" for phase in phases):
+        text = "no phase is labelled slice, so that all but air counts as slice"
+        fix = "Give label, start and end of the phases, in the time of the record."
+        findings.fact("warning", "phases", "motion.phases", text, fix)
+    for k, phase in enumerate(phases):
+        if phase.start >= time[-1] or phase.end <= time[0]:
+            text = f"{phase.label} from {phase.start:g} to {phase.end:g} s is beside the record,"
+            text += f" which has {time[0]:g} to {time[-1]:g} s"
+            fix = "Give times of the record."
+            findings.fact("warning", "phases", f"motion.phases[{k}]", text, fix)
+
+
+def _value(metadata: SliceMetadata, name: str) -> Any:
+    return functools.reduce(getattr, name.split("."), metadata)
+
+
+def _field_names(config: Any, lead: str = "") -> list[str]:
+    """Dotted names of all fields."""
+    names = []
+    for field in dc.fields(config):
+        value = getattr(config, field.name)
+        names.append(lead + field.name)
+        if dc.is_dataclass(value):
+            names += _field_names(value, f"{lead}{field.name}.")
+    return names

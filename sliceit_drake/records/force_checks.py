@@ -1,0 +1,286 @@
+"""Checks of the force in a slice record: units, sign, taring, saturation, a dead sensor."""
+
+import numpy as np
+from scipy.integrate import trapezoid
+
+from sliceit_drake.records import slice_record as fmt
+from sliceit_drake.records.findings import Findings, runs
+from sliceit_drake.records.slice_record import SliceRecord, SliceTable
+
+__all__ = ["check_force"]
+
+LEAST_FORCE = 0.1
+"""A slice whose force stays below this, N, is too light even for soft tofu: it is in kN."""
+
+FINEST_NOISE = 1e-3
+"""No sensor on a wrist is quieter, N: the finest have steps of 3 mN, a UR5e's scatters by 0.1 N. A
+weak force from a sensor that good is one in kN."""
+
+WEAK_FORCE = 1.0
+"""Below this the noise is looked at, N."""
+
+LEAST_WORK = 1.0
+"""Work of cutting over cut area below this, J/m2, is less than any food's toughness: soft gels
+have a few, vegetables some hundred."""
+
+GREATEST_FORCE = 5000.0
+"""A force above this, N, breaks any arm that holds a kitchen knife."""
+
+FROZEN_TIME = 0.2
+"""A sensor that shows exactly the same for this long while the knife cuts is stuck, s."""
+
+ALONG = 0.2
+"""Share of |F| |v| that the power must have at least for its sign to mean something."""
+
+
+def check_force(table: SliceTable, record: SliceRecord, findings: Findings) -> None:
+    """Reports what is wrong with the force.
+
+    Args:
+        table: The files.
+        record: The same, as series in W.
+        findings: Where to report.
+    """
+    magnitude = record.force_magnitude
+    name = fmt.FORCE[0] if record.force is not None else fmt.FORCE_NORM
+    if np.ptp(magnitude) == 0.0:
+        text = f"is {magnitude[0]:.6g} N in every row"
+        findings.error("constant", name, text, "Record the sensor, not its command.")
+        return
+    if record.force_norm is not None and (record.force_norm < 0.0).any():
+        k = int(record.force_norm.argmin())
+        findings.error(
+            "negative norm",
+            name,
+            f"a norm is {record.force_norm[k]:.4g} N",
+            "Give the components force_x..z, or the norm.",
+            (k, k),
+        )
+    air = record.phase("air")
+    cut = record.phase("slice", "second_pass")
+    if not cut.any():
+        cut = ~air
+    _check_tare(record, air, findings)
+    _check_units(record, air, cut, name, findings)
+    if not findings.has("kilonewtons", "force unit"):
+        _check_sign(table, record, air, cut, findings)
+    _check_saturation(table, record, findings)
+    _check_frozen(table, cut, findings)
+
+
+def _known_offset(record: SliceRecord, air: np.ndarray) -> np.ndarray | None:
+    """What to subtract from the force so that it is that of food and board alone [3].
+
+    None if an offset may be there that cannot be told.
+    """
+    if record.force is None:
+        return np.zeros(3)
+    if air.sum() >= 10:
+        return record.force[air].mean(axis=0)
+    facts = record.metadata.wrench
+    return np.zeros(3) if facts.tared == "yes" and "gravity" not in facts.includes else None
+
+
+def _check_tare(record: SliceRecord, air: np.ndarray, findings: Findings) -> None:
+    facts = record.metadata.wrench
+    if air.sum() < 10:
+        findings.fact(
+            "warning",
+            "no air phase",
+            "motion.phases",
+            "no phase labelled air has 10 rows, so that noise and zero of the sensor are not known",
+            "Label the time before contact as air; record half a second of it.",
+        )
+        return
+    first = int(np.flatnonzero(air)[0])
+    last = int(np.flatnonzero(air)[-1])
+    force = record.force if record.force is not None else record.force_magnitude[:, None]
+    mean, scatter = force[air].mean(axis=0), force[air].std(axis=0)
+    peak = float(record.force_magnitude.max())
+    # A norm of noise is not zero in the mean; ten rows of a filtered sensor are one reading.
+    allowed = 3.0 * scatter if record.force is None else 5.0 * scatter / np.sqrt(air.sum() / 10.0)
+    allowed = np.maximum(allowed, 0.02 * peak)
+    axis = int((np.abs(mean) - allowed).argmax())
+    weighs_tool = "gravity" in facts.includes and facts.tared != "yes"
+    if abs(mean[axis]) > allowed[axis] and not weighs_tool:
+        findings.warning(
+            "no tare",
+            fmt.FORCE[axis] if record.force is not None else fmt.FORCE_NORM,
+            f"the force in the air is {mean[axis]:.3g} N in the mean, with a scatter of"
+            f" {scatter[axis]:.2g} N; wrench.tared is {facts.tared}",
+            "Apply the step tare, which subtracts the mean of the air phase.",
+            (first, last),
+        )
+
+
+def _check_units(
+    record: SliceRecord, air: np.ndarray, cut: np.ndarray, name: str, findings: Findings
+) -> None:
+    offset = _known_offset(record, air)
+    magnitude = record.force_magnitude
+    k = int(magnitude.argmax())
+    if magnitude[k] > GREATEST_FORCE:
+        findings.error(
+            "force unit",
+            name,
+            f"the force reaches {magnitude[k]:.4g} N",
+            "Is it in mN, or in counts of the sensor? Convert it to newtons.",
+            (k, k),
+        )
+        return
+    if offset is None:
+        return
+    if record.force is not None:
+        magnitude = np.linalg.norm(record.force - offset, axis=1)
+    rows = np.flatnonzero(cut)
+    peak = float(np.percentile(magnitude[cut], 95.0))
+    problem = ""
+    if peak < LEAST_FORCE:
+        problem = f"the force while slicing stays below {peak:.3g} N, expected at least"
+        problem += f" {LEAST_FORCE:g} N"
+    elif peak < WEAK_FORCE and 1e-6 < (noise := _noise(record, air)) < FINEST_NOISE:
+        problem = f"the force while slicing stays below {peak:.3g} N, and its noise in the air is"
+        problem += f" {noise:.1g} N, less than any such sensor has"
+    elif (area := _section_area(record)) is not None:
+        v, _ = fmt.velocities(record.time, record.position, record.rotation)
+        speed = np.linalg.norm(v, axis=1)
+        work = trapezoid(np.where(cut, magnitude * speed, 0.0), record.time)
+        if work < LEAST_WORK * area:
+            problem = f"the work of slicing is {work / area:.2g} J per m2 of cut, expected at least"
+            problem += f" {LEAST_WORK:g} J/m2"
+    if problem:
+        findings.error(
+            "kilonewtons",
+            name,
+            problem,
+            "Is it in kN? Multiply the force and torque columns by 1000 to give N and Nm.",
+            (int(rows[0]), int(rows[-1])),
+        )
+
+
+def _noise(record: SliceRecord, air: np.ndarray) -> float:
+    """Standard deviation in the air of the noisiest component, N, after drift; 0 if not known."""
+    force = record.force if record.force is not None else record.force_magnitude[:, None]
+    if air.sum() < 10:
+        return 0.0
+    return float(np.diff(force[air], axis=0).std(axis=0).max() / np.sqrt(2.0))
+
+
+def _section_area(record: SliceRecord) -> float | None:
+    """Area of the cut through the middle of the food, m2, if its size is known."""
+    food = record.metadata.food
+    if food.size is None or food.shape == "unknown":
+        return None
+    return food.size[0] * food.size[2] * (1.0 if food.shape == "box" else 0.25 * np.pi)
+
+
+def _check_sign(
+    table: SliceTable, record: SliceRecord, air: np.ndarray, cut: np.ndarray, findings: Findings
+) -> None:
+    """Food and board take work from the knife, so that the power of their force is negative."""
+    offset = _known_offset(record, air)
+    if record.force is None or offset is None:
+        return
+    force = record.force - offset
+    v, _ = fmt.velocities(record.time, record.position, record.rotation)
+    power = np.einsum("ij,ij->i", force, v)
+    most = np.linalg.norm(force, axis=1) * np.linalg.norm(v, axis=1)
+    work = trapezoid(np.where(cut, power, 0.0), record.time)
+    scale = trapezoid(np.where(cut, most, 0.0), record.time)
+    if scale <= 0.0:
+        return
+    # What the file says, not what the record has become by it.
+    facts, rows = table.metadata.wrench, np.flatnonzero(cut)
+    lines = (int(rows[0]), int(rows[-1]))
+    axis = int(np.abs(force[cut]).mean(axis=0).argmax())
+    if work > ALONG * scale:
+        other = "on_knife" if facts.sign == "by_knife" else "by_knife"
+        findings.error(
+            "flipped sign",
+            fmt.FORCE[axis],
+            f"the force on the knife drives it: work of {work:+.3g} J while slicing, expected"
+            " negative",
+            f'Write wrench.sign: {other}, or correct wrench.frame ("{facts.frame}").',
+            lines,
+        )
+    elif work > -ALONG * scale:
+        findings.warning(
+            "frame",
+            fmt.FORCE[axis],
+            f"the force is across the knife's motion: its work while slicing is {work:+.3g} J of"
+            f" {scale:.3g} J, were it along it",
+            f'Check wrench.frame ("{facts.frame}"), and the placement of the knife on the tool.',
+            lines,
+        )
+
+
+def _check_saturation(table: SliceTable, record: SliceRecord, findings: Findings) -> None:
+    """Values at the sensor's range, or exactly the same greatest value for several rows."""
+    sensor = record.metadata.sensor
+    for names, limit in ((fmt.FORCE, sensor.force_range), (fmt.TORQUE, sensor.torque_range)):
+        if not table.has(names):
+            continue
+        for name, values in _in_sensor_axes(table, record, names):
+            at = np.abs(values) >= 0.995 * (np.inf if limit is None else limit)
+            if at.any():
+                text = f"{int(at.sum())} rows are at the sensor's range, {limit:g}"
+                _report_clipping(findings, name, text, at)
+            elif limit is None or np.abs(values).max() > 0.3 * limit:
+                # After taring a sensor saturates at another value than its range.
+                _check_flat_top(name, values, findings)
+    if record.force_norm is not None:
+        _check_flat_top(fmt.FORCE_NORM, record.force_norm, findings)
+
+
+def _in_sensor_axes(
+    table: SliceTable, record: SliceRecord, names: tuple[str, ...]
+) -> list[tuple[str, np.ndarray]]:
+    """Components in the axes in which the sensor saturates, where they are known."""
+    R_KS = fmt.sensor_rotation(table.metadata)
+    if names == fmt.FORCE and record.force is not None and R_KS is not None:
+        R_SW = (record.rotation @ R_KS).transpose(0, 2, 1)
+        values = (R_SW @ record.force[:, :, None])[:, :, 0]
+        return [(f"{name} (in S)", values[:, i]) for i, name in enumerate(names)]
+    return [(name, table.columns[name]) for name in names]
+
+
+def _check_flat_top(name: str, values: np.ndarray, findings: Findings) -> None:
+    """Runs of exactly the greatest or least value, longer than the signal's usual runs."""
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(values) != 0.0) + 1])
+    lengths = np.diff(np.concatenate([starts, [len(values)]]))
+    for extreme in (values.max(), values.min()):
+        is_extreme = values[starts] == extreme
+        if abs(extreme) < 0.5 * np.abs(values).max() or is_extreme.all():
+            continue
+        longest = int(lengths[is_extreme].max())
+        # A slow sensor in a fast table, or a coarse one, repeats values all the time.
+        if longest >= max(5.0, 3.0 * np.percentile(lengths[~is_extreme], 95.0)):
+            text = f"{longest} rows in a row are exactly {extreme:.6g}, as of a sensor at its limit"
+            _report_clipping(findings, name, text, values == extreme)
+
+
+def _report_clipping(findings: Findings, name: str, text: str, at: np.ndarray) -> None:
+    rows = max(runs(at), key=lambda run: run[1] - run[0])
+    findings.warning(
+        "clipped",
+        name,
+        text,
+        "Leave these rows out of comparisons, or repeat the slice with a sensor of greater range.",
+        rows,
+    )
+
+
+def _check_frozen(table: SliceTable, cut: np.ndarray, findings: Findings) -> None:
+    names = fmt.FORCE if table.has(fmt.FORCE) else (fmt.FORCE_NORM,)
+    same = (np.diff(table.stack(names), axis=0) == 0.0).all(axis=1) & cut[1:] & cut[:-1]
+    time = table.columns[fmt.TIME]
+    for first, last in runs(same):
+        if time[last + 1] - time[first] > FROZEN_TIME and not findings.has("clipped"):
+            findings.warning(
+                "frozen",
+                names[0],
+                f"the sensor shows the same for {time[last + 1] - time[first]:.2g} s of the slice",
+                "Check the sensor's connection; leave these rows out.",
+                (first, last + 1),
+            )
+            return
