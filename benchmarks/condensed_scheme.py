@@ -43,12 +43,16 @@ from sliceit_drake.resources import resource_path
 SPEED = 0.02
 STEPS = (2e-3, 5e-3, 1e-2, 2e-2)
 FINE = 5e-5
+REFINEMENTS = (0.5, 1.0, 1.5, 2.0)
 POINT_COST = 3.0
 DEPTH = 0.027
 SOFT = 2e5
+SOFTER = 1e5
+SMALL_STEP = 1e-4
 TOLERANCE = 1e-3
 LEAST_FORCE = 0.1
 MOST_ITERATIONS = 60
+MOST_FAILURES = 10
 DAMPED = 10
 REFRESH = 25
 SLOW = 0.3
@@ -260,6 +264,7 @@ class Contacts:
         # The first step has no step before it; the edge is above the food then.
         q = np.where(h.s > -1.0, np.clip(trial, 0.0, limit), 0.0)
         force[:, :, 2] -= 0.5 * q[:, None]
+        # Where the resistance falls with depth the tangent would not be positive definite.
         rising = np.where(passed > h.passed, np.maximum(left * slope, 0.0), 0.0)
         elastic = (trial > 0.0) & (trial < limit)
         dq = np.where(elastic, m.unloading, np.where(q > 0.0, rising, 0.0))
@@ -438,12 +443,13 @@ class Newton:
     def __init__(self, bulk: Condensed) -> None:
         self.bulk = bulk
 
-    def prepare(self, blocks: np.ndarray, slow: bool) -> bool:
+    def prepare(self, blocks: np.ndarray, slow: bool, stuck: bool) -> bool:
         """Factors the tangent if that is due.
 
         Args:
             blocks: Of `Contacts.evaluate`.
             slow: Whether the residual fell too slowly in the last iteration.
+            stuck: Whether the step takes many iterations.
 
         Returns:
             Whether it was due.
@@ -482,8 +488,8 @@ class Reused(Newton):
         super().__init__(bulk)
         self.factor: tuple | None = None
 
-    def prepare(self, blocks: np.ndarray, slow: bool) -> bool:
-        return (slow or self.factor is None) and super().prepare(blocks, slow)
+    def prepare(self, blocks: np.ndarray, slow: bool, stuck: bool) -> bool:
+        return (slow or self.factor is None) and super().prepare(blocks, slow, stuck)
 
 
 class Sparse(Newton):
@@ -493,8 +499,8 @@ class Sparse(Newton):
         super().__init__(bulk)
         self.factor = None
 
-    def prepare(self, blocks: np.ndarray, slow: bool) -> bool:
-        return (slow or self.factor is None) and super().prepare(blocks, slow)
+    def prepare(self, blocks: np.ndarray, slow: bool, stuck: bool) -> bool:
+        return (slow or self.factor is None) and super().prepare(blocks, slow, stuck)
 
     def factored(self) -> None:
         bulk, c = self.bulk, self.bulk.contacts
@@ -517,12 +523,12 @@ class Woodbury(Newton):
         super().__init__(bulk)
         self.inverse: np.ndarray | None = None
 
-    def prepare(self, blocks: np.ndarray, slow: bool) -> bool:
+    def prepare(self, blocks: np.ndarray, slow: bool, stuck: bool) -> bool:
         if self.inverse is not None and not slow:
             return False
         c, clock = self.bulk.contacts, self.bulk.clock
         values = c.entries(blocks)
-        if self.inverse is not None:
+        if self.inverse is not None and not stuck:
             with clock.of("update"):
                 change = values - self.base
                 at = np.unique(c.rows[np.abs(change) > CHANGED * self.stiffness[c.rows]])
@@ -566,7 +572,8 @@ class Cut:
     """A press cut.
 
     Attributes:
-        times, forces: On the knife in C at the ends of the steps [n + 1], [n + 1, 3].
+        times, forces: On the knife in C at the ends of the steps [n + 1], [n + 1, 3]; not a number
+            from where too many steps had failed.
         wall: Of all steps, s.
         clock: What of it is linear algebra.
         iterations: Evaluations of the contacts.
@@ -614,7 +621,8 @@ def press(bulk: Bulk, linear: Newton, period: float, top: float, depth: float) -
             old, norm = norm, float(np.linalg.norm(r))
             if norm < TOLERANCE * max(float(np.linalg.norm(knife)), LEAST_FORCE):
                 break
-            if linear.prepare(blocks, norm > SLOW * old) and bulk.linear:
+            stuck = iteration % DAMPED == DAMPED - 1
+            if linear.prepare(blocks, norm > SLOW * old, stuck) and bulk.linear:
                 exact = bulk.force(u)
                 r += inner - exact
                 inner = exact
@@ -626,6 +634,9 @@ def press(bulk: Bulk, linear: Newton, period: float, top: float, depth: float) -
             inner = inner + linear.bulk_force(r, du) if bulk.linear else bulk.force(u)
         else:
             failures += 1
+            if failures > MOST_FAILURES or not np.isfinite(norm):
+                forces[step:] = np.nan
+                break
         last, before, history, moved_before = u - before, u, new, moved
         inner_last, inner_before = inner - inner_before, inner
         forces[step] = knife
@@ -657,6 +668,13 @@ def kernel_time(solver: CuttingSolver, launch: Callable[[], None], count: int = 
     return best / count
 
 
+def point_time(solver: CuttingSolver) -> float:
+    """Time of all cut points in the solver's kernel, s."""
+    ws, count = solver._workspace, len(solver.model.point_nodes)
+    arguments = ws.point_arguments(0, ws.substep_time())
+    return kernel_time(solver, lambda: ws.launch_many(ws.kernels.points, count, arguments))
+
+
 def sparse_rate() -> float:
     """Time of each stored entry in a product with a large sparse matrix, s."""
     size = 20_000
@@ -677,17 +695,15 @@ def compiled(cut: Cut, point: float, element: float, per_entry: float) -> float:
 
 def compare(name: str, model: CuttingModel, repeats: int) -> None:
     """Prints the table of one food."""
+    hardness = model.material.youngs_modulus * model.element_size
     motion = through(model, DEPTH)
     solver = CuttingSolver(model, PERIOD)
     fine = model.derive(numerics=dc.replace(model.numerics, time_step=FINE))
     reference = simulate_slice(CuttingSolver(fine, PERIOD), motion)
     explicit = simulate_slice(solver, motion)
     sub_step = sub_step_time(solver, motion)
-    ws = solver._workspace
-    arguments = ws.point_arguments(0, ws.substep_time())
-    count = len(model.point_nodes)
-    point = kernel_time(solver, lambda: ws.launch_many(ws.kernels.points, count, arguments))
-    element = kernel_time(solver, lambda: ws.launch_elements(0))
+    point = point_time(solver)
+    element = kernel_time(solver, lambda: solver._workspace.launch_elements(0))
     per_entry = sparse_rate()
 
     condensed = Condensed(model)
@@ -713,7 +729,8 @@ def compare(name: str, model: CuttingModel, repeats: int) -> None:
                     cuts[scheme, step] = cut
     forces = [r.food_wrench[:, 3:] @ model.X_FC_rotation for r in (explicit, reference)]
     print(
-        f"\n{name}: E = {model.material.youngs_modulus:g} Pa, {model.element_count} tetrahedra, "
+        f"\n{name}: E = {model.material.youngs_modulus:g} Pa, toughness / (E h) = "
+        f"{model.material.toughness / hardness:.3f}, {model.element_count} tetrahedra, "
         f"{3 * len(model.moving)} unknowns, {len(condensed.weight)} condensed in "
         f"{1e3 * condensed.setup:.0f} ms"
     )
@@ -741,11 +758,41 @@ def compare(name: str, model: CuttingModel, repeats: int) -> None:
             f"| {clock.calls['factor'] + clock.calls['update']} | {cut.failures} "
             f"| {relative(means, forces[0]):.2f} % | {relative(means, forces[1]):.2f} % |"
         )
+    flops = len(condensed.weight) ** 3 / 3.0
     print("\nmean time of an operation [us] in steps of 2 ms:")
     for scheme in list(schemes)[:3]:
         clock = cuts[scheme, STEPS[0]].clock
         parts = (f"{k} {1e6 * v / clock.calls[k]:.0f}" for k, v in clock.seconds.items())
-        print(f"  {scheme}: " + ", ".join(parts))
+        rate = 1e-9 * flops * clock.calls["factor"] / clock.seconds["factor"]
+        print(f"  {scheme}: " + ", ".join(parts) + f" (factor at {rate:.0f} GFLOP/s)")
+
+
+def scaling(scenario: Scenario) -> None:
+    """Prints cost and error against the mesh, one run each."""
+    print("\n| tetrahedra | condensed unknowns | condensation [s] | explicit [s] ", end="")
+    print("| condensed [s], 2 ms | compiled | 10 ms | compiled | error, 2 ms | 10 ms |")
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    per_entry = sparse_rate()
+    for refinement in REFINEMENTS:
+        model = make_food_model(scenario.food, scenario.knife, scenario.numerics, refinement)
+        solver, motion = CuttingSolver(model, PERIOD), through(model, DEPTH)
+        simulate_slice(solver, motion)
+        begin = time.perf_counter()
+        explicit = simulate_slice(solver, motion)
+        wall = time.perf_counter() - begin
+        force = explicit.food_wrench[:, 3:] @ model.X_FC_rotation
+        point = point_time(solver)
+        bulk = Condensed(model)
+        costs, errors = [], []
+        for step in (STEPS[0], STEPS[2]):
+            cut = press(bulk, Reused(bulk), step, model.top + CLEARANCE, DEPTH + CLEARANCE)
+            costs += [cut.wall, compiled(cut, point, 0.0, per_entry)]
+            errors.append(relative(exchange_means(cut, len(force)), force))
+        print(
+            f"| {model.element_count} | {len(bulk.weight)} | {bulk.setup:.3f} | {wall:.3f} | ",
+            end="",
+        )
+        print(" | ".join([f"{c:.3f}" for c in costs] + [f"{e:.2f} %" for e in errors]) + " |")
 
 
 def main() -> None:
@@ -758,6 +805,14 @@ def main() -> None:
     soft = dc.replace(model.material, youngs_modulus=SOFT)
     compare("cucumber", model, options.repeats)
     compare("soft food", model.derive(material=soft), options.repeats)
+    softer = dc.replace(model.material, youngs_modulus=SOFTER)
+    # The default step is refused: the cut snaps, and scaled masses are not quasi-static then.
+    small_step = dc.replace(model.numerics, time_step=SMALL_STEP)
+    compare("softer food", model.derive(material=softer, numerics=small_step), 1)
+    one_side = dc.replace(scenario.food, held_sides="minus")
+    free = make_food_model(one_side, scenario.knife, scenario.numerics)
+    compare("cucumber, held on one side", free, options.repeats)
+    scaling(scenario)
 
 
 if __name__ == "__main__":
