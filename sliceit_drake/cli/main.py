@@ -5,11 +5,11 @@ import os
 import sys
 from collections.abc import Sequence
 
-from sliceit_drake.cli import diagram, simulate, study
+from sliceit_drake.cli import diagram, record, simulate, study
 
 __all__ = ["main"]
 
-COMMANDS = (simulate, diagram, study)
+COMMANDS = (simulate, diagram, record, study)
 BAD_INPUT = 2
 INTERRUPTED = 130
 

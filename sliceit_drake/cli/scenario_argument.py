@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from sliceit_drake.diagrams.scenario import Scenario
 
-__all__ = ["add_scenario_arguments", "scenario_of"]
+__all__ = ["add_scenario_arguments", "find_file", "scenario_of"]
 
 DEFAULT = "scenarios/cucumber.yaml"
 
@@ -44,18 +44,33 @@ def scenario_of(options: argparse.Namespace) -> "Scenario":
     # Its greeting and its regret that there is no GPU would stand between the user and the result.
     warp.config.log_level = warp.LOG_ERROR
 
-    from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.diagrams.scenario import load_scenario
+
+    return load_scenario(find_file(options.scenario, "scenario", DEFAULT), options.set)
+
+
+def find_file(name: str, kind: str, example: str) -> Path:
+    """The file that a user names: where they are, or one that ships with the package.
+
+    Args:
+        name: What they wrote.
+        kind: What it is, for the error.
+        example: One that ships, for the error.
+
+    Raises:
+        ConfigurationError: There is none.
+    """
+    from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.resources import resource_path
 
-    file = Path(options.scenario)
-    if not file.exists():
-        try:
-            file = resource_path(options.scenario)
-        except (FileNotFoundError, ValueError):
-            raise ConfigurationError(
-                "there is no such scenario, neither here nor in the package",
-                source=options.scenario,
-                fix=f"Give a YAML file; {DEFAULT} is one to start from.",
-            ) from None
-    return load_scenario(file, options.set)
+    file = Path(name)
+    if file.exists():
+        return file
+    try:
+        return resource_path(name)
+    except (FileNotFoundError, ValueError):
+        raise ConfigurationError(
+            f"there is no such {kind}, neither here nor in the package",
+            source=name,
+            fix=f"Give a YAML file; {example} is one to start from.",
+        ) from None

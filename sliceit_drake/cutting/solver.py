@@ -8,7 +8,7 @@ import numpy as np
 from sliceit_drake.cutting.kernel_types import LANES
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
-from sliceit_drake.cutting.workspace import Workspace, interpolate_motion
+from sliceit_drake.cutting.workspace import Workspace, interpolate_motion, parameter_row
 
 __all__ = ["CuttingError", "CuttingSolver", "Energies", "Exchange", "Exchanges", "knife_wrenches"]
 
@@ -206,6 +206,20 @@ class CuttingSolver:
     def initial_state(self) -> np.ndarray:
         """The food at rest, to be cut downwards [state_size]."""
         return self._workspace.initial_state()
+
+    def set_point_factors(self, toughness: float = 1.0, friction: float = 1.0) -> None:
+        """Multiplies toughness and friction of all cut points in every `exchange` from now on.
+
+        The factors stand beside the state and are not in it: for a caller who lets them go with
+        time or speed and gives them anew.
+        """
+        ws, row = self._workspace, parameter_row(self.model)
+        row[ws.parameter_layout["toughness"]] *= toughness
+        row[ws.parameter_layout["friction_scale"]] *= friction
+        # A retreat of a tougher edge must not gain anything.
+        row[ws.parameter_layout["unloading"]] *= max(1.0, toughness)
+        with self._lock:
+            ws.write(ws.parameters, row[None])
 
     def positions(self, state: np.ndarray) -> np.ndarray:
         """Positions of the computed nodes in C [N, 3], metres."""

@@ -1,0 +1,144 @@
+"""`sliceit record`: cut slices in a world with hidden effects and write their records."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sliceit_drake.cli.scenario_argument import find_file
+
+if TYPE_CHECKING:
+    from sliceit_drake.stand_in.protocol import Protocol
+
+__all__ = ["add_parser"]
+
+DEFAULT = "calibration/protocols/rich.yaml"
+
+DESCRIPTION = """\
+Record slices on a bench that stands in for a real one, on prescribed knife motions.
+
+PROTOCOL lists what is cut: food, knife, board, sensor, and conditions with their motions and
+replicates. Shipped are (calibration/protocols)
+  poor.yaml   one speed, push only, 6 slices
+  rich.yaml   three speeds, holds, withdrawals, second passes, draws, air: 18 slices
+  full.yaml   rich, and the bare board, a known weight, peeled and narrow food: 30 slices
+A scenario as `sliceit simulate` takes it will do: its food, knife, board and motion, cut
+--replicates times.
+
+Writes NAME.csv and NAME.yaml for each slice to DIR. Slices differ as the protocol's `variation`
+says, and the sensor adds noise, bias, drift and delay. A run that was stopped goes on if it is
+started again with the same --seed. What is written tells neither world nor effects nor seed.
+
+Worlds
+  finite_elements   the finite elements, finer than a diagnosis uses, with effects beside them
+  curves            measured curves with laws of speed, draw and board; no finite elements
+
+Effects, as NAME, NAME:SIZE, FILE.py or FILE.py:SIZE; several --effect act together. A file holds a
+class of your own: `sliceit_drake.stand_in.effect` shows one. --list-effects shows those there are.
+
+Examples
+  sliceit record --output records/null --seed 1
+  sliceit record calibration/protocols/full.yaml --effect arm_compliance:5e-5 --output records/a
+  sliceit record scenarios/cucumber.yaml --replicates 6 --world curves --output records/b
+"""
+
+
+def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        "record",
+        help="cut slices in a world with hidden effects and write their records",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "protocol",
+        nargs="?",
+        default=DEFAULT,
+        metavar="PROTOCOL",
+        help=f"YAML of a protocol or a scenario; default {DEFAULT}",
+    )
+    parser.add_argument(
+        "--output", metavar="DIR", type=Path, help="folder of the records; default output/NAME"
+    )
+    parser.add_argument(
+        "--world", default="finite_elements", help="finite_elements (the default) or curves"
+    )
+    parser.add_argument(
+        "--effect", metavar="NAME[:SIZE]", action="append", default=[], help="what is hidden"
+    )
+    parser.add_argument(
+        "--list-effects", action="store_true", help="list the effects with their sizes, and end"
+    )
+    parser.add_argument(
+        "--seed", type=int, help="makes a run repeatable; by default one that nobody knows"
+    )
+    parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
+    parser.add_argument(
+        "--replicates", type=int, default=6, help="slices of a scenario's one cut (default 6)"
+    )
+    parser.add_argument(
+        "--refinement", type=float, help="finite elements along an edge, against the food's mesh"
+    )
+    parser.add_argument("--time-step", type=float, metavar="S", help="their sub-step")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the command."""
+    if options.list_effects:
+        from sliceit_drake.stand_in.registry import effects_as_markdown
+
+        print(effects_as_markdown())
+        return 0
+    protocol = _protocol(options)
+    directory = options.output or Path("output") / protocol.name
+
+    from tqdm import tqdm
+
+    from sliceit_drake.configuration import validate
+    from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
+    from sliceit_drake.stand_in.session import record_session
+
+    settings = FiniteElementSettings()
+    settings.refinement = options.refinement or settings.refinement
+    settings.time_step = options.time_step or settings.time_step
+    validate(settings, "settings")
+    with tqdm(desc=protocol.name, unit="slice") as bar:
+
+        def show(done: int, count: int) -> None:
+            bar.total = count
+            bar.update(done - bar.n)
+
+        files = record_session(
+            protocol,
+            directory,
+            options.effect,
+            options.world,
+            options.seed,
+            options.workers,
+            settings,
+            show,
+        )
+    print(f"{len(files)} records in {directory}/")
+    return 0
+
+
+def _protocol(options: argparse.Namespace) -> "Protocol":
+    import warp
+    import yaml
+
+    warp.config.log_level = warp.LOG_ERROR
+
+    from sliceit_drake.configuration import ConfigurationError
+    from sliceit_drake.diagrams.scenario import load_scenario
+    from sliceit_drake.stand_in.protocol import load_protocol, protocol_of_scenario
+
+    file = find_file(options.protocol, "protocol", DEFAULT)
+    try:
+        root = yaml.compose(file.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise ConfigurationError(f"is no YAML ({error})", source=str(file)) from error
+    pairs = root.value if isinstance(root, yaml.MappingNode) else []
+    if any(key.value == "conditions" for key, _ in pairs):
+        return load_protocol(str(file))
+    return protocol_of_scenario(load_scenario(file), options.replicates)

@@ -1,0 +1,220 @@
+"""What an effect is: a small class that changes one thing in a world, and what it sees of a slice.
+
+A user's own effect is a file with one subclass, given as `sliceit record ... --effect FILE:SIZE`:
+
+    from sliceit_drake.stand_in.effect import Effect, Series
+
+    class Brine(Effect):
+        '''Food pulls on the blade in proportion to how much of it is wet.'''
+
+        unit = "N"
+        typical = 1.0
+
+        def respond(self, series: Series) -> None:
+            series.other[:, 5] -= self.size * series.cut
+"""
+
+import dataclasses as dc
+
+import numpy as np
+
+__all__ = ["Effect", "Now", "Series", "SliceFacts", "Tissue"]
+
+
+@dc.dataclass(frozen=True)
+class SliceFacts:
+    """What is the same during one slice.
+
+    Attributes:
+        index: Order in the session, from 0.
+        peeled: Whether the skin is off.
+        height: Of the food at the cut, metres; 0 without food.
+        width: Of the food along the edge, metres; 0 without food.
+        toughness: Of the food as the world has it, J/m^2.
+        reference_speed: At which it has that, m/s.
+    """
+
+    index: int = 0
+    peeled: bool = False
+    height: float = 0.0
+    width: float = 0.0
+    toughness: float = 400.0
+    reference_speed: float = 0.02
+
+
+@dc.dataclass(frozen=True)
+class Tissue:
+    """Places in the section or the food [M], metres.
+
+    Attributes:
+        x: Along the edge, from the middle of the section.
+        height: Above the board.
+        depth: Below the outline, vertically.
+        distance: From the outline, inwards.
+    """
+
+    x: np.ndarray
+    height: np.ndarray
+    depth: np.ndarray
+    distance: np.ndarray
+
+
+@dc.dataclass
+class Now:
+    """The knife before a short stretch of its path, and what an effect may change about it.
+
+    Attributes:
+        time, period: Begin and duration of the stretch, s.
+        position: Of Ko in F at its end, as commanded [3], metres.
+        press, draw: Speed of Ko into the food and along the edge, m/s.
+        depth: Of the edge below the top of the food at the end, metres; negative above it.
+        travel: Path of the edge in the food so far, metres.
+        swept: Area that the flanks have swept so far, m^2.
+        force: Of food and board on the knife in the stretch before, in F [3], N.
+        toughness, friction: Factors on the world's own; effects multiply.
+        knife_shift: Knife off its commanded position, in F [3], metres; effects add.
+        food_shift: Food off its place, in F [3], metres; effects add.
+    """
+
+    time: float
+    period: float
+    position: np.ndarray
+    press: float
+    draw: float
+    depth: float
+    travel: float
+    swept: float
+    force: np.ndarray
+    toughness: float = 1.0
+    friction: float = 1.0
+    knife_shift: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))
+    food_shift: np.ndarray = dc.field(default_factory=lambda: np.zeros(3))
+
+    @property
+    def speed(self) -> float:
+        """Of the edge, m/s."""
+        return float(np.hypot(self.press, self.draw))
+
+
+@dc.dataclass
+class Series:
+    """One slice as the world has it, every exchange. Wrenches are on the knife, moment about Ko and
+    force, in F [N, 6], Nm and N.
+
+    Attributes:
+        slice: What is the same during the slice.
+        time: End of each exchange [N], s, equally spaced.
+        R, p: Commanded pose of the knife in F [N, 3, 3] and [N, 3], metres.
+        p_true: Where Ko truly is [N, 3], metres.
+        v: Velocity of Ko, in F [N, 3], m/s.
+        phase: Label of the motion's segment at each time.
+        depth: Of the true edge below the top of the food [N], metres.
+        flank: Area of both flanks in front of cut food [N], m^2.
+        cut: Share of the section that is cut [N].
+        edge, normal, friction: Of the food by mechanism.
+        board: Of the board.
+        other: Of anything else.
+    """
+
+    slice: SliceFacts
+    time: np.ndarray
+    R: np.ndarray
+    p: np.ndarray
+    p_true: np.ndarray
+    v: np.ndarray
+    phase: list[str]
+    depth: np.ndarray
+    flank: np.ndarray
+    cut: np.ndarray
+    edge: np.ndarray
+    normal: np.ndarray
+    friction: np.ndarray
+    board: np.ndarray
+    other: np.ndarray
+
+    @property
+    def period(self) -> float:
+        """Between two rows, s."""
+        return float(self.time[1] - self.time[0])
+
+    @property
+    def press(self) -> np.ndarray:
+        """Speed of Ko into the food [N], m/s."""
+        return -self.v[:, 2]
+
+    @property
+    def draw(self) -> np.ndarray:
+        """Speed of Ko along the edge [N], m/s."""
+        return np.asarray(np.einsum("nc,nc->n", self.v, self.R[:, :, 0]))
+
+    @property
+    def force(self) -> np.ndarray:
+        """Of all on the knife, in F [N, 3], N."""
+        return self.wrench()[:, 3:]
+
+    def wrench(self) -> np.ndarray:
+        """Of all on the knife [N, 6]."""
+        return self.edge + self.normal + self.friction + self.board + self.other
+
+
+class Effect:
+    """One cause of measured forces that differ from the base model's, of a size.
+
+    Every hook does nothing unless it is overridden; a size of 0 changes nothing. A new copy serves
+    each slice, so what a hook keeps in `self` is forgotten after it.
+
+    Attributes:
+        cause: Number in the table of docs/stand_in.md, 0 for none of them.
+        unit: Of the size.
+        typical: A size that matters and could be met in a kitchen.
+        every_exchange: Whether `drive` must see every exchange, as where it feeds a force back.
+        size: How much of it.
+    """
+
+    cause = 0
+    unit = ""
+    typical = 1.0
+    every_exchange = False
+
+    def __init__(self, size: float | None = None) -> None:
+        self.size = self.typical if size is None else float(size)
+
+    def begin(self, facts: SliceFacts, rng: np.random.Generator) -> None:
+        """Before a slice.
+
+        Args:
+            facts: Of the slice.
+            rng: For what differs from slice to slice.
+        """
+        self.facts = facts
+        self.rng = rng
+
+    def reshape(self, p: np.ndarray) -> np.ndarray:
+        """Where the food's material is that nominally is at p [V, 3], metres, in F."""
+        return p
+
+    def toughness(self, at: Tissue) -> np.ndarray | float:
+        """Factor on the toughness [M]."""
+        return 1.0
+
+    def stiffness(self, at: Tissue) -> np.ndarray | float:
+        """Factor on the modulus [M]."""
+        return 1.0
+
+    def drive(self, now: Now) -> None:
+        """Changes the factors and shifts of `now` before a stretch of the path."""
+
+    def respond(self, series: Series) -> None:
+        """Changes the forces of a slice when it is done, in place."""
+
+    def measure(self, series: Series, wrench: np.ndarray) -> np.ndarray:
+        """What the sensor gets.
+
+        Args:
+            series: The slice.
+            wrench: On the knife, moment about Ko and force, in K [N, 6].
+
+        Returns:
+            The same, changed.
+        """
+        return wrench

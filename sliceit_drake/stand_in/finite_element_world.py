@@ -1,0 +1,376 @@
+"""The finite-element world: the base model on a finer mesh, with effects coded beside it.
+
+Of `cutting` it takes the base model alone, with all parameter groups of `cutting.effects` at their
+null. What an effect changes, it changes from outside: places of the mesh's vertices, factors on
+toughness and stiffness of the tissue, in each stretch of the path the knife's pose and factors on
+toughness and friction, and at the end the forces by mechanism.
+
+The base model has no time scale of its own, so where the knife is slow several exchanges are
+computed as one, with at most `travel` of motion; a hold takes a few steps and the air none.
+"""
+
+import dataclasses as dc
+from collections.abc import Sequence
+
+import numpy as np
+
+from sliceit_drake.configuration import quantity
+from sliceit_drake.cutting.board import board_wrench
+from sliceit_drake.cutting.cut_surface import depth_below, distance_inside
+from sliceit_drake.cutting.food import Box, Cylinder, Food, start_pose
+from sliceit_drake.cutting.mesh import TetrahedralMesh
+from sliceit_drake.cutting.model import CuttingModel, Numerics, PointScales, make_cutting_model
+from sliceit_drake.cutting.motion import Pose
+from sliceit_drake.cutting.simulate import (
+    board_wrenches,
+    check_clear,
+    check_energies,
+    check_in_plane,
+)
+from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceFacts, Tissue
+from sliceit_drake.stand_in.protocol import Protocol, Specimen, scaled_food, section_size
+from sliceit_drake.stand_in.world import GRAVITY, Path, resampled
+
+__all__ = ["FiniteElementSettings", "FiniteElementWorld"]
+
+CLEAR = 1e-3
+"""Height of the edge over the food above which nothing is computed, metres."""
+
+LONGEST = 50
+"""Most exchanges that are computed as one."""
+
+CHECK_TRAVEL = 1e-3
+
+SAMPLES = 5
+"""Triangles are cut into the square of this many to average over a cut point's part of them."""
+
+
+@dc.dataclass
+class FiniteElementSettings:
+    """How finely the world is computed; other than what looks at its records."""
+
+    refinement: float = quantity(
+        0.85, "", low=0.3, high=3.0, doc="Elements along an edge, relative to the food's mesh."
+    )
+    time_step: float = quantity(2.5e-4, "s", low=1e-6, high=2e-3, doc="Sub-step.")
+    travel: float = quantity(
+        4e-5, "m", low=1e-6, high=1e-3, doc="Most motion in exchanges computed as one."
+    )
+
+
+class _Section:
+    """What effects want to know of a cut's section, from its geometry."""
+
+    def __init__(self, model: CuttingModel) -> None:
+        self.model = model
+        points, triangles = model.split.points[:, [0, 2]], model.split.triangles
+        corner = np.stack([1.0 - _BARYCENTRIC.sum(1), *_BARYCENTRIC.T], axis=1)
+        places = np.einsum("mkc,sk->msc", points[triangles], corner)
+        edges = points[triangles][:, 1:] - points[triangles][:, :1]
+        area = 0.5 * np.abs(np.linalg.det(edges)) / len(corner)
+        weight = (area[:, None, None] * corner).reshape(-1, 3)
+        self._node = np.repeat(triangles, len(corner), axis=0)
+        self._weight = weight
+        self._total = np.maximum(self._sums(np.ones(len(weight))), 1e-18)
+        self.surface = self._tissue(places.reshape(-1, 2))
+        self.bulk = self._tissue(model.nodes[model.tetrahedra].mean(1)[:, [0, 2]])
+        # Width of the section and area of the part above, by the edge's height.
+        self._height = np.linspace(model.bottom - 1e-4, model.top + 1e-4, 241)
+        tables, s = model.tables, points[:, 1, None] - self._height
+        grid = np.linspace(-tables.reach, tables.reach, tables.width.shape[1])
+        above = [np.interp(at, grid, row) for at, row in zip(s, tables.fraction, strict=True)]
+        self._above = np.asarray(tables.area @ np.array(above))
+        carried = [
+            np.interp(at, grid, row, left=0.0, right=0.0)
+            for at, row in zip(s, tables.width, strict=True)
+        ]
+        self._width = np.sum(carried, axis=0)
+
+    def _tissue(self, places: np.ndarray) -> Tissue:
+        m = self.model
+        points, triangles = m.split.points[:, [0, 2]], m.split.triangles
+        low, high = m.span
+        return Tissue(
+            x=places[:, 0] - 0.5 * (low + high),
+            height=places[:, 1] - m.bottom,
+            depth=depth_below(points, triangles, places),
+            distance=distance_inside(points, triangles, places),
+        )
+
+    def _sums(self, values: np.ndarray) -> np.ndarray:
+        sums = np.zeros(len(self.model.point_nodes))
+        np.add.at(sums, self._node, self._weight * values[:, None])
+        return sums
+
+    def average(self, factor: np.ndarray | float) -> np.ndarray:
+        """Mean of a factor on the surface over each cut point's part of it [P]."""
+        values = np.broadcast_to(np.asarray(factor, float), self.surface.x.shape)
+        return self._sums(values) / self._total
+
+    def width(self, height: float) -> float:
+        """Width of the section at a height in C, metres."""
+        return float(np.interp(height, self._height, self._width, left=0.0, right=0.0))
+
+    def above(self, height: np.ndarray) -> np.ndarray:
+        """Area of the section above heights in C, m^2."""
+        return np.interp(height, self._height, self._above)
+
+
+def _barycentric(n: int) -> np.ndarray:
+    """Centroids of the n^2 triangles that a triangle is cut into, second and third coordinate."""
+    up = [(i + 1 / 3, j + 1 / 3) for i in range(n) for j in range(n - i)]
+    down = [(i + 2 / 3, j + 2 / 3) for i in range(n - 1) for j in range(n - 1 - i)]
+    return np.array(up + down) / n
+
+
+_BARYCENTRIC = _barycentric(SAMPLES)
+
+
+class FiniteElementWorld:
+    """Cuts slices with `cutting`'s base model.
+
+    Args:
+        protocol: Food, knife, board.
+        settings: How finely.
+    """
+
+    def __init__(self, protocol: Protocol, settings: FiniteElementSettings | None = None) -> None:
+        self.protocol = protocol
+        self.settings = settings or FiniteElementSettings()
+        self._numerics = Numerics(time_step=self.settings.time_step)
+        self._cuts: dict[tuple[float, bytes], _Section] = {}
+
+    def cut(
+        self, specimen: Specimen, effects: Sequence[Effect], rng: np.random.Generator
+    ) -> Series:
+        """Cuts one slice; see `World`.
+
+        Raises:
+            CuttingError: The motion is not one that can be computed, or the cut broke down.
+        """
+        protocol, condition = self.protocol, specimen.condition
+        food = scaled_food(protocol.food, condition.width_scale)
+        mesh = food.shape.mesh(self.settings.refinement)
+        nominal = self._section(food, mesh)
+        low, high = nominal.model.span
+        facts = SliceFacts(
+            index=specimen.index,
+            peeled=condition.peeled,
+            height=nominal.model.top - nominal.model.bottom,
+            width=high - low,
+            toughness=food.material.toughness,
+        )
+        for effect in effects:
+            effect.begin(facts, rng)
+        start = start_pose(nominal.model, condition.clearance, condition.offset)
+        if isinstance(food.shape, Box | Cylinder):
+            # The clearance is over the food, not over a mesh that conserves its volume.
+            start.p[2] = section_size(food)[1] + condition.clearance
+        path = Path.of(condition.motion, start, protocol.exchange_period)
+        if condition.without_food:
+            run = _Run(self, path, None, nominal, specimen, effects)
+        else:
+            moved = mesh.vertices
+            for effect in effects:
+                moved = effect.reshape(moved)
+            section = self._section(food, TetrahedralMesh(moved, mesh.tetrahedra))
+            model = _with_tissue(section, specimen, effects)
+            check_clear(model, Pose(*_in_cut(model, path.R[0], path.p[0])))
+            run = _Run(self, path, model, section, specimen, effects)
+        series = run.series(facts)
+        for effect in effects:
+            effect.respond(series)
+        return series
+
+    def _section(self, food: Food, mesh: TetrahedralMesh) -> _Section:
+        key = (float(mesh.vertices[:, 2].max()), mesh.vertices.tobytes())
+        if key not in self._cuts:
+            model = make_cutting_model(
+                mesh,
+                food.plane(),
+                food.held(mesh),
+                food.material,
+                self.protocol.knife,
+                self._numerics,
+            )
+            self._cuts[key] = _Section(model)
+        return self._cuts[key]
+
+
+def _in_cut(model: CuttingModel, R_F: np.ndarray, p_F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return model.X_FC_rotation.T @ R_F, model.to_cut_frame(p_F)
+
+
+def _with_tissue(section: _Section, specimen: Specimen, effects: Sequence[Effect]) -> CuttingModel:
+    """The cut with the slice's material and what effects do to its tissue."""
+    base = section.model
+    toughness = np.ones(len(base.point_nodes))
+    stiffness = np.ones(base.element_count)
+    for effect in effects:
+        toughness = toughness * section.average(effect.toughness(section.surface))
+        stiffness = stiffness * effect.stiffness(section.bulk)
+    # Masses are scaled for the material's modulus, which must be the largest.
+    most = float(stiffness.max())
+    material = dc.replace(
+        base.material,
+        youngs_modulus=base.material.youngs_modulus * specimen.stiffness * most,
+        toughness=base.material.toughness * specimen.toughness,
+        friction=base.material.friction * specimen.friction,
+    )
+    scales = PointScales(toughness, np.ones_like(toughness), np.ones_like(toughness))
+    model = base.derive(material=material, point_scales=scales)
+    model.element_volume = model.element_volume * stiffness / most
+    return model
+
+
+class _Run:
+    """One slice on its way."""
+
+    def __init__(
+        self,
+        world: FiniteElementWorld,
+        path: Path,
+        model: CuttingModel | None,
+        section: _Section,
+        specimen: Specimen,
+        effects: Sequence[Effect],
+    ) -> None:
+        self.world, self.path, self.model = world, path, model
+        self.section, self.specimen, self.effects = section, specimen, effects
+        self.protocol = world.protocol
+        self.board = dc.replace(self.protocol.board, height=0.0)
+        geometry = section.model
+        self.R_FC, self.top = geometry.X_FC_rotation, geometry.top
+        self.solver = None if model is None else CuttingSolver(model, path.period)
+        self.state = np.zeros(0) if self.solver is None else self.solver.initial_state()
+        self.fed = Pose(*_in_cut(geometry, path.R[0], path.p[0]))
+        self.factors = (1.0, 1.0)
+        self.spent = self.since_check = 0.0
+        self.cut = self.travel = self.swept = 0.0
+        self.force = np.zeros(3)
+
+    def series(self, facts: SliceFacts) -> Series:
+        """Drives the knife along the path."""
+        path, settings = self.path, self.world.settings
+        reach = 0.5 * self.protocol.knife.length
+        timeless = not any(effect.every_exchange for effect in self.effects)
+        rates = self.model is not None and (
+            self.model.material.static_friction > self.model.material.friction
+        )
+        longest = LONGEST if timeless and not rates else 1
+        stretches = list(path.stretches(settings.travel, longest, reach))
+        parts = np.zeros((len(stretches), 3, 6))
+        shifts = np.zeros((len(stretches), 2, 3))
+        cut = np.zeros(len(stretches))
+        for row, (a, b) in enumerate(stretches):
+            now = self._now(a, b)
+            for effect in self.effects:
+                effect.drive(now)
+            now.food_shift[2] += self.specimen.height
+            shifts[row] = now.knife_shift, now.food_shift
+            parts[row] = self._advance(now, b)
+            cut[row] = self.cut
+        return self._sampled(facts, np.array(stretches), parts, shifts, cut)
+
+    def _now(self, a: int, b: int) -> Now:
+        path = self.path
+        period = path.period * (b - a)
+        v = (path.p[b] - path.p[a]) / period
+        return Now(
+            time=float(path.time[a]),
+            period=period,
+            position=path.p[b],
+            press=-float(v[2]),
+            draw=float(v @ path.R[b][:, 0]),
+            depth=self.top - float(self.fed.p[2]),
+            travel=self.travel,
+            swept=self.swept,
+            force=self.force,
+        )
+
+    def _advance(self, now: Now, b: int) -> np.ndarray:
+        """Advances food and board through a stretch; wrenches by mechanism, in F [3, 6]."""
+        path = self.path
+        shift = now.knife_shift - now.food_shift
+        pose = Pose(*_in_cut(self.section.model, path.R[b], path.p[b] + shift))
+        reach = 0.5 * self.protocol.knife.length * abs(float(pose.R[2, 0]))
+        lowest = min(float(pose.p[2]), float(self.fed.p[2])) - reach
+        parts = np.zeros((3, 6))
+        if self.solver is not None and lowest < self.top + CLEAR:
+            assert self.model is not None
+            check_in_plane(self.model, pose, now.time + now.period)
+            factors = (now.toughness, now.friction)
+            if factors != self.factors:
+                self.solver.set_point_factors(*factors)
+                self.factors = factors
+            step = self.solver.exchange(self.state, self.fed, pose)
+            self.state, self.cut = step.state, step.cut
+            wrenches = np.array([step.edge, step.normal, step.friction])
+            parts = (wrenches.reshape(3, 2, 3) @ self.R_FC.T).reshape(3, 6)
+            self.spent += step.edge_dissipation + step.opening_dissipation
+            self.spent += step.friction_dissipation
+            moved = float(np.linalg.norm(pose.p - self.fed.p))
+            self._check(moved, pose, now.time + now.period)
+            if pose.p[2] < self.top:
+                self.travel += moved
+                self.swept += 2.0 * moved * self.section.width(float(pose.p[2]))
+        self.fed = pose
+        self.force = parts[:, 3:].sum(0)
+        p = path.p[b] + now.knife_shift
+        if p[2] < reach:
+            v, w = np.array([0.0, 0.0, -now.press]), np.zeros(3)
+            self.force += board_wrench(self.board, self.protocol.knife, path.R[b], p, v, w)[3:]
+        return parts
+
+    def _check(self, moved: float, pose: Pose, time: float) -> None:
+        self.since_check += moved
+        if self.since_check > CHECK_TRAVEL:
+            assert self.solver is not None and self.model is not None
+            self.since_check = 0.0
+            energies = self.solver.energies(self.state, pose)
+            check_energies(energies, self.spent, self.model, time)
+
+    def _sampled(
+        self,
+        facts: SliceFacts,
+        stretches: np.ndarray,
+        parts: np.ndarray,
+        shifts: np.ndarray,
+        cut: np.ndarray,
+    ) -> Series:
+        path, T = self.path, self.path.period
+        # Forces are means over stretches; shifts and cuts are those at their ends.
+        middle, ends = T * stretches.mean(1), T * stretches[:, 1]
+        time = path.time[1:]
+        forces = resampled(parts, middle, time - 0.5 * T)
+        knife, food = np.moveaxis(resampled(shifts, ends, time), 1, 0)
+        p_true = path.p[1:] + knife
+        geometry = self.section.model
+        height = geometry.to_cut_frame(p_true - food)[:, 2]
+        flank, other = np.zeros(len(time)), np.zeros((len(time), 6))
+        if self.model is not None:
+            flank = 2.0 * self.section.above(height)
+        weighed = np.array([label == "weight" for label in path.phase])
+        other[weighed, 5] -= GRAVITY * self.specimen.condition.weight
+        start = path.p[:1] + knife[:1]
+        board = board_wrenches(
+            self.board, self.protocol.knife, path.R, np.concatenate([start, p_true]), T
+        )
+        return Series(
+            slice=facts,
+            time=time,
+            R=path.R[1:],
+            p=path.p[1:],
+            p_true=p_true,
+            v=path.v,
+            phase=path.phase,
+            depth=geometry.top - height,
+            flank=flank,
+            cut=resampled(cut, ends, time),
+            edge=forces[:, 0],
+            normal=forces[:, 1],
+            friction=forces[:, 2],
+            board=board,
+            other=other,
+        )

@@ -1,0 +1,97 @@
+"""Effects of what holds knife and food: board, arm, holder, slips."""
+
+import numpy as np
+
+from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceFacts
+
+__all__ = ["ArmCompliance", "BoardHeight", "BoardLaw", "FoodSlip", "HolderCompliance"]
+
+
+class BoardHeight(Effect):
+    """Board and food that lie higher by `size` than was measured."""
+
+    cause = 13
+    unit = "m"
+    typical = 2e-4
+
+    def drive(self, now: Now) -> None:
+        now.knife_shift[2] -= self.size
+
+
+class BoardLaw(Effect):
+    """A board that stiffens as it gives: its force F becomes F (1 + size ((F / F_0)^0.5 - 1)), the
+    root of the force for the share `size` (a Hertzian contact goes with d^1.5)."""
+
+    cause = 13
+    typical = 0.5
+    reference = 5.0
+
+    def respond(self, series: Series) -> None:
+        force = np.abs(series.board[:, 5])
+        factor = 1.0 + self.size * (np.sqrt(force / self.reference) - 1.0)
+        series.board *= np.maximum(factor, 0.0)[:, None]
+
+
+class ArmCompliance(Effect):
+    """An arm that gives by `size` per vertical force: two thirds in `fast`, the rest in `slow`.
+
+    The encoders do not see it.
+    """
+
+    cause = 14
+    unit = "m/N"
+    typical = 5e-5
+    every_exchange = True
+    fast, slow = 0.03, 0.6
+    axis = 2
+
+    def begin(self, facts: SliceFacts, rng: np.random.Generator) -> None:
+        super().begin(facts, rng)
+        self._given = np.zeros(2)
+
+    def _yield(self, force: float, period: float) -> float:
+        target = self.size * force * np.array([2.0 / 3.0, 1.0 / 3.0])
+        follow = -np.expm1(-period / np.array([self.fast, self.slow]))
+        self._given += follow * (target - self._given)
+        return float(self._given.sum())
+
+    def drive(self, now: Now) -> None:
+        now.knife_shift[2] += self._yield(float(now.force[2]), now.period)
+
+
+class HolderCompliance(ArmCompliance):
+    """A holder of the food that gives by `size` per force along the edge, as the arm does."""
+
+    def drive(self, now: Now) -> None:
+        now.food_shift[0] += self._yield(-float(now.force[0]), now.period)
+
+
+class FoodSlip(Effect):
+    """Food that slips along the edge by `size` and drops by a twentieth of that, at a depth of the
+    first cut that differs from slice to slice; in one slice out of four it does not."""
+
+    cause = 15
+    unit = "m"
+    typical = 3e-3
+    duration = 6e-3
+
+    def begin(self, facts: SliceFacts, rng: np.random.Generator) -> None:
+        super().begin(facts, rng)
+        self._depth = rng.uniform(0.25, 0.9) * facts.height
+        self._side = rng.choice((-1.0, 1.0))
+        self._slips = bool(rng.random() < 0.75 and facts.height > 0.0)
+        self._since: float | None = None
+
+    def drive(self, now: Now) -> None:
+        if self._since is None and self._slips and now.press > 0.0 and now.depth > self._depth:
+            self._since = now.time
+        if self._since is not None:
+            done = -np.expm1(-(now.time + now.period - self._since) / self.duration)
+            now.food_shift += self.size * done * np.array([self._side, 0.0, -0.05])
+
+    def respond(self, series: Series) -> None:
+        if self._since is not None:
+            late = series.time - self._since
+            knock = np.where(late > 0.0, np.exp(-np.maximum(late, 0.0) / 0.05), 0.0)
+            # The blade is knocked sideways, in proportion to how far the food slipped.
+            series.other[:, 4] += 500.0 * self.size * self._side * knock

@@ -1,0 +1,246 @@
+"""A protocol: the slices of one session at the bench, in YAML, and in which order they are cut."""
+
+import copy
+import dataclasses as dc
+
+import numpy as np
+
+from sliceit_drake.configuration import ConfigurationError, load_yaml, quantity, validate
+from sliceit_drake.cutting.board import Board
+from sliceit_drake.cutting.effects import Effects
+from sliceit_drake.cutting.food import Box, Cylinder, Ellipsoid, Food
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.motion import MotionPlan
+from sliceit_drake.diagrams.scenario import Placement, Scenario
+from sliceit_drake.stand_in.sensor import SensorModel
+
+__all__ = [
+    "Condition",
+    "Protocol",
+    "Specimen",
+    "Variation",
+    "load_protocol",
+    "protocol_of_scenario",
+    "scaled_food",
+    "schedule",
+    "section_size",
+]
+
+
+@dc.dataclass
+class Condition:
+    """One kind of cut, made `replicates` times."""
+
+    label: str = "press"
+    motion: MotionPlan = dc.field(default_factory=MotionPlan)
+    """Labels of segments that are those of records (air, slice, hold, retract, second_pass,
+    board_press, weight, ...) become phases; others become "other"."""
+    replicates: int = quantity(3, "", low=1, high=1000, doc="How often.")
+    clearance: float = quantity(
+        3e-3, "m", low=-0.05, high=0.5, doc="Height of the edge above the food at the start."
+    )
+    offset: float = quantity(
+        0.0, "m", low=-0.2, high=0.2, doc="Shift of the edge's middle along the edge at the start."
+    )
+    without_food: bool = False
+    """The bare board; the clearance is over where the food's top would be."""
+    peeled: bool = False
+    """The skin is off."""
+    width_scale: float = quantity(
+        1.0, "", low=0.3, high=3.0, doc="Size of the section against the food's."
+    )
+    weight: float = quantity(
+        0.0, "kg", low=0.0, high=20.0, doc='Mass hung on the knife at Ko in segments "weight".'
+    )
+
+    def check(self, where: str) -> None:
+        if not self.label:
+            raise ConfigurationError(
+                "is empty", field=f"{where}.label", fix="Give the condition a name."
+            )
+
+
+@dc.dataclass
+class Variation:
+    """How slices differ. Relative values are spreads of logarithms; neighbours resemble each other
+    by `correlation`."""
+
+    toughness: float = quantity(0.05, "", low=0.0, high=0.5, doc="Relative spread.")
+    stiffness: float = quantity(0.05, "", low=0.0, high=0.5, doc="Relative spread.")
+    friction: float = quantity(0.05, "", low=0.0, high=0.5, doc="Relative spread.")
+    height: float = quantity(3e-4, "m", low=0.0, high=0.01, doc="Spread of the food's height.")
+    correlation: float = quantity(0.3, "", low=0.0, high=0.99, doc="Of one slice with the next.")
+
+
+@dc.dataclass
+class Protocol:
+    """A session at the bench: food, knife, board, sensor, and what is cut how often.
+
+    The food is the one that a user would describe; a world adds to it what it hides.
+    """
+
+    name: str = "session"
+    food: Food = dc.field(default_factory=Food)
+    knife: Knife = dc.field(default_factory=Knife)
+    board: Board = dc.field(default_factory=Board)
+    placement: Placement = dc.field(default_factory=Placement)
+    exchange_period: float = quantity(
+        2e-3, "s", low=2.5e-4, high=0.02, doc="Between two values of the true wrench."
+    )
+    sensor: SensorModel = dc.field(default_factory=SensorModel)
+    variation: Variation = dc.field(default_factory=Variation)
+    conditions: list[Condition] = dc.field(default_factory=list)
+    random_order: bool = True
+    """Whether the slices are cut in random order; else as listed, replicate by replicate."""
+    knife_slices: int = quantity(
+        0, "", low=0, high=10**6, doc="Slices since sharpening before the first."
+    )
+
+    def check(self, where: str) -> None:
+        if not self.conditions:
+            raise ConfigurationError(
+                "is empty", field=f"{where}.conditions", fix="Give at least one condition."
+            )
+        labels = [condition.label for condition in self.conditions]
+        for k, label in enumerate(labels):
+            if label in labels[:k]:
+                raise ConfigurationError(
+                    f"{label!r} is there twice",
+                    field=f"{where}.conditions[{k}].label",
+                    fix="Give each condition a name of its own, and replicates for repeats.",
+                )
+        if self.food.effects != Effects():
+            raise ConfigurationError(
+                "is for the simulator; a stand-in has effects of its own",
+                field=f"{where}.food.effects",
+                fix="Leave it out, and name effects by --effect.",
+            )
+
+
+@dc.dataclass(frozen=True)
+class Specimen:
+    """One slice to be cut: its condition and how it differs from the mean slice.
+
+    Attributes:
+        index: Order in the session, from 0.
+        condition: What is done.
+        toughness, stiffness, friction: Factors.
+        height: By which the food is higher, metres.
+    """
+
+    index: int
+    condition: Condition
+    toughness: float = 1.0
+    stiffness: float = 1.0
+    friction: float = 1.0
+    height: float = 0.0
+
+
+def schedule(protocol: Protocol, rng: np.random.Generator) -> list[Specimen]:
+    """The slices of a session, in the order in which they are cut."""
+    longest = max(condition.replicates for condition in protocol.conditions)
+    rounds = [[c for c in protocol.conditions if c.replicates > k] for k in range(longest)]
+    cuts = [condition for conditions in rounds for condition in conditions]
+    if protocol.random_order:
+        cuts = [cuts[k] for k in rng.permutation(len(cuts))]
+    v = protocol.variation
+    deviation = rng.normal(size=(len(cuts), 4))
+    for k in range(1, len(cuts)):
+        fresh = np.sqrt(1.0 - v.correlation**2) * deviation[k]
+        deviation[k] = v.correlation * deviation[k - 1] + fresh
+    spread = np.array([v.toughness, v.stiffness, v.friction])
+    specimens = []
+    for k, condition in enumerate(cuts):
+        toughness, stiffness, friction = np.exp(spread * deviation[k, :3]).tolist()
+        height = v.height * float(deviation[k, 3])
+        specimens.append(Specimen(k, condition, toughness, stiffness, friction, height))
+    return specimens
+
+
+def scaled_food(food: Food, scale: float) -> Food:
+    """A food of another size of section.
+
+    Raises:
+        ConfigurationError: It has no shape that can be scaled.
+    """
+    if scale == 1.0:
+        return food
+    shape = copy.deepcopy(food.shape)
+    if isinstance(shape, Cylinder):
+        shape.diameter *= scale
+    elif isinstance(shape, Box):
+        shape.size = [scale * shape.size[0], shape.size[1], scale * shape.size[2]]
+    elif isinstance(shape, Ellipsoid):
+        x, y, z = shape.diameters
+        shape.diameters = [scale * x, y, scale * z]
+    else:
+        raise _no_plain_shape()
+    return dc.replace(food, shape=shape)
+
+
+def section_size(food: Food, scale: float = 1.0) -> tuple[float, float]:
+    """Width and height of a food's section through its middle, metres.
+
+    Raises:
+        ConfigurationError: It has no shape that says so.
+    """
+    shape = scaled_food(food, scale).shape
+    if isinstance(shape, Cylinder):
+        return shape.diameter, shape.diameter
+    if isinstance(shape, Box):
+        return shape.size[0], shape.size[2]
+    if isinstance(shape, Ellipsoid):
+        return shape.diameters[0], shape.diameters[2]
+    raise _no_plain_shape()
+
+
+def _no_plain_shape() -> ConfigurationError:
+    return ConfigurationError(
+        "is no cylinder, box or ellipsoid",
+        field="protocol.food.shape",
+        fix="Describe the food by one of these shapes.",
+    )
+
+
+def load_protocol(file: str) -> Protocol:
+    """Reads and validates a protocol.
+
+    Raises:
+        ConfigurationError: Naming file, field and fix.
+    """
+    protocol = load_yaml(Protocol, file)
+    validate(protocol, "protocol")
+    return protocol
+
+
+def protocol_of_scenario(scenario: Scenario, replicates: int = 1) -> Protocol:
+    """The one cut of a scenario as a protocol; robot, controller and sensor are left out.
+
+    Raises:
+        ConfigurationError: The scenario has no food to cut, or is a sequence.
+    """
+    if not isinstance(scenario.food, Food) or scenario.sequence is not None:
+        raise ConfigurationError(
+            "has no single cut through a finite-element food",
+            field="scenario.food" if scenario.sequence is None else "scenario.sequence",
+            fix="Give a scenario with one cut, or a protocol with a list of conditions.",
+        )
+    protocol = Protocol(
+        name=scenario.name,
+        food=scenario.food,
+        knife=scenario.knife,
+        board=scenario.board,
+        placement=scenario.placement,
+        exchange_period=scenario.exchange_period,
+        conditions=[
+            Condition(
+                label=scenario.name,
+                motion=scenario.motion,
+                replicates=replicates,
+                clearance=scenario.start.clearance,
+                offset=scenario.start.offset,
+            )
+        ],
+    )
+    validate(protocol, "protocol")
+    return protocol

@@ -1,0 +1,119 @@
+"""Effects by name, and effects that a user wrote."""
+
+import importlib.util
+import inspect
+from pathlib import Path
+
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.stand_in import (
+    knife_effects,
+    mounting_effects,
+    sensor_effects,
+    tissue_effects,
+    unlisted_effects,
+)
+from sliceit_drake.stand_in.effect import Effect
+
+__all__ = ["EFFECTS", "UNLISTED", "effects_as_markdown", "make_effect"]
+
+UNLISTED: dict[str, type[Effect]] = {
+    "magnetic_board": unlisted_effects.MagneticBoard,
+    "juice_film": unlisted_effects.JuiceFilm,
+    "serrated_edge": unlisted_effects.SerratedEdge,
+    "warm_wrist": unlisted_effects.WarmWrist,
+}
+"""What stands in no list of causes."""
+
+EFFECTS: dict[str, type[Effect]] = {
+    "bulk_relaxation": tissue_effects.BulkRelaxation,
+    "rate_toughness": tissue_effects.RateToughness,
+    "flank_friction": knife_effects.FlankFriction,
+    "flank_adhesion": knife_effects.FlankAdhesion,
+    "toughness": tissue_effects.Toughness,
+    "stiffness": tissue_effects.Stiffness,
+    "skin": tissue_effects.SkinToughness,
+    "blunt_edge": knife_effects.BluntEdge,
+    "dulling_edge": knife_effects.DullingEdge,
+    "slice_push_law": tissue_effects.SlicePushLaw,
+    "section_shape": tissue_effects.SectionShape,
+    "core": tissue_effects.CoreToughness,
+    "board_height": mounting_effects.BoardHeight,
+    "board_law": mounting_effects.BoardLaw,
+    "arm_compliance": mounting_effects.ArmCompliance,
+    "holder_compliance": mounting_effects.HolderCompliance,
+    "food_slip": mounting_effects.FoodSlip,
+    "sensor_drift": sensor_effects.SensorDrift,
+    "sensor_gain": sensor_effects.SensorGain,
+    "sensor_tilt": sensor_effects.SensorTilt,
+    "sensor_delay": sensor_effects.SensorDelay,
+    "tool_weight": sensor_effects.ToolWeight,
+    "drive_vibration": sensor_effects.DriveVibration,
+    "stick_slip": sensor_effects.StickSlip,
+    **UNLISTED,
+}
+"""All effects by name."""
+
+
+def effects_as_markdown() -> str:
+    """A table of all effects: number of the cause, typical size, what it does."""
+    lines = ["| name | cause | typical size | what it does |", "|---|---|---|---|"]
+    for name, kind in EFFECTS.items():
+        words = " ".join((kind.__doc__ or "").split("\n\n")[0].split())
+        cause = str(kind.cause) if kind.cause else "unlisted" if name in UNLISTED else "-"
+        size = f"{kind.typical:g} {kind.unit}".strip()
+        lines.append(f"| `{name}` | {cause} | {size} | {words} |")
+    return "\n".join(lines)
+
+
+def make_effect(text: str) -> Effect:
+    """The effect that a text names.
+
+    Args:
+        text: NAME, NAME:SIZE, FILE.py or FILE.py:SIZE; without a size its typical one.
+
+    Raises:
+        ConfigurationError: There is no such effect, or the size is no number.
+    """
+    name, size = text, None
+    head, colon, tail = text.rpartition(":")
+    if colon and not tail.endswith(".py"):
+        name = head
+        try:
+            size = float(tail)
+        except ValueError:
+            raise ConfigurationError(
+                f"has the size {tail!r}, which is no number",
+                field=f"--effect {text}",
+                fix="Write NAME:SIZE, as skin:0.3.",
+            ) from None
+    kind = _from_file(Path(name)) if name.endswith(".py") else EFFECTS.get(name)
+    if kind is None:
+        raise ConfigurationError(
+            f"{name!r} is no effect",
+            field="--effect",
+            fix=f"Give a file.py, or one of {', '.join(EFFECTS)}.",
+        )
+    return kind(size)
+
+
+def _from_file(file: Path) -> type[Effect]:
+    spec = importlib.util.spec_from_file_location(f"stand_in_effect_{file.stem}", file)
+    if spec is None or spec.loader is None or not file.is_file():
+        raise ConfigurationError(
+            "there is no such file", source=str(file), field="--effect", fix="Check the path."
+        )
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    kinds = [
+        kind
+        for _, kind in inspect.getmembers(module, inspect.isclass)
+        if issubclass(kind, Effect) and kind.__module__ == module.__name__
+    ]
+    if len(kinds) != 1:
+        raise ConfigurationError(
+            f"holds {len(kinds)} effects",
+            source=str(file),
+            fix="Write one subclass of sliceit_drake.stand_in.effect.Effect in it; the docstring "
+            "of that module has an example.",
+        )
+    return kinds[0]

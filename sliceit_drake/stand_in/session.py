@@ -1,0 +1,352 @@
+"""A session at the bench: what a world cuts, as a sensor and the arm's encoders record it."""
+
+import copy
+import os
+import secrets
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path as FilePath
+
+import numpy as np
+
+from sliceit_drake.configuration import ConfigurationError, load_yaml
+from sliceit_drake.cutting.food import Box, Cylinder, Ellipsoid, Food
+from sliceit_drake.records.metadata import (
+    PHASE_LABELS,
+    FoodFacts,
+    KnifeFacts,
+    NominalMotion,
+    Phase,
+    SensorFacts,
+    SliceMetadata,
+    ToolFacts,
+    WrenchFacts,
+)
+from sliceit_drake.records.slice_record import SliceRecord, write_record
+from sliceit_drake.stand_in.curve_world import CurveWorld
+from sliceit_drake.stand_in.effect import Effect, Series
+from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings, FiniteElementWorld
+from sliceit_drake.stand_in.protocol import Protocol, Specimen, scaled_food, schedule
+from sliceit_drake.stand_in.registry import make_effect
+from sliceit_drake.stand_in.sensor import measured
+from sliceit_drake.stand_in.world import World
+
+__all__ = ["WORLDS", "Session", "record_session"]
+
+WORLDS = ("finite_elements", "curves")
+
+ORDER, WORLD, SENSOR = range(3)
+"""Independent streams of random numbers."""
+
+PROVENANCE = "Simulated bench, sliceit record. Not measured on a robot."
+
+
+class Session:
+    """The slices of a protocol in one world.
+
+    Everything random follows from the seed, slice by slice: a slice's record does not depend on
+    which others were made, and its noise not on the effects.
+
+    Args:
+        protocol: What is cut.
+        effects: What is hidden.
+        world: One of `WORLDS`.
+        seed: Of order, variation, noise and what effects draw.
+        settings: How finely the finite elements are computed.
+
+    Attributes:
+        specimens: The slices in the order in which they are cut.
+    """
+
+    def __init__(
+        self,
+        protocol: Protocol,
+        effects: Sequence[Effect] = (),
+        world: str = "finite_elements",
+        seed: int = 0,
+        settings: FiniteElementSettings | None = None,
+    ) -> None:
+        if world not in WORLDS:
+            raise ConfigurationError(
+                f"{world!r} is no world", field="--world", fix=f"Give one of {', '.join(WORLDS)}."
+            )
+        self.protocol, self.effects, self.seed = protocol, tuple(effects), seed
+        self.world: World = (
+            FiniteElementWorld(protocol, settings)
+            if world == "finite_elements"
+            else CurveWorld(protocol)
+        )
+        self.specimens = schedule(protocol, self._random(ORDER, 0))
+
+    def __len__(self) -> int:
+        return len(self.specimens)
+
+    def _random(self, stream: int, index: int) -> np.random.Generator:
+        return np.random.default_rng([self.seed, stream, index])
+
+    def series(self, index: int) -> tuple[Series, list[Effect]]:
+        """One slice as the world has it, and the effects that saw it.
+
+        Raises:
+            CuttingError: The motion cannot be computed, or the cut broke down.
+        """
+        effects = copy.deepcopy(list(self.effects))
+        rng = self._random(WORLD, index)
+        return self.world.cut(self.specimens[index], effects, rng), effects
+
+    def record(self, index: int) -> SliceRecord:
+        """One slice as it is recorded.
+
+        Raises:
+            CuttingError: The motion cannot be computed, or the cut broke down.
+        """
+        series, effects = self.series(index)
+        protocol, specimen = self.protocol, self.specimens[index]
+        in_knife = series.R.transpose(0, 2, 1)
+        wrench = np.einsum("nij,nkj->nki", in_knife, series.wrench().reshape(-1, 2, 3))
+        wrench = wrench.reshape(-1, 6)
+        for effect in effects:
+            wrench = effect.measure(series, wrench)
+        rng = self._random(SENSOR, index)
+        rows, readings = measured(wrench, series.period, protocol.sensor, rng)
+        R_WF, p_WF = _food_pose(protocol)
+        R_WK = R_WF @ series.R[rows]
+        vectors = np.einsum("nij,nkj->nki", R_WK, readings.reshape(-1, 2, 3))
+        turn = np.einsum("nij,nkj->nik", np.diff(series.R, axis=0), series.R[:-1])
+        turn = np.concatenate([np.zeros((1, 3, 3)), turn]) / series.period
+        w = np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], axis=1)
+        return SliceRecord(
+            metadata=_metadata(protocol, specimen, series),
+            time=series.time[rows],
+            position=p_WF + series.p[rows] @ R_WF.T,
+            rotation=R_WK,
+            velocity=series.v[rows] @ R_WF.T,
+            angular_velocity=w[rows] @ R_WF.T,
+            force=vectors[:, 1],
+            torque=vectors[:, 0],
+        )
+
+
+def _food_pose(protocol: Protocol) -> tuple[np.ndarray, np.ndarray]:
+    """X_WF."""
+    c, s = np.cos(protocol.placement.yaw), np.sin(protocol.placement.yaw)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return R, np.array([*protocol.placement.position, protocol.board.height])
+
+
+def _metadata(protocol: Protocol, specimen: Specimen, series: Series) -> SliceMetadata:
+    """What the person at the bench knows."""
+    condition, knife, sensor = specimen.condition, protocol.knife, protocol.sensor
+    metadata = SliceMetadata(
+        name=_name(specimen.index),
+        provenance=PROVENANCE,
+        food=_food_facts(protocol, specimen),
+        board_height=protocol.board.height,
+        knife=KnifeFacts(
+            name="straight double bevel",
+            length=knife.length,
+            height=knife.height,
+            spine_thickness=knife.spine_thickness,
+            edge_thickness=knife.edge_thickness,
+            tip_height=knife.tip_height,
+            edge_radius=knife.edge_radius,
+        ),
+        motion=_nominal_motion(series),
+        wrench=WrenchFacts(tared="yes"),
+        sensor=SensorFacts(
+            name="wrist sensor",
+            force_range=sensor.force_range,
+            torque_range=sensor.torque_range,
+            force_resolution=sensor.force_resolution,
+            rate=sensor.rate,
+            cutoff_frequency=sensor.cutoff_frequency or None,
+            position=[0.0, 0.0, 0.0],
+            rotation=[0.0, 0.0, 0.0],
+        ),
+        slice_index=specimen.index,
+        knife_slices=protocol.knife_slices + specimen.index,
+        condition=condition.label,
+        unknown=["food.slice_thickness", "tool.inertia"],
+    )
+    if condition.weight > 0.0:
+        metadata.tool = ToolFacts(mass=condition.weight, center_of_mass=[0.0, 0.0, 0.0])
+        metadata.wrench.includes.append("gravity")
+    else:
+        metadata.unknown += ["tool.mass", "tool.center_of_mass"]
+    return metadata
+
+
+def _name(index: int) -> str:
+    return f"slice_{index:03d}"
+
+
+def _food_facts(protocol: Protocol, specimen: Specimen) -> FoodFacts:
+    condition = specimen.condition
+    if condition.without_food:
+        return FoodFacts(name="none")
+    food = scaled_food(protocol.food, condition.width_scale)
+    shape, size = _shape(food)
+    R_WF, p_WF = _food_pose(protocol)
+    x, y, _ = food.cut_point
+    normal = food.cut_normal
+    return FoodFacts(
+        name=food.name,
+        shape=shape,
+        size=size,
+        support="clamped_slab" if food.held_sides == "both" else "end_slice",
+        peeled=condition.peeled,
+        position=(p_WF + R_WF @ [x, y, 0.0]).tolist(),
+        yaw=protocol.placement.yaw + float(np.arctan2(-normal[0], normal[1])),
+    )
+
+
+def _shape(food: Food) -> tuple[str, list[float] | None]:
+    shape = food.shape
+    if isinstance(shape, Cylinder):
+        return "cylinder", [shape.diameter, shape.length, shape.diameter]
+    if isinstance(shape, Box):
+        return "box", list(shape.size)
+    if isinstance(shape, Ellipsoid):
+        return "ellipsoid", list(shape.diameters)
+    return "unknown", None
+
+
+def _nominal_motion(series: Series) -> NominalMotion:
+    labels = [label if label in PHASE_LABELS else "other" for label in series.phase]
+    starts = [0, *(k for k in range(1, len(labels)) if labels[k] != labels[k - 1]), len(labels)]
+    edges = np.concatenate([[series.time[0] - series.period], series.time])
+    phases = [
+        Phase(labels[a], float(edges[a]), float(edges[b]))
+        for a, b in zip(starts[:-1], starts[1:], strict=True)
+    ]
+    motion = NominalMotion(phases=phases)
+    slicing = np.array([label == "slice" for label in labels]) & (series.press > 1e-5)
+    if slicing.any():
+        press = float(np.median(series.press[slicing]))
+        motion.speed = round(press, 6)
+        motion.draw_ratio = round(float(np.median(series.draw[slicing])) / press, 4)
+    return motion
+
+
+def record_session(
+    protocol: Protocol,
+    output: FilePath,
+    effects: Sequence[str] = (),
+    world: str = "finite_elements",
+    seed: int | None = None,
+    workers: int = 1,
+    settings: FiniteElementSettings | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[FilePath]:
+    """Writes the records of a protocol, one by one as they are done; goes on with what is there.
+
+    Names and metadata tell neither world nor effects nor seed.
+
+    Args:
+        protocol: What is cut.
+        output: Folder of the records.
+        effects: What is hidden, as `registry.make_effect` takes it.
+        world: One of `WORLDS`.
+        seed: None for one that nobody knows; needed to go on.
+        workers: Processes.
+        settings: How finely the finite elements are computed.
+        progress: Called with the number of records that are there, and that of all.
+
+    Returns:
+        The CSV files, by slice.
+
+    Raises:
+        ConfigurationError: An input is wrong, or the folder holds records of another session.
+        CuttingError: A motion cannot be computed, or a cut broke down.
+    """
+    output.mkdir(parents=True, exist_ok=True)
+    there = sorted(output.glob("*.yaml"))
+    if there and seed is None:
+        raise ConfigurationError(
+            f"there are {len(there)} records already",
+            source=str(output),
+            fix="Give another folder, or the --seed of these to go on.",
+        )
+    hidden = [make_effect(text) for text in effects]
+    seed = secrets.randbits(62) if seed is None else seed
+    session = Session(protocol, hidden, world, seed, settings)
+    left = [k for k in range(len(session)) if not _is_there(session, output, k)]
+    done = len(session) - len(left)
+    if progress is not None:
+        progress(done, len(session))
+    for _ in _written(session, effects, world, settings, output, left, workers):
+        done += 1
+        if progress is not None:
+            progress(done, len(session))
+    return [output / f"{_name(k)}.csv" for k in range(len(session))]
+
+
+def _is_there(session: Session, output: FilePath, index: int) -> bool:
+    file = output / f"{_name(index)}.yaml"
+    if not file.exists():
+        return False
+    found, label = load_yaml(SliceMetadata, file), session.specimens[index].condition.label
+    if found.condition != label:
+        raise ConfigurationError(
+            f"is a slice of {found.condition!r}; this protocol and seed have {label!r} there",
+            source=str(file),
+            fix="Give another folder, or the protocol and --seed that the folder was begun with.",
+        )
+    return True
+
+
+def _write(session: Session, output: FilePath, index: int) -> int:
+    # Two files make a record; a run that is killed must not leave half of one.
+    with tempfile.TemporaryDirectory(dir=output, prefix=".writing_") as folder:
+        made = write_record(session.record(index), FilePath(folder) / _name(index))
+        for file in (made, made.with_suffix(".yaml")):
+            os.replace(file, output / file.name)
+    return index
+
+
+_worker: list[tuple[Session, FilePath]] = []
+
+
+def _start_worker(
+    protocol: Protocol,
+    effects: Sequence[str],
+    world: str,
+    seed: int,
+    settings: FiniteElementSettings | None,
+    output: FilePath,
+) -> None:
+    hidden = [make_effect(text) for text in effects]
+    _worker.append((Session(protocol, hidden, world, seed, settings), output))
+
+
+def _work(index: int) -> int:
+    session, output = _worker[0]
+    return _write(session, output, index)
+
+
+def _written(
+    session: Session,
+    effects: Sequence[str],
+    world: str,
+    settings: FiniteElementSettings | None,
+    output: FilePath,
+    left: Sequence[int],
+    workers: int,
+) -> Iterator[int]:
+    """Writes the slices that are left, and yields each when its files are there."""
+    if min(workers, len(left)) < 2:
+        for index in left:
+            yield _write(session, output, index)
+        return
+    # Effects travel by name: a class from a user's file is in no module that a process can import.
+    arguments = (session.protocol, tuple(effects), world, session.seed, settings, output)
+    pool = ProcessPoolExecutor(
+        workers, get_context("spawn"), initializer=_start_worker, initargs=arguments
+    )
+    try:
+        for future in as_completed([pool.submit(_work, index) for index in left]):
+            yield future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)

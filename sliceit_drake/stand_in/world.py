@@ -1,0 +1,110 @@
+"""What a world is, and what all worlds share: the knife's path and the pieces it is cut into."""
+
+import dataclasses as dc
+import typing
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from sliceit_drake.cutting.motion import Motion, MotionPlan, Pose
+from sliceit_drake.stand_in.effect import Effect, Series
+from sliceit_drake.stand_in.protocol import Specimen
+
+__all__ = ["GRAVITY", "Path", "World", "resampled"]
+
+GRAVITY = 9.81
+
+
+class World(typing.Protocol):
+    """Cuts slices."""
+
+    def cut(
+        self, specimen: Specimen, effects: Sequence[Effect], rng: np.random.Generator
+    ) -> Series:
+        """Cuts one slice.
+
+        Args:
+            specimen: The slice.
+            effects: What is hidden; fresh copies, which the world begins.
+            rng: For what differs from slice to slice.
+        """
+        ...
+
+
+@dc.dataclass
+class Path:
+    """A prescribed motion, sampled every exchange; row 0 is the start.
+
+    Attributes:
+        period: s.
+        time: [E + 1], s.
+        R, p: Pose of the knife in F [E + 1, 3, 3] and [E + 1, 3], metres.
+        phase: Label of the segment that leads to each row but the first [E].
+        span: First row of that segment and the row at its end [E, 2].
+    """
+
+    period: float
+    time: np.ndarray
+    R: np.ndarray
+    p: np.ndarray
+    phase: list[str]
+    span: np.ndarray
+
+    @classmethod
+    def of(cls, plan: MotionPlan, start: Pose, period: float) -> "Path":
+        """Samples a plan from a start pose in F."""
+        motion = Motion(plan, start)
+        count = max(2, round(motion.duration / period))
+        time = period * np.arange(count + 1)
+        poses = [motion.pose(t) for t in time]
+        ends = np.array([end for _, _, end in motion.phases])
+        middle = time[1:] - 0.5 * period
+        segment = np.minimum(np.searchsorted(ends, middle), len(ends) - 1)
+        first = np.searchsorted(segment, segment, side="left")
+        last = np.searchsorted(segment, segment, side="right")
+        return cls(
+            period,
+            time,
+            np.array([X.R for X in poses]),
+            np.array([X.p for X in poses]),
+            [motion.phases[s][0] for s in segment],
+            np.column_stack([first, last]),
+        )
+
+    def __len__(self) -> int:
+        return len(self.time) - 1
+
+    @property
+    def v(self) -> np.ndarray:
+        """Mean velocity of Ko over each exchange [E, 3], m/s."""
+        return np.diff(self.p, axis=0) / self.period
+
+    def stretches(self, travel: float, longest: int, reach: float) -> Iterator[tuple[int, int]]:
+        """Cuts the path into stretches [a, b) of exchanges, short where the knife is fast.
+
+        A stretch is longer than one exchange only where the knife moves less than `travel` in it,
+        and short after the beginning and before the end of a segment, where things change.
+
+        Args:
+            travel: metres.
+            longest: Exchanges.
+            reach: Half the length of the edge, for turns, metres.
+        """
+        moved = np.linalg.norm(np.diff(self.p, axis=0), axis=1)
+        turned = np.linalg.norm(np.diff(self.R, axis=0), axis=(1, 2)) * reach
+        done = np.concatenate([[0.0], np.cumsum(moved + turned)])
+        a = 0
+        while a < len(self):
+            first, last = (int(k) for k in self.span[a])
+            most = min(longest, 1 + min(a - first, last - a) // 2, last - a)
+            b = int(np.searchsorted(done, done[a] + travel * (1.0 + 1e-9), side="right")) - 1
+            b = min(max(b, a + 1), a + max(most, 1))
+            yield a, b
+            a = b
+
+
+def resampled(values: np.ndarray, known: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Values [M, ...] known at times [M], at other times [N, ...], linearly between them."""
+    rows = values.reshape(len(values), -1).T
+    found = np.column_stack([np.interp(wanted, known, row) for row in rows])
+    return found.reshape(len(wanted), *values.shape[1:])
