@@ -5,11 +5,11 @@ import os
 import sys
 from collections.abc import Sequence
 
-from sliceit_drake.cli import diagram, record, simulate, study
+from sliceit_drake.cli import diagram, record, records, simulate, study
 
 __all__ = ["main"]
 
-COMMANDS = (simulate, diagram, record, study)
+COMMANDS = (simulate, diagram, record, study, records)
 BAD_INPUT = 2
 INTERRUPTED = 130
 

@@ -134,7 +134,7 @@ def _check_sampling(record: SliceRecord, findings: Findings) -> None:
     step = np.diff(record.time)
     usual = float(np.median(step))
     k = int(step.argmax())
-    if step[k] > max(5.0 * usual, 0.02):
+    if step[k] > max(6.0 * usual, 0.02):
         findings.warning(
             "dropout",
             fmt.TIME,

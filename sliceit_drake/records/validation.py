@@ -16,7 +16,7 @@ from sliceit_drake.records.metadata import SliceMetadata
 from sliceit_drake.records.motion_checks import check_motion
 from sliceit_drake.records.slice_record import SliceRecord, SliceTable
 
-__all__ = ["Finding", "check_record", "check_table", "load_record", "load_records"]
+__all__ = ["Finding", "check_record", "check_table", "load_record", "load_records", "record_files"]
 
 LEAST_ROWS = 10
 
@@ -71,13 +71,24 @@ def load_records(folder: str | Path) -> list[SliceRecord]:
     Raises:
         ConfigurationError: If there are none, or one cannot be used.
     """
-    files = sorted(Path(folder).glob("*.csv"))
+    records = [load_record(file) for file in record_files(Path(folder))]
+    return sorted(records, key=lambda record: (record.metadata.slice_index, record.name))
+
+
+def record_files(path: Path) -> list[Path]:
+    """The CSV files of the records in a folder, or the file itself.
+
+    Raises:
+        ConfigurationError: If a folder has none.
+    """
+    if path.suffix in (".csv", ".yaml", ".yml"):
+        return [path.with_suffix(".csv")]
+    files = sorted(path.glob("*.csv"))
     if not files:
         raise ConfigurationError(
-            "there are no records", source=str(folder), fix="Give a folder with NAME.csv files."
+            "there are no records", source=str(path), fix="Give a folder with NAME.csv files."
         )
-    records = [load_record(file) for file in files]
-    return sorted(records, key=lambda record: (record.metadata.slice_index, record.name))
+    return files
 
 
 def check_record(record: SliceRecord) -> list[Finding]:

@@ -1,0 +1,169 @@
+"""`sliceit records`: check slice records, and make them from other formats."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sliceit_drake.records.metadata import SliceMetadata
+    from sliceit_drake.records.slice_record import SliceRecord
+
+__all__ = ["add_parser"]
+
+DESCRIPTION = """\
+Slice records: one slice as a table (NAME.csv) and what is known about it (NAME.yaml), SI units.
+docs/records.md describes the format; calibration/records holds three to look at.
+"""
+
+CHECK = """\
+Say what is wrong with slice records: by file, column and line, and what to do about it.
+
+Finds missing columns, gaps, time that runs backwards, kN for N, mm for m, ms for s, degrees, a
+flipped sign or wrong frame, a sensor that was not tared, clipped or stuck, jumps of the pose,
+velocities that disagree with it, and facts that are missing.
+
+A record with an error cannot be used; with a warning it can, with care. Ends with status 1 if there
+is an error.
+"""
+
+IMPORT = """\
+Make a slice record from another format.
+
+  ur_rtde   a recording of ur_rtde's RTDEReceiveInterface.startFileRecording, with at least the
+            variables timestamp, actual_TCP_pose, actual_TCP_speed, actual_TCP_force (and actual_q):
+              sliceit records import ur_rtde run_07.csv --metadata session.yaml \\
+                --tcp-to-knife 0 0 0.12 3.1416 0 0 --output records
+  force     two columns, time in s and force in N; the motion is nominal, straight down at
+            motion.speed:
+              sliceit records import force scale.csv --metadata facts.yaml --contact 0.4 \\
+                --output records
+  profile   a force profile digitised from a figure, as those in calibration/measured
+
+--metadata is a YAML file with what FILE does not say: food, board, knife, nominal motion, sensor,
+provenance, and what is unknown (docs/records.md). Writes DIR/NAME.csv and DIR/NAME.yaml, and prints
+what `sliceit records check` finds in them.
+"""
+
+
+def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        "records",
+        help="check slice records, or make them from other formats",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    check = actions.add_parser(
+        "check",
+        help="what is wrong with records",
+        description=CHECK,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    check.add_argument(
+        "paths", metavar="PATH", nargs="+", type=Path, help="a record (NAME.csv), or a folder"
+    )
+    check.set_defaults(run=run_check)
+    make = actions.add_parser(
+        "import",
+        help="make a record from another format",
+        description=IMPORT,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    make.add_argument("format", choices=("ur_rtde", "force", "profile"), help="what FILE is")
+    make.add_argument("file", metavar="FILE", type=Path)
+    make.add_argument("--output", metavar="DIR", type=Path, required=True, help="folder of records")
+    make.add_argument("--metadata", metavar="YAML", type=Path, help="what FILE does not say")
+    make.add_argument("--name", help="name of the record; default: that in YAML, or FILE's")
+    pose = ("X", "Y", "Z", "ROLL", "PITCH", "YAW")
+    make.add_argument(
+        "--tcp-to-knife",
+        metavar=pose,
+        nargs=6,
+        type=float,
+        help="ur_rtde: knife in the tool frame set in the controller, m and rad; the knife "
+        "frame has its origin at the middle of the edge, x along it, z from spine to edge",
+    )
+    make.add_argument(
+        "--world-to-base",
+        metavar=pose,
+        nargs=6,
+        type=float,
+        help="ur_rtde: robot's base in the world; default: they are the same",
+    )
+    make.add_argument(
+        "--component",
+        choices=("norm", "vertical"),
+        default="norm",
+        help="force: what of the force FILE has (default: norm)",
+    )
+    make.add_argument(
+        "--contact",
+        metavar="S",
+        type=float,
+        help="force, profile: time at which the force rises, which ends the air phase",
+    )
+    make.set_defaults(run=run_import)
+
+
+def run_check(options: argparse.Namespace) -> int:
+    """Runs `sliceit records check`."""
+    from sliceit_drake.configuration import ConfigurationError
+    from sliceit_drake.records.slice_record import read_table
+    from sliceit_drake.records.validation import check_table, record_files
+
+    files = [file for path in options.paths for file in record_files(path)]
+    bad = 0
+    for file in files:
+        try:
+            findings = check_table(read_table(file))
+            lines = [str(finding) for finding in findings]
+            is_bad = any(finding.severity == "error" for finding in findings)
+        except ConfigurationError as error:
+            lines, is_bad = [f"error: {error}"], True
+        print("\n".join(lines or [f"{file}: nothing found"]))
+        bad += is_bad
+    print(f"{len(files)} records, {bad} with errors")
+    return 1 if bad else 0
+
+
+def run_import(options: argparse.Namespace) -> int:
+    """Runs `sliceit records import`."""
+    from sliceit_drake.configuration import load_yaml
+    from sliceit_drake.records.metadata import SliceMetadata
+    from sliceit_drake.records.slice_record import write_record
+    from sliceit_drake.records.validation import check_record
+
+    metadata = load_yaml(SliceMetadata, options.metadata)
+    metadata.name = options.name or metadata.name
+    record = _import(options, metadata)
+    file = write_record(record, options.output / record.name)
+    print(f"{file} and .yaml: {len(record)} rows, {record.time[-1] - record.time[0]:.4g} s")
+    record.file = str(file)
+    findings = check_record(record)
+    for finding in findings:
+        print(finding)
+    return 1 if any(finding.severity == "error" for finding in findings) else 0
+
+
+def _import(options: argparse.Namespace, metadata: "SliceMetadata") -> "SliceRecord":
+    from sliceit_drake.configuration import ConfigurationError
+    from sliceit_drake.records import importers
+
+    if options.format == "profile":
+        return importers.import_profile(options.file, metadata, contact=options.contact)
+    if options.format == "force":
+        return importers.import_force(
+            options.file, metadata, component=options.component, contact=options.contact
+        )
+    if options.tcp_to_knife is None:
+        raise ConfigurationError(
+            "is not given",
+            field="--tcp-to-knife",
+            fix="Give the pose of the knife in the controller's tool frame: X Y Z ROLL PITCH YAW.",
+        )
+
+    tcp, base = options.tcp_to_knife, options.world_to_base or [0.0] * 6
+    X_TK = importers.pose_matrix(tcp[:3], tcp[3:])
+    X_WB = importers.pose_matrix(base[:3], base[3:])
+    return importers.import_ur_rtde(options.file, metadata, X_TK, X_WB)

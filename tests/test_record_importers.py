@@ -1,0 +1,302 @@
+"""Records made from other formats say what the source said, in the frames of a record."""
+
+import dataclasses as dc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from example_slices import HEIGHT, example_metadata, example_slice, wrist_motion
+from scipy.spatial.transform import Rotation
+
+from sliceit_drake.cli.main import main
+from sliceit_drake.configuration import ConfigurationError, dump_yaml
+from sliceit_drake.records import slice_record as fmt
+from sliceit_drake.records.force_profile import load_force_profile
+from sliceit_drake.records.importers import (
+    import_force,
+    import_frame,
+    import_ur_rtde,
+    pose_matrix,
+)
+from sliceit_drake.records.metadata import SliceMetadata, WrenchFacts
+from sliceit_drake.records.phases import phases_from_motion
+from sliceit_drake.records.slice_record import SliceRecord
+from sliceit_drake.records.validation import check_record, load_record, load_records
+from sliceit_drake.resources import resource_path
+
+# 30 rows that ur_rtde 1.6.5 wrote of a controller at rest, some of them twice.
+RECORDING = Path(__file__).parent / "data" / "ur_rtde_recording.csv"
+X_TK = pose_matrix([0.01, -0.02, 0.15], [0.1, -0.3, 0.4])
+X_WB = pose_matrix([0.5, -0.4, 0.02], [0.0, 0.0, 2.1])
+
+
+def write_recording(record: SliceRecord, file: Path) -> None:
+    """Writes a record as the robot with X_TK and X_WB would have seen it, with six decimals."""
+    X_WK = np.tile(np.eye(4), (len(record), 1, 1))
+    X_WK[:, :3, :3], X_WK[:, :3, 3] = record.rotation, record.position
+    X_BT = np.linalg.inv(X_WB) @ X_WK @ np.linalg.inv(X_TK)
+    R_BW = X_WB[:3, :3].T
+    # From Ko to To, in W.
+    arm = -record.rotation @ (X_TK[:3, :3].T @ X_TK[:3, 3])
+    v_T = record.velocity + np.cross(record.angular_velocity, arm)
+    torque_T = record.torque - np.cross(arm, record.force)
+    rotvec = Rotation.from_matrix(X_BT[:, :3, :3]).as_rotvec()
+    parts = {
+        "timestamp": 1234.5 + record.time[:, None],
+        "actual_q": np.outer(np.cos(record.time), np.arange(6.0)),
+        "actual_TCP_pose": np.column_stack([X_BT[:, :3, 3], rotvec]),
+        "actual_TCP_speed": np.column_stack([v_T, record.angular_velocity]) @ twice(R_BW).T,
+        "actual_TCP_force": np.column_stack([record.force, torque_T]) @ twice(R_BW).T,
+    }
+    header = ["timestamp"] + [f"{name}_{i}" for name in list(parts)[1:] for i in range(6)]
+    table = np.column_stack(list(parts.values()))
+    # The computer's pace is not the controller's: now and then a row comes twice.
+    table = np.repeat(table, np.where(np.arange(len(table)) % 7 == 3, 2, 1), axis=0)
+    np.savetxt(file, table, fmt="%.6f", delimiter=",", header=",".join(header), comments="")
+
+
+def twice(R: np.ndarray) -> np.ndarray:
+    return np.kron(np.eye(2), R)
+
+
+def swung_slice() -> SliceRecord:
+    record = example_slice()
+    p, R, v, w = wrist_motion(record.time)
+    torque = np.cross([0.02, 0.01, 0.0], record.force)
+    return dc.replace(record, position=p, rotation=R, velocity=v, angular_velocity=w, torque=torque)
+
+
+def test_a_robots_recording_has_the_knife_and_its_wrench_in_the_world(tmp_path):
+    truth = swung_slice()
+    write_recording(truth, tmp_path / "run.csv")
+    record = import_ur_rtde(tmp_path / "run.csv", truth.metadata, X_TK, X_WB)
+    np.testing.assert_allclose(record.time, truth.time, atol=1e-6)
+    np.testing.assert_allclose(record.position, truth.position, atol=3e-6)
+    np.testing.assert_allclose(record.rotation, truth.rotation, atol=3e-6)
+    np.testing.assert_allclose(record.velocity, truth.velocity, atol=3e-6)
+    np.testing.assert_allclose(record.angular_velocity, truth.angular_velocity, atol=3e-6)
+    np.testing.assert_allclose(record.force, truth.force, atol=3e-6)
+    np.testing.assert_allclose(record.torque, truth.torque, atol=1e-4)
+    np.testing.assert_allclose(record.joints[:, 5], 5.0 * np.cos(truth.time), atol=1e-6)
+    (step,) = record.metadata.processing
+    assert step.numbers == {"start": 1234.5, "repeated_rows": 214.0}
+    assert record.metadata.wrench.frame == "W"
+
+
+def test_a_force_by_the_knife_is_turned_round(tmp_path):
+    truth = swung_slice()
+    write_recording(truth, tmp_path / "run.csv")
+    truth.metadata.wrench.sign = "by_knife"
+    record = import_ur_rtde(tmp_path / "run.csv", truth.metadata, X_TK, X_WB)
+    np.testing.assert_allclose(record.force, -truth.force, atol=3e-6)
+    assert record.metadata.wrench.sign == "on_knife"
+
+
+def test_what_the_library_itself_writes_is_read():
+    record = import_ur_rtde(RECORDING, SliceMetadata(), np.eye(4))
+    assert record.name == "ur_rtde_recording"
+    assert record.metadata.processing[0].numbers["repeated_rows"] == 30 - len(record) > 0
+    np.testing.assert_allclose(np.diff(record.time) / 0.002, np.round(np.diff(record.time) / 0.002))
+    np.testing.assert_allclose(
+        record.joints[0], [0, -np.pi / 2, np.pi / 2, -np.pi / 2, -np.pi / 2, 0], atol=1e-6
+    )
+    # The tool of this pose points down.
+    np.testing.assert_allclose(record.rotation[0] @ [0, 0, 1], [0, 0, -1], atol=1e-6)
+    np.testing.assert_allclose(record.force[0], [1.548741, -0.754905, 2.553751])
+
+
+def test_a_recording_without_a_needed_variable_is_refused(tmp_path):
+    text = RECORDING.read_text(encoding="utf-8").replace("actual_TCP_force", "ft_raw_wrench")
+    (tmp_path / "run.csv").write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigurationError, match='run.csv: there is no column "actual_TCP_force_0'):
+        import_ur_rtde(tmp_path / "run.csv", SliceMetadata(), X_TK)
+
+
+def test_phases_of_a_recording_follow_from_its_motion(tmp_path):
+    truth = example_slice()
+    write_recording(truth, tmp_path / "run.csv")
+    metadata = example_metadata()
+    metadata.motion.phases = []
+    found = import_ur_rtde(tmp_path / "run.csv", metadata, X_TK, X_WB).metadata.motion.phases
+    expected = truth.metadata.motion.phases
+    assert [phase.label for phase in found] == [phase.label for phase in expected]
+    for phase, other in zip(found, expected, strict=True):
+        assert phase.start == pytest.approx(other.start, abs=0.005)
+        assert phase.end == pytest.approx(other.end, abs=0.005)
+
+
+def test_no_phases_are_made_up_where_the_food_is_not_placed():
+    record = example_slice()
+    record.metadata.food.position = None
+    assert phases_from_motion(record.metadata, record.time, record.position[:, 2]) == []
+    record.metadata.food.position = [0.0, 0.0, 0.5]  # The knife starts inside.
+    assert phases_from_motion(record.metadata, record.time, record.position[:, 2]) == []
+
+
+def test_a_press_without_withdrawal_is_air_and_slice():
+    record = example_slice().between(0.0, 1.8)
+    phases = phases_from_motion(record.metadata, record.time, record.position[:, 2])
+    assert [(phase.label, phase.end) for phase in phases][-1] == ("slice", record.time[-1])
+    assert len(phases) == 2
+
+
+@pytest.mark.parametrize("food", ["cucumber", "tomato", "potato"])
+def test_the_shipped_records_are_the_digitised_curves(food):
+    record = load_record(resource_path(f"calibration/records/{food}.csv"))
+    profile = load_force_profile(
+        resource_path(f"calibration/measured/sliceit_real_{food}_force.csv")
+    )
+    np.testing.assert_allclose(record.time, profile.time[profile.is_read])
+    np.testing.assert_allclose(record.force_norm, profile.force[profile.is_read])
+    np.testing.assert_allclose(record.velocity, [[0.0, 0.0, -0.02]] * len(record), atol=1e-9)
+    assert {"p_WK_z", "food.support", "motion.speed"} <= set(record.metadata.unknown)
+    # Rows between the dashes are left out, and said to be.
+    assert {finding.kind for finding in check_record(record)} <= {"dropout"}
+
+
+def test_the_shipped_records_are_what_the_program_makes(tmp_path):
+    folder = resource_path("calibration/records")
+    for record in load_records(folder):
+        curve = resource_path(f"calibration/measured/sliceit_real_{record.name}_force.csv")
+        metadata = folder / f"{record.name}.yaml"
+        arguments = ["--metadata", str(metadata), "--contact", "0.15", "--output", str(tmp_path)]
+        assert main(["records", "import", "profile", str(curve), *arguments]) == 0
+        for suffix in ("csv", "yaml"):
+            made = tmp_path / f"{record.name}.{suffix}"
+            assert made.read_text() == (folder / made.name).read_text(), made.name
+
+
+def facts() -> SliceMetadata:
+    metadata = example_metadata()
+    metadata.motion.phases = []
+    return metadata
+
+
+@pytest.mark.parametrize("header", ["", "t [s],load\n"])
+def test_two_columns_and_a_speed_make_a_record(tmp_path, header):
+    truth = example_slice().between(0.0, 1.8)
+    rows = [f"{t:.4f},{f:.5f}" for t, f in zip(truth.time, truth.force_magnitude, strict=True)]
+    (tmp_path / "scale.csv").write_text(header + "\n".join(rows) + "\n", encoding="utf-8")
+    metadata = dc.replace(facts(), name="")
+    record = import_force(tmp_path / "scale.csv", metadata, contact=0.5)
+    assert record.name == "scale" and record.force is None
+    np.testing.assert_allclose(record.force_norm, truth.force_magnitude, atol=1e-5)
+    # Press at 20 mm/s with a draw of half of it along the edge, from 1 mm above the food.
+    np.testing.assert_allclose(record.velocity, [[0.01, 0.0, -0.02]] * len(record), atol=1e-9)
+    assert record.position[0, 2] == pytest.approx(0.02 + HEIGHT + 1e-3)
+    assert "p_WK_z" in record.metadata.unknown
+    assert record.phase("air").sum() == 250
+    assert [str(finding) for finding in check_record(record)] == []
+
+
+@pytest.mark.parametrize("sign", ["on_knife", "by_knife"])
+def test_a_vertical_force_keeps_its_sign(tmp_path, sign):
+    truth = example_slice().between(0.0, 1.8)
+    up = truth.force[:, 2] * (1.0 if sign == "on_knife" else -1.0)
+    np.savetxt(tmp_path / "scale.csv", np.column_stack([truth.time, up]), delimiter=",")
+    metadata = dc.replace(facts(), wrench=WrenchFacts(sign=sign, tared="yes"))
+    record = import_force(tmp_path / "scale.csv", metadata, component="vertical", contact=0.5)
+    np.testing.assert_allclose(record.force[:, 2], truth.force[:, 2])
+    assert not record.force[:, :2].any()
+    assert [str(finding) for finding in check_record(record)] == []
+
+
+@pytest.mark.parametrize(
+    ("text", "change", "message"),
+    [
+        ("0,1,2\n", {}, "scale.csv, line 1: the first row has 3 cells. Give two columns"),
+        ("0,1\n1,x\n", {}, "scale.csv: the table holds something else than numbers"),
+        ("t,f\n1,x\n", {}, "scale.csv, line 2: f: is 'x', which is not a finite number"),
+        ("t,f\n1,1\n0,1\n", {}, "scale.csv: time: row 2 has 0 after 1. Sort the rows"),
+        ("t,f\n0,1\n1,1\n", {"speed": None}, "motion.speed: is not given, but the motion of"),
+        ("t,f\n0,1\n1,1\n", {"contact": 3.0}, "contact: 3 s is not within the record, 0 to 1 s"),
+    ],
+)
+def test_a_force_that_makes_no_record_is_refused(tmp_path, text, change, message):
+    (tmp_path / "scale.csv").write_text(text, encoding="utf-8")
+    metadata = facts()
+    metadata.motion.speed = change.get("speed", 0.02)
+    with pytest.raises(ConfigurationError, match=message):
+        import_force(tmp_path / "scale.csv", metadata, contact=change.get("contact"))
+
+
+class Column:
+    """As much of a pandas Series as the importer needs."""
+
+    def __init__(self, values):
+        self.values = values
+
+    def to_numpy(self):
+        return self.values
+
+
+class Frame:
+    """As much of a pandas DataFrame as the importer needs."""
+
+    def __init__(self, columns):
+        self.columns = list(columns)
+        self._columns = columns
+
+    def __getitem__(self, name):
+        return Column(self._columns[name])
+
+
+def test_a_table_in_memory_makes_a_record():
+    truth = example_slice()
+    columns = dict(truth.table().columns)
+    columns["t"], columns["Fz"] = columns.pop("time"), columns.pop("force_z")
+    columns["comment"] = np.array(["ok"] * len(truth))
+    record = import_frame(Frame(columns), truth.metadata, {"time": "t", "force_z": "Fz"})
+    np.testing.assert_array_equal(record.time, truth.time)
+    np.testing.assert_array_equal(record.force, truth.force)
+    np.testing.assert_array_equal(record.torque, truth.torque)
+    assert [str(finding) for finding in check_record(record)] == []
+
+
+@pytest.mark.parametrize(
+    ("drop", "rename", "message"),
+    [
+        ("p_WK_y", {}, "cucumber_00: p_WK_y: the column is missing. Name it in columns"),
+        ("force_x", {}, "cucumber_00: force_x: the column is missing"),
+        ("force_x", {"force_x": "Fx"}, "cucumber_00: force_x: there is no column 'Fx'. There are:"),
+        ("force_x", {"Fx": "time"}, "there is no column 'Fx'. There are: time, p_WK_x"),
+        ("force_x", {"force_x": "words"}, "cucumber_00: words: holds no numbers"),
+    ],
+)
+def test_a_table_in_memory_that_lacks_something_is_refused(drop, rename, message):
+    columns = dict(example_slice().table().columns)
+    del columns[drop]
+    columns["words"] = np.array(["a"] * len(columns["time"]))
+    with pytest.raises(ConfigurationError, match=message):
+        import_frame(Frame(columns), example_metadata(), rename)
+
+
+def test_the_program_imports_a_recording_and_says_what_is_wrong(tmp_path, capsys):
+    truth = example_slice()
+    truth.force = -truth.force
+    write_recording(truth, tmp_path / "run.csv")
+    dump_yaml(facts(), tmp_path / "facts.yaml")
+    pose = ["0.01", "-0.02", "0.15", "0.1", "-0.3", "0.4"]
+    arguments = ["records", "import", "ur_rtde", str(tmp_path / "run.csv")]
+    arguments += ["--metadata", str(tmp_path / "facts.yaml"), "--output", str(tmp_path / "out")]
+    assert main(arguments) == 2
+    assert "--tcp-to-knife: is not given. Give the pose of the knife" in capsys.readouterr().err
+    base = ["0.5", "-0.4", "0.02", "0", "0", "2.1"]
+    arguments += ["--tcp-to-knife", *pose, "--world-to-base", *base, "--name", "flipped"]
+    assert main(arguments) == 1
+    out = capsys.readouterr().out
+    assert f"{tmp_path / 'out' / 'flipped.csv'} and .yaml: 1500 rows" in out
+    assert "flipped.csv, lines 252 to 92" in out and "Write wrench.sign: by_knife" in out
+    text = (tmp_path / "facts.yaml").read_text().replace("sign: on_knife", "sign: by_knife")
+    (tmp_path / "facts.yaml").write_text(text)
+    assert main(arguments[:-1] + ["right"]) == 0
+    assert main(["records", "check", str(tmp_path / "out")]) == 1
+    out = capsys.readouterr().out
+    assert f"{tmp_path / 'out' / 'right.csv'}: nothing found" in out
+    assert "2 records, 1 with errors" in out
+    assert main(["records", "check", str(tmp_path / "out" / "right.csv")]) == 0
+    assert np.allclose(
+        load_record(tmp_path / "out" / "right").table().stack(fmt.FORCE)[-1, 2],
+        -truth.force[-1, 2],
+        atol=1e-5,
+    )
