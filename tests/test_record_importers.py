@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
-from sliceit_drake.records import slice_record as fmt
 from sliceit_drake.records.force_profile import load_force_profile
 from sliceit_drake.records.importers import (
     import_force,
@@ -295,8 +294,3 @@ def test_the_program_imports_a_recording_and_says_what_is_wrong(tmp_path, capsys
     assert f"{tmp_path / 'out' / 'right.csv'}: nothing found" in out
     assert "2 records, 1 with errors" in out
     assert main(["records", "check", str(tmp_path / "out" / "right.csv")]) == 0
-    assert np.allclose(
-        load_record(tmp_path / "out" / "right").table().stack(fmt.FORCE)[-1, 2],
-        -truth.force[-1, 2],
-        atol=1e-5,
-    )

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.records import slice_record as fmt
-from sliceit_drake.records.metadata import Phase, WrenchFacts
+from sliceit_drake.records.metadata import FoodFacts, Phase, WrenchFacts
 from sliceit_drake.records.slice_record import SliceRecord, SliceTable, write_record
 from sliceit_drake.records.validation import check_record, check_table, load_record
 
@@ -43,6 +43,17 @@ def good_records() -> dict[str, SliceRecord]:
     weighing.force = weighing.force + np.array([0.0, 0.0, -0.3 * 9.81])
     weighing.metadata.wrench = WrenchFacts(includes=["food", "board", "gravity"], tared="no")
     records["tool's weight included"] = weighing
+    air = example_slice().between(0.0, 0.4)
+    air.metadata.motion.phases = [Phase("air", 0.0, 0.5)]
+    air.metadata.food = FoodFacts()
+    records["air alone"] = air
+    weight = example_slice(0.05)
+    weight.force = weight.force * 0.0 + [0.0, 0.0, -5.0]
+    weight.force[::2] += 0.1
+    weight.metadata.motion.phases = [Phase("air", 0.0, 0.5), Phase("weight", 0.5, 3.0)]
+    weight.force[:250, 2] += 5.0
+    weight.metadata.food = FoodFacts()
+    records["a weight"] = weight
     return records
 
 
@@ -292,7 +303,7 @@ def scale(table: SliceTable, names: tuple[str, ...], factor: float) -> None:
         (constant, "error", "constant", "force_x: is 1.73205 N in every row"),
         (frozen, "warning", "frozen", "lines 402 to 551: force_x: .*for 0.3 s of the slice"),
         (no_air, "warning", "no air phase", "yaml: motion.phases: no phase labelled air has 10"),
-        (no_phases, "warning", "phases", "no phase is labelled slice"),
+        (no_phases, "warning", "phases", "no phase is labelled, so that the whole"),
         (phase_beside, "warning", "phases", "phases.4.: other from 7 to 8 s is beside the record"),
         (jump, "error", "jump", "lines 801 to 802: p_WK_x: the pose jumps: 5 m/s between two"),
         (turned, "error", "jump", "lines 901 to 902: quat_WK_w: the pose jumps: 100 rad/s"),
@@ -306,7 +317,7 @@ def scale(table: SliceTable, names: tuple[str, ...], factor: float) -> None:
         (missing_component, "error", "missing column", "torque_y: .*missing beside torque_x"),
         (few_rows, "error", "short", "time: the table has 5 rows. Give at least 10"),
         (negative_norm, "error", "negative norm", "force_norm: a norm is -"),
-        (forgotten_facts, "warning", "missing fact", "food.size, food.support: are not given"),
+        (forgotten_facts, "warning", "missing fact", "food.size, food.support: not given"),
         (unknown_unknown, "warning", "unknown name", "unknown: 'food.sise'.*mean \"food.size\""),
         (torque_about_nowhere, "warning", "missing fact", "wrench.point: is unknown, so that the"),
         (missing_rotation, "error", "missing fact", "sensor.rotation: is not given, but wrench"),

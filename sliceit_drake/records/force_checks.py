@@ -29,6 +29,9 @@ GREATEST_FORCE = 5000.0
 FROZEN_TIME = 0.2
 """A sensor that shows exactly the same for this long while the knife cuts is stuck, s."""
 
+OFFSET = 0.02
+"""Share of the greatest force that an offset in the air may have."""
+
 ALONG = 0.2
 """Share of |F| |v| that the power must have at least for its sign to mean something."""
 
@@ -58,12 +61,18 @@ def check_force(table: SliceTable, record: SliceRecord, findings: Findings) -> N
         )
     air = record.phase("air")
     cut = record.phase("slice", "second_pass")
-    if not cut.any():
-        cut = ~air
+    if not record.metadata.motion.phases:
+        cut = np.ones(len(record), bool)
     _check_tare(record, air, findings)
-    _check_units(record, air, cut, name, findings)
-    if not findings.has("kilonewtons", "force unit"):
-        _check_sign(table, record, air, cut, findings)
+    if magnitude.max() > GREATEST_FORCE:
+        k = int(magnitude.argmax())
+        text = f"the force reaches {magnitude[k]:.4g} N"
+        fix = "Is it in mN, or in counts of the sensor? Convert it to newtons."
+        findings.error("force unit", name, text, fix, (k, k))
+    elif cut.any():
+        _check_units(record, air, cut, name, findings)
+        if not findings.has("kilonewtons"):
+            _check_sign(table, record, air, cut, findings)
     _check_saturation(table, record, findings)
     _check_frozen(table, cut, findings)
 
@@ -96,10 +105,11 @@ def _check_tare(record: SliceRecord, air: np.ndarray, findings: Findings) -> Non
     last = int(np.flatnonzero(air)[-1])
     force = record.force if record.force is not None else record.force_magnitude[:, None]
     mean, scatter = force[air].mean(axis=0), force[air].std(axis=0)
-    peak = float(record.force_magnitude.max())
+    # Air alone has no force beside which an offset is small.
+    peak = max(float(record.force_magnitude.max()), LEAST_FORCE / OFFSET if air.all() else 0.0)
     # A norm of noise is not zero in the mean; ten rows of a filtered sensor are one reading.
     allowed = 3.0 * scatter if record.force is None else 5.0 * scatter / np.sqrt(air.sum() / 10.0)
-    allowed = np.maximum(allowed, 0.02 * peak)
+    allowed = np.maximum(allowed, OFFSET * peak)
     axis = int((np.abs(mean) - allowed).argmax())
     weighs_tool = "gravity" in facts.includes and facts.tared != "yes"
     if abs(mean[axis]) > allowed[axis] and not weighs_tool:
@@ -118,16 +128,6 @@ def _check_units(
 ) -> None:
     offset = _known_offset(record, air)
     magnitude = record.force_magnitude
-    k = int(magnitude.argmax())
-    if magnitude[k] > GREATEST_FORCE:
-        findings.error(
-            "force unit",
-            name,
-            f"the force reaches {magnitude[k]:.4g} N",
-            "Is it in mN, or in counts of the sensor? Convert it to newtons.",
-            (k, k),
-        )
-        return
     if offset is None:
         return
     if record.force is not None:

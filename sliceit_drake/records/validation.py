@@ -21,7 +21,6 @@ __all__ = ["Finding", "check_record", "check_table", "load_record", "load_record
 LEAST_ROWS = 10
 
 KEY_FACTS = (
-    "date",
     "provenance",
     "food.name",
     "food.shape",
@@ -35,7 +34,7 @@ KEY_FACTS = (
     "motion.speed",
     "sensor.rate",
 )
-"""What a comparison with a simulation needs: given, or listed as unknown."""
+"""What the simulation of a slice needs: given, or listed as unknown."""
 
 
 def load_record(file: str | Path) -> SliceRecord:
@@ -185,9 +184,12 @@ def _check_facts(table: SliceTable, findings: Findings) -> None:
             fix = f'Did you mean "{close[0]}"?' if close else "Name a field, as food.size."
             text = f"{name!r} is no field and no column"
             findings.fact("warning", "unknown name", "unknown", text, fix)
+    phases = metadata.motion.phases
+    # A record of the air, the board or a weight has no food.
+    is_slice = not phases or any(phase.label == "slice" for phase in phases)
     forgotten = [
         name
-        for name in KEY_FACTS
+        for name in (KEY_FACTS if is_slice else ())
         if _value(metadata, name) in (None, "", "unknown") and name not in metadata.unknown
     ]
     if forgotten:
@@ -195,15 +197,15 @@ def _check_facts(table: SliceTable, findings: Findings) -> None:
             "warning",
             "missing fact",
             ", ".join(forgotten),
-            "is not given" if len(forgotten) == 1 else "are not given",
-            "Give them, or list them under unknown.",
+            "not given",
+            "Give a value, or list the name under unknown.",
         )
     if table.has(fmt.TORQUE) and metadata.wrench.point == "unknown":
         text = "is unknown, so that the torque is not used"
         findings.fact("warning", "missing fact", "wrench.point", text, "Give Ko or So.")
-    time, phases = table.columns[fmt.TIME], metadata.motion.phases
-    if not any(phase.label == "slice" for phase in phases):
-        text = "no phase is labelled slice, so that all but air counts as slice"
+    time = table.columns[fmt.TIME]
+    if not phases:
+        text = "no phase is labelled, so that the whole record counts as slice"
         fix = "Give label, start and end of the phases, in the time of the record."
         findings.fact("warning", "phases", "motion.phases", text, fix)
     for k, phase in enumerate(phases):
