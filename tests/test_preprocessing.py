@@ -178,6 +178,16 @@ def test_a_low_pass_has_its_gain_and_no_delay():
         np.testing.assert_allclose(result, gain * wave[500:-500], atol=0.01)
 
 
+def test_a_low_pass_means_the_same_where_rows_are_left_out():
+    """As in a curve read from the dashes of a figure."""
+    record = example_slice(0.0)
+    kept = record.rows(np.random.default_rng(4).uniform(size=len(record)) < 0.7)
+    wave = np.sin(2.0 * np.pi * 20.0 * kept.time)
+    kept.force = np.outer(wave, [1.0, 0.0, 0.0])
+    result = low_pass(kept, 20.0).force[350:-350, 0]
+    np.testing.assert_allclose(result, 0.5 * wave[350:-350], atol=0.03)
+
+
 def test_a_causal_filter_starts_at_rest_on_an_offset():
     record = example_slice(0.0)
     record.force = np.full_like(record.force, 3.0)
@@ -221,9 +231,10 @@ def test_a_cutoff_beyond_half_the_rate_is_refused():
         low_pass(example_slice(), 300.0)
 
 
-def test_a_prediction_that_ends_early_is_refused():
+@pytest.mark.parametrize(("start", "end"), [(0.0, 2.0), (0.5, 3.0)])
+def test_a_prediction_of_a_part_is_refused(start, end):
     record = resample(example_slice(), 100.0)
-    time = np.arange(0.0, 2.0, 0.002)
+    time = np.arange(start, end, 0.002)
     with pytest.raises(ConfigurationError, match="Predict the whole record"):
         apply_filters(record.metadata.processing, time, np.sin(time))
 
