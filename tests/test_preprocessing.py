@@ -182,9 +182,9 @@ def test_a_low_pass_means_the_same_where_rows_are_left_out():
     """As in a curve read from the dashes of a figure."""
     record = example_slice(0.0)
     kept = record.rows(np.random.default_rng(4).uniform(size=len(record)) < 0.7)
-    wave = np.sin(2.0 * np.pi * 20.0 * kept.time)
+    wave = np.sin(2.0 * np.pi * 10.0 * kept.time)
     kept.force = np.outer(wave, [1.0, 0.0, 0.0])
-    result = low_pass(kept, 20.0).force[350:-350, 0]
+    result = low_pass(kept, 10.0).force[350:-350, 0]
     np.testing.assert_allclose(result, 0.5 * wave[350:-350], atol=0.03)
 
 
