@@ -8,11 +8,13 @@ import pytest
 from example_slices import example_slice
 from scipy.spatial.transform import Rotation
 
+from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.records import slice_record as fmt
 from sliceit_drake.records.metadata import FoodFacts, Phase, WrenchFacts
-from sliceit_drake.records.slice_record import SliceRecord, SliceTable, write_record
+from sliceit_drake.records.slice_record import SliceRecord, SliceTable, read_table, write_record
 from sliceit_drake.records.validation import check_record, check_table, load_record
+from sliceit_drake.resources import resource_path
 
 
 def good_records() -> dict[str, SliceRecord]:
@@ -119,7 +121,7 @@ def degrees(table: SliceTable) -> None:
 
 
 def time_backwards(table: SliceTable) -> None:
-    table.columns["time"][700:] -= 0.5
+    table.columns["time"][7 * len(table.lines) // 15 :] -= 0.5
 
 
 def time_repeated(table: SliceTable) -> None:
@@ -127,7 +129,8 @@ def time_repeated(table: SliceTable) -> None:
 
 
 def nan_burst(table: SliceTable) -> None:
-    table.columns["force_z"][600:640] = np.nan
+    row = 2 * len(table.lines) // 5
+    table.columns["force_z"][row : row + 40] = np.nan
 
 
 def no_tare(table: SliceTable) -> None:
@@ -168,7 +171,8 @@ def clipped_at_its_range(table: SliceTable) -> None:
 
 def clipped_at_an_unknown_range(table: SliceTable) -> None:
     table.metadata.sensor.force_range = None
-    table.columns["force_z"] = np.clip(table.columns["force_z"], -18.0, 18.0)
+    limit = 0.75 * np.abs(table.columns["force_z"]).max()
+    table.columns["force_z"] = np.clip(table.columns["force_z"], -limit, limit)
 
 
 def constant(table: SliceTable) -> None:
@@ -299,7 +303,7 @@ def scale(table: SliceTable, names: tuple[str, ...], factor: float) -> None:
         (wrong_frame, "error", "flipped sign", 'or correct wrench.frame .*"K"'),
         (force_across, "warning", "frame", "across the knife's motion.*Check wrench.frame"),
         (clipped_at_its_range, "warning", "clipped", "force_z: .*at the sensor's range, 15"),
-        (clipped_at_an_unknown_range, "warning", "clipped", "rows in a row are exactly 18"),
+        (clipped_at_an_unknown_range, "warning", "clipped", "rows in a row are exactly 15"),
         (constant, "error", "constant", "force_x: is 1.73205 N in every row"),
         (frozen, "warning", "frozen", "lines 402 to 551: force_x: .*for 0.3 s of the slice"),
         (no_air, "warning", "no air phase", "yaml: motion.phases: no phase labelled air has 10"),
@@ -354,3 +358,38 @@ def test_a_record_with_a_warning_is_loaded(tmp_path):
     record = example_slice()
     record.force = record.force + 1.0
     load_record(write_record(record, tmp_path / "cucumber_00"))
+
+
+FAULTS = {
+    "kilonewtons": kilonewtons,
+    "millimetres": millimetres,
+    "milliseconds": milliseconds,
+    "time": time_backwards,
+    "gap": nan_burst,
+    "no tare": no_tare,
+    "flipped sign": flipped_sign,
+    "clipped": clipped_at_an_unknown_range,
+}
+
+
+@pytest.fixture(scope="module")
+def bench_tables(tmp_path_factory) -> list[SliceTable]:
+    """Records of the simulated bench: made of measured curves, with its sensor's noise."""
+    folder = tmp_path_factory.mktemp("bench")
+    protocol = str(resource_path("calibration/protocols/rich.yaml"))
+    assert main(["record", protocol, *"--world curves --seed 5 --output".split(), str(folder)]) == 0
+    return [read_table(file) for file in sorted(folder.glob("*.csv"))]
+
+
+def test_the_benchs_records_have_no_findings(bench_tables):
+    assert [str(f) for table in bench_tables for f in check_table(table)] == []
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_each_fault_is_found_in_every_record_of_the_bench(bench_tables, kind):
+    tables = [copy.deepcopy(table) for table in bench_tables]
+    tables = [t for t in tables if "slice" in {p.label for p in t.metadata.motion.phases}]
+    assert len(tables) >= 12
+    for table in tables:
+        FAULTS[kind](table)
+        assert kind in {finding.kind for finding in check_table(table)}, table.file

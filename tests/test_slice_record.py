@@ -1,6 +1,8 @@
 """A slice record is read as it was written, and means the same in every frame, sign and point."""
 
 import dataclasses as dc
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.records import slice_record as fmt
-from sliceit_drake.records.metadata import Phase, WrenchFacts
+from sliceit_drake.records.metadata import (
+    PHASE_LABELS,
+    Phase,
+    SliceMetadata,
+    WrenchFacts,
+)
 from sliceit_drake.records.slice_record import (
     SliceRecord,
     read_table,
@@ -17,7 +24,7 @@ from sliceit_drake.records.slice_record import (
     velocities,
     write_record,
 )
-from sliceit_drake.records.validation import load_record, load_records
+from sliceit_drake.records.validation import check_record, load_record, load_records
 
 
 def turning_slice() -> SliceRecord:
@@ -192,3 +199,26 @@ def test_metadata_that_are_wrong_are_refused_with_the_field(tmp_path, old, new, 
     with pytest.raises(ConfigurationError, match=message) as caught:
         load_record(file)
     assert str(caught.value).startswith(str(file))
+
+
+def test_the_example_of_the_documentation_is_a_good_record(tmp_path):
+    page = (Path(__file__).resolve().parent.parent / "docs" / "records.md").read_text()
+    for kind in ("csv", "yaml"):
+        (text,) = re.findall(rf"```{kind}\n(.*?)```", page, flags=re.DOTALL)
+        (tmp_path / f"cucumber_03.{kind}").write_text(text, encoding="utf-8")
+    assert check_record(load_record(tmp_path / "cucumber_03.csv")) == []
+
+
+def test_the_documentation_names_every_column_and_field():
+    page = (Path(__file__).resolve().parent.parent / "docs" / "records.md").read_text()
+    words = set(re.findall(r"\w+", page))
+    for group in dc.fields(SliceMetadata):
+        parts = [group.name]
+        if dc.is_dataclass(group.type):
+            parts += [field.name for field in dc.fields(group.type)]
+        assert set(parts) <= words, group.name
+    for label in PHASE_LABELS:
+        assert label in words
+    for name in fmt.COLUMNS:
+        stem, _, axis = name.rpartition("_")
+        assert name in words or (stem + "_x") in words or (stem + "_w") in words or stem == "q"

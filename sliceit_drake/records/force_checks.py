@@ -101,12 +101,13 @@ def _check_tare(record: SliceRecord, air: np.ndarray, findings: Findings) -> Non
             "Label the time before contact as air; record half a second of it.",
         )
         return
+    if air.all():
+        return  # Such a record is there to show zero and drift; no force makes them large or small.
     first = int(np.flatnonzero(air)[0])
     last = int(np.flatnonzero(air)[-1])
     force = record.force if record.force is not None else record.force_magnitude[:, None]
     mean, scatter = force[air].mean(axis=0), force[air].std(axis=0)
-    # Air alone has no force beside which an offset is small.
-    peak = max(float(record.force_magnitude.max()), LEAST_FORCE / OFFSET if air.all() else 0.0)
+    peak = float(record.force_magnitude.max())
     # A norm of noise is not zero in the mean; ten rows of a filtered sensor are one reading.
     allowed = 3.0 * scatter if record.force is None else 5.0 * scatter / np.sqrt(air.sum() / 10.0)
     allowed = np.maximum(allowed, OFFSET * peak)
