@@ -36,6 +36,9 @@ CONTACT = 0.3
 RATE = 0.07
 """Exponent of the speed."""
 
+LEAST_SPEED = 2e-3
+"""Below which the force falls no further, m/s."""
+
 FLANK_SHARE, WEDGE_SHARE = 0.15, 0.03
 """Friction and pressure of the flanks, fully buried, over the curve's largest force."""
 
@@ -118,7 +121,7 @@ class CurveWorld:
         stretches = np.array(list(path.stretches(TRAVEL, LONGEST if timeless else 1, 0.0)))
         size = facts.width / section_size(self.protocol.food, 1.0)[0]
         curve = self._force * specimen.toughness * size
-        state = _State()
+        state = _State(path.p[0])
         forces = np.zeros((len(stretches), 3, 3))
         shifts = np.zeros((len(stretches), 2, 3))
         depths = np.zeros(len(stretches))
@@ -141,8 +144,8 @@ class CurveWorld:
                 effect.drive(now)
             now.food_shift[2] += specimen.height
             shifts[row] = now.knife_shift, now.food_shift
-            height = float(path.p[b][2] + now.knife_shift[2] - now.food_shift[2])
-            state.advance(now, v, facts.height - height)
+            place = path.p[b] + now.knife_shift - now.food_shift
+            state.advance(now, path.R[b][:, 0], place, facts.height)
             depths[row] = state.depth
             if not specimen.condition.without_food:
                 forces[row] = self._forces(state, now, facts, section, curve)
@@ -167,10 +170,9 @@ class CurveWorld:
         flanks = float(curve.max()) * buried
         share = state.depth / facts.height
         whole = float(np.interp(share, self._share, curve))
-        edge = max(whole - (FLANK_SHARE + WEDGE_SHARE) * flanks, 0.0) * section.factor(state.depth)
-        if share > 1.0:
-            edge = 0.0
-        speed = max(state.speed, 1e-3 * CURVE_SPEED)
+        edge = max(whole - (FLANK_SHARE + WEDGE_SHARE) * flanks, 0.0)
+        edge = max(edge + section.more(state.depth), 0.0) if share < 1.0 else 0.0
+        speed = max(state.speed, LEAST_SPEED)
         edge *= now.toughness * (speed / CURVE_SPEED) ** RATE * state.loaded
         xi = state.ratio
         out[0] = [-xi * edge / (1.0 + xi**2), 0.0, edge / (1.0 + xi**2)]
@@ -268,21 +270,22 @@ class _Section:
             sides = effect.reshape(sides)
         wide = 0.5 * (sides[: len(half), 0] - sides[len(half) :, 0])
         stretch = np.divide(wide, half, out=np.ones_like(half), where=half > 1e-6)
-        self._factor = factor.mean(1) * stretch
+        self._more = facts.toughness * 2.0 * half * (factor.mean(1) * stretch - 1.0)
 
     def above(self, depth: float) -> float:
         """Share of the section above a depth."""
         return float(np.interp(depth, self._depth, self._above))
 
-    def factor(self, depth: float) -> float:
-        """Of the effects on the force at a depth."""
-        return float(np.interp(depth, self._depth, self._factor))
+    def more(self, depth: float) -> float:
+        """What effects add to the force of the edge at a depth, N."""
+        return float(np.interp(depth, self._depth, self._more))
 
 
 class _State:
     """What the slice remembers along the path."""
 
-    def __init__(self) -> None:
+    def __init__(self, place: np.ndarray) -> None:
+        self.place = place
         self.depth = -1.0
         self.deepest = 0.0
         self.travel = self.swept = 0.0
@@ -292,26 +295,34 @@ class _State:
         self.rest = 0.0
         self.faded = 1.0
 
-    def advance(self, now: Now, v: np.ndarray, depth: float) -> None:
-        """To the end of a stretch at the velocity v, with the edge at a depth."""
-        moved = now.speed * now.period
-        if depth > 0.0 and moved > 1e-12:
-            keep = np.exp(-moved / TURN)
-            towards = v / max(float(np.linalg.norm(v)), 1e-12)
-            self.heading = keep * self.heading + (1.0 - keep) * towards
-            self.travel += moved
-            self.swept += 2.0 * moved * min(depth, 0.03)
-        if moved > 1e-12:
-            self.speed = now.speed
-            self.ratio = now.draw / now.press if now.press > 1e-9 else 0.0
+    def advance(self, now: Now, along: np.ndarray, place: np.ndarray, height: float) -> None:
+        """To the end of a stretch.
+
+        Args:
+            now: The stretch.
+            along: Direction of the edge in F [3].
+            place: Of Ko in F relative to the food [3], metres.
+            height: Of the food, metres.
+        """
+        step, self.place = place - self.place, place
+        moved = float(np.linalg.norm(step))
+        self.depth = height - float(place[2])
+        self.deepest = max(self.deepest, self.depth)
+        if moved > 1e-9:
+            self.speed = moved / now.period
+            sunk = -float(step[2])
+            self.ratio = float(step @ along) / sunk if sunk > 1e-9 else 0.0
             self.rest = 0.0
             self.faded = min(1.0, self.faded + moved / RELOAD)
         else:
             self.rest += now.period
             loss = HOLD_FADE * np.log10(1.0 + self.rest / HOLD_ONSET)
             self.faded = min(self.faded, 1.0 - loss)
-        self.depth = depth
-        self.deepest = max(self.deepest, depth)
+        if self.depth > 0.0 and moved > 1e-9:
+            keep = np.exp(-moved / TURN)
+            self.heading = keep * self.heading + (1.0 - keep) * step / moved
+            self.travel += moved
+            self.swept += 2.0 * moved * min(self.depth, 0.03)
 
     @property
     def loaded(self) -> float:

@@ -114,7 +114,8 @@ class _Section:
 
     def above(self, height: np.ndarray) -> np.ndarray:
         """Area of the section above heights in C, m^2."""
-        return np.interp(height, self._height, self._above)
+        area = np.interp(height, self._height, self._above)
+        return np.where(height < self.model.top, area, 0.0)
 
 
 def _barycentric(n: int) -> np.ndarray:

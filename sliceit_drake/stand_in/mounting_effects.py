@@ -24,7 +24,7 @@ class BoardLaw(Effect):
 
     cause = 13
     typical = 0.5
-    reference = 5.0
+    reference = 1.5
 
     def respond(self, series: Series) -> None:
         force = np.abs(series.board[:, 5])
@@ -73,7 +73,7 @@ class FoodSlip(Effect):
     cause = 15
     unit = "m"
     typical = 3e-3
-    duration = 6e-3
+    duration = 0.02
 
     def begin(self, facts: SliceFacts, rng: np.random.Generator) -> None:
         super().begin(facts, rng)

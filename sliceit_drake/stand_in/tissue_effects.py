@@ -46,22 +46,19 @@ class BulkRelaxation(Effect):
 
     def _edge_share(self, series: Series) -> np.ndarray:
         advancing = series.press > 1e-6
-        limit = np.linalg.norm(series.edge[:, 3:], axis=1)
-        share = np.ones(len(limit))
-        held, since, force = 0.0, 0.0, 0.0
-        was_advancing, reloading = True, False
-        for k in np.flatnonzero(limit > 1e-6):
+        elastic = np.linalg.norm(series.edge[:, 3:], axis=1)
+        share = np.ones(len(elastic))
+        at_stop, since, missing = 1.0, 0.0, 0.0
+        for k in np.flatnonzero(elastic > 1e-6):
             if not advancing[k]:
-                if was_advancing:
-                    held, since = limit[k] * (share[k - 1] if k else 1.0), series.time[k]
-                force = held * (1.0 + (series.time[k] - since) / self.onset) ** -self.size
-                share[k] = min(1.0, force / limit[k])
-                reloading = True
-            elif reloading:
-                force += self.reload_stiffness * series.press[k] * series.period
-                share[k] = min(1.0, force / limit[k])
-                reloading = share[k] < 1.0
-            was_advancing = bool(advancing[k])
+                if advancing[k - 1]:
+                    at_stop, since = 1.0 - missing / elastic[k], series.time[k]
+                share[k] = at_stop * (1.0 + (series.time[k] - since) / self.onset) ** -self.size
+                missing = (1.0 - share[k]) * elastic[k]
+            else:
+                moved = series.press[k] * series.period
+                missing = min(max(missing - self.reload_stiffness * moved, 0.0), elastic[k])
+                share[k] = 1.0 - missing / elastic[k]
         return share
 
 
@@ -105,7 +102,7 @@ class SkinToughness(Effect):
 
     cause = 7
     unit = "J/m"
-    typical = 0.3
+    typical = 0.8
     thickness = 1.2e-3
 
     def toughness(self, at: Tissue) -> np.ndarray | float:

@@ -83,7 +83,8 @@ class Path:
         """Cuts the path into stretches [a, b) of exchanges, short where the knife is fast.
 
         A stretch is longer than one exchange only where the knife moves less than `travel` in it,
-        and short after the beginning and before the end of a segment, where things change.
+        and short before the end of a segment and still more so after its beginning, where food and
+        effects settle.
 
         Args:
             travel: metres.
@@ -96,7 +97,7 @@ class Path:
         a = 0
         while a < len(self):
             first, last = (int(k) for k in self.span[a])
-            most = min(longest, 1 + min(a - first, last - a) // 2, last - a)
+            most = min(longest, 1 + (a - first) // 8, 1 + (last - a) // 3)
             b = int(np.searchsorted(done, done[a] + travel * (1.0 + 1e-9), side="right")) - 1
             b = min(max(b, a + 1), a + max(most, 1))
             yield a, b
