@@ -10,12 +10,11 @@ import numpy as np
 
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.model import CuttingModel
-from sliceit_drake.cutting.motion import Motion
-from sliceit_drake.cutting.simulate import KnifePath, board_wrenches
+from sliceit_drake.cutting.simulate import KnifePath, PosedMotion, board_wrenches
 from sliceit_drake.cutting.solver import NOT_FINITE, Exchanges, run_exchanges
 from sliceit_drake.cutting.workspace import Workspace
 
-__all__ = ["BatchSlice", "simulate_batch"]
+__all__ = ["BatchSimulator", "BatchSlice", "simulate_batch"]
 
 
 @dc.dataclass
@@ -41,62 +40,101 @@ class BatchSlice:
 
 def simulate_batch(
     models: Sequence[CuttingModel],
-    motions: Sequence[Motion],
+    motions: Sequence[PosedMotion],
     exchange_period: float,
     board: Board | None = None,
     workers: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[BatchSlice]:
-    """Simulates slices with parameters and motions of their own.
-
-    Energies are not balanced and the knife's start is not checked, as in `simulate_slice`; a slice
-    that breaks down is reported and does not disturb the others. Results do not depend on
-    `workers`.
+    """Simulates slices with parameters and motions of their own; see `BatchSimulator.run`.
 
     Args:
-        models: The cuts [C]. Those derived from one model share their device arrays.
-        motions: Poses X_FK of the knife [C], or one for all.
-        exchange_period: s.
-        board: Board under the knife, its height in F; None for none.
-        workers: Threads on a CPU; the number of processors by default.
-        progress: Called with the number of slices done.
+        models, motions, progress: As `BatchSimulator.run`.
+        exchange_period, board, workers: As `BatchSimulator`.
 
     Raises:
         ValueError: The numbers of models and motions differ.
     """
-    if len(motions) == 1:
-        motions = [motions[0]] * len(models)
-    if len(motions) != len(models):
-        raise ValueError(f"{len(models)} models and {len(motions)} motions")
-    groups: dict[tuple, list[int]] = {}
-    for c, model in enumerate(models):
-        key = (id(model.split), model.layout, *dc.astuple(model.numerics))
-        groups.setdefault(key, []).append(c)
-    results: list[BatchSlice | None] = [None] * len(models)
-    done = 0
-    for members in groups.values():
-        on_cpu = models[members[0]].numerics.device == "cpu"
-        jobs = [[c] for c in members] if on_cpu else [members]
-        threads = min(len(jobs), workers or os.cpu_count() or 1)
-        spare: queue.SimpleQueue[_Runner] = queue.SimpleQueue()
-        for _ in range(threads):
-            spare.put(_Runner(exchange_period, board))
+    return BatchSimulator(exchange_period, board, workers).run(models, motions, progress)
 
-        def run(job: list[int], spare: "queue.SimpleQueue[_Runner]" = spare) -> None:
-            runner = spare.get()
-            try:
-                slices = runner.run([models[c] for c in job], [motions[c] for c in job])
-            finally:
+
+class BatchSimulator:
+    """Simulates many slices, keeping device arrays and captured graphs from one call to the next.
+
+    Not to be called from several threads at once.
+
+    Args:
+        exchange_period: s.
+        board: Board under the knife, its height in F; None for none.
+        workers: Threads on a CPU; the number of processors by default.
+    """
+
+    def __init__(
+        self, exchange_period: float, board: Board | None = None, workers: int | None = None
+    ) -> None:
+        self._period, self._board = exchange_period, board
+        self._workers = workers or os.cpu_count() or 1
+        self._runners: dict[tuple, list[_Runner]] = {}
+
+    def run(
+        self,
+        models: Sequence[CuttingModel],
+        motions: Sequence[PosedMotion],
+        progress: Callable[[int], None] | None = None,
+    ) -> list[BatchSlice]:
+        """Simulates slices with parameters and motions of their own.
+
+        Energies are not balanced and the knife's start is not checked, as in `simulate_slice`; a
+        slice that breaks down is reported and does not disturb the others. Results do not depend on
+        the number of workers.
+
+        Args:
+            models: The cuts [C]. Those derived from one model share their device arrays.
+            motions: Poses X_FK of the knife [C], or one for all.
+            progress: Called with the number of slices done.
+
+        Raises:
+            ValueError: The numbers of models and motions differ.
+        """
+        if len(motions) == 1:
+            motions = [motions[0]] * len(models)
+        if len(motions) != len(models):
+            raise ValueError(f"{len(models)} models and {len(motions)} motions")
+        groups: dict[tuple, list[int]] = {}
+        for c, model in enumerate(models):
+            key: tuple = (id(model.split), len(model.relaxing), *dc.astuple(model.numerics))
+            if model.numerics.device != "cpu":
+                # Cuts that advance side by side share the skin's tables, and their number is fixed.
+                key += (model.effects.skin.thickness,)
+            groups.setdefault(key, []).append(c)
+        results: list[BatchSlice | None] = [None] * len(models)
+        done = 0
+        for key, members in groups.items():
+            on_cpu = models[members[0]].numerics.device == "cpu"
+            jobs = [[c] for c in members] if on_cpu else [members]
+            threads = min(len(jobs), self._workers)
+            runners = self._runners.setdefault((*key, 1 if on_cpu else len(members)), [])
+            while len(runners) < threads:
+                runners.append(_Runner(self._period, self._board))
+            spare: queue.SimpleQueue[_Runner] = queue.SimpleQueue()
+            for runner in runners:
                 spare.put(runner)
-            for c, result in zip(job, slices, strict=True):
-                results[c] = result
 
-        with ThreadPoolExecutor(threads) as pool:
-            for job, _ in zip(jobs, pool.map(run, jobs), strict=True):
-                done += len(job)
-                if progress is not None:
-                    progress(done)
-    return [result for result in results if result is not None]
+            def run(job: list[int], spare: "queue.SimpleQueue[_Runner]" = spare) -> None:
+                runner = spare.get()
+                try:
+                    slices = runner.run([models[c] for c in job], [motions[c] for c in job])
+                finally:
+                    spare.put(runner)
+                for c, result in zip(job, slices, strict=True):
+                    results[c] = result
+
+            with ThreadPoolExecutor(threads) as pool:
+                for job, _ in zip(jobs, pool.map(run, jobs), strict=True):
+                    done += len(job)
+                    if progress is not None:
+                        progress(done)
+        return [result for result in results if result is not None]
 
 
 class _Runner:
@@ -115,7 +153,9 @@ class _Runner:
             ws.set_models(models)
         return ws
 
-    def run(self, models: Sequence[CuttingModel], motions: Sequence[Motion]) -> list[BatchSlice]:
+    def run(
+        self, models: Sequence[CuttingModel], motions: Sequence[PosedMotion]
+    ) -> list[BatchSlice]:
         """The slices of cuts that advance together."""
         T = self._period
         paths = [KnifePath(m, x, T) for m, x in zip(models, motions, strict=True)]

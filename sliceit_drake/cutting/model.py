@@ -130,11 +130,6 @@ class CuttingModel(CutGeometry):
         """Stepped over true mass of the moving nodes."""
         return float(self.mass[self.moving].sum() / self.true_mass[self.moving].sum())
 
-    @property
-    def layout(self) -> tuple[int, float]:
-        """What cuts that share device arrays have in common: relaxation times, skin's thickness."""
-        return len(self.relaxing), self.effects.skin.thickness
-
     def edge_forces(self) -> np.ndarray:
         """Greatest force of the edge at each cut point on the grid of its tables [P, G], N."""
         return _edge_forces(self, self.effects, self.toughness, self.outline)

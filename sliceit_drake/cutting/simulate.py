@@ -1,6 +1,7 @@
 """One slice on a prescribed knife motion, without a robot."""
 
 import dataclasses as dc
+import typing
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from sliceit_drake.cutting.solver import CuttingError, CuttingSolver, Energies, 
 __all__ = [
     "EnergyLedger",
     "KnifePath",
+    "PosedMotion",
     "SliceResult",
     "board_wrenches",
     "check_clear",
@@ -201,6 +203,15 @@ def check_energies(
     return ratio
 
 
+class PosedMotion(typing.Protocol):
+    """A motion of the knife: poses X_FK at times from 0 to `duration`, s; as `Motion` is."""
+
+    @property
+    def duration(self) -> float: ...
+
+    def pose(self, t: float) -> Pose: ...
+
+
 class KnifePath:
     """Poses of the knife at the exchanges, in F and relative to the food in C.
 
@@ -210,7 +221,7 @@ class KnifePath:
         R_CK, p_CK: The same in C; where the mounting gives, relative to the food.
     """
 
-    def __init__(self, model: CuttingModel, motion: Motion, period: float) -> None:
+    def __init__(self, model: CuttingModel, motion: PosedMotion, period: float) -> None:
         self.exchanges = max(1, round(motion.duration / period))
         poses = [motion.pose(k * period) for k in range(self.exchanges + 1)]
         self.R_FK = np.array([X_FK.R for X_FK in poses])

@@ -66,7 +66,10 @@ class Workspace:
         self._graph: Any = None
         self._energy_graph: Any = None
         self._views: dict[int, np.ndarray] = {}
-        self._make_arrays()
+        # What is allocated during a capture in another thread would be taken for part of it.
+        with DIRECT:
+            self._make_arrays()
+        self._skin_thickness = model.effects.skin.thickness
         self.set_models(models)
 
     def array(self, shape: int | tuple[int, ...]) -> wp.array:
@@ -248,12 +251,21 @@ class Workspace:
         """Takes the parameters of other cuts of the same mesh, one for each row."""
         if len(models) != self.cuts:
             raise ValueError(f"{len(models)} models for {self.cuts} cuts")
+        thickness = models[0].effects.skin.thickness
         for model in models:
-            if model.split is not self.model.split or model.layout != self.model.layout:
+            if (
+                model.split is not self.model.split
+                or len(model.relaxing) != len(self.model.relaxing)
+                or model.effects.skin.thickness != thickness
+            ):
                 raise ValueError(
                     "the cuts must be derived from one model and have as many relaxation times and "
                     "the same thickness of skin"
                 )
+        if thickness != self._skin_thickness:
+            self._skin_thickness = thickness
+            with DIRECT:
+                self.w["outline"].assign(models[0].outline.astype(self.dtype))
         self.models = tuple(models)
         self.write(self.parameters, np.array([parameter_row(m) for m in models]))
 

@@ -1,0 +1,573 @@
+"""What a calibrated food predicts for slice records: forces at their samples, derivatives."""
+
+import copy
+import dataclasses as dc
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from sliceit_drake.calibration.oscillation import Oscillation, fit_oscillation
+from sliceit_drake.calibration.setup import CalibrationSetup, from_unit, to_unit
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.batch import BatchSimulator, BatchSlice
+from sliceit_drake.cutting.food import Box, Cylinder, Ellipsoid, Food, make_food_model, start_pose
+from sliceit_drake.cutting.gradient import SliceAdjoint
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.model import CuttingModel, TimeStepError
+from sliceit_drake.cutting.motion import Pose
+from sliceit_drake.cutting.parameters import get_parameter, pull_back, with_parameters
+from sliceit_drake.cutting.simulate import KnifePath, board_wrenches
+from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.records.preprocessing import as_measured
+from sliceit_drake.records.slice_record import SliceRecord
+
+__all__ = ["EXCHANGE_PERIOD", "Parameter", "Prediction", "Predictor"]
+
+EXCHANGE_PERIOD = 2e-3
+CLEARANCE = 5e-4
+ONSET = 0.02
+"""Share of a record's greatest force at which contact is taken to begin, where its height is not
+known."""
+
+NO_ADJOINT = ("effects.skin.thickness",)
+"""Parameters whose derivative is taken by differences."""
+STEP = 1e-3
+"""Of these differences, in the unit range."""
+
+HEIGHT, SPEED = "height_offset", "speed_factor"
+
+
+@dc.dataclass(frozen=True)
+class Parameter:
+    """An unknown of a calibration.
+
+    Attributes:
+        name: Dotted name of a shared one; "height_offset:NAME" and "speed_factor:NAME" are the
+            record's.
+        low, high: Range.
+        log: Whether it is searched in its logarithm.
+        start: Value before the calibration.
+    """
+
+    name: str
+    low: float
+    high: float
+    log: bool
+    start: float
+
+    @property
+    def shared(self) -> bool:
+        """Whether it belongs to the food and not to one record."""
+        return ":" not in self.name
+
+    def value(self, unit: float) -> float:
+        """The value at a place in the range."""
+        return float(from_unit(unit, self.low, self.high, self.log))
+
+    def unit(self, value: float) -> float:
+        """Place of a value in the range, within 0 and 1."""
+        return float(np.clip(to_unit(value, self.low, self.high, self.log), 0.0, 1.0))
+
+
+@dc.dataclass
+class Prediction:
+    """Predicted and measured force at the samples of a record that are compared.
+
+    Attributes:
+        predicted: [m, channels], N; NaN where the slice broke down.
+        cut: Share of the section that was cut at the end, or when the slice broke down.
+        oscillation: That brings it nearest to the measurement; it is in `predicted`.
+        smooth: The prediction without it [m, channels], N.
+        failure: Why it broke down, or None.
+    """
+
+    predicted: np.ndarray
+    cut: float
+    oscillation: Oscillation
+    smooth: np.ndarray
+    failure: str | None
+
+
+@dc.dataclass
+class _KnifeMotion:
+    """A recorded motion in F at the exchanges, as `simulate_batch` takes it."""
+
+    R: np.ndarray
+    p: np.ndarray
+
+    @property
+    def duration(self) -> float:
+        return (len(self.p) - 1) * EXCHANGE_PERIOD
+
+    def pose(self, t: float) -> Pose:
+        k = round(t / EXCHANGE_PERIOD)
+        return Pose(self.R[k], self.p[k])
+
+
+class RecordTarget:
+    """One record: its motion relative to the food, and what of its force is compared.
+
+    The force is compared by component in F where the record has them, else by its norm, from first
+    to last contact and where the metadata name no phase that is not of the food ("air" stays in: a
+    prediction of zero there is a prediction). Prediction and measurement went through the same
+    filters: `records.preprocessing.as_measured`.
+
+    Attributes:
+        record: The record.
+        model: Its cut, with the parameters of the setup.
+        time: Of the compared samples [m], s.
+        measured: Force at them [m, channels], N; channels are x, y, z of F, or the norm.
+        depth: Of the edge below the top of the cut at them [m], metres, as the record says.
+        by_norm: Whether only the norm is known.
+    """
+
+    def __init__(self, record: SliceRecord, model: CuttingModel, setup: CalibrationSetup) -> None:
+        self.record, self.model = record, model
+        self.by_norm = record.force is None
+        facts = record.metadata.food
+        yaw = facts.yaw or 0.0
+        R_FW = Rotation.from_euler("z", -yaw)
+        p = record.position.copy()
+        home = start_pose(model, 0.0)
+        unknown = set(record.metadata.unknown)
+        rotation = R_FW * Rotation.from_matrix(record.rotation)
+        if facts.position is None:
+            p = R_FW.apply(p - p[0]) + home.p
+            rotation = Rotation.from_matrix(home.R) * (rotation[0].inv() * rotation)
+        else:
+            p = R_FW.apply(p - np.array(facts.position))
+        if facts.position is None or "p_WK_z" in unknown or "food.position" in unknown:
+            # Height is measured from where the force begins.
+            force = record.force_magnitude
+            quiet = force[: max(3, len(force) // 50)].max()
+            onset = int(np.argmax(force > quiet + ONSET * force.max()))
+            p[:, 2] += home.p[2] - p[onset, 2]
+        self.unknown_speed = "motion.speed" in unknown
+        margin = CLEARANCE + max(abs(v) for v in setup.height_offset)
+        height = p[:, 2] - home.p[2]
+        low = np.flatnonzero(height < margin)
+        if low.size == 0:
+            raise ConfigurationError(
+                f"the knife stays {1e3 * height.min():.3g} mm or more above the food",
+                source=record.file or record.name,
+                field="p_WK_z",
+                fix="Correct food.position or the heights; both are in the world frame, in metres.",
+            )
+        self.first, self.last = max(low[0] - 1, 0), min(low[-1] + 1, len(p) - 1)
+        self.contact = home.p
+        self.start = float(record.time[self.first])
+        count = max(1, round((record.time[self.last] - self.start) / EXCHANGE_PERIOD))
+        self.times = self.start + EXCHANGE_PERIOD * np.arange(count + 1)
+        at = np.minimum(self.times, record.time[-1])
+        self.position = np.column_stack([np.interp(at, record.time, column) for column in p.T])
+        self.rotation = Slerp(record.time, rotation)(at).as_matrix()
+        self.time = record.time[self.first : self.last + 1]
+        self.depth = -height[self.first : self.last + 1]
+        if self.by_norm:
+            self.measured = record.force_magnitude[self.first : self.last + 1, None]
+        else:
+            assert record.force is not None
+            self.measured = R_FW.apply(record.force)[self.first : self.last + 1]
+        self.operator = self._operator(count)
+
+    def _operator(self, count: int) -> np.ndarray:
+        """From means over exchanges to what would have been measured at the samples [m, count].
+
+        Filters are linear, so that their effect on each exchange's force is all there is to know.
+        """
+        record, T = self.record, EXCHANGE_PERIOD
+        before = int((self.start - record.time[0]) / T) + 2
+        after = int(max(record.time[-1] - self.times[-1], 0.0) / T) + 2
+        middle = self.start + T * (np.arange(-before, count + after) + 0.5)
+        series = np.zeros((len(middle), count))
+        series[before : before + count] = np.eye(count)
+        time, rows = as_measured(record.metadata, middle, series)
+        at = np.searchsorted(time, self.time, side="right")
+        low, high = np.clip(at - 1, 0, len(time) - 1), np.clip(at, 0, len(time) - 1)
+        span = np.where(high > low, time[high] - time[low], 1.0)
+        share = np.clip((self.time - time[low]) / span, 0.0, 1.0)[:, None]
+        return (1.0 - share) * rows[low] + share * rows[high]
+
+    def motion(self, height_offset: float, speed_factor: float) -> _KnifeMotion:
+        """The knife's motion in F where it stood lower by `height_offset` and moved faster."""
+        p = self.contact + speed_factor * (self.position - self.contact)
+        return _KnifeMotion(self.rotation, p - np.array([0.0, 0.0, height_offset]))
+
+    def compare(self, force: np.ndarray) -> np.ndarray:
+        """Channels at the samples [m, channels] from forces of the exchanges [E, 3], N, in F."""
+        seen = self.operator @ force
+        return np.linalg.norm(seen, axis=1)[:, None] if self.by_norm else seen
+
+    def adjoint(self, force: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Adjoint of `compare` at `force`: of the channels [m, channels] to forces [E, 3]."""
+        if self.by_norm:
+            seen = self.operator @ force
+            norm = np.maximum(np.linalg.norm(seen, axis=1), 1e-9)[:, None]
+            weights = weights * seen / norm
+        return np.asarray(self.operator.T @ weights)
+
+
+class Predictor:
+    """Predicts the forces of records for values of the parameters, in unit ranges.
+
+    Args:
+        setup: Food and ranges.
+        records: What is predicted.
+        time_step: Sub-step of the food, s; that of the setup's numerics by default.
+        precision: float32 or float64.
+        workers: Threads.
+
+    Raises:
+        ConfigurationError: A record cannot be predicted, naming file and field.
+    """
+
+    def __init__(
+        self,
+        setup: CalibrationSetup,
+        records: Sequence[SliceRecord],
+        time_step: float | None = None,
+        precision: str = "float32",
+        workers: int | None = None,
+    ) -> None:
+        if not records:
+            raise ConfigurationError("no record is given", field="RECORD", fix="Name one.")
+        self.setup = setup
+        step = time_step or setup.numerics.time_step
+        numerics = dc.replace(setup.numerics, time_step=step, precision=precision)
+        models: dict[str, CuttingModel] = {}
+        self.targets = []
+        for record in records:
+            food, knife = food_of(setup.food, record), knife_of(setup.knife, record)
+            key = repr((food, knife))
+            if key not in models:
+                models[key] = make_food_model(food, knife, numerics, setup.refinement)
+            self.targets.append(RecordTarget(record, models[key], setup))
+        self.board = dc.replace(setup.board, height=0.0)
+        self.parameters = self._list_parameters()
+        self.used = np.ones(self.measured.size, bool)
+        self._simulator = BatchSimulator(EXCHANGE_PERIOD, self.board, workers)
+        self._adjoints: dict[int, SliceAdjoint] = {}
+
+    def _list_parameters(self) -> list[Parameter]:
+        model = self.targets[0].model
+        out = [
+            Parameter(p.name, p.low, p.high, p.scale == "log", _start(model, p.name))
+            for p in self.setup.parameters
+        ]
+        low, high = self.setup.height_offset
+        slow, fast = self.setup.speed_factor
+        for target in self.targets:
+            name = target.record.name
+            out.append(Parameter(f"{HEIGHT}:{name}", low, high, False, 0.0))
+            if target.unknown_speed:
+                out.append(Parameter(f"{SPEED}:{name}", slow, fast, False, 1.0))
+        names = [p.name for p in out]
+        if len(set(names)) < len(names):
+            raise ConfigurationError(
+                "two records have the same name", field="RECORD", fix="Rename one (metadata.name)."
+            )
+        return out
+
+    @property
+    def start(self) -> np.ndarray:
+        """The setup's values, as places in the ranges [d]."""
+        return np.array([p.unit(p.start) for p in self.parameters])
+
+    @property
+    def measured(self) -> np.ndarray:
+        """All measured channels of all records, in a row [M], N."""
+        return np.concatenate([t.measured.ravel() for t in self.targets])
+
+    @property
+    def record_of(self) -> np.ndarray:
+        """Index of the record of each entry of `measured` [M]."""
+        return np.concatenate([np.full(t.measured.size, k) for k, t in enumerate(self.targets)])
+
+    @property
+    def depth(self) -> np.ndarray:
+        """Depth of the edge at each entry of `measured` [M], metres."""
+        return np.concatenate([np.repeat(t.depth, t.measured.shape[1]) for t in self.targets])
+
+    def values(self, unit: np.ndarray) -> dict[str, float]:
+        """Values of the parameters by name, from places in their ranges [d]."""
+        return {p.name: p.value(u) for p, u in zip(self.parameters, unit, strict=True)}
+
+    def model(self, target: RecordTarget, values: Mapping[str, float]) -> CuttingModel:
+        """The cut of a record with these values.
+
+        Raises:
+            TimeStepError: The step is beyond the limit and masses are not scaled.
+        """
+        shared = {name: value for name, value in values.items() if ":" not in name}
+        return with_parameters(target.model, shared)
+
+    def motion(self, target: RecordTarget, values: Mapping[str, float]) -> _KnifeMotion:
+        """The knife's motion of a record with these values."""
+        name = target.record.name
+        return target.motion(values[f"{HEIGHT}:{name}"], values.get(f"{SPEED}:{name}", 1.0))
+
+    def predict(
+        self, units: Sequence[np.ndarray], progress: Callable[[int], None] | None = None
+    ) -> list[list[Prediction]]:
+        """Forces for several sets of parameters.
+
+        Args:
+            units: Places in the ranges, each [d].
+            progress: Called with the number of slices done.
+
+        Returns:
+            For each set, one prediction a record.
+        """
+        models, motions, failed = [], [], {}
+        for s, unit in enumerate(units):
+            values = self.values(unit)
+            for r, target in enumerate(self.targets):
+                try:
+                    models.append(self.model(target, values))
+                except TimeStepError as error:
+                    failed[s, r] = str(error)
+                    models.append(target.model)
+                motions.append(self.motion(target, values))
+        slices = self._simulator.run(models, motions, progress)
+        out = []
+        n = len(self.targets)
+        for s in range(len(units)):
+            row = [
+                self._prediction(target, slices[s * n + r], failed.get((s, r)))
+                for r, target in enumerate(self.targets)
+            ]
+            out.append(row)
+        return out
+
+    def _prediction(
+        self, target: RecordTarget, result: BatchSlice, failure: str | None
+    ) -> Prediction:
+        force = (result.food_wrench + result.board_wrench)[:, 3:]
+        finite = np.isfinite(result.cut)
+        cut = float(result.cut[finite][-1]) if finite.any() else 0.0
+        failure = failure or result.failure
+        if failure is not None:
+            nothing = np.full(target.measured.shape, np.nan)
+            return Prediction(nothing, cut, Oscillation(), nothing, failure)
+        count = target.operator.shape[1]
+        smooth = target.compare(force[:count])
+        wave = self._oscillation(target, smooth)
+        return Prediction(wave.factor(target.time)[:, None] * smooth, cut, wave, smooth, None)
+
+    def _oscillation(self, target: RecordTarget, smooth: np.ndarray) -> Oscillation:
+        if self.setup.oscillation is None:
+            return Oscillation()
+        low, high = self.setup.oscillation
+        used = self.split(self.used)[self.targets.index(target)].astype(float)
+        return fit_oscillation(target.time, smooth, target.measured, used, (low, high))
+
+    def split(self, entries: np.ndarray) -> list[np.ndarray]:
+        """Entries of `measured` [M] by record, each [m, channels]."""
+        ends = np.cumsum([t.measured.size for t in self.targets])
+        parts = np.split(entries, ends[:-1])
+        return [x.reshape(t.measured.shape) for x, t in zip(parts, self.targets, strict=True)]
+
+    def holding_out(self, held_out: np.ndarray) -> "Predictor":
+        """The same predictor, fitting without these entries of `measured`, mask [M]."""
+        other = copy.copy(self)
+        other.used = ~held_out
+        return other
+
+    def error(self, row: Sequence[Prediction]) -> float:
+        """Root mean square error over the entries that are used, N; NaN if a slice broke down."""
+        residual = np.concatenate([p.predicted.ravel() for p in row]) - self.measured
+        return float(np.sqrt(np.mean(residual[self.used] ** 2)))
+
+    def residuals(self, unit: np.ndarray) -> np.ndarray:
+        """Predicted minus measured, all records in a row [M], N; NaN where a slice broke down."""
+        (row,) = self.predict([unit])
+        return np.concatenate([p.predicted.ravel() for p in row]) - self.measured
+
+    def mean_square_and_gradient(self, unit: np.ndarray) -> tuple[float, np.ndarray]:
+        """Mean square of the used residuals [N^2], and its gradient by the unit values.
+
+        The gradient is exact (the solver's adjoint) but for `NO_ADJOINT`.
+
+        Args:
+            unit: Places in the ranges [d].
+
+        Raises:
+            CuttingError: A slice broke down.
+        """
+        values = self.values(unit)
+        gradient = dict.fromkeys(values, 0.0)
+        total, scale = 0.0, float(self.used.sum())
+        for target, used in zip(self.targets, self.split(self.used), strict=True):
+            model, motion = self.model(target, values), self.motion(target, values)
+            path = KnifePath(model, motion, EXCHANGE_PERIOD)
+            adjoint = self._adjoint(model)
+            run = adjoint.run(path.R_CK, path.p_CK, model)
+            R_FC = model.X_FC_rotation
+            board = self._board(path.R_FK, path.p_FK, model.knife)
+            E = target.operator.shape[1]
+            force = (run.wrenches[:, 3:] @ R_FC.T + board[:, 3:])[:E]
+            smooth = target.compare(force)
+            factor = self._oscillation(target, smooth).factor(target.time)[:, None]
+            residual = used * (factor * smooth - target.measured)
+            total += float((residual**2).sum())
+            of_force = np.zeros((len(run.wrenches), 3))
+            of_force[:E] = target.adjoint(force, 2.0 * factor * residual / scale)
+            back = adjoint.gradient(run, np.column_stack([0.0 * of_force, of_force @ R_FC]))
+            shared = [n for n in values if ":" not in n and n not in NO_ADJOINT]
+            for name, slope in pull_back(model, back, shared).items():
+                gradient[name] += float(slope)
+            for key in (f"{kind}:{target.record.name}" for kind in (HEIGHT, SPEED)):
+                if key in values:
+                    of_position = back.position @ R_FC.T
+                    gradient[key] += self._by_motion(target, values, key, of_position, of_force)
+        slopes = np.array(
+            [gradient[p.name] * _slope(p, u) for p, u in zip(self.parameters, unit, strict=True)]
+        )
+        for k, parameter in enumerate(self.parameters):
+            if parameter.name in NO_ADJOINT:
+                slopes[k] = self._difference(unit, k)
+        return total / scale, slopes
+
+    def _by_motion(
+        self,
+        target: RecordTarget,
+        values: dict[str, float],
+        key: str,
+        of_position: np.ndarray,
+        of_force: np.ndarray,
+    ) -> float:
+        """Derivative by a parameter of the motion, from those by Ko's positions and by the forces,
+        both in F: of the latter the board has a part."""
+        step = 1e-7 if key.startswith(HEIGHT) else 1e-5
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = self.motion(target, values | {key: values[key] + sign * step})
+            path = KnifePath(target.model, moved, EXCHANGE_PERIOD)
+            forces = self._board(path.R_FK, path.p_FK, target.model.knife)[:, 3:]
+            ends.append((path.p_FK, forces))
+        dp = (ends[0][0] - ends[1][0]) / (2.0 * step)
+        dF = (ends[0][1] - ends[1][1]) / (2.0 * step)
+        return float((of_position * dp).sum() + (of_force * dF).sum())
+
+    def _difference(self, unit: np.ndarray, k: int) -> float:
+        """Derivative of the mean square by the k-th unit value, by differences."""
+        ends = np.tile(unit, (2, 1))
+        ends[:, k] = np.clip(unit[k] + STEP * np.array([1.0, -1.0]), 0.0, 1.0)
+        squares = [self.error(row) ** 2 for row in self.predict(list(ends))]
+        return (squares[0] - squares[1]) / float(ends[0, k] - ends[1, k])
+
+    def _board(self, R: np.ndarray, p: np.ndarray, knife: Knife) -> np.ndarray:
+        return board_wrenches(self.board, knife, R, p, EXCHANGE_PERIOD)
+
+    def _adjoint(self, model: CuttingModel) -> SliceAdjoint:
+        key = id(model.split)
+        if key not in self._adjoints:
+            self._adjoints[key] = SliceAdjoint(model, EXCHANGE_PERIOD)
+        return self._adjoints[key]
+
+    def jacobian(
+        self,
+        unit: np.ndarray,
+        step: float = 2e-3,
+        progress: Callable[[int], None] | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals [M] and their derivatives by the unit values [M, d], by central differences.
+
+        The oscillation is held. Steps that would leave a range are taken inwards.
+
+        Raises:
+            CuttingError: A slice breaks down there.
+        """
+        sets, spans = [unit], []
+        for k in range(len(unit)):
+            low, high = max(unit[k] - step, 0.0), min(unit[k] + step, 1.0)
+            spans.append(high - low)
+            for end in (high, low):
+                sets.append(np.where(np.arange(len(unit)) == k, end, unit))
+        rows = self.predict(sets, progress)
+        for row in rows:
+            for p in row:
+                if p.failure is not None:
+                    raise CuttingError(f"a slice near the calibrated values: {p.failure}")
+        factors = [
+            p.oscillation.factor(t.time)[:, None]
+            for p, t in zip(rows[0], self.targets, strict=True)
+        ]
+        flat = [
+            np.concatenate([(f * p.smooth).ravel() for f, p in zip(factors, row, strict=True)])
+            for row in rows
+        ]
+        columns = [(flat[1 + 2 * k] - flat[2 + 2 * k]) / span for k, span in enumerate(spans)]
+        return flat[0] - self.measured, np.array(columns).T
+
+    def nuisance_jacobian(self, unit: np.ndarray) -> np.ndarray:
+        """Derivatives of the residuals by the oscillations' numbers [M, 3 records] or [M, 0]."""
+        if self.setup.oscillation is None:
+            return np.zeros((self.measured.size, 0))
+        (row,) = self.predict([unit])
+        blocks = []
+        for p, target in zip(row, self.targets, strict=True):
+            slopes = p.oscillation.derivatives(target.time)
+            by = p.smooth[:, :, None] * slopes[:, None, :]
+            blocks.append(by.reshape(-1, 3))
+        out = np.zeros((self.measured.size, 3 * len(blocks)))
+        start = 0
+        for k, block in enumerate(blocks):
+            out[start : start + len(block), 3 * k : 3 * k + 3] = block
+            start += len(block)
+        return out
+
+
+def _start(model: CuttingModel, name: str) -> float:
+    value = get_parameter(model, name)
+    assert isinstance(value, int | float)
+    return float(value)
+
+
+def _slope(parameter: Parameter, unit: float) -> float:
+    """Derivative of the value by its place in the range."""
+    span = parameter.high - parameter.low
+    if parameter.log:
+        return float(parameter.value(unit) * np.log(parameter.high / parameter.low))
+    return span
+
+
+def food_of(food: Food, record: SliceRecord) -> Food:
+    """The food with what the record says of its size and support.
+
+    Raises:
+        ConfigurationError: The record is of another shape than the food.
+    """
+    facts = record.metadata.food
+    food = copy.deepcopy(food)
+    if facts.support != "unknown":
+        food.held_sides = "both" if facts.support == "clamped_slab" else "plus"
+    if facts.size is None or facts.shape == "unknown":
+        return food
+    shapes = {"cylinder": Cylinder, "box": Box, "ellipsoid": Ellipsoid}
+    if not isinstance(food.shape, shapes[facts.shape]):
+        raise ConfigurationError(
+            f"is a {facts.shape}, the food of the setup is a {type(food.shape).__name__.lower()}",
+            source=record.file or record.name,
+            field="food.shape",
+            fix="Calibrate it with a setup of that shape (--food FILE.yaml).",
+        )
+    if isinstance(food.shape, Cylinder):
+        food.shape.diameter, food.shape.length = facts.size[2], facts.size[1]
+    elif isinstance(food.shape, Box):
+        food.shape.size = list(facts.size)
+    elif isinstance(food.shape, Ellipsoid):
+        food.shape.diameters = list(facts.size)
+    return food
+
+
+def knife_of(knife: Knife, record: SliceRecord) -> Knife:
+    """The knife with what the record says of it."""
+    facts = record.metadata.knife
+    known = {
+        name: getattr(facts, name)
+        for name in (f.name for f in dc.fields(Knife))
+        if getattr(facts, name, None) is not None
+    }
+    return dc.replace(knife, **known)

@@ -1,0 +1,162 @@
+"""Global search by Optuna's tree-structured Parzen estimator, resumable and on many machines."""
+
+import dataclasses as dc
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import optuna
+from optuna.storages.journal import JournalFileBackend
+from optuna.trial import TrialState
+
+from sliceit_drake.calibration.prediction import Prediction, Predictor
+from sliceit_drake.configuration import ConfigurationError
+
+__all__ = ["SearchResult", "error_of", "open_study", "search"]
+
+GENERATION = 4
+"""Trials that are proposed before any of them is known: they run side by side."""
+BROKEN = 10.0
+"""Error of a slice that breaks down at once, in root mean squares of the measured force."""
+
+
+@dc.dataclass
+class SearchResult:
+    """What a search has found so far.
+
+    Attributes:
+        units: Places in the ranges of all finished trials [n, d].
+        errors: Their root mean square errors [n], N; larger than any real one where a slice broke
+            down.
+        failures: Number of trials that broke down.
+    """
+
+    units: np.ndarray
+    errors: np.ndarray
+    failures: int
+
+    def best(self, count: int, distance: float = 0.1) -> list[np.ndarray]:
+        """The best places, `distance` apart from each other in at least one parameter."""
+        chosen: list[np.ndarray] = []
+        for k in np.argsort(self.errors, kind="stable"):
+            unit = self.units[k]
+            if all(np.abs(unit - other).max() >= distance for other in chosen):
+                chosen.append(unit)
+            if len(chosen) == count:
+                break
+        return chosen
+
+
+def open_study(storage: str | Path, name: str) -> optuna.Study:
+    """Opens a study or begins it.
+
+    Args:
+        storage: A journal file (.log), or a URL that Optuna knows, as
+            postgresql://user:password@host/database, which many machines share.
+        name: Of the study in the storage.
+
+    Raises:
+        ConfigurationError: The storage cannot be opened.
+    """
+    try:
+        if "://" in str(storage):
+            backend: optuna.storages.BaseStorage = optuna.storages.get_storage(str(storage))
+        else:
+            backend = optuna.storages.JournalStorage(JournalFileBackend(str(storage)))
+        return optuna.create_study(study_name=name, storage=backend, load_if_exists=True)
+    except Exception as error:
+        raise ConfigurationError(
+            f"cannot be opened ({error})",
+            field="--storage",
+            fix="Give a journal file such as trials.log, or a URL such as "
+            "postgresql://user:password@host/database.",
+        ) from error
+
+
+def search(
+    predictor: Predictor,
+    study: optuna.Study,
+    trials: int,
+    seed: int,
+    progress: Callable[[int, float], None] | None = None,
+) -> SearchResult:
+    """Runs trials until the study holds `trials` finished ones.
+
+    What is proposed depends on the finished trials and on the seed alone, so that a search that was
+    killed goes on as if it had not been. With several workers on one storage it also depends on who
+    was faster; give each its own seed.
+
+    Args:
+        predictor: Of the records.
+        study: From `open_study`.
+        trials: Number of finished trials in the storage, those of all workers.
+        seed: Of the proposals.
+        progress: Called with the finished trials and the best error so far, N.
+
+    Raises:
+        ConfigurationError: The study in the storage is of other parameters.
+    """
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    names = [p.name for p in predictor.parameters]
+    described = [f"{p.name} {p.low!r} {p.high!r} {p.log}" for p in predictor.parameters]
+    known = study.user_attrs.get("parameters")
+    if known is None:
+        study.set_user_attr("parameters", described)
+        study.enqueue_trial(dict(zip(names, predictor.start.tolist(), strict=True)))
+    elif known != described:
+        raise ConfigurationError(
+            f"the study {study.study_name!r} was begun with other parameters or ranges",
+            field="--storage",
+            fix="Give another --output or storage, or the same setup and records.",
+        )
+    # Trials of a worker that was killed never end; they are not waited for.
+    finished = len(_finished(study))
+    space: dict[str, optuna.distributions.BaseDistribution] = {
+        name: optuna.distributions.FloatDistribution(0.0, 1.0) for name in names
+    }
+    while finished < trials:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+            study.sampler = optuna.samplers.TPESampler(
+                n_startup_trials=max(20, 4 * len(names)),
+                multivariate=True,
+                constant_liar=True,
+                seed=(1000003 * seed + finished) % 2**32,
+            )
+        # The sampler's seed follows the number of finished trials, so generations end where they
+        # would have ended.
+        batch = [
+            study.ask(space)
+            for _ in range(min(GENERATION - finished % GENERATION, trials - finished))
+        ]
+        units = [np.array([trial.params[name] for name in names]) for trial in batch]
+        for trial, row in zip(batch, predictor.predict(units), strict=True):
+            error, broken = error_of(predictor, row)
+            trial.set_user_attr("broken", broken)
+            study.tell(trial, error)
+        finished = len(_finished(study))
+        if progress is not None:
+            progress(finished, study.best_value)
+    done = _finished(study)
+    return SearchResult(
+        np.array([[t.params[name] for name in names] for t in done]),
+        np.array([t.value for t in done]),
+        sum(bool(t.user_attrs.get("broken")) for t in done),
+    )
+
+
+def _finished(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
+    return study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+
+
+def error_of(predictor: Predictor, row: list[Prediction]) -> tuple[float, bool]:
+    """Root mean square error of predictions [N], and whether a slice broke down.
+
+    A slice that broke down counts as `BROKEN` to twice that, the more the less was cut.
+    """
+    worst = [1.0 - p.cut for p in row if p.failure is not None]
+    if not worst:
+        return predictor.error(row), False
+    scale = float(np.sqrt(np.mean(predictor.measured**2)))
+    return BROKEN * scale * (1.0 + max(worst)), True

@@ -1,0 +1,157 @@
+"""What is calibrated: a food as it is known beforehand, and the parameters that are searched."""
+
+import dataclasses as dc
+import difflib
+from pathlib import Path
+
+import numpy as np
+
+from sliceit_drake.configuration import ConfigurationError, choice, load_yaml, quantity
+from sliceit_drake.cutting.board import Board
+from sliceit_drake.cutting.food import Food, make_food_model
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.mesh import MeshError
+from sliceit_drake.cutting.model import Numerics
+from sliceit_drake.cutting.parameters import POINT_PARAMETERS, parameter_names
+from sliceit_drake.resources import resource_path
+
+__all__ = ["CalibrationSetup", "ParameterRange", "load_setup", "setup_names"]
+
+FOLDER = "calibration/setups"
+
+
+@dc.dataclass
+class ParameterRange:
+    """A parameter that is searched.
+
+    Attributes:
+        name: Dotted, as `cutting.parameters.parameter_names` lists them: material.toughness.
+        why: Where the range comes from.
+    """
+
+    name: str = ""
+    low: float = quantity(0.0, "", low=-1e12, high=1e12, doc="Least value, in the field's unit.")
+    high: float = quantity(1.0, "", low=-1e12, high=1e12, doc="Greatest value.")
+    scale: str = choice("log", ("log", "linear"), doc="In what the search is uniform.")
+    why: str = ""
+
+    def check(self, where: str) -> None:
+        if self.high <= self.low or (self.scale == "log" and self.low <= 0.0):
+            raise ConfigurationError(
+                f"from {self.low:g} to {self.high:g} is no range on a {self.scale} scale",
+                field=f"{where}.low",
+                fix="Give low < high, and low > 0 on a log scale.",
+            )
+
+
+@dc.dataclass
+class CalibrationSetup:
+    """A food, what cuts it, and what is not known of it.
+
+    What a record says of the food's size, its support and the knife replaces what stands here.
+    Each record has parameters of its own beside: the height by which its knife stood lower than it
+    says, and where its `unknown` lists `motion.speed` a factor on its speed.
+    """
+
+    food: Food = dc.field(default_factory=Food)
+    knife: Knife = dc.field(default_factory=Knife)
+    board: Board = dc.field(default_factory=Board)
+    numerics: Numerics = dc.field(default_factory=Numerics)
+    parameters: list[ParameterRange] = dc.field(default_factory=list)
+    height_offset: list[float] = quantity(
+        [-2e-3, 2e-3], "m", low=-0.02, high=0.02, size=2, doc="Range of each record's height."
+    )
+    speed_factor: list[float] = quantity(
+        [0.9, 1.2], "", low=0.2, high=5.0, size=2, doc="Range where a record's speed is unknown."
+    )
+    refinement: float = quantity(
+        1.0, "", low=0.2, high=4.0, doc="Elements along an edge, relative to the food's mesh."
+    )
+    oscillation: list[float] | None = quantity(
+        None,
+        "Hz",
+        low=0.1,
+        high=250.0,
+        size=2,
+        doc="Frequencies of an oscillation of each record, see oscillation.py; null for none.",
+    )
+    search_time_step: float = quantity(
+        1e-3, "s", low=1e-6, high=1e-2, doc="Sub-step of the search; must divide 2 ms."
+    )
+
+    def check(self, where: str) -> None:
+        names = [p.name for p in self.parameters]
+        for k, name in enumerate(names):
+            if name in names[:k]:
+                raise ConfigurationError(
+                    f"{name} is there twice",
+                    field=f"{where}.parameters[{k}].name",
+                    fix="Remove one.",
+                )
+        for name in ("height_offset", "speed_factor", "oscillation"):
+            if getattr(self, name) is None:
+                continue
+            low, high = getattr(self, name)
+            if high <= low:
+                raise ConfigurationError(
+                    f"[{low:g}, {high:g}] is no range",
+                    field=f"{where}.{name}",
+                    fix="Give low < high.",
+                )
+
+
+def setup_names() -> list[str]:
+    """Foods for which a setup ships."""
+    return sorted(path.stem for path in resource_path(FOLDER).glob("*.yaml"))
+
+
+def load_setup(name: str | Path) -> CalibrationSetup:
+    """Reads a setup and checks that its parameters exist.
+
+    Args:
+        name: A food of `setup_names`, or a YAML file.
+
+    Raises:
+        ConfigurationError: Naming file, field and fix.
+    """
+    file = Path(name)
+    if file.suffix not in (".yaml", ".yml"):
+        if str(name) not in setup_names():
+            raise ConfigurationError(
+                f"{name!r} is no food that a setup ships for: {', '.join(setup_names())}",
+                field="--food",
+                fix="Name one of them, or give a YAML file of a setup.",
+            )
+        file = resource_path(f"{FOLDER}/{name}.yaml")
+    setup = load_yaml(CalibrationSetup, file)
+    assert isinstance(setup, CalibrationSetup)
+    try:
+        model = make_food_model(setup.food, setup.knife, setup.numerics, setup.refinement)
+    except MeshError as error:
+        raise ConfigurationError(str(error), source=str(file), field="food.shape") from error
+    known = [n for n in parameter_names(model) if n not in POINT_PARAMETERS]
+    known += ["effects.skin.thickness"]
+    for k, parameter in enumerate(setup.parameters):
+        if parameter.name not in known:
+            close = difflib.get_close_matches(parameter.name, known, n=1)
+            raise ConfigurationError(
+                f"there is no parameter {parameter.name!r}",
+                source=str(file),
+                field=f"parameters[{k}].name",
+                fix=f"Did you mean {close[0]}?" if close else "See cutting/parameters.py.",
+            )
+    return setup
+
+
+def to_unit(value: np.ndarray | float, low: float, high: float, log: bool) -> np.ndarray:
+    """Place of a value in its range: 0 at the low end, 1 at the high end."""
+    if log:
+        return np.asarray(np.log(np.asarray(value) / low) / np.log(high / low))
+    return np.asarray((np.asarray(value) - low) / (high - low))
+
+
+def from_unit(unit: np.ndarray | float, low: float, high: float, log: bool) -> np.ndarray:
+    """Inverse of `to_unit`."""
+    if log:
+        return np.asarray(low * np.exp(np.asarray(unit) * np.log(high / low)))
+    return np.asarray(low + np.asarray(unit) * (high - low))
