@@ -306,7 +306,12 @@ def scale(table: SliceTable, names: tuple[str, ...], factor: float) -> None:
         (clipped_at_an_unknown_range, "warning", "clipped", "rows in a row are exactly 15"),
         (constant, "error", "constant", "force_x: is 1.73205 N in every row"),
         (frozen, "warning", "frozen", "lines 402 to 551: force_x: .*for 0.3 s of the slice"),
-        (no_air, "warning", "no air phase", "yaml: motion.phases: no phase labelled air has 10"),
+        (
+            no_air,
+            "warning",
+            "no air phase",
+            "yaml: motion.phases: the first phase labelled air has not",
+        ),
         (no_phases, "warning", "phases", "no phase is labelled, so that the whole"),
         (phase_beside, "warning", "phases", "phases.4.: other from 7 to 8 s is beside the record"),
         (jump, "error", "jump", "lines 801 to 802: p_WK_x: the pose jumps: 5 m/s between two"),

@@ -59,7 +59,7 @@ def check_force(table: SliceTable, record: SliceRecord, findings: Findings) -> N
             "Give the components force_x..z, or the norm.",
             (k, k),
         )
-    air = record.phase("air")
+    air = record.first_phase("air")
     cut = record.phase("slice", "second_pass")
     if not record.metadata.motion.phases:
         cut = np.ones(len(record), bool)
@@ -97,11 +97,11 @@ def _check_tare(record: SliceRecord, air: np.ndarray, findings: Findings) -> Non
             "warning",
             "no air phase",
             "motion.phases",
-            "no phase labelled air has 10 rows, so that noise and zero of the sensor are not known",
+            "the first phase labelled air has not 10 rows; noise and zero of the sensor are unknown",
             "Label the time before contact as air; record half a second of it.",
         )
         return
-    if air.all():
+    if record.phase("air").all():
         return  # Such a record is there to show zero and drift; no force makes them large or small.
     first = int(np.flatnonzero(air)[0])
     last = int(np.flatnonzero(air)[-1])
@@ -119,7 +119,7 @@ def _check_tare(record: SliceRecord, air: np.ndarray, findings: Findings) -> Non
             fmt.FORCE[axis] if record.force is not None else fmt.FORCE_NORM,
             f"the force in the air is {mean[axis]:.3g} N in the mean, with a scatter of"
             f" {scatter[axis]:.2g} N; wrench.tared is {facts.tared}",
-            "Apply the step tare, which subtracts the mean of the air phase.",
+            "Apply the step tare, which subtracts that mean.",
             (first, last),
         )
 

@@ -36,20 +36,21 @@ frequency its two passes of order 4 leave 1/18."""
 
 
 def tare(record: SliceRecord) -> SliceRecord:
-    """Subtracts the mean wrench of the air phases.
+    """Subtracts the mean wrench of the first air phase, as zeroing the sensor there would.
 
     The zero of a sensor is constant in the sensor, hence in K: there it is averaged and subtracted.
+    Later air phases then show its drift.
 
     Raises:
-        ConfigurationError: If there is no air phase of 10 rows, or only the norm of the force is
+        ConfigurationError: If the first air phase has not 10 rows, or only the norm of the force is
             known, from which an offset cannot be subtracted.
     """
-    air = record.phase("air")
+    air = record.first_phase("air")
     if record.force is None or air.sum() < LEAST_AIR_ROWS:
         raise ConfigurationError(
             "has the norm of the force alone"
             if record.force is None
-            else f"has {air.sum()} rows in phases labelled air, expected {LEAST_AIR_ROWS}",
+            else f"has {air.sum()} rows in its first phase labelled air, expected {LEAST_AIR_ROWS}",
             source=record.file or record.name,
             fix="Leave the step tare out, or give components and an air phase.",
         )

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml, load_yaml
-from sliceit_drake.records.metadata import ProcessingStep, SliceMetadata
+from sliceit_drake.records.metadata import Phase, ProcessingStep, SliceMetadata
 
 __all__ = [
     "COLUMNS",
@@ -144,9 +144,19 @@ class SliceRecord:
         mask = np.zeros(len(self), bool)
         for phase in self.metadata.motion.phases:
             if phase.label in labels:
-                last = (self.time == phase.end) & (phase.end >= self.time[-1])
-                mask |= (self.time >= phase.start) & (self.time < phase.end) | last
+                mask |= self._rows_of(phase)
         return mask
+
+    def first_phase(self, label: str) -> np.ndarray:
+        """Bool mask [n] of the rows in the first phase with this label; none if there is none."""
+        for phase in self.metadata.motion.phases:
+            if phase.label == label:
+                return self._rows_of(phase)
+        return np.zeros(len(self), bool)
+
+    def _rows_of(self, phase: Phase) -> np.ndarray:
+        last = (self.time == phase.end) & (phase.end >= self.time[-1])
+        return (self.time >= phase.start) & (self.time < phase.end) | last
 
     def rows(self, select: np.ndarray | slice) -> "SliceRecord":
         """The rows that a mask [n], indices or a slice selects; metadata are copied."""
