@@ -97,7 +97,7 @@ def _check_tare(record: SliceRecord, air: np.ndarray, findings: Findings) -> Non
             "warning",
             "no air phase",
             "motion.phases",
-            "the first phase labelled air has not 10 rows; noise and zero of the sensor are unknown",
+            "the first phase labelled air has not 10 rows: the sensor's zero and noise are unknown",
             "Label the time before contact as air; record half a second of it.",
         )
         return
