@@ -157,7 +157,8 @@ class RecordTarget:
         self.first, self.last = max(low[0] - 1, 0), min(low[-1] + 1, len(p) - 1)
         self.contact = home.p
         self.start = float(record.time[self.first])
-        count = max(1, round((record.time[self.last] - self.start) / EXCHANGE_PERIOD))
+        # One more than there is time for, so that the last sample lies between two means.
+        count = int(np.ceil((record.time[self.last] - self.start) / EXCHANGE_PERIOD)) + 1
         self.times = self.start + EXCHANGE_PERIOD * np.arange(count + 1)
         at = np.minimum(self.times, record.time[-1])
         self.position = np.column_stack([np.interp(at, record.time, column) for column in p.T])

@@ -13,6 +13,7 @@ from sliceit_drake.cutting.food import Food
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import MotionPlan
+from sliceit_drake.diagrams.calibrated_food import load_calibrated_food
 from sliceit_drake.diagrams.robot import RobotConfig
 from sliceit_drake.diagrams.sequence import SliceSequence
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
@@ -83,6 +84,9 @@ class Scenario:
     knife: Knife = dc.field(default_factory=Knife)
     board: Board = dc.field(default_factory=Board)
     food: Food | AnalyticFood | SpringFood = dc.field(default_factory=Food)
+    calibration: str | None = None
+    """A calibrated food, by name (calibration/foods) or file: its material, effects and flank
+    stiffness take the place of those in `food` and `numerics`."""
     numerics: Numerics = dc.field(default_factory=Numerics)
     holder: str = choice(
         "clamp",
@@ -141,5 +145,17 @@ def load_scenario(file: str | Path, overrides: str | None = None) -> Scenario:
         ConfigurationError: Naming file, field and fix.
     """
     scenario = load_yaml(Scenario, file, defaults=Scenario(), overrides_text=overrides)
+    assert isinstance(scenario, Scenario)
+    if scenario.calibration is not None:
+        if not isinstance(scenario.food, Food):
+            raise ConfigurationError(
+                "is of a food of finite elements",
+                field="scenario.calibration",
+                source=str(file),
+                fix="Leave it out, or give a food with a shape and a material.",
+            )
+        calibrated = load_calibrated_food(scenario.calibration)
+        scenario.food = calibrated.apply_to(scenario.food)
+        scenario.numerics.flank_stiffness = calibrated.flank_stiffness
     validate(scenario, "scenario")
     return scenario

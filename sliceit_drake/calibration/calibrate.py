@@ -1,0 +1,339 @@
+"""A calibration from records to a food: search, refinement, polish, uncertainty, held-out error."""
+
+import copy
+import dataclasses as dc
+import hashlib
+import json
+import multiprocessing
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, wait
+from pathlib import Path
+
+import numpy as np
+
+from sliceit_drake.calibration.gauss_newton import gauss_newton
+from sliceit_drake.calibration.held_out import blocked_error
+from sliceit_drake.calibration.prediction import Prediction, Predictor
+from sliceit_drake.calibration.refine import Refinement, refine
+from sliceit_drake.calibration.search import SearchResult, open_study, search
+from sliceit_drake.calibration.setup import CalibrationSetup
+from sliceit_drake.calibration.uncertainty import Posterior, estimate_posterior
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.distribution import ParameterDistribution
+from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.diagrams.calibrated_food import CalibratedFood
+from sliceit_drake.records.slice_record import SliceRecord
+from sliceit_drake.systems.spring_food import calibrate_spring
+
+__all__ = ["Calibration", "CalibrationOptions", "Progress", "calibrate", "write_json"]
+
+Progress = Callable[[str, int, int, float], None]
+"""Called with what is done, steps done, steps in all, best error so far in N."""
+
+
+@dc.dataclass
+class CalibrationOptions:
+    """How a calibration is run.
+
+    Attributes:
+        trials: Of the search.
+        steps: Of Adam from each start.
+        starts: The best places of the search that are refined, far from each other.
+        seed: Of the search.
+        workers: Processors to use.
+        storage: Journal file or URL of the search, shared by many machines; None for a file in the
+            output folder.
+        blocks: Blocks of depth that are held out in turn; 0 for none.
+    """
+
+    trials: int = 500
+    steps: int = 100
+    starts: int = 2
+    seed: int = 0
+    workers: int = 2
+    storage: str | None = None
+    blocks: int = 5
+
+
+@dc.dataclass
+class Calibration:
+    """What a calibration found.
+
+    Attributes:
+        setup: What was searched.
+        predictor: Of the records that were fitted, at the setup's sub-step.
+        unit: Places of the parameters in their ranges [d].
+        predictions: One a record.
+        rms: On the records, N.
+        search_rms: Best of the search alone, N.
+        refined_rms: Best after Adam, N.
+        posterior: Of the parameters.
+        blocks: RMS error on each block of depth when it was held out, N.
+        held_out_rms: On all of them, N; None if none was held out.
+        held_out_records: RMS error by name on records that were not fitted, N.
+        failures: Trials that broke down.
+    """
+
+    setup: CalibrationSetup
+    predictor: Predictor
+    unit: np.ndarray
+    predictions: list[Prediction]
+    rms: float
+    search_rms: float
+    refined_rms: float
+    posterior: Posterior
+    blocks: list[float]
+    held_out_rms: float | None
+    held_out_records: dict[str, float]
+    failures: int
+
+    def calibrated_food(self, date: str, command: str, note: str = "") -> CalibratedFood:
+        """The food as scenarios load it."""
+        values = self.predictor.values(self.unit)
+        target = self.predictor.targets[0]
+        model = self.predictor.model(target, values)
+        food = copy.deepcopy(self.setup.food)
+        food.material, food.effects = model.material, model.effects
+        force = np.concatenate([t.record.force_magnitude for t in self.predictor.targets])
+        spring = calibrate_spring(force, float(model.top - model.bottom))
+        return CalibratedFood(
+            food=food,
+            knife=model.knife,
+            flank_stiffness=model.numerics.flank_stiffness,
+            distribution=distribution(self.posterior),
+            spring=spring,
+            rms_error=self.rms,
+            held_out_error=self.held_out_rms,
+            records=[t.record.name for t in self.predictor.targets],
+            date=date,
+            command=command,
+            note=note,
+        )
+
+
+def distribution(posterior: Posterior) -> ParameterDistribution:
+    """The shared parameters' part of a posterior, as `CalibratedFood` keeps it."""
+    shared = [k for k, name in enumerate(posterior.names) if ":" not in name]
+    covariance = np.array(posterior.covariance)[np.ix_(shared, shared)]
+
+    def pick(values: Sequence) -> list:
+        return [values[k] for k in shared]
+
+    return ParameterDistribution(
+        names=pick(posterior.names),
+        low=pick(posterior.low),
+        high=pick(posterior.high),
+        log=pick(posterior.log),
+        mean=[float(m) for m in pick(posterior.mean)],
+        covariance=covariance.tolist(),
+    )
+
+
+def calibrate(
+    setup: CalibrationSetup,
+    records: Sequence[SliceRecord],
+    directory: Path,
+    options: CalibrationOptions | None = None,
+    held_out: Sequence[SliceRecord] = (),
+    progress: Progress | None = None,
+) -> Calibration:
+    """Calibrates a food: TPE, Adam on the exact gradient from several starts, Gauss-Newton.
+
+    Every stage goes on from what `directory` (or the storage) holds, so that a run that was killed
+    loses at most one generation of trials or one step of Adam, and ends where it would have ended.
+
+    Args:
+        setup: Food and ranges.
+        records: That are fitted.
+        directory: For trials and checkpoints.
+        options: How.
+        held_out: Records that are predicted only.
+        progress: See `Progress`.
+
+    Raises:
+        ConfigurationError: A record or the storage cannot be used.
+        CuttingError: Nothing that was found can be cut.
+    """
+    options = options or CalibrationOptions()
+    show = progress or (lambda *_: None)
+    directory.mkdir(parents=True, exist_ok=True)
+    problem = fingerprint(setup, records)
+    found = _search(setup, records, directory, options, problem, show)
+    if not np.isfinite(found.errors).any():
+        raise CuttingError("no trial of the search could be cut; widen the ranges of the setup")
+    refinements = _refine(setup, records, directory, options, found, problem, show)
+    predictor = Predictor(setup, records, workers=options.workers)
+    best: tuple[float, np.ndarray] = (np.inf, refinements[0].unit)
+    for k, refinement in enumerate(sorted(refinements, key=lambda r: r.error)):
+        show("polish", k, len(refinements), best[0])
+        unit = gauss_newton(predictor, refinement.unit).unit
+        error = predictor.error(predictor.predict([unit])[0])
+        if error < best[0]:
+            best = (error, unit)
+    show("polish", len(refinements), len(refinements), best[0])
+    rms, unit = best
+    if not np.isfinite(rms):
+        raise CuttingError("what the search found breaks down at the setup's sub-step")
+    posterior = estimate_posterior(predictor, unit)
+    blocks: list[float] = []
+    held_out_rms = None
+    if options.blocks:
+        show("held-out blocks", 0, options.blocks, rms)
+        result = blocked_error(predictor, unit, options.blocks)
+        blocks, held_out_rms = result.blocks, result.rms
+        show("held-out blocks", options.blocks, options.blocks, rms)
+    return Calibration(
+        setup,
+        predictor,
+        unit,
+        predictor.predict([unit])[0],
+        rms,
+        float(found.errors.min()),
+        min(r.error for r in refinements),
+        posterior,
+        blocks,
+        held_out_rms,
+        _held_out(setup, records, held_out, predictor, unit, options),
+        found.failures,
+    )
+
+
+def fingerprint(setup: CalibrationSetup, records: Sequence[SliceRecord]) -> str:
+    """What tells a calibration's checkpoints from another's: setup and data."""
+    digest = hashlib.sha256(repr(setup).encode())
+    for record in records:
+        digest.update(repr(record.metadata).encode())
+        for series in (record.time, record.position, record.rotation, record.force_magnitude):
+            digest.update(np.ascontiguousarray(series).tobytes())
+    return digest.hexdigest()[:12]
+
+
+def _search(
+    setup: CalibrationSetup,
+    records: Sequence[SliceRecord],
+    directory: Path,
+    options: CalibrationOptions,
+    problem: str,
+    show: Progress,
+) -> SearchResult:
+    predictor = Predictor(setup, records, setup.search_time_step, workers=options.workers)
+    study = open_study(options.storage or directory / "trials.log", f"{setup.food.name}-{problem}")
+    return search(
+        predictor,
+        study,
+        options.trials,
+        options.seed,
+        lambda done, error: show("search", done, options.trials, error),
+    )
+
+
+def _refine(
+    setup: CalibrationSetup,
+    records: Sequence[SliceRecord],
+    directory: Path,
+    options: CalibrationOptions,
+    found: SearchResult,
+    problem: str,
+    show: Progress,
+) -> list[Refinement]:
+    starts = found.best(options.starts)
+    if options.steps == 0:
+        errors = [float(found.errors.min())] * len(starts)
+        return [Refinement(u, e, []) for u, e in zip(starts, errors, strict=True)]
+    jobs = [
+        (setup, list(records), start, options.steps, directory / f"adam-{problem}-{k}.npz")
+        for k, start in enumerate(starts)
+    ]
+    workers, total = min(options.workers, len(jobs)), options.steps * len(jobs)
+    if workers == 1:
+        return [
+            _refine_from(*job, lambda n, e, k=k: show("Adam", k * options.steps + n, total, e))
+            for k, job in enumerate(jobs)
+        ]
+    context = multiprocessing.get_context("spawn")
+    with context.Manager() as manager, ProcessPoolExecutor(workers, context) as pool:
+        steps = manager.dict()
+        futures = [pool.submit(_refine_beside, steps, k, *job) for k, job in enumerate(jobs)]
+        while not all(f.done() for f in futures):
+            wait(futures, timeout=0.5)
+            done = dict(steps)
+            if done:
+                best = min(error for _, error in done.values())
+                show("Adam", sum(n for n, _ in done.values()), total, best)
+        return [f.result() for f in futures]
+
+
+def _refine_beside(steps: "dict[int, tuple[int, float]]", k: int, *job: object) -> Refinement:
+    def note(n: int, error: float) -> None:
+        steps[k] = (n, error)
+
+    return _refine_from(*job, note)  # type: ignore[arg-type]
+
+
+def _refine_from(
+    setup: CalibrationSetup,
+    records: Sequence[SliceRecord],
+    start: np.ndarray,
+    steps: int,
+    checkpoint: Path,
+    progress: Callable[[int, float], None],
+) -> Refinement:
+    predictor = Predictor(setup, records, workers=1)
+    return refine(predictor, start, steps, checkpoint, progress)
+
+
+def _held_out(
+    setup: CalibrationSetup,
+    records: Sequence[SliceRecord],
+    held_out: Sequence[SliceRecord],
+    fitted: Predictor,
+    unit: np.ndarray,
+    options: CalibrationOptions,
+) -> dict[str, float]:
+    """Errors on other records, at the mean of the fitted records' own parameters."""
+    if not held_out:
+        return {}
+    names = {r.name for r in records} & {r.name for r in held_out}
+    if names:
+        raise ConfigurationError(
+            f"{', '.join(sorted(names))} is fitted and held out",
+            field="--hold-out",
+            fix="Name a record once.",
+        )
+    predictor = Predictor(setup, held_out, workers=options.workers)
+    values = fitted.values(unit)
+    own: dict[str, list[float]] = {}
+    for name, value in values.items():
+        if ":" in name:
+            own.setdefault(name.split(":")[0], []).append(value)
+    at = np.array(
+        [
+            p.unit(values[p.name] if p.shared else float(np.mean(own[p.name.split(":")[0]])))
+            for p in predictor.parameters
+        ]
+    )
+    (row,) = predictor.predict([at])
+    errors = {}
+    for target, prediction in zip(predictor.targets, row, strict=True):
+        residual = prediction.predicted - target.measured
+        errors[target.record.name] = float(np.sqrt(np.mean(residual**2)))
+    return errors
+
+
+def write_json(calibration: Calibration, file: Path) -> None:
+    """Writes the numbers of a calibration."""
+    c = calibration
+    content = {
+        "food": c.setup.food.name,
+        "records": [t.record.name for t in c.predictor.targets],
+        "rms_N": c.rms,
+        "search_rms_N": c.search_rms,
+        "adam_rms_N": c.refined_rms,
+        "held_out_rms_N": c.held_out_rms,
+        "held_out_blocks_N": c.blocks,
+        "held_out_records_N": c.held_out_records,
+        "failed_trials": c.failures,
+        "parameters": c.predictor.values(c.unit),
+        "oscillation": [dc.asdict(p.oscillation) for p in c.predictions],
+    }
+    file.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

@@ -1,0 +1,75 @@
+"""A calibration as a person reads it: table and figure."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from sliceit_drake.calibration.calibrate import Calibration
+from sliceit_drake.cutting.distribution import ParameterDistribution
+
+__all__ = ["figure", "food_table", "parameter_table"]
+
+MEASURED, PREDICTED = "#111827", "#c2410c"
+CHANNELS = ("force x", "force y", "force z")
+
+
+def parameter_table(
+    names: list[str],
+    values: Mapping[str, float],
+    intervals: Mapping[str, tuple[float, float]],
+    determined: Mapping[str, bool],
+) -> str:
+    """Lines of parameters with their 90 % intervals, and what is not determined."""
+    width = max(len(name) for name in names)
+    lines = [f"{'parameter':{width}}  {'value':>10}  {'90 % interval':>23}"]
+    for name in names:
+        low, high = intervals[name]
+        remark = "" if determined[name] else "  not determined by these records"
+        lines.append(
+            f"{name:{width}}  {values[name]:10.4g}  {low:10.4g} to {high:9.4g}{remark}"
+        )
+    return "\n".join(lines)
+
+
+def food_table(distribution: ParameterDistribution) -> str:
+    """`parameter_table` of a calibrated food."""
+    sd = np.sqrt(np.clip(np.diag(np.array(distribution.covariance)), 0.0, None))
+    intervals, determined = {}, {}
+    for k, name in enumerate(distribution.names):
+        ends = np.clip(distribution.mean[k] + np.array([-1.645, 1.645]) * sd[k], 0.0, 1.0)
+        intervals[name] = (distribution.value(k, ends[0]), distribution.value(k, ends[1]))
+        # A uniform range has a standard deviation of 1 / sqrt(12).
+        determined[name] = bool(sd[k] < 0.5 / np.sqrt(12.0))
+    return parameter_table(distribution.names, distribution.values(), intervals, determined)
+
+
+def figure(calibration: Calibration, file: Path) -> None:
+    """Measured and predicted force of each record, and what is left."""
+    targets = calibration.predictor.targets
+    sheet = Figure(figsize=(5.2 * min(len(targets), 3), 4.2), layout="constrained")
+    shown = targets[:3]
+    axes = sheet.subplots(
+        2, len(shown), squeeze=False, sharex="col", gridspec_kw={"height_ratios": (3, 1)}
+    )
+    for column, (target, prediction) in enumerate(zip(shown, calibration.predictions, strict=False)):
+        upper, lower = axes[0, column], axes[1, column]
+        channels = ("force",) if target.by_norm else CHANNELS
+        for c, name in enumerate(channels):
+            style = ("-", "--", ":")[c]
+            upper.plot(target.time, target.measured[:, c], style, color=MEASURED, lw=1.2)
+            upper.plot(target.time, prediction.predicted[:, c], style, color=PREDICTED, lw=1.2)
+            rest = target.measured[:, c] - prediction.predicted[:, c]
+            lower.plot(target.time, rest, style, color="#475569", lw=1.0, label=name)
+        rms = np.sqrt(np.mean((prediction.predicted - target.measured) ** 2))
+        upper.set(title=f"{target.record.name}: RMS {rms:.2f} N", ylabel="force on the knife [N]")
+        upper.plot([], [], color=MEASURED, label="measured")
+        upper.plot([], [], color=PREDICTED, label="calibrated")
+        upper.legend(frameon=False)
+        lower.set(xlabel="time [s]", ylabel="rest [N]")
+        if len(channels) > 1:
+            lower.legend(frameon=False, fontsize=7, ncols=3)
+        for axis in (upper, lower):
+            axis.grid(alpha=0.25)
+    sheet.savefig(file, dpi=150)

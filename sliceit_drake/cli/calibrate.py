@@ -1,0 +1,179 @@
+"""`sliceit calibrate`: find a food's parameters from slice records."""
+
+import argparse
+import os
+from pathlib import Path
+
+__all__ = ["add_parser"]
+
+DESCRIPTION = """\
+Calibrate a food from slice records (NAME.csv and NAME.yaml, see docs/records.md).
+
+Searches with Optuna's TPE, refines the best places with Adam on the exact gradient, polishes with
+Gauss-Newton, and says how sure it is. Writes to DIR:
+  food.yaml         the calibrated food: scenarios load it with `calibration: DIR/food.yaml`
+  calibration.json  errors by stage, held-out errors, parameters
+  fit.png           measured and predicted force
+  trials.log        all trials; a run that was killed goes on from here, and so do others
+  adam-*.npz        checkpoints of Adam
+
+Several machines: give all the same --storage and different --seed, as
+  sliceit calibrate records/*.csv --food cucumber --output a \\
+    --storage postgresql://user:password@host/sliceit --seed 1
+A journal file (--storage trials.log) serves several processes that share a file system.
+
+  sliceit calibrate calibration/records/cucumber.csv --food cucumber --output output/cucumber
+  sliceit calibrate --show cucumber
+"""
+
+
+def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        "calibrate",
+        help="find a food's parameters, with their uncertainty, from slice records",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("records", metavar="RECORD", nargs="*", type=Path, help="NAME.csv or folder")
+    parser.add_argument("--food", metavar="NAME", help="a setup by name, or a YAML file of one")
+    parser.add_argument("--output", metavar="DIR", type=Path, help="where the results go")
+    parser.add_argument("--show", metavar="NAME", help="print a calibrated food and stop")
+    parser.add_argument("--trials", type=int, default=500, help="of the search (default 500)")
+    parser.add_argument("--steps", type=int, default=100, help="of Adam (default 100)")
+    parser.add_argument("--starts", type=int, default=2, help="places refined (default 2)")
+    parser.add_argument("--seed", type=int, default=0, help="of the search (default 0)")
+    parser.add_argument(
+        "--workers", type=int, default=os.cpu_count() or 1, help="processors (default: all)"
+    )
+    parser.add_argument("--storage", metavar="URL", help="journal file or URL shared by workers")
+    parser.add_argument(
+        "--hold-out",
+        metavar="NAME",
+        nargs="+",
+        default=[],
+        help="records that are predicted but not fitted",
+    )
+    parser.add_argument(
+        "--blocks", type=int, default=5, help="blocks of depth held out in turn (default 5; 0: none)"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the command."""
+    from sliceit_drake.configuration import ConfigurationError
+
+    if options.show:
+        return _show(options.show)
+    for name in ("food", "output"):
+        if getattr(options, name) is None:
+            raise ConfigurationError(
+                "is not given", field=f"--{name}", fix=f"Give --{name}; see --help."
+            )
+    for name, least in (("trials", 1), ("steps", 0), ("starts", 1), ("workers", 1), ("blocks", 0)):
+        if getattr(options, name) < least:
+            raise ConfigurationError(
+                f"= {getattr(options, name)}", field=f"--{name}", fix=f"Give at least {least}."
+            )
+    return _calibrate(options)
+
+
+def _show(name: str) -> int:
+    from sliceit_drake.calibration.report import food_table
+    from sliceit_drake.diagrams.calibrated_food import load_calibrated_food
+
+    food = load_calibrated_food(name)
+    print(f"{food.food.name}, from {', '.join(food.records)} ({food.date})")
+    print(food.command)
+    print(food_table(food.distribution))
+    for label, value in (("on the records", food.rms_error), ("held out", food.held_out_error)):
+        if value is not None:
+            print(f"RMS error {label}: {value:.3f} N")
+    if food.spring is not None:
+        print(f"Spring-only baseline: {food.spring.stiffness:.0f} N/m")
+    if food.note:
+        print(food.note)
+    return 0
+
+
+def _calibrate(options: argparse.Namespace) -> int:
+    import datetime
+    import shlex
+    import sys
+
+    from tqdm import tqdm
+
+    from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate, write_json
+    from sliceit_drake.calibration.report import figure, parameter_table
+    from sliceit_drake.calibration.setup import load_setup
+    from sliceit_drake.configuration import ConfigurationError, dump_yaml
+    from sliceit_drake.records.validation import check_record, load_record, record_files
+
+    setup = load_setup(options.food)
+    files = [file for given in options.records for file in record_files(given)]
+    records = [load_record(file) for file in files]
+    for record in records:
+        for finding in check_record(record):
+            print(f"{finding.severity}: {finding}")
+    names = [record.name for record in records]
+    for name in options.hold_out:
+        if name not in names:
+            raise ConfigurationError(
+                f"{name!r} is not among the records {', '.join(names)}",
+                field="--hold-out",
+                fix="Give the names of records that are given.",
+            )
+    bars: dict[str, tqdm] = {}
+
+    def show(stage: str, done: int, total: int, error: float) -> None:
+        if stage not in bars:
+            bars[stage] = tqdm(total=total, desc=stage)
+        bar = bars[stage]
+        bar.set_postfix_str(f"best RMS {error:.3f} N", refresh=False)
+        bar.update(done - bar.n)
+
+    result = calibrate(
+        setup,
+        [r for r in records if r.name not in options.hold_out],
+        options.output,
+        CalibrationOptions(
+            trials=options.trials,
+            steps=options.steps,
+            starts=options.starts,
+            seed=options.seed,
+            workers=options.workers,
+            storage=options.storage,
+            blocks=options.blocks,
+        ),
+        [r for r in records if r.name in options.hold_out],
+        show,
+    )
+    for bar in bars.values():
+        bar.close()
+    arguments = [a for a in sys.argv[1:]]
+    command = shlex.join(["sliceit", *arguments])
+    food = result.calibrated_food(datetime.date.today().isoformat(), command)
+    dump_yaml(food, options.output / "food.yaml")
+    write_json(result, options.output / "calibration.json")
+    figure(result, options.output / "fit.png")
+    values = result.predictor.values(result.unit)
+    posterior = result.posterior
+    print(
+        parameter_table(
+            posterior.names, values, posterior.intervals(0.9), posterior.determined()
+        )
+    )
+    for line in posterior.remarks():
+        print(line)
+    print(
+        f"RMS error: search {result.search_rms:.3f}, Adam {result.refined_rms:.3f}, polished "
+        f"{result.rms:.3f} N"
+    )
+    if result.held_out_rms is not None:
+        blocks = ", ".join(f"{b:.2f}" for b in result.blocks)
+        print(f"Held-out blocks of depth: {result.held_out_rms:.3f} N ({blocks})")
+    for name, error in result.held_out_records.items():
+        print(f"Held-out record {name}: {error:.3f} N")
+    print(f"Results in {options.output}/")
+    return 0
