@@ -290,6 +290,16 @@ class Predictor:
         """Depth of the edge at each entry of `measured` [M], metres."""
         return np.concatenate([np.repeat(t.depth, t.measured.shape[1]) for t in self.targets])
 
+    @property
+    def time(self) -> np.ndarray:
+        """Time in its record of each entry of `measured` [M], s."""
+        return np.concatenate([np.repeat(t.time, t.measured.shape[1]) for t in self.targets])
+
+    @property
+    def conditions(self) -> list[str]:
+        """Of each record; those with the same one are replicates, "" is none."""
+        return [t.record.metadata.condition for t in self.targets]
+
     def values(self, unit: np.ndarray) -> dict[str, float]:
         """Values of the parameters by name, from places in their ranges [d]."""
         return {p.name: p.value(u) for p, u in zip(self.parameters, unit, strict=True)}
