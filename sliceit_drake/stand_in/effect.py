@@ -164,14 +164,14 @@ class Effect:
     each slice, so what a hook keeps in `self` is forgotten after it.
 
     Attributes:
-        cause: Number in the table of docs/stand_in.md, 0 for none of them.
+        cause: What a diagnosis would have to call it; empty where it stands in no list of causes.
         unit: Of the size.
         typical: A size that matters and could be met in a kitchen.
         every_exchange: Whether `drive` must see every exchange, as where it feeds a force back.
         size: How much of it.
     """
 
-    cause = 0
+    cause = ""
     unit = ""
     typical = 1.0
     every_exchange = False

@@ -14,7 +14,7 @@ class FlankFriction(Effect):
     `static` at rest to 1 (Stribeck), and a part goes with speed.
     """
 
-    cause = 4
+    cause = "flank friction"
     typical = 1.0
     travel = 3e-4
     static = 1.4
@@ -40,7 +40,7 @@ class FlankAdhesion(Effect):
     It opposes the last motion and turns round over `turn` of travel.
     """
 
-    cause = 5
+    cause = "adhesion"
     unit = "Pa"
     typical = 600.0
     reference = 0.02
@@ -62,7 +62,7 @@ class BluntEdge(Effect):
     the food, so that a draw is soon through. `size` is the excess at the surface over the
     toughness."""
 
-    cause = 8
+    cause = "blunt edge"
     typical = 0.8
     length = 2.5e-3
 
@@ -73,7 +73,7 @@ class BluntEdge(Effect):
 class DullingEdge(BluntEdge):
     """An edge that grows blunt with the slices n, as n / (n + half): `size` is what it comes to."""
 
-    cause = 9
+    cause = "dulling"
     typical = 1.2
     half = 6.0
 

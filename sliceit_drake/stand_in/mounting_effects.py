@@ -10,7 +10,7 @@ __all__ = ["ArmCompliance", "BoardHeight", "BoardLaw", "FoodSlip", "HolderCompli
 class BoardHeight(Effect):
     """Board and food that lie higher by `size` than was measured."""
 
-    cause = 13
+    cause = "board"
     unit = "m"
     typical = 2e-4
 
@@ -22,8 +22,8 @@ class BoardLaw(Effect):
     """A board that stiffens as it gives: its force F becomes F (1 + size ((F / F_0)^0.5 - 1)), the
     root of the force for the share `size` (a Hertzian contact goes with d^1.5)."""
 
-    cause = 13
-    typical = 0.5
+    cause = "board"
+    typical = 0.2
     reference = 1.5
 
     def respond(self, series: Series) -> None:
@@ -38,7 +38,7 @@ class ArmCompliance(Effect):
     The encoders do not see it.
     """
 
-    cause = 14
+    cause = "compliance"
     unit = "m/N"
     typical = 5e-5
     every_exchange = True
@@ -70,7 +70,7 @@ class FoodSlip(Effect):
     """Food that slips along the edge by `size` and drops by a twentieth of that, at a depth of the
     first cut that differs from slice to slice; in one slice out of four it does not."""
 
-    cause = 15
+    cause = "slip of the food"
     unit = "m"
     typical = 3e-3
     duration = 0.02

@@ -55,11 +55,11 @@ EFFECTS: dict[str, type[Effect]] = {
 
 
 def effects_as_markdown() -> str:
-    """A table of all effects: number of the cause, typical size, what it does."""
+    """A table of all effects: cause, typical size, what it does."""
     lines = ["| name | cause | typical size | what it does |", "|---|---|---|---|"]
     for name, kind in EFFECTS.items():
         words = " ".join((kind.__doc__ or "").split("\n\n")[0].split())
-        cause = str(kind.cause) if kind.cause else "unlisted" if name in UNLISTED else "-"
+        cause = kind.cause or "unlisted"
         size = f"{kind.typical:g} {kind.unit}".strip()
         lines.append(f"| `{name}` | {cause} | {size} | {words} |")
     return "\n".join(lines)

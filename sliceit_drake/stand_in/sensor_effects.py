@@ -21,7 +21,7 @@ GRAVITY = 9.81
 class SensorDrift(Effect):
     """A zero that is off by `size` and wanders off by as much again in 20 s, as something warms."""
 
-    cause = 16
+    cause = "sensor's zero"
     unit = "N"
     typical = 0.5
     warming = 20.0
@@ -36,7 +36,7 @@ class SensorDrift(Effect):
 class SensorGain(Effect):
     """A gain that is off by the share `size`, in all channels."""
 
-    cause = 17
+    cause = "sensor's gain"
     typical = 0.08
 
     def measure(self, series: Series, wrench: np.ndarray) -> np.ndarray:
@@ -46,7 +46,7 @@ class SensorGain(Effect):
 class SensorTilt(Effect):
     """A sensor that sits turned by `size` about an axis between Kx and Ky."""
 
-    cause = 18
+    cause = "sensor's tilt"
     unit = "rad"
     typical = 0.08
 
@@ -60,7 +60,7 @@ class SensorTilt(Effect):
 class SensorDelay(Effect):
     """Readings that come late by `size`, the mean delay of four equal filters in a row."""
 
-    cause = 19
+    cause = "delay"
     unit = "s"
     typical = 0.015
     stages = 4
@@ -84,7 +84,7 @@ class ToolWeight(Effect):
     They were zeroed at the start, so what shows is how its weight turns, and its inertia.
     """
 
-    cause = 20
+    cause = "tool's weight"
     unit = "kg"
     typical = 0.3
     lever = -0.08
@@ -101,7 +101,7 @@ class ToolWeight(Effect):
 class DriveVibration(Effect):
     """The arm's drives shake the sensor with `size` at `frequency`, while it moves."""
 
-    cause = 21
+    cause = "vibration"
     unit = "N"
     typical = 0.5
     frequency = 31.0
@@ -121,7 +121,7 @@ class DriveVibration(Effect):
 class StickSlip(Effect):
     """A saw-tooth of `size` in the press: a tooth for each `pitch` of the knife's path in food."""
 
-    cause = 21
+    cause = "vibration"
     unit = "N"
     typical = 0.6
     pitch = 8e-4

@@ -10,6 +10,7 @@ from multiprocessing import get_context
 from pathlib import Path as FilePath
 
 import numpy as np
+import warp
 
 from sliceit_drake.configuration import ConfigurationError, load_yaml
 from sliceit_drake.cutting.food import Box, Cylinder, Ellipsoid, Food
@@ -317,6 +318,7 @@ def _start_worker(
     settings: FiniteElementSettings | None,
     output: FilePath,
 ) -> None:
+    warp.config.log_level = warp.LOG_ERROR
     hidden = [make_effect(text) for text in effects]
     _worker.append((Session(protocol, hidden, world, seed, settings), output))
 

@@ -26,7 +26,7 @@ class BulkRelaxation(Effect):
     food's stiffness when the knife goes on.
     """
 
-    cause = 1
+    cause = "viscoelastic bulk"
     typical = 0.06
     onset = 0.02
     reload_stiffness = 8e3
@@ -65,7 +65,7 @@ class BulkRelaxation(Effect):
 class RateToughness(Effect):
     """Toughness 1 + size ln(v / v0), never below a fifth."""
 
-    cause = 2
+    cause = "toughness by speed"
     typical = 0.08
     least_speed = 1e-4
 
@@ -77,7 +77,7 @@ class RateToughness(Effect):
 class Toughness(Effect):
     """Toughness that is simply another by the share `size`."""
 
-    cause = 6
+    cause = "toughness"
     typical = 0.15
 
     def drive(self, now: Now) -> None:
@@ -87,6 +87,7 @@ class Toughness(Effect):
 class Stiffness(Effect):
     """Bulk that is softer by the share `size` (0 to 0.9)."""
 
+    cause = "modulus"
     typical = 0.3
 
     def stiffness(self, at: Tissue) -> np.ndarray | float:
@@ -100,7 +101,7 @@ class SkinToughness(Effect):
     `size`.
     """
 
-    cause = 7
+    cause = "skin"
     unit = "J/m"
     typical = 0.8
     thickness = 1.2e-3
@@ -116,7 +117,7 @@ class SkinToughness(Effect):
 class CoreToughness(Effect):
     """A middle that is gradually less tough, by the share `size`, and half as much softer."""
 
-    cause = 12
+    cause = "core"
     typical = 0.3
 
     def _inside(self, at: Tissue) -> np.ndarray:
@@ -133,7 +134,7 @@ class CoreToughness(Effect):
 class SectionShape(Effect):
     """A section that is wider below and narrower above than was measured, by the share `size`."""
 
-    cause = 11
+    cause = "shape of the section"
     typical = 0.12
 
     def reshape(self, p: np.ndarray) -> np.ndarray:
@@ -147,7 +148,7 @@ class SlicePushLaw(Effect):
     """A draw that helps less than work per area says, by size xi / (1 + xi), and pulls less along
     the edge than xi times the press."""
 
-    cause = 10
+    cause = "slice-push law"
     typical = 0.5
 
     def drive(self, now: Now) -> None:
