@@ -1,0 +1,295 @@
+"""How well records determine the parameters: posterior, what they cannot tell, profiles."""
+
+import dataclasses as dc
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from scipy.special import ndtri
+
+from sliceit_drake.calibration.gauss_newton import (
+    PRIOR_CENTER,
+    PRIOR_VARIANCE,
+    Fit,
+    Linearisation,
+    ResidualModel,
+    gauss_newton,
+    linearise,
+    residuals_at,
+)
+from sliceit_drake.calibration.noise import NoiseFit, NoiseModel, fit_noise, list_series
+from sliceit_drake.calibration.posterior import Posterior
+from sliceit_drake.calibration.prediction import Parameter
+
+__all__ = [
+    "Estimate",
+    "Posterior",
+    "Profile",
+    "RecordModel",
+    "estimate",
+    "estimate_posterior",
+    "profile_likelihood",
+]
+
+ROUNDS = 3
+STEPS = 3
+SETTLED = 0.1
+"""Largest move, in standard deviations, with which the alternation of noise and fit ends."""
+DISAGREEMENT = 0.3
+ODDS = 3.0
+"""Standard deviations between two estimates that noise does not explain."""
+
+
+class RecordModel(ResidualModel, Protocol):
+    """What is needed besides residuals: `prediction.Predictor`, or anything that acts like it."""
+
+    parameters: list[Parameter]
+
+    @property
+    def record_of(self) -> np.ndarray: ...
+
+    @property
+    def time(self) -> np.ndarray: ...
+
+    @property
+    def conditions(self) -> list[str]: ...
+
+    def split(self, entries: np.ndarray, /) -> list[np.ndarray]: ...
+
+
+@dc.dataclass
+class Estimate:
+    """The weighted fit of all parameters.
+
+    Attributes:
+        unit: Places in the ranges [d], those of the posterior's mean.
+        posterior: Of the parameters.
+        noise: Of the residuals.
+        covariance: Of the parameters if `noise` were exact [d, d]; the posterior's allows for its
+            uncertainty too.
+    """
+
+    unit: np.ndarray
+    posterior: Posterior
+    noise: NoiseModel
+    covariance: np.ndarray
+
+
+def estimate_posterior(model: RecordModel, unit: np.ndarray) -> Posterior:
+    """Posterior of the parameters; see `estimate`.
+
+    Args:
+        model: Of the records.
+        unit: A good fit, such as that of least squares [d].
+
+    Raises:
+        CuttingError: A slice breaks down near `unit`.
+    """
+    return estimate(model, unit).posterior
+
+
+def estimate(model: RecordModel, unit: np.ndarray, rounds: int = ROUNDS) -> Estimate:
+    """Fits parameters and noise in turn until the parameters rest.
+
+    The parameters minimise the residuals weighted with the noise's covariance (generalised least
+    squares) plus the prior of a uniform range, which has variance 1/12 about its middle: what the
+    data do not determine stays as wide as its range. Where samples are autocorrelated and slices
+    differ, this is not the fit of least squares; the posterior notes where the two are further
+    apart than noise explains.
+
+    Args:
+        model: Of the records.
+        unit: A good fit, such as that of least squares [d].
+        rounds: Most alternations.
+
+    Raises:
+        CuttingError: A slice breaks down near `unit`.
+    """
+    at = linearise(model, np.clip(unit, 0.0, 1.0))
+    first = at
+    for _ in range(rounds):
+        found = _noise(model, at)
+        fit = gauss_newton(
+            model, at.unit, noise=found.model, steps=STEPS, tolerance=1e-5, linearisation=at
+        )
+        moved = np.abs(fit.unit - at.unit) / np.sqrt(np.diag(found.covariance))
+        at = _at_end(model, fit)
+        if moved.max() < SETTLED:
+            break
+    found = _noise(model, at)
+    return _as_estimate(model, at, found, first.unit)
+
+
+def _at_end(model: ResidualModel, fit: Fit) -> Linearisation:
+    """The fit's linearisation, moved to its end: after a step that is small no new one is due."""
+    at = fit.linearisation
+    if fit.converged and np.array_equal(fit.unit, at.unit):
+        return at
+    if fit.converged:
+        (residuals,) = residuals_at(model, [fit.unit])
+        return Linearisation(fit.unit, residuals, at.jacobian, at.nuisance)
+    return linearise(model, fit.unit)
+
+
+def _noise(model: RecordModel, at: Linearisation) -> NoiseFit:
+    measured, used = model.measured, model.used
+    conditions = model.conditions
+    channels = [part.shape[1] for part in model.split(measured)]
+    series, _ = list_series(used, model.time, model.record_of, channels, conditions)
+    present = [conditions[r] for r in sorted({s.record for s in series})]
+    named = [c for c in present if c]
+    return fit_noise(
+        series,
+        at.residuals,
+        at.jacobian,
+        at.nuisance,
+        np.where(used, at.residuals + measured, 0.0),
+        PRIOR_CENTER - at.unit,
+        PRIOR_VARIANCE,
+        float(np.sqrt(np.mean(measured[used] ** 2))),
+        len(set(named)) < len(named),
+    )
+
+
+def _as_estimate(
+    model: RecordModel, at: Linearisation, found: NoiseFit, least_squares: np.ndarray
+) -> Estimate:
+    parameters = model.parameters
+    notes = []
+    scale = found.model.record_scale
+    if scale is None:
+        notes.append(
+            "no cut was repeated: how much slices differ is unknown, and the intervals hold for "
+            "the slices that were measured"
+        )
+    sd = np.sqrt(np.diag(found.inflated))
+    for k, parameter in enumerate(parameters):
+        if abs(least_squares[k] - at.unit[k]) > ODDS * sd[k]:
+            notes.append(
+                f"{parameter.name}: least squares gives "
+                f"{parameter.value(float(least_squares[k])):.3g}, the fit weighted with the noise "
+                f"{parameter.value(float(at.unit[k])):.3g}: the model lacks something that noise "
+                "does not explain"
+            )
+    posterior = Posterior(
+        names=[p.name for p in parameters],
+        low=[float(p.low) for p in parameters],
+        high=[float(p.high) for p in parameters],
+        log=[p.log for p in parameters],
+        mean=at.unit.tolist(),
+        covariance=found.inflated.tolist(),
+        effective_samples=found.model.effective_samples,
+        record_variation=scale,
+        notes=notes,
+    )
+    return Estimate(at.unit, posterior, found.model, found.covariance)
+
+
+@dc.dataclass
+class Profile:
+    """The likelihood along one parameter, all others refitted.
+
+    Attributes:
+        name: The parameter.
+        places: Where it was held, in its range [n].
+        drops: Fall of twice the log of likelihood times prior there [n].
+        expected: What the posterior's normal approximation says [n].
+        interval: Of the level that `drops` belong to, in the parameter's unit.
+        warning: Where profile and normal approximation disagree, or None.
+    """
+
+    name: str
+    places: np.ndarray
+    drops: np.ndarray
+    expected: np.ndarray
+    interval: tuple[float, float]
+    warning: str | None
+
+
+def profile_likelihood(
+    model: RecordModel,
+    found: Estimate,
+    name: str,
+    level: float = 0.9,
+    steps: int = STEPS,
+) -> Profile:
+    """Holds a parameter at several places, refits the others and finds where the fit gets worse.
+
+    It is held at one standard deviation and at the ends of the interval, on both sides, or at the
+    end of the range. Root of the drop over distance is constant in the normal approximation.
+
+    Args:
+        model: Of the records.
+        found: From `estimate`.
+        name: Of the parameter.
+        level: Of the interval.
+        steps: Most steps of each refit.
+
+    Returns:
+        The profile; its interval is widened by as much as the posterior is by what is not known of
+        the noise.
+
+    Raises:
+        CuttingError: A slice breaks down near a place.
+        ValueError: There is no such parameter.
+    """
+    names = [p.name for p in model.parameters]
+    if name not in names:
+        raise ValueError(f"there is no parameter {name!r} among {', '.join(names)}")
+    k, z = names.index(name), float(ndtri(0.5 + level / 2.0))
+    sd = float(np.sqrt(found.covariance[k, k]))
+    widening = float(np.sqrt(found.posterior.covariance[k][k])) / sd
+    others = np.arange(len(names)) != k
+    best = _refit(model, found, found.unit, np.ones(len(names), bool), steps)
+    # Where the prior or the last step moved the others, the middle is not quite the estimate.
+    places, drops, expected, ends, faults = [], [], [], [], []
+    for side in (-1.0, 1.0):
+        line = [(0.0, 0.0)]
+        for distance in (1.0, z):
+            place = float(np.clip(found.unit[k] + side * distance * sd, 0.0, 1.0))
+            away = abs(place - found.unit[k]) / sd
+            if away <= line[-1][0] + 1e-6:
+                continue
+            slope = found.covariance[k] / found.covariance[k, k]
+            start = np.clip(found.unit + slope * (place - found.unit[k]), 0.0, 1.0)
+            start[k] = place
+            fit = _refit(model, found, start, others, steps)
+            drop = max(fit.cost - best.cost, 0.0)
+            line.append((away, float(np.sqrt(drop))))
+            places.append(place)
+            drops.append(drop)
+            expected.append(away**2)
+        reach = _crossing(line, z)
+        limit = found.unit[k] if side < 0.0 else 1.0 - found.unit[k]
+        if len(line) > 1:
+            ratio = min(reach, limit / sd) / min(z, limit / sd)
+            if abs(ratio - 1.0) > DISAGREEMENT:
+                faults.append(f"{'below' if side < 0.0 else 'above'} {ratio:.2g} times as far")
+        ends.append(float(np.clip(found.unit[k] + side * reach * sd * widening, 0.0, 1.0)))
+    parameter = model.parameters[k]
+    warning = None
+    if faults:
+        warning = (
+            f"{name}: the profile of the likelihood reaches {' and '.join(faults)} as the normal "
+            "approximation"
+        )
+    interval = (parameter.value(ends[0]), parameter.value(ends[1]))
+    return Profile(name, np.array(places), np.array(drops), np.array(expected), interval, warning)
+
+
+def _refit(
+    model: RecordModel, found: Estimate, start: np.ndarray, free: np.ndarray, steps: int
+) -> Fit:
+    return gauss_newton(model, start, noise=found.noise, free=free, steps=steps, tolerance=1e-6)
+
+
+def _crossing(line: Sequence[tuple[float, float]], height: float) -> float:
+    """Where a line through points of rising height reaches one; beyond them it goes on straight."""
+    for (x0, y0), (x1, y1) in zip(line[:-1], line[1:], strict=True):
+        if y1 >= height:
+            return x0 + (height - y0) / (y1 - y0) * (x1 - x0)
+    if len(line) < 2:
+        return 0.0
+    (x0, y0), (x1, y1) = line[-2:]
+    rise = (y1 - y0) / (x1 - x0)
+    return float("inf") if rise <= 0.0 else x1 + (height - y1) / rise
