@@ -8,6 +8,7 @@ import multiprocessing
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, wait
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -241,19 +242,23 @@ def _refine(
         errors = [float(found.errors.min())] * len(starts)
         return [Refinement(u, e, []) for u, e in zip(starts, errors, strict=True)]
     jobs = [
-        (setup, list(records), start, options.steps, directory / f"adam-{problem}-{k}.npz")
+        _Start(setup, list(records), start, options.steps, directory / f"adam-{problem}-{k}.npz")
         for k, start in enumerate(starts)
     ]
     workers, total = min(options.workers, len(jobs)), options.steps * len(jobs)
     if workers == 1:
-        return [
-            _refine_from(*job, lambda n, e, k=k: show("Adam", k * options.steps + n, total, e))
-            for k, job in enumerate(jobs)
-        ]
+        out = []
+        for k, job in enumerate(jobs):
+
+            def note(done: int, error: float, before: int = k * options.steps) -> None:
+                show("Adam", before + done, total, error)
+
+            out.append(job.refine(note))
+        return out
     context = multiprocessing.get_context("spawn")
     with context.Manager() as manager, ProcessPoolExecutor(workers, context) as pool:
         steps = manager.dict()
-        futures = [pool.submit(_refine_beside, steps, k, *job) for k, job in enumerate(jobs)]
+        futures = [pool.submit(_refine_beside, job, steps, k) for k, job in enumerate(jobs)]
         while not all(f.done() for f in futures):
             wait(futures, timeout=0.5)
             done = dict(steps)
@@ -263,23 +268,28 @@ def _refine(
         return [f.result() for f in futures]
 
 
-def _refine_beside(steps: "dict[int, tuple[int, float]]", k: int, *job: object) -> Refinement:
-    def note(n: int, error: float) -> None:
-        steps[k] = (n, error)
+@dc.dataclass
+class _Start:
+    """Where Adam starts, for another process."""
 
-    return _refine_from(*job, note)  # type: ignore[arg-type]
+    setup: CalibrationSetup
+    records: list[SliceRecord]
+    unit: np.ndarray
+    steps: int
+    checkpoint: Path
+
+    def refine(self, progress: Callable[[int, float], None]) -> Refinement:
+        predictor = Predictor(self.setup, self.records, workers=1)
+        return refine(predictor, self.unit, self.steps, self.checkpoint, progress)
 
 
-def _refine_from(
-    setup: CalibrationSetup,
-    records: Sequence[SliceRecord],
-    start: np.ndarray,
-    steps: int,
-    checkpoint: Path,
-    progress: Callable[[int, float], None],
-) -> Refinement:
-    predictor = Predictor(setup, records, workers=1)
-    return refine(predictor, start, steps, checkpoint, progress)
+def _refine_beside(start: _Start, steps: Any, k: int) -> Refinement:
+    """Refines in a process of its own and notes steps and error in the shared dict `steps`."""
+
+    def note(done: int, error: float) -> None:
+        steps[k] = (done, error)
+
+    return start.refine(note)
 
 
 def _held_out(

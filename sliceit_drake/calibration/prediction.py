@@ -157,7 +157,7 @@ class RecordTarget:
         self.first, self.last = max(low[0] - 1, 0), min(low[-1] + 1, len(p) - 1)
         self.contact = home.p
         self.start = float(record.time[self.first])
-        # One more than there is time for, so that the last sample lies between two means.
+        # One more than there is time for: no sample lies beyond the last mean.
         count = int(np.ceil((record.time[self.last] - self.start) / EXCHANGE_PERIOD)) + 1
         self.times = self.start + EXCHANGE_PERIOD * np.arange(count + 1)
         at = np.minimum(self.times, record.time[-1])
@@ -180,10 +180,11 @@ class RecordTarget:
         record, T = self.record, EXCHANGE_PERIOD
         before = int((self.start - record.time[0]) / T) + 2
         after = int(max(record.time[-1] - self.times[-1], 0.0) / T) + 2
-        middle = self.start + T * (np.arange(-before, count + after) + 0.5)
-        series = np.zeros((len(middle), count))
+        # A reading stands for the mean over the exchange that ends with it, as everywhere.
+        ends = self.start + T * np.arange(1 - before, count + after + 1)
+        series = np.zeros((len(ends), count))
         series[before : before + count] = np.eye(count)
-        time, rows = as_measured(record.metadata, middle, series)
+        time, rows = as_measured(record.metadata, ends, series)
         at = np.searchsorted(time, self.time, side="right")
         low, high = np.clip(at - 1, 0, len(time) - 1), np.clip(at, 0, len(time) - 1)
         span = np.where(high > low, time[high] - time[low], 1.0)

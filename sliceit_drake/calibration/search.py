@@ -81,7 +81,7 @@ def search(
     seed: int,
     progress: Callable[[int, float], None] | None = None,
 ) -> SearchResult:
-    """Runs trials until the study holds `trials` finished ones.
+    """Runs generations of trials until the study holds `trials` finished ones or a few more.
 
     What is proposed depends on the finished trials and on the seed alone, so that a search that was
     killed goes on as if it had not been. With several workers on one storage it also depends on who
@@ -103,47 +103,87 @@ def search(
     known = study.user_attrs.get("parameters")
     if known is None:
         study.set_user_attr("parameters", described)
-        study.enqueue_trial(dict(zip(names, predictor.start.tolist(), strict=True)))
     elif known != described:
         raise ConfigurationError(
             f"the study {study.study_name!r} was begun with other parameters or ranges",
             field="--storage",
             fix="Give another --output or storage, or the same setup and records.",
         )
-    # Trials of a worker that was killed never end; they are not waited for.
-    finished = len(_finished(study))
     space: dict[str, optuna.distributions.BaseDistribution] = {
         name: optuna.distributions.FloatDistribution(0.0, 1.0) for name in names
     }
-    while finished < trials:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-            study.sampler = optuna.samplers.TPESampler(
-                n_startup_trials=max(20, 4 * len(names)),
-                multivariate=True,
-                constant_liar=True,
-                seed=(1000003 * seed + finished) % 2**32,
-            )
-        # The sampler's seed follows the number of finished trials, so generations end where they
-        # would have ended.
-        batch = [
-            study.ask(space)
-            for _ in range(min(GENERATION - finished % GENERATION, trials - finished))
-        ]
-        units = [np.array([trial.params[name] for name in names]) for trial in batch]
-        for trial, row in zip(batch, predictor.predict(units), strict=True):
-            error, broken = error_of(predictor, row)
-            trial.set_user_attr("broken", broken)
-            study.tell(trial, error)
-        finished = len(_finished(study))
-        if progress is not None:
-            progress(finished, study.best_value)
+    proposals = _Proposals(space, predictor.start, seed)
     done = _finished(study)
+    while len(done) < trials:
+        known_units = {tuple(t.params.values()) for t in done[-GENERATION:]}
+        # A generation that was cut short is proposed once more, and what it lacks is computed.
+        units = [u for u in proposals.generation(done) if tuple(u.tolist()) not in known_units]
+        for unit, row in zip(units, predictor.predict(units), strict=True):
+            error, broken = error_of(predictor, row)
+            params = dict(zip(names, unit.tolist(), strict=True))
+            study.add_trial(
+                optuna.trial.create_trial(
+                    params=params,
+                    distributions=space,
+                    value=error,
+                    user_attrs={"broken": broken},
+                )
+            )
+        done = _finished(study)
+        if progress is not None:
+            progress(len(done), min(t.value for t in done if t.value is not None))
     return SearchResult(
         np.array([[t.params[name] for name in names] for t in done]),
         np.array([t.value for t in done]),
         sum(bool(t.user_attrs.get("broken")) for t in done),
     )
+
+
+class _Proposals:
+    """Proposes generations from finished trials, the same for the same trials and seed.
+
+    The sampler works on a study in memory, in which the storage's trials are repeated: what a
+    worker that was killed had asked for is not in the way.
+    """
+
+    def __init__(
+        self,
+        space: dict[str, optuna.distributions.BaseDistribution],
+        start: np.ndarray,
+        seed: int,
+    ) -> None:
+        self._space, self._start, self._seed = space, start, seed
+        self._history: list[optuna.trial.FrozenTrial] = []
+        self._memory = optuna.create_study()
+
+    def generation(self, done: list[optuna.trial.FrozenTrial]) -> list[np.ndarray]:
+        """Places of the next generation [d]; the first begins with the setup's values."""
+        base = len(done) - len(done) % GENERATION
+        if [t.number for t in done[: len(self._history)]] != [t.number for t in self._history]:
+            self._history, self._memory = [], optuna.create_study()
+        for trial in done[len(self._history) : base]:
+            self._memory.add_trial(
+                optuna.trial.create_trial(
+                    params=trial.params, distributions=self._space, value=trial.value
+                )
+            )
+        self._history = done[:base]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+            sampler = optuna.samplers.TPESampler(
+                n_startup_trials=max(20, 4 * len(self._space)),
+                multivariate=True,
+                constant_liar=True,
+                seed=(1000003 * self._seed + base) % 2**32,
+            )
+        trials = self._memory.get_trials(deepcopy=False)
+        study = optuna.create_study(sampler=sampler)
+        study.add_trials(trials)
+        asked = [study.ask(self._space) for _ in range(GENERATION)]
+        units = [np.array([t.params[name] for name in self._space]) for t in asked]
+        if base == 0:
+            units[0] = self._start.copy()
+        return units
 
 
 def _finished(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:

@@ -1,0 +1,303 @@
+"""The calibration finds what made the records; a run that was killed ends where it would have."""
+
+import dataclasses as dc
+import multiprocessing
+
+import numpy as np
+import optuna
+import pytest
+
+from sliceit_drake.calibration.oscillation import Oscillation, fit_oscillation
+from sliceit_drake.calibration.prediction import Predictor
+from sliceit_drake.calibration.refine import refine
+from sliceit_drake.calibration.search import open_study, search
+from sliceit_drake.calibration.setup import (
+    CalibrationSetup,
+    ParameterRange,
+    load_setup,
+    setup_names,
+)
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.distribution import ParameterDistribution
+from sliceit_drake.cutting.food import Cylinder, Food
+from sliceit_drake.cutting.material import Material
+from sliceit_drake.cutting.model import Numerics
+from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
+from sliceit_drake.diagrams.calibrated_food import (
+    CalibratedFood,
+    calibrated_food_names,
+    load_calibrated_food,
+)
+from sliceit_drake.diagrams.scenario import load_scenario
+from sliceit_drake.records.preprocessing import low_pass
+from sliceit_drake.records.slice_record import SliceRecord
+from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
+from sliceit_drake.stand_in.protocol import Condition, Protocol, Variation
+from sliceit_drake.stand_in.sensor import SensorModel
+from sliceit_drake.stand_in.session import Session
+
+TRUTH = {"material.toughness": 420.0, "material.youngs_modulus": 1.2e6, "material.friction": 0.15}
+SHAPE = Cylinder(rings=2, layers=[0.0, 4e-3, 12e-3])
+SAME = Variation(toughness=0.0, stiffness=0.0, friction=0.0, height=0.0)
+
+
+def coarse_setup(**changes) -> CalibrationSetup:
+    material = Material(youngs_modulus=1.6e6, toughness=300.0, friction=0.1)
+    return CalibrationSetup(
+        food=Food(shape=SHAPE, material=material),
+        numerics=Numerics(time_step=1e-3),
+        parameters=[
+            ParameterRange("material.toughness", 100.0, 1000.0),
+            ParameterRange("material.youngs_modulus", 2e5, 5e6),
+            ParameterRange("material.friction", 0.02, 1.0),
+        ],
+        **changes,
+    )
+
+
+def bench_records(count: int = 1, noise: float = 0.1) -> list[SliceRecord]:
+    """Press cuts to 18 mm with a withdrawal, in a world without hidden effects."""
+    material = Material(
+        youngs_modulus=TRUTH["material.youngs_modulus"],
+        toughness=TRUTH["material.toughness"],
+        friction=TRUTH["material.friction"],
+    )
+    plan = MotionPlan(
+        [
+            Hold(duration=0.1, label="air"),
+            ConstantSpeed(distance=0.021, speed=0.1, acceleration=5.0, label="slice"),
+            ConstantSpeed(
+                distance=0.01,
+                speed=0.1,
+                direction=[0.0, 0.0, -1.0],
+                acceleration=5.0,
+                label="retract",
+            ),
+        ]
+    )
+    protocol = Protocol(
+        food=Food(shape=SHAPE, material=material),
+        sensor=SensorModel(
+            force_noise=noise,
+            correlated_share=0.0,
+            force_bias=0.0,
+            force_drift=0.0,
+            delay=0.0,
+            cutoff_frequency=0.0,
+            force_resolution=0.0,
+        ),
+        variation=SAME,
+        conditions=[Condition("press", plan, replicates=count)],
+    )
+    settings = FiniteElementSettings(refinement=1.0, time_step=1e-3)
+    session = Session(protocol, seed=3, settings=settings)
+    return [session.record(k) for k in range(count)]
+
+
+@pytest.fixture(scope="module")
+def records() -> list[SliceRecord]:
+    return bench_records(2)
+
+
+def truth(predictor: Predictor) -> np.ndarray:
+    return np.array([p.unit(TRUTH.get(p.name, 0.0)) for p in predictor.parameters])
+
+
+def test_the_parameters_that_made_a_record_predict_it_up_to_its_noise(records):
+    predictor = Predictor(coarse_setup(), records)
+    rest = predictor.residuals(truth(predictor))
+    assert np.std(rest) == pytest.approx(0.1, rel=0.15)
+    assert abs(np.mean(rest)) < 0.02
+
+
+def test_the_gradient_of_the_error_is_that_of_differences(records):
+    setup = coarse_setup(oscillation=[3.0, 9.0])
+    predictor = Predictor(setup, records[:1], precision="float64")
+    unit = predictor.start + 0.02
+    _, gradient = predictor.mean_square_and_gradient(unit)
+    for k, name in enumerate(p.name for p in predictor.parameters):
+        ends = [unit + sign * 3e-5 * (np.arange(len(unit)) == k) for sign in (1.0, -1.0)]
+        squares = [predictor.error(row) ** 2 for row in predictor.predict(ends)]
+        slope = (squares[0] - squares[1]) / 6e-5
+        assert gradient[k] == pytest.approx(slope, rel=1e-3, abs=1e-3 * abs(gradient).max()), name
+
+
+def test_samples_that_are_held_out_do_not_count(records):
+    predictor = Predictor(coarse_setup(), records)
+    hidden = predictor.depth > 0.01
+    spoiled = [dc.replace(r, force=r.force.copy()) for r in records]
+    for record, target in zip(spoiled, predictor.targets, strict=True):
+        deep = np.flatnonzero(target.depth > 0.01) + target.first
+        record.force[deep] += 50.0
+    unit = predictor.start
+    error, gradient = predictor.holding_out(hidden).mean_square_and_gradient(unit)
+    other = Predictor(coarse_setup(), spoiled).holding_out(hidden)
+    assert other.mean_square_and_gradient(unit)[0] == error
+    np.testing.assert_array_equal(other.mean_square_and_gradient(unit)[1], gradient)
+
+
+def test_the_filters_of_a_record_are_repeated_on_its_prediction(records):
+    (record,) = bench_records(1, noise=1e-6)
+    filtered = low_pass(record, 8.0)
+    ends = []
+    for r in (record, filtered):
+        predictor = Predictor(coarse_setup(), [r])
+        ends.append(predictor.residuals(truth(predictor)))
+    change = np.std(filtered.force - record.force)
+    assert change > 0.3
+    assert np.std(ends[1]) < 0.05 * change
+
+
+def test_a_search_that_was_killed_ends_where_it_would_have_ended(records, tmp_path, monkeypatch):
+    predictor = Predictor(coarse_setup(), records[:1])
+    whole = search(predictor, open_study(tmp_path / "whole.log", "s"), 40, seed=5)
+
+    class Killed(Exception):
+        pass
+
+    add, left = optuna.Study.add_trial, [30]
+
+    def kill(study, trial):
+        if study.study_name == "s":
+            if left[0] == 0:
+                raise Killed
+            left[0] -= 1
+        add(study, trial)
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(optuna.Study, "add_trial", kill)
+        search(predictor, open_study(tmp_path / "parts.log", "s"), 40, seed=5)
+    parts = search(predictor, open_study(tmp_path / "parts.log", "s"), 40, seed=5)
+    np.testing.assert_array_equal(parts.units, whole.units)
+    np.testing.assert_array_equal(parts.errors, whole.errors)
+    other = search(predictor, open_study(tmp_path / "other.log", "s"), 40, seed=6)
+    assert not np.array_equal(other.units, whole.units)
+
+
+def test_adam_that_was_killed_ends_where_it_would_have_ended_and_improves(records, tmp_path):
+    predictor = Predictor(coarse_setup(), records[:1])
+    start = predictor.start
+    before = predictor.error(predictor.predict([start])[0])
+    whole = refine(predictor, start, 8)
+
+    class Killed(Exception):
+        pass
+
+    def kill(step: int, error: float) -> None:
+        if step == 3:
+            raise Killed
+
+    with pytest.raises(Killed):
+        refine(predictor, start, 8, tmp_path / "adam.npz", kill)
+    parts = refine(predictor, start, 8, tmp_path / "adam.npz")
+    np.testing.assert_array_equal(parts.unit, whole.unit)
+    assert parts.errors == whole.errors
+    assert whole.error < 0.9 * before
+
+
+def test_search_and_adam_beat_the_search_alone_at_the_same_number_of_slices(records, tmp_path):
+    predictor = Predictor(coarse_setup(), records[:1])
+    study = open_study(tmp_path / "a.log", "s")
+    first = search(predictor, study, 40, seed=1)
+    refined = refine(predictor, first.best(1)[0], 15)
+    # A gradient costs six slices.
+    longer = search(predictor, study, 40 + 6 * 15, seed=1)
+    assert refined.error < longer.errors.min()
+
+
+def _work(storage: str, seed: int) -> int:
+    predictor = Predictor(coarse_setup(), bench_records(1), workers=1)
+    study = open_study(storage, "shared")
+    generations: list[int] = []
+    search(predictor, study, 24, seed, lambda done, error: generations.append(done))
+    return len(generations)
+
+
+def test_two_workers_share_a_journal_file(tmp_path):
+    storage = str(tmp_path / "shared.log")
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        generations = pool.starmap(_work, [(storage, 1), (storage, 2)])
+    assert min(generations) >= 1
+    done = [t for t in open_study(storage, "shared").trials if t.value is not None]
+    assert 24 <= len(done) <= 24 + 8
+    # Both begin with the setup's values.
+    assert len({tuple(t.params.values()) for t in done}) >= len(done) - 1
+
+
+def test_a_storage_with_other_parameters_is_refused(records, tmp_path):
+    study = open_study(tmp_path / "a.log", "s")
+    search(Predictor(coarse_setup(), records[:1]), study, 4, seed=1)
+    other = coarse_setup()
+    other.parameters[0].high = 900.0
+    with pytest.raises(ConfigurationError, match="other parameters"):
+        search(Predictor(other, records[:1]), study, 8, seed=1)
+
+
+def test_an_oscillation_in_proportion_to_the_force_is_found():
+    time = np.linspace(0.0, 1.0, 400)
+    smooth = np.column_stack([10.0 * time, 3.0 + 0.0 * time])
+    true = Oscillation(5.3, 0.04, -0.07)
+    measured = true.factor(time)[:, None] * smooth
+    found = fit_oscillation(time, smooth, measured, np.ones_like(smooth), (2.0, 12.0))
+    assert found.frequency == pytest.approx(true.frequency, abs=0.02)
+    assert (found.cosine, found.sine) == pytest.approx((true.cosine, true.sine), abs=3e-3)
+    step = 1e-6
+    for k, name in enumerate(("frequency", "cosine", "sine")):
+        moved = dc.replace(true, **{name: getattr(true, name) + step})
+        slope = (moved.factor(time) - true.factor(time)) / step
+        np.testing.assert_allclose(true.derivatives(time)[:, k], slope, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["cucumber", "potato", "tomato"])
+def test_each_setup_names_parameters_of_its_food_within_their_ranges(name):
+    assert name in setup_names()
+    setup = load_setup(name)
+    assert len(setup.parameters) + 2 + 3 * (setup.oscillation is not None) <= 14
+    assert all(p.why for p in setup.parameters)
+
+
+def test_a_setup_with_a_parameter_that_does_not_exist_is_refused(tmp_path):
+    file = tmp_path / "food.yaml"
+    file.write_text("parameters: [{name: material.toughnes, low: 1.0, high: 2.0}]\n")
+    with pytest.raises(ConfigurationError, match="Did you mean material.toughness"):
+        load_setup(file)
+    with pytest.raises(ConfigurationError, match="no food that a setup ships for"):
+        load_setup("pineapple")
+
+
+def test_draws_from_a_calibrated_food_stay_in_its_ranges_and_have_its_covariance():
+    covariance = [[0.01, 0.006], [0.006, 0.01]]
+    what = ParameterDistribution(
+        ["a", "b"], [1.0, -1.0], [100.0, 1.0], [True, False], [0.5, 0.5], covariance
+    )
+    rng = np.random.default_rng(0)
+    draws = [what.draw(rng) for _ in range(4000)]
+    places = np.array([[np.log(d["a"]) / np.log(100.0), 0.5 * (d["b"] + 1.0)] for d in draws])
+    np.testing.assert_allclose(np.cov(places.T), covariance, atol=1e-3)
+    near_end = dc.replace(what, mean=[0.99, 0.5])
+    assert max(near_end.draw(rng)["a"] for _ in range(500)) <= 100.0
+
+
+@pytest.mark.parametrize("name", calibrated_food_names())
+def test_a_scenario_loads_a_calibrated_food_by_name(name):
+    calibrated = load_calibrated_food(name)
+    scenario = load_scenario(None, f"{{calibration: {name}}}")
+    assert scenario.food.material == calibrated.food.material
+    assert scenario.food.effects.skin == calibrated.food.effects.skin
+    assert scenario.numerics.flank_stiffness == calibrated.flank_stiffness
+    # The holder's give is that of the robot that was measured.
+    assert scenario.food.effects.compliance.arm == 0.0
+
+
+def test_an_unknown_calibration_is_refused_with_the_names_there_are():
+    with pytest.raises(ConfigurationError, match="pear.*not calibrated"):
+        load_scenario(None, "{calibration: pear}")
+
+
+def test_a_distribution_that_is_none_is_refused():
+    bad = ParameterDistribution(["a"], [1.0], [2.0], [False], [0.5], [[-0.1]])
+    with pytest.raises(ConfigurationError, match="variance is negative"):
+        bad.check("distribution")
+    with pytest.raises(ConfigurationError, match="entries"):
+        dc.replace(bad, low=[]).check("distribution")
+    assert CalibratedFood().distribution.draw(np.random.default_rng(0)) == {}
