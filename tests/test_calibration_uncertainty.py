@@ -1,19 +1,14 @@
 """Uncertainty of a calibration: noise of records, intervals, profiles, held-out error, drawing."""
 
 import copy
-import dataclasses as dc
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
 from sliceit_drake.calibration.gauss_newton import gauss_newton
-from sliceit_drake.calibration.held_out import blocked_error, record_error
-from sliceit_drake.calibration.noise import NoiseModel, list_series
-from sliceit_drake.calibration.posterior import Posterior
+from sliceit_drake.calibration.noise import NoiseModel, group_series
 from sliceit_drake.calibration.prediction import Parameter
-from sliceit_drake.calibration.uncertainty import estimate, profile_likelihood
-from sliceit_drake.configuration import dump_yaml, load_yaml
+from sliceit_drake.calibration.uncertainty import estimate
 
 
 class MapModel:
@@ -74,13 +69,11 @@ def linear_model(samples=80, records=(3, 3), seed=5):
 
 def noise_of(model, ar, tau, white, scale, prediction):
     channels = [1] * len(model.conditions)
-    series, groups = list_series(
-        model.used, model.time, model.record_of, channels, model.conditions
-    )
+    groups = group_series(model.used, model.time, model.record_of, channels, model.conditions)
     scales = np.zeros((len(model.time), len(channels)))
     scales[np.arange(len(model.time)), model.record_of] = prediction
-    full = [np.full(groups, v) for v in (ar, tau, white)]
-    return NoiseModel(series, *full, scale, scales)
+    full = [np.full(len(groups), v) for v in (ar, tau, white)]
+    return NoiseModel(groups, *full, scale, scales)
 
 
 def test_covariance_of_a_record_is_that_of_an_autoregressive_process_with_white_noise():

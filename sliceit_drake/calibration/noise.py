@@ -16,35 +16,32 @@ import numpy as np
 from scipy.linalg import cholesky_banded, solve_banded, solveh_banded
 from scipy.optimize import minimize
 
-__all__ = ["NoiseModel", "NoiseFit", "Series", "fit_noise", "list_series"]
+__all__ = ["NoiseFit", "NoiseModel", "SeriesGroup", "fit_noise", "group_series"]
 
 LEAST_SHARE = 1e-4
 """Least standard deviation of a series, relative to the root mean square measurement of all."""
 SPREAD_PRIOR, TIME_PRIOR = 2.0, 1.5
 """Standard deviations of weak priors on logarithms: of the standard deviations about the residuals'
 own, and of the correlation time about the middle between step and duration."""
-LEAST_SCALE, LARGEST_SCALE = 1e-3, 1.0
+LEAST_SCALE, FIRST_SCALE, LARGEST_SCALE = 1e-3, 0.1, 1.0
 FLAT = 1e-6
 """Precision of parameters without a prior, relative to what the data say of them."""
 DRAWS = 48
 STEP = 0.05
+KEPT = 64
 
 
 @dc.dataclass(frozen=True)
-class Series:
-    """One channel of one record.
+class SeriesGroup:
+    """One channel of the records of one condition, one record after the other.
 
     Attributes:
-        rows: Its entries that are used, in the row of all measurements [n].
-        time: Of them [n], s, increasing.
-        record: Index of the record.
-        group: Series of one group share their numbers.
+        rows: Entries that are used, in the row of all measurements [n].
+        gap: Time from each to the next [n - 1], s; infinite where a record begins.
     """
 
     rows: np.ndarray
-    time: np.ndarray
-    record: int
-    group: int
+    gap: np.ndarray
 
 
 @dc.dataclass
@@ -52,7 +49,7 @@ class NoiseModel:
     """Covariance of the residuals.
 
     Attributes:
-        series: Of all records.
+        groups: Of all records; the entries of a group share the numbers below.
         ar: Standard deviation of the autoregressive part of each group [G], N.
         tau: Its correlation time [G], s.
         white: Standard deviation of the white part [G], N.
@@ -61,7 +58,7 @@ class NoiseModel:
         scales: Change of the residuals by each record's scale [M, records]; [M, 0] if unknown.
     """
 
-    series: list[Series]
+    groups: list[SeriesGroup]
     ar: np.ndarray
     tau: np.ndarray
     white: np.ndarray
@@ -80,56 +77,55 @@ class NoiseModel:
 
     def _solve_within(self, columns: np.ndarray) -> np.ndarray:
         out = np.zeros_like(columns)
-        for s in self.series:
-            ar, tau, white = self.ar[s.group], self.tau[s.group], self.white[s.group]
-            out[s.rows] = _Covariance(s.time, ar, tau, white).solve(columns[s.rows])
+        for group, V in zip(self.groups, self._covariances(), strict=True):
+            out[group.rows] = V.solve(columns[group.rows])
         return out
+
+    def _covariances(self) -> list["_Covariance"]:
+        numbers = zip(self.groups, self.ar, self.tau, self.white, strict=True)
+        return [_Covariance(group.gap, *own) for group, *own in numbers]
 
     @property
     def effective_samples(self) -> float:
         """Number of independent samples that would tell a constant as well, all series together.
 
-        Of each series var * 1' V^-1 1 with the variance var of a sample.
+        Of each group var * 1' V^-1 1 with the variance var of a sample.
         """
         total = 0.0
-        for s in self.series:
-            ar, tau, white = self.ar[s.group], self.tau[s.group], self.white[s.group]
-            one = np.ones((len(s.rows), 1))
-            total += (ar**2 + white**2) * float(
-                _Covariance(s.time, ar, tau, white).solve(one).sum()
-            )
+        for group, V in zip(self.groups, self._covariances(), strict=True):
+            total += V.variance * float(V.solve(np.ones((len(group.rows), 1))).sum())
         return total
 
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         """A sample of the noise [size]; entries that are not used are zero."""
         out = np.zeros(size)
-        for s in self.series:
-            ar, tau, white = self.ar[s.group], self.tau[s.group], self.white[s.group]
-            out[s.rows] = _Covariance(s.time, ar, tau, white).sample(rng)
+        for group, V in zip(self.groups, self._covariances(), strict=True):
+            out[group.rows] = V.sample(rng)
         if self.record_scale is not None:
             out += self.scales @ rng.normal(0.0, self.record_scale, self.scales.shape[1])
         return out
 
 
 class _Covariance:
-    """ar^2 exp(-|dt|/tau) + white^2 I at increasing times.
+    """ar^2 exp(-|dt|/tau) + white^2 I; entries with an infinite gap between them are independent.
 
     The inverse T of the first part is tridiagonal (Markov), so that with V = T^-1 + w I,
     V^-1 = T (I + w T)^-1 costs as much as there are samples.
     """
 
-    def __init__(self, time: np.ndarray, ar: float, tau: float, white: float) -> None:
-        rho = np.exp(-np.diff(time) / tau)
+    def __init__(self, gap: np.ndarray, ar: float, tau: float, white: float) -> None:
+        rho, n = np.exp(-gap / tau), len(gap) + 1
         gain = 1.0 / np.maximum(1.0 - rho**2, 1e-12)
         # Each sample given the one before it.
-        diagonal = np.zeros(len(time))
+        diagonal = np.zeros(n)
         diagonal[0] = 1.0
         diagonal[1:] += gain
         diagonal[:-1] += rho**2 * gain
         self._band = np.vstack([np.concatenate([[0.0], -rho * gain]), diagonal]) / ar**2
         # log det T^-1 from the innovations.
-        self._log_det_first = 2.0 * len(time) * np.log(ar) - np.log(gain).sum()
+        self._log_det_first = 2.0 * n * np.log(ar) - np.log(gain).sum()
         self._white = white
+        self.variance = ar**2 + white**2
         self._shifted = white**2 * self._band
         self._shifted[1] += 1.0
 
@@ -156,14 +152,14 @@ class _Covariance:
         return np.asarray(first + self._white * rng.normal(size=n))
 
 
-def list_series(
+def group_series(
     used: np.ndarray,
     time: np.ndarray,
     record_of: np.ndarray,
     channels: list[int],
     conditions: list[str],
-) -> tuple[list[Series], int]:
-    """Lists the series of all records, and the number of groups.
+) -> list[SeriesGroup]:
+    """Lists the series of all records by condition and channel.
 
     Replicates share the numbers of a channel; records of different conditions do not, because what
     the model lacks depends on the speed.
@@ -175,19 +171,21 @@ def list_series(
         channels: Number of channels of each record.
         conditions: Of each record; "" is none.
     """
-    groups: dict[tuple[str, int], int] = {}
-    out = []
+    groups: dict[tuple[str, int], list[np.ndarray]] = {}
     for record, (count, condition) in enumerate(zip(channels, conditions, strict=True)):
         rows = np.flatnonzero(record_of == record)
         for channel in range(count):
             own = rows[channel::count]
             own = own[used[own]]
-            if own.size == 0:
-                continue
-            key = (condition or f"record {record}", channel)
-            group = groups.setdefault(key, len(groups))
-            out.append(Series(own, time[own], record, group))
-    return out, len(groups)
+            if own.size:
+                groups.setdefault((condition or f"record {record}", channel), []).append(own)
+    out = []
+    for members in groups.values():
+        rows = np.concatenate(members)
+        gap = np.diff(time[rows])
+        gap[np.cumsum([len(m) for m in members])[:-1] - 1] = np.inf
+        out.append(SeriesGroup(rows, gap))
+    return out
 
 
 @dc.dataclass
@@ -198,53 +196,60 @@ class NoiseFit:
         model: The noise model.
         shift: From the place of linearisation to the estimate [d].
         covariance: Of the estimate if the noise model were known [d, d].
-        inflated: With what is not known of the noise model itself [d, d].
     """
 
     model: NoiseModel
     shift: np.ndarray
     covariance: np.ndarray
-    inflated: np.ndarray
+    _problem: "_Problem"
+    _numbers: np.ndarray
+
+    def averaged_covariance(self) -> np.ndarray:
+        """Of the estimate, averaged over what is not known of the noise model [d, d].
+
+        Over samples of a normal approximation in the logarithms of its numbers.
+        """
+        return self._problem.averaged(self._numbers)
 
 
 def fit_noise(
-    series: list[Series],
+    groups: list[SeriesGroup],
     residuals: np.ndarray,
     jacobian: np.ndarray,
     nuisance: np.ndarray,
-    prediction: np.ndarray,
+    scales: np.ndarray,
     prior_mean: np.ndarray,
     prior_variance: float,
     level: float,
-    replicated: bool,
+    start: NoiseModel | None = None,
 ) -> NoiseFit:
     """Fits the noise, with the parameters integrated out of the linear problem.
 
-    The parameters' uncertainty then is averaged over what is not known of the noise (samples of a
-    normal approximation in the logarithms of its numbers).
-
     Args:
-        series: From `list_series`.
+        groups: From `group_series`.
         residuals: [M], N.
         jacobian: By the parameters [M, d].
         nuisance: By numbers without a prior [M, q].
-        prediction: [M], N: the change by a record's scale.
+        scales: By the scale of each record [M, records]; [M, 0] where no cut was repeated, so that
+            their variation does not show.
         prior_mean: Of the parameters, from the place of linearisation [d].
         prior_variance: Of each parameter.
         level: Root mean square of the measurement, N.
-        replicated: Whether records have a condition in common, so that their variation shows.
+        start: A noise model of the same groups that is nearly right.
     """
     problem = _Problem(
-        series, residuals, jacobian, nuisance, prediction, prior_mean, prior_variance, level
+        groups, residuals, jacobian, nuisance, scales, prior_mean, prior_variance, level
     )
-    start, bounds = problem.start(replicated)
+    first = problem.first if start is None else problem.numbers_of(start)
     found = minimize(
-        problem.objective, start, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60}
+        problem.objective,
+        first,
+        method="L-BFGS-B",
+        bounds=problem.bounds,
+        options={"maxiter": 60, "ftol": 1e-6},
     )
-    x = found.x
-    covariance, shift = problem.estimate(x)
-    inflated = problem.averaged(x, np.array(bounds))
-    return NoiseFit(problem.model(x), shift, covariance, inflated)
+    covariance, shift = problem.estimate(found.x)
+    return NoiseFit(problem.model(found.x), shift, covariance, problem, found.x)
 
 
 class _Problem:
@@ -252,100 +257,78 @@ class _Problem:
 
     def __init__(
         self,
-        series: list[Series],
+        groups: list[SeriesGroup],
         residuals: np.ndarray,
         jacobian: np.ndarray,
         nuisance: np.ndarray,
-        prediction: np.ndarray,
+        scales: np.ndarray,
         prior_mean: np.ndarray,
         prior_variance: float,
         level: float,
     ) -> None:
-        self.series = series
-        self.groups = 1 + max(s.group for s in series)
+        self.groups, self.scales = groups, scales
         self.d, self.q = jacobian.shape[1], nuisance.shape[1]
-        records = sorted({s.record for s in series})
-        self.scales = np.zeros((len(residuals), len(records)))
-        for s in series:
-            self.scales[s.rows, records.index(s.record)] = prediction[s.rows]
-        columns = np.column_stack([residuals, jacobian, nuisance, self.scales])
-        self.columns = [columns[s.rows] for s in series]
+        columns = np.column_stack([residuals, jacobian, nuisance, scales])
+        self.columns = [columns[g.rows] for g in groups]
         self.prior_mean, self.prior_precision = prior_mean, 1.0 / prior_variance
-        self.least = LEAST_SHARE * level
-        rough = [np.concatenate([residuals[s.rows] for s in self._of(g)]) for g in self._all()]
-        self.spread = np.array(
-            [max(float(np.sqrt(np.mean(r**2))), 2.0 * self.least) for r in rough]
-        )
-        self.step = np.array(
-            [np.median(np.concatenate([np.diff(s.time) for s in self._of(g)])) for g in self._all()]
-        )
-        self.duration = np.array([max(np.ptp(s.time) for s in self._of(g)) for g in self._all()])
-        self.middle = np.sqrt(self.step * self.duration)
+        least = LEAST_SHARE * level
+        rough = [float(np.sqrt(np.mean(residuals[g.rows] ** 2))) for g in groups]
+        self.spread = np.maximum(rough, 2.0 * least)
+        known = [g.gap[np.isfinite(g.gap)] for g in groups]
+        step = np.array([np.median(gap) if gap.size else 1.0 for gap in known])
+        # Of the records of a group together; only the order of magnitude matters.
+        duration = np.array([max(gap.sum(), 3.0 * s) for gap, s in zip(known, step, strict=True)])
+        self.middle = np.sqrt(step * duration)
+        first, bounds = [], []
+        for g in range(len(groups)):
+            spread = (float(np.log(least)), float(np.log(10.0 * self.spread[g])))
+            first += [0.9 * self.spread[g], self.middle[g], 0.3 * self.spread[g]]
+            bounds += [spread, (np.log(step[g] / 3.0), np.log(2.0 * duration[g])), spread]
+        self.replicated = scales.shape[1] > 0
+        if self.replicated:
+            first.append(FIRST_SCALE)
+            bounds.append((np.log(LEAST_SCALE), np.log(LARGEST_SCALE)))
+        self.first, self.bounds = np.log(first), np.array(bounds)
         self._pieces: dict[tuple, tuple[np.ndarray, float]] = {}
 
-    def _all(self) -> range:
-        return range(self.groups)
-
-    def _of(self, group: int) -> list[Series]:
-        return [s for s in self.series if s.group == group]
-
-    def start(self, replicated: bool) -> tuple[np.ndarray, list[tuple[float, float]]]:
-        """First values and bounds; a last one for the records' scale if they are replicated."""
-        x, bounds = [], []
-        for g in self._all():
-            spread = (float(np.log(self.least)), float(np.log(10.0 * self.spread[g])))
-            x += [
-                np.log(0.9 * self.spread[g]),
-                np.log(self.middle[g]),
-                np.log(0.3 * self.spread[g]),
-            ]
-            time = (float(np.log(self.step[g] / 3.0)), float(np.log(2.0 * self.duration[g])))
-            bounds += [spread, time, spread]
-        if replicated:
-            x.append(np.log(0.1))
-            bounds.append((float(np.log(LEAST_SCALE)), float(np.log(LARGEST_SCALE))))
-        return np.array(x), bounds
+    def numbers_of(self, model: NoiseModel) -> np.ndarray:
+        """The numbers of a noise model."""
+        x = np.column_stack([model.ar, model.tau, model.white]).ravel()
+        if model.record_scale is not None:
+            x = np.append(x, model.record_scale)
+        return np.clip(np.log(x), self.bounds[:, 0], self.bounds[:, 1])
 
     def model(self, x: np.ndarray) -> NoiseModel:
-        ar, tau, white = np.exp(x[: 3 * self.groups]).reshape(-1, 3).T
-        scale = float(np.exp(x[-1])) if self._replicated(x) else None
-        scales = self.scales if scale is not None else np.zeros((len(self.scales), 0))
-        return NoiseModel(self.series, ar, tau, white, scale, scales)
-
-    def _replicated(self, x: np.ndarray) -> bool:
-        return len(x) > 3 * self.groups
+        """The noise model with these numbers."""
+        ar, tau, white = np.exp(x[: 3 * len(self.groups)]).reshape(-1, 3).T
+        scale = float(np.exp(x[-1])) if self.replicated else None
+        return NoiseModel(self.groups, ar, tau, white, scale, self.scales)
 
     def _piece(self, group: int, numbers: tuple[float, ...]) -> tuple[np.ndarray, float]:
         """B' V^-1 B of a group's columns B, and log det V."""
         key = (group, numbers)
         if key not in self._pieces:
-            ar, tau, white = np.exp(numbers)
-            gram, log_det = np.zeros((self.columns[0].shape[1],) * 2), 0.0
-            for s, B in zip(self.series, self.columns, strict=True):
-                if s.group == group:
-                    V = _Covariance(s.time, ar, tau, white)
-                    gram += B.T @ V.solve(B)
-                    log_det += V.log_det()
-            if len(self._pieces) > 64 * self.groups:
+            V = _Covariance(self.groups[group].gap, *np.exp(numbers))
+            B = self.columns[group]
+            if len(self._pieces) > KEPT * len(self.groups):
                 self._pieces.clear()
-            self._pieces[key] = gram, log_det
+            self._pieces[key] = B.T @ V.solve(B), V.log_det()
         return self._pieces[key]
 
     def _system(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, float]:
         """Precision A and right side b of all unknowns, rest of the cost, log det of the prior."""
         gram, log_det = np.zeros(()), 0.0
-        for g in self._all():
+        for g in range(len(self.groups)):
             piece, own = self._piece(g, tuple(x[3 * g : 3 * g + 3].tolist()))
             gram, log_det = gram + piece, log_det + own
         G = np.asarray(gram)
-        keep = np.arange(1, len(G) if self._replicated(x) else 1 + self.d + self.q)
-        A, b = G[np.ix_(keep, keep)].copy(), -G[keep, 0]
-        precision = np.zeros(len(keep))
+        A, b = G[1:, 1:].copy(), -G[1:, 0]
+        precision = np.zeros(len(A))
         precision[: self.d] = self.prior_precision
         size = np.diag(A)[self.d : self.d + self.q]
         precision[self.d : self.d + self.q] = np.where(size > 0.0, FLAT * size, 1.0)
         log_prior = 0.0
-        if self._replicated(x):
+        if self.replicated:
             precision[self.d + self.q :] = np.exp(-2.0 * x[-1])
             log_prior = -2.0 * x[-1] * self.scales.shape[1]
         A[np.diag_indices(len(A))] += precision
@@ -359,11 +342,11 @@ class _Problem:
         factor = np.linalg.cholesky(A)
         y = np.linalg.solve(factor, b)
         value = rest - log_prior + 2.0 * np.log(np.diag(factor)).sum() - float(y @ y)
-        ar, tau, white = x[: 3 * self.groups].reshape(-1, 3).T
+        ar, tau, white = x[: 3 * len(self.groups)].reshape(-1, 3).T
         value += (((ar - np.log(self.spread)) / SPREAD_PRIOR) ** 2).sum()
         value += (((white - np.log(self.spread)) / SPREAD_PRIOR) ** 2).sum()
         value += (((tau - np.log(self.middle)) / TIME_PRIOR) ** 2).sum()
-        if self._replicated(x):
+        if self.replicated:
             # Keeps the scale from zero, where few records put it by chance (Chung et al. 2013).
             value -= 2.0 * x[-1]
         return float(value)
@@ -374,16 +357,16 @@ class _Problem:
         covariance = np.linalg.inv(A)
         return covariance[: self.d, : self.d], (covariance @ b)[: self.d]
 
-    def averaged(self, x: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    def averaged(self, x: np.ndarray) -> np.ndarray:
         """Covariance [d, d] averaged over the noise's own uncertainty."""
-        blocks = [list(range(3 * g, 3 * g + 3)) for g in self._all()]
-        if self._replicated(x):
+        blocks = [list(range(3 * g, 3 * g + 3)) for g in range(len(self.groups))]
+        if self.replicated:
             blocks.append([len(x) - 1])
         rng = np.random.default_rng(0)
         sets = np.tile(x, (DRAWS, 1))
         for block in blocks:
             sets[:, block] += self._scatter(x, block, rng)
-        sets = np.clip(sets, bounds[:, 0], bounds[:, 1])
+        sets = np.clip(sets, self.bounds[:, 0], self.bounds[:, 1])
         pairs = [self.estimate(s) for s in sets]
         shifts = np.array([shift for _, shift in pairs])
         within = np.mean([covariance for covariance, _ in pairs], axis=0)

@@ -17,7 +17,7 @@ from sliceit_drake.calibration.gauss_newton import (
     linearise,
     residuals_at,
 )
-from sliceit_drake.calibration.noise import NoiseFit, NoiseModel, fit_noise, list_series
+from sliceit_drake.calibration.noise import NoiseFit, NoiseModel, fit_noise, group_series
 from sliceit_drake.calibration.posterior import Posterior
 from sliceit_drake.calibration.prediction import Parameter
 
@@ -106,18 +106,17 @@ def estimate(model: RecordModel, unit: np.ndarray, rounds: int = ROUNDS) -> Esti
         CuttingError: A slice breaks down near `unit`.
     """
     at = linearise(model, np.clip(unit, 0.0, 1.0))
-    first = at
+    found = _noise(model, at, None)
     for _ in range(rounds):
-        found = _noise(model, at)
         fit = gauss_newton(
             model, at.unit, noise=found.model, steps=STEPS, tolerance=1e-5, linearisation=at
         )
         moved = np.abs(fit.unit - at.unit) / np.sqrt(np.diag(found.covariance))
         at = _at_end(model, fit)
+        found = _noise(model, at, found.model)
         if moved.max() < SETTLED:
             break
-    found = _noise(model, at)
-    return _as_estimate(model, at, found, first.unit)
+    return _as_estimate(model, at, found, np.asarray(unit))
 
 
 def _at_end(model: ResidualModel, fit: Fit) -> Linearisation:
@@ -131,23 +130,25 @@ def _at_end(model: ResidualModel, fit: Fit) -> Linearisation:
     return linearise(model, fit.unit)
 
 
-def _noise(model: RecordModel, at: Linearisation) -> NoiseFit:
-    measured, used = model.measured, model.used
+def _noise(model: RecordModel, at: Linearisation, start: NoiseModel | None) -> NoiseFit:
+    measured, used, record_of = model.measured, model.used, model.record_of
     conditions = model.conditions
     channels = [part.shape[1] for part in model.split(measured)]
-    series, _ = list_series(used, model.time, model.record_of, channels, conditions)
-    present = [conditions[r] for r in sorted({s.record for s in series})]
-    named = [c for c in present if c]
+    present = np.unique(record_of[used])
+    named = [conditions[r] for r in present if conditions[r]]
+    replicated = len(set(named)) < len(named)
+    predicted = np.where(used, at.residuals + measured, 0.0)
+    members = present if replicated else present[:0]
     return fit_noise(
-        series,
+        group_series(used, model.time, record_of, channels, conditions),
         at.residuals,
         at.jacobian,
         at.nuisance,
-        np.where(used, at.residuals + measured, 0.0),
+        predicted[:, None] * (record_of[:, None] == members),
         PRIOR_CENTER - at.unit,
         PRIOR_VARIANCE,
         float(np.sqrt(np.mean(measured[used] ** 2))),
-        len(set(named)) < len(named),
+        start,
     )
 
 
@@ -162,7 +163,8 @@ def _as_estimate(
             "no cut was repeated: how much slices differ is unknown, and the intervals hold for "
             "the slices that were measured"
         )
-    sd = np.sqrt(np.diag(found.inflated))
+    covariance = found.averaged_covariance()
+    sd = np.sqrt(np.diag(covariance))
     for k, parameter in enumerate(parameters):
         if abs(least_squares[k] - at.unit[k]) > ODDS * sd[k]:
             notes.append(
@@ -177,7 +179,7 @@ def _as_estimate(
         high=[float(p.high) for p in parameters],
         log=[p.log for p in parameters],
         mean=at.unit.tolist(),
-        covariance=found.inflated.tolist(),
+        covariance=covariance.tolist(),
         effective_samples=found.model.effective_samples,
         record_variation=scale,
         notes=notes,
