@@ -491,12 +491,12 @@ class Predictor:
         Raises:
             CuttingError: A slice breaks down there.
         """
-        sets, spans = [unit], []
-        for k in range(len(unit)):
-            low, high = max(unit[k] - step, 0.0), min(unit[k] + step, 1.0)
-            spans.append(high - low)
+        high, low = np.minimum(unit + step, 1.0), np.maximum(unit - step, 0.0)
+        moved = self._moved_together()
+        sets = [unit]
+        for members in moved:
             for end in (high, low):
-                sets.append(np.where(np.arange(len(unit)) == k, end, unit))
+                sets.append(np.where(np.isin(np.arange(len(unit)), members), end, unit))
         rows = self.predict(sets, progress)
         for row in rows:
             for p in row:
@@ -510,8 +510,26 @@ class Predictor:
             np.concatenate([(f * p.smooth).ravel() for f, p in zip(factors, row, strict=True)])
             for row in rows
         ]
-        columns = [(flat[1 + 2 * k] - flat[2 + 2 * k]) / span for k, span in enumerate(spans)]
-        return flat[0] - self.measured, np.array(columns).T
+        columns = np.zeros((len(flat[0]), len(unit)))
+        records = [t.record.name for t in self.targets]
+        for g, members in enumerate(moved):
+            difference = flat[1 + 2 * g] - flat[2 + 2 * g]
+            for k in members:
+                name = self.parameters[k].name
+                own = (
+                    1.0
+                    if ":" not in name
+                    else self.record_of == records.index(name.split(":", 1)[1])
+                )
+                columns[:, k] = own * difference / (high[k] - low[k])
+        return flat[0] - self.measured, columns
+
+    def _moved_together(self) -> list[list[int]]:
+        """Parameters whose derivatives need one pair of predictions: those of different records."""
+        groups: dict[str, list[int]] = {}
+        for k, parameter in enumerate(self.parameters):
+            groups.setdefault(parameter.name.split(":", 1)[0], []).append(k)
+        return list(groups.values())
 
     def nuisance_jacobian(self, unit: np.ndarray) -> np.ndarray:
         """Derivatives of the residuals by the oscillations' numbers [M, 3 records] or [M, 0]."""
