@@ -339,6 +339,14 @@ def test_an_arm_gives_in_proportion_to_the_force_and_its_encoders_do_not_see_it(
     assert not np.any(rigid.p_true - rigid.p)
 
 
+def test_a_soft_arm_does_not_chatter_on_a_stiff_contact():
+    soft = series("arm_compliance:1.5e-4")
+    resting = during(soft, "hold")
+    force = soft.force[resting, 2]
+    assert np.abs(np.diff(force[25:])).max() < 0.1
+    assert force[25] > force[-1] > 0.5 * force[25]
+
+
 def test_a_holder_gives_along_the_edge_and_only_in_a_draw():
     np.testing.assert_allclose(added("holder_compliance")[during(series(), "slice")], 0.0, atol=0.1)
     s = series("holder_compliance:1e-4", "draw")
@@ -704,6 +712,8 @@ def test_the_command_hides_an_effect_from_a_users_file_in_two_processes(tmp_path
     [
         (["--effect", "no_such_thing"], "is no effect"),
         (["--effect", "skin:much"], "no number"),
+        (["--effect", "sensor_delay:-0.01"], "no meaning"),
+        (["--effect", "toughness:nan"], "no meaning"),
         (["--effect", "missing.py"], "no such file"),
         (["--world", "moon"], "is no world"),
         (["--refinement", "9"], "refinement"),

@@ -18,6 +18,8 @@ import dataclasses as dc
 
 import numpy as np
 
+from sliceit_drake.configuration import ConfigurationError
+
 __all__ = ["Effect", "Now", "Series", "SliceFacts", "Tissue"]
 
 
@@ -167,6 +169,7 @@ class Effect:
         cause: What a diagnosis would have to call it; empty where it stands in no list of causes.
         unit: Of the size.
         typical: A size that matters and could be met in a kitchen.
+        least: Least size that has a meaning.
         every_exchange: Whether `drive` must see every exchange, as where it feeds a force back.
         size: How much of it.
     """
@@ -174,10 +177,22 @@ class Effect:
     cause = ""
     unit = ""
     typical = 1.0
+    least = -np.inf
     every_exchange = False
 
     def __init__(self, size: float | None = None) -> None:
+        """Makes an effect of a size; of its typical one if there is none.
+
+        Raises:
+            ConfigurationError: The size is no finite number, or less than `least`.
+        """
         self.size = self.typical if size is None else float(size)
+        if not np.isfinite(self.size) or self.size < self.least:
+            raise ConfigurationError(
+                f"has no meaning with a size of {self.size:g}",
+                field=type(self).__name__,
+                fix=f"Give at least {self.least:g}; {self.typical:g} is typical.",
+            )
 
     def begin(self, facts: SliceFacts, rng: np.random.Generator) -> None:
         """Before a slice.

@@ -140,7 +140,7 @@ class FiniteElementWorld:
         self.protocol = protocol
         self.settings = settings or FiniteElementSettings()
         self._numerics = Numerics(time_step=self.settings.time_step)
-        self._cuts: dict[tuple[float, bytes], _Section] = {}
+        self._cuts: dict[bytes, _Section] = {}
 
     def cut(
         self, specimen: Specimen, effects: Sequence[Effect], rng: np.random.Generator
@@ -185,7 +185,7 @@ class FiniteElementWorld:
         return series
 
     def _section(self, food: Food, mesh: TetrahedralMesh) -> _Section:
-        key = (float(mesh.vertices[:, 2].max()), mesh.vertices.tobytes())
+        key = mesh.vertices.tobytes()
         if key not in self._cuts:
             model = make_cutting_model(
                 mesh,

@@ -43,6 +43,7 @@ class FlankAdhesion(Effect):
     cause = "adhesion"
     unit = "Pa"
     typical = 600.0
+    least = 0.0
     reference = 0.02
     turn = 5e-5
 

@@ -6,6 +6,12 @@ from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceFacts
 
 __all__ = ["ArmCompliance", "BoardHeight", "BoardLaw", "FoodSlip", "HolderCompliance"]
 
+STIFFEST = 3e6
+"""Of what arm and holder can meet, N/m."""
+
+FORGET = 0.8
+"""Share of the last estimate of that below which the next does not fall."""
+
 
 class BoardHeight(Effect):
     """Board and food that lie higher by `size` than was measured."""
@@ -41,29 +47,49 @@ class ArmCompliance(Effect):
     cause = "compliance"
     unit = "m/N"
     typical = 5e-5
+    least = 0.0
     every_exchange = True
     fast, slow = 0.03, 0.6
-    axis = 2
 
     def begin(self, facts: SliceFacts, rng: np.random.Generator) -> None:
         super().begin(facts, rng)
         self._given = np.zeros(2)
+        self._force = self._stiffness = self._place = self._before = 0.0
 
-    def _yield(self, force: float, period: float) -> float:
-        target = self.size * force * np.array([2.0 / 3.0, 1.0 / 3.0])
+    def _yield(self, force: float, commanded: float, period: float) -> float:
+        """How far it has given at the end of a stretch.
+
+        Args:
+            force: On what gives, in the stretch before, N.
+            commanded: Place along the direction in which it gives, at the end, metres.
+            period: s.
+        """
+        # Force answers the place with a stiffness, estimated from the last two stretches. With it
+        # taken into account a stiff contact does not chatter, and the balance is the same.
+        moved = abs(self._place - self._before)
+        stiffness = abs(force - self._force) / moved if moved > 1e-9 else 0.0
+        self._stiffness = max(min(stiffness, STIFFEST), FORGET * self._stiffness)
+        compliance = self.size * np.array([2.0 / 3.0, 1.0 / 3.0])
         follow = -np.expm1(-period / np.array([self.fast, self.slow]))
-        self._given += follow * (target - self._given)
-        return float(self._given.sum())
+        given = (follow * (compliance * force - self._given)).sum()
+        given /= 1.0 + self._stiffness * (follow * compliance).sum()
+        force_then = force - self._stiffness * given
+        self._given += follow * (compliance * force_then - self._given)
+        total = float(self._given.sum())
+        self._force, self._before, self._place = force, self._place, commanded + total
+        return total
 
     def drive(self, now: Now) -> None:
-        now.knife_shift[2] += self._yield(float(now.force[2]), now.period)
+        height = float(now.position[2])
+        now.knife_shift[2] += self._yield(float(now.force[2]), height, now.period)
 
 
 class HolderCompliance(ArmCompliance):
     """A holder of the food that gives by `size` per force along the edge, as the arm does."""
 
     def drive(self, now: Now) -> None:
-        now.food_shift[0] += self._yield(-float(now.force[0]), now.period)
+        place = -float(now.position[0])
+        now.food_shift[0] += self._yield(-float(now.force[0]), place, now.period)
 
 
 class FoodSlip(Effect):
@@ -73,6 +99,7 @@ class FoodSlip(Effect):
     cause = "slip of the food"
     unit = "m"
     typical = 3e-3
+    least = 0.0
     duration = 0.02
 
     def begin(self, facts: SliceFacts, rng: np.random.Generator) -> None:

@@ -63,6 +63,7 @@ class SensorDelay(Effect):
     cause = "delay"
     unit = "s"
     typical = 0.015
+    least = 0.0
     stages = 4
 
     def measure(self, series: Series, wrench: np.ndarray) -> np.ndarray:

@@ -28,6 +28,7 @@ class BulkRelaxation(Effect):
 
     cause = "viscoelastic bulk"
     typical = 0.06
+    least = 0.0
     onset = 0.02
     reload_stiffness = 8e3
 
