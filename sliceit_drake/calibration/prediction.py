@@ -515,13 +515,10 @@ class Predictor:
         for g, members in enumerate(moved):
             difference = flat[1 + 2 * g] - flat[2 + 2 * g]
             for k in members:
-                name = self.parameters[k].name
-                own = (
-                    1.0
-                    if ":" not in name
-                    else self.record_of == records.index(name.split(":", 1)[1])
-                )
-                columns[:, k] = own * difference / (high[k] - low[k])
+                columns[:, k] = difference / (high[k] - low[k])
+                if not self.parameters[k].shared:
+                    record = self.parameters[k].name.split(":", 1)[1]
+                    columns[self.record_of != records.index(record), k] = 0.0
         return flat[0] - self.measured, columns
 
     def _moved_together(self) -> list[list[int]]:
