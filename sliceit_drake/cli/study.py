@@ -5,6 +5,8 @@ import dataclasses as dc
 import itertools
 from pathlib import Path
 
+from sliceit_drake.cli.calibration_study import add_calibration_study
+from sliceit_drake.cli.coverage import add_coverage
 from sliceit_drake.cli.scenario_argument import add_scenario_arguments, scenario_of
 from sliceit_drake.cli.verification import add_verification
 
@@ -120,6 +122,8 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     )
     stepping.set_defaults(run=run_stepping)
     add_verification(studies)
+    add_coverage(studies)
+    add_calibration_study(studies)
 
 
 def run_coupling(options: argparse.Namespace) -> int:

@@ -1,0 +1,179 @@
+"""The measured curves of the paper beside three simulators: its two, as published, and ours."""
+
+import dataclasses as dc
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.optimize import minimize_scalar
+
+from sliceit_drake.calibration.calibrate import Calibration
+from sliceit_drake.records.force_profile import ForceProfile
+
+__all__ = ["FoodComparison", "Row", "compare", "plot_comparisons", "table"]
+
+LARGEST_SHIFT = 0.4
+NAMES = {"DiSECt": "authors' calibrated DiSECt", "spring": "authors' spring"}
+COLOURS = {"DiSECt": "#2563eb", "spring": "#16a34a", "ours": "#c2410c"}
+
+
+@dc.dataclass
+class Row:
+    """One simulator on one food.
+
+    Attributes:
+        name: Of the simulator.
+        time, force: Its curve at the compared samples [m], s and N, after the best shift.
+        shift: In time that was granted to it, s.
+        rms: Root mean square error, N.
+        peak: Largest force, N.
+        work: Integral of the force over the nominal depth, J.
+    """
+
+    name: str
+    time: np.ndarray
+    force: np.ndarray
+    shift: float
+    rms: float
+    peak: float
+    work: float
+
+
+@dc.dataclass
+class FoodComparison:
+    """All simulators on one food.
+
+    Attributes:
+        food: Its name.
+        time, measured: The record [m], s and N.
+        rows: Of the simulators; the last is ours.
+        calibration: Ours.
+        minutes: What it took.
+    """
+
+    food: str
+    time: np.ndarray
+    measured: np.ndarray
+    rows: list[Row]
+    calibration: Calibration
+    minutes: float
+
+
+def compare(calibration: Calibration, profile: ForceProfile, minutes: float) -> FoodComparison:
+    """Compares on the samples that the calibration was fitted to.
+
+    The other simulators' curves get the time shift that brings them nearest; ours has its own
+    height, speed and time among its parameters.
+    """
+    (target,), (prediction,) = calibration.predictor.targets, calibration.predictions
+    time, measured = target.time, target.measured[:, 0]
+    speed = float(calibration.predictor.targets[0].record.metadata.motion.speed or 0.0)
+    rows = []
+    for name, reference in profile.references.items():
+        shift = _best_shift(time, measured, profile.time, reference)
+        force = np.interp(time - shift, profile.time, reference)
+        rows.append(_row(name, time, force, measured, shift, speed))
+    ours = prediction.predicted[:, 0]
+    rows.append(_row("ours", time, ours, measured, 0.0, speed))
+    return FoodComparison(calibration.setup.food.name, time, measured, rows, calibration, minutes)
+
+
+def _best_shift(
+    time: np.ndarray, measured: np.ndarray, reference_time: np.ndarray, reference: np.ndarray
+) -> float:
+    def square(shift: float) -> float:
+        force = np.interp(time - shift, reference_time, reference)
+        return float(np.mean((force - measured) ** 2))
+
+    grid = np.linspace(-LARGEST_SHIFT, LARGEST_SHIFT, 161)
+    best = float(grid[int(np.argmin([square(s) for s in grid]))])
+    step = grid[1] - grid[0]
+    fit = minimize_scalar(square, bounds=(best - step, best + step), method="bounded")
+    return float(fit.x)
+
+
+def _row(
+    name: str,
+    time: np.ndarray,
+    force: np.ndarray,
+    measured: np.ndarray,
+    shift: float,
+    speed: float,
+) -> Row:
+    rms = float(np.sqrt(np.mean((force - measured) ** 2)))
+    work = float(np.trapezoid(force, time)) * speed
+    return Row(name, time, force, shift, rms, float(force.max()), work)
+
+
+def table(comparisons: Sequence[FoodComparison]) -> str:
+    """The comparison as Markdown."""
+    lines = [
+        "| food | simulator | RMS error [N] | peak [N] | work [J] | time shift [ms] |"
+        " free parameters | held-out RMS [N] |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for c in comparisons:
+        speed = c.calibration.predictor.targets[0].record.metadata.motion.speed or 0.0
+        work = float(np.trapezoid(c.measured, c.time)) * speed
+        lines.append(f"| {c.food} | measured | | {c.measured.max():.1f} | {work:.3f} | | | |")
+        for row in c.rows:
+            own = row.name == "ours"
+            count = ""
+            held = ""
+            if own:
+                k = c.calibration
+                waves = 3 * (k.setup.oscillation is not None)
+                count = str(len(k.unit) + waves)
+                held = f"{k.held_out_rms:.2f}" if k.held_out_rms is not None else ""
+            shift = "fitted" if own else f"{1e3 * row.shift:.0f}"
+            name = "**ours**" if own else NAMES.get(row.name, row.name)
+            lines.append(
+                f"| {c.food} | {name} | {row.rms:.2f} | {row.peak:.1f} | {row.work:.3f} | {shift} "
+                f"| {count} | {held} |"
+            )
+    lines += [
+        "",
+        "| food | ours / half of DiSECt's | search [N] | after Adam [N] | polished [N] | minutes |",
+        "|---|---|---|---|---|---|",
+    ]
+    for c in comparisons:
+        half = 0.5 * next(r.rms for r in c.rows if r.name == "DiSECt")
+        k = c.calibration
+        lines.append(
+            f"| {c.food} | {k.rms / half:.2f} | {k.search_rms:.3f} | {k.refined_rms:.3f} "
+            f"| {k.rms:.3f} | {c.minutes:.1f} |"
+        )
+    return "\n".join(lines)
+
+
+def plot_comparisons(comparisons: Sequence[FoodComparison], file: Path) -> None:
+    """Measured and simulated curves of all foods, with what ours leaves."""
+    figure = Figure(figsize=(4.6 * len(comparisons), 4.6), layout="constrained")
+    axes = figure.subplots(
+        2,
+        len(comparisons),
+        squeeze=False,
+        sharex="col",
+        gridspec_kw={"height_ratios": (3, 1)},
+    )
+    for column, c in enumerate(comparisons):
+        upper, lower = axes[0, column], axes[1, column]
+        upper.plot(c.time, c.measured, color="#111827", lw=1.8, label="measured")
+        for row in c.rows:
+            style = "-" if row.name == "ours" else "--"
+            label = "ours" if row.name == "ours" else NAMES.get(row.name, row.name)
+            colour = COLOURS.get(row.name)
+            upper.plot(
+                c.time, row.force, style, color=colour, lw=1.1, label=f"{label}, {row.rms:.2f} N"
+            )
+            if row.name != "spring":
+                lower.plot(c.time, row.force - c.measured, style, color=colour, lw=1.0)
+        upper.set_title(c.food)
+        upper.legend(frameon=False, fontsize=7)
+        lower.set_xlabel("time [s]")
+        for axis in (upper, lower):
+            axis.grid(alpha=0.25)
+    axes[0, 0].set_ylabel("force [N]")
+    axes[1, 0].set_ylabel("error [N]")
+    figure.savefig(file, dpi=150)

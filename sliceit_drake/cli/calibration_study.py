@@ -1,0 +1,91 @@
+"""`sliceit study calibration`: the paper's measured curves, calibrated and compared."""
+
+import argparse
+import os
+from pathlib import Path
+
+__all__ = ["add_calibration_study"]
+
+FOODS = ("cucumber", "tomato", "potato")
+
+DESCRIPTION = """\
+Calibrate the three foods that the paper measured, and compare with its two simulators.
+
+Runs `sliceit calibrate` on calibration/records for each food and writes to FOLDER the table
+(calibration.md), the figure (calibration.png), and a folder for each food with what `calibrate`
+leaves. A run that was killed goes on where it was. docs/calibration.md explains what comes out.
+"""
+
+
+def add_calibration_study(studies: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Adds the study."""
+    parser = studies.add_parser(
+        "calibration",
+        help="the paper's measured curves, calibrated and compared",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--output", metavar="FOLDER", type=Path, required=True)
+    parser.add_argument("--foods", nargs="+", choices=FOODS, default=list(FOODS))
+    parser.add_argument("--trials", type=int, default=500, help="of the search (default 500)")
+    parser.add_argument("--steps", type=int, default=100, help="of Adam (default 100)")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
+    import datetime
+    import time
+
+    from tqdm import tqdm
+
+    from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate, write_json
+    from sliceit_drake.calibration.comparison import compare, plot_comparisons, table
+    from sliceit_drake.calibration.report import figure
+    from sliceit_drake.calibration.setup import load_setup
+    from sliceit_drake.configuration import dump_yaml
+    from sliceit_drake.records.force_profile import load_force_profile
+    from sliceit_drake.records.validation import load_record
+    from sliceit_drake.resources import resource_path
+
+    comparisons = []
+    for food in options.foods:
+        record = load_record(resource_path(f"calibration/records/{food}.csv"))
+        profile = load_force_profile(
+            resource_path(f"calibration/measured/sliceit_real_{food}_force.csv")
+        )
+        folder = options.output / food
+        begin = time.monotonic()
+        bars: dict[str, tqdm] = {}
+
+        def show(
+            stage: str, done: int, total: int, error: float, bars: dict = bars, food: str = food
+        ) -> None:
+            bar = bars.setdefault(stage, tqdm(total=total, desc=f"{food}: {stage}"))
+            bar.set_postfix_str(f"best RMS {error:.3f} N", refresh=False)
+            bar.update(done - bar.n)
+
+        settings = CalibrationOptions(
+            trials=options.trials, steps=options.steps, workers=options.workers
+        )
+        result = calibrate(load_setup(food), [record], folder, settings, progress=show)
+        for bar in bars.values():
+            bar.close()
+        minutes = (time.monotonic() - begin) / 60.0
+        command = (
+            f"sliceit study calibration --foods {food} --trials {options.trials} --steps "
+            f"{options.steps}"
+        )
+        calibrated = result.calibrated_food(datetime.date.today().isoformat(), command)
+        dump_yaml(calibrated, folder / "food.yaml")
+        write_json(result, folder / "calibration.json")
+        figure(result, folder / "fit.png")
+        comparisons.append(compare(result, profile, minutes))
+        for line in result.posterior.remarks():
+            print(f"{food}: {line}")
+    text = table(comparisons) + "\n"
+    print(text)
+    (options.output / "calibration.md").write_text(text, encoding="utf-8")
+    plot_comparisons(comparisons, options.output / "calibration.png")
+    return 0
