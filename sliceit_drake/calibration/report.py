@@ -27,9 +27,7 @@ def parameter_table(
     for name in names:
         low, high = intervals[name]
         remark = "" if determined[name] else "  not determined by these records"
-        lines.append(
-            f"{name:{width}}  {values[name]:10.4g}  {low:10.4g} to {high:9.4g}{remark}"
-        )
+        lines.append(f"{name:{width}}  {values[name]:10.4g}  {low:10.4g} to {high:9.4g}{remark}")
     return "\n".join(lines)
 
 
@@ -53,7 +51,9 @@ def figure(calibration: Calibration, file: Path) -> None:
     axes = sheet.subplots(
         2, len(shown), squeeze=False, sharex="col", gridspec_kw={"height_ratios": (3, 1)}
     )
-    for column, (target, prediction) in enumerate(zip(shown, calibration.predictions, strict=False)):
+    for column, (target, prediction) in enumerate(
+        zip(shown, calibration.predictions, strict=False)
+    ):
         upper, lower = axes[0, column], axes[1, column]
         channels = ("force",) if target.by_norm else CHANNELS
         for c, name in enumerate(channels):

@@ -35,7 +35,9 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("records", metavar="RECORD", nargs="*", type=Path, help="NAME.csv or folder")
+    parser.add_argument(
+        "records", metavar="RECORD", nargs="*", type=Path, help="NAME.csv or folder"
+    )
     parser.add_argument("--food", metavar="NAME", help="a setup by name, or a YAML file of one")
     parser.add_argument("--output", metavar="DIR", type=Path, help="where the results go")
     parser.add_argument("--show", metavar="NAME", help="print a calibrated food and stop")
@@ -55,7 +57,10 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         help="records that are predicted but not fitted",
     )
     parser.add_argument(
-        "--blocks", type=int, default=5, help="blocks of depth held out in turn (default 5; 0: none)"
+        "--blocks",
+        type=int,
+        default=5,
+        help="blocks of depth held out in turn (default 5; 0: none)",
     )
     parser.set_defaults(run=run)
 
@@ -160,9 +165,7 @@ def _calibrate(options: argparse.Namespace) -> int:
     values = result.predictor.values(result.unit)
     posterior = result.posterior
     print(
-        parameter_table(
-            posterior.names, values, posterior.intervals(0.9), posterior.determined()
-        )
+        parameter_table(posterior.names, values, posterior.intervals(0.9), posterior.determined())
     )
     for line in posterior.remarks():
         print(line)
