@@ -4,11 +4,16 @@ import copy
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
+from sliceit_drake.calibration.coverage import Problem, synthetic_predictor
 from sliceit_drake.calibration.gauss_newton import gauss_newton
+from sliceit_drake.calibration.held_out import blocked_error, record_error
 from sliceit_drake.calibration.noise import NoiseModel, group_series
+from sliceit_drake.calibration.posterior import Posterior
 from sliceit_drake.calibration.prediction import Parameter
-from sliceit_drake.calibration.uncertainty import estimate
+from sliceit_drake.calibration.uncertainty import estimate, profile_likelihood
+from sliceit_drake.configuration import dump_yaml, load_yaml
 
 
 class MapModel:
@@ -113,6 +118,200 @@ def test_intervals_of_the_linear_problem_cover_the_truth_as_often_as_they_say():
         reach = 1.645 * result.deviation
         covered.append(np.abs(np.array(result.mean) - truth) < reach)
     share = np.mean(covered, axis=0)
-    print(share, np.mean(naive, axis=0))
     assert (share > 0.80).all() and (share < 0.98).all()
     assert np.mean(naive) < 0.7
+
+
+def small_model(columns, function=None, noise=0.1, seed=3, log=False):
+    """One record [n] that is linear in the places [d], or a function of them; white noise."""
+    n, d = columns.shape
+    time = np.linspace(0.0, 1.5, n)
+    names = [f"p{k}" for k in range(d)]
+    model = MapModel(function or (lambda u: columns @ u), names, [time], [""], log)
+    truth = np.linspace(0.4, 0.6, d)
+    rng = np.random.default_rng(seed)
+    model.measured = model.function(truth) + noise * rng.normal(size=n)
+    return model, truth
+
+
+def shapes(n, d):
+    x = np.linspace(0.0, 1.0, n)[:, None]
+    return np.cos(np.pi * x * np.arange(d)) * 4.0
+
+
+def test_a_single_record_is_said_to_tell_nothing_of_how_slices_differ():
+    model, truth = small_model(shapes(120, 2))
+    posterior = estimate(model, truth).posterior
+    assert posterior.record_variation is None
+    assert any("no cut was repeated" in line for line in posterior.remarks())
+
+
+def test_what_only_enters_in_a_combination_is_named():
+    columns = shapes(200, 3)
+    columns[:, 1] = -0.8 * columns[:, 2]
+    model, truth = small_model(columns, noise=0.02)
+    posterior = estimate(model, truth).posterior
+    assert posterior.determined() == {"p0": True, "p1": False, "p2": False}
+    ((one, other, correlation),) = posterior.correlated_pairs()
+    assert (one, other) == ("p1", "p2") and correlation > 0.9
+    assert any("p1 and p2" in r and "only a combination" in r for r in posterior.remarks())
+    (direction,) = posterior.undetermined_directions()
+    assert direction["p1"] / direction["p2"] == pytest.approx(1.0 / 0.8, rel=0.05)
+    # As wide as the range is, and not wider.
+    assert posterior.deviation[1] < np.sqrt(1.0 / 12.0)
+
+
+def test_a_parameter_without_effect_keeps_its_range():
+    columns = shapes(100, 2)
+    columns[:, 1] = 0.0
+    model, _ = small_model(columns, log=True)
+    posterior = estimate(model, np.array([0.5, 0.9])).posterior
+    assert posterior.mean[1] == pytest.approx(0.5)
+    assert posterior.deviation[1] == pytest.approx(np.sqrt(1.0 / 12.0))
+    assert posterior.determined() == {"p0": True, "p1": False}
+
+
+def example_posterior():
+    return Posterior(
+        names=["a", "b", "c"],
+        low=[1.0, -2.0, 1e-6],
+        high=[100.0, 2.0, 1e-3],
+        log=[True, False, True],
+        mean=[0.95, 0.5, 0.4],
+        covariance=[[0.01, 0.0, 0.0], [0.0, 2.5e-3, -1.8e-3], [0.0, -1.8e-3, 2.0e-3]],
+        effective_samples=31.5,
+        notes=["a note"],
+    )
+
+
+def test_intervals_do_not_leave_the_ranges_and_follow_the_scale():
+    intervals = example_posterior().intervals(0.9)
+    assert intervals["a"][1] == 100.0
+    assert intervals["a"][0] == pytest.approx(100.0 ** (0.95 - 1.6449 * 0.1), rel=1e-3)
+    assert intervals["b"] == pytest.approx((-4.0 * 1.6449 * 0.05, 4.0 * 1.6449 * 0.05), rel=1e-3)
+
+
+def test_drawn_places_have_the_covariance_and_stay_within_the_ranges():
+    posterior = example_posterior()
+    places = posterior.draw_places(np.random.default_rng(1), 20_000)
+    assert places.shape == (20_000, 3) and (places >= 0.0).all() and (places <= 1.0).all()
+    C = np.array(posterior.covariance)[1:, 1:]
+    assert np.cov(places[:, 1:].T) == pytest.approx(C, abs=1e-4)
+    assert places[:, 1:].mean(0) == pytest.approx([0.5, 0.4], abs=2e-3)
+    values = posterior.draw(np.random.default_rng(1), 5)
+    assert values[0]["a"] == pytest.approx(100.0 ** places[0, 0])
+
+
+def test_a_posterior_is_read_back_from_yaml_as_it_was(tmp_path):
+    dump_yaml(example_posterior(), tmp_path / "posterior.yaml")
+    assert load_yaml(Posterior, tmp_path / "posterior.yaml") == example_posterior()
+
+
+def test_the_profile_of_a_linear_problem_is_the_interval_of_the_normal_approximation():
+    model, truth = small_model(shapes(150, 3), noise=0.8)
+    found = estimate(model, truth)
+    for name in ("p0", "p2"):
+        profile = profile_likelihood(model, found, name)
+        assert profile.warning is None
+        assert profile.drops == pytest.approx(profile.expected, rel=1e-3)
+        assert profile.interval == pytest.approx(found.posterior.intervals(0.9)[name], rel=1e-3)
+
+
+def test_a_profile_that_bends_is_reported():
+    columns = shapes(150, 2)
+
+    def bent(unit):
+        # Steep below 0.5, flat above it.
+        x = unit[0] - 0.5
+        return columns @ np.array([x - 0.45 * np.sqrt(x**2 + 1e-4), unit[1]])
+
+    model, _ = small_model(columns, bent, noise=1.0)
+    model.measured = bent(np.array([0.5, 0.5])) + 1.0 * np.random.default_rng(8).normal(size=150)
+    found = estimate(model, np.array([0.5, 0.5]))
+    profile = profile_likelihood(model, found, "p0")
+    assert profile.warning is not None and "p0" in profile.warning
+
+
+def test_gauss_newton_stops_at_the_end_of_a_range():
+    columns = shapes(60, 2) + 1.0
+    model, _ = small_model(columns, noise=0.0)
+    model.measured = columns @ np.array([1.3, 0.4])
+    fit = gauss_newton(model, np.array([0.5, 0.5]))
+    assert fit.converged and fit.unit[0] == 1.0
+    # The other is best where the first is held, not where it would be without the bound.
+    best = columns[:, 1] @ (model.measured - columns[:, 0]) / (columns[:, 1] @ columns[:, 1])
+    assert fit.unit[1] == pytest.approx(best, abs=1e-6)
+    assert all((u >= 0.0).all() and (u <= 1.0).all() for u in model.tried)
+
+
+def test_gauss_newton_takes_no_step_to_where_a_slice_breaks_down():
+    columns = shapes(60, 2)
+
+    def fragile(unit):
+        return columns @ unit**2 if unit[0] < 0.7 else np.full(60, np.nan)
+
+    model, _ = small_model(columns, fragile, noise=0.0)
+    model.measured = columns @ np.array([0.69, 0.5]) ** 2
+    fit = gauss_newton(model, np.array([0.1, 0.1]), steps=20, tolerance=1e-8)
+    assert any(u[0] >= 0.7 for u in model.tried)
+    assert fit.unit == pytest.approx([0.69, 0.5], abs=1e-3)
+
+
+def test_gauss_newton_moves_only_what_is_free():
+    model, truth = small_model(shapes(60, 3))
+    free = np.array([True, False, True])
+    fit = gauss_newton(model, np.full(3, 0.1), free=free)
+    assert fit.unit[1] == 0.1 and (np.abs(fit.unit - 0.1)[free] > 0.2).all()
+
+
+def test_held_out_blocks_of_depth_show_an_overfit_and_fitted_error_does_not():
+    x = np.linspace(0.0, 1.0, 100)
+    rng = np.random.default_rng(2)
+    wave = 0.3 * np.cumsum(rng.normal(size=100)) / 5.0
+    errors = []
+    for bumps in (0, 25):
+        centers = np.linspace(0.0, 1.0, bumps)
+        columns = np.column_stack([4.0 * x, *(np.exp(-(((x - c) / 0.03) ** 2)) for c in centers)])
+        model, truth = small_model(columns, noise=0.0)
+        model.measured = 2.0 * x + wave + 0.5 * columns[:, 1:].sum(1)
+        fit = gauss_newton(model, truth)
+        held = blocked_error(model, fit.unit)
+        assert len(held.blocks) == 5 and sum(held.counts) == 100
+        assert held.rms == pytest.approx(
+            np.sqrt(np.average(np.square(held.blocks), weights=held.counts))
+        )
+        errors.append((held.fitted, held.rms))
+    assert errors[1][0] < 0.5 * errors[0][0]
+    assert errors[1][1] > 2.0 * errors[1][0]
+
+
+def test_a_record_that_is_held_out_has_the_others_height():
+    n = 40
+    time = np.linspace(0.0, 1.0, n)
+    index = np.repeat([0, 1, 2], n)
+
+    def force(unit):
+        return 4.0 * unit[0] * np.tile(time, 3) + unit[1 + index]
+
+    names = ["stiffness", "height_offset:a", "height_offset:b", "height_offset:c"]
+    model = MapModel(force, names, [time] * 3, ["x"] * 3)
+    truth = np.array([0.5, 0.2, 0.4, 0.9])
+    model.measured = force(truth)
+    held = record_error(model, gauss_newton(model, np.full(4, 0.5)).unit)
+    assert held.names == ["a", "b", "c"] and held.fitted < 1e-5
+    assert held.blocks == pytest.approx([0.65 - 0.2, 0.55 - 0.4, 0.9 - 0.3], abs=1e-3)
+
+
+def test_parameters_of_simulated_cuts_are_found_within_their_intervals():
+    problem = Problem(speeds=(0.15,), records=1)
+    rng = np.random.default_rng(4)
+    truth = np.array([0.5, 0.45, 0.6, 0.45])
+    predictor, _ = synthetic_predictor(problem, truth, rng)
+    fit = gauss_newton(predictor, truth + [0.05, -0.08, 0.06, 0.05])
+    found = estimate(predictor, fit.unit)
+    posterior = found.posterior
+    values = posterior.values(truth)
+    for name, (low, high) in posterior.intervals(0.99).items():
+        assert low <= values[name] <= high, name
+    # The data say something: force and friction go together, and each is known.
+    assert posterior.determined()["material.friction"]

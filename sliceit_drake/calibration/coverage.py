@@ -35,6 +35,8 @@ __all__ = [
 LEVEL = 0.9
 LEAST, MOST = 0.80, 0.98
 """Between which the share of 90 % intervals that hold the truth must be."""
+LEAST_SQUARES_STEPS = 5
+"""Before the weighted fit."""
 CLEARANCE, REST = 2.5e-3, 6e-3
 """Of the knife above the food at the start, and above the board at the end, m: no record's height
 brings it to the board, where the force has a kink that no normal distribution describes."""
@@ -52,6 +54,8 @@ class Problem:
         time_step: Sub-step, s.
         ar, tau, white: Noise of each channel: autoregressive part [N], its time [s], white part.
         record_scale: Relative standard deviation of the force between slices.
+        height_offset: Range of each record's height to both sides, m. The force on coarse elements
+            has waves of some millimetres in depth; beyond a part of one there are several fits.
         middle: Part of the unit range, about its middle, that true values are drawn from.
         start_error: Standard deviation of the start from the truth, in the unit range.
     """
@@ -65,6 +69,7 @@ class Problem:
     tau: float = 0.02
     white: float = 0.02
     record_scale: float = 0.05
+    height_offset: float = 5e-4
     middle: float = 0.5
     start_error: float = 0.1
 
@@ -96,12 +101,13 @@ class Replicate:
     rms: float
 
 
-def coarse_setup(names: Sequence[str]) -> CalibrationSetup:
-    """The cucumber's setup on some 300 tetrahedra with only these parameters searched."""
+def coarse_setup(problem: Problem) -> CalibrationSetup:
+    """The cucumber's setup on some 300 tetrahedra with only the problem's parameters searched."""
     setup = load_setup("cucumber")
     assert isinstance(setup.food.shape, Cylinder)
     setup.food.shape.rings, setup.food.shape.layers = 2, [0.0, 4e-3, 12e-3]
-    setup.parameters = [p for p in setup.parameters if p.name in names]
+    setup.parameters = [p for p in setup.parameters if p.name in problem.names]
+    setup.height_offset = [-problem.height_offset, problem.height_offset]
     setup.oscillation = None
     return setup
 
@@ -135,7 +141,7 @@ def synthetic_predictor(
     Raises:
         ConfigurationError: A slice breaks down at the truth.
     """
-    setup = coarse_setup(problem.names)
+    setup = coarse_setup(problem)
     assert isinstance(setup.food.shape, Cylinder)
     records = [
         press_record(f"{k}-{n}", setup.food.shape.diameter, speed, problem.rate)
@@ -176,7 +182,7 @@ def run_replicate(problem: Problem, number: int) -> Replicate:
     rng = np.random.default_rng(number)
     predictor, truth = synthetic_predictor(problem, None, rng)
     start = np.clip(truth + rng.normal(0.0, problem.start_error, len(truth)), 0.02, 0.98)
-    fit = gauss_newton(predictor, start)
+    fit = gauss_newton(predictor, start, steps=LEAST_SQUARES_STEPS)
     found = estimate(predictor, fit.unit)
     mean, deviation = found.unit, found.posterior.deviation
     reach = float(ndtri(0.5 + LEVEL / 2.0)) * deviation
