@@ -12,8 +12,9 @@ from sliceit_drake.calibration.held_out import blocked_error, record_error
 from sliceit_drake.calibration.noise import NoiseModel, group_series
 from sliceit_drake.calibration.posterior import Posterior
 from sliceit_drake.calibration.prediction import Parameter
-from sliceit_drake.calibration.uncertainty import estimate, profile_likelihood
+from sliceit_drake.calibration.uncertainty import estimate, estimate_posterior, profile_likelihood
 from sliceit_drake.configuration import dump_yaml, load_yaml
+from sliceit_drake.cutting.solver import CuttingError
 
 
 class MapModel:
@@ -230,6 +231,25 @@ def test_a_profile_that_bends_is_reported():
     found = estimate(model, np.array([0.5, 0.5]))
     profile = profile_likelihood(model, found, "p0")
     assert profile.warning is not None and "p0" in profile.warning
+    assert profile.warning in estimate_posterior(model, found.unit, ["p0"]).remarks()
+
+
+def test_a_profile_says_where_slices_break_down():
+    columns = shapes(150, 2)
+    model, truth = small_model(columns, noise=1.0)
+    found = estimate(model, truth)
+    edge = found.unit[0] + 1e-3
+
+    def jacobian(unit):
+        if unit[0] > edge:
+            raise CuttingError("a slice breaks down")
+        return columns @ unit - model.measured, columns
+
+    model.jacobian = jacobian
+    profile = profile_likelihood(model, found, "p0")
+    assert "above breaks slices down" in profile.warning
+    low, high = found.posterior.intervals(0.9)["p0"]
+    assert profile.interval == pytest.approx((low, high), rel=1e-3)
 
 
 def test_gauss_newton_stops_at_the_end_of_a_range():

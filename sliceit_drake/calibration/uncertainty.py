@@ -20,6 +20,7 @@ from sliceit_drake.calibration.gauss_newton import (
 from sliceit_drake.calibration.noise import NoiseFit, NoiseModel, fit_noise, group_series
 from sliceit_drake.calibration.posterior import Posterior
 from sliceit_drake.calibration.prediction import Parameter
+from sliceit_drake.cutting.solver import CuttingError
 
 __all__ = [
     "Estimate",
@@ -75,17 +76,26 @@ class Estimate:
     covariance: np.ndarray
 
 
-def estimate_posterior(model: RecordModel, unit: np.ndarray) -> Posterior:
+def estimate_posterior(
+    model: RecordModel, unit: np.ndarray, profiled: Sequence[str] = ()
+) -> Posterior:
     """Posterior of the parameters; see `estimate`.
 
     Args:
         model: Of the records.
         unit: A good fit, such as that of least squares [d].
+        profiled: Parameters whose intervals are compared with `profile_likelihood`; where the two
+            disagree the posterior's notes say so.
 
     Raises:
         CuttingError: A slice breaks down near `unit`.
     """
-    return estimate(model, unit).posterior
+    found = estimate(model, unit)
+    for name in profiled:
+        warning = profile_likelihood(model, found, name).warning
+        if warning is not None:
+            found.posterior.notes.append(warning)
+    return found.posterior
 
 
 def estimate(model: RecordModel, unit: np.ndarray, rounds: int = ROUNDS) -> Estimate:
@@ -232,7 +242,7 @@ def profile_likelihood(
         the noise.
 
     Raises:
-        CuttingError: A slice breaks down near a place.
+        CuttingError: A slice breaks down near the estimate.
         ValueError: There is no such parameter.
     """
     names = [p.name for p in model.parameters]
@@ -242,8 +252,8 @@ def profile_likelihood(
     sd = float(np.sqrt(found.covariance[k, k]))
     widening = float(np.sqrt(found.posterior.covariance[k][k])) / sd
     others = np.arange(len(names)) != k
+    # The last step may have left the estimate a little off the middle.
     best = _refit(model, found, found.unit, np.ones(len(names), bool), steps)
-    # Where the prior or the last step moved the others, the middle is not quite the estimate.
     places, drops, expected, ends, faults = [], [], [], [], []
     for side in (-1.0, 1.0):
         line = [(0.0, 0.0)]
@@ -255,25 +265,29 @@ def profile_likelihood(
             slope = found.covariance[k] / found.covariance[k, k]
             start = np.clip(found.unit + slope * (place - found.unit[k]), 0.0, 1.0)
             start[k] = place
-            fit = _refit(model, found, start, others, steps)
+            try:
+                fit = _refit(model, found, start, others, steps)
+            except CuttingError:
+                faults.append(f"{_side(side)} breaks slices down")
+                break
             drop = max(fit.cost - best.cost, 0.0)
             line.append((away, float(np.sqrt(drop))))
             places.append(place)
             drops.append(drop)
             expected.append(away**2)
-        reach = _crossing(line, z)
         limit = found.unit[k] if side < 0.0 else 1.0 - found.unit[k]
+        reach = _crossing(line, z) if len(line) > 1 else min(z, limit / sd)
         if len(line) > 1:
             ratio = min(reach, limit / sd) / min(z, limit / sd)
             if abs(ratio - 1.0) > DISAGREEMENT:
-                faults.append(f"{'below' if side < 0.0 else 'above'} {ratio:.2g} times as far")
+                faults.append(f"{_side(side)} reaches {ratio:.2g} times as far")
         ends.append(float(np.clip(found.unit[k] + side * reach * sd * widening, 0.0, 1.0)))
     parameter = model.parameters[k]
     warning = None
     if faults:
         warning = (
-            f"{name}: the profile of the likelihood reaches {' and '.join(faults)} as the normal "
-            "approximation"
+            f"{name}: the likelihood is not that of the normal approximation; its profile "
+            f"{', and '.join(faults)}"
         )
     interval = (parameter.value(ends[0]), parameter.value(ends[1]))
     return Profile(name, np.array(places), np.array(drops), np.array(expected), interval, warning)
@@ -285,13 +299,15 @@ def _refit(
     return gauss_newton(model, start, noise=found.noise, free=free, steps=steps, tolerance=1e-6)
 
 
+def _side(side: float) -> str:
+    return "below" if side < 0.0 else "above"
+
+
 def _crossing(line: Sequence[tuple[float, float]], height: float) -> float:
     """Where a line through points of rising height reaches one; beyond them it goes on straight."""
     for (x0, y0), (x1, y1) in zip(line[:-1], line[1:], strict=True):
         if y1 >= height:
             return x0 + (height - y0) / (y1 - y0) * (x1 - x0)
-    if len(line) < 2:
-        return 0.0
     (x0, y0), (x1, y1) = line[-2:]
     rise = (y1 - y0) / (x1 - x0)
     return float("inf") if rise <= 0.0 else x1 + (height - y1) / rise
