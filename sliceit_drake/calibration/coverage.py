@@ -288,7 +288,9 @@ ranges and presses through a coarse cucumber with them, {problem.records} times 
 {speeds}. It adds noise: first-order autoregressive ({problem.ar:g} N,
 {1e3 * problem.tau:g} ms) and white ({problem.white:g} N) in each channel, and a scale of each
 record's force ({100.0 * problem.record_scale:g} %). Then it calibrates from a start
-{problem.start_error:g} of the range away, without knowing the noise.
+{problem.start_error:g} of the range away, without knowing the noise: least squares, then the fit
+weighted with the noise that it estimates. A record's height may be up to
+{1e3 * problem.height_offset:g} mm off.
 
 All parameters together: **{100.0 * share:.1f} %**, {verdict} {100.0 * LEAST:.0f} to
 {100.0 * MOST:.0f} %. With {n} replicates one parameter's share has a standard error of
@@ -304,6 +306,10 @@ records {_quantiles(100.0 * scale)} % of {100.0 * problem.record_scale:g} %, cor
 
 The records come from the model itself, so that this tests the statistics and not the model: on real
 food the model lacks something, and that error is in no interval. Held-out errors show it.
+
+Where a height may be off by more than a part of the force's waves over the elements (some
+millimetres), or may bring the knife to the board, there are several fits that noise does not tell
+apart, and no normal distribution covers them. `profile_likelihood` finds the second case.
 """
 
 

@@ -48,7 +48,8 @@ def blocked_error(
 
     Neighbouring samples share their error, so that samples held out one by one would be predicted
     by their neighbours; a block must be predicted by the physics. What lies above the food belongs
-    to the first block.
+    to the first block. What is a record's own (its height, its speed) stays as fitted: where the
+    knife was is not what is predicted.
 
     Args:
         model: Of the records.
@@ -66,7 +67,8 @@ def blocked_error(
         (f"{1e3 * low:.1f} to {1e3 * high:.1f} mm", block == k)
         for k, (low, high) in enumerate(zip(edges[:-1], edges[1:], strict=True))
     ]
-    return _held_out(model, unit, parts, steps)
+    shared = np.array([p.shared for p in model.parameters])
+    return _held_out(model, unit, parts, steps, shared)
 
 
 def record_error(model: HeldOutModel, unit: np.ndarray, steps: int = STEPS) -> HeldOutError:
@@ -90,7 +92,11 @@ def record_error(model: HeldOutModel, unit: np.ndarray, steps: int = STEPS) -> H
 
 
 def _held_out(
-    model: HeldOutModel, unit: np.ndarray, parts: list[tuple[str, np.ndarray]], steps: int
+    model: HeldOutModel,
+    unit: np.ndarray,
+    parts: list[tuple[str, np.ndarray]],
+    steps: int,
+    free: np.ndarray | None = None,
 ) -> HeldOutError:
     names, errors, counts = [], [], []
     squares = fitted = 0.0
@@ -101,7 +107,7 @@ def _held_out(
         if not held.any() or not rest.any():
             continue
         without = model.holding_out(~rest)
-        refit = gauss_newton(without, unit, steps=steps).unit
+        refit = gauss_newton(without, unit, free=free, steps=steps).unit
         place = _of_others(model, refit, set(model.record_of[rest]))
         (row,) = without.predict([place])
         error = (np.concatenate([p.predicted.ravel() for p in row]) - model.measured)[held]

@@ -125,25 +125,9 @@ class RecordTarget:
     def __init__(self, record: SliceRecord, model: CuttingModel, setup: CalibrationSetup) -> None:
         self.record, self.model = record, model
         self.by_norm = record.force is None
-        facts = record.metadata.food
-        yaw = facts.yaw or 0.0
-        R_FW = Rotation.from_euler("z", -yaw)
-        p = record.position.copy()
+        R_FW, rotation, p = poses_in_food(record, model)
         home = start_pose(model, 0.0)
-        unknown = set(record.metadata.unknown)
-        rotation = R_FW * Rotation.from_matrix(record.rotation)
-        if facts.position is None:
-            p = R_FW.apply(p - p[0]) + home.p
-            rotation = Rotation.from_matrix(home.R) * (rotation[0].inv() * rotation)
-        else:
-            p = R_FW.apply(p - np.array(facts.position))
-        if facts.position is None or "p_WK_z" in unknown or "food.position" in unknown:
-            # Height is measured from where the force begins.
-            force = record.force_magnitude
-            quiet = force[: max(3, len(force) // 50)].max()
-            onset = int(np.argmax(force > quiet + ONSET * force.max()))
-            p[:, 2] += home.p[2] - p[onset, 2]
-        self.unknown_speed = "motion.speed" in unknown
+        self.unknown_speed = "motion.speed" in record.metadata.unknown
         margin = CLEARANCE + max(abs(v) for v in setup.height_offset)
         height = p[:, 2] - home.p[2]
         low = np.flatnonzero(height < margin)
@@ -248,6 +232,7 @@ class Predictor:
         self.board = dc.replace(setup.board, height=0.0)
         self.parameters = self._list_parameters()
         self.used = np.ones(self.measured.size, bool)
+        self.point_factors: dict[str, np.ndarray] = {}
         self._simulator = BatchSimulator(EXCHANGE_PERIOD, self.board, workers)
         self._adjoints: dict[int, SliceAdjoint] = {}
 
@@ -311,8 +296,26 @@ class Predictor:
         Raises:
             TimeStepError: The step is beyond the limit and masses are not scaled.
         """
-        shared = {name: value for name, value in values.items() if ":" not in name}
-        return with_parameters(target.model, shared)
+        shared: dict[str, float | np.ndarray] = {
+            name: value for name, value in values.items() if ":" not in name
+        }
+        return with_parameters(target.model, shared | self.point_factors)
+
+    def with_point_factors(self, factors: Mapping[str, np.ndarray]) -> "Predictor":
+        """The same predictor with factors of each cut point, by name as `POINT_PARAMETERS`.
+
+        Raises:
+            ConfigurationError: The records' foods differ, and with them the cut points.
+        """
+        if len({id(t.model.split) for t in self.targets}) > 1:
+            raise ConfigurationError(
+                "are of foods of different sizes or supports, whose cut points differ",
+                field="RECORD",
+                fix="Fit each point with records of one food alone.",
+            )
+        other = copy.copy(self)
+        other.point_factors = dict(factors)
+        return other
 
     def motion(self, target: RecordTarget, values: Mapping[str, float]) -> _KnifeMotion:
         """The knife's motion of a record with these values."""
@@ -407,8 +410,34 @@ class Predictor:
         Raises:
             CuttingError: A slice broke down.
         """
+        square, gradient = self._gradient(unit, list(self.values(unit)))
+        slopes = np.array(
+            [gradient[p.name] * _slope(p, u) for p, u in zip(self.parameters, unit, strict=True)]
+        )
+        for k, parameter in enumerate(self.parameters):
+            if parameter.name in NO_ADJOINT:
+                slopes[k] = self._difference(unit, k)
+        return square, slopes
+
+    def mean_square_and_point_gradient(
+        self, unit: np.ndarray, name: str
+    ) -> tuple[float, np.ndarray]:
+        """As `mean_square_and_gradient`, by a factor of each cut point [P].
+
+        Args:
+            unit: Places in the ranges [d].
+            name: One of `cutting.parameters.POINT_PARAMETERS`.
+        """
+        square, gradient = self._gradient(unit, [name])
+        return square, np.asarray(gradient[name])
+
+    def _gradient(
+        self, unit: np.ndarray, names: Sequence[str]
+    ) -> tuple[float, dict[str, float | np.ndarray]]:
+        """Mean square of the used residuals and its derivatives by name, in the parameters' units;
+        0 for `NO_ADJOINT`."""
         values = self.values(unit)
-        gradient = dict.fromkeys(values, 0.0)
+        gradient: dict[str, float | np.ndarray] = dict.fromkeys(names, 0.0)
         total, scale = 0.0, float(self.used.sum())
         for target, used in zip(self.targets, self.split(self.used), strict=True):
             model, motion = self.model(target, values), self.motion(target, values)
@@ -426,20 +455,15 @@ class Predictor:
             of_force = np.zeros((len(run.wrenches), 3))
             of_force[:E] = target.adjoint(force, 2.0 * factor * residual / scale)
             back = adjoint.gradient(run, np.column_stack([0.0 * of_force, of_force @ R_FC]))
-            shared = [n for n in values if ":" not in n and n not in NO_ADJOINT]
+            shared = [n for n in names if ":" not in n and n not in NO_ADJOINT]
             for name, slope in pull_back(model, back, shared).items():
-                gradient[name] += float(slope)
+                gradient[name] = gradient[name] + slope
             for key in (f"{kind}:{target.record.name}" for kind in (HEIGHT, SPEED)):
-                if key in values:
+                if key in names:
                     of_position = back.position @ R_FC.T
-                    gradient[key] += self._by_motion(target, values, key, of_position, of_force)
-        slopes = np.array(
-            [gradient[p.name] * _slope(p, u) for p, u in zip(self.parameters, unit, strict=True)]
-        )
-        for k, parameter in enumerate(self.parameters):
-            if parameter.name in NO_ADJOINT:
-                slopes[k] = self._difference(unit, k)
-        return total / scale, slopes
+                    slope = self._by_motion(target, values, key, of_position, of_force)
+                    gradient[key] = gradient[key] + slope
+        return total / scale, gradient
 
     def _by_motion(
         self,
@@ -558,6 +582,41 @@ def _slope(parameter: Parameter, unit: float) -> float:
     if parameter.log:
         return float(parameter.value(unit) * np.log(parameter.high / parameter.low))
     return span
+
+
+def poses_in_food(
+    record: SliceRecord, model: CuttingModel
+) -> tuple[Rotation, Rotation, np.ndarray]:
+    """Poses of the knife relative to the food that it cuts.
+
+    Where food or heights are not known, contact is taken to begin over the middle of the cut, as
+    high as its top, when the force does.
+
+    Args:
+        record: With n rows.
+        model: The cut.
+
+    Returns:
+        R_FW, R_FK [n], p_FK [n, 3], metres.
+    """
+    facts = record.metadata.food
+    R_FW = Rotation.from_euler("z", -(facts.yaw or 0.0))
+    p = record.position.copy()
+    home = start_pose(model, 0.0)
+    unknown = set(record.metadata.unknown)
+    rotation = R_FW * Rotation.from_matrix(record.rotation)
+    if facts.position is None:
+        p = R_FW.apply(p - p[0]) + home.p
+        rotation = Rotation.from_matrix(home.R) * (rotation[0].inv() * rotation)
+    else:
+        p = R_FW.apply(p - np.array(facts.position))
+    if facts.position is None or "p_WK_z" in unknown or "food.position" in unknown:
+        # Height is measured from where the force begins.
+        force = record.force_magnitude
+        quiet = force[: max(3, len(force) // 50)].max()
+        onset = int(np.argmax(force > quiet + ONSET * force.max()))
+        p[:, 2] += home.p[2] - p[onset, 2]
+    return R_FW, rotation, p
 
 
 def food_of(food: Food, record: SliceRecord) -> Food:
