@@ -1,19 +1,28 @@
 """Uncertainty of a calibration: noise of records, intervals, profiles, held-out error, drawing."""
 
 import copy
+import dataclasses as dc
+import json
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from sliceit_drake.calibration.coverage import Problem, synthetic_predictor
+from sliceit_drake.calibration.coverage import (
+    Problem,
+    Replicate,
+    coverage_page,
+    coverage_share,
+    coverage_study,
+    synthetic_predictor,
+)
 from sliceit_drake.calibration.gauss_newton import gauss_newton
 from sliceit_drake.calibration.held_out import blocked_error, record_error
 from sliceit_drake.calibration.noise import NoiseModel, group_series
 from sliceit_drake.calibration.posterior import Posterior
 from sliceit_drake.calibration.prediction import Parameter
 from sliceit_drake.calibration.uncertainty import estimate, estimate_posterior, profile_likelihood
-from sliceit_drake.configuration import dump_yaml, load_yaml
+from sliceit_drake.configuration import ConfigurationError, dump_yaml, load_yaml
 from sliceit_drake.cutting.solver import CuttingError
 
 
@@ -335,3 +344,20 @@ def test_parameters_of_simulated_cuts_are_found_within_their_intervals():
         assert low <= values[name] <= high, name
     # The data say something: force and friction go together, and each is known.
     assert posterior.determined()["material.friction"]
+
+
+def test_a_coverage_study_goes_on_from_its_file_and_refuses_that_of_another(tmp_path):
+    problem, names = Problem(), ["material.friction", "height_offset:0-0"]
+    done = [
+        Replicate(k, repr(problem), names, *[[0.5, 0.5]] * 3, [True, k > 0], 0.05, 0.02, 0.1)
+        for k in range(2)
+    ]
+    file = tmp_path / "coverage.jsonl"
+    file.write_text("".join(json.dumps(dc.asdict(r)) + "\n" for r in reversed(done)))
+    results = coverage_study(problem, 2, file)
+    assert results == done and coverage_share(results) == 0.75
+    page = coverage_page(problem, results, "the command")
+    assert "| material.friction | 2 of 2 | 100 % |" in page
+    assert "| height_offset | 1 of 2 | 50 % |" in page and "**75.0 %**, outside" in page
+    with pytest.raises(ConfigurationError, match="another problem"):
+        coverage_study(Problem(records=2), 2, file)

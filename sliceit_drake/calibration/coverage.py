@@ -3,6 +3,7 @@
 import dataclasses as dc
 import json
 import multiprocessing
+import textwrap
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -35,6 +36,13 @@ __all__ = [
 LEVEL = 0.9
 LEAST, MOST = 0.80, 0.98
 """Between which the share of 90 % intervals that hold the truth must be."""
+LIMITS = """\
+The records come from the model itself, so that this tests the statistics and not the model: on real
+food the model lacks something, and that error is in no interval. Held-out errors show it. Where a
+height may be off by more than a part of the force's waves over the elements (some millimetres), or
+may bring the knife to the board, there are several fits that noise does not tell apart, and no
+normal distribution covers them.
+"""
 LEAST_SQUARES_STEPS = 5
 """Before the weighted fit."""
 CLEARANCE, REST = 2.5e-3, 6e-3
@@ -277,45 +285,47 @@ def coverage_page(problem: Problem, replicates: Sequence[Replicate], command: st
     scale = np.array([r.record_scale for r in replicates])
     tau = np.array([r.tau for r in replicates])
     speeds = " and ".join(f"{1e3 * s:g} mm/s" for s in problem.speeds)
-    return f"""\
-# Coverage of calibration intervals
-
-How often the 90 % interval of a calibrated parameter holds the true value. `{command}` writes this
-page; `sliceit_drake/calibration/coverage.py` says what is done.
-
-Each of {n} replicates draws true values from the middle {100.0 * problem.middle:.0f} % of the
-ranges and presses through a coarse cucumber with them, {problem.records} times at each of
-{speeds}. It adds noise: first-order autoregressive ({problem.ar:g} N,
-{1e3 * problem.tau:g} ms) and white ({problem.white:g} N) in each channel, and a scale of each
-record's force ({100.0 * problem.record_scale:g} %). Then it calibrates from a start
-{problem.start_error:g} of the range away, without knowing the noise: least squares, then the fit
-weighted with the noise that it estimates. A record's height may be up to
-{1e3 * problem.height_offset:g} mm off.
-
-All parameters together: **{100.0 * share:.1f} %**, {verdict} {100.0 * LEAST:.0f} to
-{100.0 * MOST:.0f} %. With {n} replicates one parameter's share has a standard error of
-{100.0 * error:.0f} %. Errors and standard deviations are in parts of the range.
-
-| parameter | inside | coverage | RMS error | stated standard deviation | mean error |
-|---|---|---|---|---|---|
-{chr(10).join(rows)}
-
-The noise as it was estimated (median, and 10 and 90 % quantiles of the replicates): scale between
-records {_quantiles(100.0 * scale)} % of {100.0 * problem.record_scale:g} %, correlation time
-{_quantiles(1e3 * tau)} ms of {1e3 * problem.tau:g} ms.
-
-The records come from the model itself, so that this tests the statistics and not the model: on real
-food the model lacks something, and that error is in no interval. Held-out errors show it.
-
-Where a height may be off by more than a part of the force's waves over the elements (some
-millimetres), or may bring the knife to the board, there are several fits that noise does not tell
-apart, and no normal distribution covers them. `profile_likelihood` finds the second case.
-"""
+    method = f"""How often the 90 % interval of a calibrated parameter holds the true value. Each of
+        {n}
+        replicates draws true values from the middle {100.0 * problem.middle:.0f} % of the ranges
+        and presses through a coarse cucumber with them, {problem.records} times at each of
+        {speeds}. It adds noise: first-order autoregressive ({problem.ar:g} N,
+        {1e3 * problem.tau:g} ms) and white ({problem.white:g} N) in each channel, and a scale of
+        each record's force ({100.0 * problem.record_scale:g} %). A record's height may be up to
+        {1e3 * problem.height_offset:g} mm off. Then it calibrates from a start
+        {problem.start_error:g} of the range away, without knowing the noise: least squares, then
+        the fit weighted with the noise that it estimates. `sliceit_drake/calibration/coverage.py`
+        has the details."""
+    result = f"""All parameters together: **{100.0 * share:.1f} %**, {verdict}
+        {100.0 * LEAST:.0f} to {100.0 * MOST:.0f} %. With {n} replicates the share of a parameter
+        that all records share has a standard error of {100.0 * error:.0f} %. Errors and standard
+        deviations are in parts of the range."""
+    noise = f"""The noise as it was estimated (median, and 10 and 90 % quantiles of the replicates):
+        scale between records {_quantiles(100.0 * scale)} % of {100.0 * problem.record_scale:g} %,
+        correlation time {_quantiles(1e3 * tau)} ms of {1e3 * problem.tau:g} ms."""
+    header = (
+        "| parameter | inside | coverage | RMS error | stated standard deviation | mean error |",
+        "|---|---|---|---|---|---|",
+    )
+    parts = [
+        "# Coverage of calibration intervals",
+        _paragraph(method),
+        f"    {command}",
+        _paragraph(result),
+        "\n".join((*header, *rows)),
+        _paragraph(noise),
+        _paragraph(LIMITS),
+    ]
+    return "\n\n".join(parts) + "\n"
 
 
 def coverage_share(replicates: Sequence[Replicate]) -> float:
     """Share of all intervals that hold the truth."""
     return float(np.mean([inside for r in replicates for inside in r.inside]))
+
+
+def _paragraph(text: str) -> str:
+    return textwrap.fill(" ".join(text.split()), 100)
 
 
 def _quantiles(values: np.ndarray) -> str:
