@@ -1,0 +1,1 @@
+"""What a simulation gets wrong in measured slices, and what may cause it."""

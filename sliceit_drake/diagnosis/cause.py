@@ -1,0 +1,292 @@
+"""What a cause is: a small class that changes the prediction of a slice in one way.
+
+A user's own cause is a file with one subclass (docs/causes.md has a complete example):
+
+    from sliceit_drake.diagnosis.cause import Cause, CauseParameter
+
+    class Suction(Cause):
+        '''Wet slices suck the blade down as it leaves.'''
+
+        name = "suction"
+        family = "knife and contact"
+        parameters = (CauseParameter("pull", "N", 0.5, low=0.0),)
+        signature = "a pull on the way out, none on the way in"
+        experiment = "retract"
+
+        def wrench(self, series, values, facts):
+            out = series.wrench.copy()
+            out[series.v[:, 2] > 0.0, 5] -= values["pull"]
+            return out
+"""
+
+import dataclasses as dc
+from collections.abc import Mapping
+
+import numpy as np
+
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.model import CuttingModel
+
+__all__ = [
+    "EXPERIMENTS",
+    "FAMILIES",
+    "Cause",
+    "CauseParameter",
+    "ForceSeries",
+    "Scan",
+    "SliceFacts",
+    "check_cause",
+]
+
+FAMILIES = (
+    "material",
+    "knife and contact",
+    "board, holder, geometry",
+    "sensor",
+    "robot",
+    "numerical",
+)
+
+EXPERIMENTS = {
+    "air": "move without contact at two speeds in two orientations",
+    "speeds": "cut at three speeds over a decade",
+    "draw": "cut with a draw of 0, 1 and 3 times the press",
+    "hold": "stop half way for some seconds",
+    "retract": "withdraw the knife through the cut",
+    "second_pass": "pass once more through the open cut",
+    "repeats": "repeat the cut in random order",
+    "board_press": "press the bare board at two speeds",
+    "weight": "hang a known weight on the knife in two orientations",
+    "skinned": "cut skinned food, or food of another width",
+    "finer": "compute again with half the step and a finer mesh",
+}
+"""What a cause may name as the experiment that reveals it."""
+
+
+@dc.dataclass(frozen=True)
+class CauseParameter:
+    """A number of a cause.
+
+    Attributes:
+        name: Its name.
+        unit: Its unit.
+        size: A size that matters and is plausible before any measurement, from the null.
+        low, high: Range.
+        null: Value at which the cause is absent.
+    """
+
+    name: str
+    unit: str
+    size: float
+    low: float = -np.inf
+    high: float = np.inf
+    null: float = 0.0
+
+    @property
+    def one_sided(self) -> bool:
+        """Whether the null is a bound, so that the cause can act in one direction alone."""
+        return self.null in (self.low, self.high)
+
+
+@dc.dataclass(frozen=True)
+class Scan:
+    """A number without a meaning where the cause is absent: it is tried at some values.
+
+    Attributes:
+        name: Its name.
+        unit: Its unit.
+        values: What is tried.
+        by_record: Whether each record has one of its own, as the time of an event.
+    """
+
+    name: str
+    unit: str
+    values: tuple[float, ...]
+    by_record: bool = False
+
+
+@dc.dataclass(frozen=True)
+class SliceFacts:
+    """What is known of a slice beside its motion.
+
+    Attributes:
+        name, condition: Of the record.
+        slice_index: Order in the session, from 0.
+        knife_slices: Slices cut since the knife was sharpened, before this; the order in the
+            session where that is not known.
+        peeled: Whether the skin is off.
+        food: Whether there is food.
+        height, width: Of the food's section, metres; 0 without food.
+        speed: Of the press while slicing, m/s; 0 where none is given.
+        draw_ratio: Draw over press speed while slicing.
+        tared: Whether the sensor was zeroed before the record.
+    """
+
+    name: str = ""
+    condition: str = ""
+    slice_index: int = 0
+    knife_slices: int = 0
+    peeled: bool = False
+    food: bool = True
+    height: float = 0.0
+    width: float = 0.0
+    speed: float = 0.0
+    draw_ratio: float = 0.0
+    tared: bool = True
+
+
+@dc.dataclass
+class ForceSeries:
+    """A predicted slice on an even grid of times; wrenches on the knife, moment about Ko and force,
+    in F, mean over the exchange that ends at the time, Nm and N.
+
+    Attributes:
+        time: Ends of the exchanges [N], s, on the record's clock.
+        R, p: Pose X_FK of the knife as recorded [N, 3, 3] and [N, 3], metres.
+        v, w: Velocity of Ko and angular velocity, in F [N, 3], m/s and rad/s.
+        parts: By mechanism, each [N, 6]: edge, normal, friction, board, weight.
+        depth: Of the edge below the top of the food [N], metres; negative above it.
+        in_contact: Whether food or board touch the knife [N].
+        wrench: Sum of the parts, as causes have changed it [N, 6].
+    """
+
+    time: np.ndarray
+    R: np.ndarray
+    p: np.ndarray
+    v: np.ndarray
+    w: np.ndarray
+    parts: dict[str, np.ndarray]
+    depth: np.ndarray
+    in_contact: np.ndarray
+    wrench: np.ndarray
+
+    @property
+    def period(self) -> float:
+        """Between two rows, s."""
+        return float(self.time[1] - self.time[0])
+
+    @property
+    def speed(self) -> np.ndarray:
+        """Of Ko [N], m/s."""
+        return np.asarray(np.linalg.norm(self.v, axis=1))
+
+    def in_knife(self, vectors: np.ndarray) -> np.ndarray:
+        """Vectors of F [N, 3] in the knife's axes K."""
+        return np.asarray(np.einsum("nji,nj->ni", self.R, vectors))
+
+    def in_food(self, vectors: np.ndarray) -> np.ndarray:
+        """Vectors of K [N, 3] or [3] in the food's axes F."""
+        if vectors.ndim == 1:
+            return np.asarray(self.R @ vectors)
+        return np.asarray(np.einsum("nij,nj->ni", self.R, vectors))
+
+
+class Cause:
+    """One way in which measured slices may differ from the base model.
+
+    Hooks do nothing unless they are overridden, and change nothing where all values are at their
+    null. `values` holds the parameters by name and, where there is a scan, its value by its name.
+
+    Attributes:
+        name: Short and unique, with underscores.
+        family: One of `FAMILIES`.
+        row: Row of the list of causes in docs/causes.md that it stands for; 0 for none.
+        parameters: Its numbers.
+        scan: A number that exists only where the cause does, or None.
+        per_record: Whether each record has values of its own, as the phase of a vibration.
+        uses_force: Whether its `motion` needs the force of the slice without it.
+        absorbed_by: Base parameters that are the same thing: where one of them is free, this is
+            no cause but a shift of it.
+        signature: What it does to the force, in words.
+        experiment: What reveals it, a key of `EXPERIMENTS`.
+    """
+
+    name = ""
+    family = ""
+    row = 0
+    parameters: tuple[CauseParameter, ...] = ()
+    scan: Scan | None = None
+    per_record = False
+    uses_force = False
+    absorbed_by: tuple[str, ...] = ()
+    signature = ""
+    experiment = ""
+
+    @property
+    def simulates(self) -> bool:
+        """Whether its slices must be simulated; else it only changes wrenches that are there."""
+        kind = type(self)
+        return kind.model is not Cause.model or kind.motion is not Cause.motion
+
+    def nulls(self) -> dict[str, float]:
+        """Values at which it is absent."""
+        return {p.name: p.null for p in self.parameters}
+
+    def model(
+        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
+    ) -> CuttingModel:
+        """The cut with the cause in it, derived from the cut without."""
+        return model
+
+    def motion(
+        self,
+        R: np.ndarray,
+        p: np.ndarray,
+        t: np.ndarray,
+        values: Mapping[str, float],
+        facts: SliceFacts,
+        force: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Poses of the knife relative to the food.
+
+        Args:
+            R, p: As recorded, in F at the exchanges [N + 1, 3, 3] and [N + 1, 3], metres.
+            t: Times [N + 1], s.
+            values: Of the cause.
+            facts: Of the slice.
+            force: Of the slice without the cause, in F at the ends of the exchanges [N, 3], N; None
+                unless the cause has `uses_force`, which costs a simulation more.
+        """
+        return R, p
+
+    def wrench(
+        self, series: ForceSeries, values: Mapping[str, float], facts: SliceFacts
+    ) -> np.ndarray:
+        """The wrench as it would be measured [N, 6], from `series.wrench`."""
+        return series.wrench
+
+
+def check_cause(cause: Cause, source: str = "") -> None:
+    """Refuses a cause that lacks what every cause has.
+
+    Raises:
+        ConfigurationError: Naming the attribute.
+    """
+
+    def refuse(attribute: str, problem: str, fix: str) -> ConfigurationError:
+        return ConfigurationError(
+            problem, source=source, field=f"{type(cause).__name__}.{attribute}", fix=fix
+        )
+
+    if not cause.name.isidentifier():
+        raise refuse("name", f"is {cause.name!r}", "Give a short name with underscores.")
+    if cause.family not in FAMILIES:
+        raise refuse("family", f"is {cause.family!r}", f"Give one of {', '.join(FAMILIES)}.")
+    if cause.experiment not in EXPERIMENTS:
+        raise refuse(
+            "experiment", f"is {cause.experiment!r}", f"Give one of {', '.join(EXPERIMENTS)}."
+        )
+    if not cause.parameters:
+        raise refuse("parameters", "is empty", "Give at least one CauseParameter.")
+    names = [p.name for p in cause.parameters] + ([cause.scan.name] if cause.scan else [])
+    if len(set(names)) < len(names):
+        raise refuse("parameters", "has a name twice", "Rename one.")
+    for p in cause.parameters:
+        if not (p.low <= p.null <= p.high and p.size > 0.0 and np.isfinite(p.size)):
+            raise refuse(
+                f"parameters.{p.name}",
+                f"has null {p.null:g}, size {p.size:g} and range {p.low:g} to {p.high:g}",
+                "Give a positive size and a null within the range.",
+            )
+        if cause.scan is not None and not cause.scan.values:
+            raise refuse("scan", "has no values", "Give some.")

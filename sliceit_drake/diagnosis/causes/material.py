@@ -1,0 +1,117 @@
+"""Causes in the food's material: rates, skin, core, the law of the draw."""
+
+import dataclasses as dc
+from collections.abc import Mapping
+
+from sliceit_drake.cutting.effects import Core, Relaxation, Skin, SlicePush, ToughnessRate
+from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan, SliceFacts
+
+__all__ = ["CoreRatio", "SkinToughness", "SlicePushLaw", "ToughnessBySpeed", "Viscoelasticity"]
+
+
+class Viscoelasticity(Cause):
+    """Bulk that relaxes: a share of the modulus fades with a time (a branch of a Prony series)."""
+
+    name = "viscoelasticity"
+    family = "material"
+    row = 1
+    parameters = (CauseParameter("share", "", 0.2, low=0.0, high=0.9),)
+    scan = Scan("time", "s", (0.05, 0.5, 3.0))
+    signature = "decays exponentially in a hold; grows with the logarithm of the speed"
+    experiment = "hold"
+
+    def model(
+        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
+    ) -> CuttingModel:
+        """A further branch."""
+        old = model.effects.relaxation
+        relaxation = Relaxation([*old.shares, values["share"]], [*old.times, values["time"]])
+        return model.derive(effects=dc.replace(model.effects, relaxation=relaxation))
+
+
+class ToughnessBySpeed(Cause):
+    """Toughness that goes with a power of the edge's speed."""
+
+    name = "toughness_rate"
+    family = "material"
+    row = 2
+    parameters = (CauseParameter("exponent", "", 0.08, low=-0.5, high=0.5),)
+    absorbed_by = ("effects.toughness_rate.exponent",)
+    signature = "scales the whole plateau with the speed; ceases at once when the edge stops"
+    experiment = "speeds"
+
+    def model(
+        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
+    ) -> CuttingModel:
+        """Another exponent."""
+        old = model.effects.toughness_rate
+        rate = ToughnessRate(old.exponent + values["exponent"], old.reference_speed)
+        return model.derive(effects=dc.replace(model.effects, toughness_rate=rate))
+
+
+class SkinToughness(Cause):
+    """A skin around the section, on all slices that are not peeled."""
+
+    name = "skin"
+    family = "material"
+    row = 7
+    parameters = (CauseParameter("toughness", "J/m", 0.5, low=0.0, high=20.0),)
+    scan = Scan("thickness", "m", (5e-4, 1.2e-3, 2.5e-3))
+    absorbed_by = ("effects.skin.toughness",)
+    signature = "peaks at entry and exit; none where the food is skinned"
+    experiment = "skinned"
+
+    def model(
+        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
+    ) -> CuttingModel:
+        """More skin; its thickness takes the place of the model's."""
+        if facts.peeled:
+            return model
+        skin = Skin(model.effects.skin.toughness + values["toughness"], values["thickness"])
+        return model.derive(effects=dc.replace(model.effects, skin=skin))
+
+
+class CoreRatio(Cause):
+    """A core that is less tough than the rind by a share, and half as much softer."""
+
+    name = "core"
+    family = "material"
+    row = 12
+    parameters = (CauseParameter("weakening", "", 0.3, low=-2.0, high=0.9),)
+    scan = Scan("rind", "", (0.15, 0.3, 0.5))
+    signature = "locked to depth, at any speed; another shape than the section's width"
+    experiment = "repeats"
+
+    def model(
+        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
+    ) -> CuttingModel:
+        """Another core; the rind is given as a share of half the section's size."""
+        half = 0.5 * min(facts.height, facts.width)
+        weakening, old = values["weakening"], model.effects.core
+        core = Core(
+            rind=values["rind"] * half,
+            transition=0.4 * half,
+            toughness_ratio=old.toughness_ratio * (1.0 - weakening),
+            stiffness_ratio=old.stiffness_ratio * (1.0 - 0.5 * weakening),
+        )
+        return model.derive(effects=dc.replace(model.effects, core=core))
+
+
+class SlicePushLaw(Cause):
+    """A draw that helps more or less than work per area says: (1 + xi^2)^-(1 + exponent)."""
+
+    name = "slice_push_law"
+    family = "material"
+    row = 10
+    parameters = (CauseParameter("exponent", "", 0.25, low=-0.5, high=2.0),)
+    absorbed_by = ("effects.slice_push.exponent",)
+    signature = "nothing without a draw, grows with the draw; along the edge unlike down"
+    experiment = "draw"
+
+    def model(
+        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
+    ) -> CuttingModel:
+        """Another exponent."""
+        law = SlicePush(model.effects.slice_push.exponent + values["exponent"])
+        return model.derive(effects=dc.replace(model.effects, slice_push=law))

@@ -1,0 +1,244 @@
+"""Predicts slices at a point: base parameters, how slices differ, causes at values."""
+
+import dataclasses as dc
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sliceit_drake.calibration.setup import CalibrationSetup
+from sliceit_drake.cutting.board import Board
+from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.cutting.parameters import with_parameters
+from sliceit_drake.diagnosis.cause import Cause, ForceSeries
+from sliceit_drake.diagnosis.clock import Clock
+from sliceit_drake.diagnosis.simulator import Job, Run, Simulator
+from sliceit_drake.diagnosis.slices import Meshing, SliceTarget, make_targets
+from sliceit_drake.records.slice_record import SliceRecord
+
+__all__ = ["RECORD_EFFECTS", "ActiveCause", "Point", "RecordEffect", "SlicePredictor"]
+
+
+@dc.dataclass(frozen=True)
+class RecordEffect:
+    """What differs from slice to slice.
+
+    Attributes:
+        name: Its name.
+        unit: Its unit; "" for the logarithm of a factor.
+        size: Plausible standard deviation, and the step of the derivative.
+    """
+
+    name: str
+    unit: str
+    size: float
+
+
+RECORD_EFFECTS = (
+    RecordEffect("toughness", "", 0.05),
+    RecordEffect("stiffness", "", 0.05),
+    RecordEffect("friction", "", 0.05),
+    RecordEffect("height", "m", 3e-4),
+)
+"""Logarithms of factors on toughness, modulus and friction of the slice; by how much its food is
+higher (where heights are only known from the force: by how much its knife is lower)."""
+
+SPEED = RecordEffect("speed", "", 0.05)
+"""Logarithm of a factor on the speed, of a record whose speed is not known."""
+
+MATERIAL = {
+    "toughness": "material.toughness",
+    "stiffness": "material.youngs_modulus",
+    "friction": "material.friction",
+}
+
+
+@dc.dataclass(frozen=True)
+class ActiveCause:
+    """A cause at values of its parameters and, if it has one, of its scan.
+
+    Attributes:
+        cause: The cause.
+        values: By name; or, where it has values for each record, by the record's name.
+    """
+
+    cause: Cause
+    values: Mapping[str, float]
+    by_record: Mapping[str, Mapping[str, float]] = dc.field(default_factory=dict)
+
+    def of(self, record: str) -> Mapping[str, float]:
+        """Values for a record."""
+        return {**self.values, **self.by_record.get(record, {})}
+
+
+@dc.dataclass(frozen=True)
+class Point:
+    """Where slices are predicted.
+
+    Attributes:
+        values: Base parameters by dotted name; those of the setup's food otherwise.
+        records: Values of `RECORD_EFFECTS` by the record's name; 0 otherwise.
+        causes: What acts beside the base model, in the order in which it acts.
+        meshing: How finely; the predictor's first by default.
+        only: Records to predict, by number; all by default.
+    """
+
+    values: Mapping[str, float] = dc.field(default_factory=dict)
+    records: Mapping[str, Mapping[str, float]] = dc.field(default_factory=dict)
+    causes: tuple[ActiveCause, ...] = ()
+    meshing: Meshing | None = None
+    only: tuple[int, ...] | None = None
+
+
+class SlicePredictor:
+    """Predicts records at points. Equal slices are simulated once.
+
+    Args:
+        setup: Food at its calibrated values, knife, board, base parameters.
+        records: What is predicted.
+        meshings: How finely; the first is the default of a point.
+        clock: How time is divided.
+        cache: Folder of finished simulations.
+        workers: Threads.
+
+    Raises:
+        ConfigurationError: A record cannot be compared, naming file and field.
+    """
+
+    def __init__(
+        self,
+        setup: CalibrationSetup,
+        records: Sequence[SliceRecord],
+        meshings: Sequence[Meshing] = (Meshing(),),
+        clock: Clock | None = None,
+        cache: Path | None = None,
+        workers: int | None = None,
+    ) -> None:
+        self.setup, self.clock = setup, clock or Clock()
+        self.meshings = tuple(meshings)
+        self.targets = make_targets(setup, records, self.meshings, self.clock)
+        self.board: Board = dc.replace(setup.board, height=0.0)
+        self.simulator = Simulator(self.clock, self.board, cache, workers)
+        self._boards: dict[bytes, np.ndarray] = {}
+
+    def record_effects(self, target: SliceTarget) -> tuple[RecordEffect, ...]:
+        """What may differ in a record from others like it."""
+        if not target.facts.food:
+            return ()
+        return RECORD_EFFECTS + ((SPEED,) if target.speed_unknown else ())
+
+    def predict(
+        self, points: Sequence[Point], progress: Callable[[int, int], None] | None = None
+    ) -> list[list[ForceSeries | None]]:
+        """Predicts all records, or those that a point names, at points.
+
+        Returns:
+            For each point a series a record; None for those that it does not name. One that broke
+            down is not finite.
+        """
+        plan, runs = self._simulated(points, progress)
+        return [
+            [
+                None if planned is None else self._series(point, target, planned, runs)
+                for target, planned in zip(self.targets, row, strict=True)
+            ]
+            for point, row in zip(points, plan, strict=True)
+        ]
+
+    def simulate(
+        self, points: Sequence[Point], progress: Callable[[int, int], None] | None = None
+    ) -> None:
+        """Simulates what `predict` will need, so that points can be predicted one by one."""
+        self._simulated(points, progress)
+
+    def _simulated(
+        self, points: Sequence[Point], progress: Callable[[int, int], None] | None
+    ) -> tuple[list[list["_Planned | None"]], list[Run]]:
+        jobs: list[Job] = []
+        plan: list[list[_Planned | None]] = []
+        for point in points:
+            row: list[_Planned | None] = []
+            for k in range(len(self.targets)):
+                if point.only is not None and k not in point.only:
+                    row.append(None)
+                    continue
+                job, R, p = self._job(point, k)
+                row.append(_Planned(None if job is None else len(jobs), R, p))
+                if job is not None:
+                    jobs.append(job)
+            plan.append(row)
+        return plan, self.simulator.run(jobs, progress)
+
+    def model(self, point: Point, target: SliceTarget) -> CuttingModel:
+        """The cut of a record at a point."""
+        model = target.models[point.meshing or self.meshings[0]]
+        model = with_parameters(model, dict(point.values)) if point.values else model
+        own = point.records.get(target.facts.name, {})
+        factors = {
+            name: getattr(model.material, name.split(".")[1]) * float(np.exp(own[kind]))
+            for kind, name in MATERIAL.items()
+            if own.get(kind)
+        }
+        model = with_parameters(model, factors) if factors else model
+        for active in point.causes:
+            model = active.cause.model(model, active.of(target.facts.name), target.facts)
+        if target.facts.peeled and model.effects.skin.toughness > 0.0:
+            model = with_parameters(model, {"effects.skin.toughness": 0.0})
+        return model
+
+    def _job(self, point: Point, number: int) -> tuple[Job | None, np.ndarray, np.ndarray]:
+        """What must be simulated, and the poses of the knife over the board at the grid."""
+        target = self.targets[number]
+        own = point.records.get(target.facts.name, {})
+        R, p = target.R, target.p
+        speed, height = own.get("speed", 0.0), own.get("height", 0.0)
+        if speed:
+            p = target.home + float(np.exp(speed)) * (p - target.home)
+        lower = np.array([0.0, 0.0, height])
+        if target.height_unknown:
+            p = p - lower
+        for k, active in enumerate(point.causes):
+            values, force = active.of(target.facts.name), None
+            if active.cause.uses_force:
+                before = dc.replace(point, causes=point.causes[:k], only=(number,))
+                series = self.predict([before])[0][number]
+                assert series is not None
+                force = series.wrench[:, 3:]
+            R, p = active.cause.motion(R, p, target.grid, values, target.facts, force)
+        if target.stretches is None:
+            return None, R, p
+        at_food = p if target.height_unknown else p - lower
+        return (
+            Job(
+                self.model(point, target),
+                *target.poses(target.stretches, R, at_food),
+                target.stretches,
+                target.facts.name,
+            ),
+            R,
+            p,
+        )
+
+    def _series(
+        self, point: Point, target: SliceTarget, planned: "_Planned", runs: Sequence[Run]
+    ) -> ForceSeries:
+        run = None if planned.job is None else runs[planned.job]
+        p = planned.p
+        rise = target.rise(run)
+        if rise.any():
+            p = p + rise[:, None] * [0.0, 0.0, 1.0]
+        key = planned.R.tobytes() + p.tobytes()
+        if key not in self._boards:
+            self._boards[key] = target.board(self.setup, planned.R, p)
+        series = target.series(run, self._boards[key])
+        for active in point.causes:
+            values = active.of(target.facts.name)
+            series.wrench = active.cause.wrench(series, values, target.facts)
+        return series
+
+
+@dc.dataclass
+class _Planned:
+    job: int | None
+    R: np.ndarray
+    p: np.ndarray

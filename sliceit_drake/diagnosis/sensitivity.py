@@ -1,0 +1,458 @@
+"""How each cause would change the prediction of slice records.
+
+In short:
+
+    setup = load_setup("cucumber.yaml")         # food at its calibrated values, base parameters
+    found = sensitivities(setup, records, open_causes([p.name for p in setup.parameters]),
+                          cache=Path("cache"), progress=lambda done, of: ...)
+    for record in found.records:                # one a record, all its rows, air included
+        record.measured, record.predicted       # [m, c], channels record.channels: force_x, ...
+        record.columns                          # [m, c, K], change of the prediction
+    for k, column in enumerate(found.columns):  # what column k is
+        column.kind                             # base, record, numerical or cause
+        column.name, column.parameter, column.scan, column.size
+
+A column is the change of the prediction when the parameter goes from its null (or the point) by
+`size`: for one that can go both ways (f(+size) - f(-size)) / 2, with the even part
+(f(+size) + f(-size)) / 2 - f(0) in `even`, which a linear model does not have: their sum is the
+change by plus `size` alone. A coefficient of 1 is a parameter of `size`.
+
+- base: a base parameter, in all records at once; on a log scale `size` is of the logarithm.
+- record: what differs from slice to slice (`prediction.RECORD_EFFECTS`); `size` is its plausible
+  standard deviation, and each record has a coefficient of its own.
+- numerical: `step` and `mesh`, the prediction less that with half the step, and with a finer mesh.
+- cause: a cause's parameter at a value of its scan. Where `per_record` is set, each record has a
+  coefficient of its own.
+
+`SlicePredictor.predict` gives finite changes and several causes at once, for a refit.
+"""
+
+import dataclasses as dc
+import hashlib
+import inspect
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+import sliceit_drake.diagnosis
+from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
+from sliceit_drake.cutting.parameters import get_parameter
+from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.diagnosis.cause import Cause, ForceSeries
+from sliceit_drake.diagnosis.clock import Clock
+from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
+from sliceit_drake.diagnosis.simulator import cutting_source
+from sliceit_drake.diagnosis.slices import Meshing, SliceTarget
+from sliceit_drake.records.slice_record import SliceRecord
+
+__all__ = [
+    "Column",
+    "RecordSensitivity",
+    "Sensitivities",
+    "cause_columns",
+    "sensitivities",
+]
+
+Progress = Callable[[int, int], None]
+"""Called with the number of simulated slices, and of those that must be."""
+
+LOG_STEP = 0.05
+"""Change of the logarithm of a base parameter."""
+LINEAR_STEP = 0.02
+"""Change of one on a linear scale, relative to its range."""
+
+
+@dc.dataclass(frozen=True)
+class Column:
+    """What a column of sensitivities is.
+
+    Attributes:
+        kind: base, record, numerical or cause.
+        name: Of the base parameter, the record's effect or the cause; "step" or "mesh".
+        parameter: Of the cause; "" otherwise.
+        scan: Value of the cause's scan; None without.
+        size: Change of the parameter that the column belongs to.
+        unit: Of it; "" for a logarithm.
+        one_sided: Whether its coefficient cannot be negative.
+        per_record: Whether each record has a coefficient of its own.
+    """
+
+    kind: str
+    name: str
+    parameter: str = ""
+    scan: float | None = None
+    size: float = 1.0
+    unit: str = ""
+    one_sided: bool = False
+    per_record: bool = False
+
+    @property
+    def label(self) -> str:
+        """Name for people."""
+        scan = "" if self.scan is None else f" at {self.scan:g}"
+        return f"{self.name}.{self.parameter}{scan}" if self.parameter else self.name
+
+
+@dc.dataclass
+class RecordSensitivity:
+    """One record: what was measured, what is predicted, and how that would change.
+
+    Attributes:
+        name, condition: Of the record.
+        slice_index, knife_slices: Its place in the session and in the life of the edge.
+        speed, draw_ratio: Of the press, m/s, and the draw over it; 0 where none is given.
+        channels: Names of the channels [c].
+        time: Of the rows [m], s.
+        phase: Label at the rows [m].
+        depth: Of the edge below the top of the food [m], metres.
+        in_contact: Whether food or board touch the knife [m].
+        measured, predicted: [m, c], N and Nm.
+        columns: Changes of the prediction [m, c, K].
+        even: Even parts of the changes [m, c, K]; 0 where there is none.
+    """
+
+    name: str
+    condition: str
+    slice_index: int
+    knife_slices: int
+    speed: float
+    draw_ratio: float
+    channels: tuple[str, ...]
+    time: np.ndarray
+    phase: np.ndarray
+    depth: np.ndarray
+    in_contact: np.ndarray
+    measured: np.ndarray
+    predicted: np.ndarray
+    columns: np.ndarray
+    even: np.ndarray
+
+    @property
+    def residual(self) -> np.ndarray:
+        """Measured less predicted [m, c]."""
+        return self.measured - self.predicted
+
+
+ARRAYS = ("time", "phase", "depth", "in_contact", "measured", "predicted", "columns", "even")
+
+
+@dc.dataclass
+class Sensitivities:
+    """Sensitivities of records to causes; see the module.
+
+    Attributes:
+        columns: What the columns are [K].
+        records: One a record.
+        warnings: What a reader should know, as a cause whose slices broke down: its column is 0
+            for that record.
+    """
+
+    columns: list[Column]
+    records: list[RecordSensitivity]
+    warnings: list[str] = dc.field(default_factory=list)
+
+    def index(self, kind: str, name: str | None = None, scan: float | None = None) -> list[int]:
+        """Numbers of the columns of a kind; of a name, of a value of the scan, if given."""
+        return [
+            k
+            for k, c in enumerate(self.columns)
+            if c.kind == kind and name in (None, c.name) and scan in (None, c.scan)
+        ]
+
+    @property
+    def causes(self) -> list[str]:
+        """Names of the causes."""
+        return list(dict.fromkeys(c.name for c in self.columns if c.kind == "cause"))
+
+    def scans(self, cause: str) -> list[float | None]:
+        """Values of a cause's scan; [None] for one without."""
+        return list(dict.fromkeys(c.scan for c in self.columns if c.name == cause))
+
+    def save(self, file: str | Path) -> Path:
+        """Writes NAME.npz and NAME.json."""
+        base = Path(file).with_suffix("")
+        base.parent.mkdir(parents=True, exist_ok=True)
+        facts = {
+            "columns": [dc.asdict(c) for c in self.columns],
+            "records": [
+                {f.name: getattr(r, f.name) for f in dc.fields(r) if f.name not in ARRAYS}
+                for r in self.records
+            ],
+            "warnings": self.warnings,
+        }
+        arrays = {
+            f"{k}.{name}": getattr(r, name) for k, r in enumerate(self.records) for name in ARRAYS
+        }
+        part = base.with_name(f"{base.name}.{os.getpid()}.part")
+        with open(part, "wb") as stream:
+            np.savez(stream, allow_pickle=False, **arrays)
+        os.replace(part, base.with_name(f"{base.name}.npz"))
+        # Last, so that a pair that is there is whole.
+        part.write_text(json.dumps(facts), encoding="utf-8")
+        os.replace(part, base.with_name(f"{base.name}.json"))
+        return base.with_name(f"{base.name}.npz")
+
+    @classmethod
+    def load(cls, file: str | Path) -> "Sensitivities":
+        """Reads what `save` wrote."""
+        base = Path(file).with_suffix("")
+        facts = json.loads(base.with_name(f"{base.name}.json").read_text(encoding="utf-8"))
+        with np.load(base.with_name(f"{base.name}.npz")) as arrays:
+            records = [
+                RecordSensitivity(
+                    **{**r, "channels": tuple(r["channels"])},
+                    **{name: arrays[f"{k}.{name}"] for name in ARRAYS},
+                )
+                for k, r in enumerate(facts["records"])
+            ]
+        return cls([Column(**c) for c in facts["columns"]], records, facts["warnings"])
+
+
+def cause_columns(cause: Cause) -> list[tuple[Column, dict[str, float], dict[str, float] | None]]:
+    """Columns of a cause, with the values at plus its size, and at minus where that may be."""
+    out = []
+    for value in cause.scan.values if cause.scan else (None,):
+        at = cause.nulls()
+        if cause.scan is not None and value is not None:
+            at[cause.scan.name] = value
+        for p in cause.parameters:
+            sign = -1.0 if p.one_sided and p.null == p.high else 1.0
+            up = at | {p.name: p.null + sign * p.size}
+            down = None if p.one_sided else at | {p.name: p.null - p.size}
+            column = Column(
+                "cause",
+                cause.name,
+                p.name,
+                value,
+                sign * p.size,
+                p.unit,
+                p.one_sided,
+                cause.per_record,
+            )
+            out.append((column, up, down))
+    return out
+
+
+def sensitivities(
+    setup: CalibrationSetup,
+    records: Sequence[SliceRecord],
+    causes: Sequence[Cause],
+    point: Point | None = None,
+    meshing: Meshing | None = None,
+    finer: float | None = 1.5,
+    clock: Clock | None = None,
+    cache: Path | None = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Sensitivities:
+    """Computes sensitivities at a point.
+
+    Args:
+        setup: Food at its calibrated values, knife, board, base parameters.
+        records: Slice records.
+        causes: What may be wrong.
+        point: Where; the setup's values without any cause by default.
+        meshing: How finely the food is computed; the setup's refinement and a step of 0.5 ms by
+            default.
+        finer: Elements along an edge of the refined mesh, relative to this one; None for no column
+            `mesh`.
+        clock: How time is divided.
+        cache: Folder for finished simulations and results, found again by their content.
+        workers: Threads.
+        progress: Called with the number of simulated slices, and of those that must be.
+
+    Raises:
+        ConfigurationError: A record cannot be compared, naming file and field.
+        CuttingError: The prediction itself broke down.
+    """
+    point, meshing, clock = point or Point(), meshing or Meshing(), clock or Clock()
+    file = None
+    if cache is not None:
+        key = _content_key(setup, records, causes, (point, meshing, finer, clock))
+        if key is not None:
+            file = cache / "sensitivities" / key
+            if file.with_name(f"{key}.json").exists():
+                return Sensitivities.load(file)
+    meshings = [meshing, dc.replace(meshing, time_step=0.5 * meshing.time_step)]
+    if finer is not None:
+        meshings.append(dc.replace(meshing, refinement=finer * meshing.refinement))
+    runs = None if cache is None else cache / "slices"
+    predictor = SlicePredictor(setup, records, meshings, clock, runs, workers)
+    result = _Computation(predictor, point, causes).result(progress)
+    if file is not None:
+        result.save(file)
+    return result
+
+
+class _Computation:
+    """Sensitivities of one set of records."""
+
+    def __init__(self, predictor: SlicePredictor, point: Point, causes: Sequence[Cause]) -> None:
+        self.predictor, self.point = predictor, point
+        self.columns: list[Column] = []
+        self.ends: list[tuple[Point, Point | None, float]] = []
+        """Of each column the point at plus its size, that at minus, and a factor on the change."""
+        self.shown: list[tuple[int, Cause, dict[str, float], dict[str, float] | None]] = []
+        """Columns that follow from the prediction without a simulation."""
+        for parameter in predictor.setup.parameters:
+            self._add_base(parameter)
+        effects = {e.name: e for t in predictor.targets for e in predictor.record_effects(t)}
+        for effect in effects.values():
+            column = Column(
+                "record", effect.name, size=effect.size, unit=effect.unit, per_record=True
+            )
+            up, down = (self._record_point(effect.name, s * effect.size) for s in (1.0, -1.0))
+            self._add(column, up, down)
+        for name, finer in zip(("step", "mesh"), predictor.meshings[1:], strict=False):
+            self._add(Column("numerical", name), dc.replace(point, meshing=finer), None, -1.0)
+        for cause in causes:
+            for column, up_values, down_values in cause_columns(cause):
+                if not cause.simulates:
+                    self.shown.append((len(self.columns), cause, up_values, down_values))
+                    self._add(column, point, None)
+                    continue
+                other = None if down_values is None else self._cause_point(cause, down_values)
+                self._add(column, self._cause_point(cause, up_values), other)
+
+    def _add(self, column: Column, up: Point, down: Point | None, factor: float = 1.0) -> None:
+        self.columns.append(column)
+        self.ends.append((up, down, factor))
+
+    def _add_base(self, parameter: ParameterRange) -> None:
+        name = parameter.name
+        start = self.point.values.get(name)
+        if start is None:
+            models = next((t.models for t in self.predictor.targets if t.models), None)
+            if models is None:
+                return
+            start = float(get_parameter(models[self.predictor.meshings[0]], name))
+        if parameter.scale == "log":
+            size, high = LOG_STEP, start * float(np.exp(LOG_STEP))
+            low = start * float(np.exp(-LOG_STEP))
+        else:
+            size = LINEAR_STEP * (parameter.high - parameter.low)
+            high, low = start + size, start - size
+        up, down = (
+            dc.replace(self.point, values={**self.point.values, name: v}) for v in (high, low)
+        )
+        self._add(Column("base", name, size=size), up, down)
+
+    def _record_point(self, effect: str, change: float) -> Point:
+        own = {
+            t.facts.name: dict(self.point.records.get(t.facts.name, {}))
+            for t in self.predictor.targets
+        }
+        for values in own.values():
+            values[effect] = values.get(effect, 0.0) + change
+        return dc.replace(self.point, records=own)
+
+    def _cause_point(self, cause: Cause, values: dict[str, float]) -> Point:
+        return dc.replace(self.point, causes=(*self.point.causes, ActiveCause(cause, values)))
+
+    def result(self, progress: Progress | None) -> Sensitivities:
+        """All columns of all records."""
+        predictor = self.predictor
+        points = [
+            self.point,
+            *(p for up, down, _ in self.ends for p in (up, down) if p is not None),
+        ]
+        predictor.simulate(points, progress)
+        nominal = predictor.predict([self.point])[0]
+        targets = predictor.targets
+        out, warnings = [], []
+        for target, series in zip(targets, nominal, strict=True):
+            assert series is not None
+            predicted = target.compare(series.wrench)
+            if not np.isfinite(predicted).all():
+                raise CuttingError(
+                    f"{target.facts.name}: the prediction broke down at the calibrated values"
+                )
+            out.append(_empty(target, series, predicted, len(self.columns)))
+        shown = {k for k, *_ in self.shown}
+        for k, (up, down, factor) in enumerate(self.ends):
+            if k in shown:
+                continue
+            ends = [predictor.predict([p])[0] for p in (up, down) if p is not None]
+            for r, (record, target) in enumerate(zip(out, targets, strict=True)):
+                moved = [row[r] for row in ends]
+                seen = [target.compare(s.wrench) - record.predicted for s in moved if s is not None]
+                if not all(np.isfinite(s).all() for s in seen):
+                    warnings.append(f"{self.columns[k].label}: {record.name} broke down")
+                    continue
+                _put(record, k, seen, factor)
+        for record, target, base in zip(out, targets, nominal, strict=True):
+            assert base is not None
+            for k, cause, *values in self.shown:
+                seen = [
+                    target.compare(cause.wrench(base, v, target.facts)) - record.predicted
+                    for v in values
+                    if v is not None
+                ]
+                _put(record, k, seen, 1.0)
+        return Sensitivities(self.columns, out, warnings)
+
+
+def _put(record: RecordSensitivity, k: int, changes: list[np.ndarray], factor: float) -> None:
+    if len(changes) == 1:
+        record.columns[:, :, k] = factor * changes[0]
+    else:
+        record.columns[:, :, k] = 0.5 * factor * (changes[0] - changes[1])
+        record.even[:, :, k] = 0.5 * factor * (changes[0] + changes[1])
+
+
+def _empty(
+    target: SliceTarget, series: ForceSeries, predicted: np.ndarray, columns: int
+) -> RecordSensitivity:
+    facts = target.facts
+    return RecordSensitivity(
+        name=facts.name,
+        condition=facts.condition,
+        slice_index=facts.slice_index,
+        knife_slices=facts.knife_slices,
+        speed=facts.speed,
+        draw_ratio=facts.draw_ratio,
+        channels=target.channels,
+        time=target.time,
+        phase=target.phase,
+        depth=target.depth,
+        in_contact=target.at_rows(series.in_contact),
+        measured=target.measured,
+        predicted=predicted,
+        columns=np.zeros((*predicted.shape, columns), np.float32),
+        even=np.zeros((*predicted.shape, columns), np.float32),
+    )
+
+
+def _content_key(
+    setup: CalibrationSetup,
+    records: Sequence[SliceRecord],
+    causes: Sequence[Cause],
+    options: tuple[object, ...],
+) -> str | None:
+    """Hash of all that the result depends on; None where the source of a cause cannot be read."""
+    h = hashlib.sha256(cutting_source())
+    folder = Path(sliceit_drake.diagnosis.__file__).parent
+    for file in sorted(folder.glob("*.py")):
+        h.update(file.read_bytes())
+    point = options[0]
+    assert isinstance(point, Point)
+    everything = [*causes, *(active.cause for active in point.causes)]
+    for cause in everything:
+        try:
+            source = Path(inspect.getfile(type(cause))).read_bytes()
+        except (TypeError, OSError):
+            return None
+        facts = (cause.name, cause.parameters, cause.scan, cause.per_record, vars(cause))
+        h.update(source + repr(facts).encode())
+    active = [(a.cause.name, dict(a.values), dict(a.by_record)) for a in point.causes]
+    h.update(repr((setup, point.values, point.records, active, point.meshing)).encode())
+    h.update(repr(options[1:]).encode())
+    for record in records:
+        h.update(repr(record.metadata).encode())
+        for name in ("time", "position", "rotation", "force", "torque", "force_norm"):
+            values = getattr(record, name)
+            h.update(name.encode() if values is None else np.ascontiguousarray(values).tobytes())
+    return h.hexdigest()[:40]
