@@ -1,5 +1,6 @@
 """The calibration finds what made the records; a run that was killed ends where it would have."""
 
+import copy
 import dataclasses as dc
 import multiprocessing
 
@@ -7,7 +8,9 @@ import numpy as np
 import optuna
 import pytest
 
+from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate
 from sliceit_drake.calibration.oscillation import Oscillation, fit_oscillation
+from sliceit_drake.calibration.per_point import fit_points
 from sliceit_drake.calibration.prediction import Predictor
 from sliceit_drake.calibration.refine import refine
 from sliceit_drake.calibration.search import open_study, search
@@ -17,7 +20,7 @@ from sliceit_drake.calibration.setup import (
     load_setup,
     setup_names,
 )
-from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.distribution import ParameterDistribution
 from sliceit_drake.cutting.food import Cylinder, Food
 from sliceit_drake.cutting.material import Material
@@ -231,6 +234,50 @@ def test_a_storage_with_other_parameters_is_refused(records, tmp_path):
     other.parameters[0].high = 900.0
     with pytest.raises(ConfigurationError, match="other parameters"):
         search(Predictor(other, records[:1]), study, 8, seed=1)
+
+
+def test_a_calibration_recovers_what_made_the_records_within_its_intervals(records, tmp_path):
+    options = CalibrationOptions(trials=24, steps=6, starts=1, workers=1, blocks=3)
+    setup = coarse_setup(search_time_step=1e-3)
+    result = calibrate(setup, records[:1], tmp_path, options, held_out=records[1:])
+    intervals = result.posterior.intervals(0.99)
+    for name, value in TRUTH.items():
+        low, high = intervals[name]
+        assert low < value < high
+        assert result.posterior.determined()[name]
+    assert result.rms == pytest.approx(0.1, rel=0.2)
+    assert result.rms <= result.refined_rms + 1e-6
+    assert result.held_out_records["slice_001"] == pytest.approx(0.1, rel=0.3)
+    assert result.held_out_rms == pytest.approx(0.1, rel=0.5)
+    again = calibrate(setup, records[:1], tmp_path, options)
+    np.testing.assert_array_equal(again.unit, result.unit)
+    food = result.calibrated_food("2026-01-01", "sliceit calibrate")
+    dump_yaml(food, tmp_path / "food.yaml")
+    loaded = load_calibrated_food(tmp_path / "food.yaml")
+    assert loaded.food.material == food.food.material
+    assert set(loaded.distribution.names) == set(TRUTH)
+    spread = [loaded.distribution.draw(np.random.default_rng(k)) for k in range(50)]
+    for name, value in TRUTH.items():
+        assert np.mean([d[name] for d in spread]) == pytest.approx(value, rel=0.1)
+
+
+def test_a_toughness_for_each_cut_point_finds_a_layer_that_shared_parameters_lack(records):
+    predictor = Predictor(coarse_setup(), records[:1])
+    unit = truth(predictor)
+    model = predictor.targets[0].model
+    z = model.split.points[:, 2]
+    layer = 1.0 + 0.6 * ((z > np.quantile(z, 0.5)) & (z < np.quantile(z, 0.8)))
+    scaled = predictor.with_point_factors({"point_scales.toughness": layer})
+    (prediction,) = scaled.predict([unit])[0]
+    spoiled = copy.copy(predictor)
+    target = copy.copy(predictor.targets[0])
+    target.measured = prediction.predicted
+    spoiled.targets = [target]
+    before = spoiled.error(spoiled.predict([unit])[0])
+    fit = fit_points(spoiled, unit, steps=25)
+    assert fit.rms < 0.3 * before
+    inside = layer > 1.0
+    assert fit.factors[inside].mean() > fit.factors[~inside].mean() + 0.2
 
 
 def test_an_oscillation_in_proportion_to_the_force_is_found():

@@ -50,6 +50,7 @@ class FoodComparison:
         rows: Of the simulators; the last is ours.
         calibration: Ours.
         minutes: What it took.
+        per_point_rms: Error with a toughness for each cut point besides, N; None if not fitted.
     """
 
     food: str
@@ -58,6 +59,7 @@ class FoodComparison:
     rows: list[Row]
     calibration: Calibration
     minutes: float
+    per_point_rms: float | None = None
 
 
 def compare(calibration: Calibration, profile: ForceProfile, minutes: float) -> FoodComparison:
@@ -140,9 +142,11 @@ def table(comparisons: Sequence[FoodComparison]) -> str:
     for c in comparisons:
         half = 0.5 * next(r.rms for r in c.rows if r.name == "DiSECt")
         k = c.calibration
+        points = "" if c.per_point_rms is None else f"{c.per_point_rms:.2f}"
+        number = len(k.predictor.targets[0].model.point_nodes)
         lines.append(
             f"| {c.food} | {k.rms / half:.2f} | {k.search_rms:.3f} | {k.refined_rms:.3f} "
-            f"| {k.rms:.3f} | {c.minutes:.1f} |"
+            f"| {k.rms:.3f} | {c.minutes:.1f} | {points} | {number} |"
         )
     return "\n".join(lines)
 

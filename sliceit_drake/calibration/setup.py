@@ -15,7 +15,7 @@ from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.parameters import POINT_PARAMETERS, parameter_names
 from sliceit_drake.resources import resource_path
 
-__all__ = ["CalibrationSetup", "ParameterRange", "load_setup", "setup_names"]
+__all__ = ["CalibrationSetup", "Literature", "ParameterRange", "load_setup", "setup_names"]
 
 FOLDER = "calibration/setups"
 
@@ -45,6 +45,25 @@ class ParameterRange:
 
 
 @dc.dataclass
+class Literature:
+    """What is published of a food that nobody recorded for us."""
+
+    peak_force: list[float] = quantity(
+        [1.0, 100.0], "N", low=0.01, high=1e4, size=2, doc="Range of the largest force of a cut."
+    )
+    speed: float = quantity(0.02, "m/s", low=1e-4, high=1.0, doc="Of the simulated press cut.")
+    source: str = ""
+
+    def check(self, where: str) -> None:
+        if self.peak_force[1] <= self.peak_force[0]:
+            raise ConfigurationError(
+                f"{self.peak_force} is no range",
+                field=f"{where}.peak_force",
+                fix="Give the least and the largest published value.",
+            )
+
+
+@dc.dataclass
 class CalibrationSetup:
     """A food, what cuts it, and what is not known of it.
 
@@ -67,6 +86,8 @@ class CalibrationSetup:
     refinement: float = quantity(
         1.0, "", low=0.2, high=4.0, doc="Elements along an edge, relative to the food's mesh."
     )
+    literature: Literature | None = None
+    """For a food without records, see literature.py."""
     oscillation: list[float] | None = quantity(
         None,
         "Hz",

@@ -24,6 +24,9 @@ A journal file (--storage trials.log) serves several processes that share a file
 
   sliceit calibrate calibration/records/cucumber.csv --food cucumber --output output/cucumber
   sliceit calibrate --show cucumber
+
+A food that nobody recorded, from published levels in its setup:
+  sliceit calibrate --food carrot --literature --output output/carrot
 """
 
 
@@ -41,6 +44,11 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument("--food", metavar="NAME", help="a setup by name, or a YAML file of one")
     parser.add_argument("--output", metavar="DIR", type=Path, help="where the results go")
     parser.add_argument("--show", metavar="NAME", help="print a calibrated food and stop")
+    parser.add_argument(
+        "--literature",
+        action="store_true",
+        help="take the setup's published levels in place of records",
+    )
     parser.add_argument("--trials", type=int, default=500, help="of the search (default 500)")
     parser.add_argument("--steps", type=int, default=100, help="of Adam (default 100)")
     parser.add_argument("--starts", type=int, default=2, help="places refined (default 2)")
@@ -81,7 +89,35 @@ def run(options: argparse.Namespace) -> int:
             raise ConfigurationError(
                 f"= {getattr(options, name)}", field=f"--{name}", fix=f"Give at least {least}."
             )
-    return _calibrate(options)
+    return _from_literature(options) if options.literature else _calibrate(options)
+
+
+def _from_literature(options: argparse.Namespace) -> int:
+    import datetime
+
+    from tqdm import tqdm
+
+    from sliceit_drake.calibration.literature import food_from_literature
+    from sliceit_drake.calibration.report import food_table
+    from sliceit_drake.calibration.setup import load_setup
+    from sliceit_drake.configuration import dump_yaml
+
+    setup = load_setup(options.food)
+    with tqdm(total=options.trials, desc="cuts") as bar:
+        food = food_from_literature(
+            setup, options.trials, options.seed, lambda done: (bar.update(done - bar.n), None)[1]
+        )
+    food.date = datetime.date.today().isoformat()
+    food.command = (
+        f"sliceit calibrate --food {options.food} --literature --trials {options.trials} "
+        f"--seed {options.seed}"
+    )
+    options.output.mkdir(parents=True, exist_ok=True)
+    dump_yaml(food, options.output / "food.yaml")
+    print(food_table(food.distribution))
+    print(food.note)
+    print(f"Results in {options.output}/")
+    return 0
 
 
 def _show(name: str) -> int:

@@ -29,6 +29,12 @@ def add_calibration_study(studies: "argparse._SubParsersAction[argparse.Argument
     parser.add_argument("--foods", nargs="+", choices=FOODS, default=list(FOODS))
     parser.add_argument("--trials", type=int, default=500, help="of the search (default 500)")
     parser.add_argument("--steps", type=int, default=100, help="of Adam (default 100)")
+    parser.add_argument(
+        "--point-steps",
+        type=int,
+        default=100,
+        help="of Adam on a toughness for each cut point (default 100; 0: none)",
+    )
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.set_defaults(run=run)
 
@@ -42,6 +48,7 @@ def run(options: argparse.Namespace) -> int:
 
     from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate, write_json
     from sliceit_drake.calibration.comparison import compare, plot_comparisons, table
+    from sliceit_drake.calibration.per_point import fit_points
     from sliceit_drake.calibration.report import figure
     from sliceit_drake.calibration.setup import load_setup
     from sliceit_drake.configuration import dump_yaml
@@ -62,7 +69,9 @@ def run(options: argparse.Namespace) -> int:
         def show(
             stage: str, done: int, total: int, error: float, bars: dict = bars, food: str = food
         ) -> None:
-            bar = bars.setdefault(stage, tqdm(total=total, desc=f"{food}: {stage}"))
+            if stage not in bars:
+                bars[stage] = tqdm(total=total, desc=f"{food}: {stage}")
+            bar = bars[stage]
             bar.set_postfix_str(f"best RMS {error:.3f} N", refresh=False)
             bar.update(done - bar.n)
 
@@ -81,7 +90,17 @@ def run(options: argparse.Namespace) -> int:
         dump_yaml(calibrated, folder / "food.yaml")
         write_json(result, folder / "calibration.json")
         figure(result, folder / "fit.png")
-        comparisons.append(compare(result, profile, minutes))
+        comparison = compare(result, profile, minutes)
+        if options.point_steps:
+            points = fit_points(
+                result.predictor,
+                result.unit,
+                options.point_steps,
+                lambda done, error: show("each point", done, options.point_steps, error),
+            )
+            bars["each point"].close()
+            comparison.per_point_rms = points.rms
+        comparisons.append(comparison)
         for line in result.posterior.remarks():
             print(f"{food}: {line}")
     text = table(comparisons) + "\n"

@@ -77,8 +77,8 @@ class Mounting:
         excess = np.where(gives, force - held, 0.0)
         self._attempts += 1
         small = self.tolerance * np.maximum(1.0, np.abs(force))
-        # Where the cut broke down there is nothing to balance. Where its force jumps, as when a skin
-        # gives way, there is no balance, but a displacement at which it jumps.
+        # Where the cut broke down there is nothing to balance. Where its force jumps, as when a
+        # skin gives way, there is no balance, but a displacement at which it jumps.
         over = self._attempts >= ATTEMPTS or not np.isfinite(force).all()
         jump = (self._between[1] - self._between[0]) * stiffness < small
         if over or (jump | ~gives).all() or (np.abs(excess) <= small).all():

@@ -1,0 +1,109 @@
+"""A food from published levels of force: what its parameters may be, and no more."""
+
+import copy
+from collections.abc import Callable
+
+import numpy as np
+from scipy.stats import qmc
+
+from sliceit_drake.calibration.setup import CalibrationSetup, from_unit
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.batch import simulate_batch
+from sliceit_drake.cutting.distribution import ParameterDistribution
+from sliceit_drake.cutting.food import make_food_model, start_pose
+from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
+from sliceit_drake.cutting.parameters import with_parameters
+from sliceit_drake.diagrams.calibrated_food import CalibratedFood
+from sliceit_drake.systems.spring_food import calibrate_spring
+
+__all__ = ["food_from_literature"]
+
+PERIOD = 2e-3
+CLEARANCE = 5e-4
+LEAST_KEPT = 20
+
+
+def food_from_literature(
+    setup: CalibrationSetup,
+    cuts: int = 256,
+    seed: int = 0,
+    progress: Callable[[int], None] | None = None,
+) -> CalibratedFood:
+    """Keeps the parameters whose press cut peaks within the published range.
+
+    Approximate Bayesian computation by rejection (Pritchard et al. 1999): places drawn evenly from
+    the ranges (a scrambled Sobol sequence) are kept where the simulated peak is in the range. Mean
+    and covariance of what is kept are the food's; the range of forces leaves most of them wide.
+
+    Args:
+        setup: With `literature`.
+        cuts: Number of places tried; rounded up to a power of two.
+        seed: Of the sequence.
+        progress: Called with the number of cuts done.
+
+    Raises:
+        ConfigurationError: The setup has no literature, or hardly any cut is within the range.
+    """
+    literature = setup.literature
+    if literature is None:
+        raise ConfigurationError(
+            "has no published levels",
+            field="literature",
+            fix="Give peak_force and source in the setup, or calibrate from records.",
+        )
+    model = make_food_model(setup.food, setup.knife, setup.numerics, setup.refinement)
+    plan = MotionPlan([ConstantSpeed(distance=model.top + CLEARANCE, speed=literature.speed)])
+    ranges = setup.parameters
+    sampler = qmc.Sobol(len(ranges), seed=seed)
+    places = sampler.random_base2(int(np.ceil(np.log2(max(cuts, 2)))))
+    values = [
+        {
+            p.name: float(from_unit(u, p.low, p.high, p.scale == "log"))
+            for p, u in zip(ranges, place, strict=True)
+        }
+        for place in places
+    ]
+    slices = simulate_batch(
+        [with_parameters(model, v) for v in values],
+        [Motion(plan, start_pose(model, CLEARANCE))],
+        PERIOD,
+        progress=progress,
+    )
+    low, high = literature.peak_force
+    peaks = np.array(
+        [
+            np.nan if s.failure else float(np.linalg.norm(s.food_wrench[:, 3:], axis=1).max())
+            for s in slices
+        ]
+    )
+    kept = (peaks >= low) & (peaks <= high)
+    if kept.sum() < LEAST_KEPT:
+        middle = np.nanquantile(peaks, [0.05, 0.95])
+        raise ConfigurationError(
+            f"{int(kept.sum())} of {len(peaks)} cuts peak within {low:g} to {high:g} N; most are "
+            f"within {middle[0]:.3g} to {middle[1]:.3g} N",
+            field="literature.peak_force",
+            fix="Widen the ranges of the parameters, or try more cuts (--trials).",
+        )
+    mean, covariance = places[kept].mean(0), np.cov(places[kept].T)
+    distribution = ParameterDistribution(
+        names=[p.name for p in ranges],
+        low=[p.low for p in ranges],
+        high=[p.high for p in ranges],
+        log=[p.scale == "log" for p in ranges],
+        mean=mean.tolist(),
+        covariance=np.atleast_2d(covariance).tolist(),
+    )
+    central = with_parameters(model, distribution.values())
+    food = copy.deepcopy(setup.food)
+    food.material, food.effects = central.material, central.effects
+    return CalibratedFood(
+        food=food,
+        knife=setup.knife,
+        flank_stiffness=central.numerics.flank_stiffness,
+        distribution=distribution,
+        spring=calibrate_spring(peaks[kept].mean()[None], float(model.top - model.bottom)),
+        records=[literature.source],
+        note=f"From a published range of {low:g} to {high:g} N alone, not from a record: "
+        f"{int(kept.sum())} of {len(peaks)} cuts are within it.",
+    )
