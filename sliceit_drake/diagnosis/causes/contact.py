@@ -1,0 +1,107 @@
+"""Causes between knife and food: adhesion, static friction, a blunt and a dulling edge."""
+
+import dataclasses as dc
+from collections.abc import Mapping
+
+from sliceit_drake.cutting.effects import Adhesion, Bluntness
+from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan, SliceFacts
+
+__all__ = ["BluntEdge", "Dulling", "FlankAdhesion", "StaticFriction"]
+
+DULLED = 10.0
+"""Slices after which a dulling edge has its `growth`."""
+
+
+class StaticFriction(Cause):
+    """Friction that is higher at rest than sliding, by a share (Stribeck)."""
+
+    name = "static_friction"
+    family = "knife and contact"
+    row = 4
+    parameters = (CauseParameter("share", "", 0.5, low=0.0, high=5.0),)
+    scan = Scan("speed", "m/s", (3e-3, 1e-2, 3e-2))
+    absorbed_by = ("material.static_friction",)
+    signature = "as friction, less the faster the knife; flips its sign on withdrawal"
+    experiment = "second_pass"
+
+    def model(
+        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
+    ) -> CuttingModel:
+        """Higher friction at rest."""
+        old = model.material
+        rest = max(old.static_friction, old.friction) + values["share"] * old.friction
+        if values["share"] == 0.0:
+            return model
+        material = dc.replace(old, static_friction=rest, stribeck_velocity=values["speed"])
+        return model.derive(material=material)
+
+
+class FlankAdhesion(Cause):
+    """Food that sticks to the flanks: a shear stress, and one that grows with the speed."""
+
+    name = "adhesion"
+    family = "knife and contact"
+    row = 5
+    parameters = (
+        CauseParameter("stress", "Pa", 400.0, low=0.0, high=1e5),
+        CauseParameter("viscosity", "Pa s/m", 1.5e4, low=0.0, high=1e6),
+    )
+    absorbed_by = ("effects.adhesion.stress", "effects.adhesion.viscosity")
+    signature = "as friction without pressure; pulls at the end of a withdrawal, more the faster"
+    experiment = "retract"
+
+    def model(
+        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
+    ) -> CuttingModel:
+        """More adhesion."""
+        old = model.effects.adhesion
+        adhesion = Adhesion(old.stress + values["stress"], old.viscosity + values["viscosity"])
+        return model.derive(effects=dc.replace(model.effects, adhesion=adhesion))
+
+
+class BluntEdge(Cause):
+    """An edge that needs more to begin a cut."""
+
+    name = "bluntness"
+    family = "knife and contact"
+    row = 8
+    parameters = (CauseParameter("initiation", "J/m2", 250.0, low=0.0, high=1e4),)
+    scan = Scan("depth", "m", (1.5e-3, 4e-3))
+    absorbed_by = ("effects.bluntness.initiation",)
+    signature = "raises the first peak, the plateau hardly; with skin or without, less in a draw"
+    experiment = "skinned"
+
+    def model(
+        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
+    ) -> CuttingModel:
+        """More to begin with; the depth over which it falls takes the place of the model's."""
+        return _blunter(model, values["initiation"], values["depth"])
+
+
+class Dulling(Cause):
+    """An edge that grows blunt with the slices since it was sharpened, as a power of them."""
+
+    name = "dulling"
+    family = "knife and contact"
+    row = 9
+    parameters = (CauseParameter("growth", "J/m2", 250.0, low=0.0, high=1e4),)
+    scan = Scan("exponent", "", (0.5, 1.0))
+    absorbed_by = ("effects.bluntness.dulling",)
+    signature = "the first peak grows from slice to slice, and is back when the knife is sharpened"
+    experiment = "repeats"
+
+    def model(
+        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
+    ) -> CuttingModel:
+        """More to begin with, by the number of slices."""
+        grown = values["growth"] * (facts.knife_slices / DULLED) ** values["exponent"]
+        return _blunter(model, grown, model.effects.bluntness.depth)
+
+
+def _blunter(model: CuttingModel, excess: float, depth: float) -> CuttingModel:
+    if excess == 0.0:
+        return model
+    old = model.effects.bluntness
+    blunt = Bluntness(old.grown + excess, depth)
+    return model.derive(effects=dc.replace(model.effects, bluntness=blunt))
