@@ -116,20 +116,22 @@ def white_noise_interval(model, truth):
 
 def test_intervals_of_the_linear_problem_cover_the_truth_as_often_as_they_say():
     rng = np.random.default_rng(11)
-    covered, naive = [], []
+    covered, naive, variation = [], [], []
     for _ in range(120):
         model = linear_model()
         truth = rng.uniform(0.3, 0.7, 3)
         force = model.function(truth)
-        model.measured = force - noise_of(model, 0.3, 0.1, 0.1, 0.07, force).sample(rng, len(force))
+        model.measured = force - noise_of(model, 0.2, 0.1, 0.1, 0.2, force).sample(rng, len(force))
         mean, reach = white_noise_interval(model, truth)
         naive.append(np.abs(mean - truth) < reach)
         result = estimate(model, mean, rounds=1).posterior
+        variation.append(result.record_variation)
         reach = 1.645 * result.deviation
         covered.append(np.abs(np.array(result.mean) - truth) < reach)
     share = np.mean(covered, axis=0)
     assert (share > 0.80).all() and (share < 0.98).all()
     assert np.mean(naive) < 0.7
+    assert 0.75 * 0.2 < np.median(variation) < 1.25 * 0.2
 
 
 def small_model(columns, function=None, noise=0.1, seed=3, log=False):
