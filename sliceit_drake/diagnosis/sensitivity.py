@@ -358,54 +358,51 @@ class _Computation:
     def result(self, progress: Progress | None) -> Sensitivities:
         """All columns of all records."""
         predictor = self.predictor
-        points = [
-            self.point,
-            *(p for up, down, _ in self.ends for p in (up, down) if p is not None),
-        ]
+        points = [self.point, *(p for ends in self.ends for p in ends[:2] if p is not None)]
         # First, because causes may ask for its force.
         predictor.simulate(points[:1])
         predictor.simulate(points, progress)
-        nominal = predictor.predict([self.point])[0]
-        targets = predictor.targets
-        out, warnings = [], []
-        for target, series in zip(targets, nominal, strict=True):
-            assert series is not None
-            predicted = target.compare(series.wrench)
-            if not np.isfinite(predicted).all():
-                raise CuttingError(
-                    f"{target.facts.name}: the prediction broke down at the calibrated values"
-                )
-            out.append(_empty(target, series, predicted, len(self.columns)))
-        shown = {k for k, *_ in self.shown}
-        for k, (up, down, factor) in enumerate(self.ends):
+        warnings: list[str] = []
+        records = [self._record(r, warnings) for r in range(len(predictor.targets))]
+        return Sensitivities(self.columns, records, warnings)
+
+    def _record(self, number: int, warnings: list[str]) -> RecordSensitivity:
+        target = self.predictor.targets[number]
+        base = self._series(self.point, number)
+        shown = {k: (cause, up, down) for k, cause, up, down in self.shown}
+        wrenches, of = [base.wrench], []
+        for k, (up, down, _) in enumerate(self.ends):
             if k in shown:
-                continue
-            ends = [predictor.predict([p])[0] for p in (up, down) if p is not None]
-            for r, (record, target) in enumerate(zip(out, targets, strict=True)):
-                moved = [row[r] for row in ends]
-                seen = [target.compare(s.wrench) - record.predicted for s in moved if s is not None]
-                if not all(np.isfinite(s).all() for s in seen):
-                    warnings.append(f"{self.columns[k].label}: {record.name} broke down")
-                    continue
-                _put(record, k, seen, factor)
-        for record, target, base in zip(out, targets, nominal, strict=True):
-            assert base is not None
-            for k, cause, *values in self.shown:
-                seen = [
-                    target.compare(cause.wrench(base, v, target.facts)) - record.predicted
-                    for v in values
-                    if v is not None
-                ]
-                _put(record, k, seen, 1.0)
-        return Sensitivities(self.columns, out, warnings)
+                cause, *values = shown[k]
+                moved = [cause.wrench(base, v, target.facts) for v in values if v is not None]
+            else:
+                moved = [self._series(p, number).wrench for p in (up, down) if p is not None]
+            of.append(range(len(wrenches), len(wrenches) + len(moved)))
+            wrenches += moved
+        # All at once: the filters of the record are made anew in each call.
+        seen = target.compare(np.stack(wrenches, axis=2))
+        predicted, changes = seen[:, :, 0], seen - seen[:, :, :1]
+        if not np.isfinite(predicted).all():
+            raise CuttingError(
+                f"{target.facts.name}: the prediction broke down at the calibrated values"
+            )
+        record = _empty(target, base, predicted, len(self.columns))
+        for k, (members, (_, _, factor)) in enumerate(zip(of, self.ends, strict=True)):
+            change = changes[:, :, members.start : members.stop]
+            if not np.isfinite(change).all():
+                warnings.append(f"{self.columns[k].label}: {record.name} broke down")
+            elif len(members) == 1:
+                record.columns[:, :, k] = factor * change[:, :, 0]
+            else:
+                record.columns[:, :, k] = 0.5 * factor * (change[:, :, 0] - change[:, :, 1])
+                record.even[:, :, k] = 0.5 * factor * (change[:, :, 0] + change[:, :, 1])
+        return record
 
-
-def _put(record: RecordSensitivity, k: int, changes: list[np.ndarray], factor: float) -> None:
-    if len(changes) == 1:
-        record.columns[:, :, k] = factor * changes[0]
-    else:
-        record.columns[:, :, k] = 0.5 * factor * (changes[0] - changes[1])
-        record.even[:, :, k] = 0.5 * factor * (changes[0] + changes[1])
+    def _series(self, point: Point, number: int) -> ForceSeries:
+        (row,) = self.predictor.predict([dc.replace(point, only=(number,))])
+        series = row[number]
+        assert series is not None
+        return series
 
 
 def _empty(
