@@ -10,23 +10,34 @@ from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan, SliceFact
 __all__ = ["CoreRatio", "SkinToughness", "SlicePushLaw", "ToughnessBySpeed", "Viscoelasticity"]
 
 
+BRANCHES = {"fast": 0.03, "medium": 0.3, "slow": 3.0}
+"""Relaxation times, s."""
+
+
 class Viscoelasticity(Cause):
-    """Bulk that relaxes: a share of the modulus fades with a time (a branch of a Prony series)."""
+    """Bulk that relaxes: shares of the modulus fade, each with its time (a Prony series).
+
+    A decade apart, branches together follow a power law of time within a few per cent, which one
+    alone does not.
+    """
 
     name = "viscoelasticity"
     family = "material"
     row = 1
-    parameters = (CauseParameter("share", "", 0.2, low=0.0, high=0.9),)
-    scan = Scan("time", "s", (0.05, 0.5, 3.0))
-    signature = "decays exponentially in a hold; grows with the logarithm of the speed"
+    parameters = tuple(
+        CauseParameter(f"share_{speed}", "", 0.1, low=0.0, high=0.33) for speed in BRANCHES
+    )
+    signature = "decays in a hold; grows with the logarithm of the speed"
     experiment = "hold"
 
     def model(
         self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
     ) -> CuttingModel:
-        """A further branch."""
+        """Further branches."""
         old = model.effects.relaxation
-        relaxation = Relaxation([*old.shares, values["share"]], [*old.times, values["time"]])
+        added = {time: values[f"share_{speed}"] for speed, time in BRANCHES.items()}
+        added = {time: share for time, share in added.items() if share != 0.0}
+        relaxation = Relaxation([*old.shares, *added.values()], [*old.times, *added])
         return model.derive(effects=dc.replace(model.effects, relaxation=relaxation))
 
 

@@ -1,0 +1,232 @@
+"""The linear problem of a diagnosis, reduced to moments: records, what they share, what is their
+own.
+
+A record r is y_r = F_r b + E_r a_r + D_r d + C_r g + noise: y_r measured less predicted, F_r the
+base parameters, E_r what differs from slice to slice (a_r normal, its variance estimated), D_r the
+discretisation and what else the model may be off by in a known measure (d normal, known variance),
+C_r the causes. The noise is that of `noise_levels`. All that the statistics need of a record is its
+Gram matrix weighted with the inverse of the noise's covariance.
+"""
+
+import dataclasses as dc
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import minimize
+
+from sliceit_drake.diagnosis.noise_levels import ChannelNoise, estimate_noise, replicates
+from sliceit_drake.diagnosis.sensitivity import RecordSensitivity, Sensitivities
+
+__all__ = ["LinearProblem", "Moments", "integrate_out"]
+
+KNOT = 4e-3
+"""Spacing of the splines of depth in which the discretisation's error is taken to vary, metres."""
+PHASE_KNOTS = 8
+"""Splines over the time of each condition's record, for the nonparametric correction."""
+USUAL = (
+    ("sensor_delay", 1.0, "delay", 4e-3),
+    ("sensor_delay", 4.0, "delay", 4e-3),
+    *(("sensor_zero", None, f"bias_{a}", 0.1) for a in "xyz"),
+    *(("sensor_zero", None, f"drift_{a}", 0.02) for a in "xyz"),
+)
+"""What every sensor has: cause, value of its scan, parameter, usual standard deviation in its unit.
+Only more than that is a finding."""
+DISCRETISATION = 1.0
+"""Standard deviation of the discretisation's error, in that of the mesh column."""
+RIDGE = 1e-8
+
+
+@dc.dataclass
+class Moments:
+    """Gram matrices of all records, each over [columns, splines of depth, correction, y].
+
+    Attributes:
+        gram: [R, K + 1, K + 1], y last. The correction's columns are of the record's condition.
+        rows: Number of samples of each record [R].
+    """
+
+    gram: np.ndarray
+    rows: np.ndarray
+
+
+class LinearProblem:
+    """Moments of records, and the levels of noise and variation.
+
+    Args:
+        found: Sensitivities.
+        noise: Of each channel; estimated by default.
+
+    Attributes:
+        found: Sensitivities.
+        noise: Of each channel.
+        repeated: Whether the noise is from replicates.
+        conditions: Numbers of the records of each condition.
+        base, own, numerical: Numbers of columns.
+        usual: Numbers of columns of `USUAL` that all records share, and their standard deviations.
+        usual_own: The same of those that are each record's own.
+        spline: Numbers of the columns appended for the discretisation's error.
+        correction: Numbers of the columns of each condition's nonparametric correction.
+        size: Number of all columns; y stands there.
+        moments: Of the records.
+        variation: Standard deviations of what differs from slice to slice [len(own)], in the
+            columns' sizes.
+        variation_samples: Number of independent differences that they were estimated from.
+    """
+
+    def __init__(self, found: Sensitivities, noise: Sequence[ChannelNoise] | None = None) -> None:
+        self.found = found
+        self.base = found.index("base")
+        self.own = found.index("record")
+        self.numerical = found.index("numerical")
+        self.conditions = replicates(found.records)
+        if noise is None:
+            self.noise, self.repeated = estimate_noise(found.records, self.own)
+        else:
+            self.noise, self.repeated = tuple(noise), True
+        self.usual, self.usual_own = self._usual()
+        self._make_moments()
+        self.variation_samples = sum(len(g) - 1 for g in self.conditions.values())
+        self.variation = self._estimate_variation()
+
+    def _usual(self) -> tuple[dict[int, float], dict[int, float]]:
+        shared: dict[int, float] = {}
+        own: dict[int, float] = {}
+        for k, column in enumerate(self.found.columns):
+            for cause, scan, parameter, deviation in USUAL:
+                if (column.name, column.scan, column.parameter) == (cause, scan, parameter):
+                    (own if column.per_record else shared)[k] = deviation / column.size
+        return shared, own
+
+    def _make_moments(self) -> None:
+        found = self.found
+        K = len(found.columns)
+        channels = found.records[0].channels
+        reach = max(float(r.depth.max()) for r in found.records)
+        count = max(2, int(np.ceil(max(reach, KNOT) / KNOT)) + 1)
+        S = count * len(channels)
+        N = PHASE_KNOTS * len(channels)
+        self.spline = list(range(K, K + S))
+        self.correction = list(range(K + S, K + S + N))
+        self.size = K + S + N
+        self.discretisation = np.zeros(S)
+        mesh = [k for k in self.numerical if found.columns[k].name == "mesh"]
+        scale = self._mesh_scale(mesh, len(channels))
+        for c in range(len(channels)):
+            self.discretisation[c * count : (c + 1) * count] = scale[c]
+        gram = np.zeros((len(found.records), self.size + 1, self.size + 1))
+        rows = np.zeros(len(found.records), int)
+        for r, record in enumerate(found.records):
+            X = np.concatenate(
+                [
+                    record.columns,
+                    _depth_splines(record, count, len(channels)),
+                    _time_splines(record, len(channels)),
+                    record.residual[:, :, None],
+                ],
+                axis=2,
+            )
+            for c, noise in enumerate(self.noise):
+                gram[r] += X[:, c].T @ noise.solve(record.time, X[:, c])
+            gram[r] = 0.5 * (gram[r] + gram[r].T)
+            rows[r] = X.shape[0] * X.shape[1]
+        self.moments = Moments(gram, rows)
+
+    def _mesh_scale(self, mesh: list[int], channels: int) -> np.ndarray:
+        """Standard deviation of the discretisation's error by channel [c]."""
+        if not mesh:
+            return np.full(channels, RIDGE)
+        squares, count = np.zeros(channels), 0
+        for record in self.found.records:
+            inside = record.in_contact
+            squares += (record.columns[inside][:, :, mesh[0]] ** 2).sum(0)
+            count += int(inside.sum())
+        return DISCRETISATION * np.sqrt(squares / max(count, 1)) + RIDGE
+
+    def prior(self) -> np.ndarray:
+        """Precision of the columns' coefficients before the data [K]: 0 where nothing is known."""
+        out = np.zeros(self.size)
+        out[self.numerical] = 1.0
+        out[self.spline] = 1.0 / self.discretisation**2
+        for k, deviation in self.usual.items():
+            out[k] = 1.0 / deviation**2
+        return out
+
+    def _estimate_variation(self) -> np.ndarray:
+        """Maximum likelihood of the variation, from differences within conditions alone."""
+        if self.variation_samples == 0 or not self.own:
+            return np.ones(len(self.own))
+        differences = []
+        for members in self.conditions.values():
+            n = len(members)
+            if n > 1:
+                own = self._differences([self.found.records[k] for k in members])
+                # Of n deviations from their mean n - 1 are independent.
+                differences += [(G, (n - 1.0) / n) for G in own]
+        d = len(self.own)
+        usual = np.array(list(self.usual_own.values()))
+
+        def objective(log_s: np.ndarray) -> float:
+            s2 = np.concatenate([np.exp(2.0 * log_s), usual**2])
+            total = 0.0
+            for G, weight in differences:
+                inner = np.eye(len(s2)) + np.sqrt(np.outer(s2, s2)) * G[:-1, :-1]
+                _, logdet = np.linalg.slogdet(inner)
+                rest = integrate_out(G, list(range(len(s2))), s2)[-1, -1]
+                total += weight * (logdet + rest)
+            return float(total) + 0.05 * float((log_s**2).sum())
+
+        fit = minimize(objective, np.zeros(d), method="L-BFGS-B", bounds=[(-4.0, 2.5)] * d)
+        return np.exp(fit.x)
+
+    def _differences(self, members: list[RecordSensitivity]) -> list[np.ndarray]:
+        """Gram matrices of each replicate's own columns and its difference from the mean."""
+        n, count = len(members), min(len(r.time) for r in members)
+        columns = [*self.own, *self.usual_own]
+        mean = np.mean([r.residual[:count] for r in members], axis=0)
+        out = []
+        for r in members:
+            rest = np.sqrt(n / (n - 1.0)) * (r.residual[:count] - mean)
+            X = np.concatenate([r.columns[:count][:, :, columns], rest[:, :, None]], axis=2)
+            G = np.zeros((X.shape[2], X.shape[2]))
+            for c, noise in enumerate(self.noise):
+                G += X[:, c].T @ noise.solve(r.time[:count], X[:, c])
+            out.append(0.5 * (G + G.T))
+        return out
+
+
+def integrate_out(G: np.ndarray, own: list[int], variance: np.ndarray) -> np.ndarray:
+    """Gram matrix after normal coefficients of these columns are integrated out."""
+    if not own:
+        return G
+    inner = G[np.ix_(own, own)] + np.diag(1.0 / np.maximum(variance, 1e-12))
+    factor = cho_factor(inner, check_finite=False)
+    return np.asarray(G - G[:, own] @ cho_solve(factor, G[own], check_finite=False))
+
+
+def _depth_splines(record: RecordSensitivity, count: int, channels: int) -> np.ndarray:
+    """Hat functions of depth for each channel while the edge is in the food [m, c, c * count]."""
+    out = np.zeros((len(record.time), channels, channels * count))
+    knots = KNOT * np.arange(count)
+    hats = np.maximum(1.0 - np.abs(record.depth[:, None] - knots) / KNOT, 0.0)
+    hats[~record.in_contact | (record.depth <= 0.0)] = 0.0
+    for c in range(channels):
+        out[:, c, c * count : (c + 1) * count] = hats
+    return out
+
+
+def _time_splines(record: RecordSensitivity, channels: int) -> np.ndarray:
+    """Cubic splines over the time of a record for each channel [m, c, c * PHASE_KNOTS]."""
+    inside = record.in_contact
+    time = record.time
+    low, high = (time[inside][[0, -1]] if inside.sum() > 10 else time[[0, -1]]).tolist()
+    inner = np.linspace(low, high, PHASE_KNOTS - 2)
+    knots = np.concatenate([[inner[0]] * 3, inner, [inner[-1]] * 3])
+    basis = BSpline.design_matrix(np.clip(time, low, high), knots, 3).toarray()
+    basis = basis[:, :PHASE_KNOTS]
+    basis[(time < low) | (time > high)] = 0.0
+    out = np.zeros((len(time), channels, channels * PHASE_KNOTS))
+    for c in range(channels):
+        out[:, c, c * PHASE_KNOTS : (c + 1) * PHASE_KNOTS] = basis
+    return out

@@ -1,0 +1,166 @@
+"""How noisy a record is within itself, estimated from what replicates do not share.
+
+Records of one condition were nominally the same cut: what is wrong with the model is wrong in all
+of them alike, and drops out of their differences. What is left there is the sensor's noise and the
+food's unevenness (and what slices differ in as a whole, which is projected out before).
+"""
+
+import dataclasses as dc
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.linalg import solveh_banded
+from scipy.optimize import least_squares
+
+from sliceit_drake.diagnosis.sensitivity import RecordSensitivity
+
+__all__ = ["ChannelNoise", "estimate_noise", "replicates"]
+
+LAGS = 40
+LEAST_ROWS = 60
+FLOOR = 1e-3
+"""Least standard deviation, in N and Nm."""
+
+
+@dc.dataclass(frozen=True)
+class ChannelNoise:
+    """Noise of one channel: ar^2 exp(-|dt| / tau) + white^2 for equal times.
+
+    Attributes:
+        ar: Standard deviation of the correlated part, N or Nm.
+        tau: Its correlation time, s.
+        white: Standard deviation of the rest.
+    """
+
+    ar: float
+    tau: float
+    white: float
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of a sample."""
+        return float(np.hypot(self.ar, self.white))
+
+    def solve(self, time: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """The inverse covariance at increasing times [m] times columns [m, k].
+
+        The correlated part is Markov, so that its inverse T is tridiagonal, and with V = T^-1 + w I
+        V^-1 x = (x - (I + w T)^-1 x) / w.
+        """
+        rho = np.exp(-np.diff(time) / self.tau)
+        gain = 1.0 / np.maximum(1.0 - rho**2, 1e-12)
+        diagonal = np.zeros(len(time))
+        diagonal[0] = 1.0
+        diagonal[1:] += gain
+        diagonal[:-1] += rho**2 * gain
+        w = self.white**2
+        band = np.vstack([np.concatenate([[0.0], -rho * gain]), diagonal]) * (w / self.ar**2)
+        band[1] += 1.0
+        return np.asarray((columns - solveh_banded(band, columns, check_finite=False)) / w)
+
+
+def replicates(records: Sequence[RecordSensitivity]) -> dict[str, list[int]]:
+    """Numbers of the records of each condition."""
+    out: dict[str, list[int]] = {}
+    for k, record in enumerate(records):
+        out.setdefault(record.condition or record.name, []).append(k)
+    return out
+
+
+def estimate_noise(
+    records: Sequence[RecordSensitivity], own: Sequence[int]
+) -> tuple[tuple[ChannelNoise, ...], bool]:
+    """Noise of each channel, pooled over the records.
+
+    Args:
+        records: With the same channels.
+        own: Columns that differ from record to record; they are projected out of the differences.
+
+    Returns:
+        The noise of each channel, and whether it is from replicates: where no condition has two
+        records it is from the air phases and from what is rough in the residuals.
+    """
+    groups = [g for g in replicates(records).values() if len(g) > 1]
+    series: list[tuple[np.ndarray, np.ndarray, float]] = []
+    for members in groups:
+        series += _deviations([records[k] for k in members], own)
+    repeated = bool(series)
+    if not repeated:
+        series = [_roughness(r) for r in records]
+    channels = len(records[0].channels)
+    return tuple(_channel(series, c) for c in range(channels)), repeated
+
+
+def _deviations(
+    members: list[RecordSensitivity], own: Sequence[int]
+) -> list[tuple[np.ndarray, np.ndarray, float]]:
+    """Times, deviations from the mean of the replicates [m, c], and a factor on their variance."""
+    count = min(len(r.time) for r in members)
+    since = np.array([r.time[:count] - r.time[0] for r in members])
+    if np.abs(since - since[0]).max() > 0.25 * float(np.median(np.diff(since[0]))):
+        grid = since[0]
+        values = [_on_grid(r.residual, r.time - r.time[0], grid) for r in members]
+        columns = [_on_grid(r.columns[:, :, own], r.time - r.time[0], grid) for r in members]
+    else:
+        grid = since[0]
+        values = [r.residual[:count] for r in members]
+        columns = [r.columns[:count][:, :, own] for r in members]
+    mean = np.mean(values, axis=0)
+    n = len(members)
+    out = []
+    for value, column in zip(values, columns, strict=True):
+        rest = value - mean
+        flat = column.reshape(-1, len(own))
+        scale = np.linalg.norm(flat, axis=0)
+        flat = flat[:, scale > 1e-9]
+        if flat.shape[1]:
+            fitted, *_ = np.linalg.lstsq(flat, rest.ravel(), rcond=1e-6)
+            rest = rest - (flat @ fitted).reshape(rest.shape)
+        out.append((grid, rest, n / (n - 1.0)))
+    return out
+
+
+def _on_grid(values: np.ndarray, time: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    flat = values.reshape(len(values), -1)
+    out = np.column_stack([np.interp(grid, time, column) for column in flat.T])
+    return out.reshape(len(grid), *values.shape[1:])
+
+
+def _roughness(record: RecordSensitivity) -> tuple[np.ndarray, np.ndarray, float]:
+    """The residual less its running mean over a tenth of a second."""
+    step = float(np.median(np.diff(record.time)))
+    width = max(3, 2 * round(0.05 / step) + 1)
+    kernel = np.ones(width) / width
+    smooth = np.column_stack([np.convolve(c, kernel, mode="same") for c in record.residual.T])
+    inside = slice(width, len(record.time) - width)
+    rest = (record.residual - smooth)[inside]
+    return record.time[inside], rest, 1.0 / (1.0 - 1.0 / width)
+
+
+def _channel(series: list[tuple[np.ndarray, np.ndarray, float]], c: int) -> ChannelNoise:
+    """Fits the autocovariance of a channel."""
+    step = float(np.median(np.concatenate([np.diff(t) for t, _, _ in series])))
+    sums, counts = np.zeros(LAGS), np.zeros(LAGS)
+    for _, rest, factor in series:
+        x = rest[:, c]
+        for lag in range(min(LAGS, len(x) - 1)):
+            products = x[lag:] * x[: len(x) - lag]
+            sums[lag] += factor * products.sum()
+            counts[lag] += len(products)
+    used = counts > 0
+    covariance = sums[used] / counts[used]
+    lags = np.arange(LAGS)[used] * step
+    total = max(float(covariance[0]), FLOOR**2)
+
+    def misfit(x: np.ndarray) -> np.ndarray:
+        share, log_tau = x
+        model = share * np.exp(-lags / np.exp(log_tau))
+        model[0] = 1.0
+        return model - covariance / total
+
+    start = np.array([np.clip(covariance[1] / total, 0.05, 0.95) if len(lags) > 1 else 0.5, -3.5])
+    fit = least_squares(misfit, start, bounds=([0.0, np.log(step)], [0.99, np.log(10.0)]))
+    share, tau = float(fit.x[0]), float(np.exp(fit.x[1]))
+    ar = max(np.sqrt(share * total), 0.1 * FLOOR)
+    white = max(np.sqrt((1.0 - share) * total), 0.1 * np.sqrt(total))
+    return ChannelNoise(float(ar), tau, float(white))

@@ -1,0 +1,180 @@
+"""From evidence to a verdict: nothing, causes, a class of causes, unknown, or too little data."""
+
+import dataclasses as dc
+from collections.abc import Callable
+
+import numpy as np
+
+from sliceit_drake.diagnosis.effect_size import effect_in_noise
+from sliceit_drake.diagnosis.linear import LinearProblem
+from sliceit_drake.diagnosis.screen import CauseEvidence, Screening, screen
+
+__all__ = ["Finding", "Verdict", "reach_verdict"]
+
+ALARM = 0.02
+"""Greatest p-value of the largest gain."""
+LEAST_SIZE = 0.7
+"""Least effect against the in-contact noise that is called one: below, the simulation's own errors
+are as large."""
+EXPLAINED = 0.6
+"""Least share of what could be gained that a named cause explains."""
+SECOND_SHARE = 0.2
+"""Least share that a second cause adds."""
+CLASS_ANGLE = 20.0
+"""Causes whose projected sensitivities are closer than this, degrees, are one class."""
+CLASS_GAIN = 0.15
+"""A member of the class is kept where its gain falls short by less than this share."""
+LEAST_REPLICATES = 3
+
+
+@dc.dataclass
+class Finding:
+    """A cause that is supported, with those that these records cannot tell from it.
+
+    Attributes:
+        evidence: Of the cause that explains most.
+        size: What is left of its effect after a refit of all else, over the in-contact noise.
+        share: Of what could be gained that it explains.
+        others: Names of the causes that would explain as much.
+    """
+
+    evidence: CauseEvidence
+    size: float
+    share: float
+    others: list[str]
+
+    @property
+    def names(self) -> list[str]:
+        """The class: the cause first."""
+        return [self.evidence.name, *self.others]
+
+
+@dc.dataclass
+class Verdict:
+    """What the records allow to say.
+
+    Attributes:
+        kind: nothing, cause, causes, unknown, or too_few_replicates.
+        findings: Of the causes; of `unknown` the one that comes nearest, if any.
+        screening: The evidence that it rests on.
+        second: Evidence once the first finding is part of the model, or None.
+        misfit: All that could be gained, as an effect over the in-contact noise.
+        reason: In a sentence.
+        slices_needed: Replicates of each condition that are missing.
+    """
+
+    kind: str
+    findings: list[Finding]
+    screening: Screening
+    second: Screening | None
+    misfit: float
+    reason: str
+    slices_needed: int = 0
+
+    @property
+    def names(self) -> list[list[str]]:
+        """Classes that are named."""
+        named = self.kind in ("cause", "causes", "too_few_replicates")
+        return [f.names for f in self.findings] if named else []
+
+
+def reach_verdict(
+    problem: LinearProblem,
+    replicates: int = 200,
+    seed: int = 0,
+    progress: Callable[[int], None] | None = None,
+) -> Verdict:
+    """Screens, and decides.
+
+    Args:
+        problem: The records' moments.
+        replicates: Of the bootstrap.
+        seed: Of the bootstrap.
+        progress: Called with the replicates done.
+    """
+    first = screen(problem, replicates, seed, progress=progress)
+    reducible = max(first.misfit - first.expected_misfit, 0.0)
+    findings = [_finding(problem, first, e, reducible) for e in first.causes[:6]]
+    large = [f for f in findings if f.size >= LEAST_SIZE]
+    misfit = _misfit_size(findings, reducible)
+    counts = [len(m) for m in problem.conditions.values()]
+    needed = max(0, LEAST_REPLICATES - min(counts)) if max(counts) < LEAST_REPLICATES else 0
+    if first.p_value > ALARM or not large:
+        if first.misfit_p_value <= ALARM and misfit >= LEAST_SIZE:
+            reason = "the records differ from the simulation, but no cause of the list explains it"
+            return Verdict("unknown", [], first, None, misfit, reason, needed)
+        reason = "nothing beyond the noise and what the simulation itself is unsure of"
+        return Verdict("nothing", [], first, None, misfit, reason, needed)
+    best = max(large, key=lambda f: f.evidence.score)
+    second = screen(
+        problem, replicates, seed + 1, ((best.evidence.name, best.evidence.scan),), progress
+    )
+    added = [
+        _finding(problem, second, e, reducible)
+        for e in second.causes[:6]
+        if e.name not in best.names
+    ]
+    added = [
+        f
+        for f in added
+        if f.size >= LEAST_SIZE
+        and f.share >= SECOND_SHARE
+        and f.evidence.score > 0.0
+        and second.p_value <= ALARM
+    ]
+    other = max(added, key=lambda f: f.evidence.score, default=None)
+    explained = best.share + (other.share if other else 0.0)
+    if explained < EXPLAINED:
+        reason = (
+            f"the cause that comes nearest, {best.evidence.name}, explains {100 * explained:.0f} % "
+            "of what the simulation gets wrong"
+        )
+        return Verdict("unknown", [best], first, second, misfit, reason, needed)
+    found = [best] if other is None else [best, other]
+    if needed:
+        reason = (
+            f"no condition has {LEAST_REPLICATES} slices, so that an effect cannot be told from "
+            "how slices vary"
+        )
+        return Verdict("too_few_replicates", found, first, second, misfit, reason, needed)
+    reason = f"explains {100 * min(explained, 1.0):.0f} % of what the simulation gets wrong"
+    return Verdict("cause" if other is None else "causes", found, first, second, misfit, reason)
+
+
+def _finding(
+    problem: LinearProblem, screening: Screening, evidence: CauseEvidence, reducible: float
+) -> Finding:
+    columns = problem.found.index("cause", evidence.name, evidence.scan)
+    size, _ = effect_in_noise(problem, columns, np.array(evidence.coefficients))
+    if evidence.per_record:
+        # The mean of signed amplitudes says nothing of their size; the gain does.
+        size = _size_of_gain(problem, evidence.gain - evidence.expected)
+    share = max(evidence.gain - evidence.expected, 0.0) / max(reducible, 1e-9)
+    floor = evidence.score - CLASS_GAIN * evidence.gain
+    others = [
+        e.name
+        for e in screening.causes
+        if e.name != evidence.name
+        and screening.angle(evidence.name, e.name) <= CLASS_ANGLE
+        and e.score >= floor
+    ]
+    return Finding(evidence, size, share, others)
+
+
+def _size_of_gain(problem: LinearProblem, gain: float) -> float:
+    """Effect over the noise that would give such a gain if its samples were independent a
+    correlation time apart."""
+    samples = 0.0
+    for record in problem.found.records:
+        step = float(np.median(np.diff(record.time)))
+        inside = float(record.in_contact.sum())
+        for noise in problem.noise:
+            share = noise.ar**2 / noise.deviation**2
+            samples += inside / (1.0 + share * 2.0 * noise.tau / step)
+    return float(np.sqrt(max(gain, 0.0) / max(samples, 1.0)))
+
+
+def _misfit_size(findings: list[Finding], reducible: float) -> float:
+    """All that could be gained as an effect over the noise, at the rate of the causes'."""
+    rates = [f.evidence.gain / f.size**2 for f in findings if f.size > 1e-3]
+    return float(np.sqrt(reducible / np.median(rates))) if rates else 0.0
