@@ -148,11 +148,13 @@ class Sensitivities:
         records: One a record.
         warnings: What a reader should know, as a cause whose slices broke down: its column is 0
             for that record.
+        elements: Most tetrahedra of a slice's food.
     """
 
     columns: list[Column]
     records: list[RecordSensitivity]
     warnings: list[str] = dc.field(default_factory=list)
+    elements: int = 0
 
     def index(self, kind: str, name: str | None = None, scan: float | None = None) -> list[int]:
         """Numbers of the columns of a kind; of a name, of a value of the scan, if given."""
@@ -182,6 +184,7 @@ class Sensitivities:
                 for r in self.records
             ],
             "warnings": self.warnings,
+            "elements": self.elements,
         }
         arrays = {
             f"{k}.{name}": getattr(r, name) for k, r in enumerate(self.records) for name in ARRAYS
@@ -208,7 +211,8 @@ class Sensitivities:
                 )
                 for k, r in enumerate(facts["records"])
             ]
-        return cls([Column(**c) for c in facts["columns"]], records, facts["warnings"])
+        columns = [Column(**c) for c in facts["columns"]]
+        return cls(columns, records, facts["warnings"], facts["elements"])
 
 
 def cause_columns(cause: Cause) -> list[tuple[Column, dict[str, float], dict[str, float] | None]]:
@@ -364,7 +368,9 @@ class _Computation:
         predictor.simulate(points, progress)
         warnings: list[str] = []
         records = [self._record(r, warnings) for r in range(len(predictor.targets))]
-        return Sensitivities(self.columns, records, warnings)
+        first = predictor.meshings[0]
+        counts = [t.models[first].element_count for t in predictor.targets if t.models]
+        return Sensitivities(self.columns, records, warnings, max(counts, default=0))
 
     def _record(self, number: int, warnings: list[str]) -> RecordSensitivity:
         target = self.predictor.targets[number]

@@ -1,0 +1,445 @@
+"""Causes: at their null they change nothing, and each has the signature that it claims."""
+
+import functools
+import re
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sliceit_drake.calibration.setup import CalibrationSetup
+from sliceit_drake.cli.identifiability import nominal_records, protocol_setup
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.motion import (
+    ConstantSpeed,
+    Hold,
+    MotionPlan,
+    PressAndDraw,
+    Retract,
+    Waypoints,
+)
+from sliceit_drake.diagnosis import registry
+from sliceit_drake.diagnosis.cause import EXPERIMENTS, FAMILIES, Cause, CauseParameter
+from sliceit_drake.diagnosis.causes import BUILT_IN
+from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
+from sliceit_drake.diagnosis.registry import all_causes, load_cause, open_causes
+from sliceit_drake.diagnosis.sensitivity import RecordSensitivity, Sensitivities, sensitivities
+from sliceit_drake.records.slice_record import SliceRecord
+from sliceit_drake.resources import resource_path
+from sliceit_drake.stand_in.protocol import Condition, Protocol, load_protocol
+
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+GRAVITY = 9.81
+TURN, MASS = 0.5, 1.0
+X, Y, Z = range(3)
+MIDDLE = "share_medium"
+
+
+def push(speed: float) -> MotionPlan:
+    """Down to the middle, held, on to 0.2 mm below the board's top, withdrawn."""
+    return MotionPlan(
+        [
+            Hold(0.1, label="air"),
+            ConstantSpeed(distance=0.0165, speed=speed, acceleration=2.0, label="slice"),
+            Hold(0.6, label="hold"),
+            ConstantSpeed(distance=0.0137, speed=speed, acceleration=2.0, label="slice"),
+            Retract(distance=0.0302, speed=0.06, acceleration=2.0, label="retract"),
+            Hold(0.1, label="air"),
+        ]
+    )
+
+
+DRAW = MotionPlan(
+    [
+        Hold(0.1, label="air"),
+        PressAndDraw(press_speed=0.03, distance=0.0302, draw_ratio=1.0, label="slice"),
+        Retract(distance=0.0302, speed=0.06, acceleration=2.0, label="retract"),
+    ]
+)
+TURNED = MotionPlan(
+    [
+        Hold(0.1, label="air"),
+        Hold(0.3, label="weight"),
+        Waypoints(times=[0.4], positions=[[0.0] * 3], rotations=[[TURN, 0.0, 0.0]], label="air"),
+        Hold(0.3, label="weight"),
+    ]
+)
+BOARD = MotionPlan(
+    [
+        Hold(0.1, label="air"),
+        ConstantSpeed(distance=0.0075, speed=0.02, acceleration=0.5, label="board_press"),
+        Hold(0.2, label="board_press"),
+    ]
+)
+CONDITIONS = [
+    Condition("slow", push(0.012), 1),
+    Condition("fast", push(0.04), 1),
+    Condition("peeled", push(0.04), 1, peeled=True),
+    Condition("draw", DRAW, 1, offset=-0.015),
+    Condition("board", BOARD, 1, clearance=-0.02, without_food=True),
+    Condition("weight", TURNED, 1, clearance=0.08, without_food=True, weight=MASS),
+]
+
+
+@functools.cache
+def bench() -> tuple[CalibrationSetup, list[SliceRecord]]:
+    """Slices of a coarse cucumber."""
+    protocol = load_protocol(str(resource_path("calibration/protocols/poor.yaml")))
+    protocol = Protocol(food=protocol.food, conditions=CONDITIONS, random_order=False)
+    return protocol_setup(protocol, refinement=0.5), nominal_records(protocol)
+
+
+@functools.cache
+def found() -> Sensitivities:
+    setup, records = bench()
+    return sensitivities(setup, records, all_causes(), finer=None)
+
+
+def record(condition: str) -> RecordSensitivity:
+    (only,) = (r for r in found().records if r.condition == condition)
+    return only
+
+
+def change(condition: str, name: str, parameter: str = "", scan: float | None = None) -> np.ndarray:
+    """What a cause or base parameter changes in a record [m, c]; its first parameter by default,
+    at the middle of its scan."""
+    s = found()
+    kind = "cause" if name in s.causes else "base"
+    if scan is None and kind == "cause":
+        scans = s.scans(name)
+        scan = scans[len(scans) // 2]
+    columns = s.index(kind, name, scan)
+    (k,) = [k for k in columns if parameter in ("", s.columns[k].parameter)][:1]
+    return record(condition).columns[:, :, k].astype(float)
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def within(condition: str, low: float, high: float, phase: str = "slice") -> np.ndarray:
+    """Rows of a phase between two shares of the food's height."""
+    r = record(condition)
+    share = r.depth / 0.027
+    return (r.phase == phase) & (share > low) & (share < high)
+
+
+def settled_hold(condition: str) -> tuple[np.ndarray, np.ndarray]:
+    """Rows at the beginning and at the end of the hold half way, without where it still settles."""
+    r = record(condition)
+    held = np.flatnonzero(r.phase == "hold")
+    return held[20:30], held[-10:]
+
+
+SIMULATED = [kind() for kind in BUILT_IN]
+
+
+def test_a_cause_at_its_null_changes_nothing():
+    setup, records = bench()
+    chosen = [r for r in records if r.metadata.condition in ("fast", "board")]
+    predictor = SlicePredictor(setup, chosen)
+    base = predictor.predict([Point()])[0]
+    assert all(series is not None and np.abs(series.wrench).max() > 1.0 for series in base)
+    for cause in SIMULATED:
+        values = cause.nulls()
+        if cause.scan is not None:
+            values[cause.scan.name] = cause.scan.values[0]
+        rows = predictor.predict([Point(causes=(ActiveCause(cause, values),))])[0]
+        for series, before in zip(rows, base, strict=True):
+            assert np.array_equal(series.wrench, before.wrench), cause.name
+
+
+def test_each_cause_says_what_it_is():
+    rows = set()
+    for cause in SIMULATED:
+        assert cause.family in FAMILIES and cause.experiment in EXPERIMENTS, cause.name
+        assert cause.signature and cause.__doc__, cause.name
+        rows.add(cause.row)
+    # 3 is that of the discretisation's columns; 6 is the toughness, a base parameter.
+    assert rows == set(range(1, 22)) - {3, 6}
+
+
+def test_a_free_base_parameter_takes_the_place_of_its_cause():
+    names = {cause.name for cause in open_causes(["effects.skin.toughness"])}
+    assert "skin" not in names and "bluntness" in names
+
+
+def test_only_a_viscoelastic_bulk_decays_in_a_hold():
+    first, last = settled_hold("fast")
+    decay = {
+        name: abs(change("fast", name)[first, Z].mean() - change("fast", name)[last, Z].mean())
+        for name in found().causes
+    }
+    del decay["viscoelasticity"]
+    force = change("fast", "viscoelasticity", MIDDLE)[:, Z]
+    relaxed = force[first].mean() - force[last].mean()
+    assert force[last].mean() < -0.1
+    assert relaxed > 0.05
+    # What a sensor adds by time is no force of the food.
+    del decay["sensor_zero"]
+    assert all(value < 0.2 * relaxed for value in decay.values()), decay
+
+
+def test_a_rate_of_the_toughness_goes_with_the_speed_and_ceases_when_the_edge_stops():
+    slow, fast = (change(c, "toughness_rate")[:, Z] for c in ("slow", "fast"))
+    assert slow[within("slow", 0.3, 0.48)].mean() < -0.1
+    assert fast[within("fast", 0.3, 0.48)].mean() > 0.1
+    first, _ = settled_hold("fast")
+    # At rest R is less for an exponent above zero; below, the edge asks for no more than at rest.
+    assert fast[first].mean() < -0.5
+
+
+def test_friction_and_adhesion_flip_their_sign_on_withdrawal():
+    # The withdrawal is faster than the press, so that less is left of the friction at rest.
+    for name, out in (
+        ("material.friction", -0.02),
+        ("adhesion", -0.02),
+        ("static_friction", -1e-3),
+    ):
+        force = change("fast", name)[:, Z]
+        assert force[within("fast", 0.3, 0.48)].mean() > 0.01, name
+        assert force[within("fast", 0.2, 0.8, "retract")].mean() < out, name
+    # Toughness asks for nothing on the way out.
+    toughness = change("fast", "material.toughness")[:, Z]
+    out = within("fast", 0.2, 0.8, "retract")
+    assert abs(toughness[out].mean()) < 0.1 * toughness[within("fast", 0.3, 0.48)].mean()
+
+
+def test_the_viscous_part_of_adhesion_grows_with_the_speed_and_the_other_does_not():
+    def ratio(parameter: str) -> float:
+        slow, fast = (
+            change(c, "adhesion", parameter)[within(c, 0.2, 0.48), Z].mean()
+            for c in ("slow", "fast")
+        )
+        return float(fast / slow)
+
+    assert ratio("stress") == pytest.approx(1.0, abs=0.35)
+    assert ratio("viscosity") > 2.0
+
+
+def test_friction_at_rest_matters_less_the_faster_the_knife():
+    slow, fast = (
+        change(c, "static_friction")[within(c, 0.2, 0.48), Z].mean() for c in ("slow", "fast")
+    )
+    assert slow > 2.0 * fast > 0.0
+
+
+def test_a_skin_shows_at_entry_and_exit_and_not_where_it_was_peeled():
+    force = change("fast", "skin")[:, Z]
+    middle = rms(force[within("fast", 0.25, 0.45)])
+    assert force[within("fast", 0.0, 0.12)].max() > 3.0 * middle
+    assert force[within("fast", 0.85, 1.0)].max() > 3.0 * middle
+    assert not change("peeled", "skin").any()
+
+
+def test_a_blunt_edge_shows_at_entry_alone_and_less_in_a_draw():
+    force = change("fast", "bluntness", scan=1.5e-3)[:, Z]
+    assert force[within("fast", 0.0, 0.12)].max() > 5.0 * rms(force[within("fast", 0.6, 0.95)])
+    drawn = change("draw", "bluntness", scan=1.5e-3)[:, Z]
+    assert drawn[within("draw", 0.0, 0.12)].max() < 0.7 * force[within("fast", 0.0, 0.12)].max()
+
+
+def test_dulling_begins_with_nothing_and_grows_with_the_slices():
+    assert record("slow").knife_slices == 0
+    assert not change("slow", "dulling").any()
+    entry = within("fast", 0.0, 0.12)
+    peak = [change("fast", "dulling", scan=s)[entry, Z].max() for s in (0.5, 1.0)]
+    later = [change("peeled", "dulling", scan=s)[entry, Z].max() for s in (0.5, 1.0)]
+    # After one and after two slices.
+    assert later[1] / peak[1] == pytest.approx(2.0, rel=0.15)
+    assert later[0] / peak[0] == pytest.approx(np.sqrt(2.0), rel=0.15)
+
+
+def test_the_slice_push_law_shows_in_a_draw_alone():
+    assert rms(change("fast", "slice_push_law")) < 1e-3
+    cutting = within("draw", 0.2, 0.8)
+    assert change("draw", "slice_push_law")[cutting, Z].mean() < -0.1
+
+
+def test_a_section_that_is_wider_below_asks_for_more_there_at_any_speed():
+    for condition in ("slow", "fast"):
+        force = change(condition, "section_shape", "taper")[:, Z]
+        upper, lower = within(condition, 0.1, 0.35), within(condition, 0.65, 0.9)
+        assert force[upper].mean() < -0.05 < 0.05 < force[lower].mean()
+
+
+def test_a_weak_core_shows_in_the_middle():
+    force = change("fast", "core", scan=0.5)[:, Z]
+    assert force[within("fast", 0.4, 0.48)].mean() < -0.5
+    assert abs(force[within("fast", 0.0, 0.06)].mean()) < 0.1
+
+
+def test_a_board_shows_where_it_is_touched():
+    touched = record("fast").depth > 0.027
+    stiffer = change("fast", "board_stiffness", "share")
+    assert stiffer[touched, Z].max() > 0.5
+    assert rms(stiffer[record("fast").depth < 0.026]) < 1e-6
+    higher = change("fast", "board_height")[:, Z]
+    assert higher[touched].max() > 2.0
+
+
+def test_an_arm_that_gives_halves_the_force_of_a_board_that_is_as_stiff():
+    setup, _ = bench()
+    board = record("board")
+    held = slice(-20, None)
+    compliance = 4e-5
+    expected = board.predicted[held, Z] / (1.0 + compliance * setup.board.stiffness)
+    after = board.predicted[held, Z] + change("board", "arm_compliance")[held, Z]
+    assert board.predicted[held, Z].mean() > 3.0
+    assert after == pytest.approx(expected, rel=0.01)
+
+
+def test_an_arm_that_gives_takes_from_a_force_that_rises():
+    force = change("fast", "arm_compliance")[:, Z]
+    assert force[within("fast", 0.02, 0.2)].mean() < -0.1
+
+
+def test_a_holder_that_gives_shows_along_the_edge_of_a_draw():
+    assert rms(change("draw", "holder_compliance")[:, X]) > 0.05
+    assert rms(change("fast", "holder_compliance")) < 0.01
+
+
+def test_a_slip_shows_after_it_and_knocks_the_blade():
+    knock, depth = change("fast", "slip", "knock", scan=0.6)[:, Y], 0.6 * 0.027
+    before = record("fast").time < record("fast").time[np.argmax(record("fast").depth > depth)]
+    assert not knock[before].any()
+    assert knock.max() > 0.8
+    moved = change("draw", "slip", "distance", scan=0.6)[:, X]
+    before = record("draw").time < record("draw").time[np.argmax(record("draw").depth > depth)]
+    assert rms(moved[before]) < 1e-6 < 0.1 < np.abs(moved).max()
+
+
+def test_a_gain_scales_everything_a_known_weight_too():
+    for condition in ("fast", "weight"):
+        predicted = record(condition).predicted
+        assert change(condition, "sensor_gain") == pytest.approx(0.08 * predicted, abs=1e-5)
+    held = record("weight").phase == "weight"
+    assert record("weight").predicted[held, Z].min() == pytest.approx(-MASS * GRAVITY, abs=0.05)
+
+
+def test_a_zero_is_there_in_the_air_and_turns_with_the_tool():
+    offset = change("weight", "sensor_zero", "bias_z")
+    assert offset[0, Z] == pytest.approx(-0.3, abs=0.01)
+    assert offset[-1, Z] == pytest.approx(-0.3 * np.cos(TURN), abs=0.01)
+    drift = change("fast", "sensor_zero", "drift_z")[:, Z]
+    assert drift[-1] == pytest.approx(-0.03 * np.ptp(record("fast").time), rel=0.02)
+
+
+def test_a_turned_sensor_shows_the_press_sideways():
+    force = record("fast").predicted[:, Z]
+    sideways = change("fast", "sensor_tilt", "about_x")[:, Y]
+    assert sideways == pytest.approx(-np.sin(0.06) * force, abs=0.02)
+
+
+def test_a_delay_takes_its_time_times_the_rate():
+    r = record("fast")
+    smooth = within("fast", 0.05, 0.3)
+    rate = np.gradient(r.predicted[:, Z], r.time)[smooth]
+    late = change("fast", "sensor_delay", scan=4.0)[smooth, Z]
+    assert (late @ rate) / (rate @ rate) == pytest.approx(-0.01, rel=0.3)
+
+
+def test_a_tool_that_nobody_weighed_shows_when_it_turns():
+    weight = change("weight", "tool_weight", "mass")
+    assert not weight[0].any()
+    mass = 0.15
+    turned = weight[-1]
+    # What was there at the start was taken off, in the axes of the sensor.
+    assert turned[Y] == pytest.approx(-mass * GRAVITY * np.sin(TURN), abs=0.02)
+    assert turned[Z] == pytest.approx(mass * GRAVITY * (np.cos(TURN) - 1.0), abs=0.02)
+
+
+def test_a_vibration_is_locked_to_time_and_gone_at_rest():
+    wave = change("slow", "vibration", "sine_z", scan=12.0)[:, Z]
+    assert rms(wave[record("slow").phase == "hold"][30:-5]) < 0.01
+    moving = within("slow", 0.1, 0.5)
+    at = record("slow").time[moving]
+    spectrum = np.abs(np.fft.rfft(wave[moving] * np.hanning(moving.sum())))
+    frequency = np.fft.rfftfreq(moving.sum(), at[1] - at[0])[spectrum.argmax()]
+    assert frequency == pytest.approx(12.0, abs=1.0)
+
+
+def test_stick_slip_is_locked_to_the_path_and_not_there_in_the_air():
+    for condition, speed in (("slow", 0.012), ("fast", 0.04)):
+        wave = change(condition, "stick_slip", "sine", scan=3.2e-3)[:, Z]
+        moving = within(condition, 0.55, 0.95)
+        at = record(condition).time[moving]
+        padded = np.fft.rfft(wave[moving] * np.hanning(moving.sum()), 4096)
+        frequency = np.fft.rfftfreq(4096, at[1] - at[0])[np.abs(padded).argmax()]
+        assert frequency == pytest.approx(speed / 3.2e-3, rel=0.1), condition
+        assert rms(wave[record(condition).depth < -1e-3]) < 1e-6
+
+
+def example() -> str:
+    """The example of the documentation."""
+    (code,) = re.findall(r"```python\n(.*?)```", (DOCS / "causes.md").read_text(), re.DOTALL)[:1]
+    return code
+
+
+def test_a_cause_in_a_file_is_loaded_and_used(tmp_path):
+    file = tmp_path / "my_cause.py"
+    file.write_text(example())
+    cause = load_cause(file)
+    setup, records = bench()
+    chosen = [r for r in records if r.metadata.condition == "fast"]
+    s = sensitivities(setup, chosen, [cause], finer=None)
+    (k,) = s.index("cause", cause.name)
+    (r,) = s.records
+    out = (r.phase == "retract") & (r.depth > 2e-3) & (r.depth < 0.02)
+    assert r.columns[out, Z, k].mean() < -0.05
+    assert abs(r.columns[r.phase == "slice", Z, k].mean()) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ('family = "cosmic"', "family: is 'cosmic'"),
+        ('experiment = "pray"', "experiment: is 'pray'"),
+        ("parameters = ()", "parameters: is empty"),
+        ('name = "two words"', "name: is 'two words'"),
+    ],
+)
+def test_an_incomplete_cause_is_refused_with_its_attribute(tmp_path, change, message):
+    attribute = change.split(" =")[0]
+    file = tmp_path / "my_cause.py"
+    text = re.sub(rf"^    {attribute} = .*$", f"    {change}", example(), flags=re.MULTILINE)
+    file.write_text(text)
+    with pytest.raises(ConfigurationError, match=re.escape(message)) as error:
+        load_cause(file)
+    assert str(file) in str(error.value)
+
+
+def test_a_file_without_a_cause_is_refused(tmp_path):
+    (tmp_path / "empty.py").write_text("x = 1\n")
+    with pytest.raises(ConfigurationError, match="holds 0 causes"):
+        load_cause(tmp_path / "empty.py")
+    with pytest.raises(ConfigurationError, match="no such file"):
+        load_cause(tmp_path / "absent.py")
+
+
+class Installed(Cause):
+    """A cause of an installed package."""
+
+    name = "installed"
+    family = "sensor"
+    parameters = (CauseParameter("size", "N", 1.0),)
+    signature = "any"
+    experiment = "air"
+
+
+class Skin(Installed):
+    """One with a name that is taken."""
+
+    name = "skin"
+
+
+def test_causes_of_installed_packages_are_found(monkeypatch):
+    def points(kind: str) -> list[EntryPoint]:
+        return [EntryPoint(kind, f"{__name__}:{kind}", registry.ENTRY_POINTS)]
+
+    monkeypatch.setattr(registry, "entry_points", lambda group: points("Installed"))
+    assert all_causes()[-1].name == "installed"
+    monkeypatch.setattr(registry, "entry_points", lambda group: points("Skin"))
+    with pytest.raises(ConfigurationError, match="two causes 'skin'"):
+        all_causes()
