@@ -3,29 +3,40 @@
 import dataclasses as dc
 from collections.abc import Mapping
 
+import numpy as np
+
 from sliceit_drake.cutting.effects import Core, Relaxation, Skin, SlicePush, ToughnessRate
 from sliceit_drake.cutting.model import CuttingModel
-from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan, SliceFacts
+from sliceit_drake.diagnosis.cause import Cause, CauseParameter, ForceSeries, Scan, SliceFacts
 
 __all__ = ["CoreRatio", "SkinToughness", "SlicePushLaw", "ToughnessBySpeed", "Viscoelasticity"]
 
 
 BRANCHES = {"fast": 0.03, "medium": 0.3, "slow": 3.0}
 """Relaxation times, s."""
+RESTING = 2e-4
+"""Speed below which a knife rests, m/s."""
+RECOVERY = 5e-4
+"""Travel over which a force that faded comes back, metres."""
 
 
 class Viscoelasticity(Cause):
-    """Bulk that relaxes: shares of the modulus fade, each with its time (a Prony series).
+    """Food that relaxes: the bulk's modulus (a Prony series), and what a resting edge stands on.
 
-    A decade apart, branches together follow a power law of time within a few per cent, which one
-    alone does not.
+    `share_*`: of the modulus that fades with each time, in the finite elements. `rest_*`: of the
+    force at a stop that fades with each time while the knife rests in the food, and comes back over
+    `RECOVERY` of travel: around an edge at rest the food flows, where one that moves always meets
+    fresh food. A decade apart, branches together follow a power law of time within a few per cent,
+    which one alone does not.
     """
 
     name = "viscoelasticity"
     family = "material"
     row = 1
     parameters = tuple(
-        CauseParameter(f"share_{speed}", "", 0.1, low=0.0, high=0.33) for speed in BRANCHES
+        CauseParameter(f"{kind}_{speed}", "", 0.1, low=0.0, high=0.33)
+        for kind in ("share", "rest")
+        for speed in BRANCHES
     )
     signature = "decays in a hold; grows with the logarithm of the speed"
     experiment = "hold"
@@ -37,8 +48,31 @@ class Viscoelasticity(Cause):
         old = model.effects.relaxation
         added = {time: values[f"share_{speed}"] for speed, time in BRANCHES.items()}
         added = {time: share for time, share in added.items() if share != 0.0}
+        if not added:
+            return model
         relaxation = Relaxation([*old.shares, *added.values()], [*old.times, *added])
         return model.derive(effects=dc.replace(model.effects, relaxation=relaxation))
+
+    def wrench(
+        self, series: ForceSeries, values: Mapping[str, float], facts: SliceFacts
+    ) -> np.ndarray:
+        """Less what has faded while the knife rests."""
+        shares = {time: values[f"rest_{speed}"] for speed, time in BRANCHES.items()}
+        if not any(shares.values()):
+            return series.wrench
+        food = series.parts["edge"] + series.parts["normal"] + series.parts["friction"]
+        faded = np.zeros(len(food))
+        held = dict.fromkeys(shares, 0.0)
+        speed, period = series.speed, series.period
+        for k in range(len(food)):
+            resting = series.in_contact[k] and speed[k] < RESTING
+            for time in held:
+                if resting:
+                    held[time] += (1.0 - held[time]) * (1.0 - np.exp(-period / time))
+                else:
+                    held[time] *= float(np.exp(-speed[k] * period / RECOVERY))
+            faded[k] = sum(share * held[time] for time, share in shares.items())
+        return np.asarray(series.wrench - faded[:, None] * food)
 
 
 class ToughnessBySpeed(Cause):
