@@ -115,8 +115,8 @@ def nominal_records(protocol: "Protocol", prefix: str = "") -> "list[SliceRecord
 
 def study(
     protocols: "Sequence[Protocol]",
+    causes: "Sequence[Cause]",
     refinement: float = 0.5,
-    extra: "Sequence[Cause]" = (),
     cache: Path | None = None,
     workers: int | None = None,
     progress: "Callable[[int, int], None] | None" = None,
@@ -125,15 +125,14 @@ def study(
 
     Args:
         protocols: Of one food and knife; conditions of the last are what is proposed.
+        causes: What may be wrong.
         refinement: Elements along an edge, relative to the food's mesh.
-        extra: Causes beside those that come with the package.
         cache: Folder for finished simulations; None for none.
         workers: Threads.
         progress: Called with the number of simulated slices, and of those that must be.
     """
     from sliceit_drake.diagnosis.identifiability import Evidence, identifiability
     from sliceit_drake.diagnosis.identifiability_report import Study
-    from sliceit_drake.diagnosis.registry import open_causes
     from sliceit_drake.diagnosis.sensitivity import sensitivities
 
     records: list[SliceRecord] = []
@@ -142,7 +141,6 @@ def study(
         own = nominal_records(protocol, f"{protocol.name}_")
         ranges.append(list(range(len(records), len(records) + len(own))))
         records += own
-    causes = open_causes([name for name, *_ in BASE], extra)
     setup = protocol_setup(protocols[-1], refinement)
     found = sensitivities(
         setup, records, causes, cache=cache, workers=workers, progress=progress, store=False
@@ -166,7 +164,7 @@ def run(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from sliceit_drake.diagnosis.identifiability_report import plot_angles, report
-    from sliceit_drake.diagnosis.registry import load_cause
+    from sliceit_drake.diagnosis.registry import load_cause, open_causes
     from sliceit_drake.resources import resource_path
     from sliceit_drake.stand_in.protocol import load_protocol
 
@@ -175,6 +173,7 @@ def run(options: argparse.Namespace) -> int:
         for name in PROTOCOLS
     ]
     extra = [load_cause(file) for file in options.cause]
+    causes = open_causes([name for name, *_ in BASE], extra)
     with tqdm(desc="slices") as bar:
 
         def progress(done: int, of: int) -> None:
@@ -182,7 +181,7 @@ def run(options: argparse.Namespace) -> int:
             bar.update(done - bar.n)
 
         found = study(
-            protocols, options.refinement, extra, options.cache, options.workers, progress
+            protocols, causes, options.refinement, options.cache, options.workers, progress
         )
     text = report(found)
     print(text)

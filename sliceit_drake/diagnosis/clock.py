@@ -36,34 +36,43 @@ class Clock:
         period: Of the grid, the shortest exchange, s.
         travel: Most motion in an exchange that is longer, metres.
         longest: Most periods of an exchange, a power of two.
+        settling: Blocks of exchanges that could be longer before they are. Masses grow with the
+            step, so that what still swings when it grows would swing with more energy.
     """
 
     period: float = 2e-3
     travel: float = 6e-5
     longest: int = 8
+    settling: int = 3
 
     def stretches(self, moved: np.ndarray, first: int, last: int) -> Stretches:
         """Divides the grid from row `first` to beyond `last`.
 
-        An exchange is at most twice as long as those of the block before it, so that food that
-        settles after a stop does so at every scale of time.
+        An exchange is at most twice as long as the one before it, and only `settling` blocks after
+        the motion allows it, so that food settles after a stop at every scale of time.
 
         Args:
             moved: Way of the knife in each period [N], metres; 0 where it touches nothing.
             first, last: Rows of the grid.
         """
         way = np.concatenate([[0.0], np.cumsum(moved)])
-        ends, multiples, at, most = [first], [], first, 1
+
+        def allowed(m: int) -> bool:
+            if m == 1:
+                return True
+            rows = np.minimum(at + m * np.arange(BLOCK + 1), len(way) - 1)
+            slow = np.diff(way[rows]).max() <= self.travel * (1.0 + 1e-9)
+            return bool(slow and at + m * BLOCK <= last)
+
+        ends, multiples, at, m, waited = [first], [], first, 1, 0
         while at < last:
-            m = most
-            while m > 1:
-                steps = np.minimum(at + m * np.arange(BLOCK + 1), len(way) - 1)
-                inside = at + m * BLOCK <= last
-                if inside and np.diff(way[steps]).max() <= self.travel * (1.0 + 1e-9):
-                    break
-                m //= 2
+            while not allowed(m):
+                m, waited = m // 2, 0
+            longer = m < self.longest and allowed(2 * m)
+            waited = waited + 1 if longer else 0
+            if waited > self.settling:
+                m, waited = 2 * m, 0
             ends.extend((at + m * np.arange(1, BLOCK + 1)).tolist())
             multiples.append(m)
             at += m * BLOCK
-            most = min(2 * m, self.longest)
         return Stretches(np.array(ends), np.array(multiples))
