@@ -1,0 +1,368 @@
+"""A diagnosis from records to a result: what is wrong, why, how much, and the extended model."""
+
+import copy
+import dataclasses as dc
+import datetime
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
+from sliceit_drake.configuration import ConfigurationError, dump_yaml
+from sliceit_drake.cutting.food import make_food_model
+from sliceit_drake.cutting.parameters import get_parameter, with_parameters
+from sliceit_drake.diagnosis.cause import Cause, SliceFacts
+from sliceit_drake.diagnosis.held_out import HeldOutGain, held_out_gain
+from sliceit_drake.diagnosis.linear import LinearProblem
+from sliceit_drake.diagnosis.registry import open_causes
+from sliceit_drake.diagnosis.sensitivity import Sensitivities, sensitivities
+from sliceit_drake.diagnosis.verdict import Finding, Verdict, reach_verdict
+from sliceit_drake.diagrams.calibrated_food import CalibratedFood
+from sliceit_drake.records.slice_record import SliceRecord
+
+__all__ = ["BASE", "Diagnosis", "diagnose", "setup_of_food"]
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is done, steps done and steps in all."""
+
+BASE = (
+    ParameterRange("material.toughness", 10.0, 5000.0),
+    ParameterRange("material.youngs_modulus", 2e4, 2e7),
+    ParameterRange("material.friction", 1e-3, 2.0),
+)
+"""Base parameters of a calibrated food: a shift of theirs is reported as such."""
+
+LEAST_RECORDS = 2
+
+
+@dc.dataclass
+class Diagnosis:
+    """What a diagnosis found; prints as a table, plots itself, saves to a folder.
+
+    Attributes:
+        verdict: The decision and the evidence.
+        problem: The records' moments.
+        setup: The model that was tested.
+        causes: All that were tested, by name.
+        shifts: Changes of the base parameters with the verdict's causes in the model, by name:
+            factor (log scale) and its standard error.
+        gain: Error on records that were left out; None if nothing is named.
+        remarks: What a reader must know.
+    """
+
+    verdict: Verdict
+    problem: LinearProblem
+    setup: CalibrationSetup
+    causes: dict[str, Cause]
+    shifts: dict[str, tuple[float, float]]
+    gain: HeldOutGain | None
+    remarks: list[str]
+
+    @property
+    def sensitivities(self) -> Sensitivities:
+        """What the evidence rests on."""
+        return self.problem.found
+
+    def values(self, finding: Finding) -> dict[str, float]:
+        """Parameters of a finding's cause."""
+        e, cause = finding.evidence, self.causes[finding.evidence.name]
+        values = cause.nulls()
+        if cause.scan is not None and e.scan is not None:
+            values[cause.scan.name] = e.scan
+        by_name = {p.name: p for p in cause.parameters}
+        for name, coefficient, size in zip(e.parameters, e.coefficients, e.sizes, strict=True):
+            p = by_name[name]
+            values[name] = float(np.clip(p.null + coefficient * size, p.low, p.high))
+        return values
+
+    def table(self) -> str:
+        """The result in a minute."""
+        v, lines = self.verdict, []
+        count, kinds = len(self.problem.found.records), len(self.problem.conditions)
+        lines.append(f"{count} records of {kinds} conditions")
+        lines.append(f"Verdict: {v.kind.replace('_', ' ')}: {v.reason}")
+        for finding in v.findings:
+            lines += self._lines(finding, v.kind != "unknown")
+        lines.append(
+            f"All that the simulation gets wrong: {v.misfit:.2f} of the in-contact noise"
+            f" (p = {v.screening.misfit_p_value:.3f})"
+        )
+        if self.gain is not None:
+            g = self.gain
+            lines.append(
+                f"Held-out error of the force: {g.before:.3f} N before, {g.after:.3f} N after, "
+                f"noise {g.floor:.3f} N: {100 * g.share:.0f} % of the reducible removed (90 % "
+                f"interval {100 * g.interval[0]:.0f} to {100 * g.interval[1]:.0f} %)"
+            )
+        if v.slices_needed:
+            lines.append(
+                f"Needed to tell variation from effect: {v.slices_needed} more slices of each "
+                "condition"
+            )
+        lines.append("")
+        lines.append(f"{'cause':20}{'gain':>10}{'by chance':>11}{'95 % limit':>12}{'visible':>9}")
+        screening = v.screening
+        for e in screening.causes[:8]:
+            visible = screening.visible[screening.names.index(e.name)]
+            lines.append(
+                f"{e.name:20}{e.gain:10.1f}{e.expected:11.1f}{e.limit:12.1f}{visible:9.0f}"
+            )
+        for name, (factor, error) in self.shifts.items():
+            if abs(np.log(factor)) > 2.0 * error:
+                lines.append(f"Shift of {name}: times {factor:.3f} (+-{error:.3f})")
+        return "\n".join(lines + self.remarks)
+
+    def _lines(self, finding: Finding, named: bool) -> list[str]:
+        e, cause = finding.evidence, self.causes[finding.evidence.name]
+        values = self.values(finding)
+        parts = []
+        for name, size, error, unit in zip(e.parameters, e.sizes, e.errors, e.units, strict=True):
+            spread = f" +- {abs(error * size):.2g}" if np.isfinite(error) else ""
+            parts.append(f"{name} = {values[name]:.3g}{spread} {unit}".rstrip())
+        head = "Supported" if named else "Nearest"
+        lines = [
+            f"  {head}: {e.name} ({cause.family}), {', '.join(parts)}; "
+            f"{finding.size:.2f} of the noise, explains {100 * min(finding.share, 1.0):.0f} %"
+        ]
+        if finding.others:
+            lines.append(
+                f"    These records cannot tell it from: {', '.join(finding.others)}. To split "
+                f"them: {', '.join(sorted({self.causes[n].experiment for n in finding.names}))}"
+            )
+        return lines
+
+    def extended(self) -> CalibratedFood:
+        """The food with the named causes and the shifts of the base parameters in it.
+
+        Causes of sensor and robot do not belong to the food; the note names them.
+        """
+        food = copy.deepcopy(self.setup.food)
+        model = make_food_model(food, self.setup.knife, self.setup.numerics)
+        values = {
+            name: float(get_parameter(model, name)) * factor
+            for name, (factor, _) in self.shifts.items()
+        }
+        model = with_parameters(model, values)
+        left = []
+        named = self.verdict.findings if self.verdict.kind in ("cause", "causes") else []
+        for finding in named:
+            cause = self.causes[finding.evidence.name]
+            changed = cause.model(model, self.values(finding), SliceFacts())
+            if changed is model:
+                left.append(f"{cause.name} ({cause.family})")
+            model = changed
+        food.material, food.effects = model.material, model.effects
+        note = f"Not in the food: {', '.join(left)}." if left else ""
+        return CalibratedFood(
+            food=food,
+            knife=self.setup.knife,
+            flank_stiffness=model.numerics.flank_stiffness,
+            records=[r.name for r in self.problem.found.records],
+            date=datetime.date.today().isoformat(),
+            note=note,
+        )
+
+    def facts(self) -> dict[str, Any]:
+        """The result as plain values."""
+        v = self.verdict
+        return {
+            "verdict": v.kind,
+            "reason": v.reason,
+            "classes": v.names,
+            "findings": [
+                {
+                    "cause": f.evidence.name,
+                    "others": f.others,
+                    "values": self.values(f),
+                    "size_over_noise": f.size,
+                    "share_explained": f.share,
+                }
+                for f in v.findings
+            ],
+            "misfit_over_noise": v.misfit,
+            "p_value": v.screening.p_value,
+            "misfit_p_value": v.screening.misfit_p_value,
+            "slices_needed": v.slices_needed,
+            "gain": None
+            if self.gain is None
+            else {
+                "before_N": self.gain.before,
+                "after_N": self.gain.after,
+                "floor_N": self.gain.floor,
+                "share_removed": self.gain.share,
+                "interval": list(self.gain.interval),
+            },
+            "evidence": [
+                {
+                    "cause": e.name,
+                    "gain": e.gain,
+                    "expected": e.expected,
+                    "limit": e.limit,
+                    "scan": e.scan,
+                }
+                for e in v.screening.causes
+            ],
+            "noise": {
+                c: dc.asdict(n)
+                for c, n in zip(
+                    self.problem.found.records[0].channels, self.problem.noise, strict=True
+                )
+            },
+            "variation": {
+                self.problem.found.columns[k].name: float(s) * self.problem.found.columns[k].size
+                for k, s in zip(self.problem.own, self.problem.variation, strict=True)
+            },
+            "shifts": {name: list(pair) for name, pair in self.shifts.items()},
+            "remarks": self.remarks,
+        }
+
+    def save(self, directory: Path) -> None:
+        """Writes diagnosis.json, report.html and extended.yaml."""
+        from sliceit_drake.diagnosis.report import report_html
+
+        directory.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(self.facts(), indent=2) + "\n"
+        (directory / "diagnosis.json").write_text(text, encoding="utf-8")
+        dump_yaml(self.extended(), directory / "extended.yaml")
+        (directory / "report.html").write_text(report_html(self), encoding="utf-8")
+
+
+def setup_of_food(food: CalibratedFood, refinement: float = 1.0) -> CalibrationSetup:
+    """What is tested of a calibrated food: its values, with `BASE` free."""
+    setup = CalibrationSetup(
+        food=food.food, knife=food.knife, parameters=list(BASE), refinement=refinement
+    )
+    setup.numerics.flank_stiffness = food.flank_stiffness
+    return setup
+
+
+def diagnose(
+    setup: CalibrationSetup,
+    records: Sequence[SliceRecord],
+    extra: Sequence[Cause] = (),
+    cache: Path | None = None,
+    replicates: int = 200,
+    seed: int = 0,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Diagnosis:
+    """Shows what the simulation gets wrong in records, names the cause and measures the gain.
+
+    Args:
+        setup: The model: food at its calibrated values, base parameters.
+        records: Slice records.
+        extra: Causes of the user's, beside the built-in ones.
+        cache: Folder for sensitivities.
+        replicates: Of the bootstrap.
+        seed: Of the bootstrap.
+        workers: Threads.
+        progress: See `Progress`.
+
+    Raises:
+        ConfigurationError: The records do not carry a diagnosis, with what would be needed.
+    """
+    show = progress or (lambda *_: None)
+    if len(records) < LEAST_RECORDS:
+        raise ConfigurationError(
+            f"{len(records)} record is too few: what is wrong in one slice may be that slice",
+            field="RECORDS_DIR",
+            fix=f"Give at least {LEAST_RECORDS}, better 3 of each condition.",
+        )
+    remarks = _remarks(records)
+    causes = open_causes([p.name for p in setup.parameters], extra)
+    found = sensitivities(
+        setup,
+        records,
+        causes,
+        cache=cache,
+        workers=workers,
+        progress=lambda done, total: show("simulations", done, total),
+    )
+    remarks += found.warnings
+    problem = LinearProblem(found)
+    if not problem.repeated:
+        remarks.append(
+            "No condition was repeated: noise is from what is rough in the residuals, and how "
+            "slices vary is unknown. Repeat each cut at least 3 times."
+        )
+    steps = 2 * replicates
+    done = [0]
+
+    def count(_: int) -> None:
+        done[0] += 1
+        show("bootstrap", done[0], steps)
+
+    verdict = reach_verdict(problem, replicates, seed, count)
+    show("bootstrap", steps, steps)
+    named = [(f.evidence.name, f.evidence.scan) for f in verdict.findings]
+    gain = held_out_gain(problem, named, seed) if named else None
+    return Diagnosis(
+        verdict=verdict,
+        problem=problem,
+        setup=setup,
+        causes={c.name: c for c in causes},
+        shifts=_shifts(problem, named),
+        gain=gain,
+        remarks=remarks,
+    )
+
+
+def _remarks(records: Sequence[SliceRecord]) -> list[str]:
+    out = []
+    for record in records:
+        spread = float(np.ptp(record.force_magnitude))
+        if spread < 1e-9:
+            raise ConfigurationError(
+                "has a constant force: there is nothing to compare",
+                source=record.file or record.name,
+                field="force",
+                fix="Check the sensor and its cable; record again.",
+            )
+        if not record.phase("air").any():
+            out.append(f"{record.name} has no air phase: its sensor's zero is taken as it is.")
+        limit = record.metadata.sensor.force_range
+        if limit is not None and record.force is not None:
+            clipped = int((np.abs(record.force) >= 0.999 * limit).any(axis=1).sum())
+            if clipped:
+                out.append(
+                    f"{record.name} is clipped in {clipped} rows at {limit:g} N: give a sensor of "
+                    "a larger range, or cut with less force."
+                )
+    return out
+
+
+def _shifts(
+    problem: LinearProblem, causes: Sequence[tuple[str, float | None]]
+) -> dict[str, tuple[float, float]]:
+    """Factors of the base parameters and their relative standard errors, causes in the model."""
+    from sliceit_drake.diagnosis.linear import integrate_out
+
+    found, y = problem.found, problem.size
+    shared = [
+        k
+        for name, scan in causes
+        for k in found.index("cause", name, scan)
+        if not found.columns[k].per_record
+    ]
+    columns = [*problem.base, *problem.numerical, *problem.spline, *problem.usual, *shared]
+    own = [*problem.own, *problem.usual_own]
+    variance = np.concatenate(
+        [problem.variation**2, np.array(list(problem.usual_own.values())) ** 2]
+    )
+    total = np.sum([integrate_out(G, own, variance) for G in problem.moments.gram], axis=0)
+    A = total[np.ix_(columns, columns)] + np.diag(problem.prior()[columns])
+    scale = np.sqrt(np.maximum(np.diag(A), 1e-30))
+    inverse = np.linalg.pinv(A / np.outer(scale, scale), rcond=1e-10, hermitian=True)
+    theta = inverse @ (total[columns, y] / scale) / scale
+    errors = np.sqrt(np.maximum(np.diag(inverse), 0.0)) / scale
+    out = {}
+    for i, k in enumerate(problem.base):
+        size = found.columns[k].size
+        out[found.columns[k].name] = (
+            float(np.exp(np.clip(theta[i] * size, -2.0, 2.0))),
+            float(errors[i] * size),
+        )
+    return out

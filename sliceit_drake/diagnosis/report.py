@@ -1,0 +1,119 @@
+"""The report of a diagnosis: one HTML file with its figures in it."""
+
+import base64
+import html
+import io
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.figure import Figure
+
+if TYPE_CHECKING:
+    from sliceit_drake.diagnosis.diagnose import Diagnosis
+
+__all__ = ["evidence_figure", "records_figure", "report_html"]
+
+MEASURED, PREDICTED, EXTENDED = "#111827", "#2563eb", "#c2410c"
+SHOWN = 8
+
+STYLE = """
+body{font:15px/1.5 system-ui,sans-serif;color:#111827;
+max-width:62rem;margin:2rem auto;padding:0 1rem}
+h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}
+pre{background:#f3f4f6;padding:1rem;overflow-x:auto;font-size:13px}
+img{max-width:100%}
+"""
+
+
+def records_figure(diagnosis: "Diagnosis") -> Figure:
+    """One record of each condition: vertical force measured and predicted, and what is left."""
+    problem = diagnosis.problem
+    found = problem.found
+    picked = [members[0] for members in problem.conditions.values()][:SHOWN]
+    channels = found.records[0].channels
+    channel = channels.index("force_z") if "force_z" in channels else 0
+    figure = Figure(figsize=(11.0, 2.6 * len(picked)), layout="constrained")
+    axes = figure.subplots(len(picked), 2, squeeze=False)
+    for (left, right), r in zip(axes, picked, strict=True):
+        record = found.records[r]
+        change = np.zeros(len(record.time))
+        for finding in diagnosis.verdict.findings:
+            e = finding.evidence
+            if not e.per_record:
+                columns = found.index("cause", e.name, e.scan)
+                change += record.columns[:, channel][:, columns] @ np.array(e.coefficients)
+        left.plot(record.time, record.measured[:, channel], color=MEASURED, lw=1.0)
+        left.plot(record.time, record.predicted[:, channel], "--", color=PREDICTED, lw=1.0)
+        left.set_ylabel("vertical force [N]")
+        left.set_title(record.condition or record.name, loc="left", fontsize=10)
+        right.plot(record.time, record.residual[:, channel], color=MEASURED, lw=0.8)
+        if diagnosis.verdict.findings:
+            right.plot(record.time, change, color=EXTENDED, lw=1.2)
+        right.set_ylabel("measured - simulated [N]")
+        for axis in (left, right):
+            axis.grid(alpha=0.25)
+            axis.set_xlabel("time [s]")
+    axes[0, 0].plot([], [], color=MEASURED, label="measured")
+    axes[0, 0].plot([], [], "--", color=PREDICTED, label="simulated")
+    axes[0, 0].legend(frameon=False, fontsize=8)
+    if diagnosis.verdict.findings:
+        axes[0, 1].plot([], [], color=EXTENDED, label="what the cause would change")
+        axes[0, 1].legend(frameon=False, fontsize=8)
+    return figure
+
+
+def evidence_figure(diagnosis: "Diagnosis") -> Figure:
+    """Gain of each cause against chance, and angles between causes."""
+    screening = diagnosis.verdict.screening
+    figure = Figure(figsize=(11.0, 4.6), layout="constrained")
+    bars, matrix = figure.subplots(1, 2)
+    causes = screening.causes[::-1]
+    places = np.arange(len(causes))
+    bars.barh(places, [max(e.gain, 0.1) for e in causes], color=PREDICTED, label="these records")
+    bars.plot([e.limit for e in causes], places, "k|", ms=9, label="95 % where nothing is wrong")
+    bars.set_yticks(places, [e.name for e in causes], fontsize=7)
+    bars.set_xscale("log")
+    bars.set_xlabel("twice the gain in log-likelihood")
+    bars.legend(frameon=False, fontsize=7, loc="lower right")
+    image = matrix.imshow(screening.angles, vmin=0.0, vmax=90.0, cmap="viridis")
+    ticks = np.arange(len(screening.names))
+    matrix.set_xticks(ticks, screening.names, rotation=90, fontsize=6)
+    matrix.set_yticks(ticks, screening.names, fontsize=6)
+    matrix.set_title("angle between causes [degrees]", fontsize=9)
+    figure.colorbar(image, ax=matrix, shrink=0.8)
+    return figure
+
+
+def _image(figure: Figure) -> str:
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=110)
+    code = base64.b64encode(stream.getvalue()).decode()
+    return f'<img alt="figure" src="data:image/png;base64,{code}">'
+
+
+def report_html(diagnosis: "Diagnosis") -> str:
+    """The report as one self-contained page."""
+    problem = diagnosis.problem
+    rows = []
+    if diagnosis.gain is not None:
+        for record, (before, after) in zip(
+            problem.found.records, diagnosis.gain.by_record, strict=True
+        ):
+            rows.append(f"{record.name:20}{record.condition:20}{before:10.3f}{after:10.3f}")
+    held_out = "\n".join([f"{'record':20}{'condition':20}{'before N':>10}{'after N':>10}", *rows])
+    parts = [
+        "<!doctype html><html lang=en><meta charset=utf-8><title>Diagnosis</title>",
+        f"<style>{STYLE}</style>",
+        "<h1>What the simulation gets wrong</h1>",
+        f"<pre>{html.escape(diagnosis.table())}</pre>",
+        "<h2>Measured and simulated</h2>",
+        _image(records_figure(diagnosis)),
+        "<h2>Evidence</h2>",
+        _image(evidence_figure(diagnosis)),
+    ]
+    if rows:
+        parts += [
+            "<h2>Error on records that were left out</h2>",
+            f"<pre>{html.escape(held_out)}</pre>",
+        ]
+    return "\n".join([*parts, "</html>", ""])
