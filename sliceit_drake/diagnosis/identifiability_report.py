@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sliceit_drake.diagnosis.cause import EXPERIMENTS, Cause
+from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.identifiability import ANGLE, SHIFT, SHOWS, Identifiability
 from sliceit_drake.diagnosis.sensitivity import Sensitivities
 
@@ -33,13 +33,12 @@ def short(name: str) -> str:
     return f"shift of {name.rsplit('.', 1)[-1].replace('youngs_', '')}" if "." in name else name
 
 
-def table(result: Identifiability, causes: Sequence[Cause]) -> str:
+def table(result: Identifiability) -> str:
     """One line a cause: what shows, with what it can be confused, what would part it."""
     lines = [
         "| cause | shows [sd] | delta | class | nearest other | parted by |",
         "|---|---|---|---|---|---|",
     ]
-    by_name = {cause.name: cause for cause in causes}
     for a, name in enumerate(result.names):
         others = [f"`{short(b)}`" for b in result.equivalence_class(name)[1:]]
         nearest = result.nearest(name)
@@ -47,7 +46,9 @@ def table(result: Identifiability, causes: Sequence[Cause]) -> str:
             what = "does not show" + (f", taken up by {', '.join(others)}" if others else "")
         else:
             what = "with " + ", ".join(others) if others else "alone"
-        near = f"`{short(nearest[0])}`, {nearest[1]:.0f} deg" if nearest else ""
+        near = ""
+        if nearest is not None and result.visible[a]:
+            near = f"`{short(nearest[0])}`, {nearest[1]:.0f} deg"
         split, parted = result.split[a], ""
         if result.visible[a] and not others:
             pass
@@ -55,8 +56,8 @@ def table(result: Identifiability, causes: Sequence[Cause]) -> str:
             parted = f"{split[0]}: {split[1]:.0f} deg"
         elif split is not None:
             parted = f"{split[0]}: shows {split[1]:.0f} sd"
-        elif name in by_name:
-            parted = EXPERIMENTS[by_name[name].experiment]
+        elif a >= result.shifts:
+            parted = "no condition"
         lines.append(
             f"| {short(name) if a < result.shifts else f'`{name}`'} | {result.shows[a]:.0f} "
             f"| {result.delta[a]:.2f} | {what} | {near} | {parted} |"
@@ -185,7 +186,8 @@ def report(study: Study, figure: str = "docs/figures/identifiability.png") -> st
         if groups:
             listed = "; ".join("{" + ", ".join(map(short, g)) + "}" for g in groups)
             parts.append(f"Not told apart: {listed}.")
-        parts.append(table(result, study.causes))
+        parts.append(table(result))
+    parts.append(f"![Angles between causes]({figure.removeprefix('docs/')})")
     bent, scanned = nonlinearity(found), scan_angles(found)
     rows = "\n".join(
         f"| `{name}` | {f'{scanned[name]:.0f}' if name in scanned else ''} "
@@ -235,7 +237,7 @@ def plot_angles(study: Study, file: Path) -> None:
             f"{result.protocol}: what is left of the row's cause when the column's explains it"
         )
     if image is not None:
-        figure.colorbar(image, ax=axes, shrink=0.2, location="top", label="angle [deg]")
+        figure.colorbar(image, ax=axes, shrink=0.5, aspect=40, location="top", label="angle [deg]")
     file.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(file, dpi=110)
     plt.close(figure)

@@ -37,7 +37,7 @@ from pathlib import Path
 
 import numpy as np
 
-import sliceit_drake.diagnosis
+from sliceit_drake.calibration.prediction import poses_in_food
 from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.cutting.parameters import get_parameter
 from sliceit_drake.cutting.solver import CuttingError
@@ -46,6 +46,7 @@ from sliceit_drake.diagnosis.clock import Clock
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.diagnosis.simulator import cutting_source
 from sliceit_drake.diagnosis.slices import Meshing, SliceTarget
+from sliceit_drake.records.preprocessing import as_measured
 from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = [
@@ -135,6 +136,9 @@ class RecordSensitivity:
         """Measured less predicted [m, c]."""
         return self.measured - self.predicted
 
+
+SOURCES = (Cause, Clock, SlicePredictor, SliceTarget, as_measured, poses_in_food)
+"""Whose modules a result depends on, beside `cutting` and this one."""
 
 ARRAYS = ("time", "phase", "depth", "in_contact", "measured", "predicted", "columns", "even")
 
@@ -442,19 +446,19 @@ def _content_key(
 ) -> str | None:
     """Hash of all that the result depends on; None where the source of a cause cannot be read."""
     h = hashlib.sha256(cutting_source())
-    folder = Path(sliceit_drake.diagnosis.__file__).parent
-    for file in sorted(folder.glob("*.py")):
-        h.update(file.read_bytes())
+    for source in SOURCES:
+        h.update(Path(inspect.getfile(source)).read_bytes())
+    h.update(Path(__file__).read_bytes())
     point = options[0]
     assert isinstance(point, Point)
     everything = [*causes, *(active.cause for active in point.causes)]
     for cause in everything:
         try:
-            source = Path(inspect.getfile(type(cause))).read_bytes()
+            text = Path(inspect.getfile(type(cause))).read_bytes()
         except (TypeError, OSError):
             return None
         facts = (cause.name, cause.parameters, cause.scan, cause.per_record, vars(cause))
-        h.update(source + repr(facts).encode())
+        h.update(text + repr(facts).encode())
     active = [(a.cause.name, dict(a.values), dict(a.by_record)) for a in point.causes]
     h.update(repr((setup, point.values, point.records, active, point.meshing)).encode())
     h.update(repr(options[1:]).encode())
