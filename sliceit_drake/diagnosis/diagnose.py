@@ -19,7 +19,7 @@ from sliceit_drake.diagnosis.held_out import HeldOutGain, held_out_gain
 from sliceit_drake.diagnosis.linear import LinearProblem
 from sliceit_drake.diagnosis.registry import open_causes
 from sliceit_drake.diagnosis.sensitivity import Sensitivities, sensitivities
-from sliceit_drake.diagnosis.verdict import Finding, Verdict, reach_verdict
+from sliceit_drake.diagnosis.verdict import ALARM, Finding, Verdict, reach_verdict
 from sliceit_drake.diagrams.calibrated_food import CalibratedFood
 from sliceit_drake.records.slice_record import SliceRecord
 
@@ -270,6 +270,12 @@ def diagnose(
             f"{len(records)} record is too few: what is wrong in one slice may be that slice",
             field="RECORDS_DIR",
             fix=f"Give at least {LEAST_RECORDS}, better 3 of each condition.",
+        )
+    if replicates * ALARM < 1.0:
+        raise ConfigurationError(
+            f"{replicates} replicates of the bootstrap cannot show a p-value of {ALARM:g}",
+            field="--replicates",
+            fix=f"Give at least {round(1.0 / ALARM)}.",
         )
     remarks = _remarks(records)
     causes = open_causes([p.name for p in setup.parameters], extra)

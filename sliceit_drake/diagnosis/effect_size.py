@@ -9,7 +9,10 @@ __all__ = ["effect_in_noise"]
 
 
 def effect_in_noise(
-    problem: LinearProblem, columns: list[int], coefficients: np.ndarray
+    problem: LinearProblem,
+    columns: list[int],
+    coefficients: np.ndarray,
+    refit_slices: bool = True,
 ) -> tuple[float, np.ndarray]:
     """Root mean square of what is left of an effect over the in-contact noise.
 
@@ -20,12 +23,14 @@ def effect_in_noise(
         problem: The records' moments.
         columns: Of the effect.
         coefficients: Of the columns [n], or of each record [R, n].
+        refit_slices: Whether what is each record's own is refitted as well. Without, an effect that
+            differs between records as slices may differ keeps its size.
 
     Returns:
         The ratio, and that of each record [R].
     """
     own = problem.own
-    variance = problem.variation**2
+    variance = problem.variation**2 if refit_slices else np.full(len(own), 1e-12)
     base = problem.base
     moments = problem.moments.gram
     coefficients = np.broadcast_to(coefficients, (len(moments), len(columns)))

@@ -7,10 +7,12 @@ import numpy as np
 
 from sliceit_drake.diagnosis.linear import LinearProblem, integrate_out
 
-__all__ = ["HeldOutGain", "held_out_gain"]
+__all__ = ["HeldOutGain", "fitted_changes", "held_out_gain"]
 
 FORCES = ("force_x", "force_y", "force_z", "force_norm")
 BOOTSTRAP = 1000
+FLAT = 1e4
+"""Variance of a coefficient of which nothing is known, in the column's size."""
 
 
 @dc.dataclass
@@ -48,12 +50,7 @@ def held_out_gain(
         seed: For the interval.
     """
     found = problem.found
-    shared: list[int] = []
-    own: list[int] = []
-    for name, scan in causes:
-        columns = found.index("cause", name, scan)
-        (own if found.columns[columns[0]].per_record else shared).extend(columns)
-    squares = np.array([_errors(problem, s, o) for s, o in (([], []), (shared, own))])
+    squares = np.array([_errors(problem, given) for given in ((), causes)])
     counts = np.array([int(r.in_contact.sum()) for r in found.records])
     forces = [k for k, c in enumerate(found.records[0].channels) if c in FORCES]
     noise = float(sum(problem.noise[k].deviation ** 2 for k in forces))
@@ -79,33 +76,64 @@ def _share(mean: np.ndarray, noise: float) -> float:
     return float((mean[0] - mean[1]) / max(mean[0] - noise, 1e-12))
 
 
-def _errors(problem: LinearProblem, shared: list[int], own_causes: list[int]) -> np.ndarray:
+def fitted_changes(
+    problem: LinearProblem, causes: Sequence[tuple[str, float | None]]
+) -> list[np.ndarray]:
+    """Change of each record's prediction by causes and all that is refitted with them [m, c]."""
+    linear = _Linear(problem, causes)
+    theta = linear.shared(linear.reduced.sum(0))
+    return [linear.change(r, theta) for r in range(len(problem.found.records))]
+
+
+def _errors(problem: LinearProblem, causes: Sequence[tuple[str, float | None]]) -> np.ndarray:
     """Sum of squared force errors in contact of each record when it is left out [R], N^2."""
-    y = problem.size
-    columns = [*problem.base, *problem.numerical, *problem.usual, *shared]
-    prior = problem.prior()[columns]
-    own = [*problem.own, *problem.usual_own, *own_causes]
-    variance = np.concatenate(
-        [
-            problem.variation**2,
-            np.array(list(problem.usual_own.values())) ** 2,
-            np.full(len(own_causes), 1e4),
-        ]
-    )
-    reduced = np.array([integrate_out(G, own, variance) for G in problem.moments.gram])
-    total = reduced.sum(0)
+    linear = _Linear(problem, causes)
+    total = linear.reduced.sum(0)
     forces = [k for k, c in enumerate(problem.found.records[0].channels) if c in FORCES]
-    out = np.zeros(len(reduced))
+    out = np.zeros(len(linear.reduced))
     for r, record in enumerate(problem.found.records):
-        rest = total - reduced[r]
-        A = rest[np.ix_(columns, columns)] + np.diag(prior)
-        scale = np.sqrt(np.maximum(np.diag(A), 1e-30))
-        inverse = np.linalg.pinv(A / np.outer(scale, scale), rcond=1e-10, hermitian=True)
-        theta = inverse @ (rest[columns, y] / scale) / scale
-        G = problem.moments.gram[r]
-        inner = G[np.ix_(own, own)] + np.diag(1.0 / np.maximum(variance, 1e-12))
-        alpha = np.linalg.solve(inner, G[own, y] - G[np.ix_(own, columns)] @ theta)
-        left = record.residual - record.columns[:, :, columns] @ theta
-        left = left - record.columns[:, :, own] @ alpha
+        theta = linear.shared(total - linear.reduced[r])
+        left = record.residual - linear.change(r, theta)
         out[r] = float((left[record.in_contact][:, forces] ** 2).sum())
     return out
+
+
+class _Linear:
+    """Generalised least squares of what records share, and of what is their own."""
+
+    def __init__(self, problem: LinearProblem, causes: Sequence[tuple[str, float | None]]) -> None:
+        found = problem.found
+        shared: list[int] = []
+        own: list[int] = []
+        for name, scan in causes:
+            columns = found.index("cause", name, scan)
+            (own if found.columns[columns[0]].per_record else shared).extend(columns)
+        self.problem = problem
+        self.columns = [*problem.base, *problem.numerical, *problem.usual, *shared]
+        self.own = [*problem.own, *problem.usual_own, *own]
+        self.variance = np.concatenate(
+            [
+                problem.variation**2,
+                np.array(list(problem.usual_own.values())) ** 2,
+                np.full(len(own), FLAT),
+            ]
+        )
+        gram = problem.moments.gram
+        self.reduced = np.array([integrate_out(G, self.own, self.variance) for G in gram])
+
+    def shared(self, total: np.ndarray) -> np.ndarray:
+        """Coefficients of the shared columns from a sum of reduced Gram matrices."""
+        columns, y = self.columns, self.problem.size
+        A = total[np.ix_(columns, columns)] + np.diag(self.problem.prior()[columns])
+        scale = np.sqrt(np.maximum(np.diag(A), 1e-30))
+        inverse = np.linalg.pinv(A / np.outer(scale, scale), rcond=1e-10, hermitian=True)
+        return np.asarray(inverse @ (total[columns, y] / scale) / scale)
+
+    def change(self, r: int, theta: np.ndarray) -> np.ndarray:
+        """Change of a record's prediction, its own part taken from itself [m, c]."""
+        record, G, own = self.problem.found.records[r], self.problem.moments.gram[r], self.own
+        inner = G[np.ix_(own, own)] + np.diag(1.0 / np.maximum(self.variance, 1e-12))
+        rest = G[own, self.problem.size] - G[np.ix_(own, self.columns)] @ theta
+        alpha = np.linalg.solve(inner, rest)
+        shared = record.columns[:, :, self.columns] @ theta
+        return np.asarray(shared + record.columns[:, :, own] @ alpha)

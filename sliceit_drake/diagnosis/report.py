@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
+from sliceit_drake.diagnosis.held_out import fitted_changes
+
 if TYPE_CHECKING:
     from sliceit_drake.diagnosis.diagnose import Diagnosis
 
@@ -34,21 +36,16 @@ def records_figure(diagnosis: "Diagnosis") -> Figure:
     channel = channels.index("force_z") if "force_z" in channels else 0
     figure = Figure(figsize=(11.0, 2.6 * len(picked)), layout="constrained")
     axes = figure.subplots(len(picked), 2, squeeze=False)
+    named = [(f.evidence.name, f.evidence.scan) for f in diagnosis.verdict.findings]
+    changes = fitted_changes(problem, named)
     for (left, right), r in zip(axes, picked, strict=True):
         record = found.records[r]
-        change = np.zeros(len(record.time))
-        for finding in diagnosis.verdict.findings:
-            e = finding.evidence
-            if not e.per_record:
-                columns = found.index("cause", e.name, e.scan)
-                change += record.columns[:, channel][:, columns] @ np.array(e.coefficients)
         left.plot(record.time, record.measured[:, channel], color=MEASURED, lw=1.0)
         left.plot(record.time, record.predicted[:, channel], "--", color=PREDICTED, lw=1.0)
         left.set_ylabel("vertical force [N]")
         left.set_title(record.condition or record.name, loc="left", fontsize=10)
         right.plot(record.time, record.residual[:, channel], color=MEASURED, lw=0.8)
-        if diagnosis.verdict.findings:
-            right.plot(record.time, change, color=EXTENDED, lw=1.2)
+        right.plot(record.time, changes[r][:, channel], color=EXTENDED, lw=1.2)
         right.set_ylabel("measured - simulated [N]")
         for axis in (left, right):
             axis.grid(alpha=0.25)
@@ -56,9 +53,9 @@ def records_figure(diagnosis: "Diagnosis") -> Figure:
     axes[0, 0].plot([], [], color=MEASURED, label="measured")
     axes[0, 0].plot([], [], "--", color=PREDICTED, label="simulated")
     axes[0, 0].legend(frameon=False, fontsize=8)
-    if diagnosis.verdict.findings:
-        axes[0, 1].plot([], [], color=EXTENDED, label="what the cause would change")
-        axes[0, 1].legend(frameon=False, fontsize=8)
+    what = "refitted with the causes" if named else "refitted"
+    axes[0, 1].plot([], [], color=EXTENDED, label=f"what the model changes, {what}")
+    axes[0, 1].legend(frameon=False, fontsize=8)
     return figure
 
 

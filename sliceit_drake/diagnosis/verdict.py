@@ -34,12 +34,15 @@ class Finding:
     Attributes:
         evidence: Of the cause that explains most.
         size: What is left of its effect after a refit of all else, over the in-contact noise.
+        spread: The same without what is each slice's own being refitted: an effect that differs
+            between records as slices may differ is large here alone.
         share: Of what could be gained that it explains.
         others: Names of the causes that would explain as much.
     """
 
     evidence: CauseEvidence
     size: float
+    spread: float
     share: float
     others: list[str]
 
@@ -95,7 +98,7 @@ def reach_verdict(
     first = screen(problem, replicates, seed, progress=progress)
     reducible = max(first.misfit - first.expected_misfit, 0.0)
     findings = [_finding(problem, first, e, reducible) for e in first.causes[:6]]
-    large = [f for f in findings if f.size >= LEAST_SIZE]
+    large = [f for f in findings if f.spread >= LEAST_SIZE]
     misfit = _misfit_size(findings, reducible)
     counts = [len(m) for m in problem.conditions.values()]
     needed = max(0, LEAST_REPLICATES - min(counts)) if max(counts) < LEAST_REPLICATES else 0
@@ -117,7 +120,7 @@ def reach_verdict(
     added = [
         f
         for f in added
-        if f.size >= LEAST_SIZE
+        if f.spread >= LEAST_SIZE
         and f.share >= SECOND_SHARE
         and f.evidence.score > 0.0
         and second.p_value <= ALARM
@@ -145,10 +148,12 @@ def _finding(
     problem: LinearProblem, screening: Screening, evidence: CauseEvidence, reducible: float
 ) -> Finding:
     columns = problem.found.index("cause", evidence.name, evidence.scan)
-    size, _ = effect_in_noise(problem, columns, np.array(evidence.coefficients))
+    coefficients = np.array(evidence.coefficients)
+    size, _ = effect_in_noise(problem, columns, coefficients)
+    spread, _ = effect_in_noise(problem, columns, coefficients, refit_slices=False)
     if evidence.per_record:
         # The mean of signed amplitudes says nothing of their size; the gain does.
-        size = _size_of_gain(problem, evidence.gain - evidence.expected)
+        size = spread = _size_of_gain(problem, evidence.gain - evidence.expected)
     share = max(evidence.gain - evidence.expected, 0.0) / max(reducible, 1e-9)
     floor = evidence.score - CLASS_GAIN * evidence.gain
     others = [
@@ -158,7 +163,7 @@ def _finding(
         and screening.angle(evidence.name, e.name) <= CLASS_ANGLE
         and e.score >= floor
     ]
-    return Finding(evidence, size, share, others)
+    return Finding(evidence, size, spread, share, others)
 
 
 def _size_of_gain(problem: LinearProblem, gain: float) -> float:

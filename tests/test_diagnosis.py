@@ -1,0 +1,207 @@
+"""A diagnosis finds what is hidden, is silent where nothing is, and says what it cannot know.
+
+Synthetic records: the sensitivities are given shapes, so that no slice is simulated.
+"""
+
+import dataclasses as dc
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from sliceit_drake.diagnosis.effect_size import effect_in_noise
+from sliceit_drake.diagnosis.held_out import fitted_changes, held_out_gain
+from sliceit_drake.diagnosis.linear import LinearProblem
+from sliceit_drake.diagnosis.noise_levels import ChannelNoise
+from sliceit_drake.diagnosis.sensitivity import Column, RecordSensitivity, Sensitivities
+from sliceit_drake.diagnosis.verdict import reach_verdict
+
+ROWS = 300
+NOISE = 0.1
+VARIATION = 0.05
+COLUMNS = [
+    Column("base", "material.toughness", size=0.05),
+    Column("record", "toughness", size=0.05, per_record=True),
+    Column("numerical", "mesh"),
+    Column("cause", "rate", "exponent", size=0.1),
+    Column("cause", "skin", "toughness", size=1.0, one_sided=True),
+    Column("cause", "skin_like", "toughness", size=1.0, one_sided=True),
+    Column("cause", "fading", "share", scan=0.2, size=0.2, one_sided=True),
+    Column("cause", "fading", "share", scan=1.0, size=0.2, one_sided=True),
+]
+SPEEDS = (0.005, 0.02, 0.08)
+
+
+def shapes(speed: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Time, depth, contact and force of a press with a hold in its middle third."""
+    time = np.linspace(0.0, 3.0, ROWS)
+    depth = 0.02 * np.interp(time, [0.0, 0.3, 1.2, 2.0, 3.0], [-0.1, 0.0, 0.5, 0.5, 1.0])
+    contact = depth > 0.0
+    return time, depth, contact, 10.0 * np.sqrt(np.clip(depth / 0.02, 0.0, None))
+
+
+def record(
+    name: str, speed: float, rng: np.random.Generator, hidden: dict[str, float], unknown: float
+) -> RecordSensitivity:
+    time, depth, contact, force = shapes(speed)
+    edge = np.exp(-np.clip(depth, 0.0, None) / 2e-3) * contact
+    near = np.exp(-np.clip(depth, 0.0, None) / 1.8e-3) * contact
+    held = np.clip(time - 1.2, 0.0, 0.8) * (time < 2.0)
+    ripple = 0.02 * np.sin(2.0 * np.pi * depth / 5e-3) * contact
+    columns = {
+        "material.toughness": 0.05 * force,
+        "toughness": 0.05 * force,
+        "mesh": ripple,
+        "rate": force * 0.1 * np.log(speed / 0.02),
+        "skin": edge,
+        "skin_like": near,
+        "fading0.2": -0.2 * force * (1.0 - np.exp(-held / 0.2)),
+        "fading1.0": -0.2 * force * (1.0 - np.exp(-held / 1.0)),
+    }
+    table = np.column_stack(list(columns.values()))[:, None, :]
+    noise = lfilter([np.sqrt(1.0 - 0.9**2)], [1.0, -0.9], rng.normal(size=ROWS))
+    y = NOISE * noise + rng.normal() * VARIATION / 0.05 * columns["toughness"]
+    for cause, amount in hidden.items():
+        y = y + amount * columns[cause]
+    # Grows with the square of time and turns with depth: in no column.
+    y = y + unknown * contact * np.sin(3.0 * time) ** 2 * (speed > 0.01) * np.sign(depth - 0.012)
+    return RecordSensitivity(
+        name=name,
+        condition=f"press at {speed}",
+        slice_index=0,
+        knife_slices=0,
+        speed=speed,
+        draw_ratio=0.0,
+        channels=("force_z",),
+        time=time,
+        phase=np.full(ROWS, "slice"),
+        depth=depth,
+        in_contact=contact,
+        measured=(force + y)[:, None],
+        predicted=force[:, None],
+        columns=table,
+        even=np.zeros_like(table),
+    )
+
+
+def problem(
+    seed: int,
+    replicates: int = 3,
+    speeds: tuple[float, ...] = SPEEDS,
+    unknown: float = 0.0,
+    **hidden: float,
+) -> LinearProblem:
+    rng = np.random.default_rng(seed)
+    renamed = {name.replace("_at_", "").replace("p", "."): x for name, x in hidden.items()}
+    names = {"rate", "skin", "fading0.2", "fading1.0"}
+    renamed = {
+        n if n in names else next(m for m in names if m[:4] == n[:4]): x for n, x in renamed.items()
+    }
+    records = [
+        record(f"slice {k} at {speed}", speed, rng, renamed, unknown)
+        for speed in speeds
+        for k in range(replicates)
+    ]
+    return LinearProblem(Sensitivities(COLUMNS, records))
+
+
+def test_noise_is_that_of_replicates_whatever_the_model_gets_wrong():
+    for hidden in ({}, {"rate": 1.0, "skin": 3.0}):
+        noise = problem(1, replicates=6, **hidden).noise[0]
+        assert noise.deviation == pytest.approx(NOISE, rel=0.2)
+        assert noise.tau == pytest.approx(-3.0 / (ROWS - 1) / np.log(0.9), rel=0.5)
+
+
+def test_the_weights_of_a_channel_are_the_inverse_of_its_covariance():
+    noise = ChannelNoise(0.3, 0.2, 0.1)
+    time = np.cumsum(np.random.default_rng(0).uniform(0.01, 0.1, 40))
+    V = 0.09 * np.exp(-np.abs(time[:, None] - time) / 0.2) + 0.01 * np.eye(40)
+    np.testing.assert_allclose(noise.solve(time, V), np.eye(40), atol=1e-9)
+
+
+def test_variation_between_slices_is_that_of_replicates():
+    found = problem(2, replicates=12)
+    assert found.variation[0] == pytest.approx(VARIATION / 0.05, rel=0.3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_is_named_where_nothing_is_hidden(seed):
+    assert reach_verdict(problem(10 + seed), 60, seed).kind == "nothing"
+
+
+def test_slices_that_differ_are_no_effect_of_the_speed():
+    """With records at few speeds a test by samples calls most differences between slices an effect
+    of the speed; one by records must not."""
+    kinds = [
+        reach_verdict(problem(100 + seed, speeds=(0.01, 0.04)), 60, seed).kind for seed in range(12)
+    ]
+    assert kinds.count("nothing") >= 11
+
+
+@pytest.mark.parametrize(
+    ("hidden", "name"),
+    [({"rate": 2.0}, "rate"), ({"skin": 2.5}, "skin"), ({"fading_at_1p0": 0.5}, "fading")],
+)
+def test_a_hidden_cause_is_named_with_its_size_and_its_class(hidden, name):
+    verdict = reach_verdict(problem(20, **hidden), 60)
+    assert verdict.kind == "cause"
+    (finding,) = verdict.findings
+    expected = {"skin", "skin_like"} if name == "skin" else {name}
+    assert name in finding.names and set(finding.names) <= expected
+    amount = next(iter(hidden.values()))
+    if finding.evidence.name == name:
+        error = 4.0 * finding.evidence.errors[0]
+        assert finding.evidence.coefficients[0] == pytest.approx(amount, abs=error + 0.1 * amount)
+    gain = held_out_gain(problem(20, **hidden), [(finding.evidence.name, finding.evidence.scan)])
+    assert gain.share > 0.8 and gain.after < gain.before
+    assert gain.after == pytest.approx(NOISE, rel=0.3)
+
+
+def test_two_hidden_causes_are_both_named():
+    verdict = reach_verdict(problem(30, rate=2.5, fading_at_1p0=0.6), 60)
+    assert verdict.kind == "causes"
+    assert {f.evidence.name for f in verdict.findings} == {"rate", "fading"}
+
+
+def test_what_no_cause_explains_is_unknown():
+    assert reach_verdict(problem(40, unknown=1.5), 60).kind == "unknown"
+
+
+def test_without_three_slices_of_a_cut_it_asks_for_more():
+    verdict = reach_verdict(problem(50, replicates=2, rate=3.0), 60)
+    assert verdict.kind == "too_few_replicates"
+    assert verdict.slices_needed == 1
+
+
+def test_a_shift_of_a_base_parameter_is_no_cause():
+    shifted = problem(60)
+    for r in shifted.found.records:
+        r.measured = r.measured + 4.0 * r.columns[:, :, 0]
+    assert reach_verdict(LinearProblem(shifted.found), 60).kind == "nothing"
+
+
+def test_the_size_of_an_effect_is_what_a_refit_leaves_of_it():
+    found = problem(70)
+    base = found.found.index("base")
+    assert effect_in_noise(found, base, np.array([5.0]))[0] < 1e-6
+    rate = found.found.index("cause", "rate")
+    one, by_record = effect_in_noise(found, rate, np.array([1.0]))
+    assert effect_in_noise(found, rate, np.array([2.0]))[0] == pytest.approx(2.0 * one)
+    # At the middle speed nothing changes.
+    assert by_record.min() < 0.3 * by_record.max()
+
+
+def test_what_the_model_changes_with_its_cause_follows_the_residual():
+    found = problem(80, skin=4.0)
+    (change, *_) = fitted_changes(found, [("skin", None)])
+    rest = found.found.records[0].residual - change
+    assert np.std(rest) == pytest.approx(NOISE, rel=0.3)
+    assert np.std(found.found.records[0].residual) > 2.0 * NOISE
+
+
+def test_sensitivities_of_one_record_only_are_from_what_is_rough():
+    rng = np.random.default_rng(0)
+    alone = Sensitivities(COLUMNS, [record("only", 0.02, rng, {}, 0.0)])
+    found = LinearProblem(alone)
+    assert not found.repeated
+    assert dc.astuple(found.noise[0])[0] > 0.0
