@@ -3,6 +3,10 @@
 import argparse
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sliceit_drake.calibration.calibrate import Calibration
 
 __all__ = ["add_parser"]
 
@@ -14,6 +18,7 @@ Gauss-Newton, and says how sure it is. Writes to DIR:
   food.yaml         the calibrated food: scenarios load it with `calibration: DIR/food.yaml`
   calibration.json  errors by stage, held-out errors, parameters
   fit.png           measured and predicted force
+  points.csv        with --per-point: factors of the cut points' toughness
   trials.log        all trials; a run that was killed goes on from here, and so do others
   adam-*.npz        checkpoints of Adam
 
@@ -63,6 +68,13 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         nargs="+",
         default=[],
         help="records that are predicted but not fitted",
+    )
+    parser.add_argument(
+        "--per-point",
+        metavar="STEPS",
+        type=int,
+        default=0,
+        help="then fit a toughness for each cut point, STEPS of Adam (points.csv; default: not)",
     )
     parser.add_argument(
         "--blocks",
@@ -214,5 +226,34 @@ def _calibrate(options: argparse.Namespace) -> int:
         print(f"Held-out blocks of depth: {result.held_out_rms:.3f} N ({blocks})")
     for name, error in result.held_out_records.items():
         print(f"Held-out record {name}: {error:.3f} N")
+    if options.per_point:
+        _fit_points(options, result)
     print(f"Results in {options.output}/")
     return 0
+
+
+def _fit_points(options: argparse.Namespace, result: "Calibration") -> None:
+    import numpy as np
+    from tqdm import tqdm
+
+    from sliceit_drake.calibration.per_point import fit_points
+
+    with tqdm(total=options.per_point, desc="each point") as bar:
+
+        def show(done: int, error: float) -> None:
+            bar.set_postfix_str(f"best RMS {error:.3f} N", refresh=False)
+            bar.update(done - bar.n)
+
+        points = fit_points(result.predictor, result.unit, options.per_point, show)
+    np.savetxt(
+        options.output / "points.csv",
+        np.column_stack([points.positions, points.factors]),
+        fmt="%.6g",
+        delimiter=",",
+        header="x,z,toughness_factor",
+        comments="",
+    )
+    print(
+        f"With a toughness for each of {len(points.factors)} cut points: RMS {points.rms:.3f} N, "
+        "on the records that they were fitted to"
+    )
