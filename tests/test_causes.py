@@ -227,16 +227,17 @@ def test_friction_at_rest_matters_less_the_faster_the_knife():
 
 def test_a_skin_shows_at_entry_and_exit_and_not_where_it_was_peeled():
     force = change("fast", "skin")[:, Z]
-    middle = rms(force[within("fast", 0.25, 0.45)])
-    assert force[within("fast", 0.0, 0.12)].max() > 3.0 * middle
-    assert force[within("fast", 0.85, 1.0)].max() > 3.0 * middle
+    # Two rings of elements: the skin is as thick as half of one.
+    middle = force[within("fast", 0.4, 0.5)].mean()
+    assert force[within("fast", 0.05, 0.2)].mean() > 1.4 * middle > 0.1
+    assert force[within("fast", 0.8, 0.95)].mean() > 1.4 * middle
     assert not change("peeled", "skin").any()
 
 
 def test_a_blunt_edge_shows_at_entry_alone_and_less_in_a_draw():
-    force = change("fast", "bluntness", scan=1.5e-3)[:, Z]
+    force = change("fast", "bluntness", scan=2e-3)[:, Z]
     assert force[within("fast", 0.0, 0.12)].max() > 5.0 * rms(force[within("fast", 0.6, 0.95)])
-    drawn = change("draw", "bluntness", scan=1.5e-3)[:, Z]
+    drawn = change("draw", "bluntness", scan=2e-3)[:, Z]
     assert drawn[within("draw", 0.0, 0.12)].max() < 0.7 * force[within("fast", 0.0, 0.12)].max()
 
 
@@ -255,6 +256,10 @@ def test_the_slice_push_law_shows_in_a_draw_alone():
     assert rms(change("fast", "slice_push_law")) < 1e-3
     cutting = within("draw", 0.2, 0.8)
     assert change("draw", "slice_push_law")[cutting, Z].mean() < -0.1
+    # The pull is along the edge alone.
+    pull = change("draw", "slice_push_law", "pull")
+    assert np.abs(pull[cutting, X]).mean() > 0.2
+    assert rms(pull[:, [Y, Z]]) < 1e-3
 
 
 def test_a_section_that_is_wider_below_asks_for_more_there_at_any_speed():

@@ -228,6 +228,11 @@ class Cause:
         """The cut with the cause in it, derived from the cut without."""
         return model
 
+    def extension(self, model: CuttingModel, values: Mapping[str, float]) -> CuttingModel:
+        """The cut with the cause in material and effects alone, as the food of a scenario has it;
+        the same cut if it is not of the food."""
+        return self.model(model, values, SliceFacts())
+
     def motion(
         self,
         R: np.ndarray,

@@ -3,14 +3,19 @@
 import dataclasses as dc
 from collections.abc import Mapping
 
+import numpy as np
+
 from sliceit_drake.cutting.effects import Adhesion, Bluntness
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan, SliceFacts
+from sliceit_drake.diagnosis.causes.material import tougher
 
 __all__ = ["BluntEdge", "Dulling", "FlankAdhesion", "StaticFriction"]
 
 DULLED = 10.0
 """Slices after which a dulling edge has its `growth`."""
+DULLED_DEPTH = 2e-3
+"""Over which its excess falls to 1/e, metres."""
 
 
 class StaticFriction(Cause):
@@ -67,7 +72,7 @@ class BluntEdge(Cause):
     family = "knife and contact"
     row = 8
     parameters = (CauseParameter("initiation", "J/m2", 250.0, low=0.0, high=1e4),)
-    scan = Scan("depth", "m", (1.5e-3, 4e-3))
+    scan = Scan("depth", "m", (1e-3, 2e-3, 4e-3))
     absorbed_by = ("effects.bluntness.initiation",)
     signature = "raises the first peak, the plateau hardly; with skin or without, less in a draw"
     experiment = "skinned"
@@ -75,6 +80,10 @@ class BluntEdge(Cause):
     def model(
         self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
     ) -> CuttingModel:
+        """Tougher points near the surface."""
+        return _harder_to_begin(model, values["initiation"], values["depth"])
+
+    def extension(self, model: CuttingModel, values: Mapping[str, float]) -> CuttingModel:
         """More to begin with; the depth over which it falls takes the place of the model's."""
         return _blunter(model, values["initiation"], values["depth"])
 
@@ -94,14 +103,26 @@ class Dulling(Cause):
     def model(
         self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
     ) -> CuttingModel:
-        """More to begin with, by the number of slices."""
+        """Tougher points near the surface, by the number of slices."""
         grown = values["growth"] * (facts.knife_slices / DULLED) ** values["exponent"]
-        return _blunter(model, grown, model.effects.bluntness.depth)
+        return _harder_to_begin(model, grown, DULLED_DEPTH)
+
+    def extension(self, model: CuttingModel, values: Mapping[str, float]) -> CuttingModel:
+        """An edge after `DULLED` slices."""
+        return _blunter(model, values["growth"], DULLED_DEPTH)
+
+
+def _harder_to_begin(model: CuttingModel, initiation: float, depth: float) -> CuttingModel:
+    """Tougher points near the surface: all that parts there is harder to begin, and not what the
+    edge alone does, as in `effects.bluntness`."""
+    tables = model.tables
+    grid = np.linspace(-tables.reach, tables.reach, tables.width.shape[1])
+    below = np.maximum(model.point_depth[:, None] + grid, 0.0)
+    work = float((np.exp(-below / depth) * tables.width).sum()) * tables.spacing
+    shape = np.exp(-np.maximum(model.point_depth, 0.0) / depth)
+    return tougher(model, shape, initiation * work)
 
 
 def _blunter(model: CuttingModel, excess: float, depth: float) -> CuttingModel:
-    if excess == 0.0:
-        return model
-    old = model.effects.bluntness
-    blunt = Bluntness(old.grown + excess, depth)
+    blunt = Bluntness(model.effects.bluntness.grown + excess, depth)
     return model.derive(effects=dc.replace(model.effects, bluntness=blunt))

@@ -9,7 +9,14 @@ from sliceit_drake.cutting.effects import Core, Relaxation, Skin, SlicePush, Tou
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.diagnosis.cause import Cause, CauseParameter, ForceSeries, Scan, SliceFacts
 
-__all__ = ["CoreRatio", "SkinToughness", "SlicePushLaw", "ToughnessBySpeed", "Viscoelasticity"]
+__all__ = [
+    "CoreRatio",
+    "SkinToughness",
+    "SlicePushLaw",
+    "ToughnessBySpeed",
+    "Viscoelasticity",
+    "tougher",
+]
 
 
 BRANCHES = {"fast": 0.03, "medium": 0.3, "slow": 3.0}
@@ -96,13 +103,17 @@ class ToughnessBySpeed(Cause):
 
 
 class SkinToughness(Cause):
-    """A skin around the section, on all slices that are not peeled."""
+    """Food that is tougher towards the outside, by exp(-distance / thickness); where not peeled.
+
+    All that parts there is tougher, by the edge or ahead of it. The skin of `effects.skin` is cut
+    by the edge alone.
+    """
 
     name = "skin"
     family = "material"
     row = 7
     parameters = (CauseParameter("toughness", "J/m", 0.5, low=0.0, high=20.0),)
-    scan = Scan("thickness", "m", (5e-4, 1.2e-3, 2.5e-3))
+    scan = Scan("thickness", "m", (5e-4, 1.2e-3, 3e-3))
     absorbed_by = ("effects.skin.toughness",)
     signature = "peaks at entry and exit; none where the food is skinned"
     experiment = "skinned"
@@ -110,9 +121,15 @@ class SkinToughness(Cause):
     def model(
         self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
     ) -> CuttingModel:
-        """More skin; its thickness takes the place of the model's."""
+        """Tougher points near the outside; in all by `toughness` times the outline."""
         if facts.peeled:
             return model
+        outline = float(model.tables.skin(values["thickness"]).sum()) * model.tables.spacing
+        shape = np.exp(-model.point_distance / values["thickness"])
+        return tougher(model, shape, values["toughness"] * outline)
+
+    def extension(self, model: CuttingModel, values: Mapping[str, float]) -> CuttingModel:
+        """More skin; its thickness takes the place of the model's."""
         skin = Skin(model.effects.skin.toughness + values["toughness"], values["thickness"])
         return model.derive(effects=dc.replace(model.effects, skin=skin))
 
@@ -144,12 +161,16 @@ class CoreRatio(Cause):
 
 
 class SlicePushLaw(Cause):
-    """A draw that helps more or less than work per area says: (1 + xi^2)^-(1 + exponent)."""
+    """A draw that helps more or less than work per area says, (1 + xi^2)^-(1 + exponent), and an
+    edge that pulls along itself by a share more or less than xi times the press."""
 
     name = "slice_push_law"
     family = "material"
     row = 10
-    parameters = (CauseParameter("exponent", "", 0.25, low=-0.5, high=2.0),)
+    parameters = (
+        CauseParameter("exponent", "", 0.25, low=-0.5, high=2.0),
+        CauseParameter("pull", "", 0.15, low=-1.0, high=1.0),
+    )
     absorbed_by = ("effects.slice_push.exponent",)
     signature = "nothing without a draw, grows with the draw; along the edge unlike down"
     experiment = "draw"
@@ -158,5 +179,31 @@ class SlicePushLaw(Cause):
         self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
     ) -> CuttingModel:
         """Another exponent."""
+        if values["exponent"] == 0.0:
+            return model
         law = SlicePush(model.effects.slice_push.exponent + values["exponent"])
         return model.derive(effects=dc.replace(model.effects, slice_push=law))
+
+    def wrench(
+        self, series: ForceSeries, values: Mapping[str, float], facts: SliceFacts
+    ) -> np.ndarray:
+        """With more or less of the edge's force along itself."""
+        edge = series.R[:, :, 0]
+        along = np.einsum("nc,nc->n", series.parts["edge"][:, 3:], edge)
+        out = series.wrench.copy()
+        out[:, 3:] += values["pull"] * along[:, None] * edge
+        return out
+
+
+def tougher(model: CuttingModel, shape: np.ndarray, work: float) -> CuttingModel:
+    """A cut that takes more work.
+
+    Args:
+        model: The cut.
+        shape: How the excess of the toughness is distributed over the cut points [P].
+        work: To cut through it all, more than before, J: whatever the mesh makes of the shape.
+    """
+    old = model.point_scales
+    excess = work * shape / float(model.tables.area @ shape)
+    toughness = old.toughness + excess / model.material.toughness
+    return model.derive(point_scales=dc.replace(old, toughness=toughness))
