@@ -113,13 +113,14 @@ class Dulling(Cause):
 
 
 def _harder_to_begin(model: CuttingModel, initiation: float, depth: float) -> CuttingModel:
-    """Tougher points near the surface: all that parts there is harder to begin, and not what the
-    edge alone does, as in `effects.bluntness`."""
+    """Tougher points near the top, where the edge begins: all that parts there is harder, and not
+    what the edge alone does below each place of the outside, as in `effects.bluntness`."""
     tables = model.tables
     grid = np.linspace(-tables.reach, tables.reach, tables.width.shape[1])
-    below = np.maximum(model.point_depth[:, None] + grid, 0.0)
+    depths = model.top - model.split.points[:, 2]
+    below = np.maximum(depths[:, None] + grid, 0.0)
     work = float((np.exp(-below / depth) * tables.width).sum()) * tables.spacing
-    shape = np.exp(-np.maximum(model.point_depth, 0.0) / depth)
+    shape = np.exp(-np.maximum(depths, 0.0) / depth)
     return tougher(model, shape, initiation * work)
 
 
