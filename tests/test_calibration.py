@@ -256,6 +256,12 @@ def test_a_calibration_recovers_what_made_the_records_within_its_intervals(recor
     loaded = load_calibrated_food(tmp_path / "food.yaml")
     assert loaded.food.material == food.food.material
     assert set(loaded.distribution.names) == set(TRUTH)
+    start = {p.name: result.predictor.values(result.unit)[p.name] for p in setup.parameters}
+    polished = calibrate(
+        setup, records[1:], tmp_path / "other", dc.replace(options, start=start, blocks=0)
+    )
+    assert polished.rms == pytest.approx(0.1, rel=0.2)
+    assert not (tmp_path / "other" / "trials.log").exists()
     spread = [loaded.distribution.draw(np.random.default_rng(k)) for k in range(50)]
     for name, value in TRUTH.items():
         assert np.mean([d[name] for d in spread]) == pytest.approx(value, rel=0.1)

@@ -5,7 +5,7 @@ import dataclasses as dc
 import hashlib
 import json
 import multiprocessing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, wait
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from sliceit_drake.calibration.gauss_newton import gauss_newton
 from sliceit_drake.calibration.held_out import blocked_error
 from sliceit_drake.calibration.prediction import Prediction, Predictor
 from sliceit_drake.calibration.refine import Refinement, refine
-from sliceit_drake.calibration.search import SearchResult, open_study, search
+from sliceit_drake.calibration.search import SearchResult, error_of, open_study, search
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.calibration.uncertainty import Posterior, estimate_posterior
 from sliceit_drake.configuration import ConfigurationError
@@ -45,6 +45,8 @@ class CalibrationOptions:
         storage: Journal file or URL of the search, shared by many machines; None for a file in the
             output folder.
         blocks: Blocks of depth that are held out in turn; 0 for none.
+        start: Values of shared parameters to polish in place of a search, as those of a food that
+            was calibrated before; None to search.
     """
 
     trials: int = 500
@@ -54,6 +56,7 @@ class CalibrationOptions:
     workers: int = 2
     storage: str | None = None
     blocks: int = 5
+    start: Mapping[str, float] | None = None
 
 
 @dc.dataclass
@@ -66,8 +69,8 @@ class Calibration:
         unit: Places of the parameters in their ranges [d].
         predictions: One a record.
         rms: On the records, N.
-        search_rms: Best of the search alone, N.
-        refined_rms: Best after Adam, N.
+        search_rms: Best of the search alone, N; of the start where there was no search.
+        refined_rms: Best after Adam, N; the same.
         posterior: Of the parameters.
         blocks: RMS error on each block of depth when it was held out, N.
         held_out_rms: On all of them, N; None if none was held out.
@@ -158,12 +161,16 @@ def calibrate(
     options = options or CalibrationOptions()
     show = progress or (lambda *_: None)
     directory.mkdir(parents=True, exist_ok=True)
-    problem = fingerprint(setup, records)
-    found = _search(setup, records, directory, options, problem, show)
-    if not np.isfinite(found.errors).any():
-        raise CuttingError("no trial of the search could be cut; widen the ranges of the setup")
-    refinements = _refine(setup, records, directory, options, found, problem, show)
     predictor = Predictor(setup, records, workers=options.workers)
+    if options.start is not None:
+        found = _given(predictor, options.start)
+        refinements = [Refinement(found.units[0], float(found.errors[0]), [])]
+    else:
+        problem = fingerprint(setup, records)
+        found = _search(setup, records, directory, options, problem, show)
+        if not np.isfinite(found.errors).any():
+            raise CuttingError("no trial of the search could be cut; widen the setup's ranges")
+        refinements = _refine(setup, records, directory, options, found, problem, show)
     best: tuple[float, np.ndarray] = (np.inf, refinements[0].unit)
     for k, refinement in enumerate(sorted(refinements, key=lambda r: r.error)):
         show("polish", k, len(refinements), best[0])
@@ -197,6 +204,20 @@ def calibrate(
         _held_out(setup, records, held_out, predictor, unit, options),
         found.failures,
     )
+
+
+def _given(predictor: Predictor, start: Mapping[str, float]) -> SearchResult:
+    """The place of given values, as if a search had found it.
+
+    Raises:
+        CuttingError: It cannot be cut.
+    """
+    unit = np.array([p.unit(start.get(p.name, p.start)) for p in predictor.parameters])
+    (row,) = predictor.predict([unit])
+    error, broken = error_of(predictor, row)
+    if broken:
+        raise CuttingError("the food that was given breaks down on these records")
+    return SearchResult(unit[None], np.array([error]), 0)
 
 
 def fingerprint(setup: CalibrationSetup, records: Sequence[SliceRecord]) -> str:

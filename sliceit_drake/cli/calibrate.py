@@ -54,6 +54,11 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         action="store_true",
         help="take the setup's published levels in place of records",
     )
+    parser.add_argument(
+        "--start",
+        metavar="NAME",
+        help="polish a calibrated food, by name or YAML file, in place of a search",
+    )
     parser.add_argument("--trials", type=int, default=500, help="of the search (default 500)")
     parser.add_argument("--steps", type=int, default=100, help="of Adam (default 100)")
     parser.add_argument("--starts", type=int, default=2, help="places refined (default 2)")
@@ -198,6 +203,7 @@ def _calibrate(options: argparse.Namespace) -> int:
             workers=options.workers,
             storage=options.storage,
             blocks=options.blocks,
+            start=_start(options.start) if options.start else None,
         ),
         [r for r in records if r.name in options.hold_out],
         show,
@@ -230,6 +236,20 @@ def _calibrate(options: argparse.Namespace) -> int:
         _fit_points(options, result)
     print(f"Results in {options.output}/")
     return 0
+
+
+def _start(name: str) -> "dict[str, float]":
+    """Values of a calibrated food's parameters."""
+    from sliceit_drake.cutting.food import make_food_model
+    from sliceit_drake.cutting.model import Numerics
+    from sliceit_drake.cutting.parameters import get_parameter
+    from sliceit_drake.diagrams.calibrated_food import load_calibrated_food
+
+    given = load_calibrated_food(name)
+    numerics = Numerics(flank_stiffness=given.flank_stiffness)
+    model = make_food_model(given.food, given.knife, numerics)
+    values = {n: get_parameter(model, n) for n in given.distribution.names}
+    return {n: float(v) for n, v in values.items() if isinstance(v, int | float)}
 
 
 def _fit_points(options: argparse.Namespace, result: "Calibration") -> None:

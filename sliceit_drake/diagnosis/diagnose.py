@@ -14,7 +14,7 @@ from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.food import make_food_model
 from sliceit_drake.cutting.parameters import get_parameter, with_parameters
-from sliceit_drake.diagnosis.cause import Cause, SliceFacts
+from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.held_out import HeldOutGain, held_out_gain
 from sliceit_drake.diagnosis.linear import LinearProblem
 from sliceit_drake.diagnosis.registry import open_causes
@@ -150,7 +150,7 @@ class Diagnosis:
         named = self.verdict.findings if self.verdict.kind in ("cause", "causes") else []
         for finding in named:
             cause = self.causes[finding.evidence.name]
-            changed = cause.model(model, self.values(finding), SliceFacts())
+            changed = cause.extension(model, self.values(finding))
             if changed is model:
                 left.append(f"{cause.name} ({cause.family})")
             model = changed

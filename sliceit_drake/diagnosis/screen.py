@@ -71,6 +71,7 @@ class Screening:
             `names`; for several parameters and scans the least.
         visible: Norm of each cause's projected sensitivity at its plausible size, in noise.
         names: Of the causes.
+        projected: Gram matrix of all columns and y beside what is free in any case.
     """
 
     causes: list[CauseEvidence]
@@ -81,14 +82,30 @@ class Screening:
     angles: np.ndarray
     visible: np.ndarray
     names: list[str]
+    projected: np.ndarray
 
     def evidence(self, name: str) -> CauseEvidence:
         """Of one cause."""
         return next(c for c in self.causes if c.name == name)
 
-    def angle(self, one: str, other: str) -> float:
-        """Between two causes, degrees."""
-        return float(self.angles[self.names.index(one), self.names.index(other)])
+    def angle_to(self, problem: LinearProblem, effect: CauseEvidence, other: str) -> float:
+        """Between the effect of a cause as it was found and all that another can do, degrees.
+
+        A cause with several numbers explains more than one with few, so that this is not the same
+        both ways.
+        """
+        G = self.projected
+        own = problem.found.index("cause", effect.name, effect.scan)
+        e = np.array(effect.coefficients)
+        norm = float(e @ G[np.ix_(own, own)] @ e)
+        best = 0.0
+        for scan in problem.found.scans(other):
+            columns = problem.found.index("cause", other, scan)
+            A, b = G[np.ix_(columns, columns)], G[np.ix_(columns, own)] @ e
+            scale = np.sqrt(np.maximum(np.diag(A), 1e-12))
+            inverse = np.linalg.pinv(A / np.outer(scale, scale), rcond=1e-8, hermitian=True)
+            best = max(best, float((b / scale) @ inverse @ (b / scale)))
+        return float(np.degrees(np.arccos(np.sqrt(min(best / max(norm, 1e-12), 1.0)))))
 
 
 class _Statistics:
@@ -292,6 +309,7 @@ def screen(
         angles=angles,
         visible=visible,
         names=statistics.names,
+        projected=projected,
     )
 
 

@@ -21,8 +21,8 @@ EXPLAINED = 0.6
 SECOND_SHARE = 0.2
 """Least share that a second cause adds."""
 CLASS_ANGLE = 20.0
-"""Causes whose projected sensitivities are closer than this, degrees, are one class."""
-CLASS_GAIN = 0.15
+"""Causes that can do what was found to within this, degrees, are one class."""
+CLASS_GAIN = 0.2
 """A member of the class is kept where its gain falls short by less than this share."""
 LEAST_REPLICATES = 3
 
@@ -160,7 +160,8 @@ def _finding(
         e.name
         for e in screening.causes
         if e.name != evidence.name
-        and screening.angle(evidence.name, e.name) <= CLASS_ANGLE
+        and not (evidence.per_record or e.per_record)
+        and screening.angle_to(problem, evidence, e.name) <= CLASS_ANGLE
         and e.score >= floor
     ]
     return Finding(evidence, size, spread, share, others)
