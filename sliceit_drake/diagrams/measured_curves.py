@@ -40,6 +40,8 @@ __all__ = [
 
 PERIOD = 2e-3
 CLEARANCE = 5e-4
+CHECK_PERIOD = 0.02
+"""Interval at which the largest energy ratio is looked for, s."""
 
 FITTED = {
     "material.toughness": (30.0, 1500.0),
@@ -158,7 +160,8 @@ def cut_measured_food(case: MeasuredFood, refinement: float = 1.0) -> MeasuredCu
     """
     profile = case.profile()
     model = make_food_model(case.food, Knife(), case.numerics, refinement)
-    result = simulate_slice(CuttingSolver(model, PERIOD), case.motion(model, profile))
+    solver = CuttingSolver(model, PERIOD)
+    result = simulate_slice(solver, case.motion(model, profile), check_period=CHECK_PERIOD)
     comparison = compare_with_measurement(
         profile,
         case.measurement,
