@@ -16,7 +16,14 @@ import numpy as np
 from scipy.linalg import cholesky_banded, solve_banded, solveh_banded
 from scipy.optimize import minimize
 
-__all__ = ["NoiseFit", "NoiseModel", "SeriesGroup", "fit_noise", "group_series"]
+__all__ = [
+    "MarkovCovariance",
+    "NoiseFit",
+    "NoiseModel",
+    "SeriesGroup",
+    "fit_noise",
+    "group_series",
+]
 
 LEAST_SHARE = 1e-4
 """Least standard deviation of a series, relative to the root mean square measurement of all."""
@@ -81,9 +88,9 @@ class NoiseModel:
             out[group.rows] = V.solve(columns[group.rows])
         return out
 
-    def _covariances(self) -> list["_Covariance"]:
+    def _covariances(self) -> list["MarkovCovariance"]:
         numbers = zip(self.groups, self.ar, self.tau, self.white, strict=True)
-        return [_Covariance(group.gap, *own) for group, *own in numbers]
+        return [MarkovCovariance(group.gap, *own) for group, *own in numbers]
 
     @property
     def effective_samples(self) -> float:
@@ -106,7 +113,7 @@ class NoiseModel:
         return out
 
 
-class _Covariance:
+class MarkovCovariance:
     """ar^2 exp(-|dt|/tau) + white^2 I; entries with an infinite gap between them are independent.
 
     The inverse T of the first part is tridiagonal (Markov), so that with V = T^-1 + w I,
@@ -308,7 +315,7 @@ class _Problem:
         """B' V^-1 B of a group's columns B, and log det V."""
         key = (group, numbers)
         if key not in self._pieces:
-            V = _Covariance(self.groups[group].gap, *np.exp(numbers))
+            V = MarkovCovariance(self.groups[group].gap, *np.exp(numbers))
             B = self.columns[group]
             if len(self._pieces) > KEPT * len(self.groups):
                 self._pieces.clear()

@@ -16,7 +16,7 @@ from sliceit_drake.cutting.food import make_food_model
 from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.held_out import HeldOutGain, held_out_gain
-from sliceit_drake.diagnosis.linear import LinearProblem
+from sliceit_drake.diagnosis.linear import LinearProblem, integrate_out
 from sliceit_drake.diagnosis.registry import open_causes
 from sliceit_drake.diagnosis.sensitivity import Sensitivities, sensitivities
 from sliceit_drake.diagnosis.verdict import ALARM, Finding, Verdict, reach_verdict
@@ -344,9 +344,7 @@ def _shifts(
     problem: LinearProblem, causes: Sequence[tuple[str, float | None]]
 ) -> dict[str, tuple[float, float]]:
     """Factors of the base parameters and their relative standard errors, causes in the model."""
-    from sliceit_drake.diagnosis.linear import integrate_out
-
-    found, y = problem.found, problem.size
+    found = problem.found
     shared = [
         k
         for name, scan in causes
@@ -354,16 +352,10 @@ def _shifts(
         if not found.columns[k].per_record
     ]
     columns = [*problem.base, *problem.numerical, *problem.spline, *problem.usual, *shared]
-    own = [*problem.own, *problem.usual_own]
-    variance = np.concatenate(
-        [problem.variation**2, np.array(list(problem.usual_own.values())) ** 2]
-    )
+    own, variance = problem.own_prior()
     total = np.sum([integrate_out(G, own, variance) for G in problem.moments.gram], axis=0)
-    A = total[np.ix_(columns, columns)] + np.diag(problem.prior()[columns])
-    scale = np.sqrt(np.maximum(np.diag(A), 1e-30))
-    inverse = np.linalg.pinv(A / np.outer(scale, scale), rcond=1e-10, hermitian=True)
-    theta = inverse @ (total[columns, y] / scale) / scale
-    errors = np.sqrt(np.maximum(np.diag(inverse), 0.0)) / scale
+    theta, covariance = problem.fit_shared(total, columns)
+    errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     out = {}
     for i, k in enumerate(problem.base):
         size = found.columns[k].size

@@ -110,24 +110,15 @@ class _Linear:
             (own if found.columns[columns[0]].per_record else shared).extend(columns)
         self.problem = problem
         self.columns = [*problem.base, *problem.numerical, *problem.usual, *shared]
-        self.own = [*problem.own, *problem.usual_own, *own]
-        self.variance = np.concatenate(
-            [
-                problem.variation**2,
-                np.array(list(problem.usual_own.values())) ** 2,
-                np.full(len(own), FLAT),
-            ]
-        )
+        known, variance = problem.own_prior()
+        self.own = [*known, *own]
+        self.variance = np.concatenate([variance, np.full(len(own), FLAT)])
         gram = problem.moments.gram
         self.reduced = np.array([integrate_out(G, self.own, self.variance) for G in gram])
 
     def shared(self, total: np.ndarray) -> np.ndarray:
         """Coefficients of the shared columns from a sum of reduced Gram matrices."""
-        columns, y = self.columns, self.problem.size
-        A = total[np.ix_(columns, columns)] + np.diag(self.problem.prior()[columns])
-        scale = np.sqrt(np.maximum(np.diag(A), 1e-30))
-        inverse = np.linalg.pinv(A / np.outer(scale, scale), rcond=1e-10, hermitian=True)
-        return np.asarray(inverse @ (total[columns, y] / scale) / scale)
+        return self.problem.fit_shared(total, self.columns)[0]
 
     def change(self, r: int, theta: np.ndarray) -> np.ndarray:
         """Change of a record's prediction, its own part taken from itself [m, c]."""

@@ -16,10 +16,15 @@ from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
-from sliceit_drake.diagnosis.noise_levels import ChannelNoise, estimate_noise, replicates
+from sliceit_drake.diagnosis.noise_levels import (
+    ChannelNoise,
+    differences,
+    estimate_noise,
+    replicates,
+)
 from sliceit_drake.diagnosis.sensitivity import RecordSensitivity, Sensitivities
 
-__all__ = ["LinearProblem", "Moments", "integrate_out"]
+__all__ = ["LinearProblem", "Moments", "integrate_out", "scaled_inverse"]
 
 KNOT = 4e-3
 """Spacing of the splines of depth in which the discretisation's error is taken to vary, metres."""
@@ -127,9 +132,7 @@ class LinearProblem:
                 ],
                 axis=2,
             )
-            for c, noise in enumerate(self.noise):
-                gram[r] += X[:, c].T @ noise.solve(record.time, X[:, c])
-            gram[r] = 0.5 * (gram[r] + gram[r].T)
+            gram[r] = self._weighted(record.time, X)
             rows[r] = X.shape[0] * X.shape[1]
         self.moments = Moments(gram, rows)
 
@@ -143,6 +146,23 @@ class LinearProblem:
             squares += (record.columns[inside][:, :, mesh[0]] ** 2).sum(0)
             count += int(inside.sum())
         return DISCRETISATION * np.sqrt(squares / max(count, 1)) + RIDGE
+
+    def own_prior(self) -> tuple[list[int], np.ndarray]:
+        """Numbers of the columns that are each record's own, and the variances of their
+        coefficients."""
+        usual = np.array(list(self.usual_own.values()))
+        return [*self.own, *self.usual_own], np.concatenate([self.variation, usual]) ** 2
+
+    def fit_shared(self, total: np.ndarray, columns: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Coefficients of columns that all records share, and their covariance.
+
+        Args:
+            total: Sum of Gram matrices from which what is each record's own is integrated out.
+            columns: Numbers [n].
+        """
+        A = total[np.ix_(columns, columns)] + np.diag(self.prior()[columns])
+        covariance = scaled_inverse(A)
+        return covariance @ total[columns, self.size], covariance
 
     def prior(self) -> np.ndarray:
         """Precision of the columns' coefficients before the data [K]: 0 where nothing is known."""
@@ -182,18 +202,26 @@ class LinearProblem:
 
     def _differences(self, members: list[RecordSensitivity]) -> list[np.ndarray]:
         """Gram matrices of each replicate's own columns and its difference from the mean."""
-        n, count = len(members), min(len(r.time) for r in members)
-        columns = [*self.own, *self.usual_own]
-        mean = np.mean([r.residual[:count] for r in members], axis=0)
+        n = len(members)
         out = []
-        for r in members:
-            rest = np.sqrt(n / (n - 1.0)) * (r.residual[:count] - mean)
-            X = np.concatenate([r.columns[:count][:, :, columns], rest[:, :, None]], axis=2)
-            G = np.zeros((X.shape[2], X.shape[2]))
-            for c, noise in enumerate(self.noise):
-                G += X[:, c].T @ noise.solve(r.time[:count], X[:, c])
-            out.append(0.5 * (G + G.T))
+        for time, rest, columns in differences(members, [*self.own, *self.usual_own]):
+            scaled = np.sqrt(n / (n - 1.0)) * rest
+            out.append(self._weighted(time, np.concatenate([columns, scaled[:, :, None]], axis=2)))
         return out
+
+    def _weighted(self, time: np.ndarray, X: np.ndarray) -> np.ndarray:
+        """Gram matrix of columns [m, c, k] with the inverse covariance of the noise [k, k]."""
+        G = np.zeros((X.shape[2], X.shape[2]))
+        for c, noise in enumerate(self.noise):
+            G += X[:, c].T @ noise.solve(time, X[:, c])
+        return 0.5 * (G + G.T)
+
+
+def scaled_inverse(A: np.ndarray, cutoff: float = 1e-10) -> np.ndarray:
+    """Pseudo-inverse of a Gram matrix whose columns are of very different sizes."""
+    scale = np.sqrt(np.maximum(np.diag(A), 1e-30))
+    inverse = np.linalg.pinv(A / np.outer(scale, scale), rcond=cutoff, hermitian=True)
+    return np.asarray(inverse / np.outer(scale, scale))
 
 
 def integrate_out(G: np.ndarray, own: list[int], variance: np.ndarray) -> np.ndarray:

@@ -9,12 +9,12 @@ import dataclasses as dc
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.linalg import solveh_banded
 from scipy.optimize import least_squares
 
+from sliceit_drake.calibration.noise import MarkovCovariance
 from sliceit_drake.diagnosis.sensitivity import RecordSensitivity
 
-__all__ = ["ChannelNoise", "estimate_noise", "replicates"]
+__all__ = ["ChannelNoise", "differences", "estimate_noise", "replicates"]
 
 LAGS = 40
 LEAST_ROWS = 60
@@ -42,21 +42,8 @@ class ChannelNoise:
         return float(np.hypot(self.ar, self.white))
 
     def solve(self, time: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """The inverse covariance at increasing times [m] times columns [m, k].
-
-        The correlated part is Markov, so that its inverse T is tridiagonal, and with V = T^-1 + w I
-        V^-1 x = (x - (I + w T)^-1 x) / w.
-        """
-        rho = np.exp(-np.diff(time) / self.tau)
-        gain = 1.0 / np.maximum(1.0 - rho**2, 1e-12)
-        diagonal = np.zeros(len(time))
-        diagonal[0] = 1.0
-        diagonal[1:] += gain
-        diagonal[:-1] += rho**2 * gain
-        w = self.white**2
-        band = np.vstack([np.concatenate([[0.0], -rho * gain]), diagonal]) * (w / self.ar**2)
-        band[1] += 1.0
-        return np.asarray((columns - solveh_banded(band, columns, check_finite=False)) / w)
+        """The inverse covariance at increasing times [m] times columns [m, k]."""
+        return MarkovCovariance(np.diff(time), self.ar, self.tau, self.white).solve(columns)
 
 
 def replicates(records: Sequence[RecordSensitivity]) -> dict[str, list[int]]:
@@ -91,28 +78,45 @@ def estimate_noise(
     return tuple(_channel(series, c) for c in range(channels)), repeated
 
 
+def differences(
+    members: Sequence[RecordSensitivity], own: Sequence[int]
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """What replicates do not share: each one's residual less their mean.
+
+    Replicates whose rows are not at the same times are interpolated to those of the first.
+
+    Args:
+        members: Records of one condition.
+        own: Numbers of columns.
+
+    Returns:
+        Of each the times since its start [m], the difference [m, c] and those columns [m, c, k].
+    """
+    count = min(len(r.time) for r in members)
+    since = np.array([r.time[:count] - r.time[0] for r in members])
+    grid = since[0]
+    aligned = np.abs(since - grid).max() <= 0.25 * float(np.median(np.diff(grid)))
+    values, columns = [], []
+    for r in members:
+        if aligned:
+            values.append(r.residual[:count])
+            columns.append(r.columns[:count][:, :, own])
+        else:
+            values.append(_on_grid(r.residual, r.time - r.time[0], grid))
+            columns.append(_on_grid(r.columns[:, :, own], r.time - r.time[0], grid))
+    mean = np.mean(values, axis=0)
+    return [(grid, v - mean, c) for v, c in zip(values, columns, strict=True)]
+
+
 def _deviations(
     members: list[RecordSensitivity], own: Sequence[int]
 ) -> list[tuple[np.ndarray, np.ndarray, float]]:
-    """Times, deviations from the mean of the replicates [m, c], and a factor on their variance."""
-    count = min(len(r.time) for r in members)
-    since = np.array([r.time[:count] - r.time[0] for r in members])
-    if np.abs(since - since[0]).max() > 0.25 * float(np.median(np.diff(since[0]))):
-        grid = since[0]
-        values = [_on_grid(r.residual, r.time - r.time[0], grid) for r in members]
-        columns = [_on_grid(r.columns[:, :, own], r.time - r.time[0], grid) for r in members]
-    else:
-        grid = since[0]
-        values = [r.residual[:count] for r in members]
-        columns = [r.columns[:count][:, :, own] for r in members]
-    mean = np.mean(values, axis=0)
+    """Times, differences less what columns take of them [m, c], and a factor on their variance."""
     n = len(members)
     out = []
-    for value, column in zip(values, columns, strict=True):
-        rest = value - mean
+    for grid, rest, column in differences(members, own):
         flat = column.reshape(-1, len(own))
-        scale = np.linalg.norm(flat, axis=0)
-        flat = flat[:, scale > 1e-9]
+        flat = flat[:, np.linalg.norm(flat, axis=0) > 1e-9]
         if flat.shape[1]:
             fitted, *_ = np.linalg.lstsq(flat, rest.ravel(), rcond=1e-6)
             rest = rest - (flat @ fitted).reshape(rest.shape)

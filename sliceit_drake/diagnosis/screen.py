@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from sliceit_drake.diagnosis.linear import LinearProblem, integrate_out
+from sliceit_drake.diagnosis.linear import LinearProblem, integrate_out, scaled_inverse
 
 __all__ = ["CauseEvidence", "Screening", "screen"]
 
@@ -101,10 +101,8 @@ class Screening:
         best = 0.0
         for scan in problem.found.scans(other):
             columns = problem.found.index("cause", other, scan)
-            A, b = G[np.ix_(columns, columns)], G[np.ix_(columns, own)] @ e
-            scale = np.sqrt(np.maximum(np.diag(A), 1e-12))
-            inverse = np.linalg.pinv(A / np.outer(scale, scale), rcond=1e-8, hermitian=True)
-            best = max(best, float((b / scale) @ inverse @ (b / scale)))
+            b = G[np.ix_(columns, own)] @ e
+            best = max(best, float(b @ scaled_inverse(G[np.ix_(columns, columns)], 1e-8) @ b))
         return float(np.degrees(np.arccos(np.sqrt(min(best / max(norm, 1e-12), 1.0)))))
 
 
@@ -135,34 +133,23 @@ class _Statistics:
             for name in self.names
         }
 
-    def reduced(self, gram: np.ndarray, variation: np.ndarray) -> np.ndarray:
+    def reduced(self, gram: np.ndarray) -> np.ndarray:
         """Without what is each record's own."""
-        usual = self.problem.usual_own
-        own = [*self.problem.own, *usual, *self.own_extra]
-        variance = np.concatenate(
-            [
-                variation**2,
-                np.array(list(usual.values())) ** 2,
-                np.full(len(self.own_extra), FLAT),
-            ]
-        )
+        own, variance = self.problem.own_prior()
+        variance = np.concatenate([variance, np.full(len(self.own_extra), FLAT)])
+        own = [*own, *self.own_extra]
         return np.array([integrate_out(G, own, variance) for G in gram])
 
-    def project(self, total: np.ndarray, null: Sequence[int] | None = None) -> np.ndarray:
+    def project(self, total: np.ndarray) -> np.ndarray:
         """What is left of a summed Gram matrix beside the null's columns."""
-        null = self.null if null is None else list(null)
-        A = total[np.ix_(null, null)] + np.diag(self.prior[null])
-        scale = np.sqrt(np.maximum(np.diag(A), 1e-30))
-        inverse = np.linalg.pinv(A / np.outer(scale, scale), rcond=1e-10, hermitian=True)
-        inverse /= np.outer(scale, scale)
+        null = self.null
+        inverse = scaled_inverse(total[np.ix_(null, null)] + np.diag(self.prior[null]))
         return np.asarray(total - total[:, null] @ inverse @ total[null])
 
-    def gains(
-        self, gram: np.ndarray, variation: np.ndarray
-    ) -> tuple[dict[str, tuple[float, float | None]], np.ndarray]:
+    def gains(self, gram: np.ndarray) -> tuple[dict[str, tuple[float, float | None]], np.ndarray]:
         """Of each cause the largest gain and its scan; and the projected Gram matrix."""
         y = self.problem.size
-        reduced = self.reduced(gram, variation)
+        reduced = self.reduced(gram)
         projected = self.project(reduced.sum(0))
         out: dict[str, tuple[float, float | None]] = {}
         for name, scan, columns in self.options:
@@ -203,10 +190,10 @@ class _Statistics:
                 best = gain, value, error
         return best
 
-    def misfit(self, gram: np.ndarray, variation: np.ndarray, projected: np.ndarray) -> float:
+    def misfit(self, gram: np.ndarray, projected: np.ndarray) -> float:
         """Gain by a correction of each condition."""
         y = self.problem.size
-        reduced = self.reduced(gram, variation)
+        reduced = self.reduced(gram)
         correction = self.problem.correction
         variance = np.full(len(correction), CORRECTION_VARIANCE)
         total = np.zeros_like(reduced[0])
@@ -215,7 +202,7 @@ class _Statistics:
         return float(projected[y, y] - self.project(total)[y, y])
 
     def coefficients(
-        self, gram: np.ndarray, variation: np.ndarray, projected: np.ndarray, columns: list[int]
+        self, gram: np.ndarray, projected: np.ndarray, columns: list[int]
     ) -> tuple[np.ndarray, np.ndarray]:
         """Of a cause's columns; where each record has its own their mean and its standard error."""
         kinds = self.problem.found.columns
@@ -224,7 +211,7 @@ class _Statistics:
             return value, error
         y = self.problem.size
         own = []
-        for G in self.reduced(gram, variation):
+        for G in self.reduced(gram):
             A, b = G[np.ix_(columns, columns)], G[columns, y]
             if np.diag(A).min() > 1e-9:
                 own.append(np.linalg.lstsq(A, b, rcond=1e-9)[0])
@@ -255,26 +242,26 @@ def screen(
         progress: Called with the replicates done.
     """
     statistics = _Statistics(problem, assumed)
-    gram, variation = problem.moments.gram, problem.variation
-    gains, projected = statistics.gains(gram, variation)
-    misfit = statistics.misfit(gram, variation, projected)
+    gram = problem.moments.gram
+    gains, projected = statistics.gains(gram)
+    misfit = statistics.misfit(gram, projected)
     rng = np.random.default_rng(seed)
     draw = _Bootstrap(problem, rng)
     null_gains: dict[str, list[float]] = {name: [] for name in statistics.names}
     null_misfits = []
     for k in range(replicates):
         sample = draw()
-        own, inside = statistics.gains(sample, variation)
+        own, inside = statistics.gains(sample)
         for name, (gain, _) in own.items():
             null_gains[name].append(gain)
-        null_misfits.append(statistics.misfit(sample, variation, inside))
+        null_misfits.append(statistics.misfit(sample, inside))
         if progress is not None:
             progress(k + 1)
     evidence = []
     for name in statistics.names:
         gain, scan = gains[name]
         columns = problem.found.index("cause", name, scan)
-        value, error = statistics.coefficients(gram, variation, projected, columns)
+        value, error = statistics.coefficients(gram, projected, columns)
         kinds = [problem.found.columns[c] for c in columns]
         null = np.array(null_gains[name])
         evidence.append(
