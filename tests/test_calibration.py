@@ -262,7 +262,7 @@ def test_a_calibration_recovers_what_made_the_records_within_its_intervals(recor
     )
     assert polished.rms == pytest.approx(0.1, rel=0.2)
     assert not (tmp_path / "other" / "trials.log").exists()
-    spread = [loaded.distribution.draw(np.random.default_rng(k)) for k in range(50)]
+    spread = [loaded.distribution.draw(np.random.default_rng(k), 1)[0] for k in range(50)]
     for name, value in TRUTH.items():
         assert np.mean([d[name] for d in spread]) == pytest.approx(value, rel=0.1)
 
@@ -324,11 +324,11 @@ def test_draws_from_a_calibrated_food_stay_in_its_ranges_and_have_its_covariance
         ["a", "b"], [1.0, -1.0], [100.0, 1.0], [True, False], [0.5, 0.5], covariance
     )
     rng = np.random.default_rng(0)
-    draws = [what.draw(rng) for _ in range(4000)]
+    draws = what.draw(rng, 4000)
     places = np.array([[np.log(d["a"]) / np.log(100.0), 0.5 * (d["b"] + 1.0)] for d in draws])
     np.testing.assert_allclose(np.cov(places.T), covariance, atol=1e-3)
     near_end = dc.replace(what, mean=[0.99, 0.5])
-    assert max(near_end.draw(rng)["a"] for _ in range(500)) <= 100.0
+    assert max(draw["a"] for draw in near_end.draw(rng, 500)) <= 100.0
 
 
 @pytest.mark.parametrize("name", calibrated_food_names())
@@ -353,4 +353,4 @@ def test_a_distribution_that_is_none_is_refused():
         bad.check("distribution")
     with pytest.raises(ConfigurationError, match="entries"):
         dc.replace(bad, low=[]).check("distribution")
-    assert CalibratedFood().distribution.draw(np.random.default_rng(0)) == {}
+    assert CalibratedFood().distribution.draw(np.random.default_rng(0), 1) == [{}]

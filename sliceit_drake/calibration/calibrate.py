@@ -20,7 +20,6 @@ from sliceit_drake.calibration.search import SearchResult, error_of, open_study,
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.calibration.uncertainty import Posterior, estimate_posterior
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.distribution import ParameterDistribution
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.calibrated_food import CalibratedFood
 from sliceit_drake.records.slice_record import SliceRecord
@@ -104,7 +103,7 @@ class Calibration:
             food=food,
             knife=model.knife,
             flank_stiffness=model.numerics.flank_stiffness,
-            distribution=distribution(self.posterior),
+            distribution=self.posterior.shared(),
             spring=spring,
             rms_error=self.rms,
             held_out_error=self.held_out_rms,
@@ -113,24 +112,6 @@ class Calibration:
             command=command,
             note=note,
         )
-
-
-def distribution(posterior: Posterior) -> ParameterDistribution:
-    """The shared parameters' part of a posterior, as `CalibratedFood` keeps it."""
-    shared = [k for k, name in enumerate(posterior.names) if ":" not in name]
-    covariance = np.array(posterior.covariance)[np.ix_(shared, shared)]
-
-    def pick(values: Sequence) -> list:
-        return [values[k] for k in shared]
-
-    return ParameterDistribution(
-        names=pick(posterior.names),
-        low=pick(posterior.low),
-        high=pick(posterior.high),
-        log=pick(posterior.log),
-        mean=[float(m) for m in pick(posterior.mean)],
-        covariance=covariance.tolist(),
-    )
 
 
 def calibrate(
@@ -171,15 +152,16 @@ def calibrate(
         if not np.isfinite(found.errors).any():
             raise CuttingError("no trial of the search could be cut; widen the setup's ranges")
         refinements = _refine(setup, records, directory, options, found, problem, show)
-    best: tuple[float, np.ndarray] = (np.inf, refinements[0].unit)
+    best: tuple[float, np.ndarray, list[Prediction]] = (np.inf, refinements[0].unit, [])
     for k, refinement in enumerate(sorted(refinements, key=lambda r: r.error)):
         show("polish", k, len(refinements), best[0])
         unit = gauss_newton(predictor, refinement.unit).unit
-        error = predictor.error(predictor.predict([unit])[0])
+        (row,) = predictor.predict([unit])
+        error = predictor.error(row)
         if error < best[0]:
-            best = (error, unit)
+            best = (error, unit, row)
     show("polish", len(refinements), len(refinements), best[0])
-    rms, unit = best
+    rms, unit, predictions = best
     if not np.isfinite(rms):
         raise CuttingError("what the search found breaks down at the setup's sub-step")
     posterior = estimate_posterior(predictor, unit)
@@ -194,7 +176,7 @@ def calibrate(
         setup,
         predictor,
         unit,
-        predictor.predict([unit])[0],
+        predictions,
         rms,
         float(found.errors.min()),
         min(r.error for r in refinements),

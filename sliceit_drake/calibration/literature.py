@@ -6,10 +6,10 @@ from collections.abc import Callable
 import numpy as np
 from scipy.stats import qmc
 
-from sliceit_drake.calibration.setup import CalibrationSetup, from_unit
+from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.batch import simulate_batch
-from sliceit_drake.cutting.distribution import ParameterDistribution
+from sliceit_drake.cutting.distribution import ParameterDistribution, from_unit
 from sliceit_drake.cutting.food import make_food_model, start_pose
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.parameters import with_parameters

@@ -3,108 +3,45 @@
 import dataclasses as dc
 
 import numpy as np
-from scipy.special import ndtri
 
-from sliceit_drake.calibration.setup import from_unit
 from sliceit_drake.configuration import quantity
+from sliceit_drake.cutting.distribution import DETERMINED, PRIOR_DEVIATION, ParameterDistribution
 
 __all__ = ["Posterior"]
 
-PRIOR_DEVIATION = float(np.sqrt(1.0 / 12.0))
-"""Of a place that is uniform in the unit range."""
-DETERMINED = 0.5
-"""Greatest standard deviation of what is determined, relative to that before the data."""
 CORRELATED = 0.9
 SHARE = 0.3
 """Least part of a parameter in a direction for it to be named."""
-BATCH, BATCHES = 20_000, 500
 
 
 @dc.dataclass
-class Posterior:
-    """Joint distribution of the parameters: normal in places of their ranges, cut off at the ends.
+class Posterior(ParameterDistribution):
+    """What records say of all parameters, those of single records included.
 
     Attributes:
-        names: Of the parameters [d].
-        low, high: Ranges [d], each in its parameter's unit.
-        log: Whether a place is that of the logarithm [d].
-        mean: Places, 0 at the low end and 1 at the high [d].
-        covariance: Of the places [d, d].
         effective_samples: Independent samples that would be worth as much as those of the records.
         record_variation: Relative standard deviation of the force between slices, or null where no
             cut was repeated.
         notes: What a reader must know.
     """
 
-    names: list[str] = dc.field(default_factory=list)
-    low: list[float] = dc.field(default_factory=list)
-    high: list[float] = dc.field(default_factory=list)
-    log: list[bool] = dc.field(default_factory=list)
-    mean: list[float] = dc.field(default_factory=list)
-    covariance: list[list[float]] = dc.field(default_factory=list)
     effective_samples: float = quantity(0.0, "", low=0.0, high=1e12, doc="In number.")
     record_variation: float | None = quantity(
         None, "", low=0.0, high=10.0, doc="Relative, between slices."
     )
     notes: list[str] = dc.field(default_factory=list)
 
-    @property
-    def deviation(self) -> np.ndarray:
-        """Standard deviations of the places [d]."""
-        return np.sqrt(np.diag(np.array(self.covariance)))
-
-    def values(self, unit: np.ndarray) -> dict[str, float]:
-        """Parameters by name at places in their ranges [d]."""
-        ranges = zip(self.names, unit, self.low, self.high, self.log, strict=True)
-        return {n: float(from_unit(u, low, high, log)) for n, u, low, high, log in ranges}
-
-    def intervals(self, level: float = 0.9) -> dict[str, tuple[float, float]]:
-        """Central intervals by name, in the parameters' units, within their ranges.
-
-        Args:
-            level: Probability within, such as 0.9.
-        """
-        reach = float(ndtri(0.5 + level / 2.0)) * self.deviation
-        low = self.values(np.clip(np.array(self.mean) - reach, 0.0, 1.0))
-        high = self.values(np.clip(np.array(self.mean) + reach, 0.0, 1.0))
-        ranges = zip(self.names, self.low, self.high, strict=True)
-        # The logarithm's rounding may exceed a range.
-        return {n: (max(low[n], least), min(high[n], most)) for n, least, most in ranges}
-
-    def draw_places(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """A sample of places [n, d], all within the ranges.
-
-        Raises:
-            ValueError: So little of the distribution is within the ranges that none was found.
-        """
-        mean, found = np.array(self.mean), []
-        values, vectors = np.linalg.eigh(np.array(self.covariance))
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
-        count = 0
-        for _ in range(BATCHES):
-            sample = mean + rng.normal(size=(max(n, min(4 * n, BATCH)), len(mean))) @ root.T
-            sample = sample[((sample >= 0.0) & (sample <= 1.0)).all(1)]
-            found.append(sample)
-            count += len(sample)
-            if count >= n:
-                return np.concatenate(found)[:n]
-        raise ValueError(f"{count} of {n} samples were found within the ranges")
-
-    def draw(self, rng: np.random.Generator, n: int) -> list[dict[str, float]]:
-        """A sample of n sets of parameters by name, all within the ranges.
-
-        Raises:
-            ValueError: So little of the distribution is within the ranges that none was found.
-        """
-        return [self.values(place) for place in self.draw_places(rng, n)]
-
-    def determined(self) -> dict[str, bool]:
-        """Whether the data say more than the range does, for each parameter by name.
-
-        What they say is its standard deviation below half of that of the range.
-        """
-        inside = self.deviation < DETERMINED * PRIOR_DEVIATION
-        return {name: bool(d) for name, d in zip(self.names, inside, strict=True)}
+    def shared(self) -> ParameterDistribution:
+        """The part of the parameters that belong to the food and not to one record."""
+        own = [k for k, name in enumerate(self.names) if ":" not in name]
+        return ParameterDistribution(
+            names=[self.names[k] for k in own],
+            low=[self.low[k] for k in own],
+            high=[self.high[k] for k in own],
+            log=[self.log[k] for k in own],
+            mean=[float(self.mean[k]) for k in own],
+            covariance=np.array(self.covariance)[np.ix_(own, own)].tolist(),
+        )
 
     def correlation(self) -> np.ndarray:
         """Of the places [d, d]."""

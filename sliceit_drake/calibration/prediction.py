@@ -8,9 +8,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from sliceit_drake.calibration.oscillation import Oscillation, fit_oscillation
-from sliceit_drake.calibration.setup import CalibrationSetup, from_unit, to_unit
+from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.batch import BatchSimulator, BatchSlice
+from sliceit_drake.cutting.distribution import from_unit, to_unit
 from sliceit_drake.cutting.food import Box, Cylinder, Ellipsoid, Food, make_food_model, start_pose
 from sliceit_drake.cutting.gradient import SliceAdjoint
 from sliceit_drake.cutting.knife import Knife

@@ -15,13 +15,10 @@ MEASURED, PREDICTED = "#111827", "#c2410c"
 CHANNELS = ("force x", "force y", "force z")
 
 
-def parameter_table(
-    names: list[str],
-    values: Mapping[str, float],
-    intervals: Mapping[str, tuple[float, float]],
-    determined: Mapping[str, bool],
-) -> str:
-    """Lines of parameters with their 90 % intervals, and what is not determined."""
+def parameter_table(distribution: ParameterDistribution, values: Mapping[str, float]) -> str:
+    """Lines of parameters with values and 90 % intervals, and what is not determined."""
+    names, intervals = distribution.names, distribution.intervals(0.9)
+    determined = distribution.determined()
     width = max(len(name) for name in names)
     lines = [f"{'parameter':{width}}  {'value':>10}  {'90 % interval':>23}"]
     for name in names:
@@ -33,14 +30,7 @@ def parameter_table(
 
 def food_table(distribution: ParameterDistribution) -> str:
     """`parameter_table` of a calibrated food."""
-    sd = np.sqrt(np.clip(np.diag(np.array(distribution.covariance)), 0.0, None))
-    intervals, determined = {}, {}
-    for k, name in enumerate(distribution.names):
-        ends = np.clip(distribution.mean[k] + np.array([-1.645, 1.645]) * sd[k], 0.0, 1.0)
-        intervals[name] = (distribution.value(k, ends[0]), distribution.value(k, ends[1]))
-        # A uniform range has a standard deviation of 1 / sqrt(12).
-        determined[name] = bool(sd[k] < 0.5 / np.sqrt(12.0))
-    return parameter_table(distribution.names, distribution.values(), intervals, determined)
+    return parameter_table(distribution, distribution.values())
 
 
 def figure(calibration: Calibration, file: Path) -> None:

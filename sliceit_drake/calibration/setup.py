@@ -4,8 +4,6 @@ import dataclasses as dc
 import difflib
 from pathlib import Path
 
-import numpy as np
-
 from sliceit_drake.configuration import ConfigurationError, choice, load_yaml, quantity
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.food import Food, make_food_model
@@ -162,17 +160,3 @@ def load_setup(name: str | Path) -> CalibrationSetup:
                 fix=f"Did you mean {close[0]}?" if close else "See cutting/parameters.py.",
             )
     return setup
-
-
-def to_unit(value: np.ndarray | float, low: float, high: float, log: bool) -> np.ndarray:
-    """Place of a value in its range: 0 at the low end, 1 at the high end."""
-    if log:
-        return np.asarray(np.log(np.asarray(value) / low) / np.log(high / low))
-    return np.asarray((np.asarray(value) - low) / (high - low))
-
-
-def from_unit(unit: np.ndarray | float, low: float, high: float, log: bool) -> np.ndarray:
-    """Inverse of `to_unit`."""
-    if log:
-        return np.asarray(low * np.exp(np.asarray(unit) * np.log(high / low)))
-    return np.asarray(low + np.asarray(unit) * (high - low))

@@ -218,9 +218,7 @@ def _calibrate(options: argparse.Namespace) -> int:
     figure(result, options.output / "fit.png")
     values = result.predictor.values(result.unit)
     posterior = result.posterior
-    print(
-        parameter_table(posterior.names, values, posterior.intervals(0.9), posterior.determined())
-    )
+    print(parameter_table(posterior, values))
     for line in posterior.remarks():
         print(line)
     print(

@@ -1,15 +1,19 @@
 """What is known of parameters after a calibration: a normal distribution within their ranges."""
 
 import dataclasses as dc
-from collections.abc import Mapping
 
 import numpy as np
+from scipy.special import ndtri
 
 from sliceit_drake.configuration import ConfigurationError
 
-__all__ = ["ParameterDistribution"]
+__all__ = ["DETERMINED", "PRIOR_DEVIATION", "ParameterDistribution", "from_unit", "to_unit"]
 
-ATTEMPTS = 200
+PRIOR_DEVIATION = float(np.sqrt(1.0 / 12.0))
+"""Of a place that is uniform in the unit range."""
+DETERMINED = 0.5
+"""Greatest standard deviation of what is determined, relative to that before the data."""
+BATCH, BATCHES = 20_000, 500
 
 
 @dc.dataclass
@@ -64,28 +68,75 @@ class ParameterDistribution:
                     fix="Give low < high, and low > 0 for a logarithm.",
                 )
 
-    def value(self, k: int, place: float) -> float:
-        """The k-th parameter at a place in its range."""
-        if self.log[k]:
-            return float(self.low[k] * (self.high[k] / self.low[k]) ** place)
-        return float(self.low[k] + (self.high[k] - self.low[k]) * place)
+    @property
+    def deviation(self) -> np.ndarray:
+        """Standard deviations of the places [d]."""
+        return np.sqrt(np.diag(np.array(self.covariance)))
 
-    def values(self) -> dict[str, float]:
-        """The parameters at the mean."""
-        return {name: self.value(k, self.mean[k]) for k, name in enumerate(self.names)}
+    def values(self, places: np.ndarray | None = None) -> dict[str, float]:
+        """Parameters by name at places in their ranges [d]; at the mean by default."""
+        places = np.array(self.mean) if places is None else places
+        ranges = zip(self.names, places, self.low, self.high, self.log, strict=True)
+        return {n: float(from_unit(u, low, high, log)) for n, u, low, high, log in ranges}
 
-    def draw(self, rng: np.random.Generator) -> Mapping[str, float]:
-        """A sample within the ranges, by name.
+    def intervals(self, level: float = 0.9) -> dict[str, tuple[float, float]]:
+        """Central intervals by name, in the parameters' units, within their ranges.
 
-        What falls outside is drawn again; after `ATTEMPTS` times it is clipped.
+        Args:
+            level: Probability within, such as 0.9.
+        """
+        reach = float(ndtri(0.5 + level / 2.0)) * self.deviation
+        low = self.values(np.clip(np.array(self.mean) - reach, 0.0, 1.0))
+        high = self.values(np.clip(np.array(self.mean) + reach, 0.0, 1.0))
+        return {name: (low[name], high[name]) for name in self.names}
+
+    def determined(self) -> dict[str, bool]:
+        """Whether the data say more than the range does, for each parameter by name.
+
+        What they say is its standard deviation below half of that of the range.
+        """
+        inside = self.deviation < DETERMINED * PRIOR_DEVIATION
+        return {name: bool(d) for name, d in zip(self.names, inside, strict=True)}
+
+    def draw_places(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """A sample of places [n, d], all within the ranges.
+
+        Raises:
+            ValueError: So little of the distribution is within the ranges that none was found.
+        """
+        mean, found = np.array(self.mean), []
+        values, vectors = np.linalg.eigh(np.array(self.covariance))
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        count = 0
+        for _ in range(BATCHES):
+            sample = mean + rng.normal(size=(max(n, min(4 * n, BATCH)), len(mean))) @ root.T
+            sample = sample[((sample >= 0.0) & (sample <= 1.0)).all(1)]
+            found.append(sample)
+            count += len(sample)
+            if count >= n:
+                return np.concatenate(found)[:n]
+        raise ValueError(f"{count} of {n} samples were found within the ranges")
+
+    def draw(self, rng: np.random.Generator, n: int) -> list[dict[str, float]]:
+        """A sample of n sets of parameters by name, all within the ranges.
+
+        Raises:
+            ValueError: So little of the distribution is within the ranges that none was found.
         """
         if not self.names:
-            return {}
-        mean = np.array(self.mean)
-        place = mean
-        for _ in range(ATTEMPTS):
-            place = rng.multivariate_normal(mean, np.array(self.covariance), method="eigh")
-            if ((place >= 0.0) & (place <= 1.0)).all():
-                break
-        place = np.clip(place, 0.0, 1.0)
-        return {name: self.value(k, float(place[k])) for k, name in enumerate(self.names)}
+            return [{}] * n
+        return [self.values(place) for place in self.draw_places(rng, n)]
+
+
+def to_unit(value: np.ndarray | float, low: float, high: float, log: bool) -> np.ndarray:
+    """Place of a value in its range: 0 at the low end, 1 at the high end."""
+    if log:
+        return np.asarray(np.log(np.asarray(value) / low) / np.log(high / low))
+    return np.asarray((np.asarray(value) - low) / (high - low))
+
+
+def from_unit(unit: np.ndarray | float, low: float, high: float, log: bool) -> np.ndarray:
+    """Inverse of `to_unit`."""
+    if log:
+        return np.asarray(low * np.exp(np.asarray(unit) * np.log(high / low)))
+    return np.asarray(low + np.asarray(unit) * (high - low))
