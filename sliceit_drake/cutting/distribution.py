@@ -88,7 +88,9 @@ class ParameterDistribution:
         reach = float(ndtri(0.5 + level / 2.0)) * self.deviation
         low = self.values(np.clip(np.array(self.mean) - reach, 0.0, 1.0))
         high = self.values(np.clip(np.array(self.mean) + reach, 0.0, 1.0))
-        return {name: (low[name], high[name]) for name in self.names}
+        ranges = zip(self.names, self.low, self.high, strict=True)
+        # The logarithm's rounding may exceed a range.
+        return {n: (max(low[n], least), min(high[n], most)) for n, least, most in ranges}
 
     def determined(self) -> dict[str, bool]:
         """Whether the data say more than the range does, for each parameter by name.
