@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pydrake.multibody.parsing import Parser
 
-__all__ = ["MODEL_PACKAGE", "add_package_map", "resource_path"]
+__all__ = ["MODEL_PACKAGE", "add_package_map", "named_yaml", "resource_path"]
 
 MODEL_PACKAGE = "sliceit_drake_models"
 FOLDERS = ("calibration", "hardware", "models", "scenarios")
@@ -44,6 +44,23 @@ def resource_path(relative: str) -> Path:
             "the installation is incomplete: reinstall sliceit_drake."
         )
     return path
+
+
+def named_yaml(name: str | Path, folder: str) -> Path | None:
+    """The YAML file that a user means by a file name, or by the name of one that ships.
+
+    Args:
+        name: A file that ends in .yaml or .yml, or a name.
+        folder: Where the files that ship lie, as for `resource_path`.
+
+    Returns:
+        The file, or None where no file of that name ships.
+    """
+    file = Path(name)
+    if file.suffix in (".yaml", ".yml"):
+        return file
+    file = resource_path(folder) / f"{name}.yaml"
+    return file if file.is_file() and file.parent == resource_path(folder) else None
 
 
 def add_package_map(parser: "Parser") -> None:

@@ -136,8 +136,9 @@ def table(comparisons: Sequence[FoodComparison]) -> str:
             )
     lines += [
         "",
-        "| food | ours / half of DiSECt's | search [N] | after Adam [N] | polished [N] | minutes |",
-        "|---|---|---|---|---|---|",
+        "| food | ours / half of DiSECt's | search [N] | after Adam [N] | polished [N] | minutes |"
+        " a toughness for each cut point [N] | cut points |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for c in comparisons:
         half = 0.5 * next(r.rms for r in c.rows if r.name == "DiSECt")

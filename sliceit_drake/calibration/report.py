@@ -1,15 +1,17 @@
 """A calibration as a person reads it: table and figure."""
 
+import datetime
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from sliceit_drake.calibration.calibrate import Calibration
+from sliceit_drake.calibration.calibrate import Calibration, write_json
+from sliceit_drake.configuration import dump_yaml
 from sliceit_drake.cutting.distribution import ParameterDistribution
 
-__all__ = ["figure", "food_table", "parameter_table"]
+__all__ = ["figure", "food_table", "parameter_table", "write_results"]
 
 MEASURED, PREDICTED = "#111827", "#c2410c"
 CHANNELS = ("force x", "force y", "force z")
@@ -63,3 +65,17 @@ def figure(calibration: Calibration, file: Path) -> None:
         for axis in (upper, lower):
             axis.grid(alpha=0.25)
     sheet.savefig(file, dpi=150)
+
+
+def write_results(calibration: Calibration, directory: Path, command: str) -> None:
+    """Writes `food.yaml`, `calibration.json` and `fit.png`.
+
+    Args:
+        calibration: The result.
+        directory: Where; it exists.
+        command: What was typed, for the food's provenance.
+    """
+    food = calibration.calibrated_food(datetime.date.today().isoformat(), command)
+    dump_yaml(food, directory / "food.yaml")
+    write_json(calibration, directory / "calibration.json")
+    figure(calibration, directory / "fit.png")

@@ -11,7 +11,7 @@ from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.mesh import MeshError
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.parameters import POINT_PARAMETERS, parameter_names
-from sliceit_drake.resources import resource_path
+from sliceit_drake.resources import named_yaml, resource_path
 
 __all__ = ["CalibrationSetup", "Literature", "ParameterRange", "load_setup", "setup_names"]
 
@@ -133,15 +133,13 @@ def load_setup(name: str | Path) -> CalibrationSetup:
     Raises:
         ConfigurationError: Naming file, field and fix.
     """
-    file = Path(name)
-    if file.suffix not in (".yaml", ".yml"):
-        if str(name) not in setup_names():
-            raise ConfigurationError(
-                f"{name!r} is no food that a setup ships for: {', '.join(setup_names())}",
-                field="--food",
-                fix="Name one of them, or give a YAML file of a setup.",
-            )
-        file = resource_path(f"{FOLDER}/{name}.yaml")
+    file = named_yaml(name, FOLDER)
+    if file is None:
+        raise ConfigurationError(
+            f"{name!r} is no food that a setup ships for: {', '.join(setup_names())}",
+            field="--food",
+            fix="Name one of them, or give a YAML file of a setup.",
+        )
     setup = load_yaml(CalibrationSetup, file)
     assert isinstance(setup, CalibrationSetup)
     try:

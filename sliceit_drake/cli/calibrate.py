@@ -5,10 +5,13 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sliceit_drake.cli.progress import StageBars
+
 if TYPE_CHECKING:
     from sliceit_drake.calibration.calibrate import Calibration
+    from sliceit_drake.calibration.per_point import PointFit
 
-__all__ = ["add_parser"]
+__all__ = ["add_parser", "fit_points_shown"]
 
 DESCRIPTION = """\
 Calibrate a food from slice records (NAME.csv and NAME.yaml, see docs/records.md).
@@ -156,16 +159,13 @@ def _show(name: str) -> int:
 
 
 def _calibrate(options: argparse.Namespace) -> int:
-    import datetime
     import shlex
     import sys
 
-    from tqdm import tqdm
-
-    from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate, write_json
-    from sliceit_drake.calibration.report import figure, parameter_table
+    from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate
+    from sliceit_drake.calibration.report import parameter_table, write_results
     from sliceit_drake.calibration.setup import load_setup
-    from sliceit_drake.configuration import ConfigurationError, dump_yaml
+    from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.records.validation import check_record, load_record, record_files
 
     setup = load_setup(options.food)
@@ -182,40 +182,27 @@ def _calibrate(options: argparse.Namespace) -> int:
                 field="--hold-out",
                 fix="Give the names of records that are given.",
             )
-    bars: dict[str, tqdm] = {}
-
-    def show(stage: str, done: int, total: int, error: float) -> None:
-        if stage not in bars:
-            bars[stage] = tqdm(total=total, desc=stage)
-        bar = bars[stage]
-        bar.set_postfix_str(f"best RMS {error:.3f} N", refresh=False)
-        bar.update(done - bar.n)
-
-    result = calibrate(
-        setup,
-        [r for r in records if r.name not in options.hold_out],
-        options.output,
-        CalibrationOptions(
-            trials=options.trials,
-            steps=options.steps,
-            starts=options.starts,
-            seed=options.seed,
-            workers=options.workers,
-            storage=options.storage,
-            blocks=options.blocks,
-            start=_start(options.start) if options.start else None,
-        ),
-        [r for r in records if r.name in options.hold_out],
-        show,
-    )
-    for bar in bars.values():
-        bar.close()
+    with StageBars() as bars:
+        result = calibrate(
+            setup,
+            [r for r in records if r.name not in options.hold_out],
+            options.output,
+            CalibrationOptions(
+                trials=options.trials,
+                steps=options.steps,
+                starts=options.starts,
+                seed=options.seed,
+                workers=options.workers,
+                storage=options.storage,
+                blocks=options.blocks,
+                start=_start(options.start) if options.start else None,
+            ),
+            [r for r in records if r.name in options.hold_out],
+            bars.show_error,
+        )
     arguments = [a for a in sys.argv[1:]]
     command = shlex.join(["sliceit", *arguments])
-    food = result.calibrated_food(datetime.date.today().isoformat(), command)
-    dump_yaml(food, options.output / "food.yaml")
-    write_json(result, options.output / "calibration.json")
-    figure(result, options.output / "fit.png")
+    write_results(result, options.output, command)
     values = result.predictor.values(result.unit)
     posterior = result.posterior
     print(parameter_table(posterior, values))
@@ -250,19 +237,23 @@ def _start(name: str) -> "dict[str, float]":
     return {n: float(v) for n, v in values.items() if isinstance(v, int | float)}
 
 
-def _fit_points(options: argparse.Namespace, result: "Calibration") -> None:
-    import numpy as np
-    from tqdm import tqdm
-
+def fit_points_shown(result: "Calibration", steps: int) -> "PointFit":
+    """Fits a toughness for each cut point, behind a progress bar."""
     from sliceit_drake.calibration.per_point import fit_points
 
-    with tqdm(total=options.per_point, desc="each point") as bar:
+    with StageBars() as bars:
+        return fit_points(
+            result.predictor,
+            result.unit,
+            steps,
+            lambda done, error: bars.show_error("each point", done, steps, error),
+        )
 
-        def show(done: int, error: float) -> None:
-            bar.set_postfix_str(f"best RMS {error:.3f} N", refresh=False)
-            bar.update(done - bar.n)
 
-        points = fit_points(result.predictor, result.unit, options.per_point, show)
+def _fit_points(options: argparse.Namespace, result: "Calibration") -> None:
+    import numpy as np
+
+    points = fit_points_shown(result, options.per_point)
     np.savetxt(
         options.output / "points.csv",
         np.column_stack([points.positions, points.factors]),

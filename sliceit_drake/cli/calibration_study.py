@@ -4,6 +4,9 @@ import argparse
 import os
 from pathlib import Path
 
+from sliceit_drake.cli.calibrate import fit_points_shown
+from sliceit_drake.cli.progress import StageBars
+
 __all__ = ["add_calibration_study"]
 
 FOODS = ("cucumber", "tomato", "potato")
@@ -41,17 +44,12 @@ def add_calibration_study(studies: "argparse._SubParsersAction[argparse.Argument
 
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
-    import datetime
     import time
 
-    from tqdm import tqdm
-
-    from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate, write_json
+    from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate
     from sliceit_drake.calibration.comparison import compare, plot_comparisons, table
-    from sliceit_drake.calibration.per_point import fit_points
-    from sliceit_drake.calibration.report import figure
+    from sliceit_drake.calibration.report import write_results
     from sliceit_drake.calibration.setup import load_setup
-    from sliceit_drake.configuration import dump_yaml
     from sliceit_drake.records.force_profile import load_force_profile
     from sliceit_drake.records.validation import load_record
     from sliceit_drake.resources import resource_path
@@ -64,42 +62,22 @@ def run(options: argparse.Namespace) -> int:
         )
         folder = options.output / food
         begin = time.monotonic()
-        bars: dict[str, tqdm] = {}
-
-        def show(
-            stage: str, done: int, total: int, error: float, bars: dict = bars, food: str = food
-        ) -> None:
-            if stage not in bars:
-                bars[stage] = tqdm(total=total, desc=f"{food}: {stage}")
-            bar = bars[stage]
-            bar.set_postfix_str(f"best RMS {error:.3f} N", refresh=False)
-            bar.update(done - bar.n)
-
         settings = CalibrationOptions(
             trials=options.trials, steps=options.steps, workers=options.workers
         )
-        result = calibrate(load_setup(food), [record], folder, settings, progress=show)
-        for bar in bars.values():
-            bar.close()
+        with StageBars(f"{food}: ") as bars:
+            result = calibrate(
+                load_setup(food), [record], folder, settings, progress=bars.show_error
+            )
         minutes = (time.monotonic() - begin) / 60.0
         command = (
             f"sliceit study calibration --foods {food} --trials {options.trials} --steps "
             f"{options.steps}"
         )
-        calibrated = result.calibrated_food(datetime.date.today().isoformat(), command)
-        dump_yaml(calibrated, folder / "food.yaml")
-        write_json(result, folder / "calibration.json")
-        figure(result, folder / "fit.png")
+        write_results(result, folder, command)
         comparison = compare(result, profile, minutes)
         if options.point_steps:
-            points = fit_points(
-                result.predictor,
-                result.unit,
-                options.point_steps,
-                lambda done, error: show("each point", done, options.point_steps, error),
-            )
-            bars["each point"].close()
-            comparison.per_point_rms = points.rms
+            comparison.per_point_rms = fit_points_shown(result, options.point_steps).rms
         comparisons.append(comparison)
         for line in result.posterior.remarks():
             print(f"{food}: {line}")

@@ -4,6 +4,8 @@ import argparse
 import os
 from pathlib import Path
 
+from sliceit_drake.cli.progress import StageBars
+
 __all__ = ["add_parser"]
 
 DESCRIPTION = """\
@@ -57,8 +59,6 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 def run(options: argparse.Namespace) -> int:
     """Runs the command."""
-    from tqdm import tqdm
-
     from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.diagnosis.diagnose import diagnose, setup_of_food
     from sliceit_drake.diagnosis.registry import load_cause
@@ -71,25 +71,17 @@ def run(options: argparse.Namespace) -> int:
         )
     records = load_records(options.records)
     setup = setup_of_food(load_calibrated_food(options.model), options.refinement)
-    bars: dict[str, tqdm] = {}
-
-    def show(stage: str, done: int, total: int) -> None:
-        if stage not in bars:
-            bars[stage] = tqdm(total=total, desc=stage)
-        bars[stage].update(done - bars[stage].n)
-
-    result = diagnose(
-        setup,
-        records,
-        [load_cause(file) for file in options.cause],
-        options.cache or options.output / "cache",
-        options.replicates,
-        options.seed,
-        options.workers,
-        show,
-    )
-    for bar in bars.values():
-        bar.close()
+    with StageBars() as bars:
+        result = diagnose(
+            setup,
+            records,
+            [load_cause(file) for file in options.cause],
+            options.cache or options.output / "cache",
+            options.replicates,
+            options.seed,
+            options.workers,
+            bars.show,
+        )
     print(result.table())
     result.save(options.output)
     print(f"Results in {options.output}/: diagnosis.json, extended.yaml, report.html")

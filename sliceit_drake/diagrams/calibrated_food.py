@@ -9,7 +9,7 @@ from sliceit_drake.cutting.distribution import ParameterDistribution
 from sliceit_drake.cutting.effects import Compliance
 from sliceit_drake.cutting.food import Food
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.resources import resource_path
+from sliceit_drake.resources import named_yaml, resource_path
 from sliceit_drake.systems.spring_food import SpringFood
 
 __all__ = ["CalibratedFood", "calibrated_food_names", "load_calibrated_food"]
@@ -70,15 +70,13 @@ def load_calibrated_food(name: str | Path) -> CalibratedFood:
     Raises:
         ConfigurationError: Naming file, field and fix.
     """
-    file = Path(name)
-    if file.suffix not in (".yaml", ".yml"):
-        if str(name) not in calibrated_food_names():
-            raise ConfigurationError(
-                f"{name!r} is not calibrated; there are {', '.join(calibrated_food_names())}",
-                field="calibration",
-                fix="Name one of them, or give the food.yaml of a calibration.",
-            )
-        file = resource_path(f"{FOLDER}/{name}.yaml")
+    file = named_yaml(name, FOLDER)
+    if file is None:
+        raise ConfigurationError(
+            f"{name!r} is not calibrated; there are {', '.join(calibrated_food_names())}",
+            field="calibration",
+            fix="Name one of them, or give the food.yaml of a calibration.",
+        )
     food = load_yaml(CalibratedFood, file)
     assert isinstance(food, CalibratedFood)
     return food
