@@ -297,8 +297,8 @@ def diagnose(
     steps = 2 * replicates
     done = [0]
 
-    def count(_: int) -> None:
-        done[0] += 1
+    def count(more: int) -> None:
+        done[0] += more
         show("bootstrap", done[0], steps)
 
     verdict = reach_verdict(problem, replicates, seed, count)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from sliceit_drake.diagnosis.linear import LinearProblem, integrate_out, scaled_inverse
+from sliceit_drake.diagnosis.linear import LinearProblem, scaled_inverse
 
 __all__ = ["CauseEvidence", "Screening", "screen"]
 
@@ -13,6 +13,8 @@ FLAT = 1e8
 """Variance of a coefficient of which nothing is known, in the column's size."""
 CORRECTION_VARIANCE = 1e4
 """Of the nonparametric correction, N^2."""
+BATCH = 100
+"""Replicates of the bootstrap that are computed in one go."""
 
 
 @dc.dataclass
@@ -107,7 +109,12 @@ class Screening:
 
 
 class _Statistics:
-    """Gains of all causes from Gram matrices, given what is assumed already."""
+    """Gains of all causes, given what is assumed already.
+
+    The columns are the same whatever was measured, so that all that is solved is solved once and
+    many measurements [n] are tested in one go. A measurement is given by its products with the
+    columns of each record [n, R, K]. Gains are differences, so that its square is not needed.
+    """
 
     def __init__(self, problem: LinearProblem, assumed: Sequence[tuple[str, float | None]]) -> None:
         self.problem = problem
@@ -132,93 +139,168 @@ class _Statistics:
             name: any(found.columns[k].per_record for k in found.index("cause", name))
             for name in self.names
         }
-
-    def reduced(self, gram: np.ndarray) -> np.ndarray:
-        """Without what is each record's own."""
-        own, variance = self.problem.own_prior()
+        own, variance = problem.own_prior()
         variance = np.concatenate([variance, np.full(len(self.own_extra), FLAT)])
-        own = [*own, *self.own_extra]
-        return np.array([integrate_out(G, own, variance) for G in gram])
+        self.own = [*own, *self.own_extra]
+        y = problem.size
+        self.reduced, self.own_weights = [], []
+        for G in problem.moments.gram:
+            A, weights, _ = _integrated(G[:y, :y], self.own, variance)
+            self.reduced.append(A)
+            self.own_weights.append(weights)
+        total = np.sum(self.reduced, axis=0)
+        self.null_covariance = self._null_covariance(total)
+        self.null_weights = total[:, self.null] @ self.null_covariance
+        self.projected = total - self.null_weights @ total[self.null]
+        self._eliminated = {
+            columns[0]: self._eliminate([[r] for r in range(len(self.reduced))], columns, FLAT)
+            for name, _, columns in self.options
+            if self.per_record[name]
+        }
+        self._corrected = self._eliminate(
+            list(problem.conditions.values()), problem.correction, CORRECTION_VARIANCE
+        )
 
-    def project(self, total: np.ndarray) -> np.ndarray:
-        """What is left of a summed Gram matrix beside the null's columns."""
+    def _null_covariance(self, total: np.ndarray) -> np.ndarray:
         null = self.null
-        inverse = scaled_inverse(total[np.ix_(null, null)] + np.diag(self.prior[null]))
-        return np.asarray(total - total[:, null] @ inverse @ total[null])
+        return scaled_inverse(total[np.ix_(null, null)] + np.diag(self.prior[null]))
 
-    def gains(self, gram: np.ndarray) -> tuple[dict[str, tuple[float, float | None]], np.ndarray]:
-        """Of each cause the largest gain and its scan; and the projected Gram matrix."""
-        y = self.problem.size
-        reduced = self.reduced(gram)
-        projected = self.project(reduced.sum(0))
-        out: dict[str, tuple[float, float | None]] = {}
+    def _eliminate(
+        self, groups: Sequence[Sequence[int]], columns: list[int], variance: float
+    ) -> "_Eliminated":
+        weights, inverses, total = [], [], np.zeros_like(self.projected)
+        for members in groups:
+            A = np.sum([self.reduced[r] for r in members], axis=0)
+            A, weight, inverse = _integrated(A, columns, np.full(len(columns), variance))
+            total += A
+            weights.append(weight)
+            inverses.append(inverse)
+        return _Eliminated(groups, columns, weights, inverses, self._null_covariance(total))
+
+    def products(self, b: np.ndarray) -> np.ndarray:
+        """Without what is each record's own [n, R, K]."""
+        own = b[:, :, self.own]
+        out = b.copy()
+        for r, weights in enumerate(self.own_weights):
+            out[:, r] -= own[:, r] @ weights.T
+        return out
+
+    def project(self, reduced: np.ndarray) -> np.ndarray:
+        """Products with all columns beside the null's [n, K]."""
+        total = reduced.sum(1)
+        return np.asarray(total - total[:, self.null] @ self.null_weights.T)
+
+    def gains(
+        self, b: np.ndarray
+    ) -> tuple[dict[str, tuple[np.ndarray, list[float | None]]], np.ndarray, np.ndarray]:
+        """Of each cause the largest gains [n] and their scans; gains by a correction of each
+        condition [n]; and the products beside the null's columns [n, K]."""
+        reduced = self.products(b)
+        projected = self.project(reduced)
+        of_null = _squares(reduced.sum(1)[:, self.null], self.null_covariance)
+        out: dict[str, tuple[np.ndarray, list[float | None]]] = {}
         for name, scan, columns in self.options:
             if self.per_record[name]:
-                inner = np.array(
-                    [integrate_out(G, columns, np.full(len(columns), FLAT)) for G in reduced]
-                )
-                gain = float(projected[y, y] - self.project(inner.sum(0))[y, y])
+                gain = self._eliminated[columns[0]].gain(reduced, self.null) - of_null
             else:
-                gain = self._bounded_gain(projected, columns)[0]
-            if name not in out or gain > out[name][0]:
-                out[name] = gain, scan
-        return out, projected
+                gain = self._bounded(projected, columns)[0]
+            if name not in out:
+                out[name] = gain, [scan] * len(gain)
+                continue
+            before, scans = out[name]
+            better = gain > before
+            scans = [scan if new else old for new, old in zip(better, scans, strict=True)]
+            out[name] = np.where(better, gain, before), scans
+        return out, self._corrected.gain(reduced, self.null) - of_null, projected
 
-    def _bounded_gain(
+    def _bounded(
         self, projected: np.ndarray, columns: list[int]
-    ) -> tuple[float, np.ndarray, np.ndarray]:
-        """Gain, coefficients and their errors, within the bounds of one-sided parameters."""
-        y = self.problem.size
-        kinds = self.problem.found.columns
-        A, b = projected[np.ix_(columns, columns)], projected[columns, y]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Gains [n], coefficients and their errors [n, c], within the bounds of one-sided
+        parameters."""
+        kinds = [self.problem.found.columns[k] for k in columns]
+        A, b = self.projected[np.ix_(columns, columns)], projected[:, columns]
         visible = np.diag(A) > 1e-9
-        best = (0.0, np.zeros(len(columns)), np.full(len(columns), np.inf))
+        best = np.zeros(len(b))
+        values, errors = np.zeros(b.shape), np.full(b.shape, np.inf)
         # So few parameters that every set of active ones is tried.
         for bits in range(1, 2 ** len(columns)):
             active = [k for k in range(len(columns)) if bits >> k & 1 and visible[k]]
             if not active:
                 continue
             inverse = np.linalg.pinv(A[np.ix_(active, active)], rcond=1e-10, hermitian=True)
-            g = inverse @ b[active]
-            if any(kinds[columns[k]].one_sided and x < 0.0 for k, x in zip(active, g, strict=True)):
-                continue
-            gain = float(b[active] @ g)
-            if gain > best[0]:
-                value, error = np.zeros(len(columns)), np.full(len(columns), np.inf)
-                value[active] = g
-                error[active] = np.sqrt(np.maximum(np.diag(inverse), 0.0))
-                best = gain, value, error
-        return best
+            g = b[:, active] @ inverse
+            bounded = [i for i, k in enumerate(active) if kinds[k].one_sided]
+            gain = (b[:, active] * g).sum(1)
+            better = (gain > best) & (g[:, bounded] >= 0.0).all(1)
+            best = np.where(better, gain, best)
+            value, error = np.zeros(b.shape), np.full(b.shape, np.inf)
+            value[:, active] = g
+            error[:, active] = np.sqrt(np.maximum(np.diag(inverse), 0.0))
+            values[better], errors[better] = value[better], error[better]
+        return best, values, errors
 
-    def misfit(self, gram: np.ndarray, projected: np.ndarray) -> float:
-        """Gain by a correction of each condition."""
-        y = self.problem.size
-        reduced = self.reduced(gram)
-        correction = self.problem.correction
-        variance = np.full(len(correction), CORRECTION_VARIANCE)
-        total = np.zeros_like(reduced[0])
-        for members in self.problem.conditions.values():
-            total += integrate_out(reduced[members].sum(0), correction, variance)
-        return float(projected[y, y] - self.project(total)[y, y])
-
-    def coefficients(
-        self, gram: np.ndarray, projected: np.ndarray, columns: list[int]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Of a cause's columns; where each record has its own their mean and its standard error."""
+    def coefficients(self, b: np.ndarray, columns: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Of a cause's columns for one measurement [1, R, K]; where each record has its own their
+        mean and its standard error."""
+        reduced = self.products(b)
         kinds = self.problem.found.columns
         if not kinds[columns[0]].per_record:
-            _, value, error = self._bounded_gain(projected, columns)
-            return value, error
-        y = self.problem.size
+            _, value, error = self._bounded(self.project(reduced), columns)
+            return value[0], error[0]
         own = []
-        for G in self.reduced(gram):
-            A, b = G[np.ix_(columns, columns)], G[columns, y]
+        for A, y in zip(self.reduced, reduced[0], strict=True):
+            A = A[np.ix_(columns, columns)]
             if np.diag(A).min() > 1e-9:
-                own.append(np.linalg.lstsq(A, b, rcond=1e-9)[0])
+                own.append(np.linalg.lstsq(A, y[columns], rcond=1e-9)[0])
         if not own:
             return np.zeros(len(columns)), np.full(len(columns), np.inf)
         spread = np.std(own, axis=0, ddof=1) if len(own) > 1 else np.full(len(columns), np.inf)
         return np.mean(own, axis=0), spread / np.sqrt(len(own))
+
+
+@dc.dataclass
+class _Eliminated:
+    """Columns of which each group of records has coefficients of its own, integrated out.
+
+    Attributes:
+        groups: Numbers of records.
+        columns: Numbers of the columns.
+        weights: Of each group [K, c].
+        inverses: Of each group [c, c].
+        covariance: Of the null's columns with these integrated out.
+    """
+
+    groups: Sequence[Sequence[int]]
+    columns: list[int]
+    weights: list[np.ndarray]
+    inverses: list[np.ndarray]
+    covariance: np.ndarray
+
+    def gain(self, reduced: np.ndarray, null: list[int]) -> np.ndarray:
+        """By these columns and the null's together [n]."""
+        gain, total = np.zeros(len(reduced)), np.zeros((len(reduced), reduced.shape[2]))
+        for members, weight, inverse in zip(self.groups, self.weights, self.inverses, strict=True):
+            b = reduced[:, members].sum(1)
+            gain += _squares(b[:, self.columns], inverse)
+            total += b - b[:, self.columns] @ weight.T
+        return gain + _squares(total[:, null], self.covariance)
+
+
+def _squares(b: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """b' inverse b of each row [n]."""
+    return np.asarray(np.einsum("nk,nk->n", b @ inverse, b))
+
+
+def _integrated(
+    A: np.ndarray, own: list[int], variance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A Gram matrix without normal coefficients of these columns, the weights [K, c] with which
+    their products are taken from the others', and the inverse [c, c]."""
+    inner = A[np.ix_(own, own)] + np.diag(1.0 / np.maximum(variance, 1e-12))
+    inverse = scaled_inverse(inner, 1e-15)
+    weights = A[:, own] @ inverse
+    return A - weights @ A[own], weights, inverse
 
 
 def screen(
@@ -239,35 +321,34 @@ def screen(
         replicates: Of the bootstrap.
         seed: Of the bootstrap.
         assumed: Causes, each at a value of its scan, that are part of the model already.
-        progress: Called with the replicates done.
+        progress: Called with a number of replicates each time that these are done.
     """
     statistics = _Statistics(problem, assumed)
-    gram = problem.moments.gram
-    gains, projected = statistics.gains(gram)
-    misfit = statistics.misfit(gram, projected)
-    rng = np.random.default_rng(seed)
-    draw = _Bootstrap(problem, rng)
+    y = problem.size
+    measured = problem.moments.gram[None, :, :y, y]
+    gains, misfit, _ = statistics.gains(measured)
+    draw = _Bootstrap(problem, np.random.default_rng(seed))
     null_gains: dict[str, list[float]] = {name: [] for name in statistics.names}
-    null_misfits = []
-    for k in range(replicates):
-        sample = draw()
-        own, inside = statistics.gains(sample)
+    null_misfits: list[float] = []
+    while len(null_misfits) < replicates:
+        count = min(BATCH, replicates - len(null_misfits))
+        own, of_correction, _ = statistics.gains(draw(count))
         for name, (gain, _) in own.items():
-            null_gains[name].append(gain)
-        null_misfits.append(statistics.misfit(sample, inside))
+            null_gains[name] += gain.tolist()
+        null_misfits += of_correction.tolist()
         if progress is not None:
-            progress(k + 1)
+            progress(count)
     evidence = []
     for name in statistics.names:
-        gain, scan = gains[name]
+        gain, (scan,) = gains[name]
         columns = problem.found.index("cause", name, scan)
-        value, error = statistics.coefficients(gram, projected, columns)
+        value, error = statistics.coefficients(measured, columns)
         kinds = [problem.found.columns[c] for c in columns]
         null = np.array(null_gains[name])
         evidence.append(
             CauseEvidence(
                 name=name,
-                gain=gain,
+                gain=float(gain[0]),
                 expected=float(null.mean()),
                 deviation=float(null.std()),
                 limit=float(np.quantile(null, 0.95)),
@@ -285,56 +366,56 @@ def screen(
     null = (np.array([null_gains[e.name] for e in evidence]) - means) / spreads
     largest = max(e.deviations for e in evidence)
     p = (1.0 + (null.max(0) >= largest).sum()) / (replicates + 1.0)
-    p_misfit = (1.0 + (np.array(null_misfits) >= misfit).sum()) / (replicates + 1.0)
-    angles, visible = _angles(statistics, projected)
+    p_misfit = (1.0 + (np.array(null_misfits) >= misfit[0]).sum()) / (replicates + 1.0)
+    angles, visible = _angles(statistics, statistics.projected)
     return Screening(
         causes=sorted(evidence, key=lambda e: -e.score),
         p_value=float(p),
-        misfit=misfit,
+        misfit=float(misfit[0]),
         expected_misfit=float(np.mean(null_misfits)),
         misfit_p_value=float(p_misfit),
         angles=angles,
         visible=visible,
         names=statistics.names,
-        projected=projected,
+        projected=statistics.projected,
     )
 
 
 class _Bootstrap:
-    """Gram matrices of records in which nothing is wrong."""
+    """Measurements in which nothing is wrong, by their products with the columns."""
 
     def __init__(self, problem: LinearProblem, rng: np.random.Generator) -> None:
         self.problem, self.rng = problem, rng
-        gram = problem.moments.gram[:, :-1, :-1]
-        values, vectors = np.linalg.eigh(gram)
-        values = np.where(values > 1e-12 * values.max(1, keepdims=True), values, 0.0)
-        self.roots = vectors * np.sqrt(values)[:, None, :]
-        inverse = np.where(values > 0.0, 1.0 / np.sqrt(np.where(values > 0.0, values, 1.0)), 0.0)
-        self.whitening = vectors * inverse[:, None, :]
+        y = problem.size
+        self.gram = problem.moments.gram[:, :y, :y]
+        values, vectors = np.linalg.eigh(self.gram)
+        self.roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
 
-    def __call__(self) -> np.ndarray:
+    def __call__(self, number: int) -> np.ndarray:
+        """Draws some [number, R, K]."""
         problem, rng = self.problem, self.rng
-        gram = problem.moments.gram.copy()
-        count, y = len(gram), problem.size
+        count, y = len(self.gram), problem.size
         samples = max(problem.variation_samples, 1)
-        spread = problem.variation * np.sqrt(
-            samples / np.maximum(rng.chisquare(samples, len(problem.own)), 0.1 * samples)
+        chi = rng.chisquare(samples, (number, 1, len(problem.own)))
+        spread = problem.variation * np.sqrt(samples / np.maximum(chi, 0.1 * samples))
+        shared = np.zeros((number, 1, y))
+        for columns, deviation in (
+            (problem.numerical, 1.0),
+            (problem.spline, problem.discretisation),
+            (list(problem.usual), np.array(list(problem.usual.values()))),
+        ):
+            shared[:, 0, columns] = deviation * rng.normal(size=(number, len(columns)))
+        coefficients = np.repeat(shared, count, axis=1)
+        coefficients[:, :, problem.own] = spread * rng.normal(
+            size=(number, count, len(problem.own))
         )
-        shared = np.zeros(y)
-        shared[problem.numerical] = rng.normal(size=len(problem.numerical))
-        shared[problem.spline] = problem.discretisation * rng.normal(size=len(problem.spline))
-        for k, deviation in problem.usual.items():
-            shared[k] = deviation * rng.normal()
+        for k, deviation in problem.usual_own.items():
+            coefficients[:, :, k] += deviation * rng.normal(size=(number, count))
+        noise = rng.normal(size=(number, count, y))
+        out = np.empty((number, count, y))
         for r in range(count):
-            coefficients = shared.copy()
-            coefficients[problem.own] = spread * rng.normal(size=len(problem.own))
-            for k, deviation in problem.usual_own.items():
-                coefficients[k] += deviation * rng.normal()
-            b = gram[r, :-1, :-1] @ coefficients + self.roots[r] @ rng.normal(size=y)
-            gram[r, y, :-1] = gram[r, :-1, y] = b
-            # Of the square of y only the part that the columns reach matters.
-            gram[r, y, y] = float(((self.whitening[r].T @ b) ** 2).sum())
-        return gram
+            out[:, r] = coefficients[:, r] @ self.gram[r] + noise[:, r] @ self.roots[r].T
+        return out
 
 
 def _angles(statistics: _Statistics, projected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -93,7 +93,7 @@ def reach_verdict(
         problem: The records' moments.
         replicates: Of the bootstrap.
         seed: Of the bootstrap.
-        progress: Called with the replicates done.
+        progress: Called with a number of replicates each time that these are done.
     """
     first = screen(problem, replicates, seed, progress=progress)
     reducible = max(first.misfit - first.expected_misfit, 0.0)
