@@ -25,6 +25,15 @@ LAYERS: dict[str, set[str]] = {
     "diagnosis": {"cutting", "systems", "diagrams", "records", "calibration"},
     "emulator": {"cutting", "systems", "diagrams", "records"},
 }
+LAYERS["hidden_study"] = {
+    "cutting",
+    "systems",
+    "diagrams",
+    "records",
+    "stand_in",
+    "calibration",
+    "diagnosis",
+}
 LAYERS["cli"] = set(LAYERS)
 
 # All that some packages may import from others' libraries.

@@ -1,0 +1,115 @@
+"""`sliceit study hidden` and `sliceit study sizes`: effects are hidden in records and diagnosed."""
+
+import argparse
+from pathlib import Path
+
+from sliceit_drake.cli.progress import StageBars
+
+__all__ = ["add_hidden_study"]
+
+DESCRIPTION = """\
+Hide effects in records of the stand-in, have them diagnosed, and keep what the diagnosis says.
+
+Each run draws effects and their sizes (2 to 3 times the noise, after all else is refitted), makes
+the records of a session, and starts `sliceit diagnose` on that folder alone. What was hidden is
+kept apart, in DIR/truth. `sliceit score DIR` judges. A study that was stopped goes on.
+
+Kinds of runs
+  single   one effect, rich or full protocol      nothing  nothing hidden, all protocols
+  unknown  an effect that stands in no list       pairs    two effects at once
+  poor     an effect of an ambiguous class, poor protocol
+  base     a shift of a base parameter            curve    one effect at several strengths
+
+  sliceit study hidden --output output/hidden --minutes 120
+"""
+
+SIZES = """\
+Print at which size each effect has a wanted strength against the noise, protocol by protocol.
+"""
+
+
+def add_hidden_study(studies: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Adds the studies."""
+    hidden = studies.add_parser(
+        "hidden",
+        help="hide effects in records and have them diagnosed",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    hidden.add_argument("--output", metavar="DIR", type=Path, required=True)
+    hidden.add_argument("--kinds", nargs="+", metavar="KIND", help="only these (default: all)")
+    hidden.add_argument("--runs", type=int, metavar="N", help="only the first N of the list")
+    hidden.add_argument("--minutes", type=float, metavar="M", help="begin no run after these")
+    hidden.add_argument("--workers", type=int, default=2, help="processes (default 2)")
+    hidden.add_argument("--seed", type=int, default=0, help="of the list of runs (default 0)")
+    hidden.add_argument(
+        "--replicates", type=int, default=200, help="of each diagnosis's bootstrap (default 200)"
+    )
+    hidden.set_defaults(run=run_hidden)
+    sizes = studies.add_parser(
+        "sizes",
+        help="sizes of effects by their strength against the noise",
+        description=SIZES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    sizes.add_argument("--protocols", nargs="+", metavar="NAME", default=["poor", "rich", "full"])
+    sizes.add_argument("--effects", nargs="+", metavar="NAME", help="default: all")
+    sizes.add_argument("--cache", metavar="DIR", type=Path, help="keep what was computed there")
+    sizes.add_argument("--output", metavar="FILE", type=Path, help="also write the table there")
+    sizes.set_defaults(run=run_sizes)
+
+
+def run_hidden(options: argparse.Namespace) -> int:
+    """Runs the study."""
+    _quiet()
+    from sliceit_drake.configuration import ConfigurationError
+    from sliceit_drake.hidden_study.cases import KINDS
+    from sliceit_drake.hidden_study.study import StudyOptions, prepare, run_study
+
+    kinds = tuple(options.kinds or KINDS)
+    for kind in kinds:
+        if kind not in KINDS:
+            raise ConfigurationError(
+                f"{kind!r} is no kind of run",
+                field="--kinds",
+                fix=f"Give some of {', '.join(KINDS)}.",
+            )
+    options.output.mkdir(parents=True, exist_ok=True)
+    settings = StudyOptions(kinds, options.seed, options.replicates)
+    with StageBars() as bars:
+        cases = prepare(options.output, settings, bars.show)[: options.runs]
+        done = run_study(
+            cases,
+            options.output,
+            options.replicates,
+            options.workers,
+            options.minutes,
+            bars.show,
+        )
+    print(f"{done} of {len(cases)} runs are done. Judge them: sliceit score {options.output}")
+    return 0
+
+
+def run_sizes(options: argparse.Namespace) -> int:
+    """Prints the table."""
+    _quiet()
+    from tqdm import tqdm
+
+    from sliceit_drake.hidden_study.sizes import ProtocolSizes, sizes_as_markdown
+    from sliceit_drake.stand_in.registry import EFFECTS
+
+    effects = options.effects or list(EFFECTS)
+    protocols = [ProtocolSizes(name, options.cache) for name in options.protocols]
+    with tqdm(total=len(effects) * len(protocols), desc="sizes") as bar:
+        text = sizes_as_markdown(protocols, effects, bar.update)
+    print(text)
+    if options.output is not None:
+        options.output.parent.mkdir(parents=True, exist_ok=True)
+        options.output.write_text(text, encoding="utf-8")
+    return 0
+
+
+def _quiet() -> None:
+    import warp
+
+    warp.config.log_level = warp.LOG_ERROR

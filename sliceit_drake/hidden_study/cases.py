@@ -1,0 +1,227 @@
+"""The runs of the study: which effects are hidden, how strong, in which protocol, by which seed.
+
+All follows from one seed. Kinds and effects alternate, so that any first part of the list says
+something of all.
+"""
+
+import dataclasses as dc
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from sliceit_drake.hidden_study.truth import BASE_OF, CAUSE_OF, UNKNOWN
+from sliceit_drake.stand_in.registry import EFFECTS
+
+__all__ = ["CURVE_EFFECTS", "KINDS", "PAIRS", "Case", "Hidden", "SizeOf", "make_cases"]
+
+KINDS: dict[str, int] = {
+    "single": 231,
+    "nothing": 204,
+    "unknown": 64,
+    "pairs": 44,
+    "poor": 60,
+    "base": 30,
+    "curve": 120,
+}
+"""Kinds of runs, and the least number of each."""
+
+STRENGTHS = (2.0, 3.0)
+"""Range of what is drawn for delta."""
+
+PAIRS: tuple[tuple[str, str, str], ...] = (
+    ("rich", "skin", "sensor_delay"),
+    ("full", "bulk_relaxation", "board_height"),
+    ("rich", "rate_toughness", "sensor_tilt"),
+    ("full", "arm_compliance", "blunt_edge"),
+    ("rich", "flank_adhesion", "drive_vibration"),
+    ("full", "dulling_edge", "sensor_delay"),
+    ("rich", "holder_compliance", "section_shape"),
+    ("full", "stick_slip", "rate_toughness"),
+    ("rich", "food_slip", "bulk_relaxation"),
+    ("full", "sensor_drift", "slice_push_law"),
+    ("rich", "board_height", "core"),
+)
+"""Effects that are hidden together, fixed before any was diagnosed: families and phases differ, and
+none is of a class with the other by docs/identifiability.md (all at 20 degrees or more)."""
+
+CURVE_EFFECTS = ("skin", "rate_toughness", "sensor_delay", "board_height", "flank_adhesion")
+CURVE_DELTAS = (0.5, 1.0, 2.0, 4.0)
+BASE_LEFT = 0.5
+"""Greatest strength of what a refit leaves of a shift of a base parameter: a refit takes up small
+ones, and of larger ones what is not linear is left."""
+BASE_RANGE = (0.5, 1.0)
+"""Sizes of such shifts, of the size of that strength or, if less, of twice the typical one."""
+
+RICH_AND_FULL = ("rich", "full")
+
+
+@dc.dataclass(frozen=True)
+class Hidden:
+    """An effect at a size; `delta` is its strength, None for a shift of a base parameter."""
+
+    effect: str
+    size: float
+    delta: float | None
+
+    @property
+    def text(self) -> str:
+        """As `make_effect` takes it."""
+        return f"{self.effect}:{self.size!r}"
+
+
+@dc.dataclass(frozen=True)
+class Case:
+    """A run.
+
+    Attributes:
+        name: That tells nothing.
+        kind: One of `KINDS`.
+        protocol: Name.
+        hidden: Effects.
+        seed: Of the session.
+    """
+
+    name: str
+    kind: str
+    protocol: str
+    hidden: tuple[Hidden, ...]
+    seed: int
+
+    @classmethod
+    def of(cls, facts: Mapping[str, object]) -> "Case":
+        """From plain values."""
+        values = dict(facts)
+        hidden = values.pop("hidden")
+        assert isinstance(hidden, list)
+        return cls(hidden=tuple(Hidden(**h) for h in hidden), **values)  # type: ignore[arg-type]
+
+
+SizeOf = Callable[[str, str, float], float | None]
+"""Size of an effect in a protocol at a strength, or None."""
+
+
+def make_cases(
+    size_of: SizeOf,
+    poor_effects: Sequence[str],
+    seed: int = 0,
+    kinds: Sequence[str] = tuple(KINDS),
+    counts: Mapping[str, int] | None = None,
+) -> list[Case]:
+    """The list of runs.
+
+    Args:
+        size_of: Finds sizes.
+        poor_effects: Effects whose cause is of a class with others in the poor protocol.
+        seed: All follows from it.
+        kinds: Which kinds.
+        counts: Of each kind, other than `KINDS`.
+    """
+    maker = _Maker(size_of, seed)
+    of_kind = {
+        "single": maker.single,
+        "nothing": maker.nothing,
+        "unknown": maker.unknown,
+        "pairs": maker.pairs,
+        "poor": lambda n: maker.listed("poor", _visible(size_of, poor_effects, ("poor",)), n),
+        "base": maker.base,
+        "curve": maker.curve,
+    }
+    placed: list[tuple[float, int, Case]] = []
+    for rank, kind in enumerate(kinds):
+        cases = of_kind[kind]((counts or KINDS)[kind])
+        placed += [((k + 0.5) / len(cases), rank, case) for k, case in enumerate(cases)]
+    return [case for _, _, case in sorted(placed, key=lambda entry: entry[:2])]
+
+
+def _visible(
+    size_of: SizeOf, effects: Sequence[str], protocols: Sequence[str]
+) -> list[tuple[str, list[str]]]:
+    """Effects that can reach the least strength, and in which protocols."""
+    out = []
+    for effect in effects:
+        where = [p for p in protocols if size_of(p, effect, STRENGTHS[0]) is not None]
+        if where:
+            out.append((effect, where))
+    return out
+
+
+class _Maker:
+    def __init__(self, size_of: SizeOf, seed: int) -> None:
+        self.size_of, self.seed = size_of, seed
+
+    def _case(
+        self,
+        kind: str,
+        number: int,
+        protocol: str,
+        effects: Sequence[str],
+        delta: float | None = None,
+    ) -> Case:
+        digest = hashlib.sha256(f"{self.seed} {kind} {number}".encode()).hexdigest()
+        rng = np.random.default_rng(int(digest[:15], 16))
+        hidden = tuple(self._hidden(protocol, effect, delta, rng) for effect in effects)
+        return Case(digest[-10:], kind, protocol, hidden, int(rng.integers(1, 2**31)))
+
+    def _hidden(
+        self, protocol: str, effect: str, delta: float | None, rng: np.random.Generator
+    ) -> Hidden:
+        if effect in BASE_OF:
+            largest = 2.0 * EFFECTS[effect].typical
+            linear = self.size_of(protocol, effect, BASE_LEFT)
+            largest = largest if linear is None else min(largest, linear)
+            return Hidden(effect, largest * float(rng.uniform(*BASE_RANGE)), None)
+        wanted = float(rng.uniform(*STRENGTHS)) if delta is None else delta
+        size = self.size_of(protocol, effect, wanted)
+        while size is None and delta is None and wanted > STRENGTHS[0]:
+            # Stronger than any sensible size: drawn from what there is.
+            wanted = max(STRENGTHS[0], wanted - 0.1)
+            size = self.size_of(protocol, effect, wanted)
+        assert size is not None
+        return Hidden(effect, size, wanted)
+
+    def listed(self, kind: str, visible: Sequence[tuple[str, list[str]]], count: int) -> list[Case]:
+        """Effects in turn, and the protocols that show them in turn."""
+        out: list[Case] = []
+        rounds = -(-count // max(len(visible), 1))
+        for turn in range(rounds):
+            for effect, where in visible:
+                protocol = where[turn % len(where)]
+                out.append(self._case(kind, len(out), protocol, [effect]))
+        return out
+
+    def single(self, count: int) -> list[Case]:
+        return self.listed("single", _visible(self.size_of, list(CAUSE_OF), RICH_AND_FULL), count)
+
+    def unknown(self, count: int) -> list[Case]:
+        return self.listed("unknown", _visible(self.size_of, UNKNOWN, RICH_AND_FULL), count)
+
+    def base(self, count: int) -> list[Case]:
+        return self.listed("base", [(effect, ["rich"]) for effect in BASE_OF], count)
+
+    def nothing(self, count: int) -> list[Case]:
+        protocols = ("rich", "poor", "full")
+        return [self._case("nothing", k, protocols[k % 3], ()) for k in range(count)]
+
+    def pairs(self, count: int) -> list[Case]:
+        possible = [
+            pair
+            for pair in PAIRS
+            if all(self.size_of(pair[0], effect, STRENGTHS[0]) is not None for effect in pair[1:])
+        ]
+        return [
+            self._case("pairs", k, possible[k % len(possible)][0], possible[k % len(possible)][1:])
+            for k in range(count)
+        ]
+
+    def curve(self, count: int) -> list[Case]:
+        grid = [
+            (effect, delta)
+            for delta in CURVE_DELTAS
+            for effect in CURVE_EFFECTS
+            if self.size_of("rich", effect, delta) is not None
+        ]
+        return [
+            self._case("curve", k, "rich", [grid[k % len(grid)][0]], grid[k % len(grid)][1])
+            for k in range(count)
+        ]

@@ -1,0 +1,145 @@
+"""The study as a whole: a list of runs, worked off by processes, that can be stopped and go on."""
+
+import dataclasses as dc
+import json
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from multiprocessing import get_context
+from pathlib import Path
+
+import warp
+
+from sliceit_drake.configuration import ConfigurationError, dump_yaml
+from sliceit_drake.hidden_study.bench import PROTOCOLS, model_food, protocol_named
+from sliceit_drake.hidden_study.cases import KINDS, Case, make_cases
+from sliceit_drake.hidden_study.classes import ProtocolClasses, protocol_classes
+from sliceit_drake.hidden_study.runner import food_file, is_done, run_case
+from sliceit_drake.hidden_study.sizes import size_for
+from sliceit_drake.hidden_study.truth import CAUSE_OF
+
+__all__ = ["StudyOptions", "load_cases", "prepare", "run_study"]
+
+Progress = Callable[[str, int, int], None]
+"""Called with a stage, what is done and what there is."""
+
+
+@dc.dataclass(frozen=True)
+class StudyOptions:
+    """What is run.
+
+    Attributes:
+        kinds: Of runs.
+        seed: All follows from it.
+        replicates: Of each diagnosis's bootstrap.
+    """
+
+    kinds: tuple[str, ...] = tuple(KINDS)
+    seed: int = 0
+    replicates: int = 200
+
+
+def prepare(output: Path, options: StudyOptions, progress: Progress) -> list[Case]:
+    """The list of runs; the foods that are given, and the truth, are written.
+
+    Raises:
+        ConfigurationError: The folder holds another study.
+    """
+    file = output / "study.json"
+    facts = {"seed": options.seed, "replicates": options.replicates}
+    if file.exists():
+        found = json.loads(file.read_text(encoding="utf-8"))
+        if found != facts:
+            raise ConfigurationError(
+                f"was begun with {found}, not {facts}",
+                source=str(file),
+                fix="Give the same options, or another --output.",
+            )
+    cache = output / "cache"
+    calls = [0]
+
+    def size(protocol: str, effect: str, delta: float) -> float | None:
+        calls[0] += 1
+        progress("sizes", calls[0], calls[0])
+        return size_for(protocol, effect, delta, cache)
+
+    classes = _classes(output, progress)["poor"].classes
+    ambiguous = [e for e, cause in CAUSE_OF.items() if len(classes.get(cause, [])) > 1]
+    cases = make_cases(size, ambiguous, options.seed, options.kinds)
+    for name in PROTOCOLS:
+        food_file(output, name).parent.mkdir(parents=True, exist_ok=True)
+        dump_yaml(model_food(protocol_named(name)), food_file(output, name))
+    truth = output / "truth"
+    truth.mkdir(exist_ok=True)
+    for case in cases:
+        text = json.dumps(dc.asdict(case), indent=2) + "\n"
+        (truth / f"{case.name}.json").write_text(text, encoding="utf-8")
+    file.write_text(json.dumps(facts) + "\n", encoding="utf-8")
+    return cases
+
+
+def _classes(output: Path, progress: Progress) -> dict[str, ProtocolClasses]:
+    found = {}
+    for k, name in enumerate(PROTOCOLS):
+        found[name] = protocol_classes(name, output / "cache")
+        progress("classes", k + 1, len(PROTOCOLS))
+    text = json.dumps({name: dc.asdict(c) for name, c in found.items()}) + "\n"
+    (output / "classes.json").write_text(text, encoding="utf-8")
+    return found
+
+
+def load_cases(output: Path) -> list[Case]:
+    """All runs that the study's folder knows of, done or not."""
+    files = sorted((output / "truth").glob("*.json"))
+    return [Case.of(json.loads(file.read_text(encoding="utf-8"))) for file in files]
+
+
+def run_study(
+    cases: Sequence[Case],
+    output: Path,
+    replicates: int,
+    workers: int = 2,
+    minutes: float | None = None,
+    progress: Progress | None = None,
+) -> int:
+    """Works off the runs that are not done.
+
+    Args:
+        cases: All runs, in their order.
+        output: Of the study.
+        replicates: Of each diagnosis's bootstrap.
+        workers: Processes.
+        minutes: After which no run is begun; None for no end.
+        progress: See `Progress`.
+
+    Returns:
+        Number of runs that are done.
+    """
+    show = progress or (lambda *_: None)
+    end = None if minutes is None else time.monotonic() + 60.0 * minutes
+    left = [case for case in cases if not is_done(output, case.name)]
+    done = len(cases) - len(left)
+    show("runs", done, len(cases))
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_start_worker)
+    running: set[Future[str]] = set()
+    queue = iter(left)
+    try:
+        while True:
+            while len(running) < workers and (end is None or time.monotonic() < end):
+                case = next(queue, None)
+                if case is None:
+                    break
+                running.add(pool.submit(run_case, case, output, replicates))
+            if not running:
+                return done
+            ended, running = wait(running, return_when=FIRST_COMPLETED)
+            for future in ended:
+                future.result()
+                done += 1
+                show("runs", done, len(cases))
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _start_worker() -> None:
+    warp.config.log_level = warp.LOG_ERROR
