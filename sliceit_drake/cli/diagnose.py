@@ -20,7 +20,14 @@ speeds, with a hold, a withdrawal and draws. Writes to DIR:
 The verdict is one of: nothing beyond noise; a cause (or two) with size; a class of causes that
 these records cannot tell apart, and the experiment that would; unknown; too few replicates.
 
+With --next-experiment FILE it writes what to cut next: a scenario for `sliceit simulate`, for
+`sliceit record` and for the robot, with the angles to expect and the number of slices. This
+simulates a menu of motions and takes about as long as the diagnosis. Old and new records are then
+diagnosed together; give the folders in the order in which they were recorded.
+
   sliceit diagnose records/monday --model cucumber --output output/diagnosis
+  sliceit diagnose records/monday --model cucumber --output output/a --next-experiment next.yaml
+  sliceit diagnose records/monday records/tuesday --model cucumber --output output/b
 """
 
 
@@ -32,13 +39,16 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("records", metavar="RECORDS_DIR", type=Path)
+    parser.add_argument("records", metavar="RECORDS_DIR", type=Path, nargs="+")
     parser.add_argument(
         "--model", metavar="FOOD", required=True, help="a calibrated food by name, or its YAML file"
     )
     parser.add_argument("--output", metavar="DIR", type=Path, required=True)
     parser.add_argument(
         "--cause", metavar="FILE", type=Path, action="append", default=[], help="a cause of yours"
+    )
+    parser.add_argument(
+        "--next-experiment", metavar="FILE", type=Path, help="write what to cut next, as a scenario"
     )
     parser.add_argument(
         "--refinement",
@@ -61,27 +71,39 @@ def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.diagnosis.diagnose import diagnose, setup_of_food
+    from sliceit_drake.diagnosis.next_experiment import next_experiment
     from sliceit_drake.diagnosis.registry import load_cause
     from sliceit_drake.diagrams.calibrated_food import load_calibrated_food
-    from sliceit_drake.records.validation import load_records
+    from sliceit_drake.records.validation import load_sessions
 
-    if not options.records.is_dir():
-        raise ConfigurationError(
-            "is no folder", source=str(options.records), fix="Give a folder of slice records."
-        )
-    records = load_records(options.records)
+    for folder in options.records:
+        if not folder.is_dir():
+            raise ConfigurationError(
+                "is no folder", source=str(folder), fix="Give folders of slice records."
+            )
+    records = load_sessions(options.records)
     setup = setup_of_food(load_calibrated_food(options.model), options.refinement)
+    cache = options.cache or options.output / "cache"
     with StageBars() as bars:
         result = diagnose(
             setup,
             records,
             [load_cause(file) for file in options.cause],
-            options.cache or options.output / "cache",
+            cache,
             options.replicates,
             options.seed,
             options.workers,
             bars.show,
         )
+        if options.next_experiment is not None:
+            result.next_experiment = next_experiment(
+                result,
+                records,
+                cache,
+                options.workers,
+                lambda done, total: bars.show("motions of the menu", done, total),
+            )
+            result.next_experiment.write(options.next_experiment)
     print(result.table())
     result.save(options.output)
     print(f"Results in {options.output}/: diagnosis.json, extended.yaml, report.html")

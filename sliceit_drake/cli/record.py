@@ -130,6 +130,8 @@ def _protocol(options: argparse.Namespace) -> "Protocol":
     warp.config.log_level = warp.LOG_ERROR
 
     from sliceit_drake.configuration import ConfigurationError
+    from sliceit_drake.cutting.effects import Effects
+    from sliceit_drake.cutting.food import Food
     from sliceit_drake.diagrams.scenario import load_scenario
     from sliceit_drake.stand_in.protocol import load_protocol, protocol_of_scenario
 
@@ -141,4 +143,7 @@ def _protocol(options: argparse.Namespace) -> "Protocol":
     pairs = root.value if isinstance(root, yaml.MappingNode) else []
     if any(key.value == "conditions" for key, _ in pairs):
         return load_protocol(str(file))
-    return protocol_of_scenario(load_scenario(file), options.replicates)
+    scenario = load_scenario(file)
+    if isinstance(scenario.food, Food) and scenario.food.effects != Effects():
+        print("The food's effects are left out: this world has its own, named by --effect")
+    return protocol_of_scenario(scenario, options.replicates)

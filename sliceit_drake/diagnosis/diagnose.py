@@ -17,6 +17,7 @@ from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.held_out import HeldOutGain, held_out_gain
 from sliceit_drake.diagnosis.linear import LinearProblem, integrate_out
+from sliceit_drake.diagnosis.next_experiment import NextExperiment
 from sliceit_drake.diagnosis.registry import open_causes
 from sliceit_drake.diagnosis.sensitivity import Sensitivities, sensitivities
 from sliceit_drake.diagnosis.verdict import ALARM, Finding, Verdict, reach_verdict
@@ -51,6 +52,7 @@ class Diagnosis:
             factor (log scale) and its standard error.
         gain: Error on records that were left out; None if nothing is named.
         remarks: What a reader must know.
+        next_experiment: What to cut next, where that was asked for.
     """
 
     verdict: Verdict
@@ -60,6 +62,7 @@ class Diagnosis:
     shifts: dict[str, tuple[float, float]]
     gain: HeldOutGain | None
     remarks: list[str]
+    next_experiment: NextExperiment | None = None
 
     @property
     def sensitivities(self) -> Sensitivities:
@@ -102,6 +105,8 @@ class Diagnosis:
                 f"Needed to tell variation from effect: {v.slices_needed} more slices of each "
                 "condition"
             )
+        if self.next_experiment is not None:
+            lines += self.next_experiment.lines()
         lines.append("")
         lines.append(f"{'cause':20}{'gain':>10}{'by chance':>11}{'95 % limit':>12}{'visible':>9}")
         screening = v.screening
@@ -132,6 +137,8 @@ class Diagnosis:
                 f"    These records cannot tell it from: {', '.join(finding.others)}. To split "
                 f"them: {', '.join(sorted({self.causes[n].experiment for n in finding.names}))}"
             )
+            if self.next_experiment is None:
+                lines.append("    --next-experiment FILE finds the motion that does, and writes it")
         return lines
 
     def extended(self) -> CalibratedFood:
@@ -216,6 +223,9 @@ class Diagnosis:
                 for k, s in zip(self.problem.own, self.problem.variation, strict=True)
             },
             "shifts": {name: list(pair) for name, pair in self.shifts.items()},
+            "next_experiment": None
+            if self.next_experiment is None
+            else self.next_experiment.facts(),
             "remarks": self.remarks,
         }
 

@@ -22,7 +22,7 @@ from sliceit_drake.systems.contact_monitor import ContactMonitorConfig
 from sliceit_drake.systems.spring_food import SpringFood
 from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig
 
-__all__ = ["Measurement", "Placement", "Scenario", "Start", "load_scenario"]
+__all__ = ["Measurement", "Placement", "Preparation", "Scenario", "Start", "load_scenario"]
 
 CLEAR_OF_FOOD = 1e-3
 """Least height of the knife over the food while it goes from one slice to the next, metres."""
@@ -65,6 +65,27 @@ class Measurement:
 
 
 @dc.dataclass
+class Preparation:
+    """What a person does before the cut, as the record of it shall say.
+
+    Attributes:
+        peeled: Whether the skin is off; what the food has of one does not act.
+    """
+
+    peeled: bool = False
+    weight: float = quantity(
+        0.0,
+        "kg",
+        low=0.0,
+        high=20.0,
+        doc='Mass hung on the knife at Ko in segments "weight"; the simulated arm has none.',
+    )
+    knife_slices: int = quantity(
+        0, "", low=0, high=10**6, doc="Slices since sharpening before the first."
+    )
+
+
+@dc.dataclass
 class Scenario:
     """One slice: robot, controller, knife, food, board, motion."""
 
@@ -97,6 +118,7 @@ class Scenario:
     start: Start = dc.field(default_factory=Start)
     motion: MotionPlan = dc.field(default_factory=MotionPlan)
     measurement: Measurement | None = None
+    preparation: Preparation | None = None
     sequence: SliceSequence | None = None
     """Slices in a row; it places the cuts and makes the motion."""
 
@@ -157,5 +179,8 @@ def load_scenario(file: str | Path, overrides: str | None = None) -> Scenario:
         calibrated = load_calibrated_food(scenario.calibration)
         scenario.food = calibrated.apply_to(scenario.food)
         scenario.numerics.flank_stiffness = calibrated.flank_stiffness
+    if scenario.preparation is not None and scenario.preparation.peeled:
+        if isinstance(scenario.food, Food):
+            scenario.food.effects.skin.toughness = 0.0
     validate(scenario, "scenario")
     return scenario

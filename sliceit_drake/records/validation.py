@@ -3,6 +3,7 @@
 import dataclasses as dc
 import difflib
 import functools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,15 @@ from sliceit_drake.records.metadata import SliceMetadata
 from sliceit_drake.records.motion_checks import check_motion
 from sliceit_drake.records.slice_record import SliceRecord, SliceTable
 
-__all__ = ["Finding", "check_record", "check_table", "load_record", "load_records", "record_files"]
+__all__ = [
+    "Finding",
+    "check_record",
+    "check_table",
+    "load_record",
+    "load_records",
+    "load_sessions",
+    "record_files",
+]
 
 LEAST_ROWS = 10
 
@@ -72,6 +81,42 @@ def load_records(folder: str | Path) -> list[SliceRecord]:
     """
     records = [load_record(file) for file in record_files(Path(folder))]
     return sorted(records, key=lambda record: (record.metadata.slice_index, record.name))
+
+
+def load_sessions(folders: Sequence[str | Path]) -> list[SliceRecord]:
+    """Reads the records of folders that are sessions one after the other, as one.
+
+    Slices are numbered through, and where there are several folders a record's name has its
+    folder's before it.
+
+    Args:
+        folders: In the order of the sessions.
+
+    Raises:
+        ConfigurationError: As `load_records`, or a folder is there twice.
+    """
+    paths = [Path(folder) for folder in folders]
+    for k, path in enumerate(paths):
+        if path.resolve() in [p.resolve() for p in paths[:k]]:
+            raise ConfigurationError(
+                "is there twice",
+                source=str(path),
+                fix="Name each folder once: a slice counted twice would look like two.",
+            )
+    if len(paths) == 1:
+        return load_records(paths[0])
+    names = [path.resolve().name for path in paths]
+    out: list[SliceRecord] = []
+    first = 0
+    for k, path in enumerate(paths):
+        prefix = names[k] if names.count(names[k]) == 1 else f"{k + 1}_{names[k]}"
+        records = load_records(path)
+        for record in records:
+            record.metadata.name = f"{prefix}/{record.name}"
+            record.metadata.slice_index += first
+        first = 1 + max(record.metadata.slice_index for record in records)
+        out += records
+    return out
 
 
 def record_files(path: Path) -> list[Path]:

@@ -11,8 +11,9 @@ from sliceit_drake.cutting.effects import Effects
 from sliceit_drake.cutting.food import Box, Cylinder, Ellipsoid, Food
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.motion import MotionPlan
-from sliceit_drake.diagrams.scenario import Placement, Scenario
+from sliceit_drake.diagrams.scenario import Placement, Preparation, Scenario
 from sliceit_drake.stand_in.sensor import SensorModel
+from sliceit_drake.systems.analytic_cutter import AnalyticFood
 
 __all__ = [
     "Condition",
@@ -214,12 +215,17 @@ def load_protocol(file: str) -> Protocol:
 
 
 def protocol_of_scenario(scenario: Scenario, replicates: int = 1) -> Protocol:
-    """The one cut of a scenario as a protocol; robot, controller and sensor are left out.
+    """The one cut of a scenario as a protocol; robot, controller, sensor and the food's effects are
+    left out. An analytic food of no toughness, which the station's knife does not feel, is none.
 
     Raises:
         ConfigurationError: The scenario has no food to cut, or is a sequence.
     """
-    if not isinstance(scenario.food, Food) or scenario.sequence is not None:
+    food, prepared = scenario.food, scenario.preparation or Preparation()
+    without_food = isinstance(food, AnalyticFood) and food.toughness == 0.0
+    if isinstance(food, AnalyticFood) and without_food:
+        food = Food(name="none", shape=Cylinder(diameter=food.diameter))
+    if not isinstance(food, Food) or scenario.sequence is not None:
         raise ConfigurationError(
             "has no single cut through a finite-element food",
             field="scenario.food" if scenario.sequence is None else "scenario.sequence",
@@ -227,7 +233,7 @@ def protocol_of_scenario(scenario: Scenario, replicates: int = 1) -> Protocol:
         )
     protocol = Protocol(
         name=scenario.name,
-        food=scenario.food,
+        food=dc.replace(food, effects=Effects()),
         knife=scenario.knife,
         board=scenario.board,
         placement=scenario.placement,
@@ -239,8 +245,12 @@ def protocol_of_scenario(scenario: Scenario, replicates: int = 1) -> Protocol:
                 replicates=replicates,
                 clearance=scenario.start.clearance,
                 offset=scenario.start.offset,
+                without_food=without_food,
+                peeled=prepared.peeled,
+                weight=prepared.weight,
             )
         ],
+        knife_slices=prepared.knife_slices,
     )
     validate(protocol, "protocol")
     return protocol
