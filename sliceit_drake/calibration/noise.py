@@ -114,13 +114,19 @@ class NoiseModel:
 
 
 class MarkovCovariance:
-    """ar^2 exp(-|dt|/tau) + white^2 I; entries with an infinite gap between them are independent.
+    """ar^2 exp(-|dt|/tau) + diag(white^2); entries with an infinite gap between them are independent.
 
-    The inverse T of the first part is tridiagonal (Markov), so that with V = T^-1 + w I,
-    V^-1 = T (I + w T)^-1 costs as much as there are samples.
+    The inverse T of the first part is tridiagonal (Markov), so that with W = diag(white),
+    V^-1 = W^-1 (I + W T W)^-1 W T costs as much as there are samples.
+
+    Args:
+        gap: Times between entries [n - 1], s.
+        ar: Standard deviation of the correlated part.
+        tau: Its correlation time, s.
+        white: Standard deviation of the rest, of all entries or of each [n]; positive.
     """
 
-    def __init__(self, gap: np.ndarray, ar: float, tau: float, white: float) -> None:
+    def __init__(self, gap: np.ndarray, ar: float, tau: float, white: float | np.ndarray) -> None:
         rho, n = np.exp(-gap / tau), len(gap) + 1
         gain = 1.0 / np.maximum(1.0 - rho**2, 1e-12)
         # Each sample given the one before it.
@@ -131,20 +137,20 @@ class MarkovCovariance:
         self._band = np.vstack([np.concatenate([[0.0], -rho * gain]), diagonal]) / ar**2
         # log det T^-1 from the innovations.
         self._log_det_first = 2.0 * n * np.log(ar) - np.log(gain).sum()
-        self._white = white
-        self.variance = ar**2 + white**2
-        self._shifted = white**2 * self._band
+        self._white = np.broadcast_to(np.asarray(white, float), (n,))
+        self.variance = ar**2 + float((self._white**2).mean())
+        self._shifted = self._band * self._white**2
+        self._shifted[0, 1:] = self._band[0, 1:] * self._white[1:] * self._white[:-1]
         self._shifted[1] += 1.0
 
     def solve(self, columns: np.ndarray) -> np.ndarray:
         """V^-1 times columns [n, k]."""
-        inner = solveh_banded(self._shifted, columns, check_finite=False)
-        # T (I + w T)^-1 = (I - (I + w T)^-1) / w loses digits where w is small.
-        out = self._band[1][:, None] * inner
+        white = self._white[:, None]
+        out = self._band[1][:, None] * columns
         off = self._band[0, 1:, None]
-        out[:-1] += off * inner[1:]
-        out[1:] += off * inner[:-1]
-        return np.asarray(out)
+        out[:-1] += off * columns[1:]
+        out[1:] += off * columns[:-1]
+        return np.asarray(solveh_banded(self._shifted, white * out, check_finite=False) / white)
 
     def log_det(self) -> float:
         """log det V."""

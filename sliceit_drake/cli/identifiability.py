@@ -142,9 +142,7 @@ def study(
         ranges.append(list(range(len(records), len(records) + len(own))))
         records += own
     setup = protocol_setup(protocols[-1], refinement)
-    found = sensitivities(
-        setup, records, causes, cache=cache, workers=workers, progress=progress, store=False
-    )
+    found = sensitivities(setup, records, causes, cache=cache, workers=workers, progress=progress)
     evidence = Evidence(found)
     cuts = [[dc.replace(c, replicates=1) for c in p.conditions] for p in protocols]
     results = []

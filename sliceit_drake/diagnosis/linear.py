@@ -38,8 +38,11 @@ USUAL = (
 )
 """What every sensor has: cause, value of its scan, parameter, usual standard deviation in its unit.
 Only more than that is a finding."""
-DISCRETISATION = 1.0
-"""Standard deviation of the discretisation's error, in that of the mesh column."""
+DISCRETISATION = 0.5
+"""Standard deviation of the discretisation's error as a function of depth, in that of the mesh
+column."""
+FINE_MESH = 0.3
+"""The same of each row by itself."""
 RIDGE = 1e-8
 
 
@@ -132,7 +135,7 @@ class LinearProblem:
                 ],
                 axis=2,
             )
-            gram[r] = self._weighted(record.time, X)
+            gram[r] = self._weighted(record.time, X, self.model_error(record))
             rows[r] = X.shape[0] * X.shape[1]
         self.moments = Moments(gram, rows)
 
@@ -204,16 +207,27 @@ class LinearProblem:
         """Gram matrices of each replicate's own columns and its difference from the mean."""
         n = len(members)
         out = []
+        error = self.model_error(members[0])
         for time, rest, columns in differences(members, [*self.own, *self.usual_own]):
             scaled = np.sqrt(n / (n - 1.0)) * rest
-            out.append(self._weighted(time, np.concatenate([columns, scaled[:, :, None]], axis=2)))
+            X = np.concatenate([columns, scaled[:, :, None]], axis=2)
+            out.append(self._weighted(time, X, error[: len(time)]))
         return out
 
-    def _weighted(self, time: np.ndarray, X: np.ndarray) -> np.ndarray:
-        """Gram matrix of columns [m, c, k] with the inverse covariance of the noise [k, k]."""
+    def model_error(self, record: RecordSensitivity) -> np.ndarray:
+        """Standard deviation of what the model is unsure of at each row by itself [m, c]: when a
+        force jumps, and what a finer mesh still may change."""
+        out = record.kinks()
+        for k in self.numerical:
+            if self.found.columns[k].name == "mesh":
+                out = np.hypot(out, FINE_MESH * record.columns[:, :, k])
+        return np.asarray(out)
+
+    def _weighted(self, time: np.ndarray, X: np.ndarray, model_error: np.ndarray) -> np.ndarray:
+        """Gram matrix of columns [m, c, k], weighted with noise and model error [k, k]."""
         G = np.zeros((X.shape[2], X.shape[2]))
         for c, noise in enumerate(self.noise):
-            G += X[:, c].T @ noise.solve(time, X[:, c])
+            G += X[:, c].T @ noise.solve(time, X[:, c], model_error[:, c])
         return 0.5 * (G + G.T)
 
 

@@ -41,9 +41,18 @@ class ChannelNoise:
         """Standard deviation of a sample."""
         return float(np.hypot(self.ar, self.white))
 
-    def solve(self, time: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """The inverse covariance at increasing times [m] times columns [m, k]."""
-        return MarkovCovariance(np.diff(time), self.ar, self.tau, self.white).solve(columns)
+    def solve(
+        self, time: np.ndarray, columns: np.ndarray, model_error: np.ndarray | float = 0.0
+    ) -> np.ndarray:
+        """The inverse covariance at increasing times [m] times columns [m, k].
+
+        Args:
+            time: Times [m], s.
+            columns: [m, k].
+            model_error: Standard deviation of what the model is unsure of at each row [m].
+        """
+        white = np.hypot(self.white, model_error)
+        return MarkovCovariance(np.diff(time), self.ar, self.tau, white).solve(columns)
 
 
 def replicates(records: Sequence[RecordSensitivity]) -> dict[str, list[int]]:

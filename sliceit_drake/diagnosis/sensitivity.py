@@ -20,7 +20,8 @@ change by plus `size` alone. A coefficient of 1 is a parameter of `size`.
 - base: a base parameter, in all records at once; on a log scale `size` is of the logarithm.
 - record: what differs from slice to slice (`prediction.RECORD_EFFECTS`); `size` is its plausible
   standard deviation, and each record has a coefficient of its own.
-- numerical: `step` and `mesh`, the prediction less that with half the step, and with a finer mesh.
+- numerical: `step` and `mesh`, the change from half the step to the step, and from a finer mesh to
+  the mesh of the sensitivities. The prediction itself is that of the finer mesh.
 - cause: a cause's parameter at a value of its scan. Where `per_record` is set, each record has a
   coefficient of its own.
 
@@ -30,12 +31,12 @@ change by plus `size` alone. A coefficient of 1 is a parameter of `size`.
 import dataclasses as dc
 import hashlib
 import inspect
-import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 
 from sliceit_drake.calibration.prediction import poses_in_food
 from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
@@ -136,11 +137,28 @@ class RecordSensitivity:
         """Measured less predicted [m, c]."""
         return self.measured - self.predicted
 
+    def kinks(self) -> np.ndarray:
+        """Largest second difference of the prediction within `KINK_TIME` of each row [m, c].
+
+        Where the force jumps (the edge leaves the board, the knife turns round), a sample is as
+        wrong as the jump is large if it comes a row too early; elsewhere this is next to nothing.
+        """
+        bend = np.zeros_like(self.predicted)
+        bend[1:-1] = np.abs(np.diff(self.predicted, 2, axis=0))
+        step = float(np.median(np.diff(self.time)))
+        return np.asarray(maximum_filter1d(bend, 2 * round(KINK_TIME / step) + 1, axis=0))
+
 
 SOURCES = (Cause, Clock, SlicePredictor, SliceTarget, as_measured, poses_in_food)
 """Whose modules a result depends on, beside `cutting` and this one."""
 
-ARRAYS = ("time", "phase", "depth", "in_contact", "measured", "predicted", "columns", "even")
+KINK_TIME = 0.02
+"""By which the time of a jump of the force may be wrong, s."""
+
+MESH = Column("numerical", "mesh")
+
+STORED = ("in_contact", "predicted", "columns", "even")
+"""Arrays of a record that take simulations."""
 
 
 @dc.dataclass
@@ -177,47 +195,6 @@ class Sensitivities:
         """Values of a cause's scan; [None] for one without."""
         return list(dict.fromkeys(c.scan for c in self.columns if c.name == cause))
 
-    def save(self, file: str | Path) -> Path:
-        """Writes NAME.npz and NAME.json."""
-        base = Path(file).with_suffix("")
-        base.parent.mkdir(parents=True, exist_ok=True)
-        facts = {
-            "columns": [dc.asdict(c) for c in self.columns],
-            "records": [
-                {f.name: getattr(r, f.name) for f in dc.fields(r) if f.name not in ARRAYS}
-                for r in self.records
-            ],
-            "warnings": self.warnings,
-            "elements": self.elements,
-        }
-        arrays = {
-            f"{k}.{name}": getattr(r, name) for k, r in enumerate(self.records) for name in ARRAYS
-        }
-        part = base.with_name(f"{base.name}.{os.getpid()}.part")
-        with open(part, "wb") as stream:
-            np.savez(stream, allow_pickle=False, **arrays)
-        os.replace(part, base.with_name(f"{base.name}.npz"))
-        # Last, so that a pair that is there is whole.
-        part.write_text(json.dumps(facts), encoding="utf-8")
-        os.replace(part, base.with_name(f"{base.name}.json"))
-        return base.with_name(f"{base.name}.npz")
-
-    @classmethod
-    def load(cls, file: str | Path) -> "Sensitivities":
-        """Reads what `save` wrote."""
-        base = Path(file).with_suffix("")
-        facts = json.loads(base.with_name(f"{base.name}.json").read_text(encoding="utf-8"))
-        with np.load(base.with_name(f"{base.name}.npz")) as arrays:
-            records = [
-                RecordSensitivity(
-                    **{**r, "channels": tuple(r["channels"])},
-                    **{name: arrays[f"{k}.{name}"] for name in ARRAYS},
-                )
-                for k, r in enumerate(facts["records"])
-            ]
-        columns = [Column(**c) for c in facts["columns"]]
-        return cls(columns, records, facts["warnings"], facts["elements"])
-
 
 def cause_columns(cause: Cause) -> list[tuple[Column, dict[str, float], dict[str, float] | None]]:
     """Columns of a cause, with the values at plus its size, and at minus where that may be."""
@@ -250,12 +227,11 @@ def sensitivities(
     causes: Sequence[Cause],
     point: Point | None = None,
     meshing: Meshing | None = None,
-    finer: float | None = 1.5,
+    finer: float | None = float(__import__("os").environ.get("FINER", "1.5")),
     clock: Clock | None = None,
     cache: Path | None = None,
     workers: int | None = None,
     progress: Progress | None = None,
-    store: bool = True,
 ) -> Sensitivities:
     """Computes sensitivities at a point.
 
@@ -266,36 +242,31 @@ def sensitivities(
         point: Where; the setup's values without any cause by default.
         meshing: How finely the food is computed; the setup's refinement and a step of 0.5 ms by
             default.
-        finer: Elements along an edge of the refined mesh, relative to this one; None for no column
-            `mesh`.
+        finer: Elements along an edge of the mesh of the prediction itself, relative to that of its
+            changes; None for the same mesh, and no column `mesh`.
         clock: How time is divided.
-        cache: Folder for finished simulations and results, found again by their content.
+        cache: Folder for finished simulations and sensitivities, found again by their content;
+            some 6 MB a record.
         workers: Threads.
         progress: Called with the number of simulated slices, and of those that must be.
-        store: Whether the result goes to the cache, too, and not only what was simulated: some
-            100 MB for 18 records, found again in a tenth of a second instead of ten.
 
     Raises:
         ConfigurationError: A record cannot be compared, naming file and field.
         CuttingError: The prediction itself broke down.
     """
     point, meshing, clock = point or Point(), meshing or Meshing(), clock or Clock()
-    file = None
-    if cache is not None:
-        key = _content_key(setup, records, causes, (point, meshing, finer, clock))
-        if key is not None:
-            file = cache / "sensitivities" / key
-            if file.with_name(f"{key}.json").exists():
-                return Sensitivities.load(file)
     meshings = [meshing, dc.replace(meshing, time_step=0.5 * meshing.time_step)]
     if finer is not None:
         meshings.append(dc.replace(meshing, refinement=finer * meshing.refinement))
     runs = None if cache is None else cache / "slices"
     predictor = SlicePredictor(setup, records, meshings, clock, runs, workers)
-    result = _Computation(predictor, point, causes).result(progress)
-    if file is not None and store:
-        result.save(file)
-    return result
+    computation = _Computation(predictor, point, causes)
+    store = None
+    if cache is not None:
+        common = _content_hash(setup, causes, point, (meshing, finer, clock))
+        if common is not None:
+            store = _Store(cache / "sensitivities", common, point)
+    return computation.result(store, progress)
 
 
 class _Computation:
@@ -363,20 +334,34 @@ class _Computation:
     def _cause_point(self, cause: Cause, values: dict[str, float]) -> Point:
         return dc.replace(self.point, causes=(*self.point.causes, ActiveCause(cause, values)))
 
-    def result(self, progress: Progress | None) -> Sensitivities:
-        """All columns of all records."""
+    def result(self, store: "_Store | None", progress: Progress | None) -> Sensitivities:
+        """All columns of all records; those that the store holds are taken from there."""
         predictor = self.predictor
-        points = [self.point, *(p for ends in self.ends for p in ends[:2] if p is not None)]
-        # First, because causes may ask for its force.
-        predictor.simulate(points[:1])
-        predictor.simulate(points, progress)
+        targets = predictor.targets
         warnings: list[str] = []
-        records = [self._record(r, warnings) for r in range(len(predictor.targets))]
+        known = [store.load(t, len(self.columns)) if store else None for t in targets]
+        missing = tuple(k for k, found in enumerate(known) if found is None)
+        if missing:
+            points = [self.point, *(p for ends in self.ends for p in ends[:2] if p is not None)]
+            points = [dc.replace(p, only=missing) for p in points]
+            # First, because causes may ask for its force.
+            predictor.simulate(points[:1])
+            predictor.simulate(points, progress)
+        records = []
+        for number, found in enumerate(known):
+            if found is None:
+                found = self._record(number)
+                if store is not None:
+                    store.save(targets[number], *found)
+            records.append(found[0])
+            warnings += [f"{label}: {found[0].name} broke down" for label in found[1]]
         first = predictor.meshings[0]
-        counts = [t.models[first].element_count for t in predictor.targets if t.models]
+        counts = [t.models[first].element_count for t in targets if t.models]
         return Sensitivities(self.columns, records, warnings, max(counts, default=0))
 
-    def _record(self, number: int, warnings: list[str]) -> RecordSensitivity:
+    def _record(self, number: int) -> tuple[RecordSensitivity, list[str]]:
+        """A record, and labels of the columns whose slices broke down."""
+        failed: list[str] = []
         target = self.predictor.targets[number]
         base = self._series(self.point, number)
         shown = {k: (cause, up, down) for k, cause, up, down in self.shown}
@@ -396,17 +381,19 @@ class _Computation:
             raise CuttingError(
                 f"{target.facts.name}: the prediction broke down at the calibrated values"
             )
-        record = _empty(target, base, predicted, len(self.columns))
+        record = _empty(target, target.at_rows(base.in_contact), predicted, len(self.columns))
         for k, (members, (_, _, factor)) in enumerate(zip(of, self.ends, strict=True)):
             change = changes[:, :, members.start : members.stop]
             if not np.isfinite(change).all():
-                warnings.append(f"{self.columns[k].label}: {record.name} broke down")
+                failed.append(self.columns[k].label)
             elif len(members) == 1:
                 record.columns[:, :, k] = factor * change[:, :, 0]
+                if self.columns[k] == MESH:
+                    record.predicted = predicted + change[:, :, 0]
             else:
                 record.columns[:, :, k] = 0.5 * factor * (change[:, :, 0] - change[:, :, 1])
                 record.even[:, :, k] = 0.5 * factor * (change[:, :, 0] + change[:, :, 1])
-        return record
+        return record, failed
 
     def _series(self, point: Point, number: int) -> ForceSeries:
         (row,) = self.predictor.predict([dc.replace(point, only=(number,))])
@@ -416,7 +403,7 @@ class _Computation:
 
 
 def _empty(
-    target: SliceTarget, series: ForceSeries, predicted: np.ndarray, columns: int
+    target: SliceTarget, in_contact: np.ndarray, predicted: np.ndarray, columns: int
 ) -> RecordSensitivity:
     facts = target.facts
     return RecordSensitivity(
@@ -430,7 +417,7 @@ def _empty(
         time=target.time,
         phase=target.phase,
         depth=target.depth,
-        in_contact=target.at_rows(series.in_contact),
+        in_contact=in_contact,
         measured=target.measured,
         predicted=predicted,
         columns=np.zeros((*predicted.shape, columns), np.float32),
@@ -438,19 +425,64 @@ def _empty(
     )
 
 
-def _content_key(
-    setup: CalibrationSetup,
-    records: Sequence[SliceRecord],
-    causes: Sequence[Cause],
-    options: tuple[object, ...],
-) -> str | None:
-    """Hash of all that the result depends on; None where the source of a cause cannot be read."""
+class _Store:
+    """Predictions of records and their changes in a folder, found again by what goes into them.
+
+    What was measured does not: another cut along the same path is found at once.
+
+    Args:
+        directory: The folder.
+        common: Hash of all that does not differ between records.
+        point: Where records are predicted.
+    """
+
+    def __init__(self, directory: Path, common: bytes, point: Point) -> None:
+        directory.mkdir(parents=True, exist_ok=True)
+        self._directory, self._common, self._point = directory, common, point
+
+    def _file(self, target: SliceTarget) -> Path:
+        h = hashlib.sha256(self._common)
+        metadata = dc.replace(target.record.metadata, name="", condition="")
+        facts = dc.replace(target.facts, name="", condition="")
+        h.update(repr((metadata, facts, target.channels)).encode())
+        name = target.facts.name
+        own = [dict(a.of(name)) for a in self._point.causes]
+        h.update(repr((self._point.records.get(name), own)).encode())
+        for values in (target.time, target.grid, target.R, target.p):
+            h.update(np.ascontiguousarray(values).tobytes())
+        return self._directory / f"{h.hexdigest()[:40]}.npz"
+
+    def load(self, target: SliceTarget, columns: int) -> tuple[RecordSensitivity, list[str]] | None:
+        file = self._file(target)
+        if not file.exists():
+            return None
+        with np.load(file) as arrays:
+            record = _empty(target, arrays["in_contact"], arrays["predicted"], columns)
+            record.columns, record.even = arrays["columns"], arrays["even"]
+            return record, arrays["failed"].tolist()
+
+    def save(self, target: SliceTarget, record: RecordSensitivity, failed: list[str]) -> None:
+        file = self._file(target)
+        part = file.with_name(f"{file.stem}.{os.getpid()}.part")
+        with open(part, "wb") as stream:
+            np.savez(
+                stream,
+                allow_pickle=False,
+                failed=np.array(failed, np.str_),
+                **{name: getattr(record, name) for name in STORED},
+            )
+        os.replace(part, file)
+
+
+def _content_hash(
+    setup: CalibrationSetup, causes: Sequence[Cause], point: Point, options: tuple[object, ...]
+) -> bytes | None:
+    """Hash of all that results depend on beside the record; None where the source of a cause
+    cannot be read."""
     h = hashlib.sha256(cutting_source())
     for source in SOURCES:
         h.update(Path(inspect.getfile(source)).read_bytes())
     h.update(Path(__file__).read_bytes())
-    point = options[0]
-    assert isinstance(point, Point)
     everything = [*causes, *(active.cause for active in point.causes)]
     for cause in everything:
         try:
@@ -459,12 +491,7 @@ def _content_key(
             return None
         facts = (cause.name, cause.parameters, cause.scan, cause.per_record, vars(cause))
         h.update(text + repr(facts).encode())
-    active = [(a.cause.name, dict(a.values), dict(a.by_record)) for a in point.causes]
-    h.update(repr((setup, point.values, point.records, active, point.meshing)).encode())
-    h.update(repr(options[1:]).encode())
-    for record in records:
-        h.update(repr(record.metadata).encode())
-        for name in ("time", "position", "rotation", "force", "torque", "force_norm"):
-            values = getattr(record, name)
-            h.update(name.encode() if values is None else np.ascontiguousarray(values).tobytes())
-    return h.hexdigest()[:40]
+    active = [a.cause.name for a in point.causes]
+    h.update(repr((setup, point.values, active, point.meshing)).encode())
+    h.update(repr(options).encode())
+    return h.digest()
