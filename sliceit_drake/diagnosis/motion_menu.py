@@ -55,7 +55,7 @@ class Scale:
 
     def times(self, factor: float) -> float:
         """A multiple of the records' speed that the station can follow, m/s."""
-        return float(min(max(factor * self.speed, SLOWEST), FASTEST))
+        return round(min(max(factor * self.speed, SLOWEST), FASTEST), 6)
 
 
 @dc.dataclass(frozen=True)
@@ -99,15 +99,22 @@ def _ramp(speed: float) -> float:
 
 
 def _press(distance: float, speed: float, label: str = "slice") -> ConstantSpeed:
-    return ConstantSpeed(speed=speed, distance=distance, acceleration=_ramp(speed), label=label)
+    way = round(distance, 6)
+    return ConstantSpeed(speed=speed, distance=way, acceleration=_ramp(speed), label=label)
 
 
 def _retract(distance: float, speed: float, label: str = "retract") -> Retract:
-    return Retract(distance=distance, speed=speed, acceleration=_ramp(speed), label=label)
+    way = round(distance, 6)
+    return Retract(distance=way, speed=speed, acceleration=_ramp(speed), label=label)
 
 
 def _air(duration: float = 0.3) -> Hold:
     return Hold(duration=duration, label="air")
+
+
+def _end() -> Hold:
+    """On the board."""
+    return Hold(duration=0.3, label="hold")
 
 
 def _plan(*segments: Segment) -> MotionPlan:
@@ -116,7 +123,7 @@ def _plan(*segments: Segment) -> MotionPlan:
 
 def _through(scale: Scale) -> float:
     """From the start through the food."""
-    return scale.clearance + scale.height + OVERTRAVEL
+    return round(scale.clearance + scale.height + OVERTRAVEL, 6)
 
 
 def tour(scale: Scale, speeds: tuple[float, float] = (0.3, 3.0)) -> MotionPlan:
@@ -130,7 +137,7 @@ def tour(scale: Scale, speeds: tuple[float, float] = (0.3, 3.0)) -> MotionPlan:
         _press(half, slow),
         Hold(duration=2.0, label="hold"),
         _press(way - half, fast),
-        Hold(duration=0.3, label="hold"),
+        _end(),
         _retract(way, scale.times(1.0)),
         _air(0.2),
         _press(again, scale.times(1.0), "second_pass"),
@@ -147,13 +154,13 @@ def _cuts(scale: Scale) -> list[Experiment]:
         Experiment(
             "slow",
             f"a press at {1e3 * slow:.3g} mm/s, and out",
-            _plan(_air(), _press(way, slow), _retract(way, usual), _air()),
+            _plan(_air(), _press(way, slow), _end(), _retract(way, usual), _air()),
             scale.clearance,
         ),
         Experiment(
             "fast",
             f"a press at {1e3 * fast:.3g} mm/s, and out",
-            _plan(_air(), _press(way, fast), _retract(way, usual), _air()),
+            _plan(_air(), _press(way, fast), _end(), _retract(way, usual), _air()),
             scale.clearance,
         ),
         Experiment(
@@ -164,6 +171,7 @@ def _cuts(scale: Scale) -> list[Experiment]:
                 _press(half, usual),
                 Hold(duration=3.0, label="hold"),
                 _press(way - half, usual),
+                _end(),
                 _retract(way, fast),
                 _air(),
             ),
@@ -175,6 +183,7 @@ def _cuts(scale: Scale) -> list[Experiment]:
             _plan(
                 _air(),
                 _press(way, usual),
+                _end(),
                 _retract(way, slow),
                 _air(0.2),
                 _press(again, usual, "second_pass"),
@@ -205,12 +214,12 @@ def _cuts(scale: Scale) -> list[Experiment]:
                     PressAndDraw(
                         press_speed=usual, distance=way, draw_ratio=ratio, acceleration=RAMP
                     ),
-                    Hold(duration=0.3, label="hold"),
+                    _end(),
                     _retract(way, fast),
                     _air(),
                 ),
                 scale.clearance,
-                offset=-0.5 * travel,
+                offset=round(-0.5 * travel, 6),
             )
         )
     return out
@@ -240,7 +249,7 @@ def _in_air(scale: Scale) -> list[Experiment]:
 
 def _by_hand(scale: Scale) -> list[Experiment]:
     narrow = dc.replace(scale, height=NARROW * scale.height, width=NARROW * scale.width)
-    first = _plan(_air(), _press(_through(scale), scale.times(1.0)), _air())
+    first = _plan(_air(), _press(_through(scale), scale.times(1.0)), _end())
     # Down to a clearance's height over the board, then slowly.
     press = scale.clearance + BOARD_PRESS
     return [
@@ -278,6 +287,7 @@ def _by_hand(scale: Scale) -> list[Experiment]:
             AIR,
             by_hand=f"hang {WEIGHT:g} kg on the knife at the middle of its edge while the phases "
             '"weight" last (1 s, twice), and take it off between; no food is needed',
+            food=False,
             weight=WEIGHT,
         ),
         Experiment(
