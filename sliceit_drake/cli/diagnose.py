@@ -3,8 +3,14 @@
 import argparse
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sliceit_drake.cli.progress import StageBars
+
+if TYPE_CHECKING:
+    from sliceit_drake.diagnosis.cause import Cause
+    from sliceit_drake.diagrams.calibrated_food import CalibratedFood
+    from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = ["add_parser"]
 
@@ -18,7 +24,8 @@ speeds, with a hold, a withdrawal and draws. Writes to DIR:
   extended.yaml   the food with the cause in it: `calibration: DIR/extended.yaml` in a scenario
 
 The verdict is one of: nothing beyond noise; a cause (or two) with size; a class of causes that
-these records cannot tell apart, and the experiment that would; unknown; too few replicates.
+these records cannot tell apart, and the experiment that would; unknown; too few replicates. For a
+single record it is `one_slice`: what that slice shows, and no diagnosis; no food is extended by it.
 
 With --next-experiment FILE it writes what to cut next: a scenario for `sliceit simulate`, for
 `sliceit record` and for the robot, with the angles to expect and the number of slices. This
@@ -48,6 +55,11 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         "--cause", metavar="FILE", type=Path, action="append", default=[], help="a cause of yours"
     )
     parser.add_argument(
+        "--other-food",
+        action="store_true",
+        help="records of a food of another name than the model's are meant",
+    )
+    parser.add_argument(
         "--next-experiment", metavar="FILE", type=Path, help="write what to cut next, as a scenario"
     )
     parser.add_argument(
@@ -71,6 +83,7 @@ def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.diagnosis.diagnose import diagnose, setup_of_food
+    from sliceit_drake.diagnosis.input_checks import check_folder
     from sliceit_drake.diagnosis.next_experiment import next_experiment
     from sliceit_drake.diagnosis.registry import load_cause
     from sliceit_drake.diagrams.calibrated_food import load_calibrated_food
@@ -81,19 +94,26 @@ def run(options: argparse.Namespace) -> int:
             raise ConfigurationError(
                 "is no folder", source=str(folder), fix="Give folders of slice records."
             )
+    food = load_calibrated_food(options.model)
+    extra = [load_cause(file) for file in options.cause]
     records = load_sessions(options.records)
-    setup = setup_of_food(load_calibrated_food(options.model), options.refinement)
+    setup = setup_of_food(food, options.refinement)
     cache = options.cache or options.output / "cache"
+    check_folder(options.output, "--output")
+    check_folder(cache, "--cache")
+    if len(records) == 1:
+        return _one_slice(options, food, records[0], extra, cache)
     with StageBars() as bars:
         result = diagnose(
             setup,
             records,
-            [load_cause(file) for file in options.cause],
+            extra,
             cache,
             options.replicates,
             options.seed,
             options.workers,
             bars.show,
+            options.other_food,
         )
         if options.next_experiment is not None:
             result.next_experiment = next_experiment(
@@ -107,4 +127,42 @@ def run(options: argparse.Namespace) -> int:
     print(result.table())
     result.save(options.output)
     print(f"Results in {options.output}/: diagnosis.json, extended.yaml, report.html")
+    return 0
+
+
+def _one_slice(
+    options: argparse.Namespace,
+    food: "CalibratedFood",
+    record: "SliceRecord",
+    extra: "list[Cause]",
+    cache: Path,
+) -> int:
+    """Says what one slice shows."""
+    from sliceit_drake.configuration import ConfigurationError
+    from sliceit_drake.diagnosis.input_checks import check_records
+    from sliceit_drake.diagnosis.one_slice import diagnose_slice, setup_of_slice
+
+    if options.next_experiment is not None:
+        raise ConfigurationError(
+            "one slice carries no diagnosis that an experiment could follow from",
+            field="--next-experiment",
+            fix="Leave it out: the table says what is needed first. With two records or more the"
+            " scenario is written.",
+        )
+    remarks = check_records([record], food.food, options.other_food)
+    with StageBars() as bars:
+        result = diagnose_slice(
+            setup_of_slice(food, options.refinement),
+            record,
+            extra,
+            cache,
+            options.replicates,
+            options.seed,
+            options.workers,
+            bars.show,
+            remarks,
+        )
+    print(result.table())
+    result.save(options.output)
+    print(f"Results in {options.output}/: diagnosis.json, report.html")
     return 0

@@ -16,6 +16,7 @@ from sliceit_drake.cutting.food import make_food_model
 from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.held_out import HeldOutGain, held_out_gain
+from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
 from sliceit_drake.diagnosis.linear import LinearProblem, integrate_out
 from sliceit_drake.diagnosis.next_experiment import NextExperiment
 from sliceit_drake.diagnosis.registry import open_causes
@@ -258,6 +259,7 @@ def diagnose(
     seed: int = 0,
     workers: int | None = None,
     progress: Progress | None = None,
+    other_food: bool = False,
 ) -> Diagnosis:
     """Shows what the simulation gets wrong in records, names the cause and measures the gain.
 
@@ -270,6 +272,7 @@ def diagnose(
         seed: Of the bootstrap.
         workers: Threads.
         progress: See `Progress`.
+        other_food: Whether records of a food of another name than the model's are meant.
 
     Raises:
         ConfigurationError: The records do not carry a diagnosis, with what would be needed.
@@ -279,7 +282,8 @@ def diagnose(
         raise ConfigurationError(
             f"{len(records)} record is too few: what is wrong in one slice may be that slice",
             field="RECORDS_DIR",
-            fix=f"Give at least {LEAST_RECORDS}, better 3 of each condition.",
+            fix=f"Give at least {LEAST_RECORDS}, better 3 of each condition; `diagnose_slice` says"
+            " what one slice shows.",
         )
     if replicates * ALARM < 1.0:
         raise ConfigurationError(
@@ -287,7 +291,8 @@ def diagnose(
             field="--replicates",
             fix=f"Give at least {round(1.0 / ALARM)}.",
         )
-    remarks = _remarks(records)
+    remarks = check_records(records, setup.food, other_food)
+    records = without_lone_torques(records)
     causes = open_causes([p.name for p in setup.parameters], extra)
     found = sensitivities(
         setup,
@@ -324,30 +329,6 @@ def diagnose(
         gain=gain,
         remarks=remarks,
     )
-
-
-def _remarks(records: Sequence[SliceRecord]) -> list[str]:
-    out = []
-    for record in records:
-        spread = float(np.ptp(record.force_magnitude))
-        if spread < 1e-9:
-            raise ConfigurationError(
-                "has a constant force: there is nothing to compare",
-                source=record.file or record.name,
-                field="force",
-                fix="Check the sensor and its cable; record again.",
-            )
-        if not record.phase("air").any():
-            out.append(f"{record.name} has no air phase: its sensor's zero is taken as it is.")
-        limit = record.metadata.sensor.force_range
-        if limit is not None and record.force is not None:
-            clipped = int((np.abs(record.force) >= 0.999 * limit).any(axis=1).sum())
-            if clipped:
-                out.append(
-                    f"{record.name} is clipped in {clipped} rows at {limit:g} N: give a sensor of "
-                    "a larger range, or cut with less force."
-                )
-    return out
 
 
 def _shifts(

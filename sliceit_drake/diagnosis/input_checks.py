@@ -1,0 +1,314 @@
+"""Looks at the records of a diagnosis before anything is simulated.
+
+Each record by itself was read and checked (`records.validation`). Here stands what only a diagnosis
+asks: that the records belong together and to the model, and that they hold what it needs. What
+cannot be used is an error with file, field and fix; what a reader must know is a remark.
+"""
+
+import dataclasses as dc
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.food import Box, Cylinder, Ellipsoid, Food
+from sliceit_drake.diagnosis.slices import is_bare
+from sliceit_drake.records.slice_record import SliceRecord
+from sliceit_drake.records.validation import check_record
+
+__all__ = ["check_folder", "check_records", "without_lone_torques"]
+
+BEGUN = 0.1
+"""Share of the greatest force that the first rows may have before contact."""
+CONTACT = 0.1
+"""Share of the greatest force at which there is contact for certain."""
+EARLY, LATE = 2e-3, 0.5
+"""How far above the food contact may begin, metres, and how deep in it, of its height."""
+SAME_SPEED, SAME_DRAW = 0.1, 0.1
+"""Differences that cuts of one condition may have, relative and absolute."""
+UNNAMED = ("", "unknown")
+OBVIOUS = ("missing fact", "phases", "unknown name")
+"""Warnings on facts that a diagnosis does not ask for; `sliceit records check` has them."""
+
+
+def check_folder(folder: Path, field: str) -> None:
+    """Refuses a folder that cannot be written to, before anything is computed for it.
+
+    Args:
+        folder: It is made if it is not there.
+        field: Option that names it.
+
+    Raises:
+        ConfigurationError: Naming folder and reason.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=folder)
+        os.close(handle)
+        os.unlink(name)
+    except OSError as error:
+        raise ConfigurationError(
+            f"cannot be written to ({error.strerror or error})",
+            source=str(folder),
+            field=field,
+            fix="Give a folder of yours on a disk with room.",
+        ) from error
+
+
+def check_records(
+    records: Sequence[SliceRecord], food: Food, other_food: bool = False
+) -> list[str]:
+    """Refuses records that do not belong together or to the model.
+
+    Args:
+        records: Of the diagnosis.
+        food: Of the model.
+        other_food: Whether records of a food of another name are meant.
+
+    Returns:
+        What a reader must know.
+
+    Raises:
+        ConfigurationError: Naming file, field and fix.
+    """
+    _check_same_slice(records)
+    _check_foods(records, food, other_food)
+    _check_channels(records)
+    for record in records:
+        _check_force(record)
+        if not is_bare(record):
+            _check_contact(record, food)
+    remarks = [*_conditions(records), *_knives(records), *_torques(records), *_warnings(records)]
+    return list(dict.fromkeys(remarks))
+
+
+def without_lone_torques(records: Sequence[SliceRecord]) -> list[SliceRecord]:
+    """The records without torques, where some have none: all must have the same channels."""
+    if all(r.torque is not None for r in records):
+        return list(records)
+    return [dc.replace(r, torque=None) for r in records]
+
+
+def _torques(records: Sequence[SliceRecord]) -> list[str]:
+    lack = [r.name for r in records if r.torque is None]
+    if len(lack) == len(records) or not lack:
+        return []
+    return [
+        f"{_some(lack)}: no torque, so that the torques of the other records are not used either."
+        " Give torque_x..z and wrench.point for all."
+    ]
+
+
+def _file(record: SliceRecord) -> str:
+    return record.file or record.name
+
+
+def _facts_file(record: SliceRecord) -> str:
+    return str(Path(_file(record)).with_suffix(".yaml"))
+
+
+def _check_same_slice(records: Sequence[SliceRecord]) -> None:
+    """The same file twice looks like a slice that repeats itself without any noise."""
+    seen: dict[bytes, SliceRecord] = {}
+    names: dict[str, SliceRecord] = {}
+    for record in records:
+        force = record.force if record.force is not None else record.force_magnitude
+        content = (record.time - record.time[0]).round(9).tobytes() + force.tobytes()
+        if content in seen:
+            raise ConfigurationError(
+                f"holds the same measurement as {_file(seen[content])}",
+                source=_file(record),
+                field="force",
+                fix="Remove one: a slice counted twice would look like two that agree.",
+            )
+        if record.name in names:
+            raise ConfigurationError(
+                f"is {record.name!r}, as in {_facts_file(names[record.name])}",
+                source=_facts_file(record),
+                field="name",
+                fix="Give each record a name of its own, or leave the field out: then it is that"
+                " of the file.",
+            )
+        seen[content] = names[record.name] = record
+
+
+def _check_foods(records: Sequence[SliceRecord], food: Food, other_food: bool) -> None:
+    cut = [r for r in records if not is_bare(r)]
+    if not cut:
+        raise ConfigurationError(
+            "in none of the records is there food",
+            source=_file(records[0]),
+            field="food.name",
+            fix="Add records of slices; those of air, board and weight go with them.",
+        )
+    foods: dict[str, list[SliceRecord]] = {}
+    for record in cut:
+        foods.setdefault(record.metadata.food.name, []).append(record)
+    if len(foods) > 1:
+        few = min(foods, key=lambda name: len(foods[name]))
+        counts = ", ".join(f"{len(own)} of {name}" for name, own in foods.items())
+        raise ConfigurationError(
+            f"the records are of different foods: {counts}",
+            source=_facts_file(foods[few][0]),
+            field="food.name",
+            fix="Put each food into a folder of its own and diagnose them one by one; correct the"
+            " field if it is one food under two names.",
+        )
+    (name,) = foods
+    if UNNAMED[0] in (name, food.name) or UNNAMED[1] in (name, food.name) or other_food:
+        return
+    if name.lower() != food.name.lower():
+        raise ConfigurationError(
+            f"the records are of {name}, the model is of {food.name}",
+            source=_facts_file(foods[name][0]),
+            field="food.name",
+            fix=f"Give the model of that food (--model {name}; sliceit calibrate makes one), or say"
+            " --other-food if you mean it.",
+        )
+
+
+def _check_channels(records: Sequence[SliceRecord]) -> None:
+    norms = [r for r in records if r.force is None]
+    if norms and len(norms) < len(records):
+        few = norms if 2 * len(norms) <= len(records) else [r for r in records if r not in norms]
+        what = "the norm of the force alone" if few is norms else "the components of the force"
+        raise ConfigurationError(
+            f"has {what}, unlike {len(records) - len(few)} of the {len(records)} records",
+            source=_file(few[0]),
+            field="force_norm" if few is norms else "force_x",
+            fix="Give all records the same columns: force_x, force_y, force_z, or force_norm alone;"
+            " or diagnose the two kinds apart.",
+        )
+
+
+def _check_force(record: SliceRecord) -> None:
+    if float(np.ptp(record.force_magnitude)) < 1e-9:
+        raise ConfigurationError(
+            "has a constant force: there is nothing to compare",
+            source=_file(record),
+            field="force",
+            fix="Check the sensor and its cable; record again.",
+        )
+
+
+def _check_contact(record: SliceRecord, food: Food) -> None:
+    """Refuses a record that begins in the food, or whose knife is not where its force is."""
+    if not record.phase("slice").any():
+        return
+    force = record.force_magnitude
+    if record.force is not None:
+        force = np.linalg.norm(record.force - record.force[:3].mean(axis=0), axis=1)
+    peak = float(force.max())
+    facts = record.metadata
+    if record.force is None and force[:3].mean() > BEGUN * peak:
+        raise ConfigurationError(
+            f"begins with {force[:3].mean():.3g} N, {100 * force[:3].mean() / peak:.0f} % of its"
+            " greatest force: the knife is in the food already, or the sensor was not tared",
+            source=_file(record),
+            field="force_norm",
+            fix="Record from before the first contact, with the sensor tared.",
+        )
+    unknown = {"p_WK_z", "food.position"} & set(facts.unknown)
+    height = _height(record, food)
+    if unknown or facts.food.position is None or height is None:
+        return
+    cut = record.phase("slice")
+    above = record.position[:, 2] - (facts.food.position[2] + height)
+    if above[cut].min() > 0.0:
+        raise ConfigurationError(
+            f"the knife stays {1e3 * above[cut].min():.3g} mm or more above the food",
+            source=_file(record),
+            field="p_WK_z",
+            fix="Correct food.position or the heights; both are in the world frame, in metres.",
+        )
+    begins = int(np.argmax(cut & (force > CONTACT * peak)))
+    if not EARLY >= above[begins] >= -LATE * height:
+        where = f"{1e3 * abs(above[begins]):.1f} mm {'above' if above[begins] > 0 else 'below'}"
+        raise ConfigurationError(
+            f"the force begins {where} the top of the food, which is {1e3 * height:.0f} mm high",
+            source=_file(record),
+            field="p_WK_z",
+            fix="Correct food.position, food.size or the knife's pose on the tool; list p_WK_z"
+            " under unknown if only changes of the height are known.",
+        )
+
+
+def _height(record: SliceRecord, food: Food) -> float | None:
+    """Of the food over its origin, metres, as far as it is known without computing it."""
+    size = record.metadata.food.size
+    if size is not None:
+        return size[2]
+    if isinstance(food.shape, Cylinder):
+        return food.shape.diameter
+    if isinstance(food.shape, Box):
+        return food.shape.size[2]
+    if isinstance(food.shape, Ellipsoid):
+        return food.shape.diameters[2]
+    return None
+
+
+def _conditions(records: Sequence[SliceRecord]) -> list[str]:
+    unnamed = [r.name for r in records if not r.metadata.condition]
+    out = []
+    if unnamed:
+        out.append(
+            f"{_some(unnamed)}: no condition given, so that each counts as a cut of its own. Give"
+            " slices that were nominally the same the same `condition`."
+        )
+    first: dict[str, SliceRecord] = {}
+    for record in records:
+        label, motion = record.metadata.condition, record.metadata.motion
+        if not label:
+            continue
+        other = first.setdefault(label, record)
+        was = other.metadata.motion
+        if motion.speed is not None and was.speed is not None:
+            differs = abs(motion.speed - was.speed) > SAME_SPEED * was.speed
+            draws = (motion.draw_ratio or 0.0), (was.draw_ratio or 0.0)
+            if differs or abs(draws[0] - draws[1]) > SAME_DRAW:
+                raise ConfigurationError(
+                    f"is {label!r}, as that of {_facts_file(other)}, which was cut at"
+                    f" {was.speed:g} m/s with a draw of {draws[1]:g}, not {motion.speed:g} m/s with"
+                    f" {draws[0]:g}",
+                    source=_facts_file(record),
+                    field="condition",
+                    fix="Give different cuts different conditions: what replicates do not share is"
+                    " taken for noise.",
+                )
+    return out
+
+
+def _knives(records: Sequence[SliceRecord]) -> list[str]:
+    kinds: dict[str, list[str]] = {}
+    for record in records:
+        kinds.setdefault(repr(record.metadata.knife), []).append(record.name)
+    if len(kinds) < 2:
+        return []
+    few = min(kinds.values(), key=len)
+    return [
+        f"{_some(few)}: another knife than in the other records. Each is simulated with its own"
+        " measures, but bluntness and dulling are taken for the same. Diagnose each knife apart if"
+        " these are in question."
+    ]
+
+
+def _warnings(records: Sequence[SliceRecord]) -> list[str]:
+    """What the check of each record warns of, one line a kind."""
+    found: dict[str, tuple[list[str], str]] = {}
+    for record in records:
+        for finding in check_record(record):
+            if finding.severity == "warning" and finding.kind not in OBVIOUS:
+                names, _ = found.setdefault(
+                    finding.kind, ([], f"{finding.problem.rstrip('.')}. {finding.fix}")
+                )
+                if record.name not in names:
+                    names.append(record.name)
+    return [f"{_some(names)}: {kind}: {text}" for kind, (names, text) in found.items()]
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return ", ".join(names[:3]) + more
