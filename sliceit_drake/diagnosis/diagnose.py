@@ -15,7 +15,7 @@ from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.food import make_food_model
 from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.diagnosis.cause import Cause
-from sliceit_drake.diagnosis.held_out import HeldOutGain, held_out_gain
+from sliceit_drake.diagnosis.held_out import HeldOutGain, held_out_gain, held_out_share
 from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
 from sliceit_drake.diagnosis.linear import LinearProblem, integrate_out
 from sliceit_drake.diagnosis.next_experiment import NextExperiment
@@ -210,6 +210,7 @@ class Diagnosis:
                     "expected": e.expected,
                     "limit": e.limit,
                     "scan": e.scan,
+                    "held_out_share": held_out_share(self.problem, [(e.name, e.scan)]),
                 }
                 for e in v.screening.causes
             ],

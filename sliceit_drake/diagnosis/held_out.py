@@ -7,9 +7,8 @@ import numpy as np
 
 from sliceit_drake.diagnosis.linear import LinearProblem, integrate_out
 
-__all__ = ["HeldOutGain", "fitted_changes", "held_out_gain"]
+__all__ = ["HeldOutGain", "fitted_changes", "held_out_gain", "held_out_share"]
 
-FORCES = ("force_x", "force_y", "force_z", "force_norm")
 BOOTSTRAP = 1000
 FLAT = 1e4
 """Variance of a coefficient of which nothing is known, in the column's size."""
@@ -17,7 +16,7 @@ FLAT = 1e4
 
 @dc.dataclass
 class HeldOutGain:
-    """Errors of the force on records that were left out, in contact.
+    """Errors of the force on records that were left out, in contact, but for where it jumps.
 
     Each record in turn is predicted from a fit to the others; what is its own (its toughness, its
     height) is taken from itself, in all fits alike.
@@ -49,13 +48,11 @@ def held_out_gain(
         causes: Names and values of the scan.
         seed: For the interval.
     """
-    found = problem.found
     squares = np.array([_errors(problem, given) for given in ((), causes)])
-    counts = np.array([int(r.in_contact.sum()) for r in found.records])
-    forces = [k for k, c in enumerate(found.records[0].channels) if c in FORCES]
-    noise = float(sum(problem.noise[k].deviation ** 2 for k in forces))
+    counts = problem.moments.force_rows
     rng = np.random.default_rng(seed)
     touched = np.flatnonzero(counts > 0)
+    noise = _noise(problem)
     shares = []
     for _ in range(BOOTSTRAP):
         pick = rng.choice(touched, len(touched))
@@ -70,6 +67,17 @@ def held_out_gain(
         share=_share(mean, noise),
         interval=(low, high),
     )
+
+
+def held_out_share(problem: LinearProblem, causes: Sequence[tuple[str, float | None]]) -> float:
+    """Of what is above the floor in the held-out mean square, what causes remove."""
+    total = max(int(problem.moments.force_rows.sum()), 1)
+    mean = np.array([_errors(problem, given).sum() for given in ((), causes)]) / total
+    return _share(mean, _noise(problem))
+
+
+def _noise(problem: LinearProblem) -> float:
+    return float(sum(problem.noise[k].deviation ** 2 for k in problem.forces))
 
 
 def _share(mean: np.ndarray, noise: float) -> float:
@@ -89,12 +97,14 @@ def _errors(problem: LinearProblem, causes: Sequence[tuple[str, float | None]]) 
     """Sum of squared force errors in contact of each record when it is left out [R], N^2."""
     linear = _Linear(problem, causes)
     total = linear.reduced.sum(0)
-    forces = [k for k, c in enumerate(problem.found.records[0].channels) if c in FORCES]
     out = np.zeros(len(linear.reduced))
-    for r, record in enumerate(problem.found.records):
+    for r, H in enumerate(problem.moments.force_gram):
         theta = linear.shared(total - linear.reduced[r])
-        left = record.residual - linear.change(r, theta)
-        out[r] = float((left[record.in_contact][:, forces] ** 2).sum())
+        left = np.zeros(len(H))
+        left[-1] = 1.0
+        left[linear.columns] -= theta
+        left[linear.own] -= linear.of_own(r, theta)
+        out[r] = max(float(left @ H @ left), 0.0)
     return out
 
 
@@ -120,11 +130,15 @@ class _Linear:
         """Coefficients of the shared columns from a sum of reduced Gram matrices."""
         return self.problem.fit_shared(total, self.columns)[0]
 
-    def change(self, r: int, theta: np.ndarray) -> np.ndarray:
-        """Change of a record's prediction, its own part taken from itself [m, c]."""
-        record, G, own = self.problem.found.records[r], self.problem.moments.gram[r], self.own
+    def of_own(self, r: int, theta: np.ndarray) -> np.ndarray:
+        """Coefficients of what is a record's own, from itself."""
+        G, own = self.problem.moments.gram[r], self.own
         inner = G[np.ix_(own, own)] + np.diag(1.0 / np.maximum(self.variance, 1e-12))
         rest = G[own, self.problem.size] - G[np.ix_(own, self.columns)] @ theta
-        alpha = np.linalg.solve(inner, rest)
+        return np.asarray(np.linalg.solve(inner, rest))
+
+    def change(self, r: int, theta: np.ndarray) -> np.ndarray:
+        """Change of a record's prediction, its own part taken from itself [m, c]."""
+        record = self.problem.found.records[r]
         shared = record.columns[:, :, self.columns] @ theta
-        return np.asarray(shared + record.columns[:, :, own] @ alpha)
+        return np.asarray(shared + record.columns[:, :, self.own] @ self.of_own(r, theta))

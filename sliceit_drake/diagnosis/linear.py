@@ -52,11 +52,14 @@ class Moments:
 
     Attributes:
         gram: [R, K + 1, K + 1], y last. The correction's columns are of the record's condition.
-        rows: Number of samples of each record [R].
+        force_gram: Of the force's components without weights, where the knife touches and the force
+            does not jump [R, K + 1, K + 1], N^2.
+        force_rows: Number of such rows of each record [R].
     """
 
     gram: np.ndarray
-    rows: np.ndarray
+    force_gram: np.ndarray
+    force_rows: np.ndarray
 
 
 class LinearProblem:
@@ -78,6 +81,7 @@ class LinearProblem:
         correction: Numbers of the columns of each condition's nonparametric correction.
         size: Number of all columns; y stands there.
         moments: Of the records.
+        forces: Numbers of the channels that are forces.
         variation: Standard deviations of what differs from slice to slice [len(own)], in the
             columns' sizes.
         variation_samples: Number of independent differences that they were estimated from.
@@ -124,7 +128,9 @@ class LinearProblem:
         for c in range(len(channels)):
             self.discretisation[c * count : (c + 1) * count] = scale[c]
         gram = np.zeros((len(found.records), self.size + 1, self.size + 1))
-        rows = np.zeros(len(found.records), int)
+        force_gram, force_rows = np.zeros_like(gram), np.zeros(len(found.records), int)
+        self.forces = [c for c, name in enumerate(channels) if name.startswith("force")]
+        deviation = np.array([noise.deviation for noise in self.noise])
         for r, record in enumerate(found.records):
             X = np.concatenate(
                 [
@@ -136,8 +142,11 @@ class LinearProblem:
                 axis=2,
             )
             gram[r] = self._weighted(record.time, X, self.model_error(record))
-            rows[r] = X.shape[0] * X.shape[1]
-        self.moments = Moments(gram, rows)
+            calm = record.in_contact & (record.kinks() < deviation).all(1)
+            inside = X[calm][:, self.forces].reshape(-1, self.size + 1)
+            force_gram[r] = inside.T @ inside
+            force_rows[r] = int(calm.sum())
+        self.moments = Moments(gram, force_gram, force_rows)
 
     def _mesh_scale(self, mesh: list[int], channels: int) -> np.ndarray:
         """Standard deviation of the discretisation's error by channel [c]."""
