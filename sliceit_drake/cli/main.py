@@ -5,11 +5,11 @@ import os
 import sys
 from collections.abc import Sequence
 
-from sliceit_drake.cli import calibrate, diagnose, diagram, record, records, simulate, study
+from sliceit_drake.cli import calibrate, diagnose, diagram, record, records, score, simulate, study
 
 __all__ = ["main"]
 
-COMMANDS = (simulate, diagram, record, records, calibrate, diagnose, study)
+COMMANDS = (simulate, diagram, record, records, calibrate, diagnose, study, score)
 BAD_INPUT = 2
 INTERRUPTED = 130
 

@@ -107,6 +107,7 @@ def make_cases(
     seed: int = 0,
     kinds: Sequence[str] = tuple(KINDS),
     counts: Mapping[str, int] | None = None,
+    protocols: Sequence[str] = ("rich", "full", "poor"),
 ) -> list[Case]:
     """The list of runs.
 
@@ -116,14 +117,15 @@ def make_cases(
         seed: All follows from it.
         kinds: Which kinds.
         counts: Of each kind, other than `KINDS`.
+        protocols: Which may be used; a kind that has none of its own among them is left out.
     """
-    maker = _Maker(size_of, seed)
+    maker = _Maker(size_of, seed, protocols)
     of_kind = {
         "single": maker.single,
         "nothing": maker.nothing,
         "unknown": maker.unknown,
         "pairs": maker.pairs,
-        "poor": lambda n: maker.listed("poor", _visible(size_of, poor_effects, ("poor",)), n),
+        "poor": lambda n: maker.poor(poor_effects, n),
         "base": maker.base,
         "curve": maker.curve,
     }
@@ -134,21 +136,21 @@ def make_cases(
     return [case for _, _, case in sorted(placed, key=lambda entry: entry[:2])]
 
 
-def _visible(
-    size_of: SizeOf, effects: Sequence[str], protocols: Sequence[str]
-) -> list[tuple[str, list[str]]]:
-    """Effects that can reach the least strength, and in which protocols."""
-    out = []
-    for effect in effects:
-        where = [p for p in protocols if size_of(p, effect, STRENGTHS[0]) is not None]
-        if where:
-            out.append((effect, where))
-    return out
-
-
 class _Maker:
-    def __init__(self, size_of: SizeOf, seed: int) -> None:
-        self.size_of, self.seed = size_of, seed
+    def __init__(self, size_of: SizeOf, seed: int, protocols: Sequence[str]) -> None:
+        self.size_of, self.seed, self.protocols = size_of, seed, protocols
+
+    def _visible(
+        self, effects: Sequence[str], wanted: Sequence[str]
+    ) -> list[tuple[str, list[str]]]:
+        """Effects that can reach the least strength, and in which protocols."""
+        protocols = [p for p in wanted if p in self.protocols]
+        out = []
+        for effect in effects:
+            where = [p for p in protocols if self.size_of(p, effect, STRENGTHS[0]) is not None]
+            if where:
+                out.append((effect, where))
+        return out
 
     def _case(
         self,
@@ -191,27 +193,32 @@ class _Maker:
         return out
 
     def single(self, count: int) -> list[Case]:
-        return self.listed("single", _visible(self.size_of, list(CAUSE_OF), RICH_AND_FULL), count)
+        return self.listed("single", self._visible(list(CAUSE_OF), RICH_AND_FULL), count)
+
+    def poor(self, effects: Sequence[str], count: int) -> list[Case]:
+        return self.listed("poor", self._visible(effects, ("poor",)), count)
 
     def unknown(self, count: int) -> list[Case]:
-        return self.listed("unknown", _visible(self.size_of, UNKNOWN, RICH_AND_FULL), count)
+        return self.listed("unknown", self._visible(UNKNOWN, RICH_AND_FULL), count)
 
     def base(self, count: int) -> list[Case]:
-        return self.listed("base", [(effect, ["rich"]) for effect in BASE_OF], count)
+        where = [p for p in ("rich",) if p in self.protocols]
+        return self.listed("base", [(effect, where) for effect in BASE_OF if where], count)
 
     def nothing(self, count: int) -> list[Case]:
-        protocols = ("rich", "poor", "full")
-        return [self._case("nothing", k, protocols[k % 3], ()) for k in range(count)]
+        names = self.protocols
+        return [self._case("nothing", k, names[k % len(names)], ()) for k in range(count)]
 
     def pairs(self, count: int) -> list[Case]:
         possible = [
             pair
             for pair in PAIRS
-            if all(self.size_of(pair[0], effect, STRENGTHS[0]) is not None for effect in pair[1:])
+            if pair[0] in self.protocols
+            and all(self.size_of(pair[0], effect, STRENGTHS[0]) is not None for effect in pair[1:])
         ]
         return [
             self._case("pairs", k, possible[k % len(possible)][0], possible[k % len(possible)][1:])
-            for k in range(count)
+            for k in range(count if possible else 0)
         ]
 
     def curve(self, count: int) -> list[Case]:
@@ -219,9 +226,9 @@ class _Maker:
             (effect, delta)
             for delta in CURVE_DELTAS
             for effect in CURVE_EFFECTS
-            if self.size_of("rich", effect, delta) is not None
+            if "rich" in self.protocols and self.size_of("rich", effect, delta) is not None
         ]
         return [
             self._case("curve", k, "rich", [grid[k % len(grid)][0]], grid[k % len(grid)][1])
-            for k in range(count)
+            for k in range(count if grid else 0)
         ]

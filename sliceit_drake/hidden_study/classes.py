@@ -62,9 +62,7 @@ def protocol_classes(name: str, cache: Path | None = None) -> ProtocolClasses:
             return ProtocolClasses(**json.loads(file.read_text(encoding="utf-8")))
     records = QuietBench(protocol, SEED).records()
     setup = setup_of_food(model_food(protocol), DIAGNOSIS_REFINEMENT)
-    found = sensitivities(
-        setup, records, causes, cache=None if cache is None else cache / "diagnosis"
-    )
+    found = sensitivities(setup, records, causes, cache=cache)
     told = identifiability(Evidence(found), causes, name, range(len(records)), {})
     listed = [n for n in told.names if "." not in n]
     at = {n: told.names.index(n) for n in listed}

@@ -172,8 +172,7 @@ class ProtocolSizes:
         records = [real.record(k) for k in range(len(real))]
         usual = [c for c in all_causes() if c.name in {name for name, *_ in USUAL}]
         setup = setup_of_food(model_food(self.protocol), DIAGNOSIS_REFINEMENT)
-        cache = None if self.cache is None else self.cache / "diagnosis"
-        found = sensitivities(setup, records, usual, cache=cache, workers=1)
+        found = sensitivities(setup, records, usual, cache=self.cache, workers=1)
         return found, LinearProblem(found)
 
     @functools.cached_property

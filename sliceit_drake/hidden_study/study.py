@@ -11,7 +11,7 @@ from pathlib import Path
 import warp
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
-from sliceit_drake.hidden_study.bench import PROTOCOLS, model_food, protocol_named
+from sliceit_drake.hidden_study.bench import model_food, protocol_named
 from sliceit_drake.hidden_study.cases import KINDS, Case, make_cases
 from sliceit_drake.hidden_study.classes import ProtocolClasses, protocol_classes
 from sliceit_drake.hidden_study.runner import food_file, is_done, run_case
@@ -32,11 +32,13 @@ class StudyOptions:
         kinds: Of runs.
         seed: All follows from it.
         replicates: Of each diagnosis's bootstrap.
+        protocols: That may be used.
     """
 
     kinds: tuple[str, ...] = tuple(KINDS)
     seed: int = 0
     replicates: int = 200
+    protocols: tuple[str, ...] = ("rich", "full", "poor")
 
 
 def prepare(output: Path, options: StudyOptions, progress: Progress) -> list[Case]:
@@ -63,10 +65,11 @@ def prepare(output: Path, options: StudyOptions, progress: Progress) -> list[Cas
         progress("sizes", calls[0], calls[0])
         return size_for(protocol, effect, delta, cache)
 
-    classes = _classes(output, progress)["poor"].classes
-    ambiguous = [e for e, cause in CAUSE_OF.items() if len(classes.get(cause, [])) > 1]
-    cases = make_cases(size, ambiguous, options.seed, options.kinds)
-    for name in PROTOCOLS:
+    classes = _classes(output, options.protocols, progress)
+    poor = classes["poor"].classes if "poor" in classes else {}
+    ambiguous = [e for e, cause in CAUSE_OF.items() if len(poor.get(cause, [])) > 1]
+    cases = make_cases(size, ambiguous, options.seed, options.kinds, protocols=options.protocols)
+    for name in options.protocols:
         food_file(output, name).parent.mkdir(parents=True, exist_ok=True)
         dump_yaml(model_food(protocol_named(name)), food_file(output, name))
     truth = output / "truth"
@@ -78,11 +81,13 @@ def prepare(output: Path, options: StudyOptions, progress: Progress) -> list[Cas
     return cases
 
 
-def _classes(output: Path, progress: Progress) -> dict[str, ProtocolClasses]:
+def _classes(
+    output: Path, protocols: Sequence[str], progress: Progress
+) -> dict[str, ProtocolClasses]:
     found = {}
-    for k, name in enumerate(PROTOCOLS):
+    for k, name in enumerate(protocols):
         found[name] = protocol_classes(name, output / "cache")
-        progress("classes", k + 1, len(PROTOCOLS))
+        progress("classes", k + 1, len(protocols))
     text = json.dumps({name: dc.asdict(c) for name, c in found.items()}) + "\n"
     (output / "classes.json").write_text(text, encoding="utf-8")
     return found

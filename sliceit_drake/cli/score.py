@@ -1,0 +1,50 @@
+"""`sliceit score`: judge the diagnoses of a study of hidden effects."""
+
+import argparse
+from pathlib import Path
+
+__all__ = ["add_parser"]
+
+DESCRIPTION = """\
+Judge the diagnoses of `sliceit study hidden`: what was said against what was hidden.
+
+Prints rates with Wilson's lower bounds, what is asked for, rates by cause, detection curves and
+what was said where it was not right. With --output FOLDER it also writes hidden_effects.md,
+hidden_effects.json and figures/hidden_effects.png there. A study that is not done is judged by
+what there is.
+
+  sliceit score output/hidden --output docs
+"""
+
+
+def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        "score",
+        help="judge the diagnoses of a study of hidden effects",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("study", metavar="DIR", type=Path, help="folder of the study")
+    parser.add_argument("--output", metavar="FOLDER", type=Path, help="also write the report there")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the command."""
+    import json
+
+    from sliceit_drake.hidden_study.report import numbers, plot_curves, report
+    from sliceit_drake.hidden_study.score import judge_study
+
+    judgements = judge_study(options.study)
+    figure = "figures/hidden_effects.png" if options.output is not None else None
+    text = report(judgements, str(options.study), figure)
+    print(text)
+    if options.output is not None:
+        options.output.mkdir(parents=True, exist_ok=True)
+        (options.output / "hidden_effects.md").write_text(text, encoding="utf-8")
+        facts = json.dumps(numbers(judgements), indent=2) + "\n"
+        (options.output / "hidden_effects.json").write_text(facts, encoding="utf-8")
+        plot_curves(judgements, options.output / "figures" / "hidden_effects.png")
+    return 0

@@ -1,0 +1,197 @@
+"""Judges the runs of the study: what was said against what was hidden."""
+
+import dataclasses as dc
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.hidden_study.cases import Case
+from sliceit_drake.hidden_study.classes import ProtocolClasses
+from sliceit_drake.hidden_study.runner import is_done
+from sliceit_drake.hidden_study.study import load_cases
+from sliceit_drake.hidden_study.truth import CAUSE_OF
+
+__all__ = ["Judgement", "Rate", "judge", "judge_study", "load_classes"]
+
+NAMING = ("cause", "causes", "too_few_replicates")
+Z = 1.6448536269514722
+"""Of a one-sided bound of 95 %."""
+
+
+@dc.dataclass(frozen=True)
+class Rate:
+    """So many of so many."""
+
+    hits: int
+    runs: int
+
+    @property
+    def share(self) -> float:
+        """Hits over runs; not a number without runs."""
+        return self.hits / self.runs if self.runs else math.nan
+
+    @property
+    def lower(self) -> float:
+        """Wilson's one-sided lower bound, 95 %."""
+        n, p = self.runs, self.share
+        if not n:
+            return math.nan
+        middle = p + Z * Z / (2 * n)
+        spread = Z * math.sqrt(p * (1 - p) / n + Z * Z / (4 * n * n))
+        return (middle - spread) / (1 + Z * Z / n)
+
+
+@dc.dataclass(frozen=True)
+class Judgement:
+    """What a run came to.
+
+    Attributes:
+        case: The run.
+        verdict: Of the diagnosis; "failed" where it broke down.
+        classes: Classes of causes that it named.
+        right: Whether it said what it should.
+        wrong: Causes that it named and should not have.
+        gain: Share of the reducible held-out error that it removed, or None.
+        oracle: The same of the true cause, or None.
+        resolved: Whether the next experiment told the cause from the others of its class; None
+            where none was run.
+        shifts: Factors and relative errors of base parameters.
+        seconds: That the diagnosis took.
+    """
+
+    case: Case
+    verdict: str
+    classes: list[list[str]]
+    right: bool
+    wrong: list[str]
+    gain: float | None
+    oracle: float | None
+    resolved: bool | None
+    shifts: dict[str, list[float]]
+    seconds: float
+
+    @property
+    def truth(self) -> list[str]:
+        """What should be named."""
+        return [CAUSE_OF[h.effect] for h in self.case.hidden if h.effect in CAUSE_OF]
+
+    @property
+    def effects(self) -> str:
+        """What was hidden, in words."""
+        return " and ".join(h.effect for h in self.case.hidden) or "nothing"
+
+
+def judge(
+    case: Case,
+    facts: Mapping[str, Any] | None,
+    classes: Mapping[str, ProtocolClasses],
+    following: Mapping[str, Any] | None = None,
+    seconds: float = math.nan,
+) -> Judgement:
+    """Judges a run.
+
+    Args:
+        case: The run.
+        facts: Of diagnosis.json; None where it broke down.
+        classes: What each protocol cannot tell apart.
+        following: The same of the diagnosis after the next experiment.
+        seconds: That the diagnosis took.
+    """
+    if facts is None:
+        return Judgement(case, "failed", [], False, [], None, None, None, {}, seconds)
+    verdict, named = facts["verdict"], facts["classes"]
+    truth = [CAUSE_OF[h.effect] for h in case.hidden if h.effect in CAUSE_OF]
+    at = classes[case.protocol].classes
+    allowed = {member for cause in truth for member in at.get(cause, [cause])}
+    wrong = sorted({n for c in named for n in c} - allowed)
+    gain = facts.get("gain")
+    shares = {e["cause"]: e.get("held_out_share") for e in facts["evidence"]}
+    oracle = shares.get(truth[0]) if len(truth) == 1 else None
+    return Judgement(
+        case=case,
+        verdict=verdict,
+        classes=named,
+        right=_is_right(case.kind, verdict, named, truth, wrong),
+        wrong=wrong,
+        gain=None if gain is None else float(gain["share_removed"]),
+        oracle=None if oracle is None else float(oracle),
+        resolved=None if following is None else _is_resolved(following, truth),
+        shifts=facts["shifts"],
+        seconds=seconds,
+    )
+
+
+def _is_right(
+    kind: str, verdict: str, named: list[list[str]], truth: list[str], wrong: list[str]
+) -> bool:
+    if kind in ("nothing", "base"):
+        return bool(verdict == "nothing")
+    if kind == "unknown":
+        return bool(verdict == "unknown")
+    if kind == "pairs":
+        if verdict != "causes" or len(named) != 2:
+            return False
+        (a, b), (first, second) = truth, named
+        return (a in first and b in second) or (a in second and b in first)
+    # One cause: no other may stand beside it, and nothing outside its class.
+    return verdict == "cause" and len(named) == 1 and truth[0] in named[0] and not wrong
+
+
+def _is_resolved(facts: Mapping[str, Any], truth: list[str]) -> bool:
+    return bool(facts["verdict"] == "cause" and facts["classes"] == [truth])
+
+
+def load_classes(output: Path) -> dict[str, ProtocolClasses]:
+    """What each protocol cannot tell apart, as the study computed it.
+
+    Raises:
+        ConfigurationError: There is no study.
+    """
+    file = output / "classes.json"
+    if not file.exists():
+        raise ConfigurationError(
+            "is no folder of a study: there is no classes.json",
+            source=str(output),
+            fix="Give the --output of `sliceit study hidden`.",
+        )
+    found = json.loads(file.read_text(encoding="utf-8"))
+    return {name: ProtocolClasses(**facts) for name, facts in found.items()}
+
+
+def judge_study(output: Path) -> list[Judgement]:
+    """Judges all runs that are done.
+
+    Raises:
+        ConfigurationError: There is no study.
+    """
+    classes = load_classes(output)
+    out = []
+    for case in load_cases(output):
+        if is_done(output, case.name):
+            folder = output / "runs" / case.name
+            timing = _read(folder / "timing.json") or {}
+            out.append(
+                judge(
+                    case,
+                    _read(folder / "diagnosis.json"),
+                    classes,
+                    _read(folder / "diagnosis_next.json"),
+                    timing.get("diagnosis_s", math.nan),
+                )
+            )
+    return out
+
+
+def _read(file: Path) -> dict[str, Any] | None:
+    if not file.exists():
+        return None
+    found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    return found
+
+
+def rate(judgements: Sequence[Judgement]) -> Rate:
+    """How many are right."""
+    return Rate(sum(j.right for j in judgements), len(judgements))
