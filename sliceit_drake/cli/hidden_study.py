@@ -38,6 +38,9 @@ def add_hidden_study(studies: "argparse._SubParsersAction[argparse.ArgumentParse
     )
     hidden.add_argument("--output", metavar="DIR", type=Path, required=True)
     hidden.add_argument("--kinds", nargs="+", metavar="KIND", help="only these (default: all)")
+    hidden.add_argument(
+        "--protocols", nargs="+", metavar="NAME", help="only these (default: rich full poor)"
+    )
     hidden.add_argument("--runs", type=int, metavar="N", help="only the first N of the list")
     hidden.add_argument("--minutes", type=float, metavar="M", help="begin no run after these")
     hidden.add_argument("--workers", type=int, default=2, help="processes (default 2)")
@@ -67,6 +70,7 @@ def run_hidden(options: argparse.Namespace) -> int:
     from sliceit_drake.hidden_study.study import StudyOptions, prepare, run_study
 
     kinds = tuple(options.kinds or KINDS)
+    protocols = tuple(options.protocols or ("rich", "full", "poor"))
     for kind in kinds:
         if kind not in KINDS:
             raise ConfigurationError(
@@ -75,7 +79,7 @@ def run_hidden(options: argparse.Namespace) -> int:
                 fix=f"Give some of {', '.join(KINDS)}.",
             )
     options.output.mkdir(parents=True, exist_ok=True)
-    settings = StudyOptions(kinds, options.seed, options.replicates)
+    settings = StudyOptions(kinds, options.seed, options.replicates, protocols)
     with StageBars() as bars:
         cases = prepare(options.output, settings, bars.show)[: options.runs]
         done = run_study(

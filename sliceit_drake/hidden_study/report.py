@@ -127,7 +127,7 @@ def _requirements(judgements: Sequence[Judgement]) -> list[dict[str, Any]]:
     add("poor protocol, the class", ">= 90 % of >= 60", r, r.runs >= 60 and r.share >= 0.90)
     followed = [j for j in poor if j.resolved is not None]
     r = Rate(sum(bool(j.resolved) for j in followed), len(followed))
-    add("the next experiment resolves it", ">= 90 %", r, r.runs >= 50 and r.share >= 0.90)
+    add("the next experiment resolves it", ">= 90 %", r, r.runs >= 60 and r.share >= 0.90)
     both = [(j.gain or 0.0, j.oracle) for j in single if j.oracle is not None and j.oracle > 0.0]
     good = Rate(sum(g >= 0.9 * o for g, o in both), len(both))
     ratio = sum(g for g, _ in both) / sum(o for _, o in both) if both else math.nan

@@ -9,15 +9,25 @@ import time
 from pathlib import Path
 
 from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.hidden_study.bench import DIAGNOSIS_REFINEMENT, WORLD, protocol_named
 from sliceit_drake.hidden_study.cases import Case
 from sliceit_drake.records.slice_record import write_record
+from sliceit_drake.stand_in.protocol import Protocol, protocol_of_scenario
 from sliceit_drake.stand_in.registry import make_effect
 from sliceit_drake.stand_in.session import Session
 
 __all__ = ["food_file", "is_done", "run_case"]
 
-KEPT = ("diagnosis.json", "table.txt", "timing.json", "failure.txt")
+KEPT = (
+    "diagnosis.json",
+    "table.txt",
+    "diagnosis_next.json",
+    "table_next.txt",
+    "timing.json",
+    "failure.txt",
+)
+NEXT = "next.yaml"
 
 
 def food_file(output: Path, protocol: str) -> Path:
@@ -47,17 +57,11 @@ def run_case(case: Case, output: Path, replicates: int) -> str:
     folder = output / "runs" / case.name
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    timing: dict[str, float] = {}
-    begin = time.monotonic()
+    bench = _Bench(case, output, replicates)
     try:
-        _make_records(case, folder / "records")
-    except CuttingError as error:
-        (folder / "failure.txt").write_text(f"records: {error}\n", encoding="utf-8")
-    else:
-        timing["records_s"] = time.monotonic() - begin
-        begin = time.monotonic()
-        _diagnose(folder, food_file(output, case.protocol), output / "cache", replicates)
-        timing["diagnosis_s"] = time.monotonic() - begin
+        bench.run()
+    except (CuttingError, _Failure) as error:
+        (folder / "failure.txt").write_text(f"{error}\n", encoding="utf-8")
     for entry in folder.iterdir():
         if entry.is_dir():
             shutil.rmtree(entry)
@@ -65,54 +69,81 @@ def run_case(case: Case, output: Path, replicates: int) -> str:
             entry.unlink()
     # Last: what is here is whole.
     part = folder / "timing.part"
-    part.write_text(json.dumps(timing) + "\n", encoding="utf-8")
+    part.write_text(json.dumps(bench.seconds) + "\n", encoding="utf-8")
     os.replace(part, folder / "timing.json")
     return case.name
 
 
-def _make_records(case: Case, folder: Path) -> None:
-    folder.mkdir()
-    effects = [make_effect(hidden.text) for hidden in case.hidden]
-    session = Session(protocol_named(case.protocol), effects, seed=case.seed, settings=WORLD)
-    for k in range(len(session)):
-        record = session.record(k)
-        write_record(record, folder / record.name)
+class _Failure(RuntimeError):
+    """A diagnosis that broke down."""
 
 
-def _diagnose(folder: Path, food: Path, cache: Path, replicates: int) -> None:
-    """Runs `sliceit diagnose`, and keeps its result."""
-    result = folder / "diagnosis"
-    command = [
-        sys.executable,
-        "-m",
-        "sliceit_drake.cli.main",
-        "diagnose",
-        "records",
-        "--model",
-        str(food.resolve()),
-        "--output",
-        "diagnosis",
-        "--refinement",
-        str(DIAGNOSIS_REFINEMENT),
-        "--replicates",
-        str(replicates),
-        "--cache",
-        str(cache.resolve()),
-        "--workers",
-        "1",
-    ]
-    done = subprocess.run(
-        command,
-        cwd=folder,
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    file = result / "diagnosis.json"
-    if done.returncode != 0 or not file.exists():
-        text = f"diagnosis: {done.returncode}\n{done.stderr[-4000:]}\n"
-        (folder / "failure.txt").write_text(text, encoding="utf-8")
-        return
-    os.replace(file, folder / "diagnosis.json")
-    (folder / "table.txt").write_text(done.stdout, encoding="utf-8")
+class _Bench:
+    """One run on its way.
+
+    Attributes:
+        seconds: That each part took.
+    """
+
+    def __init__(self, case: Case, output: Path, replicates: int) -> None:
+        self.case, self.output, self.replicates = case, output, replicates
+        self.folder = output / "runs" / case.name
+        self.seconds: dict[str, float] = {}
+
+    def run(self) -> None:
+        """Makes records and has them diagnosed; in the poor protocol goes on as is proposed."""
+        self._cut(protocol_named(self.case.protocol), "records", self.case.seed)
+        wanted = ("--next-experiment", NEXT) if self.case.kind == "poor" else ()
+        self._diagnose(["records"], "", wanted)
+        if self.case.kind != "poor":
+            return
+        facts = json.loads((self.folder / "diagnosis.json").read_text(encoding="utf-8"))
+        steps = (facts["next_experiment"] or {}).get("steps", [])
+        sessions = ["records"]
+        for k, step in enumerate(steps):
+            scenario = load_scenario(self.folder / step["file"])
+            protocol = protocol_of_scenario(scenario, step["slices"])
+            sessions.append(f"more_{k + 1}")
+            self._cut(protocol, sessions[-1], self.case.seed + 1 + k)
+        if steps:
+            self._diagnose(sessions, "_next")
+
+    def _cut(self, protocol: Protocol, name: str, seed: int) -> None:
+        begin = time.monotonic()
+        (self.folder / name).mkdir()
+        effects = [make_effect(hidden.text) for hidden in self.case.hidden]
+        session = Session(protocol, effects, seed=seed, settings=WORLD)
+        for k in range(len(session)):
+            record = session.record(k)
+            write_record(record, self.folder / name / record.name)
+        self.seconds[f"{name}_s"] = time.monotonic() - begin
+
+    def _diagnose(self, sessions: list[str], mark: str, more: tuple[str, ...] = ()) -> None:
+        """Runs `sliceit diagnose` on folders, and keeps its result with a mark.
+
+        Raises:
+            _Failure: It broke down.
+        """
+        begin = time.monotonic()
+        result = f"result{mark}"
+        command = [
+            *(sys.executable, "-m", "sliceit_drake.cli.main", "diagnose", *sessions),
+            *("--model", str(food_file(self.output, self.case.protocol).resolve())),
+            *("--output", result, "--refinement", str(DIAGNOSIS_REFINEMENT)),
+            *("--replicates", str(self.replicates), "--workers", "1"),
+            *("--cache", str((self.output / "cache").resolve()), *more),
+        ]
+        done = subprocess.run(
+            command,
+            cwd=self.folder,
+            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        file = self.folder / result / "diagnosis.json"
+        if done.returncode != 0 or not file.exists():
+            raise _Failure(f"diagnosis of {sessions}: {done.returncode}\n{done.stderr[-4000:]}")
+        os.replace(file, self.folder / f"diagnosis{mark}.json")
+        (self.folder / f"table{mark}.txt").write_text(done.stdout, encoding="utf-8")
+        self.seconds[f"diagnosis{mark}_s"] = time.monotonic() - begin

@@ -56,8 +56,8 @@ class Judgement:
         wrong: Causes that it named and should not have.
         gain: Share of the reducible held-out error that it removed, or None.
         oracle: The same of the true cause, or None.
-        resolved: Whether the next experiment told the cause from the others of its class; None
-            where none was run.
+        resolved: Whether in the end, after the next experiment, the one cause was named; None but
+            in the poor protocol.
         shifts: Factors and relative errors of base parameters.
         seconds: That the diagnosis took.
     """
@@ -97,11 +97,12 @@ def judge(
         case: The run.
         facts: Of diagnosis.json; None where it broke down.
         classes: What each protocol cannot tell apart.
-        following: The same of the diagnosis after the next experiment.
+        following: The same of the diagnosis after the next experiment; None if none was made.
         seconds: That the diagnosis took.
     """
     if facts is None:
-        return Judgement(case, "failed", [], False, [], None, None, None, {}, seconds)
+        resolved = False if case.kind == "poor" else None
+        return Judgement(case, "failed", [], False, [], None, None, resolved, {}, seconds)
     verdict, named = facts["verdict"], facts["classes"]
     truth = [CAUSE_OF[h.effect] for h in case.hidden if h.effect in CAUSE_OF]
     at = classes[case.protocol].classes
@@ -118,7 +119,7 @@ def judge(
         wrong=wrong,
         gain=None if gain is None else float(gain["share_removed"]),
         oracle=None if oracle is None else float(oracle),
-        resolved=None if following is None else _is_resolved(following, truth),
+        resolved=_is_resolved(following or facts, truth) if case.kind == "poor" else None,
         shifts=facts["shifts"],
         seconds=seconds,
     )
