@@ -33,7 +33,7 @@ from sliceit_drake.diagnosis.linear import LinearProblem, integrate_out, scaled_
 from sliceit_drake.diagnosis.motion_menu import Experiment, menu
 from sliceit_drake.diagnosis.screen import CauseEvidence, Screening
 from sliceit_drake.diagnosis.sensitivity import RecordSensitivity, Sensitivities, sensitivities
-from sliceit_drake.diagnosis.verdict import ALARM, CLASS_ANGLE, LEAST_REPLICATES
+from sliceit_drake.diagnosis.verdict import ALARM, CLASS_ANGLE, CLASS_GAIN, LEAST_REPLICATES
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.records.slice_record import SliceRecord
 
@@ -226,10 +226,10 @@ def next_experiment(
             "draw and pose differ most"
         )
         return NextExperiment("explore", reason, _exploring(diagnosis, records))
-    classes = [f.names for f in verdict.findings if f.others]
+    classes = _classes(diagnosis)
     if not classes:
         return _nothing(diagnosis, records)
-    return _Search(diagnosis, records, cache, workers, progress).result()
+    return _Search(diagnosis, classes, records, cache, workers, progress).result()
 
 
 def _repeat(diagnosis: "Diagnosis", records: Sequence[SliceRecord]) -> NextExperiment:
@@ -258,8 +258,8 @@ def _nothing(diagnosis: "Diagnosis", records: Sequence[SliceRecord]) -> NextExpe
     """Nothing to split: what these records would not have shown, and motions that may show it."""
     verdict, screening = diagnosis.verdict, diagnosis.verdict.screening
     if verdict.kind != "nothing":
-        names = ", ".join(f.evidence.name for f in verdict.findings)
-        return NextExperiment("none", f"nothing to split: {names} stands alone")
+        names = " and ".join(f.evidence.name for f in verdict.findings)
+        return NextExperiment("none", f"nothing to split: nothing else looks like {names}")
     blind = [
         name
         for name, visible in zip(screening.names, screening.visible, strict=True)
@@ -310,6 +310,47 @@ class _Class:
     assumed: tuple[tuple[str, float | None], ...]
 
 
+def _classes(diagnosis: "Diagnosis") -> list[_Class]:
+    """What is to be told apart: of each finding those that the verdict names with it, and those
+    that would have been taken for it if they were the ones that act."""
+    verdict, problem = diagnosis.verdict, diagnosis.problem
+    out = []
+    assumed: tuple[tuple[str, float | None], ...] = ()
+    for finding, screening in zip(
+        verdict.findings, (verdict.screening, verdict.second), strict=False
+    ):
+        best = finding.evidence
+        if screening is not None and not best.per_record:
+            floor = best.score - CLASS_GAIN * best.gain
+            alike = [
+                e.name
+                for e in screening.causes
+                if e.name not in finding.names
+                and not e.per_record
+                and e.score >= floor
+                and max(map(abs, e.coefficients)) > 0.0
+                and screening.angle_to(problem, e, best.name) <= CLASS_ANGLE
+            ]
+            names = [*finding.names, *alike]
+            if len(names) > 1:
+                evidence = [_within_range(diagnosis, screening.evidence(n)) for n in names]
+                out.append(_Class(evidence, screening, assumed))
+        assumed = (*assumed, (best.name, best.scan))
+    return out
+
+
+def _within_range(diagnosis: "Diagnosis", evidence: CauseEvidence) -> CauseEvidence:
+    """Evidence whose coefficients give values that the cause may have."""
+    by_name = {p.name: p for p in diagnosis.causes[evidence.name].parameters}
+    coefficients = []
+    for name, x, size in zip(
+        evidence.parameters, evidence.coefficients, evidence.sizes, strict=True
+    ):
+        p = by_name[name]
+        coefficients.append(float(np.clip(p.null + x * size, p.low, p.high) - p.null) / size)
+    return dc.replace(evidence, coefficients=coefficients)
+
+
 @dc.dataclass
 class _Choice:
     """A number of slices of an experiment, and what it does."""
@@ -332,14 +373,13 @@ class _Search:
     def __init__(
         self,
         diagnosis: "Diagnosis",
+        classes: list[_Class],
         records: Sequence[SliceRecord],
         cache: Path | None,
         workers: int | None,
         progress: Progress | None,
     ) -> None:
-        self.diagnosis = diagnosis
-        self.experiments = _menu(diagnosis, records)
-        self.classes = self._classes()
+        self.experiments, self.classes = _menu(diagnosis, records), classes
         setup, template = diagnosis.setup, template_of(records)
         knife = _next_knife_slice(records)
         self.scenarios = [scenario_of(e, setup, template, knife) for e in self.experiments]
@@ -368,18 +408,6 @@ class _Search:
         self.new = reduced[count:]
         self._before = self._angles(self.old)
 
-    def _classes(self) -> list[_Class]:
-        verdict, out = self.diagnosis.verdict, []
-        assumed: tuple[tuple[str, float | None], ...] = ()
-        for finding, screening in zip(
-            verdict.findings, (verdict.screening, verdict.second), strict=False
-        ):
-            if finding.others and screening is not None:
-                evidence = [self._within_range(screening.evidence(name)) for name in finding.names]
-                out.append(_Class(evidence, screening, assumed))
-            assumed = (*assumed, (finding.evidence.name, finding.evidence.scan))
-        return out
-
     def _projected(self, total: np.ndarray, assumed: Sequence[tuple[str, float | None]]) -> Any:
         """What is left of a summed Gram matrix beside what is fitted in any case."""
         problem = self.problem
@@ -405,17 +433,6 @@ class _Search:
                 gain = square * float(np.sin(np.radians(angle))) ** 2
                 out.append((a.name, b.name, angle, gain))
         return out
-
-    def _within_range(self, evidence: CauseEvidence) -> CauseEvidence:
-        """Evidence whose coefficients give values that the cause may have."""
-        by_name = {p.name: p for p in self.diagnosis.causes[evidence.name].parameters}
-        coefficients = []
-        for name, x, size in zip(
-            evidence.parameters, evidence.coefficients, evidence.sizes, strict=True
-        ):
-            p = by_name[name]
-            coefficients.append(float(np.clip(p.null + x * size, p.low, p.high) - p.null) / size)
-        return dc.replace(evidence, coefficients=coefficients)
 
     def pairs(self, counts: Mapping[int, int]) -> list[Pair]:
         """What slices of experiments do, by the number of the experiment."""
