@@ -5,7 +5,7 @@ import functools
 import hashlib
 import os
 import queue
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -18,9 +18,10 @@ from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.simulate import KnifePath
 from sliceit_drake.cutting.solver import NOT_FINITE, run_exchanges
 from sliceit_drake.cutting.workspace import Workspace, parameter_row
+from sliceit_drake.diagnosis import cluster
 from sliceit_drake.diagnosis.clock import BLOCK, Clock, Stretches
 
-__all__ = ["Job", "Run", "Simulator", "cutting_source"]
+__all__ = ["Job", "Run", "Runner", "Simulator", "cutting_source"]
 
 KEPT = 4000
 """Runs that are kept in memory."""
@@ -78,9 +79,10 @@ class _Poses:
 
 
 class Simulator:
-    """Runs jobs in threads; keeps what was run, in memory and on disk, by what goes into it.
+    """Runs jobs; keeps what was run, in memory and on disk, by what goes into it.
 
-    Not to be called from several threads at once.
+    They run in threads; within `cluster.on_cluster`, on the cluster. Not to be called from several
+    threads at once.
 
     Args:
         clock: Of the jobs.
@@ -98,7 +100,7 @@ class Simulator:
     ) -> None:
         self._clock, self._board, self._cache = clock, board, cache
         self._workers = workers or os.cpu_count() or 1
-        self._runners: list[_Runner] = []
+        self._runners: list[Runner] = []
         self._memory: dict[str, Run] = {}
         self._geometry: dict[int, tuple[object, bytes]] = {}
         self.simulated = 0
@@ -123,10 +125,30 @@ class Simulator:
                     missing[key] = job
                 else:
                     self._memory[key] = found
-        threads = max(1, min(self._workers, len(missing)))
+        # Those of one mesh in a row, so that few device arrays change hands.
+        order = sorted(missing.items(), key=lambda item: id(item[1].model.split))
+        finished = (
+            cluster.run_jobs(order, self._clock.period, self._board)
+            if cluster.active()
+            else self._in_threads(order)
+        )
+        for done, (key, run) in enumerate(finished, 1):
+            self._memory[key] = run
+            if run.failure is None:
+                self._save(key, run)
+            self.simulated += 1
+            if progress is not None:
+                progress(done, len(order))
+        runs = [self._memory[key] for key in keys]
+        while len(self._memory) > KEPT:
+            self._memory.pop(next(iter(self._memory)))
+        return runs
+
+    def _in_threads(self, order: Sequence[tuple[str, Job]]) -> Iterator[tuple[str, Run]]:
+        threads = max(1, min(self._workers, len(order)))
         while len(self._runners) < threads:
-            self._runners.append(_Runner(self._clock.period, self._board))
-        spare: queue.SimpleQueue[_Runner] = queue.SimpleQueue()
+            self._runners.append(Runner(self._clock.period, self._board))
+        spare: queue.SimpleQueue[Runner] = queue.SimpleQueue()
         for runner in self._runners:
             spare.put(runner)
 
@@ -137,20 +159,8 @@ class Simulator:
             finally:
                 spare.put(runner)
 
-        # Those of one mesh in a row, so that few device arrays change hands.
-        order = sorted(missing.items(), key=lambda item: id(item[1].model.split))
         with ThreadPoolExecutor(threads) as pool:
-            for done, (key, run) in enumerate(pool.map(work, order), 1):
-                self._memory[key] = run
-                if run.failure is None:
-                    self._save(key, run)
-                self.simulated += 1
-                if progress is not None:
-                    progress(done, len(order))
-        runs = [self._memory[key] for key in keys]
-        while len(self._memory) > KEPT:
-            self._memory.pop(next(iter(self._memory)))
-        return runs
+            yield from pool.map(work, order)
 
     def _key(self, job: Job) -> str:
         """Hash of all that the result depends on, the cutting code included."""
@@ -200,7 +210,7 @@ def cutting_source() -> bytes:
     return h.digest()
 
 
-class _Runner:
+class Runner:
     """Runs one job at a time, keeping the device arrays from one to the next."""
 
     def __init__(self, period: float, board: Board) -> None:

@@ -1,0 +1,153 @@
+"""Spreads simulations over a cluster, through joblib's Dask back end.
+
+    with on_cluster("tcp://192.168.0.5:8786"):
+        result = diagnose(...)
+
+Every simulator that runs within the block sends its missing slices to the scheduler's workers. The
+workers need this package, in the same version. What is found in memory or on disk is not sent, and
+what comes back is kept here, so that results are those of one process.
+"""
+
+import contextlib
+import dataclasses as dc
+import threading
+from collections.abc import Iterator, Sequence
+from contextvars import ContextVar
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.board import Board
+from sliceit_drake.cutting.geometry import CutGeometry
+from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.diagnosis.clock import Stretches
+
+if TYPE_CHECKING:
+    from sliceit_drake.diagnosis.simulator import Job, Run
+
+__all__ = ["active", "on_cluster", "run_jobs"]
+
+CONNECT = 10.0
+"""Time to reach a scheduler and one worker, s."""
+GEOMETRIC = ("blocks", "shape", "_gradient_products", "section_area")
+"""What a cut keeps that only depends on its geometry; see `CuttingModel.derive`."""
+
+_CLIENT: ContextVar[Any] = ContextVar("client", default=None)
+
+
+def active() -> bool:
+    """Whether simulations go to a cluster here."""
+    return _CLIENT.get() is not None
+
+
+@contextlib.contextmanager
+def on_cluster(scheduler: str, patience: float = CONNECT) -> Iterator[None]:
+    """Sends simulations to a Dask scheduler.
+
+    Args:
+        scheduler: Its address, as tcp://HOST:8786.
+        patience: For it and for its first worker, s.
+
+    Raises:
+        ConfigurationError: The package is not installed, or nobody answers there.
+    """
+    try:
+        import joblib  # noqa: F401
+        from distributed import Client
+    except ImportError as error:
+        raise ConfigurationError(
+            f"needs the packages of the extra `cluster` ({error.name} is missing)",
+            field="--backend",
+            fix="pip install 'sliceit_drake[cluster]'",
+        ) from error
+    try:
+        client = Client(scheduler, timeout=patience, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(
+            f"no Dask scheduler answers at {scheduler}",
+            field="--scheduler",
+            fix="Start one (dask scheduler), give the address that it prints, and check that no"
+            " firewall is between.",
+        ) from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=patience)
+        except TimeoutError as error:
+            raise ConfigurationError(
+                f"the scheduler at {scheduler} has no workers",
+                field="--scheduler",
+                fix=f"Start some on the machines of the cluster: dask worker {scheduler}",
+            ) from error
+        token = _CLIENT.set(client)
+        try:
+            yield
+        finally:
+            _CLIENT.reset(token)
+
+
+def run_jobs(
+    items: "Sequence[tuple[str, Job]]", period: float, board: Board
+) -> "Iterator[tuple[str, Run]]":
+    """Runs jobs on the cluster, in any order.
+
+    Args:
+        items: Keys and jobs, those of one mesh in a row.
+        period: Of the shortest exchange, s.
+        board: Under the knife.
+    """
+    import joblib
+
+    if not items:
+        return
+    work: list[Any] = []
+    meshes: list[CuttingModel] = []
+    for key, job in items:
+        model = job.model
+        if not meshes or meshes[-1].split is not model.split:
+            meshes.append(model)
+        shared = meshes[-1]
+        own = {
+            f.name: getattr(model, f.name)
+            for f in dc.fields(model)
+            if getattr(model, f.name) is not getattr(shared, f.name)
+        }
+        rest = (job.R, job.p, job.stretches, job.name)
+        work.append(joblib.delayed(_run_there)(key, shared, own, rest, period, board))
+    # What is scattered travels to a worker once, however many calls name it.
+    with joblib.parallel_config(backend="dask", client=_CLIENT.get(), scatter=meshes):
+        # One slice takes longer than to send it; larger batches would leave workers idle.
+        parallel = joblib.Parallel(n_jobs=-1, batch_size=1, return_as="generator_unordered")
+        yield from parallel(work)
+
+
+def _rebuilt(shared: CuttingModel, own: dict[str, Any]) -> CuttingModel:
+    """The cut of a job from the one that it shares most with."""
+    fields = {f.name: getattr(shared, f.name) for f in dc.fields(shared)} | own
+    model = type(shared)(**fields)
+    if not set(own) & {f.name for f in dc.fields(CutGeometry)}:
+        for name in GEOMETRIC:
+            if name in shared.__dict__:
+                model.__dict__[name] = shared.__dict__[name]
+    return model
+
+
+_THREAD = threading.local()
+
+
+def _run_there(
+    key: str,
+    shared: CuttingModel,
+    own: dict[str, Any],
+    rest: tuple[np.ndarray, np.ndarray, Stretches, str],
+    period: float,
+    board: Board,
+) -> "tuple[str, Run]":
+    """Runs a job on a worker, which keeps what it needs from one to the next."""
+    from sliceit_drake.diagnosis.simulator import Job, Runner
+
+    runners: dict[tuple[float, str], Runner] = _THREAD.__dict__.setdefault("runners", {})
+    place = (period, repr(board))
+    if place not in runners:
+        runners[place] = Runner(period, board)
+    return key, runners[place].run(Job(_rebuilt(shared, own), *rest))
