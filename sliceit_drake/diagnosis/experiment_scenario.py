@@ -34,6 +34,8 @@ __all__ = [
 
 TOLERANCE = 2e-5
 """By which a motion that is read from a record may be off, metres."""
+REACH = (0.3, 0.7)
+"""Distances from the base at which the arm cuts, metres."""
 GAINS = 200.0
 """Of the controller in motion mode, as scenarios/cucumber.yaml has it."""
 
@@ -70,16 +72,16 @@ def scenario_of(
     food = _scaled(food_of(setup.food, template), experiment.size)
     # An arm and a holder that give belong to the station, not to the food.
     food.effects = dc.replace(food.effects, compliance=Compliance(), slip=Slip())
+    if experiment.peeled:
+        food.effects.skin = dc.replace(food.effects.skin, toughness=0.0)
     facts, scenario = template.metadata.food, Scenario(name=experiment.name)
     scenario.board = dc.replace(setup.board)
-    if facts.position is not None:
+    if facts.position is not None and _in_reach(facts.position, scenario):
         yaw = (facts.yaw or 0.0) - float(np.arctan2(-food.cut_normal[0], food.cut_normal[1]))
         turn = Rotation.from_euler("z", yaw)
         place = np.array(facts.position) - turn.apply([*food.cut_point[:2], 0.0])
         scenario.placement = Placement(position=place[:2].tolist(), yaw=yaw)
         scenario.board.height = float(place[2])
-    elif template.metadata.board_height is not None:
-        scenario.board.height = template.metadata.board_height
     scenario.controller.mode = "motion"
     scenario.controller.error_scale = 1.0
     scenario.controller.p_gains = [GAINS] * 6
@@ -225,6 +227,13 @@ def _legs(time: np.ndarray, values: np.ndarray) -> list[int]:
             kept.append(worst)
             open_ += [(a, worst), (worst, b)]
     return sorted(kept)
+
+
+def _in_reach(position: Sequence[float], scenario: Scenario) -> bool:
+    """Whether the station's arm reaches a place; records of others have their own origin."""
+    away = np.array(position) - scenario.robot.base_position
+    low, high = REACH
+    return bool(low <= np.hypot(*away[:2]) <= high and abs(away[2]) <= low)
 
 
 def _start(scenario: Scenario, setup: CalibrationSetup) -> Pose:

@@ -33,7 +33,7 @@ from sliceit_drake.diagnosis.linear import LinearProblem, integrate_out, scaled_
 from sliceit_drake.diagnosis.motion_menu import Experiment, menu
 from sliceit_drake.diagnosis.screen import CauseEvidence, Screening
 from sliceit_drake.diagnosis.sensitivity import RecordSensitivity, Sensitivities, sensitivities
-from sliceit_drake.diagnosis.verdict import ALARM, CLASS_ANGLE, CLASS_GAIN, LEAST_REPLICATES
+from sliceit_drake.diagnosis.verdict import ALARM, CLASS_ANGLE, LEAST_REPLICATES
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.records.slice_record import SliceRecord
 
@@ -48,6 +48,9 @@ NEEDED = float((norm.ppf(1.0 - ALARM) + norm.ppf(POWER)) ** 2)
 """Expected gain that a test at the verdict's level finds with `POWER`."""
 MARGIN = 5.0
 """By which the angle shall exceed that of a class, degrees: sizes were estimated."""
+ALIKE_GAIN = 0.35
+"""A cause whose gain falls short of the largest by no more than this share may be the one that
+acts: what it gains depends on how well the form that is assumed for it fits."""
 MOST_SLICES = 12
 """More slices of one motion are not proposed."""
 MOST_STEPS = 3
@@ -312,7 +315,7 @@ class _Class:
 
 def _classes(diagnosis: "Diagnosis") -> list[_Class]:
     """What is to be told apart: of each finding those that the verdict names with it, and those
-    that would have been taken for it if they were the ones that act."""
+    that are nearly so, or would be taken for it if they were the ones that act."""
     verdict, problem = diagnosis.verdict, diagnosis.problem
     out = []
     assumed: tuple[tuple[str, float | None], ...] = ()
@@ -321,15 +324,17 @@ def _classes(diagnosis: "Diagnosis") -> list[_Class]:
     ):
         best = finding.evidence
         if screening is not None and not best.per_record:
-            floor = best.score - CLASS_GAIN * best.gain
             alike = [
                 e.name
                 for e in screening.causes
                 if e.name not in finding.names
                 and not e.per_record
-                and e.score >= floor
-                and max(map(abs, e.coefficients)) > 0.0
-                and screening.angle_to(problem, e, best.name) <= CLASS_ANGLE
+                and e.gain >= (1.0 - ALIKE_GAIN) * best.gain
+                and min(
+                    screening.angle_to(problem, e, best.name),
+                    screening.angle_to(problem, best, e.name),
+                )
+                < CLASS_ANGLE + MARGIN
             ]
             names = [*finding.names, *alike]
             if len(names) > 1:
