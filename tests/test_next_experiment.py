@@ -1,5 +1,6 @@
 """What is cut next parts causes that the records could not, on the station and on the stand-in."""
 
+import copy
 import dataclasses as dc
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.effects import Effects
 from sliceit_drake.cutting.food import Cylinder
 from sliceit_drake.diagnosis import next_experiment as proposing
 from sliceit_drake.diagnosis.diagnose import Diagnosis, setup_of_food
@@ -24,7 +26,7 @@ from sliceit_drake.diagnosis.sensitivity import Sensitivities, sensitivities
 from sliceit_drake.diagnosis.verdict import CLASS_ANGLE, reach_verdict
 from sliceit_drake.diagrams.calibrated_food import CalibratedFood
 from sliceit_drake.diagrams.run import prepare_run, simulate
-from sliceit_drake.diagrams.scenario import load_scenario
+from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.records.validation import load_sessions
 from sliceit_drake.resources import resource_path
@@ -191,6 +193,27 @@ def test_a_peeled_food_has_no_skin_on_the_station(tmp_path):
     assert load_scenario(file).food.effects.skin.toughness == 0.0
     file.write_text("food: {effects: {skin: {toughness: 0.5}}}\n")
     assert load_scenario(file).food.effects.skin.toughness == 0.5
+
+
+def test_the_stand_in_cuts_a_scenario_of_a_calibrated_food_without_its_effects(tmp_path):
+    file = tmp_path / "calibrated.yaml"
+    file.write_text("calibration: cucumber\n")
+    scenario = load_scenario(file)
+    assert scenario.food.effects.skin.toughness > 0.0
+    food = protocol_of_scenario(scenario).food
+    assert food.effects == Effects() and food.material == scenario.food.material
+
+
+def test_records_of_another_place_are_cut_where_the_station_reaches(bench):
+    far = dc.replace(bench.records[0], metadata=copy.deepcopy(bench.records[0].metadata))
+    far.metadata.food.position = [3.0, -2.0, 0.9]
+    experiment = menu(scale_of(SETUP, bench.records))[0]
+    scenario = scenario_of(experiment, SETUP, far)
+    assert scenario.placement == Scenario().placement
+    near = scenario_of(experiment, SETUP, bench.records[0])
+    place = bench.records[0].metadata.food.position
+    assert near.placement.position == pytest.approx(place[:2])
+    assert near.board.height == pytest.approx(place[2])
 
 
 @pytest.mark.parametrize("height", [0.02, 0.027, 0.04, 0.06])

@@ -463,19 +463,21 @@ class _Search:
     def result(self) -> NextExperiment:
         """The motions that part most pairs with fewest slices."""
         counts: dict[int, int] = {}
-        pairs: list[Pair] = []
-        while len(counts) < MOST_STEPS and not (pairs and all(p.parts for p in pairs)):
+        pairs = [Pair(a, b, angle, angle, gain, 0.0) for a, b, angle, gain in self._before]
+        while len(counts) < MOST_STEPS and not all(p.parts for p in pairs):
             choice = self._best(counts)
-            parted = sum(p.parts for p in pairs)
-            if choice is None or sum(p.parts for p in choice.pairs) <= parted:
+            if choice is None or sum(p.parts for p in choice.pairs) <= sum(p.parts for p in pairs):
                 break
             counts[choice.number], pairs = choice.slices, choice.pairs
         steps = [Step(self.experiments[k], self.scenarios[k], n) for k, n in counts.items()]
         classes = "; ".join("{" + ", ".join(e.name for e in c.evidence) + "}" for c in self.classes)
+        if all(p.parts for p in pairs) and not steps:
+            reason = f"nothing to split: the records at hand part {classes}"
+            return NextExperiment("none", reason, [], pairs)
         if not steps:
             number, angle = self._largest()
             reason = (
-                f"no motion of the menu parts any of {classes} at the sizes found; the largest "
+                f"no motion of the menu parts more of {classes} at the sizes found; the largest "
                 f"least angle, {angle:.0f} degrees, is that of {self.experiments[number].name}"
             )
             return NextExperiment("none", reason, [], self.pairs({number: MOST_SLICES}))
