@@ -78,6 +78,17 @@ def example_slice(noise: float = 0.1, seed: int = 0) -> SliceRecord:
     )
 
 
+def short_press() -> SliceRecord:
+    """From 1 mm above the food to 4 mm in it at 50 mm/s."""
+    metadata = example_metadata()
+    metadata.motion.phases, metadata.motion.speed, metadata.motion.draw_ratio = [], 0.05, 0.0
+    time = np.arange(0.0, 0.1, 2e-3)
+    position = np.column_stack([0.4 + 0 * time, 0.1 + 0 * time, 0.02 + HEIGHT + 1e-3 - 0.05 * time])
+    rotation = np.broadcast_to(np.diag([1.0, -1.0, -1.0]), (len(time), 3, 3)).copy()
+    v, w = velocities(time, position, rotation)
+    return SliceRecord(metadata, time, position, rotation, v, w, np.zeros((len(time), 3)))
+
+
 def wrist_motion(time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """A smooth motion about all axes with its exact velocities: p_WK, R_WK, v_WK, w_WK."""
     axis = np.array([1.0, 2.0, -0.5]) / np.linalg.norm([1.0, 2.0, -0.5])

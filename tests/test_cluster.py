@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from example_slices import HEIGHT, example_metadata
+from example_slices import HEIGHT, short_press
 
 from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.configuration import ConfigurationError
@@ -12,20 +12,8 @@ from sliceit_drake.diagnosis.cluster import active, on_cluster
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.diagnosis.simulator import Runner
 from sliceit_drake.diagnosis.slices import Meshing
-from sliceit_drake.records.slice_record import SliceRecord, velocities
 
 distributed = pytest.importorskip("distributed")
-
-
-def short_press() -> SliceRecord:
-    """From 1 mm above the food to 4 mm in it at 50 mm/s."""
-    metadata = example_metadata()
-    metadata.motion.phases, metadata.motion.speed, metadata.motion.draw_ratio = [], 0.05, 0.0
-    time = np.arange(0.0, 0.1, 2e-3)
-    position = np.column_stack([0.4 + 0 * time, 0.1 + 0 * time, 0.02 + HEIGHT + 1e-3 - 0.05 * time])
-    rotation = np.broadcast_to(np.diag([1.0, -1.0, -1.0]), (len(time), 3, 3)).copy()
-    v, w = velocities(time, position, rotation)
-    return SliceRecord(metadata, time, position, rotation, v, w, np.zeros((len(time), 3)))
 
 
 def points() -> list[Point]:

@@ -2,6 +2,7 @@
 
 import argparse
 import os
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,8 +18,8 @@ __all__ = ["add_parser"]
 DESCRIPTION = """\
 Compare slice records with a calibrated food, name what causes the difference and measure the gain.
 
-RECORDS_DIR holds slice records (docs/records.md), best three or more of each condition at several
-speeds, with a hold, a withdrawal and draws. Writes to DIR:
+RECORDS_DIR holds slice records (docs/records.md), or is one; best three or more of each condition
+at several speeds, with a hold, a withdrawal and draws. Writes to DIR:
   diagnosis.json  verdict, evidence, values, errors
   report.html     prediction against measurement, evidence, angles between causes; opens anywhere
   extended.yaml   the food with the cause in it: `calibration: DIR/extended.yaml` in a scenario
@@ -35,6 +36,8 @@ diagnosed together; give the folders in the order in which they were recorded.
   sliceit diagnose records/monday --model cucumber --output output/diagnosis
   sliceit diagnose records/monday --model cucumber --output output/a --next-experiment next.yaml
   sliceit diagnose records/monday records/tuesday --model cucumber --output output/b
+  sliceit diagnose records/monday --model cucumber --output output/c \\
+      --backend dask --scheduler tcp://192.168.0.5:8786
 """
 
 
@@ -76,39 +79,87 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument(
         "--workers", type=int, default=os.cpu_count() or 1, help="processors (default: all)"
     )
+    parser.add_argument(
+        "--backend",
+        choices=("threads", "dask"),
+        default="threads",
+        help="where slices are simulated: threads of this machine (the default), or the workers of"
+        " a Dask cluster",
+    )
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="of the cluster, as tcp://192.168.0.5:8786"
+    )
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     from sliceit_drake.configuration import ConfigurationError
-    from sliceit_drake.diagnosis.diagnose import diagnose, setup_of_food
+    from sliceit_drake.diagnosis.cluster import on_cluster
     from sliceit_drake.diagnosis.input_checks import check_folder
-    from sliceit_drake.diagnosis.next_experiment import next_experiment
     from sliceit_drake.diagnosis.registry import load_cause
     from sliceit_drake.diagrams.calibrated_food import load_calibrated_food
     from sliceit_drake.records.validation import load_sessions
 
     for folder in options.records:
-        if not folder.is_dir():
+        if not folder.is_dir() and folder.suffix not in (".csv", ".yaml"):
             raise ConfigurationError(
                 "is no folder", source=str(folder), fix="Give folders of slice records."
             )
+    _check_options(options)
     food = load_calibrated_food(options.model)
     extra = [load_cause(file) for file in options.cause]
     records = load_sessions(options.records)
-    setup = setup_of_food(food, options.refinement)
-    cache = options.cache or options.output / "cache"
+    # Before hours are spent for what cannot be kept.
+    options.cache = options.cache or options.output / "cache"
     check_folder(options.output, "--output")
-    check_folder(cache, "--cache")
-    if len(records) == 1:
-        return _one_slice(options, food, records[0], extra, cache)
+    check_folder(options.cache, "--cache")
+    if options.next_experiment is not None:
+        check_folder(options.next_experiment.parent, "--next-experiment")
+    place = on_cluster(options.scheduler) if options.backend == "dask" else nullcontext()
+    with place:
+        if len(records) == 1:
+            return _one_slice(options, food, records[0], extra)
+        return _diagnose(options, food, records, extra)
+
+
+def _check_options(options: argparse.Namespace) -> None:
+    from sliceit_drake.configuration import ConfigurationError
+
+    for name, least, most in (
+        ("workers", 1, 10_000),
+        ("refinement", 0.2, 4.0),
+        ("replicates", 1, 100_000),
+    ):
+        value = getattr(options, name)
+        if not least <= value <= most:
+            raise ConfigurationError(
+                f"is {value:g}", field=f"--{name}", fix=f"Give {least:g} to {most:g}."
+            )
+    if (options.backend == "dask") != (options.scheduler is not None):
+        raise ConfigurationError(
+            "is given without --backend dask" if options.scheduler else "is not given",
+            field="--scheduler",
+            fix="Give both: --backend dask --scheduler tcp://HOST:8786.",
+        )
+
+
+def _diagnose(
+    options: argparse.Namespace,
+    food: "CalibratedFood",
+    records: "list[SliceRecord]",
+    extra: "list[Cause]",
+) -> int:
+    """Diagnoses several slices."""
+    from sliceit_drake.diagnosis.diagnose import diagnose, setup_of_food
+    from sliceit_drake.diagnosis.next_experiment import next_experiment
+
     with StageBars() as bars:
         result = diagnose(
-            setup,
+            setup_of_food(food, options.refinement),
             records,
             extra,
-            cache,
+            options.cache,
             options.replicates,
             options.seed,
             options.workers,
@@ -119,7 +170,7 @@ def run(options: argparse.Namespace) -> int:
             result.next_experiment = next_experiment(
                 result,
                 records,
-                cache,
+                options.cache,
                 options.workers,
                 lambda done, total: bars.show("motions of the menu", done, total),
             )
@@ -135,7 +186,6 @@ def _one_slice(
     food: "CalibratedFood",
     record: "SliceRecord",
     extra: "list[Cause]",
-    cache: Path,
 ) -> int:
     """Says what one slice shows."""
     from sliceit_drake.configuration import ConfigurationError
@@ -155,7 +205,7 @@ def _one_slice(
             setup_of_slice(food, options.refinement),
             record,
             extra,
-            cache,
+            options.cache,
             options.replicates,
             options.seed,
             options.workers,

@@ -25,6 +25,7 @@ BEGUN = 0.1
 """Share of the greatest force that the first rows may have before contact."""
 CONTACT = 0.1
 """Share of the greatest force at which there is contact for certain."""
+CUTTING = ("slice", "second_pass", "hold", "retract")
 EARLY, LATE = 2e-3, 0.5
 """How far above the food contact may begin, metres, and how deep in it, of its height."""
 SAME_SPEED, SAME_DRAW = 0.1, 0.1
@@ -143,6 +144,13 @@ def _check_foods(records: Sequence[SliceRecord], food: Food, other_food: bool) -
             source=_file(records[0]),
             field="food.name",
             fix="Add records of slices; those of air, board and weight go with them.",
+        )
+    if all(r.metadata.motion.phases and not r.phase(*CUTTING).any() for r in cut):
+        raise ConfigurationError(
+            "in none of the records is a phase labelled slice: nothing is cut",
+            source=_facts_file(cut[0]),
+            field="motion.phases",
+            fix="Add records of slices, and label the time in which the knife cuts as slice.",
         )
     foods: dict[str, list[SliceRecord]] = {}
     for record in cut:

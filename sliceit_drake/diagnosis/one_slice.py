@@ -72,6 +72,9 @@ CONFIRMED = 3
 """Most causes that are fitted by simulation."""
 REPLICATES = 3
 """Slices of each condition from which variation can be told from an effect."""
+LEAST_SPREAD = 0.5
+"""Of a gain where nothing is wrong: that of a cause that hardly shows is next to none, and must not
+turn what is small into many standard deviations."""
 REFINED = 1.5
 END = 0.02
 """Last stretch of a record without a say in the evidence, s: the simulated knife comes to rest when
@@ -140,6 +143,7 @@ class OneSlice:
         angles: Between causes, from projected sensitivities.
         causes: All that were tested, by name.
         remarks: What a reader must know.
+        elements: Tetrahedra of the food.
     """
 
     record: RecordSensitivity
@@ -150,6 +154,7 @@ class OneSlice:
     angles: Identifiability
     causes: dict[str, Cause]
     remarks: list[str]
+    elements: int = 0
 
     kind = KIND
 
@@ -422,6 +427,7 @@ def diagnose_slice(
         angles=angles,
         causes=by_name,
         remarks=[*remarks, *found.warnings],
+        elements=found.elements,
     )
     show("fits", 2, stages)
     for done, c in enumerate(_promising(evidence), 3):
@@ -539,10 +545,10 @@ def slice_evidence(
     best = _best_gains(problem, options, record.residual)
     null = []
     for _ in range(replicates):
-        gains = _best_gains(problem, options, problem.sample(rng, known))
+        gains = _best_gains(problem, options, problem.sample(rng))
         null.append([gains[name][0] for name in found.causes])
     draws = np.array(null)
-    mean, spread = draws.mean(0), np.maximum(draws.std(0), 1e-9)
+    mean, spread = draws.mean(0), np.maximum(draws.std(0), LEAST_SPREAD)
     largest = ((draws - mean) / spread).max(1)
     held_out = _HeldOut(problem, block, own)
     causes = []
@@ -651,12 +657,12 @@ class _Slice:
             b - self.cross.T @ (self.inverse @ np.tensordot(self.XV, y, ((0, 1), (0, 1))))
         )
 
-    def sample(self, rng: np.random.Generator, known: Sequence[int]) -> np.ndarray:
-        """A residual where nothing is wrong [m, c]."""
+    def sample(self, rng: np.random.Generator) -> np.ndarray:
+        """A residual where nothing is wrong [m, c]: the process, and what is free or known but for
+        a spread as it may be."""
         y = np.column_stack([V.sample(rng) for V in self._draws])
-        n = len(known)
-        deviation = 1.0 / np.sqrt(self.precision[len(self.precision) - n :])
-        return y + self.X[:, :, self.X.shape[2] - n :] @ (deviation * rng.normal(size=n))
+        deviation = 1.0 / np.sqrt(self.precision)
+        return np.asarray(y + self.X @ (deviation * rng.normal(size=len(deviation))))
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:

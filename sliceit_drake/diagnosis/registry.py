@@ -3,6 +3,7 @@
 import importlib.util
 import inspect
 import sys
+import traceback
 from collections.abc import Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagnosis.cause import Cause, check_cause
 from sliceit_drake.diagnosis.causes import BUILT_IN
+from sliceit_drake.diagnosis.rehearsal import rehearse
 
 __all__ = ["ENTRY_POINTS", "all_causes", "causes_as_markdown", "load_cause", "open_causes"]
 
@@ -21,11 +23,20 @@ def all_causes() -> list[Cause]:
     """The causes that come with the package, and those of installed packages.
 
     Raises:
-        ConfigurationError: An installed cause is incomplete, or a name is there twice.
+        ConfigurationError: An installed cause cannot be loaded or is incomplete, or a name is there
+            twice.
     """
     causes = [kind() for kind in BUILT_IN]
     for point in entry_points(group=ENTRY_POINTS):
-        cause = point.load()()
+        try:
+            cause = point.load()()
+        except Exception as error:
+            raise ConfigurationError(
+                f"cannot be loaded: {type(error).__name__}: {error}",
+                source=f"entry point {point.name} = {point.value}",
+                field=ENTRY_POINTS,
+                fix="Correct or uninstall the package that offers it.",
+            ) from error
         check_cause(cause, f"entry point {point.name}")
         causes.append(cause)
     _check_names(causes)
@@ -60,8 +71,8 @@ def load_cause(file: str | Path) -> Cause:
     """The cause in a user's file.
 
     Raises:
-        ConfigurationError: There is no such file, it does not hold one cause, or that is
-            incomplete.
+        ConfigurationError: There is no such file, it does not run or does not hold one cause, or
+            that is incomplete or fails on a made-up slice.
     """
     file = Path(file)
     spec = importlib.util.spec_from_file_location(f"sliceit_cause_{file.stem}", file)
@@ -72,7 +83,10 @@ def load_cause(file: str | Path) -> Cause:
     module = importlib.util.module_from_spec(spec)
     # Where the source of a class is looked up.
     sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise _broken(file, error, "cannot be read as Python") from error
     kinds = [
         kind
         for _, kind in inspect.getmembers(module, inspect.isclass)
@@ -84,9 +98,31 @@ def load_cause(file: str | Path) -> Cause:
             source=str(file),
             fix="Write one subclass of sliceit_drake.diagnosis.cause.Cause in it (docs/causes.md).",
         )
-    cause = kinds[0]()
+    try:
+        cause = kinds[0]()
+    except Exception as error:
+        raise _broken(file, error, "cannot be made") from error
     check_cause(cause, str(file))
+    try:
+        rehearse(cause, str(file))
+    except ConfigurationError:
+        raise
+    except Exception as error:
+        raise _broken(file, error, "fails on a made-up slice") from error
     return cause
+
+
+def _broken(file: Path, error: Exception, what: str) -> ConfigurationError:
+    """An error in a user's file, with the line of that file where it happened."""
+    lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(file)]
+    line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
+    text = error.msg if isinstance(error, SyntaxError) else str(error)
+    return ConfigurationError(
+        f"{what}: {type(error).__name__}: {text}",
+        source=f"{file}, line {line}" if line else str(file),
+        field="--cause",
+        fix="Correct the file (docs/causes.md has a complete example).",
+    )
 
 
 def causes_as_markdown(causes: Sequence[Cause]) -> str:

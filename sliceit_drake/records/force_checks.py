@@ -32,6 +32,10 @@ FROZEN_TIME = 0.2
 OFFSET = 0.02
 """Share of the greatest force that an offset in the air may have."""
 
+FLAT, FLAT_FAR = 5.0, 50.0
+"""Rows at exactly the greatest value from which on a sensor is taken for saturated, near its range
+and far from it."""
+
 ALONG = 0.2
 """Share of |F| |v| that the power must have at least for its sign to mean something."""
 
@@ -226,9 +230,11 @@ def _check_saturation(table: SliceTable, record: SliceRecord, findings: Findings
             if at.any():
                 text = f"{int(at.sum())} rows are at the sensor's range, {limit:g}"
                 _report_clipping(findings, name, text, at)
-            elif limit is None or np.abs(values).max() > 0.3 * limit:
-                # After taring a sensor saturates at another value than its range.
-                _check_flat_top(name, values, findings)
+            else:
+                # After taring a sensor saturates at another value than its range; one that does so
+                # far from it, an amplifier or a wrong range, must do so for longer to be believed.
+                near = limit is None or np.abs(values).max() > 0.3 * limit
+                _check_flat_top(name, values, findings, FLAT if near else FLAT_FAR)
     if record.force_norm is not None:
         _check_flat_top(fmt.FORCE_NORM, record.force_norm, findings)
 
@@ -245,7 +251,7 @@ def _in_sensor_axes(
     return [(name, table.columns[name]) for name in names]
 
 
-def _check_flat_top(name: str, values: np.ndarray, findings: Findings) -> None:
+def _check_flat_top(name: str, values: np.ndarray, findings: Findings, least: float = FLAT) -> None:
     """Runs of exactly the greatest or least value, longer than the signal's usual runs."""
     starts = np.concatenate([[0], np.flatnonzero(np.diff(values) != 0.0) + 1])
     lengths = np.diff(np.concatenate([starts, [len(values)]]))
@@ -255,7 +261,7 @@ def _check_flat_top(name: str, values: np.ndarray, findings: Findings) -> None:
             continue
         longest = int(lengths[is_extreme].max())
         # A slow sensor in a fast table, or a coarse one, repeats values all the time.
-        if longest >= max(5.0, 3.0 * np.percentile(lengths[~is_extreme], 95.0)):
+        if longest >= max(least, 3.0 * np.percentile(lengths[~is_extreme], 95.0)):
             text = f"{longest} rows in a row are exactly {extreme:.6g}, as of a sensor at its limit"
             _report_clipping(findings, name, text, values == extreme)
 

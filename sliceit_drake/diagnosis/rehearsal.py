@@ -1,0 +1,134 @@
+"""Tries a user's cause on a made-up slice, so that its mistakes show before any simulation."""
+
+import numpy as np
+
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.food import Cylinder, Food, make_food_model
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.model import CuttingModel, Numerics
+from sliceit_drake.diagnosis.cause import Cause, ForceSeries, SliceFacts
+
+__all__ = ["rehearse"]
+
+ROWS = 200
+PERIOD = 2e-3
+HEIGHT = 0.027
+
+
+def rehearse(cause: Cause, source: str = "") -> None:
+    """Calls the hooks of a cause at its nulls and at its size.
+
+    Args:
+        cause: Complete, as `check_cause` has it.
+        source: File, for messages.
+
+    Raises:
+        ConfigurationError: A hook gives what cannot be used, or changes something at the nulls.
+        Exception: Whatever a hook raises.
+    """
+    facts = SliceFacts("rehearsal", "press", height=HEIGHT, width=HEIGHT, speed=0.02)
+    nulls = cause.nulls()
+    if cause.scan is not None:
+        nulls[cause.scan.name] = cause.scan.values[0]
+    full = dict(nulls)
+    for p in cause.parameters:
+        full[p.name] = p.null - p.size if p.null == p.high else p.null + p.size
+    _try_wrench(cause, nulls, full, facts, source)
+    if type(cause).motion is not Cause.motion:
+        _try_motion(cause, nulls, full, facts, source)
+    if type(cause).model is not Cause.model:
+        food = Food(shape=Cylinder(HEIGHT, 0.06, 2, [0.0, 0.004, 0.012]), hold_distance=0.0119)
+        model = make_food_model(food, Knife(), Numerics(time_step=1e-3))
+        for values in (nulls, full):
+            if not isinstance(cause.model(model, values, facts), CuttingModel):
+                raise _refuse(cause, "model", "gives no CuttingModel", "Return one.", source)
+
+
+def _try_wrench(
+    cause: Cause,
+    nulls: dict[str, float],
+    full: dict[str, float],
+    facts: SliceFacts,
+    source: str,
+) -> None:
+    series = made_up_slice()
+    before = series.wrench.copy()
+    for values, name in ((nulls, "nulls"), (full, "size")):
+        out = cause.wrench(series, values, facts)
+        if not np.array_equal(series.wrench, before):
+            fix = "Begin with out = series.wrench.copy(), change out and return it."
+            raise _refuse(cause, "wrench", "changes series.wrench itself", fix, source)
+        if np.shape(out) != before.shape:
+            raise _refuse(
+                cause,
+                "wrench",
+                f"gives an array {list(np.shape(out))}, expected {list(before.shape)}",
+                "Return moments and forces of all rows [N, 6].",
+                source,
+            )
+        if not np.isfinite(out).all():
+            fix = "Mind divisions by a speed or depth of zero."
+            raise _refuse(cause, "wrench", f"is not finite at its {name}", fix, source)
+        if values is nulls and not np.allclose(out, before, rtol=0.0, atol=1e-9):
+            fix = "Multiply all that it adds by a parameter whose null is 0."
+            raise _refuse(cause, "wrench", "changes the force at its nulls", fix, source)
+
+
+def _try_motion(
+    cause: Cause,
+    nulls: dict[str, float],
+    full: dict[str, float],
+    facts: SliceFacts,
+    source: str,
+) -> None:
+    series = made_up_slice()
+    t = np.concatenate([[series.time[0] - PERIOD], series.time])
+    R, p = (np.concatenate([v[:1], v]) for v in (series.R, series.p))
+    force = series.wrench[:, 3:]
+    for values in (nulls, full):
+        moved = cause.motion(R.copy(), p.copy(), t, values, facts, force)
+        shapes = [list(np.shape(v)) for v in moved]
+        if shapes != [list(R.shape), list(p.shape)]:
+            raise _refuse(
+                cause,
+                "motion",
+                f"gives arrays {shapes}, expected {[list(R.shape), list(p.shape)]}",
+                "Return R [N + 1, 3, 3] and p [N + 1, 3].",
+                source,
+            )
+        if values is nulls and not (np.allclose(moved[0], R) and np.allclose(moved[1], p)):
+            fix = "Multiply all that it adds by a parameter whose null is 0."
+            raise _refuse(cause, "motion", "changes the motion at its nulls", fix, source)
+
+
+def _refuse(cause: Cause, hook: str, problem: str, fix: str, source: str) -> ConfigurationError:
+    return ConfigurationError(
+        problem, source=source, field=f"{type(cause).__name__}.{hook}", fix=fix
+    )
+
+
+def made_up_slice() -> ForceSeries:
+    """A press into food, a stop and a withdrawal, with a force that goes with the depth."""
+    time = PERIOD * np.arange(1, ROWS + 1)
+    turn = 0.6 * time[-1]
+    depth = 0.1 * np.minimum(time, turn) - 0.005 - 0.1 * np.maximum(time - 0.7 * time[-1], 0.0)
+    v = np.zeros((ROWS, 3))
+    v[:, 2] = -np.gradient(depth, PERIOD)
+    p = np.zeros((ROWS, 3))
+    p[:, 2] = HEIGHT - depth
+    inside = depth > 0.0
+    parts = {name: np.zeros((ROWS, 6)) for name in ("edge", "normal", "friction", "board")}
+    parts["weight"] = np.zeros((ROWS, 6))
+    parts["edge"][:, 5] = 500.0 * np.clip(depth, 0.0, None)
+    parts["friction"][:, 5] = -50.0 * np.sign(v[:, 2]) * np.clip(depth, 0.0, None)
+    return ForceSeries(
+        time=time,
+        R=np.broadcast_to(np.diag([1.0, -1.0, -1.0]), (ROWS, 3, 3)).copy(),
+        p=p,
+        v=v,
+        w=np.zeros((ROWS, 3)),
+        parts=parts,
+        depth=depth,
+        in_contact=inside,
+        wrench=np.asarray(sum(parts.values())),
+    )
