@@ -96,6 +96,20 @@ def test_cases_follow_from_the_seed_and_any_first_part_has_all_kinds():
     assert all(c.hidden == () for c in cases if c.kind == "nothing")
 
 
+def test_only_the_effects_that_are_wanted_are_looked_up_and_hidden():
+    asked = set()
+
+    def size(protocol: str, effect: str, delta: float) -> float | None:
+        asked.add(effect)
+        return size_of(protocol, effect, delta)
+
+    cases = make_cases(size, ["skin"], effects=("skin", "warm_wrist"), protocols=("rich",))
+    assert asked == {"skin", "warm_wrist"}
+    assert {h.effect for c in cases for h in c.hidden} == asked
+    assert {c.kind for c in cases} == {"single", "nothing", "unknown", "curve"}
+    assert {c.protocol for c in cases} == {"rich"}
+
+
 def test_a_case_survives_its_file():
     case = Case("ab", "pairs", "rich", (Hidden("skin", 0.5, 2.0), Hidden("core", 0.1, 3.0)), 7)
     assert Case.of(json.loads(json.dumps(dc.asdict(case)))) == case

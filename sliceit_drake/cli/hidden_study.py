@@ -41,6 +41,7 @@ def add_hidden_study(studies: "argparse._SubParsersAction[argparse.ArgumentParse
     hidden.add_argument(
         "--protocols", nargs="+", metavar="NAME", help="only these (default: rich full poor)"
     )
+    hidden.add_argument("--effects", nargs="+", metavar="NAME", help="only these (default: all)")
     hidden.add_argument("--runs", type=int, metavar="N", help="only the first N of the list")
     hidden.add_argument("--minutes", type=float, metavar="M", help="begin no run after these")
     hidden.add_argument("--workers", type=int, default=2, help="processes (default 2)")
@@ -68,7 +69,10 @@ def run_hidden(options: argparse.Namespace) -> int:
     from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.hidden_study.cases import KINDS
     from sliceit_drake.hidden_study.study import StudyOptions, prepare, run_study
+    from sliceit_drake.stand_in.registry import make_effect
 
+    for effect in options.effects or ():
+        make_effect(effect)
     kinds = tuple(options.kinds or KINDS)
     protocols = tuple(options.protocols or ("rich", "full", "poor"))
     for kind in kinds:
@@ -78,8 +82,9 @@ def run_hidden(options: argparse.Namespace) -> int:
                 field="--kinds",
                 fix=f"Give some of {', '.join(KINDS)}.",
             )
+    effects = None if options.effects is None else tuple(options.effects)
     options.output.mkdir(parents=True, exist_ok=True)
-    settings = StudyOptions(kinds, options.seed, options.replicates, protocols)
+    settings = StudyOptions(kinds, options.seed, options.replicates, protocols, effects)
     with StageBars() as bars:
         cases = prepare(options.output, settings, bars.show)[: options.runs]
         done = run_study(

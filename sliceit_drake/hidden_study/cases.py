@@ -6,7 +6,7 @@ something of all.
 
 import dataclasses as dc
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -108,6 +108,7 @@ def make_cases(
     kinds: Sequence[str] = tuple(KINDS),
     counts: Mapping[str, int] | None = None,
     protocols: Sequence[str] = ("rich", "full", "poor"),
+    effects: Sequence[str] | None = None,
 ) -> list[Case]:
     """The list of runs.
 
@@ -118,8 +119,9 @@ def make_cases(
         kinds: Which kinds.
         counts: Of each kind, other than `KINDS`.
         protocols: Which may be used; a kind that has none of its own among them is left out.
+        effects: Which may be hidden; all by default. Only their sizes are asked for.
     """
-    maker = _Maker(size_of, seed, protocols)
+    maker = _Maker(size_of, seed, protocols, EFFECTS if effects is None else effects)
     of_kind = {
         "single": maker.single,
         "nothing": maker.nothing,
@@ -137,8 +139,11 @@ def make_cases(
 
 
 class _Maker:
-    def __init__(self, size_of: SizeOf, seed: int, protocols: Sequence[str]) -> None:
-        self.size_of, self.seed, self.protocols = size_of, seed, protocols
+    def __init__(
+        self, size_of: SizeOf, seed: int, protocols: Sequence[str], effects: Collection[str]
+    ) -> None:
+        self.size_of, self.seed = size_of, seed
+        self.protocols, self.effects = protocols, effects
 
     def _visible(
         self, effects: Sequence[str], wanted: Sequence[str]
@@ -146,7 +151,7 @@ class _Maker:
         """Effects that can reach the least strength, and in which protocols."""
         protocols = [p for p in wanted if p in self.protocols]
         out = []
-        for effect in effects:
+        for effect in (e for e in effects if e in self.effects):
             where = [p for p in protocols if self.size_of(p, effect, STRENGTHS[0]) is not None]
             if where:
                 out.append((effect, where))
@@ -203,7 +208,9 @@ class _Maker:
 
     def base(self, count: int) -> list[Case]:
         where = [p for p in ("rich",) if p in self.protocols]
-        return self.listed("base", [(effect, where) for effect in BASE_OF if where], count)
+        return self.listed(
+            "base", [(e, where) for e in BASE_OF if where and e in self.effects], count
+        )
 
     def nothing(self, count: int) -> list[Case]:
         names = self.protocols
@@ -214,6 +221,7 @@ class _Maker:
             pair
             for pair in PAIRS
             if pair[0] in self.protocols
+            and set(pair[1:]) <= set(self.effects)
             and all(self.size_of(pair[0], effect, STRENGTHS[0]) is not None for effect in pair[1:])
         ]
         return [
@@ -226,7 +234,9 @@ class _Maker:
             (effect, delta)
             for delta in CURVE_DELTAS
             for effect in CURVE_EFFECTS
-            if "rich" in self.protocols and self.size_of("rich", effect, delta) is not None
+            if "rich" in self.protocols
+            and effect in self.effects
+            and self.size_of("rich", effect, delta) is not None
         ]
         return [
             self._case("curve", k, "rich", [grid[k % len(grid)][0]], grid[k % len(grid)][1])

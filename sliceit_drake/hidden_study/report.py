@@ -203,6 +203,9 @@ def report(judgements: Sequence[Judgement], folder: str, figure: str | None) -> 
         ]
     if seconds:
         lines += [f"A diagnosis took {np.median(seconds):.0f} s in the middle."]
+    versions = len({j.code for j in judgements})
+    if versions > 1:
+        lines += [f"The runs are of {versions} versions of the package."]
     lines += ["", *_effect_table(judgements), *_base_table(judgements), *_curve_table(judgements)]
     if figure is not None and _of(judgements, "curve"):
         lines += [f"![Detection curves]({figure})", ""]

@@ -1,5 +1,7 @@
 """One run of the study: records are made, and a process that sees nothing else diagnoses them."""
 
+import functools
+import hashlib
 import json
 import os
 import shutil
@@ -8,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import sliceit_drake
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.hidden_study.bench import DIAGNOSIS_REFINEMENT, WORLD, protocol_named
@@ -40,6 +43,15 @@ def is_done(output: Path, name: str) -> bool:
     return (output / "runs" / name / "timing.json").exists()
 
 
+@functools.cache
+def code_version() -> str:
+    """Hash of the package's source, by which runs of one version are known."""
+    h = hashlib.sha256()
+    for file in sorted(Path(sliceit_drake.__file__).parent.rglob("*.py")):
+        h.update(file.read_bytes())
+    return h.hexdigest()[:12]
+
+
 def run_case(case: Case, output: Path, replicates: int) -> str:
     """Makes the records of a run, has them diagnosed, and keeps what the diagnosis said.
 
@@ -69,7 +81,7 @@ def run_case(case: Case, output: Path, replicates: int) -> str:
             entry.unlink()
     # Last: what is here is whole.
     part = folder / "timing.part"
-    part.write_text(json.dumps(bench.seconds) + "\n", encoding="utf-8")
+    part.write_text(json.dumps({**bench.seconds, "code": code_version()}) + "\n", encoding="utf-8")
     os.replace(part, folder / "timing.json")
     return case.name
 

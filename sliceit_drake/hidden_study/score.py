@@ -60,6 +60,7 @@ class Judgement:
             in the poor protocol.
         shifts: Factors and relative errors of base parameters.
         seconds: That the diagnosis took.
+        code: Version of the package that made it.
     """
 
     case: Case
@@ -72,6 +73,7 @@ class Judgement:
     resolved: bool | None
     shifts: dict[str, list[float]]
     seconds: float
+    code: str = ""
 
     @property
     def truth(self) -> list[str]:
@@ -174,15 +176,14 @@ def judge_study(output: Path) -> list[Judgement]:
         if is_done(output, case.name):
             folder = output / "runs" / case.name
             timing = _read(folder / "timing.json") or {}
-            out.append(
-                judge(
-                    case,
-                    _read(folder / "diagnosis.json"),
-                    classes,
-                    _read(folder / "diagnosis_next.json"),
-                    timing.get("diagnosis_s", math.nan),
-                )
+            judgement = judge(
+                case,
+                _read(folder / "diagnosis.json"),
+                classes,
+                _read(folder / "diagnosis_next.json"),
+                timing.get("diagnosis_s", math.nan),
             )
+            out.append(dc.replace(judgement, code=timing.get("code", "")))
     return out
 
 

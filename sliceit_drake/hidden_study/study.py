@@ -33,12 +33,14 @@ class StudyOptions:
         seed: All follows from it.
         replicates: Of each diagnosis's bootstrap.
         protocols: That may be used.
+        effects: That may be hidden; all by default.
     """
 
     kinds: tuple[str, ...] = tuple(KINDS)
     seed: int = 0
     replicates: int = 200
     protocols: tuple[str, ...] = ("rich", "full", "poor")
+    effects: tuple[str, ...] | None = None
 
 
 def prepare(output: Path, options: StudyOptions, progress: Progress) -> list[Case]:
@@ -68,7 +70,14 @@ def prepare(output: Path, options: StudyOptions, progress: Progress) -> list[Cas
     classes = _classes(output, options.protocols, progress)
     poor = classes["poor"].classes if "poor" in classes else {}
     ambiguous = [e for e, cause in CAUSE_OF.items() if len(poor.get(cause, [])) > 1]
-    cases = make_cases(size, ambiguous, options.seed, options.kinds, protocols=options.protocols)
+    cases = make_cases(
+        size,
+        ambiguous,
+        options.seed,
+        options.kinds,
+        protocols=options.protocols,
+        effects=options.effects,
+    )
     for name in options.protocols:
         food_file(output, name).parent.mkdir(parents=True, exist_ok=True)
         dump_yaml(model_food(protocol_named(name)), food_file(output, name))
