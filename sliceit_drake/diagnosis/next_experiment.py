@@ -48,6 +48,10 @@ NEEDED = float((norm.ppf(1.0 - ALARM) + norm.ppf(POWER)) ** 2)
 """Expected gain that a test at the verdict's level finds with `POWER`."""
 MARGIN = 5.0
 """By which the angle shall exceed that of a class, degrees: sizes were estimated."""
+WANTED = CLASS_ANGLE + 10.0
+"""Angle beyond which more is no better, degrees."""
+SLICE_COST, HAND_COST = 1.0, 5.0
+"""What a slice, and handwork, must bring: degrees nearer to `WANTED`, over all pairs."""
 ALIKE_GAIN = 0.35
 """A cause whose gain falls short of the largest by no more than this share may be the one that
 acts: what it gains depends on how well the form that is assumed for it fits."""
@@ -84,6 +88,12 @@ class Pair:
     def parts(self) -> bool:
         """Whether the one is no longer taken for the other."""
         return bool(self.after >= CLASS_ANGLE + MARGIN and self.gain >= NEEDED)
+
+    @property
+    def missing(self) -> float:
+        """By how much it is short of `WANTED`, degrees; an angle that noise hides counts less."""
+        seen = self.after * min(self.gain / NEEDED, 1.0)
+        return max(WANTED - seen, 0.0)
 
 
 @dc.dataclass
@@ -358,18 +368,22 @@ def _within_range(diagnosis: "Diagnosis", evidence: CauseEvidence) -> CauseEvide
 
 @dc.dataclass
 class _Choice:
-    """A number of slices of an experiment, and what it does."""
+    """Slices of experiments, by the number of the experiment, and what they do."""
 
-    number: int
-    slices: int
+    counts: dict[int, int]
     pairs: list[Pair]
-    by_hand: bool
+    by_hand: int
 
     @property
-    def key(self) -> tuple[int, bool, int, float]:
+    def cost(self) -> float:
+        """What is missing and what it takes, degrees."""
+        missing = sum(p.missing for p in self.pairs)
+        return missing + SLICE_COST * sum(self.counts.values()) + HAND_COST * self.by_hand
+
+    @property
+    def key(self) -> tuple[float, float]:
         """The smaller the better."""
-        parted = [p.after for p in self.pairs if p.parts]
-        return -len(parted), self.by_hand, self.slices, -min(parted, default=0.0)
+        return self.cost, -min(p.after for p in self.pairs)
 
 
 class _Search:
@@ -449,26 +463,29 @@ class _Search:
             )
         ]
 
-    def _best(self, counts: Mapping[int, int]) -> _Choice | None:
-        """The next experiment, beside slices of others."""
+    def _further(self, choice: _Choice) -> _Choice:
+        """The best with one experiment more."""
         choices = []
         for number, experiment in enumerate(self.experiments):
-            if number in counts:
+            if number in choice.counts:
                 continue
+            by_hand = choice.by_hand + bool(experiment.by_hand)
             for slices in range(LEAST_REPLICATES, MOST_SLICES + 1):
-                pairs = self.pairs({**counts, number: slices})
-                choices.append(_Choice(number, slices, pairs, bool(experiment.by_hand)))
-        return min(choices, key=lambda c: c.key, default=None)
+                counts = {**choice.counts, number: slices}
+                choices.append(_Choice(counts, self.pairs(counts), by_hand))
+        return min(choices, key=lambda c: c.key)
 
     def result(self) -> NextExperiment:
-        """The motions that part most pairs with fewest slices."""
-        counts: dict[int, int] = {}
-        pairs = [Pair(a, b, angle, angle, gain, 0.0) for a, b, angle, gain in self._before]
-        while len(counts) < MOST_STEPS and not all(p.parts for p in pairs):
-            choice = self._best(counts)
-            if choice is None or sum(p.parts for p in choice.pairs) <= sum(p.parts for p in pairs):
+        """The motions that part most with least."""
+        choice = _Choice(
+            {}, [Pair(a, b, angle, angle, gain, 0.0) for a, b, angle, gain in self._before], 0
+        )
+        while len(choice.counts) < MOST_STEPS and not all(p.parts for p in choice.pairs):
+            further = self._further(choice)
+            if further.cost >= choice.cost:
                 break
-            counts[choice.number], pairs = choice.slices, choice.pairs
+            choice = further
+        counts, pairs = choice.counts, choice.pairs
         steps = [Step(self.experiments[k], self.scenarios[k], n) for k, n in counts.items()]
         classes = "; ".join("{" + ", ".join(e.name for e in c.evidence) + "}" for c in self.classes)
         if all(p.parts for p in pairs) and not steps:
