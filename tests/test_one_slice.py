@@ -67,6 +67,12 @@ def test_a_hidden_cause_stands_out(hidden, names):
     assert best.name in names and best.p_value <= LEVEL
 
 
+def test_a_cause_that_does_the_same_is_named_beside():
+    best = evidence(1, skin=3.0).causes[0]
+    assert {best.name, *best.others} == {"skin", "skin_like"}
+    assert evidence(1, broad=1.0).causes[0].others == []
+
+
 def test_a_cause_that_all_depths_tell_of_predicts_depth_that_was_left_out():
     found = evidence(1, broad=1.0)
     broad = next(c for c in found.causes if c.name == "broad")

@@ -23,6 +23,7 @@ from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.cutting.effects import Effects
 from sliceit_drake.diagnosis.cause import EXPERIMENTS, Cause
 from sliceit_drake.diagnosis.identifiability import (
+    ANGLE,
     SHIFT,
     SHOWS,
     Evidence,
@@ -98,6 +99,8 @@ class CauseInSlice:
         confirmed: The same by simulation, N; None where that was not done.
         fitted: Error of the fit by simulation, N; None where that was not done.
         blocks_better: Of the left-out blocks, those that it predicts better, by simulation.
+        without_best: Error with it over that without on all left-out blocks but the one where it
+            gains most, by simulation: what rests on one block may be its accident.
         values: Fitted by simulation, by name.
         others: Causes and shifts that this motion cannot tell it from.
     """
@@ -111,6 +114,7 @@ class CauseInSlice:
     confirmed: float | None = None
     fitted: float | None = None
     blocks_better: int = 0
+    without_best: float = 1.0
     values: dict[str, float] = dc.field(default_factory=dict)
     others: list[str] = dc.field(default_factory=list)
 
@@ -168,8 +172,18 @@ class OneSlice:
             if c.p_value <= LEVEL
             and c.confirmed is not None
             and c.confirmed <= (1.0 - LEAST_GAIN) * before
-            and c.blocks_better > 0.5 * (int(self.block.max()) + 1)
+            and c.without_best <= 1.0 - LEAST_GAIN
         ]
+
+    @property
+    def supported_classes(self) -> list[list[str]]:
+        """Those causes with what this slice cannot tell from each; one that is in the class of
+        another has none of its own."""
+        out: list[list[str]] = []
+        for c in self.supported:
+            if not any(c.name in group for group in out):
+                out.append([c.name, *c.others])
+        return out
 
     @property
     def verdict(self) -> str:
@@ -180,7 +194,7 @@ class OneSlice:
                 "in this slice no cause of the list explains more of what is left than chance would"
                 " and predicts depth that was left out"
             )
-        names = "; ".join(" or ".join([c.name, *map(short, c.others)]) for c in found)
+        names = "; ".join(" or ".join(map(short, group)) for group in self.supported_classes)
         return f"this slice is described better with {names}; another slice may show otherwise"
 
     @property
@@ -295,7 +309,7 @@ class OneSlice:
             "verdict": KIND,
             "reason": self.verdict,
             "record": self.record.name,
-            "supported_in_this_slice": [[c.name, *c.others] for c in self.supported],
+            "supported_in_this_slice": self.supported_classes,
             "error_N": self.error(self.fit.predicted),
             "held_out_depth_error_N": self.error(self.fit.held_out),
             "values": self.fit.values("base") | self.fit.values("own"),
@@ -435,7 +449,8 @@ def diagnose_slice(
         show("fits", done, stages)
     show("fits", stages, stages)
     for c in evidence.causes:
-        c.others = angles.equivalence_class(c.name)[1:]
+        alike = angles.equivalence_class(c.name)[1:]
+        c.others = [*alike, *(name for name in c.others if name not in alike)]
     return result
 
 
@@ -469,11 +484,13 @@ def _confirm(
     evidence.fitted = result.error(own.predicted)
     evidence.confirmed = result.error(own.held_out)
     evidence.values = own.values("cause")
-    better = 0
-    for k in np.unique(result.block):
-        rows = result.block == k
-        better += result.error(own.held_out, rows) < result.error(fit.held_out, rows)
-    evidence.blocks_better = int(better)
+    rows = [result.block == k for k in np.unique(result.block)]
+    squares = np.array(
+        [[r.sum() * result.error(f.held_out, r) ** 2 for r in rows] for f in (fit, own)]
+    )
+    evidence.blocks_better = int((squares[1] < squares[0]).sum())
+    rest = np.arange(len(rows)) != np.argmax(squares[0] - squares[1])
+    evidence.without_best = float(np.sqrt(squares[1, rest].sum() / squares[0, rest].sum()))
 
 
 def _priors(fit: SliceFit) -> np.ndarray:
@@ -560,6 +577,9 @@ def slice_evidence(
         own_columns = found.index("cause", name)
         shows = float(np.sqrt(max(0.0, np.diag(problem.gram)[own_columns].max())))
         causes.append(CauseInSlice(name, scan, gain, p, shows, error))
+    for c in causes:
+        if c.p_value <= LEVEL:
+            c.others = _same_effect(problem, options, c)
     causes.sort(key=lambda c: (c.p_value, c.held_out))
     return SliceEvidence(causes, held_out.error([[]]), noise)
 
@@ -677,25 +697,52 @@ def _best_gains(
     out: dict[str, tuple[float, float | None]] = {}
     for name, scan, columns in options:
         A = problem.gram[np.ix_(columns, columns)]
-        gain = _bounded(A, b[columns], [kinds[k].one_sided for k in columns])
+        gain, _ = _bounded(A, b[columns], [kinds[k].one_sided for k in columns])
         if name not in out or gain > out[name][0]:
             out[name] = gain, scan
     return out
 
 
-def _bounded(A: np.ndarray, b: np.ndarray, one_sided: list[bool]) -> float:
-    """Gain in the quadratic form where one-sided coefficients are not negative."""
+def _bounded(A: np.ndarray, b: np.ndarray, one_sided: list[bool]) -> tuple[float, np.ndarray]:
+    """Gain in the quadratic form where one-sided coefficients are not negative, and these."""
     n = len(b)
     full = (1 << n) - 1
-    best = 0.0
+    best, at = 0.0, np.zeros(n)
     for bits in range(1, full + 1) if any(one_sided) else [full]:
         active = [k for k in range(n) if bits >> k & 1 and A[k, k] > 1e-9]
         if not active:
             continue
         g = scaled_inverse(A[np.ix_(active, active)], 1e-8) @ b[active]
         if all(x >= 0.0 or not one_sided[k] for k, x in zip(active, g, strict=True)):
-            best = max(best, float(b[active] @ g))
-    return best
+            gain = float(b[active] @ g)
+            if gain > best:
+                best, at = gain, np.zeros(n)
+                at[active] = g
+    return best, at
+
+
+def _same_effect(
+    problem: _Slice, options: Sequence[tuple[str, float | None, list[int]]], found: CauseInSlice
+) -> list[str]:
+    """Causes that can do what one was found to do to within `ANGLE`, at a value of their scan."""
+    kinds = problem.found.columns
+    b = problem.with_y(problem.record.residual)
+    own = next(c for n, s, c in options if (n, s) == (found.name, found.scan))
+    _, e = _bounded(problem.gram[np.ix_(own, own)], b[own], [kinds[k].one_sided for k in own])
+    square = float(e @ problem.gram[np.ix_(own, own)] @ e)
+    least = square * np.cos(np.radians(ANGLE)) ** 2
+    out = []
+    for name, _, columns in options:
+        if name == found.name or name in out or square <= 0.0:
+            continue
+        explained, _ = _bounded(
+            problem.gram[np.ix_(columns, columns)],
+            problem.gram[np.ix_(columns, own)] @ e,
+            [kinds[k].one_sided for k in columns],
+        )
+        if explained >= least:
+            out.append(name)
+    return out
 
 
 class _HeldOut:

@@ -70,10 +70,17 @@ def slice_figure(results: Sequence[OneSlice], titles: Sequence[str]) -> Figure:
         top.set_title(title, loc="left", fontsize=11)
         bottom.set_xlabel("depth of the edge, as the record says [mm]")
         top.legend(frameon=False, fontsize=9, loc="upper left")
-        # Room for the legend below the curves.
-        low, high = bottom.get_ylim()
-        bottom.set_ylim(low - 0.45 * (high - low), high)
         bottom.legend(frameon=False, fontsize=9, loc="lower left")
+    rest = np.concatenate(
+        [
+            (r.record.measured - p)[:, r.shown]
+            for r in results
+            for p in (r.fit.predicted, r.fit.held_out)
+        ]
+    )
+    low, high = float(rest.min()), float(rest.max())
+    # Room for the legend below the curves.
+    axes[1, 0].set_ylim(low - 0.55 * (high - low), high + 0.1 * (high - low))
     what = "force" if results[0].record.channels[0] == "force_norm" else "vertical force"
     axes[0, 0].set_ylabel(f"{what} [N]")
     axes[1, 0].set_ylabel("measured - simulated [N]")
@@ -91,20 +98,23 @@ def _blocks(axis: Axes, result: OneSlice) -> None:
 def evidence_table(result: OneSlice, most: int = 8) -> str:
     """Evidence of the causes that come nearest, in Markdown."""
     lines = [
-        "| cause | gain | p | left out, linear [N] | by simulation [N] | blocks better |",
-        "|---|---|---|---|---|---|",
+        "| cause | gain | p | left out, linear [N] | by simulation [N] | blocks better "
+        "| ratio without its best block |",
+        "|---|---|---|---|---|---|---|",
     ]
     before = result.error(result.fit.held_out)
     blocks = len(np.unique(result.block))
-    lines.append(f"| none | | | {result.evidence.held_out:.2f} | {before:.2f} | |")
+    lines.append(f"| none | | | {result.evidence.held_out:.2f} | {before:.2f} | | |")
     shown = [c for k, c in enumerate(result.evidence.causes) if k < most or c.confirmed is not None]
     names = {c.name for c in result.supported}
     for c in shown:
         own = "" if c.confirmed is None else f"{c.confirmed:.2f}"
         better = "" if c.confirmed is None else f"{c.blocks_better} of {blocks}"
+        ratio = "" if c.confirmed is None else f"{c.without_best:.2f}"
         name = f"**`{c.name}`**" if c.name in names else f"`{c.name}`"
         lines.append(
-            f"| {name} | {c.gain:.1f} | {c.p_value:.3f} | {c.held_out:.2f} | {own} | {better} |"
+            f"| {name} | {c.gain:.1f} | {c.p_value:.3f} | {c.held_out:.2f} | {own} | {better} "
+            f"| {ratio} |"
         )
     return "\n".join(lines)
 

@@ -69,9 +69,9 @@ fit leaves is taken for an autocorrelated process within the slice (restricted m
 *p*: that of a gain as large, relative to its spread, by any cause of the list where nothing is
 wrong, from {replicates} draws of that process. A cause is **supported in this slice** if p is at
 most {level:g}, and a fit by simulation with it takes {least:.0f} % or more off the error on
-left-out depth, in most of the blocks. *Linear* errors come from the derivatives at the fit; by
-these and by p the causes are chosen that are fitted by simulation. No interval stands beside the
-errors: blocks of one slice are no replicates. {elements}
+left-out depth, also without the block where it gains most. *Linear* errors come from the
+derivatives at the fit; by these and by p the causes are chosen that are fitted by simulation. No
+interval stands beside the errors: blocks of one slice are no replicates. {elements}
 
 Two simulations: {simulations}. The first was calibrated on these very records; the second shows
 what its layers are worth.
@@ -133,8 +133,8 @@ def _summary(items: Sequence[MeasuredSlice]) -> str:
     for item in items:
         for name, result in item.results.items():
             found = result.supported
-            causes = "; ".join(" or ".join([c.name, *map(short, c.others)]) for c in found)
-            errors = "; ".join(f"{c.confirmed:.2f}" for c in found if c.confirmed is not None)
+            causes = "; ".join(" or ".join(map(short, g)) for g in result.supported_classes)
+            errors = "; ".join(f"{c.name} {c.confirmed:.2f}" for c in found)
             lines.append(
                 f"| {item.food} | {name} | {result.error(result.fit.predicted):.2f} "
                 f"| {result.error(result.fit.held_out):.2f} | {causes or 'none'} | {errors} |"
