@@ -76,6 +76,7 @@ def record(
         time=time,
         phase=np.full(ROWS, "slice"),
         depth=depth,
+        path=np.clip(depth, 0.0, None),
         in_contact=contact,
         measured=(force + y)[:, None],
         predicted=force[:, None],

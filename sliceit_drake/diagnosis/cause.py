@@ -20,12 +20,16 @@ A user's own cause is a file with one subclass (docs/causes.md has a complete ex
 """
 
 import dataclasses as dc
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.model import CuttingModel
+
+if TYPE_CHECKING:
+    from sliceit_drake.diagnosis.sensitivity import RecordSensitivity
 
 __all__ = [
     "EXPERIMENTS",
@@ -34,6 +38,7 @@ __all__ = [
     "CauseParameter",
     "ForceSeries",
     "Scan",
+    "SharedFacts",
     "SliceFacts",
     "check_cause",
 ]
@@ -96,13 +101,11 @@ class Scan:
         name: Its name.
         unit: Its unit.
         values: What is tried.
-        by_record: Whether each record has one of its own, as the time of an event.
     """
 
     name: str
     unit: str
     values: tuple[float, ...]
-    by_record: bool = False
 
 
 @dc.dataclass(frozen=True)
@@ -133,6 +136,24 @@ class SliceFacts:
     speed: float = 0.0
     draw_ratio: float = 0.0
     tared: bool = True
+
+
+class SharedFacts(SliceFacts):
+    """What replicates have in common: what a cause sees that does not go `by_slice`."""
+
+    @classmethod
+    def of(cls, facts: SliceFacts) -> "SharedFacts":
+        """Those of a slice."""
+        return cls(**{f.name: getattr(facts, f.name) for f in dc.fields(SliceFacts)})
+
+    def __getattribute__(self, name: str) -> Any:
+        if name in ("slice_index", "knife_slices"):
+            raise ConfigurationError(
+                f"asks for {name}, which replicates do not share",
+                field="cause",
+                fix="Set by_slice = True in its class.",
+            )
+        return super().__getattribute__(name)
 
 
 @dc.dataclass
@@ -194,6 +215,10 @@ class Cause:
         parameters: Its numbers.
         scan: A number that exists only where the cause does, or None.
         per_record: Whether each record has values of its own, as the phase of a vibration.
+        searched: Twice the gain in log-likelihood that `adapted` finds in a record where there is
+            nothing, because it looked for it.
+        by_slice: Whether it goes by which slice of the session or of the knife it is
+            (`SliceFacts.slice_index`, `knife_slices`).
         uses_force: Whether its `motion` needs the force of the slice without it.
         absorbed_by: Base parameters that are the same thing: where one of them is free, this is
             no cause but a shift of it.
@@ -207,6 +232,8 @@ class Cause:
     parameters: tuple[CauseParameter, ...] = ()
     scan: Scan | None = None
     per_record = False
+    searched = 0.0
+    by_slice = False
     uses_force = False
     absorbed_by: tuple[str, ...] = ()
     signature = ""
@@ -217,6 +244,19 @@ class Cause:
         """Whether its slices must be simulated; else it only changes wrenches that are there."""
         kind = type(self)
         return kind.model is not Cause.model or kind.motion is not Cause.motion
+
+    @property
+    def adapts(self) -> bool:
+        """Whether it looks at the records first, for where to look more closely."""
+        return type(self).adapted is not Cause.adapted
+
+    def adapted(self, records: "Sequence[RecordSensitivity]") -> "Cause":
+        """The same cause with its scan, or what else it needs, taken from the residuals.
+
+        A period or the time of an event cannot be tried at a few values. Only for causes that act
+        on wrenches alone.
+        """
+        return self
 
     def nulls(self) -> dict[str, float]:
         """Values at which it is absent."""
@@ -281,6 +321,8 @@ def check_cause(cause: Cause, source: str = "") -> None:
         raise refuse(
             "experiment", f"is {cause.experiment!r}", f"Give one of {', '.join(EXPERIMENTS)}."
         )
+    if cause.adapts and cause.simulates:
+        raise refuse("adapted", "is there, and so is model or motion", "Act on the wrench alone.")
     if not cause.parameters:
         raise refuse("parameters", "is empty", "Give at least one CauseParameter.")
     names = [p.name for p in cause.parameters] + ([cause.scan.name] if cause.scan else [])

@@ -181,7 +181,9 @@ class SlicePredictor:
         }
         model = with_parameters(model, factors) if factors else model
         for active in point.causes:
-            model = active.cause.model(model, active.of(target.facts.name), target.facts)
+            model = active.cause.model(
+                model, active.of(target.facts.name), target.seen_by(active.cause)
+            )
         if target.facts.peeled and model.effects.skin.toughness > 0.0:
             model = with_parameters(model, {"effects.skin.toughness": 0.0})
         return model
@@ -204,7 +206,9 @@ class SlicePredictor:
                 series = self.predict([before])[0][number]
                 assert series is not None
                 force = series.wrench[:, 3:]
-            R, p = active.cause.motion(R, p, target.grid, values, target.facts, force)
+            R, p = active.cause.motion(
+                R, p, target.grid, values, target.seen_by(active.cause), force
+            )
         if target.stretches is None:
             return None, R, p
         at_food = p if target.height_unknown else p - lower
@@ -233,7 +237,7 @@ class SlicePredictor:
         series = target.series(run, self._boards[key])
         for active in point.causes:
             values = active.of(target.facts.name)
-            series.wrench = active.cause.wrench(series, values, target.facts)
+            series.wrench = active.cause.wrench(series, values, target.seen_by(active.cause))
         return series
 
 

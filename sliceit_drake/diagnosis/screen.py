@@ -344,6 +344,7 @@ def screen(
         columns = problem.found.index("cause", name, scan)
         value, error = statistics.coefficients(measured, columns)
         kinds = [problem.found.columns[c] for c in columns]
+        null_gains[name] = [g + _searched(problem, columns) for g in null_gains[name]]
         null = np.array(null_gains[name])
         evidence.append(
             CauseEvidence(
@@ -379,6 +380,12 @@ def screen(
         names=statistics.names,
         projected=statistics.projected,
     )
+
+
+def _searched(problem: LinearProblem, columns: list[int]) -> float:
+    """Gain by a cause that looked for itself in records where there is nothing."""
+    touched = sum(bool(r.columns[:, :, columns].any()) for r in problem.found.records)
+    return problem.found.columns[columns[0]].searched * touched
 
 
 class _Bootstrap:

@@ -80,6 +80,7 @@ class Column:
         unit: Of it; "" for a logarithm.
         one_sided: Whether its coefficient cannot be negative.
         per_record: Whether each record has a coefficient of its own.
+        searched: `Cause.searched`.
     """
 
     kind: str
@@ -90,6 +91,7 @@ class Column:
     unit: str = ""
     one_sided: bool = False
     per_record: bool = False
+    searched: float = 0.0
 
     @property
     def label(self) -> str:
@@ -110,6 +112,7 @@ class RecordSensitivity:
         time: Of the rows [m], s.
         phase: Label at the rows [m].
         depth: Of the edge below the top of the food [m], metres.
+        path: Way of the knife since the start [m], metres.
         in_contact: Whether food or board touch the knife [m].
         measured, predicted: [m, c], N and Nm.
         columns: Changes of the prediction [m, c, K].
@@ -126,6 +129,7 @@ class RecordSensitivity:
     time: np.ndarray
     phase: np.ndarray
     depth: np.ndarray
+    path: np.ndarray
     in_contact: np.ndarray
     measured: np.ndarray
     predicted: np.ndarray
@@ -191,6 +195,14 @@ class Sensitivities:
         """Names of the causes."""
         return list(dict.fromkeys(c.name for c in self.columns if c.kind == "cause"))
 
+    def append(self, more: "Sensitivities") -> None:
+        """Adds columns for the same records."""
+        self.columns += more.columns
+        self.warnings += more.warnings
+        for record, added in zip(self.records, more.records, strict=True):
+            record.columns = np.concatenate([record.columns, added.columns], axis=2)
+            record.even = np.concatenate([record.even, added.even], axis=2)
+
     def scans(self, cause: str) -> list[float | None]:
         """Values of a cause's scan; [None] for one without."""
         return list(dict.fromkeys(c.scan for c in self.columns if c.name == cause))
@@ -216,6 +228,7 @@ def cause_columns(cause: Cause) -> list[tuple[Column, dict[str, float], dict[str
                 p.unit,
                 p.one_sided,
                 cause.per_record,
+                cause.searched,
             )
             out.append((column, up, down))
     return out
@@ -260,36 +273,63 @@ def sensitivities(
         meshings.append(dc.replace(meshing, refinement=finer * meshing.refinement))
     runs = None if cache is None else cache / "slices"
     predictor = SlicePredictor(setup, records, meshings, clock, runs, workers)
-    computation = _Computation(predictor, point, causes)
-    store = None
-    if cache is not None:
-        common = _content_hash(setup, causes, point, (meshing, finer, clock))
-        if common is not None:
-            store = _Store(cache / "sensitivities", common, point)
-    return computation.result(store, progress)
+    options = (meshing, finer, clock)
+
+    def computed(some: Sequence[Cause], alone: bool, show: Progress | None) -> Sensitivities:
+        store = None
+        if cache is not None and not any(cause.adapts for cause in some):
+            common = _content_hash(setup, some, point, (alone, *options))
+            if common is not None:
+                by_slice = any(c.by_slice for c in (*some, *(a.cause for a in point.causes)))
+                store = _Store(cache / "sensitivities", common, point, by_slice)
+        return _Computation(predictor, point, some, alone).result(store, show)
+
+    # What replicates share is computed once for all of them.
+    found = computed([c for c in causes if not (c.by_slice or c.adapts)], False, progress)
+    for some in (
+        [c for c in causes if c.by_slice and not c.adapts],
+        [c.adapted(found.records) for c in causes if c.adapts],
+    ):
+        if some:
+            found.append(computed(some, True, None))
+    return found
 
 
 class _Computation:
-    """Sensitivities of one set of records."""
+    """Sensitivities of one set of records.
 
-    def __init__(self, predictor: SlicePredictor, point: Point, causes: Sequence[Cause]) -> None:
+    Args:
+        predictor: Of the records.
+        point: Where.
+        causes: What may be wrong.
+        alone: Whether there are to be columns of the causes alone.
+    """
+
+    def __init__(
+        self,
+        predictor: SlicePredictor,
+        point: Point,
+        causes: Sequence[Cause],
+        alone: bool = False,
+    ) -> None:
         self.predictor, self.point = predictor, point
         self.columns: list[Column] = []
         self.ends: list[tuple[Point, Point | None, float]] = []
         """Of each column the point at plus its size, that at minus, and a factor on the change."""
         self.shown: list[tuple[int, Cause, dict[str, float], dict[str, float] | None]] = []
         """Columns that follow from the prediction without a simulation."""
-        for parameter in predictor.setup.parameters:
-            self._add_base(parameter)
-        effects = {e.name: e for t in predictor.targets for e in predictor.record_effects(t)}
-        for effect in effects.values():
-            column = Column(
-                "record", effect.name, size=effect.size, unit=effect.unit, per_record=True
-            )
-            up, down = (self._record_point(effect.name, s * effect.size) for s in (1.0, -1.0))
-            self._add(column, up, down)
-        for name, finer in zip(("step", "mesh"), predictor.meshings[1:], strict=False):
-            self._add(Column("numerical", name), dc.replace(point, meshing=finer), None, -1.0)
+        if not alone:
+            for parameter in predictor.setup.parameters:
+                self._add_base(parameter)
+            effects = {e.name: e for t in predictor.targets for e in predictor.record_effects(t)}
+            for effect in effects.values():
+                column = Column(
+                    "record", effect.name, size=effect.size, unit=effect.unit, per_record=True
+                )
+                up, down = (self._record_point(effect.name, s * effect.size) for s in (1.0, -1.0))
+                self._add(column, up, down)
+            for name, finer in zip(("step", "mesh"), predictor.meshings[1:], strict=False):
+                self._add(Column("numerical", name), dc.replace(point, meshing=finer), None, -1.0)
         for cause in causes:
             for column, up_values, down_values in cause_columns(cause):
                 if not cause.simulates:
@@ -349,6 +389,9 @@ class _Computation:
             predictor.simulate(points, progress)
         records = []
         for number, found in enumerate(known):
+            if found is None and store is not None:
+                # A replicate may just have been computed.
+                found = store.load(targets[number], len(self.columns))
             if found is None:
                 found = self._record(number)
                 if store is not None:
@@ -369,7 +412,9 @@ class _Computation:
         for k, (up, down, _) in enumerate(self.ends):
             if k in shown:
                 cause, *values = shown[k]
-                moved = [cause.wrench(base, v, target.facts) for v in values if v is not None]
+                moved = [
+                    cause.wrench(base, v, target.seen_by(cause)) for v in values if v is not None
+                ]
             else:
                 moved = [self._series(p, number).wrench for p in (up, down) if p is not None]
             of.append(range(len(wrenches), len(wrenches) + len(moved)))
@@ -406,6 +451,8 @@ def _empty(
     target: SliceTarget, in_contact: np.ndarray, predicted: np.ndarray, columns: int
 ) -> RecordSensitivity:
     facts = target.facts
+    moved = np.linalg.norm(np.diff(target.p, axis=0), axis=1)
+    way = np.concatenate([[0.0], np.cumsum(moved)])
     return RecordSensitivity(
         name=facts.name,
         condition=facts.condition,
@@ -417,6 +464,7 @@ def _empty(
         time=target.time,
         phase=target.phase,
         depth=target.depth,
+        path=np.interp(target.time, target.grid, way),
         in_contact=in_contact,
         measured=target.measured,
         predicted=predicted,
@@ -434,16 +482,21 @@ class _Store:
         directory: The folder.
         common: Hash of all that does not differ between records.
         point: Where records are predicted.
+        by_slice: Whether it matters which slice of the session a record is.
     """
 
-    def __init__(self, directory: Path, common: bytes, point: Point) -> None:
+    def __init__(self, directory: Path, common: bytes, point: Point, by_slice: bool) -> None:
         directory.mkdir(parents=True, exist_ok=True)
         self._directory, self._common, self._point = directory, common, point
+        self._by_slice = by_slice
 
     def _file(self, target: SliceTarget) -> Path:
         h = hashlib.sha256(self._common)
         metadata = dc.replace(target.record.metadata, name="", condition="")
         facts = dc.replace(target.facts, name="", condition="")
+        if not self._by_slice:
+            metadata = dc.replace(metadata, slice_index=0, knife_slices=None)
+            facts = dc.replace(facts, slice_index=0, knife_slices=0)
         h.update(repr((metadata, facts, target.channels)).encode())
         name = target.facts.name
         own = [dict(a.of(name)) for a in self._point.causes]

@@ -13,7 +13,7 @@ from sliceit_drake.cutting.food import make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.cutting.simulate import board_wrenches
-from sliceit_drake.diagnosis.cause import ForceSeries, SliceFacts
+from sliceit_drake.diagnosis.cause import Cause, ForceSeries, SharedFacts, SliceFacts
 from sliceit_drake.diagnosis.clock import Clock, Stretches
 from sliceit_drake.diagnosis.simulator import Run
 from sliceit_drake.records.preprocessing import as_measured
@@ -135,6 +135,10 @@ class SliceTarget:
             if record.torque is not None:
                 self.channels = CHANNELS
                 self.measured = np.column_stack([force, R_FW.apply(record.torque)[:, 1]])
+
+    def seen_by(self, cause: Cause) -> SliceFacts:
+        """The facts, without those that a cause does not go by."""
+        return self.facts if cause.by_slice else SharedFacts.of(self.facts)
 
     def _stretches(self) -> Stretches | None:
         height = self.p[:, 2] - self._top

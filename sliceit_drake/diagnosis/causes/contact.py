@@ -94,6 +94,7 @@ class Dulling(Cause):
     name = "dulling"
     family = "knife and contact"
     row = 9
+    by_slice = True
     parameters = (CauseParameter("growth", "J/m2", 250.0, low=0.0, high=1e4),)
     scan = Scan("exponent", "", (0.5, 1.0))
     absorbed_by = ("effects.bluntness.dulling",)

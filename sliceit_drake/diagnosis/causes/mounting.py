@@ -1,12 +1,18 @@
 """Causes in board, holder, arm and geometry."""
 
 import dataclasses as dc
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.signal import lfilter
 
 from sliceit_drake.cutting.model import CuttingModel, PointScales
 from sliceit_drake.diagnosis.cause import Cause, CauseParameter, ForceSeries, Scan, SliceFacts
+from sliceit_drake.diagnosis.jumps import largest_jump, unlike_others
+
+if TYPE_CHECKING:
+    from sliceit_drake.diagnosis.sensitivity import RecordSensitivity
 
 __all__ = [
     "ArmCompliance",
@@ -17,6 +23,8 @@ __all__ = [
     "SectionShape",
 ]
 
+CALM = 0.3
+"""Jump of the prediction itself near which none is looked for, N."""
 BOARD_FORCE = 5.0
 """Force at which an exponent of the board changes nothing, N."""
 
@@ -68,21 +76,27 @@ class BoardLaw(Cause):
 
 
 class ArmCompliance(Cause):
-    """An arm that gives under the press, unseen by its encoders."""
+    """An arm that gives under the press, unseen by its encoders: at once, and more with time."""
 
     name = "arm_compliance"
     family = "robot"
     row = 14
-    parameters = (CauseParameter("compliance", "m/N", 4e-5, low=0.0, high=1e-3),)
+    parameters = (
+        CauseParameter("compliance", "m/N", 1e-5, low=0.0, high=1e-3),
+        CauseParameter("creep", "m/N", 5e-6, low=0.0, high=1e-3),
+    )
+    scan = Scan("time", "s", (0.1, 0.5))
     uses_force = True
     absorbed_by = ("effects.compliance.arm",)
-    signature = "depth stretched in proportion to the force; at once, without a decay"
+    signature = "depth stretched in proportion to the force"
     experiment = "board_press"
 
     def model(
         self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
     ) -> CuttingModel:
         """A softer arm."""
+        if values["compliance"] == 0.0:
+            return model
         old = model.effects.compliance
         softer = dc.replace(old, arm=old.arm + values["compliance"])
         return model.derive(effects=dc.replace(model.effects, compliance=softer))
@@ -96,14 +110,19 @@ class ArmCompliance(Cause):
         facts: SliceFacts,
         force: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """On the bare board in balance with its spring; over food the cut finds the balance."""
-        if facts.food or force is None:
-            return R, p
+        """Higher by what creeps, and on the bare board by all that gives; over food the cut finds
+        the balance of what gives at once."""
+        assert force is not None
         pressed = np.concatenate([[0.0], np.maximum(force[:, 2], 0.0)])
+        # On the board the force falls as the arm gives, in food next to nothing.
         deep = np.maximum(-p[:, 2], 1e-9)
         stiffness = np.where(p[:, 2] < 0.0, pressed / deep, 0.0)
-        given = values["compliance"] * stiffness
-        rise = np.where(p[:, 2] < 0.0, deep * given / (1.0 + given), 0.0)
+        creep = values["creep"] * pressed / (1.0 + values["creep"] * stiffness)
+        keep = np.exp(-float(t[1] - t[0]) / values["time"])
+        rise = lfilter([1.0 - keep], [1.0, -keep], creep)
+        if not facts.food:
+            given = values["compliance"] * stiffness
+            rise = rise + np.where(p[:, 2] < 0.0, deep * given / (1.0 + given), 0.0)
         return R, p + rise[:, None] * [0.0, 0.0, 1.0]
 
 
@@ -128,54 +147,47 @@ class HolderCompliance(Cause):
 
 
 class FoodSlip(Cause):
-    """Food that slips along the edge at some depth, another in each slice, and knocks the blade."""
+    """Food that slips at some moment, another in each slice: the force jumps, and comes back."""
 
     name = "slip"
     family = "board, holder, geometry"
     row = 15
-    parameters = (
-        CauseParameter("distance", "m", 2e-3, low=-0.02, high=0.02),
-        CauseParameter("knock", "N", 1.0),
-    )
-    scan = Scan("depth", "", (0.3, 0.45, 0.6, 0.75, 0.9), by_record=True)
+    parameters = tuple(CauseParameter(f"knock_{a}", "N", 1.0) for a in "xyz")
+    scan = Scan("fading", "s", (0.02, 0.05, 0.12))
     per_record = True
-    signature = "an abrupt drop at no certain depth, with a jump sideways; does not repeat"
+    searched = 45.0
+    signature = "an abrupt change at no certain depth, sideways above all; does not repeat"
     experiment = "repeats"
 
-    duration = 0.02
-    fading = 0.05
+    def __init__(self) -> None:
+        self._moments: dict[str, float] = {}
 
-    def _since(self, t: np.ndarray, depth: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
-        """Time since the slip [N], s; 0 before."""
-        down = np.diff(depth, append=depth[-1]) > 0.0
-        past = np.flatnonzero((depth > values["depth"]) & down)
-        return np.maximum(t - t[past[0]], 0.0) if past.size else np.zeros(len(t))
-
-    def motion(
-        self,
-        R: np.ndarray,
-        p: np.ndarray,
-        t: np.ndarray,
-        values: Mapping[str, float],
-        facts: SliceFacts,
-        force: np.ndarray | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Back along the edge, relative to food that has slipped."""
-        if facts.height <= 0.0 or values["distance"] == 0.0:
-            return R, p
-        since = self._since(t, 1.0 - p[:, 2] / facts.height, values)
-        done = -np.expm1(-since / self.duration)
-        return R, p - values["distance"] * done[:, None] * [1.0, 0.0, 0.0]
+    def adapted(self, records: Sequence["RecordSensitivity"]) -> Cause:
+        """At the moment of each record at which the residual jumps most, less what its condition
+        has in common: what repeats is no slip."""
+        assert self.scan is not None
+        out = FoodSlip()
+        for r, rest in zip(records, unlike_others(records), strict=True):
+            forces = [k for k, name in enumerate(r.channels) if name.startswith("force")]
+            calm = (r.kinks()[:, forces] < CALM).all(1)
+            inside = r.in_contact & (r.depth > 0.0) & calm
+            if inside.any():
+                moment = largest_jump(r.time, rest[:, forces], inside, self.scan.values[1])
+                out._moments[r.name] = moment
+        return out
 
     def wrench(
         self, series: ForceSeries, values: Mapping[str, float], facts: SliceFacts
     ) -> np.ndarray:
         """With the knock."""
-        if facts.height <= 0.0 or values["knock"] == 0.0:
+        moment = self._moments.get(facts.name)
+        if moment is None:
             return series.wrench
-        since = self._since(series.time, series.depth / facts.height, values)
+        since = series.time - moment
+        fading = np.where(since >= 0.0, np.exp(-np.maximum(since, 0.0) / values["fading"]), 0.0)
         out = series.wrench.copy()
-        out[:, 4] += values["knock"] * np.where(since > 0.0, np.exp(-since / self.fading), 0.0)
+        for k, axis in enumerate("xyz"):
+            out[:, 3 + k] += values[f"knock_{axis}"] * fading
         return out
 
 

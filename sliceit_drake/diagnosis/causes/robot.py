@@ -1,10 +1,17 @@
 """Causes in what the robot carries and how it moves. They act on predicted wrenches alone."""
 
-from collections.abc import Mapping
+import copy
+import dataclasses as dc
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sliceit_drake.diagnosis.cause import Cause, CauseParameter, ForceSeries, Scan, SliceFacts
+from sliceit_drake.diagnosis.periodicity import strongest_frequencies
+
+if TYPE_CHECKING:
+    from sliceit_drake.diagnosis.sensitivity import RecordSensitivity
 
 __all__ = ["StickSlip", "ToolWeight", "Vibration"]
 
@@ -61,10 +68,23 @@ class Vibration(Cause):
     parameters = tuple(
         CauseParameter(f"{wave}_{axis}", "N", 0.3) for axis in AXES for wave in ("cosine", "sine")
     )
-    scan = Scan("frequency", "Hz", (3.0, 5.0, 8.0, 12.0, 18.0, 27.0, 40.0, 60.0))
+    scan = Scan("frequency", "Hz", (5.0, 10.0, 20.0, 40.0))
     per_record = True
+    searched = 10.0
     signature = "waves locked to time, also in the air, none at rest"
     experiment = "air"
+
+    range = (3.0, 80.0)
+    """Frequencies at which it is looked for, Hz."""
+
+    def adapted(self, records: Sequence["RecordSensitivity"]) -> Cause:
+        """At the frequencies at which the residuals of all records are strongest."""
+        series = []
+        for r in records:
+            moving = np.gradient(r.path, r.time) > REST
+            forces = [k for k, name in enumerate(r.channels) if name.startswith("force")]
+            series.append((r.time[moving], r.residual[moving][:, forces]))
+        return _at(self, strongest_frequencies(series, *self.range))
 
     def wrench(
         self, series: ForceSeries, values: Mapping[str, float], facts: SliceFacts
@@ -80,16 +100,35 @@ class Vibration(Cause):
 
 
 class StickSlip(Cause):
-    """Food that sticks and slips on the flanks: waves with the path of the knife in it."""
+    """Food that sticks and slips on the flanks: waves with the path of the knife in it, of any
+    form (three harmonics)."""
 
     name = "stick_slip"
     family = "knife and contact"
     row = 21
-    parameters = (CauseParameter("cosine", "N", 0.3), CauseParameter("sine", "N", 0.3))
-    scan = Scan("pitch", "m", (4e-4, 5.5e-4, 8e-4, 1.1e-3, 1.6e-3, 2.2e-3, 3.2e-3))
+    parameters = tuple(
+        CauseParameter(f"{wave}_{n}", "N", 0.3 / n)
+        for n in (1, 2, 3)
+        for wave in ("cosine", "sine")
+    )
+    scan = Scan("pitch", "m", (5e-4, 1e-3, 2e-3))
     per_record = True
+    searched = 10.0
     signature = "waves locked to the path, so that their frequency goes with the speed; not in air"
     experiment = "speeds"
+
+    range = (3e-4, 4e-3)
+    """Pitches at which it is looked for, metres."""
+
+    def adapted(self, records: Sequence["RecordSensitivity"]) -> Cause:
+        """At the pitches at which the residuals of all records are strongest."""
+        series = []
+        for r in records:
+            cutting = r.in_contact & (r.depth > 0.0) & (np.gradient(r.path, r.time) > REST)
+            vertical = [k for k, name in enumerate(r.channels) if name in ("force_z", "force_norm")]
+            series.append((r.path[cutting], r.residual[cutting][:, vertical]))
+        found = strongest_frequencies(series, 1.0 / self.range[1], 1.0 / self.range[0])
+        return _at(self, tuple(1.0 / f for f in found))
 
     def wrench(
         self, series: ForceSeries, values: Mapping[str, float], facts: SliceFacts
@@ -97,7 +136,10 @@ class StickSlip(Cause):
         """With the waves, against the motion."""
         path = np.cumsum(series.speed) * series.period
         angle = 2.0 * np.pi * path / values["pitch"]
-        wave = values["cosine"] * np.cos(angle) + values["sine"] * np.sin(angle)
+        wave = np.zeros(len(angle))
+        for n in (1, 2, 3):
+            wave += values[f"cosine_{n}"] * np.cos(n * angle)
+            wave += values[f"sine_{n}"] * np.sin(n * angle)
         flank = np.abs(series.parts["normal"][:, 3:]).max(1) + np.abs(
             series.parts["friction"][:, 3:]
         ).max(1)
@@ -105,3 +147,12 @@ class StickSlip(Cause):
         out = series.wrench.copy()
         out[:, 5] += np.where(sliding, -np.sign(series.v[:, 2]) * wave, 0.0)
         return out
+
+
+def _at(cause: Cause, values: tuple[float, ...]) -> Cause:
+    """The cause with these values of its scan; as it is if there are none."""
+    if not values or cause.scan is None:
+        return cause
+    out = copy.copy(cause)
+    out.scan = dc.replace(cause.scan, values=values)
+    return out
