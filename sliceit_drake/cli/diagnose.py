@@ -30,8 +30,8 @@ single record it is `one_slice`: what that slice shows, and no diagnosis; no foo
 
 With --next-experiment FILE it writes what to cut next: a scenario for `sliceit simulate`, for
 `sliceit record` and for the robot, with the angles to expect and the number of slices. This
-simulates a menu of motions, some 200 slices for a class of three causes. Old and new records are then
-diagnosed together; give the folders in the order in which they were recorded.
+simulates a menu of motions, some 200 slices for a class of three causes. Old and new records are
+then diagnosed together; give the folders in the order in which they were recorded.
 
   sliceit diagnose records/monday --model cucumber --output output/diagnosis
   sliceit diagnose records/monday --model cucumber --output output/a --next-experiment next.yaml
