@@ -31,8 +31,8 @@ KNOT = 4e-3
 PHASE_KNOTS = 8
 """Splines over the time of each condition's record, for the nonparametric correction."""
 USUAL = (
-    ("sensor_delay", 1.0, "delay", 4e-3),
-    ("sensor_delay", 4.0, "delay", 4e-3),
+    ("sensor_delay", 1.0, "delay", 1.5e-3),
+    ("sensor_delay", 4.0, "delay", 1.5e-3),
     *(("sensor_zero", None, f"bias_{a}", 0.1) for a in "xyz"),
     *(("sensor_zero", None, f"drift_{a}", 0.02) for a in "xyz"),
 )

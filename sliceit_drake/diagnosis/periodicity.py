@@ -9,7 +9,10 @@ __all__ = ["strongest_frequencies"]
 
 BINS = 8
 """Places of the coordinate in the shortest period."""
-FLOOR_BINS = 101
+FINENESS = 8
+"""Frequencies in the resolution of the longest series: an eighth of it moves the phase at the ends
+by an eighth of a period."""
+FLOOR_BINS = 401
 """Frequencies over whose median the spectrum is what it would be without a period."""
 
 
@@ -38,7 +41,7 @@ def strongest_frequencies(
     spans = [float(u[-1] - u[0]) for u, values in series if len(values) > smooth]
     if not spans:
         return ()
-    size = 1 << int(np.ceil(np.log2(2.0 * max(spans) / step + 2.0)))
+    size = 1 << int(np.ceil(np.log2(FINENESS * max(spans) / step + 2.0)))
     power = np.zeros(size // 2 + 1)
     for u, values in series:
         if len(values) <= smooth:

@@ -126,7 +126,9 @@ class StickSlip(Cause):
         for r in records:
             cutting = r.in_contact & (r.depth > 0.0) & (np.gradient(r.path, r.time) > REST)
             vertical = [k for k, name in enumerate(r.channels) if name in ("force_z", "force_norm")]
-            series.append((r.path[cutting], r.residual[cutting][:, vertical]))
+            # Against the motion, as below.
+            down = np.sign(np.gradient(r.depth))[:, None]
+            series.append((r.path[cutting], (down * r.residual[:, vertical])[cutting]))
         found = strongest_frequencies(series, 1.0 / self.range[1], 1.0 / self.range[0])
         return _at(self, tuple(1.0 / f for f in found))
 
