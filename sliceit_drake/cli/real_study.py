@@ -73,6 +73,11 @@ def run(options: argparse.Namespace) -> int:
         draw(item, options.output / "figures")
         items.append(item)
     file = options.output / "what_the_simulation_gets_wrong.md"
-    file.write_text(page(items, REPLICATES), encoding="utf-8")
+    command = "sliceit study real --output docs"
+    if options.refinement != 1.0:
+        command += f" --refinement {options.refinement:g}"
+    if options.foods != list(FOODS):
+        command += f" --foods {' '.join(options.foods)}"
+    file.write_text(page(items, REPLICATES, command), encoding="utf-8")
     print(f"{file} and {options.output}/figures/one_slice_FOOD.png")
     return 0

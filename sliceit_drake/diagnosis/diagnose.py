@@ -19,7 +19,7 @@ from sliceit_drake.diagnosis.held_out import HeldOutGain, held_out_gain, held_ou
 from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
 from sliceit_drake.diagnosis.linear import LinearProblem, integrate_out
 from sliceit_drake.diagnosis.next_experiment import NextExperiment
-from sliceit_drake.diagnosis.registry import open_causes
+from sliceit_drake.diagnosis.registry import is_users, open_causes
 from sliceit_drake.diagnosis.sensitivity import Sensitivities, sensitivities
 from sliceit_drake.diagnosis.verdict import ALARM, Finding, Verdict, reach_verdict
 from sliceit_drake.diagrams.calibrated_food import CalibratedFood
@@ -111,7 +111,9 @@ class Diagnosis:
         lines.append("")
         lines.append(f"{'cause':20}{'gain':>10}{'by chance':>11}{'95 % limit':>12}{'visible':>9}")
         screening = v.screening
-        for e in screening.causes[:8]:
+        # A user looks for their own cause, whether it matters or not.
+        own = [e for e in screening.causes[8:] if is_users(self.causes[e.name])]
+        for e in (*screening.causes[:8], *own):
             visible = screening.visible[screening.names.index(e.name)]
             lines.append(
                 f"{e.name:20}{e.gain:10.1f}{e.expected:11.1f}{e.limit:12.1f}{visible:9.0f}"

@@ -34,7 +34,7 @@ from sliceit_drake.diagnosis.identifiability_report import classes, short
 from sliceit_drake.diagnosis.linear import USUAL, scaled_inverse
 from sliceit_drake.diagnosis.noise_levels import ChannelNoise
 from sliceit_drake.diagnosis.prediction import SlicePredictor
-from sliceit_drake.diagnosis.registry import open_causes
+from sliceit_drake.diagnosis.registry import is_users, open_causes
 from sliceit_drake.diagnosis.sensitivity import RecordSensitivity, Sensitivities, sensitivities
 from sliceit_drake.diagnosis.slice_fit import (
     BLOCKS,
@@ -274,7 +274,8 @@ class OneSlice:
         for name, rows, mean, rms, out in self.by_depth():
             lines.append(f"{name:>18}{rows:6d}{mean:13.2f}{rms:8.2f}{out:12.2f}")
         lines += ["", f"{'cause':20}{'gain':>8}{'p':>8}{'left out N':>12}{'by simulation':>15}"]
-        for c in self.evidence.causes[:10]:
+        mine = [c for c in self.evidence.causes[10:] if is_users(self.causes[c.name])]
+        for c in (*self.evidence.causes[:10], *mine):
             own = "" if c.confirmed is None else f"{c.confirmed:.3f}"
             lines.append(f"{c.name:20}{c.gain:8.1f}{c.p_value:8.3f}{c.held_out:12.3f}{own:>15}")
         lines.append(

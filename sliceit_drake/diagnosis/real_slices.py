@@ -54,7 +54,7 @@ HEAD = """\
 In the paper's cucumber, tomato and potato: one recording each, one speed, a push, the norm of the
 force, read off a figure (calibration/measured/README.md). Written by
 
-    sliceit study real --output docs
+    {command}
 
 **What such a recording can carry.** The unit of replication is the slice. There is one of each
 food, so that nothing here says how slices vary, and no cause is named: what is found holds *in this
@@ -101,12 +101,19 @@ def draw(item: MeasuredSlice, folder: Path) -> Path:
     return file
 
 
-def page(items: Sequence[MeasuredSlice], replicates: int) -> str:
-    """The page in Markdown."""
+def page(items: Sequence[MeasuredSlice], replicates: int, command: str) -> str:
+    """The page in Markdown.
+
+    Args:
+        items: One a food.
+        replicates: Of the bootstrap.
+        command: That wrote it.
+    """
     simulations = " and ".join(f"*{k}* ({v})" for k, v in SIMULATIONS.items())
     counts = ", ".join(f"{i.food} {i.results['plain'].elements}" for i in items)
     parts = [
         HEAD.format(
+            command=command,
             replicates=replicates,
             level=LEVEL,
             least=100 * LEAST_GAIN,

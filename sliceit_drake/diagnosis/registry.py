@@ -13,7 +13,14 @@ from sliceit_drake.diagnosis.cause import Cause, check_cause
 from sliceit_drake.diagnosis.causes import BUILT_IN
 from sliceit_drake.diagnosis.rehearsal import rehearse
 
-__all__ = ["ENTRY_POINTS", "all_causes", "causes_as_markdown", "load_cause", "open_causes"]
+__all__ = [
+    "ENTRY_POINTS",
+    "all_causes",
+    "causes_as_markdown",
+    "is_users",
+    "load_cause",
+    "open_causes",
+]
 
 ENTRY_POINTS = "sliceit_drake.causes"
 """Group of entry points that name classes of causes."""
@@ -56,6 +63,11 @@ def open_causes(base: Sequence[str], extra: Sequence[Cause] = ()) -> list[Cause]
     causes = [*all_causes(), *extra]
     _check_names(causes)
     return [c for c in causes if not set(c.absorbed_by) & set(base)]
+
+
+def is_users(cause: Cause) -> bool:
+    """Whether a cause is a user's and not one of the package."""
+    return type(cause) not in BUILT_IN
 
 
 def _check_names(causes: Sequence[Cause]) -> None:
