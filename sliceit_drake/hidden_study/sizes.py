@@ -2,7 +2,7 @@
 
 The strength delta of an effect is the root mean square, over samples in contact and channels, of
 what is left of its noise-free change of the readings once base parameters and what is each slice's
-own are refitted to it, over the noise in contact. In short:
+own (material, height, the sensor's zero and drift) are refitted to it, over the noise in contact. In short:
 
     size_for("rich", "skin", 2.5)          # J/m, or None where no sensible size is that strong
 """
@@ -213,7 +213,9 @@ class ProtocolSizes:
                 ],
             )
             problem = LinearProblem(with_effect, null.noise)
-            problem.variation = null.variation
+            # What is each record's own is also the sensor's usual zero and drift.
+            own, variance = null.own_prior()
+            problem.own, problem.variation = own, np.sqrt(variance)
             column = len(found.columns)
             out.append(effect_in_noise(problem, [column], np.ones(1))[0])
         return out
