@@ -2,7 +2,8 @@
 
 The strength delta of an effect is the root mean square, over samples in contact and channels, of
 what is left of its noise-free change of the readings once base parameters and what is each slice's
-own (material, height, the sensor's zero and drift) are refitted to it, over the noise in contact. In short:
+own (material, height, the sensor's zero and drift) are refitted to it, over the noise in contact.
+In short:
 
     size_for("rich", "skin", 2.5)          # J/m, or None where no sensible size is that strong
 """
