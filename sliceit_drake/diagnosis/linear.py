@@ -28,16 +28,17 @@ __all__ = ["LinearProblem", "Moments", "integrate_out", "scaled_inverse"]
 
 KNOT = 4e-3
 """Spacing of the splines of depth in which the discretisation's error is taken to vary, metres."""
-PHASE_KNOTS = 8
+PHASE_KNOTS = 20
 """Splines over the time of each condition's record, for the nonparametric correction."""
 USUAL = (
-    ("sensor_delay", 1.0, "delay", 1.5e-3),
-    ("sensor_delay", 4.0, "delay", 1.5e-3),
-    *(("sensor_zero", None, f"bias_{a}", 0.1) for a in "xyz"),
-    *(("sensor_zero", None, f"drift_{a}", 0.02) for a in "xyz"),
+    ("sensor_delay", 1.0, "delay", 1.5e-3, False),
+    ("sensor_delay", 4.0, "delay", 1.5e-3, False),
+    *(("sensor_zero", None, f"bias_{a}", 0.1, True) for a in "xyz"),
+    *(("sensor_zero", None, f"drift_{a}", 0.02, True) for a in "xyz"),
 )
-"""What every sensor has: cause, value of its scan, parameter, usual standard deviation in its unit.
-Only more than that is a finding."""
+"""What every sensor has: cause, value of its scan, parameter, usual standard deviation in its unit,
+and whether that differs from record to record. Only more than that is a finding, or what should
+differ and is the same in all records."""
 DISCRETISATION = 0.5
 """Standard deviation of the discretisation's error as a function of depth, in that of the mesh
 column."""
@@ -106,9 +107,9 @@ class LinearProblem:
         shared: dict[int, float] = {}
         own: dict[int, float] = {}
         for k, column in enumerate(self.found.columns):
-            for cause, scan, parameter, deviation in USUAL:
+            for cause, scan, parameter, deviation, differs in USUAL:
                 if (column.name, column.scan, column.parameter) == (cause, scan, parameter):
-                    (own if column.per_record else shared)[k] = deviation / column.size
+                    (own if differs else shared)[k] = deviation / column.size
         return shared, own
 
     def _make_moments(self) -> None:

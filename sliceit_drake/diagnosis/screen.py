@@ -13,6 +13,8 @@ FLAT = 1e8
 """Variance of a coefficient of which nothing is known, in the column's size."""
 CORRECTION_VARIANCE = 1e4
 """Of the nonparametric correction, N^2."""
+UNUSUAL = 0.98
+"""Quantile of the gain beyond the usual from which on what a sensor has a little of is a cause."""
 BATCH = 100
 """Replicates of the bootstrap that are computed in one go."""
 
@@ -23,7 +25,9 @@ class CauseEvidence:
 
     Attributes:
         name: Of the cause.
-        gain: Twice the gain in log-likelihood by the cause, at the best value of its scan.
+        gain: Twice the gain in log-likelihood by the cause, at the best value of its scan. Of a
+            cause that every sensor has a little of (`linear.USUAL`) the gain beyond that; where
+            that is not to be had by chance, all that it gains.
         expected, deviation: Mean and standard deviation of `gain` where nothing is wrong.
         limit: Its 95 % quantile there.
         scan: The best value of the scan, or None.
@@ -240,6 +244,33 @@ class _Statistics:
             values[better], errors[better] = value[better], error[better]
         return best, values, errors
 
+    def gain_with_usual(self, b: np.ndarray, columns: list[int]) -> float:
+        """Gain of a cause for one measurement [1, R, K] against a model without what is usual of
+        it; 0 for one of which nothing is usual."""
+        problem = self.problem
+        mine = set(columns)
+        if not mine & {*problem.usual, *problem.usual_own}:
+            return 0.0
+        own, variance = problem.own_prior()
+        kept = [i for i, k in enumerate(own) if k not in mine]
+        variance = np.concatenate([variance[kept], np.full(len(self.own_extra), FLAT)])
+        own = [*(own[i] for i in kept), *self.own_extra]
+        null = [k for k in self.null if k not in mine]
+        prior = self.prior.copy()
+        prior[columns] = 0.0
+        y = problem.size
+        total, products = np.zeros((y, y)), np.zeros(y)
+        for G, measured in zip(problem.moments.gram, b[0], strict=True):
+            A, weights, _ = _integrated(G[:y, :y], own, variance)
+            total = total + A
+            products = products + measured - weights @ measured[own]
+        gains = []
+        for chosen in (null, [*null, *columns]):
+            inner = total[np.ix_(chosen, chosen)] + np.diag(prior[chosen])
+            seen = products[chosen]
+            gains.append(float(seen @ scaled_inverse(inner) @ seen))
+        return gains[1] - gains[0]
+
     def coefficients(self, b: np.ndarray, columns: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """Of a cause's columns for one measurement [1, R, K]; where each record has its own their
         mean and its standard error."""
@@ -367,6 +398,10 @@ def screen(
     null = (np.array([null_gains[e.name] for e in evidence]) - means) / spreads
     largest = max(e.deviations for e in evidence)
     p = (1.0 + (null.max(0) >= largest).sum()) / (replicates + 1.0)
+    for e in evidence:
+        if e.gain > float(np.quantile(null_gains[e.name], UNUSUAL)):
+            columns = problem.found.index("cause", e.name, e.scan)
+            e.gain = max(e.gain, statistics.gain_with_usual(measured, columns))
     p_misfit = (1.0 + (np.array(null_misfits) >= misfit[0]).sum()) / (replicates + 1.0)
     angles, visible = _angles(statistics, statistics.projected)
     return Screening(

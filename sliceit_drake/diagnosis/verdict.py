@@ -16,6 +16,8 @@ ALARM = 0.02
 LEAST_SIZE = 0.7
 """Least effect against the in-contact noise that is called one: below, the simulation's own errors
 are as large."""
+TOLERATED = 0.4
+"""Misfit against the in-contact noise that the simulation leaves where nothing is wrong."""
 EXPLAINED = 0.6
 """Least share of what could be gained that a named cause explains."""
 SECOND_SHARE = 0.2
@@ -25,6 +27,8 @@ CLASS_ANGLE = 20.0
 CLASS_GAIN = 0.2
 """A member of the class is kept where its gain falls short by less than this share."""
 LEAST_REPLICATES = 3
+CANDIDATES = 8
+"""Causes that are looked at more closely, those with most evidence."""
 
 
 @dc.dataclass
@@ -96,12 +100,12 @@ def reach_verdict(
         progress: Called with a number of replicates each time that these are done.
     """
     first = screen(problem, replicates, seed, progress=progress)
-    reducible = max(first.misfit - first.expected_misfit, 0.0)
-    findings = [_finding(problem, first, e, reducible) for e in first.causes[:6]]
-    large = [f for f in findings if f.spread >= LEAST_SIZE]
-    misfit = _misfit_size(findings, reducible)
     counts = [len(m) for m in problem.conditions.values()]
     needed = max(0, LEAST_REPLICATES - min(counts)) if max(counts) < LEAST_REPLICATES else 0
+    unexplained = max(first.misfit - first.expected_misfit, 0.0)
+    findings = [_finding(problem, first, e, unexplained) for e in first.causes[:CANDIDATES]]
+    misfit = _misfit_size(problem, findings, unexplained)
+    large = [f for f in findings if f.spread >= LEAST_SIZE]
     if first.p_value > ALARM or not large:
         if first.misfit_p_value <= ALARM and misfit >= LEAST_SIZE:
             reason = "the records differ from the simulation, but no cause of the list explains it"
@@ -112,9 +116,18 @@ def reach_verdict(
     second = screen(
         problem, replicates, seed + 1, ((best.evidence.name, best.evidence.scan),), progress
     )
+    gain = max(best.evidence.gain - best.evidence.expected, 0.0)
+    left = max(
+        second.misfit - second.expected_misfit, *(e.gain - e.expected for e in second.causes), 0.0
+    )
+    # All that could be gained: what the cause explains, and what is left then beyond that which is
+    # left where nothing is wrong.
+    left = max(left - TOLERATED**2 * _gain_of_unit(problem, findings), 0.0)
+    total = gain + left
+    best = dc.replace(best, share=gain / total)
     added = [
-        _finding(problem, second, e, reducible)
-        for e in second.causes[:6]
+        _finding(problem, second, e, total)
+        for e in second.causes[:CANDIDATES]
         if e.name not in best.names
     ]
     added = [
@@ -145,7 +158,7 @@ def reach_verdict(
 
 
 def _finding(
-    problem: LinearProblem, screening: Screening, evidence: CauseEvidence, reducible: float
+    problem: LinearProblem, screening: Screening, evidence: CauseEvidence, total: float
 ) -> Finding:
     columns = problem.found.index("cause", evidence.name, evidence.scan)
     coefficients = np.array(evidence.coefficients)
@@ -154,7 +167,7 @@ def _finding(
     if evidence.per_record:
         # The mean of signed amplitudes says nothing of their size; the gain does.
         size = spread = _size_of_gain(problem, evidence.gain - evidence.expected)
-    share = max(evidence.gain - evidence.expected, 0.0) / max(reducible, 1e-9)
+    share = max(evidence.gain - evidence.expected, 0.0) / max(total, 1e-9)
     floor = evidence.score - CLASS_GAIN * evidence.gain
     others = [
         e.name
@@ -180,7 +193,12 @@ def _size_of_gain(problem: LinearProblem, gain: float) -> float:
     return float(np.sqrt(max(gain, 0.0) / max(samples, 1.0)))
 
 
-def _misfit_size(findings: list[Finding], reducible: float) -> float:
-    """All that could be gained as an effect over the noise, at the rate of the causes'."""
+def _gain_of_unit(problem: LinearProblem, findings: list[Finding]) -> float:
+    """Gain by an effect as large as the noise."""
     rates = [f.evidence.gain / f.size**2 for f in findings if f.size > 1e-3]
-    return float(np.sqrt(reducible / np.median(rates))) if rates else 0.0
+    return float(np.median(rates)) if rates else 1.0 / _size_of_gain(problem, 1.0) ** 2
+
+
+def _misfit_size(problem: LinearProblem, findings: list[Finding], unexplained: float) -> float:
+    """All that could be gained as an effect over the noise, at the rate of the causes'."""
+    return float(np.sqrt(unexplained / _gain_of_unit(problem, findings)))
