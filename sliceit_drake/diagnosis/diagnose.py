@@ -15,12 +15,16 @@ from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.food import make_food_model
 from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.diagnosis.cause import Cause
+from sliceit_drake.diagnosis.clock import Clock
+from sliceit_drake.diagnosis.confirm import Confirmation, confirm
 from sliceit_drake.diagnosis.held_out import HeldOutGain, held_out_gain, held_out_share
 from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
 from sliceit_drake.diagnosis.linear import LinearProblem, integrate_out
 from sliceit_drake.diagnosis.next_experiment import NextExperiment
+from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import is_users, open_causes
 from sliceit_drake.diagnosis.sensitivity import Sensitivities, sensitivities
+from sliceit_drake.diagnosis.slices import Meshing
 from sliceit_drake.diagnosis.verdict import ALARM, Finding, Verdict, reach_verdict
 from sliceit_drake.diagrams.calibrated_food import CalibratedFood
 from sliceit_drake.records.slice_record import SliceRecord
@@ -63,7 +67,31 @@ class Diagnosis:
     shifts: dict[str, tuple[float, float]]
     gain: HeldOutGain | None
     remarks: list[str]
+    confirmation: Confirmation | None = None
     next_experiment: NextExperiment | None = None
+
+    def confirm(
+        self,
+        predictor: SlicePredictor,
+        seed: int = 0,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        """Simulates the records with what is named, and measures its worth from there."""
+        findings = self.verdict.findings
+        named = [(f.evidence.name, f.evidence.scan) for f in findings]
+        shared = [f for f in findings if not f.evidence.per_record]
+        if shared:
+            chosen = [(self.causes[f.evidence.name], self.values(f)) for f in shared]
+            self.confirmation = confirm(self.problem, predictor, chosen, progress)
+        simulated = None
+        if self.confirmation is not None and self.confirmation.holds:
+            simulated = self.confirmation.problem
+        elif self.confirmation is not None:
+            self.remarks.append(
+                "A simulation with the cause in it gains less than half of what its derivatives "
+                "promise: take the values for a direction."
+            )
+        self.gain = held_out_gain(self.problem, named, seed, simulated)
 
     @property
     def sensitivities(self) -> Sensitivities:
@@ -73,6 +101,8 @@ class Diagnosis:
     def values(self, finding: Finding) -> dict[str, float]:
         """Parameters of a finding's cause."""
         e, cause = finding.evidence, self.causes[finding.evidence.name]
+        if self.confirmation is not None and e.name in self.confirmation.values:
+            return dict(self.confirmation.values[e.name])
         values = cause.nulls()
         if cause.scan is not None and e.scan is not None:
             values[cause.scan.name] = e.scan
@@ -195,6 +225,9 @@ class Diagnosis:
             "misfit_over_noise": v.misfit,
             "p_value": v.screening.p_value,
             "misfit_p_value": v.screening.misfit_p_value,
+            "simulated_share_of_gain": None
+            if self.confirmation is None
+            else self.confirmation.gained / max(self.confirmation.promised, 1e-9),
             "slices_needed": v.slices_needed,
             "gain": None
             if self.gain is None
@@ -322,16 +355,20 @@ def diagnose(
     verdict = reach_verdict(problem, replicates, seed, count)
     show("bootstrap", steps, steps)
     named = [(f.evidence.name, f.evidence.scan) for f in verdict.findings]
-    gain = held_out_gain(problem, named, seed) if named else None
-    return Diagnosis(
+    result = Diagnosis(
         verdict=verdict,
         problem=problem,
         setup=setup,
         causes={c.name: c for c in causes},
         shifts=_shifts(problem, named),
-        gain=gain,
+        gain=None,
         remarks=remarks,
     )
+    if named:
+        runs = None if cache is None else cache / "slices"
+        predictor = SlicePredictor(setup, records, (Meshing(),), Clock(), runs, workers)
+        result.confirm(predictor, seed, lambda done, total: show("confirmation", done, total))
+    return result
 
 
 def _shifts(

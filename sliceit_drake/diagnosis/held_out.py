@@ -10,6 +10,8 @@ from sliceit_drake.diagnosis.linear import LinearProblem, integrate_out
 __all__ = ["HeldOutGain", "fitted_changes", "held_out_gain", "held_out_share"]
 
 BOOTSTRAP = 1000
+LEAST_REDUCIBLE = 0.02
+"""Least of the mean square that is called reducible, against the noise."""
 FLAT = 1e4
 """Variance of a coefficient of which nothing is known, in the column's size."""
 
@@ -39,7 +41,10 @@ class HeldOutGain:
 
 
 def held_out_gain(
-    problem: LinearProblem, causes: Sequence[tuple[str, float | None]], seed: int = 0
+    problem: LinearProblem,
+    causes: Sequence[tuple[str, float | None]],
+    seed: int = 0,
+    simulated: LinearProblem | None = None,
 ) -> HeldOutGain:
     """Leaves out each record in turn, with and without causes.
 
@@ -47,8 +52,10 @@ def held_out_gain(
         problem: The records' moments.
         causes: Names and values of the scan.
         seed: For the interval.
+        simulated: The moments with the causes in the simulation (`confirm`), from which they are
+            fitted; by default from where they are absent.
     """
-    squares = np.array([_errors(problem, given) for given in ((), causes)])
+    squares = _both(problem, causes, simulated)
     counts = problem.moments.force_rows
     rng = np.random.default_rng(seed)
     touched = np.flatnonzero(counts > 0)
@@ -72,8 +79,18 @@ def held_out_gain(
 def held_out_share(problem: LinearProblem, causes: Sequence[tuple[str, float | None]]) -> float:
     """Of what is above the floor in the held-out mean square, what causes remove."""
     total = max(int(problem.moments.force_rows.sum()), 1)
-    mean = np.array([_errors(problem, given).sum() for given in ((), causes)]) / total
-    return _share(mean, _noise(problem))
+    return _share(_both(problem, causes).sum(1) / total, _noise(problem))
+
+
+def _both(
+    problem: LinearProblem,
+    causes: Sequence[tuple[str, float | None]],
+    simulated: LinearProblem | None = None,
+) -> np.ndarray:
+    """Squared errors of the records without and with causes [2, R], N^2."""
+    named = [k for name, scan in causes for k in problem.found.index("cause", name, scan)]
+    without = _errors(problem, (), named)
+    return np.array([without, _errors(simulated or problem, causes, named)])
 
 
 def _noise(problem: LinearProblem) -> float:
@@ -81,7 +98,8 @@ def _noise(problem: LinearProblem) -> float:
 
 
 def _share(mean: np.ndarray, noise: float) -> float:
-    return float((mean[0] - mean[1]) / max(mean[0] - noise, 1e-12))
+    # Where nothing is above the noise there is nothing to remove a share of.
+    return float((mean[0] - mean[1]) / max(mean[0] - noise, LEAST_REDUCIBLE * noise))
 
 
 def fitted_changes(
@@ -93,9 +111,17 @@ def fitted_changes(
     return [linear.change(r, theta) for r in range(len(problem.found.records))]
 
 
-def _errors(problem: LinearProblem, causes: Sequence[tuple[str, float | None]]) -> np.ndarray:
-    """Sum of squared force errors in contact of each record when it is left out [R], N^2."""
-    linear = _Linear(problem, causes)
+def _errors(
+    problem: LinearProblem, causes: Sequence[tuple[str, float | None]], not_usual: Sequence[int]
+) -> np.ndarray:
+    """Sum of squared force errors in contact of each record when it is left out [R], N^2.
+
+    Args:
+        problem: The records' moments.
+        causes: What is fitted.
+        not_usual: Columns of which nothing is taken for usual.
+    """
+    linear = _Linear(problem, causes, not_usual)
     total = linear.reduced.sum(0)
     out = np.zeros(len(linear.reduced))
     for r, H in enumerate(problem.moments.force_gram):
@@ -111,16 +137,23 @@ def _errors(problem: LinearProblem, causes: Sequence[tuple[str, float | None]]) 
 class _Linear:
     """Generalised least squares of what records share, and of what is their own."""
 
-    def __init__(self, problem: LinearProblem, causes: Sequence[tuple[str, float | None]]) -> None:
+    def __init__(
+        self,
+        problem: LinearProblem,
+        causes: Sequence[tuple[str, float | None]],
+        not_usual: Sequence[int] = (),
+    ) -> None:
         found = problem.found
         shared: list[int] = []
         own: list[int] = []
         for name, scan in causes:
             columns = found.index("cause", name, scan)
             (own if found.columns[columns[0]].per_record else shared).extend(columns)
-        self.problem = problem
-        self.columns = [*problem.base, *problem.numerical, *problem.usual, *shared]
-        known, variance = problem.own_prior()
+        self.problem, self.flat = problem, shared
+        mine = {*shared, *own, *not_usual}
+        usual = [k for k in problem.usual if k not in mine]
+        self.columns = [*problem.base, *problem.numerical, *usual, *shared]
+        known, variance = problem.own_prior(without=tuple(mine))
         self.own = [*known, *own]
         self.variance = np.concatenate([variance, np.full(len(own), FLAT)])
         gram = problem.moments.gram
@@ -128,7 +161,7 @@ class _Linear:
 
     def shared(self, total: np.ndarray) -> np.ndarray:
         """Coefficients of the shared columns from a sum of reduced Gram matrices."""
-        return self.problem.fit_shared(total, self.columns)[0]
+        return self.problem.fit_shared(total, self.columns, self.flat)[0]
 
     def of_own(self, r: int, theta: np.ndarray) -> np.ndarray:
         """Coefficients of what is a record's own, from itself."""

@@ -69,6 +69,7 @@ class LinearProblem:
     Args:
         found: Sensitivities.
         noise: Of each channel; estimated by default.
+        variation: Standard deviations of what differs from slice to slice; estimated by default.
 
     Attributes:
         found: Sensitivities.
@@ -88,7 +89,12 @@ class LinearProblem:
         variation_samples: Number of independent differences that they were estimated from.
     """
 
-    def __init__(self, found: Sensitivities, noise: Sequence[ChannelNoise] | None = None) -> None:
+    def __init__(
+        self,
+        found: Sensitivities,
+        noise: Sequence[ChannelNoise] | None = None,
+        variation: np.ndarray | None = None,
+    ) -> None:
         self.found = found
         self.base = found.index("base")
         self.own = found.index("record")
@@ -101,7 +107,7 @@ class LinearProblem:
         self.usual, self.usual_own = self._usual()
         self._make_moments()
         self.variation_samples = sum(len(g) - 1 for g in self.conditions.values())
-        self.variation = self._estimate_variation()
+        self.variation = self._estimate_variation() if variation is None else variation
 
     def _usual(self) -> tuple[dict[int, float], dict[int, float]]:
         shared: dict[int, float] = {}
@@ -160,20 +166,30 @@ class LinearProblem:
             count += int(inside.sum())
         return DISCRETISATION * np.sqrt(squares / max(count, 1)) + RIDGE
 
-    def own_prior(self) -> tuple[list[int], np.ndarray]:
+    def own_prior(self, without: Sequence[int] = ()) -> tuple[list[int], np.ndarray]:
         """Numbers of the columns that are each record's own, and the variances of their
-        coefficients."""
-        usual = np.array(list(self.usual_own.values()))
-        return [*self.own, *self.usual_own], np.concatenate([self.variation, usual]) ** 2
+        coefficients.
 
-    def fit_shared(self, total: np.ndarray, columns: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        Args:
+            without: Columns to leave out.
+        """
+        usual = {k: deviation for k, deviation in self.usual_own.items() if k not in without}
+        deviations = np.concatenate([self.variation, np.array(list(usual.values()))])
+        return [*self.own, *usual], deviations**2
+
+    def fit_shared(
+        self, total: np.ndarray, columns: list[int], flat: Sequence[int] = ()
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Coefficients of columns that all records share, and their covariance.
 
         Args:
             total: Sum of Gram matrices from which what is each record's own is integrated out.
             columns: Numbers [n].
+            flat: Those of them of which nothing is taken for usual.
         """
-        A = total[np.ix_(columns, columns)] + np.diag(self.prior()[columns])
+        prior = self.prior()
+        prior[list(flat)] = 0.0
+        A = total[np.ix_(columns, columns)] + np.diag(prior[columns])
         covariance = scaled_inverse(A)
         return covariance @ total[columns, self.size], covariance
 

@@ -251,10 +251,9 @@ class _Statistics:
         mine = set(columns)
         if not mine & {*problem.usual, *problem.usual_own}:
             return 0.0
-        own, variance = problem.own_prior()
-        kept = [i for i, k in enumerate(own) if k not in mine]
-        variance = np.concatenate([variance[kept], np.full(len(self.own_extra), FLAT)])
-        own = [*(own[i] for i in kept), *self.own_extra]
+        own, variance = problem.own_prior(without=columns)
+        variance = np.concatenate([variance, np.full(len(self.own_extra), FLAT)])
+        own = [*own, *self.own_extra]
         null = [k for k in self.null if k not in mine]
         prior = self.prior.copy()
         prior[columns] = 0.0
