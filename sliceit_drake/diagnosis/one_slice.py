@@ -190,9 +190,13 @@ class OneSlice:
         """In a sentence."""
         found = self.supported
         if not found:
+            untried = [
+                c.name for c in self.evidence.causes if c.p_value <= LEVEL and c.confirmed is None
+            ]
             return (
-                "in this slice no cause of the list explains more of what is left than chance would"
-                " and predicts depth that was left out"
+                "in this slice no cause that was fitted explains more of what is left than chance"
+                " would and predicts depth that was left out"
+                + (f" (not fitted by simulation: {', '.join(untried)})" if untried else "")
             )
         names = "; ".join(" or ".join(map(short, group)) for group in self.supported_classes)
         return f"this slice is described better with {names}; another slice may show otherwise"

@@ -193,13 +193,19 @@ def _worst(result: OneSlice) -> str:
     fit = max(rows, key=lambda row: row[3])
     out = max(rows, key=lambda row: row[4])
     noise = result.evidence.noise[0]
-    return (
+    span = float(result.record.time[-1] - result.record.time[0])
+    text = (
         f"The fit leaves most at {fit[0]} ({fit[3]:.2f} N RMS, mean {fit[2]:+.2f} N); left out,"
         f" most is wrong at {out[0]} ({out[4]:.2f} N). What is left goes with itself over "
-        f"{1e3 * noise.tau:.0f} ms ({noise.ar:.2f} N): it is a model error or the slice's own "
-        "structure, not reading noise"
-        f"{' (' + format(noise.white, '.2f') + ' N)' if noise.white >= 5e-3 else ''}."
+        f"{1e3 * noise.tau:.0f} ms ({noise.ar:.2f} N; without memory {noise.white:.2f} N): a model "
+        "error or the slice's own structure, not noise of the sensor."
     )
+    if noise.tau > 0.45 * span:
+        text += (
+            " That is the longest time that was allowed: what is left is no process with a level of"
+            " its own, and p is not to be trusted here."
+        )
+    return text
 
 
 def _by_depth(result: OneSlice) -> str:
@@ -223,7 +229,10 @@ def _fitted(result: OneSlice) -> str:
             scan = result.causes[c.name].scan
             at = "" if scan is None or c.scan is None else f" at {scan.name} {c.scan:g} {scan.unit}"
             shown.append(f"`{c.name}`{at.rstrip()}: {values or 'none of it'}")
-    base = {short(k).replace("shift of ", ""): v for k, v in result.fit.values("base").items()}
+    base = {
+        k.removeprefix("material.").removeprefix("effects.").removeprefix("numerics."): v
+        for k, v in result.fit.values("base").items()
+    }
     own = result.fit.values("own")
     text = "Fitted: " + ", ".join(f"{k} {v:.3g}" for k, v in base.items())
     if "height" in own:
@@ -251,7 +260,12 @@ def _claims(items: Sequence[MeasuredSlice]) -> str:
 
 
 WHY_OTHER = """\
-TO BE WRITTEN"""
+Where it says no: the list speaks of the form of a residual in any simulation. These angles come
+from one simulation, after base parameters, height and speed were refitted, and trust that the
+section is round and that the pressure on the flank is that of the finite elements. What the fits
+above leave shows that the simulation is not right to that level. So where the two differ, the list
+is the safer reading, and more slices decide. What does not show is taken up by the refit entirely:
+that is the extreme of not being told apart."""
 
 
 def _cell(result: OneSlice, expected: str, pairs: Sequence[tuple[str, str]]) -> str:
