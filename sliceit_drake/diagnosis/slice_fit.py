@@ -23,6 +23,8 @@ __all__ = ["BLOCKS", "SliceFit", "Unknown", "depth_blocks", "fit_slice", "slice_
 BLOCKS = 5
 STEPS = 8
 HELD_OUT_STEPS = 2
+AS_GOOD = 1.03
+"""Ratio of sums of squares up to which two fits are as good."""
 LONGEST = 6.0
 """Longest step of an unknown, in its sizes."""
 ENOUGH = 1e-3
@@ -267,12 +269,18 @@ class _Work:
         rows: np.ndarray,
         free: np.ndarray,
     ) -> np.ndarray:
-        """The prediction by a fit to the other rows, with the derivatives of the fit to all."""
-        cost = self.cost(theta, predicted, ~rows)
+        """The prediction by a fit to the other rows, with the derivatives of the fit to all.
+
+        It begins where all rows were fitted, so that one that stayed there would have seen what it
+        predicts. The first step is taken even where it makes the rest a little worse: as good a
+        fit to the rest as it can tell, and one without the rows.
+        """
+        cost = AS_GOOD * self.cost(theta, predicted, ~rows)
         for _ in range(HELD_OUT_STEPS):
             aim = self.refit(theta, predicted, jacobian, ~rows, free)
             tries, seen, costs = self.search(theta, aim, ~rows)
-            best = int(np.argmin(costs))
+            # The longest step that is nearly as good as the best one.
+            best = int(np.argmax(np.array(costs) <= AS_GOOD * min(costs)))
             if not costs[best] < (1.0 - ENOUGH) * cost:
                 break
             theta, predicted, cost = tries[best], seen[best], costs[best]
