@@ -114,7 +114,7 @@ class NoiseModel:
 
 
 class MarkovCovariance:
-    """ar^2 exp(-|dt|/tau) + diag(white^2); entries with an infinite gap between them are independent.
+    """ar^2 exp(-|dt|/tau) + diag(white^2); entries an infinite gap apart are independent.
 
     The inverse T of the first part is tridiagonal (Markov), so that with W = diag(white),
     V^-1 = W^-1 (I + W T W)^-1 W T costs as much as there are samples.

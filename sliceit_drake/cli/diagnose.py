@@ -68,9 +68,11 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument(
         "--refinement",
         type=float,
-        default=1.0,
-        help="elements along an edge, relative to the food's mesh (default 1)",
+        default=0.5,
+        help="elements along an edge for changes of the force, relative to the food's mesh; the"
+        " force itself is computed with twice as many (default 0.5)",
     )
+    parser.add_argument("--no-report", action="store_true", help="write no report.html")
     parser.add_argument(
         "--replicates", type=int, default=200, help="of the bootstrap (default 200)"
     )
@@ -176,8 +178,9 @@ def _diagnose(
             )
             result.next_experiment.write(options.next_experiment)
     print(result.table())
-    result.save(options.output)
-    print(f"Results in {options.output}/: diagnosis.json, extended.yaml, report.html")
+    result.save(options.output, not options.no_report)
+    report = "" if options.no_report else ", report.html"
+    print(f"Results in {options.output}/: diagnosis.json, extended.yaml{report}")
     return 0
 
 

@@ -13,9 +13,9 @@ import numpy as np
 
 from sliceit_drake.cutting.parameters import get_parameter
 from sliceit_drake.diagnosis.cause import Cause
-from sliceit_drake.diagnosis.linear import LinearProblem, integrate_out
+from sliceit_drake.diagnosis.linear import LinearProblem
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
-from sliceit_drake.diagnosis.sensitivity import MESH, Sensitivities
+from sliceit_drake.diagnosis.sensitivity import MESH
 
 __all__ = ["Confirmation", "confirm"]
 
@@ -114,7 +114,7 @@ def _fit(
 ) -> tuple[np.ndarray, float]:
     """Coefficients of columns [n], and twice the negative log-likelihood but for a constant."""
     own, variance = problem.own_prior(without=not_usual)
-    total = np.sum([integrate_out(G, own, variance) for G in problem.moments.gram], axis=0)
+    total = problem.reduced(own, variance).sum(0)
     usual = [k for k in problem.usual if k not in not_usual]
     chosen = [*problem.numerical, *problem.spline, *usual, *columns]
     theta, _ = problem.fit_shared(total, chosen, columns)
@@ -141,7 +141,7 @@ def _at_point(
     active = tuple(ActiveCause(cause, at[cause.name]) for cause, _ in causes)
     before, after = predictor.predict([Point(), Point(values=values, causes=active)], progress)
     mesh = next((k for k in problem.numerical if found.columns[k] == MESH), None)
-    records = []
+    moved = []
     for record, target, first, second in zip(
         found.records, predictor.targets, before, after, strict=True
     ):
@@ -151,5 +151,5 @@ def _at_point(
         if mesh is not None:
             # Of the finer mesh, as the prediction is; its difference is taken from the base model.
             predicted = predicted - record.columns[:, :, mesh]
-        records.append(dc.replace(record, predicted=predicted))
-    return LinearProblem(Sensitivities(found.columns, records), problem.noise, problem.variation)
+        moved.append(predicted)
+    return problem.predicting(moved)

@@ -19,7 +19,7 @@ from sliceit_drake.diagnosis.clock import Clock
 from sliceit_drake.diagnosis.confirm import Confirmation, confirm
 from sliceit_drake.diagnosis.held_out import HeldOutGain, held_out_gain, held_out_share
 from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
-from sliceit_drake.diagnosis.linear import LinearProblem, integrate_out
+from sliceit_drake.diagnosis.linear import LinearProblem
 from sliceit_drake.diagnosis.next_experiment import NextExperiment
 from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import is_users, open_causes
@@ -266,15 +266,16 @@ class Diagnosis:
             "remarks": self.remarks,
         }
 
-    def save(self, directory: Path) -> None:
-        """Writes diagnosis.json, report.html and extended.yaml."""
+    def save(self, directory: Path, report: bool = True) -> None:
+        """Writes diagnosis.json, extended.yaml and, if wanted, report.html."""
         from sliceit_drake.diagnosis.report import report_html
 
         directory.mkdir(parents=True, exist_ok=True)
         text = json.dumps(self.facts(), indent=2) + "\n"
         (directory / "diagnosis.json").write_text(text, encoding="utf-8")
         dump_yaml(self.extended(), directory / "extended.yaml")
-        (directory / "report.html").write_text(report_html(self), encoding="utf-8")
+        if report:
+            (directory / "report.html").write_text(report_html(self), encoding="utf-8")
 
 
 def setup_of_food(food: CalibratedFood, refinement: float = 1.0) -> CalibrationSetup:
@@ -384,7 +385,7 @@ def _shifts(
     ]
     columns = [*problem.base, *problem.numerical, *problem.spline, *problem.usual, *shared]
     own, variance = problem.own_prior()
-    total = np.sum([integrate_out(G, own, variance) for G in problem.moments.gram], axis=0)
+    total = problem.reduced(own, variance).sum(0)
     theta, covariance = problem.fit_shared(total, columns)
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     out = {}

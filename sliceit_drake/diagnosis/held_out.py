@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sliceit_drake.diagnosis.linear import LinearProblem, integrate_out
+from sliceit_drake.diagnosis.linear import LinearProblem
 
 __all__ = ["HeldOutGain", "fitted_changes", "held_out_gain", "held_out_share"]
 
@@ -156,8 +156,7 @@ class _Linear:
         known, variance = problem.own_prior(without=tuple(mine))
         self.own = [*known, *own]
         self.variance = np.concatenate([variance, np.full(len(own), FLAT)])
-        gram = problem.moments.gram
-        self.reduced = np.array([integrate_out(G, self.own, self.variance) for G in gram])
+        self.reduced = problem.reduced(self.own, self.variance)
 
     def shared(self, total: np.ndarray) -> np.ndarray:
         """Coefficients of the shared columns from a sum of reduced Gram matrices."""

@@ -8,6 +8,7 @@ C_r the causes. The noise is that of `noise_levels`. All that the statistics nee
 Gram matrix weighted with the inverse of the noise's covariance.
 """
 
+import copy
 import dataclasses as dc
 from collections.abc import Sequence
 
@@ -45,6 +46,8 @@ column."""
 FINE_MESH = 0.3
 """The same of each row by itself."""
 RIDGE = 1e-8
+KEPT = 4
+"""Sets of reduced Gram matrices that are kept."""
 
 
 @dc.dataclass
@@ -104,6 +107,7 @@ class LinearProblem:
             self.noise, self.repeated = estimate_noise(found.records, self.own)
         else:
             self.noise, self.repeated = tuple(noise), True
+        self._reduced: dict[tuple[tuple[int, ...], bytes], np.ndarray] = {}
         self.usual, self.usual_own = self._usual()
         self._make_moments()
         self.variation_samples = sum(len(g) - 1 for g in self.conditions.values())
@@ -137,23 +141,71 @@ class LinearProblem:
         gram = np.zeros((len(found.records), self.size + 1, self.size + 1))
         force_gram, force_rows = np.zeros_like(gram), np.zeros(len(found.records), int)
         self.forces = [c for c, name in enumerate(channels) if name.startswith("force")]
-        deviation = np.array([noise.deviation for noise in self.noise])
         for r, record in enumerate(found.records):
-            X = np.concatenate(
-                [
-                    record.columns,
-                    _depth_splines(record, count, len(channels)),
-                    _time_splines(record, len(channels)),
-                    record.residual[:, :, None],
-                ],
-                axis=2,
-            )
+            X = self._table(record)
             gram[r] = self._weighted(record.time, X, self.model_error(record))
-            calm = record.in_contact & (record.kinks() < deviation).all(1)
+            calm = self._calm(record)
             inside = X[calm][:, self.forces].reshape(-1, self.size + 1)
             force_gram[r] = inside.T @ inside
             force_rows[r] = int(calm.sum())
         self.moments = Moments(gram, force_gram, force_rows)
+
+    def _table(self, record: RecordSensitivity) -> np.ndarray:
+        """All columns and what is left of a record [m, c, K + 1]."""
+        channels = len(record.channels)
+        return np.concatenate(
+            [
+                record.columns,
+                _depth_splines(record, len(self.spline) // channels, channels),
+                _time_splines(record, channels),
+                record.residual[:, :, None],
+            ],
+            axis=2,
+        )
+
+    def _calm(self, record: RecordSensitivity) -> np.ndarray:
+        """Rows in contact at which the force does not jump [m]."""
+        deviation = np.array([noise.deviation for noise in self.noise])
+        return np.asarray(record.in_contact & (record.kinks() < deviation).all(1))
+
+    def predicting(self, predicted: Sequence[np.ndarray]) -> "LinearProblem":
+        """The same problem, weights included, about other predictions.
+
+        Args:
+            predicted: Of each record [m, c].
+        """
+        out = copy.copy(self)
+        out._reduced = {}
+        gram, force_gram = self.moments.gram.copy(), self.moments.force_gram.copy()
+        records = []
+        for r, (record, values) in enumerate(zip(self.found.records, predicted, strict=True)):
+            moved = dc.replace(record, predicted=values)
+            records.append(moved)
+            X, error, calm = self._table(moved), self.model_error(record), self._calm(record)
+            b, inside = np.zeros(self.size + 1), X[calm][:, self.forces]
+            for c, noise in enumerate(self.noise):
+                b += X[:, c].T @ noise.solve(record.time, X[:, c, -1:], error[:, c])[:, 0]
+            gram[r, -1], gram[r, :, -1] = b, b
+            b = np.einsum("mck,mc->k", inside, inside[:, :, -1])
+            force_gram[r, -1], force_gram[r, :, -1] = b, b
+        out.found = Sensitivities(self.found.columns, records, self.found.warnings)
+        out.moments = Moments(gram, force_gram, self.moments.force_rows)
+        return out
+
+    def reduced(self, own: Sequence[int], variance: np.ndarray) -> np.ndarray:
+        """Gram matrices with normal coefficients of these columns integrated out [R, K + 1, K + 1].
+
+        Args:
+            own: Numbers of columns [n].
+            variance: Of their coefficients [n].
+        """
+        key = (tuple(own), variance.tobytes())
+        if key not in self._reduced:
+            if len(self._reduced) > KEPT:
+                self._reduced.clear()
+            gram = self.moments.gram
+            self._reduced[key] = np.array([integrate_out(G, list(own), variance) for G in gram])
+        return self._reduced[key]
 
     def _mesh_scale(self, mesh: list[int], channels: int) -> np.ndarray:
         """Standard deviation of the discretisation's error by channel [c]."""

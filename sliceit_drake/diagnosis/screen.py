@@ -15,6 +15,8 @@ CORRECTION_VARIANCE = 1e4
 """Of the nonparametric correction, N^2."""
 UNUSUAL = 0.98
 """Quantile of the gain beyond the usual from which on what a sensor has a little of is a cause."""
+JITTER = 1e-9
+"""Added to the diagonal of Gram matrices of unit columns, some of which are the same."""
 BATCH = 100
 """Replicates of the bootstrap that are computed in one go."""
 
@@ -374,7 +376,8 @@ def screen(
         columns = problem.found.index("cause", name, scan)
         value, error = statistics.coefficients(measured, columns)
         kinds = [problem.found.columns[c] for c in columns]
-        null_gains[name] = [g + _searched(problem, columns) for g in null_gains[name]]
+        searched = _searched(problem, columns)
+        null_gains[name] = [g + searched for g in null_gains[name]]
         null = np.array(null_gains[name])
         evidence.append(
             CauseEvidence(
@@ -429,8 +432,9 @@ class _Bootstrap:
         self.problem, self.rng = problem, rng
         y = problem.size
         self.gram = problem.moments.gram[:, :y, :y]
-        values, vectors = np.linalg.eigh(self.gram)
-        self.roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+        scale = np.sqrt(np.maximum(np.diagonal(self.gram, axis1=1, axis2=2), 1e-30))
+        unit = self.gram / scale[:, :, None] / scale[:, None, :] + JITTER * np.eye(y)
+        self.roots = scale[:, :, None] * np.linalg.cholesky(unit)
 
     def __call__(self, number: int) -> np.ndarray:
         """Draws some [number, R, K]."""

@@ -22,7 +22,7 @@ EXPLAINED = 0.6
 """Least share of what could be gained that a named cause explains."""
 SECOND_SHARE = 0.2
 """Least share that a second cause adds."""
-CLASS_ANGLE = 20.0
+CLASS_ANGLE = 15.0
 """Causes that can do what was found to within this, degrees, are one class."""
 CLASS_GAIN = 0.2
 """A member of the class is kept where its gain falls short by less than this share."""

@@ -142,7 +142,7 @@ class _Bench:
             *(sys.executable, "-m", "sliceit_drake.cli.main", "diagnose", *sessions),
             *("--model", str(food_file(self.output, self.case.protocol).resolve())),
             *("--output", result, "--refinement", str(DIAGNOSIS_REFINEMENT)),
-            *("--replicates", str(self.replicates), "--workers", "1"),
+            *("--replicates", str(self.replicates), "--workers", "1", "--no-report"),
             *("--cache", str((self.output / "cache").resolve()), *more),
         ]
         done = subprocess.run(

@@ -214,9 +214,7 @@ class ProtocolSizes:
                 ],
             )
             problem = LinearProblem(with_effect, null.noise)
-            # What is each record's own is also the sensor's usual zero and drift.
-            own, variance = null.own_prior()
-            problem.own, problem.variation = own, np.sqrt(variance)
+            problem.variation = null.variation
             column = len(found.columns)
             out.append(effect_in_noise(problem, [column], np.ones(1))[0])
         return out
