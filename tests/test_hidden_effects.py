@@ -17,7 +17,6 @@ from sliceit_drake.diagrams.calibrated_food import load_calibrated_food
 from sliceit_drake.hidden_study import runner
 from sliceit_drake.hidden_study.bench import PROTOCOLS, QuietBench, model_food, protocol_named
 from sliceit_drake.hidden_study.cases import KINDS, PAIRS, Case, Hidden, make_cases
-from sliceit_drake.hidden_study.classes import ProtocolClasses
 from sliceit_drake.hidden_study.report import numbers, plot_curves, report
 from sliceit_drake.hidden_study.runner import food_file, is_done, run_case
 from sliceit_drake.hidden_study.score import Judgement, Rate, judge
@@ -153,16 +152,16 @@ def test_nothing_that_the_diagnosis_sees_tells_what_is_hidden(tmp_path, monkeypa
     assert not (output / "runs" / case.name / "records").exists()
 
 
-CLASSES = {
-    "rich": ProtocolClasses("rich", {"skin": ["skin", "core"], "core": ["core", "skin"]}, {}),
-    "poor": ProtocolClasses("poor", {"skin": ["skin", "core"], "core": ["core", "skin"]}, {}),
+NEAR = {
+    name: {"skin": {"skin": 8.0, "core": 12.0, "dulling": 24.0}, "sensor_delay": {"skin": 80.0}}
+    for name in ("rich", "poor")
 }
 
 
 def said(kind: str, effects: tuple[str, ...], verdict: str, *named: list[str]) -> Judgement:
     case = Case("x", kind, "rich", tuple(Hidden(e, 1.0, 2.5) for e in effects), 1)
     facts = {"verdict": verdict, "classes": list(named), "evidence": [], "shifts": {}}
-    return judge(case, facts, CLASSES)
+    return judge(case, facts, NEAR)
 
 
 @pytest.mark.parametrize(
@@ -193,7 +192,7 @@ def test_a_run_is_right_only_if_it_says_just_what_was_hidden(judgement, right):
 
 def test_a_run_that_broke_down_is_a_miss_and_counts():
     case = Case("x", "single", "rich", (Hidden("skin", 1.0, 2.5),), 1)
-    broken = judge(case, None, CLASSES)
+    broken = judge(case, None, NEAR)
     found = numbers([broken, said("single", ("skin",), "cause", ["skin"])])
     assert not broken.right
     assert found["by_effect"]["single"]["skin"]["hits"] == 1
@@ -204,9 +203,9 @@ def test_the_next_experiment_must_leave_the_one_cause():
     case = Case("x", "poor", "poor", (Hidden("skin", 1.0, 2.5),), 1)
     facts = {"verdict": "cause", "classes": [["skin", "core"]], "evidence": [], "shifts": {}}
     then = facts | {"classes": [["skin"]]}
-    assert judge(case, facts, CLASSES).resolved is False
-    assert judge(case, facts, CLASSES, then).resolved is True
-    assert judge(case, facts, CLASSES, facts).resolved is False
+    assert judge(case, facts, NEAR).resolved is False
+    assert judge(case, facts, NEAR, then).resolved is True
+    assert judge(case, facts, NEAR, facts).resolved is False
 
 
 def test_the_lower_bound_is_wilsons():
@@ -227,7 +226,7 @@ def test_too_few_runs_never_meet_a_requirement():
 def test_the_report_shows_wrong_names_and_curves(tmp_path):
     curve = Case("y", "curve", "rich", (Hidden("skin", 1.0, 0.5),), 1)
     facts = {"verdict": "nothing", "classes": [], "evidence": [], "shifts": {}}
-    judgements = [said("single", ("skin",), "cause", ["dulling"]), judge(curve, facts, CLASSES)]
+    judgements = [said("single", ("skin",), "cause", ["dulling"]), judge(curve, facts, NEAR)]
     text = report(judgements, "output/hidden", "figures/hidden_effects.png")
     assert "| single: skin | {dulling} | 1 |" in text
     assert "| skin | 0 of 1 (0) |" in text

@@ -15,6 +15,9 @@ CORRECTION_VARIANCE = 1e4
 """Of the nonparametric correction, N^2."""
 UNUSUAL = 0.98
 """Quantile of the gain beyond the usual from which on what a sensor has a little of is a cause."""
+LEAST_DEVIATION = 0.5
+"""Least standard deviation of a gain where nothing is wrong: one that is always nought there is no
+proof of anything by being a little more."""
 JITTER = 1e-9
 """Added to the diagonal of Gram matrices of unit columns, some of which are the same."""
 BATCH = 100
@@ -62,7 +65,7 @@ class CauseEvidence:
     @property
     def deviations(self) -> float:
         """Gain beyond its mean under the null, in its standard deviations there."""
-        return (self.gain - self.expected) / max(self.deviation, 1e-9)
+        return (self.gain - self.expected) / max(self.deviation, LEAST_DEVIATION)
 
 
 @dc.dataclass
@@ -396,7 +399,7 @@ def screen(
             )
         )
     means = np.array([[e.expected] for e in evidence])
-    spreads = np.array([[max(e.deviation, 1e-9)] for e in evidence])
+    spreads = np.array([[max(e.deviation, LEAST_DEVIATION)] for e in evidence])
     null = (np.array([null_gains[e.name] for e in evidence]) - means) / spreads
     largest = max(e.deviations for e in evidence)
     p = (1.0 + (null.max(0) >= largest).sum()) / (replicates + 1.0)

@@ -16,13 +16,13 @@ from sliceit_drake.stand_in.registry import EFFECTS
 __all__ = ["CURVE_EFFECTS", "KINDS", "PAIRS", "Case", "Hidden", "SizeOf", "make_cases"]
 
 KINDS: dict[str, int] = {
-    "single": 231,
-    "nothing": 204,
-    "unknown": 64,
-    "pairs": 44,
+    "single": 210,
+    "nothing": 201,
+    "unknown": 60,
+    "pairs": 40,
     "poor": 60,
-    "base": 30,
-    "curve": 120,
+    "base": 18,
+    "curve": 60,
 }
 """Kinds of runs, and the least number of each."""
 
@@ -188,12 +188,12 @@ class _Maker:
         return Hidden(effect, size, wanted)
 
     def listed(self, kind: str, visible: Sequence[tuple[str, list[str]]], count: int) -> list[Case]:
-        """Effects in turn, and the protocols that show them in turn."""
+        """Effects in turn, two rounds in the first protocol that shows them and one in the next."""
         out: list[Case] = []
         rounds = -(-count // max(len(visible), 1))
         for turn in range(rounds):
             for effect, where in visible:
-                protocol = where[turn % len(where)]
+                protocol = where[min(turn % 3 // 2, len(where) - 1)]
                 out.append(self._case(kind, len(out), protocol, [effect]))
         return out
 

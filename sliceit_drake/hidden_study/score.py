@@ -9,14 +9,16 @@ from typing import Any
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.hidden_study.cases import Case
-from sliceit_drake.hidden_study.classes import ProtocolClasses
 from sliceit_drake.hidden_study.runner import is_done
 from sliceit_drake.hidden_study.study import load_cases
 from sliceit_drake.hidden_study.truth import CAUSE_OF
 
-__all__ = ["Judgement", "Rate", "judge", "judge_study", "load_classes"]
+__all__ = ["Judgement", "Rate", "judge", "judge_study", "load_near"]
 
 NAMING = ("cause", "causes", "too_few_replicates")
+CLASS_ANGLE = 20.0
+"""Causes that can do what was hidden to within this, degrees, are its class."""
+Near = Mapping[str, Mapping[str, Mapping[str, float]]]
 Z = 1.6448536269514722
 """Of a one-sided bound of 95 %."""
 
@@ -89,7 +91,7 @@ class Judgement:
 def judge(
     case: Case,
     facts: Mapping[str, Any] | None,
-    classes: Mapping[str, ProtocolClasses],
+    near: Near,
     following: Mapping[str, Any] | None = None,
     seconds: float = math.nan,
 ) -> Judgement:
@@ -98,7 +100,7 @@ def judge(
     Args:
         case: The run.
         facts: Of diagnosis.json; None where it broke down.
-        classes: What each protocol cannot tell apart.
+        near: By protocol and effect the angles to all causes, degrees (`sizes.angles_for`).
         following: The same of the diagnosis after the next experiment; None if none was made.
         seconds: That the diagnosis took.
     """
@@ -107,8 +109,10 @@ def judge(
         return Judgement(case, "failed", [], False, [], None, None, resolved, {}, seconds)
     verdict, named = facts["verdict"], facts["classes"]
     truth = [CAUSE_OF[h.effect] for h in case.hidden if h.effect in CAUSE_OF]
-    at = classes[case.protocol].classes
-    allowed = {member for cause in truth for member in at.get(cause, [cause])}
+    allowed = set(truth)
+    for h in case.hidden:
+        angles = near.get(case.protocol, {}).get(h.effect, {})
+        allowed |= {name for name, angle in angles.items() if angle <= CLASS_ANGLE}
     wrong = sorted({n for c in named for n in c} - allowed)
     gain = facts.get("gain")
     shares = {e["cause"]: e.get("held_out_share") for e in facts["evidence"]}
@@ -147,21 +151,21 @@ def _is_resolved(facts: Mapping[str, Any], truth: list[str]) -> bool:
     return bool(facts["verdict"] == "cause" and facts["classes"] == [truth])
 
 
-def load_classes(output: Path) -> dict[str, ProtocolClasses]:
-    """What each protocol cannot tell apart, as the study computed it.
+def load_near(output: Path) -> Near:
+    """Which causes effects are how near to, as the study computed it.
 
     Raises:
         ConfigurationError: There is no study.
     """
-    file = output / "classes.json"
+    file = output / "near.json"
     if not file.exists():
         raise ConfigurationError(
-            "is no folder of a study: there is no classes.json",
+            "is no folder of a study: there is no near.json",
             source=str(output),
             fix="Give the --output of `sliceit study hidden`.",
         )
-    found = json.loads(file.read_text(encoding="utf-8"))
-    return {name: ProtocolClasses(**facts) for name, facts in found.items()}
+    found: dict[str, dict[str, dict[str, float]]] = json.loads(file.read_text(encoding="utf-8"))
+    return found
 
 
 def judge_study(output: Path) -> list[Judgement]:
@@ -170,7 +174,7 @@ def judge_study(output: Path) -> list[Judgement]:
     Raises:
         ConfigurationError: There is no study.
     """
-    classes = load_classes(output)
+    near = load_near(output)
     out = []
     for case in load_cases(output):
         if is_done(output, case.name):
@@ -179,7 +183,7 @@ def judge_study(output: Path) -> list[Judgement]:
             judgement = judge(
                 case,
                 _read(folder / "diagnosis.json"),
-                classes,
+                near,
                 _read(folder / "diagnosis_next.json"),
                 timing.get("diagnosis_s", math.nan),
             )

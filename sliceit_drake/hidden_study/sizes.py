@@ -21,10 +21,11 @@ from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.solver import CuttingError
-from sliceit_drake.diagnosis.diagnose import setup_of_food
+from sliceit_drake.diagnosis.diagnose import BASE, setup_of_food
 from sliceit_drake.diagnosis.effect_size import effect_in_noise
 from sliceit_drake.diagnosis.linear import USUAL, LinearProblem
-from sliceit_drake.diagnosis.registry import all_causes
+from sliceit_drake.diagnosis.registry import all_causes, open_causes
+from sliceit_drake.diagnosis.screen import screen
 from sliceit_drake.diagnosis.sensitivity import Column, Sensitivities, sensitivities
 from sliceit_drake.diagnosis.simulator import cutting_source
 from sliceit_drake.hidden_study import bench
@@ -42,7 +43,7 @@ from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
 from sliceit_drake.stand_in.registry import EFFECTS, make_effect
 from sliceit_drake.stand_in.session import Session
 
-__all__ = ["DELTAS", "ProtocolSizes", "SizeCurve", "size_for", "sizes_as_markdown"]
+__all__ = ["DELTAS", "ProtocolSizes", "SizeCurve", "angles_for", "size_for", "sizes_as_markdown"]
 
 DELTAS = (0.5, 1.0, 2.0, 2.5, 3.0, 4.0)
 """Strengths that a table shows."""
@@ -68,6 +69,9 @@ LIMITS = {
     "arm_compliance": 2e-4,
 }
 """Largest sizes that have a meaning, where these are less than `LARGEST` times the typical one."""
+
+MIDDLE = 2.5
+"""Strength at which an effect is compared with the causes."""
 
 ROUNDS = 3
 CLOSE = 0.08
@@ -158,7 +162,7 @@ class ProtocolSizes:
         sources = [inspect.getfile(m) for m in modules]
         for source in [*sources, inspect.getfile(EFFECTS[effect])]:
             h.update(Path(source).read_bytes())
-        h.update(inspect.getsource(ProtocolSizes).encode())
+        h.update(inspect.getsource(ProtocolSizes.strengths).encode())
         h.update(
             repr(
                 (self.protocol, self.settings, effect, EFFECTS[effect].typical, LIMITS.get(effect))
@@ -205,18 +209,54 @@ class ProtocolSizes:
             except CuttingError:
                 out.append(float("nan"))
                 continue
-            with_effect = dc.replace(
-                found,
-                columns=[*found.columns, Column("cause", "hidden")],
-                records=[
-                    dc.replace(r, columns=np.concatenate([r.columns, change[:, :, None]], axis=2))
-                    for r, change in zip(found.records, changes, strict=True)
-                ],
-            )
-            problem = LinearProblem(with_effect, null.noise)
-            problem.variation = null.variation
+            problem = LinearProblem(_with_column(found, changes), null.noise, null.variation)
             column = len(found.columns)
             out.append(effect_in_noise(problem, [column], np.ones(1))[0])
+        return out
+
+    @functools.cached_property
+    def _full(self) -> tuple[Sensitivities, LinearProblem]:
+        """The same session with the sensitivities of all causes."""
+        real = Session(self.protocol, seed=SEED, settings=self.settings)
+        records = [real.record(k) for k in range(len(real))]
+        setup = setup_of_food(model_food(self.protocol), DIAGNOSIS_REFINEMENT)
+        causes = open_causes([p.name for p in BASE])
+        found = sensitivities(setup, records, causes, cache=self.cache, workers=1)
+        return found, LinearProblem(found)
+
+    def angles(self, effect: str, delta: float = MIDDLE) -> dict[str, float]:
+        """Angles in degrees between what an effect leaves and all that each cause of the list can
+        do, what is free in any case taken off both: a cause that is near can mimic it.
+
+        Args:
+            effect: Its name.
+            delta: Its strength; where it is never so strong, at its greatest.
+        """
+        file = self._file(effect)
+        if file is not None:
+            causes = open_causes([p.name for p in BASE])
+            key = hashlib.sha256(repr([(c.name, c.parameters, c.scan) for c in causes]).encode())
+            file = file.with_name(f"angles_{file.stem}_{key.hexdigest()[:8]}.json")
+            if file.exists():
+                known: dict[str, float] = json.loads(file.read_text(encoding="utf-8"))
+                return known
+        curve = self.curve(effect)
+        size = curve.size(delta) or (curve.sizes[-1] if curve.sizes else None)
+        if size is None:
+            return {}
+        found, null = self._full
+        problem = LinearProblem(
+            _with_column(found, self._change(effect, size)), null.noise, null.variation
+        )
+        screening = screen(problem, 2)
+        hidden = dc.replace(screening.evidence("hidden"), coefficients=[1.0], scan=None)
+        out = {
+            name: screening.angle_to(problem, hidden, name)
+            for name in screening.names
+            if name != "hidden"
+        }
+        if file is not None:
+            file.write_text(json.dumps(out, indent=2) + "\n", encoding="utf-8")
         return out
 
     def _compute(self, effect: str) -> SizeCurve:
@@ -258,6 +298,18 @@ class ProtocolSizes:
         return min(size, largest)
 
 
+def _with_column(found: Sensitivities, changes: Sequence[np.ndarray]) -> Sensitivities:
+    """With a cause "hidden" that changes records so [m, c]."""
+    return dc.replace(
+        found,
+        columns=[*found.columns, Column("cause", "hidden")],
+        records=[
+            dc.replace(r, columns=np.concatenate([r.columns, change[:, :, None]], axis=2))
+            for r, change in zip(found.records, changes, strict=True)
+        ],
+    )
+
+
 def _curve(effect: str, known: dict[float, float]) -> SizeCurve:
     sizes = sorted(known)
     return SizeCurve(effect, tuple(sizes), tuple(known[s] for s in sizes))
@@ -284,6 +336,11 @@ def size_for(protocol: str, effect: str, delta: float, cache: Path | None = None
         ConfigurationError: There is no such protocol or effect.
     """
     return _sizes(protocol, cache).curve(effect).size(delta)
+
+
+def angles_for(protocol: str, effect: str, cache: Path | None = None) -> dict[str, float]:
+    """`ProtocolSizes.angles` of a protocol that ships."""
+    return _sizes(protocol, cache).angles(effect)
 
 
 def sizes_as_markdown(

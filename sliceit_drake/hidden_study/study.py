@@ -15,7 +15,7 @@ from sliceit_drake.hidden_study.bench import model_food, protocol_named
 from sliceit_drake.hidden_study.cases import KINDS, Case, make_cases
 from sliceit_drake.hidden_study.classes import ProtocolClasses, protocol_classes
 from sliceit_drake.hidden_study.runner import food_file, is_done, run_case
-from sliceit_drake.hidden_study.sizes import size_for
+from sliceit_drake.hidden_study.sizes import angles_for, size_for
 from sliceit_drake.hidden_study.truth import CAUSE_OF
 
 __all__ = ["StudyOptions", "load_cases", "prepare", "run_study"]
@@ -78,6 +78,7 @@ def prepare(output: Path, options: StudyOptions, progress: Progress) -> list[Cas
         protocols=options.protocols,
         effects=options.effects,
     )
+    _near(output, cases, progress)
     for name in options.protocols:
         food_file(output, name).parent.mkdir(parents=True, exist_ok=True)
         dump_yaml(model_food(protocol_named(name)), food_file(output, name))
@@ -100,6 +101,21 @@ def _classes(
     text = json.dumps({name: dc.asdict(c) for name, c in found.items()}) + "\n"
     (output / "classes.json").write_text(text, encoding="utf-8")
     return found
+
+
+def _near(output: Path, cases: Sequence[Case], progress: Progress) -> None:
+    """Writes which causes each hidden effect is how near to."""
+    wanted = sorted(
+        {(c.protocol, h.effect) for c in cases for h in c.hidden if h.effect in CAUSE_OF}
+    )
+    file = output / "near.json"
+    near: dict[str, dict[str, dict[str, float]]] = {}
+    if file.exists():
+        near = json.loads(file.read_text(encoding="utf-8"))
+    for k, (protocol, effect) in enumerate(wanted):
+        near.setdefault(protocol, {})[effect] = angles_for(protocol, effect, output / "cache")
+        progress("classes of effects", k + 1, len(wanted))
+    file.write_text(json.dumps(near, indent=1) + "\n", encoding="utf-8")
 
 
 def load_cases(output: Path) -> list[Case]:
