@@ -137,13 +137,14 @@ class _Statistics:
                 self.own_extra += columns
             else:
                 self.null += columns
-        skipped = {name for name, _ in assumed}
-        self.names = [name for name in found.causes if name not in skipped]
+        # At another value of its scan an assumed cause may still add something.
         self.options: list[tuple[str, float | None, list[int]]] = [
             (name, scan, found.index("cause", name, scan))
-            for name in self.names
+            for name in found.causes
             for scan in found.scans(name)
+            if (name, scan) not in assumed
         ]
+        self.names = list(dict.fromkeys(name for name, _, _ in self.options))
         self.per_record = {
             name: any(found.columns[k].per_record for k in found.index("cause", name))
             for name in self.names

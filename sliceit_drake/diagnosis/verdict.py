@@ -16,6 +16,8 @@ ALARM = 0.02
 LEAST_SIZE = 0.7
 """Least effect against the in-contact noise that is called one: below, the simulation's own errors
 are as large."""
+LEAST_MISFIT = 0.55
+"""Least misfit against the in-contact noise that calls for a cause."""
 TOLERATED = 0.4
 """Misfit against the in-contact noise that the simulation leaves where nothing is wrong."""
 EXPLAINED = 0.6
@@ -107,7 +109,7 @@ def reach_verdict(
     misfit = _misfit_size(problem, findings, unexplained)
     large = [f for f in findings if f.spread >= LEAST_SIZE]
     if first.p_value > ALARM or not large:
-        if first.misfit_p_value <= ALARM and misfit >= LEAST_SIZE:
+        if first.misfit_p_value <= ALARM and misfit >= LEAST_MISFIT:
             reason = "the records differ from the simulation, but no cause of the list explains it"
             return Verdict("unknown", [], first, None, misfit, reason, needed)
         reason = "nothing beyond the noise and what the simulation itself is unsure of"
