@@ -86,6 +86,8 @@ class Diagnosis:
         simulated = None
         if self.confirmation is not None and self.confirmation.holds:
             simulated = self.confirmation.problem
+            factors = self.confirmation.factors
+            self.shifts = {n: (factors.get(n, f), error) for n, (f, error) in self.shifts.items()}
         elif self.confirmation is not None:
             self.remarks.append(
                 "A simulation with the cause in it gains less than half of what its derivatives "
@@ -181,9 +183,12 @@ class Diagnosis:
         """
         food = copy.deepcopy(self.setup.food)
         model = make_food_model(food, self.setup.knife, self.setup.numerics)
+        # What is not understood, or may be the slices, is no reason to change a food.
+        sure = self.verdict.kind in ("cause", "causes", "nothing")
         values = {
             name: float(get_parameter(model, name)) * factor
             for name, (factor, _) in self.shifts.items()
+            if sure
         }
         model = with_parameters(model, values)
         left = []

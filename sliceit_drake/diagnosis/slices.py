@@ -97,7 +97,9 @@ class SliceTarget:
             home, top, width = np.zeros(3), 0.0, 0.0
         self.home = home
         T = clock.period
-        count = max(2, round((record.time[-1] - record.time[0]) / T))
+        # Not beyond the last row: a knife that stopped there would show weight and speed that it
+        # never had.
+        count = max(2, int((record.time[-1] - record.time[0]) / T + 1e-6))
         self.grid = record.time[0] + T * np.arange(count + 1)
         at = np.minimum(self.grid, record.time[-1])
         self.p = np.column_stack([np.interp(at, record.time, column) for column in p.T])
