@@ -21,8 +21,8 @@ KINDS: dict[str, int] = {
     "unknown": 60,
     "pairs": 40,
     "poor": 60,
-    "base": 18,
-    "curve": 60,
+    "base": 12,
+    "curve": 40,
 }
 """Kinds of runs, and the least number of each."""
 

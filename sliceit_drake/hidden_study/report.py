@@ -33,8 +33,10 @@ base parameters and what is each slice's own are refitted, over the noise in con
 What counts as right:
 
 - **one cause**: the verdict is one cause; its class holds the one that was hidden, and nothing that
-  these slices could tell from it ([identifiability.md](identifiability.md)). A second finding is a
-  miss, and so is a class that is too large.
+  these slices could tell from it: all others must mimic what was hidden to within 20 degrees, or
+  to within 3 degrees of what the cause itself can do as it is modelled here, computed from the
+  effect's noise-free change of the forces. A second finding is a miss, and so is a class
+  that is too large.
 - **nothing hidden**: any other verdict than "nothing" is an alarm.
 - **unknown**: the effect stands in no list of causes; "unknown" is right, a name is wrong.
 - **two causes**: two findings, one of each.

@@ -18,6 +18,10 @@ __all__ = ["Judgement", "Rate", "judge", "judge_study", "load_near"]
 NAMING = ("cause", "causes", "too_few_replicates")
 CLASS_ANGLE = 20.0
 """Causes that can do what was hidden to within this, degrees, are its class."""
+AS_WELL = 3.0
+"""Difference of angles below which two causes explain an effect as well, degrees."""
+NOT_ITSELF = 60.0
+"""Angle from which on an effect has nothing in common with its cause's sensitivities, degrees."""
 Near = Mapping[str, Mapping[str, Mapping[str, float]]]
 Z = 1.6448536269514722
 """Of a one-sided bound of 95 %."""
@@ -112,7 +116,11 @@ def judge(
     allowed = set(truth)
     for h in case.hidden:
         angles = near.get(case.protocol, {}).get(h.effect, {})
-        allowed |= {name for name, angle in angles.items() if angle <= CLASS_ANGLE}
+        # What explains the effect as well as the cause itself, as it is modelled, is no other.
+        own = angles.get(CAUSE_OF.get(h.effect, ""), 0.0)
+        # One that looks for itself in the records has nothing to be near to here.
+        least = own + AS_WELL if own < NOT_ITSELF else 0.0
+        allowed |= {n for n, angle in angles.items() if angle <= max(CLASS_ANGLE, least)}
     wrong = sorted({n for c in named for n in c} - allowed)
     gain = facts.get("gain")
     shares = {e["cause"]: e.get("held_out_share") for e in facts["evidence"]}
