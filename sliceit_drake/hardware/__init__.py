@@ -1,0 +1,1 @@
+"""A real UR5e: limits, safety layer, the link through RTDE, and its Drake system."""

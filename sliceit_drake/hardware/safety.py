@@ -1,0 +1,391 @@
+"""The safety layer: every joint target passes here before it goes out, or stops the robot.
+
+Plain Python, no input or output, no clock but the controller's. It is not a safety function in the
+sense of ISO 13849 or ISO 10218: the robot's own safety system is (docs/hardware.md).
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from sliceit_drake.hardware.knife_kinematics import Edge, KnifeKinematics
+from sliceit_drake.hardware.limits import SafetyLimits
+from sliceit_drake.hardware.robot_state import (
+    PLAYING,
+    RUNTIME_STATES,
+    SAFE_BITS,
+    RobotState,
+    safety_text,
+)
+
+__all__ = ["Decision", "LatchedError", "SafetyLayer", "Stop"]
+
+RESET_WORD = "reset"
+# Differences of the controller's times and of targets carry rounding errors of this order.
+_ROUNDING = 1e-9
+_REACH = 1.6  # Of the tool's farthest point from the first joint's axis, m, generously.
+_REST_SPEED = 0.02  # A joint slower than this counts as at rest, rad/s.
+
+
+class Stop(NamedTuple):
+    """Why the layer stopped.
+
+    Attributes:
+        limit: Name of the limit, as in `SafetyLimits`, or of the fault.
+        detail: A sentence for the operator.
+        value: What was found; NaN where a number does not tell.
+        bound: What was allowed; NaN likewise.
+        time: Of the controller, s.
+        sends: Whether targets go on out, to brake and hold; after a fault of the link or of the
+            robot's program nothing does, so that nothing moves when it comes back.
+    """
+
+    limit: str
+    detail: str
+    value: float
+    bound: float
+    time: float
+    sends: bool
+
+    def __str__(self) -> str:
+        return f"{self.limit} at controller time {self.time:.3f} s: {self.detail}"
+
+
+class Decision(NamedTuple):
+    """What to do in a cycle.
+
+    Attributes:
+        q: Target to send [6], rad; None to send nothing.
+        stop: Why the layer is latched; None while it is not.
+    """
+
+    q: list[float] | None
+    stop: Stop | None
+
+
+class LatchedError(RuntimeError):
+    """The layer is latched; only an operator's reset ends that."""
+
+
+class SafetyLayer:
+    """Passes targets that keep every limit; at the first that does not, stops and stays stopped.
+
+    What counts is what goes out: each target is judged against the one sent before, at the
+    controller's times of both. A target is passed only if the arm, braked from it, also comes to
+    rest within the limits; braking goes along the line of the last motion in joint space, each
+    joint within its acceleration. So all that is sent keeps the limits, the stop included.
+
+    Args:
+        limits: What is allowed.
+        kinematics: Of the knife.
+        board_height: Of the board's surface in the world, m.
+        start: Joint positions around which `SafetyLimits.joint_window` lies [6], rad.
+        period: Of the controller, s.
+    """
+
+    def __init__(
+        self,
+        limits: SafetyLimits,
+        kinematics: KnifeKinematics,
+        board_height: float,
+        start: Sequence[float],
+        period: float = 0.002,
+    ) -> None:
+        self.limits, self.period = limits, period
+        self._kinematics = kinematics
+        window = limits.joint_window
+        self._lower = [max(a, s - window) for a, s in zip(limits.joint_lower, start, strict=True)]
+        self._upper = [min(b, s + window) for b, s in zip(limits.joint_upper, start, strict=True)]
+        self._speed = list(limits.joint_speed)
+        self._acceleration = list(limits.joint_acceleration)
+        self._low, self._high = list(limits.workspace_lower), list(limits.workspace_upper)
+        self._floor = board_height - limits.board_depth
+        self._down = math.cos(limits.tilt)
+        self._stop: Stop | None = None
+        self._armed = False
+        self._q = [0.0] * 6
+        self._v = [0.0] * 6
+        self._edge = kinematics.edge(self._q)
+        self._time = -math.inf  # Of the last state.
+        self._sent_time = -math.inf
+
+    @property
+    def stop(self) -> Stop | None:
+        """Why the layer is latched, or None."""
+        return self._stop
+
+    def arm(self, state: RobotState) -> Stop | None:
+        """Takes the arm's actual position, at rest, as the target sent last.
+
+        Returns:
+            Why the layer latched instead: the robot is not in a state to start from.
+
+        Raises:
+            LatchedError: If it is latched already.
+        """
+        if self._stop is not None:
+            raise LatchedError(f"The safety layer is latched ({self._stop}); reset it first.")
+        self._armed = False
+        stop = self._robot_fault(state) or self._measurement_fault(state)
+        if stop is None:
+            self._q, self._v = list(state.q), [0.0] * 6
+            self._time = self._sent_time = state.time
+            edge = self._kinematics.edge(self._q)
+            stop = self._position_fault(self._q, edge, "the arm's actual position", state.time)
+            self._edge = edge
+            fastest = max(map(abs, state.qd))
+            if stop is None and fastest > _REST_SPEED:
+                stop = self._breach(
+                    "at rest", "a joint moves at the start", fastest, _REST_SPEED, "rad/s",
+                    state.time,
+                )  # fmt: skip
+        if stop is not None:
+            self._stop = stop
+            return stop
+        self._armed = True
+        return None
+
+    def reset(self, state: RobotState, word: str) -> Stop | None:
+        """Ends a stop, for an operator who typed `RESET_WORD`; continues from the actual position.
+
+        Returns:
+            Why the layer latched at once again, or None.
+
+        Raises:
+            LatchedError: If the word is another.
+        """
+        if word != RESET_WORD:
+            raise LatchedError(f'A stop is reset by the word "{RESET_WORD}", not by {word!r}.')
+        self._stop = None
+        return self.arm(state)
+
+    def latch(
+        self, limit: str, detail: str, value: float = math.nan, bound: float = math.nan
+    ) -> Stop:
+        """Stops for a fault that another part found, after which nothing is sent.
+
+        Returns:
+            The first stop, which may be an earlier one.
+        """
+        if self._stop is None or self._stop.sends:
+            first = self._stop
+            self._stop = Stop(limit, detail, value, bound, self._time, False)
+            if first is not None:  # What came first stays the reason.
+                self._stop = first._replace(sends=False)
+        return self._stop
+
+    def step(
+        self, state: RobotState, command: Sequence[float] | None, command_time: float
+    ) -> Decision:
+        """Judges one cycle.
+
+        Args:
+            state: New data of the controller.
+            command: The target wanted [6], rad; None where there is none that was not judged yet.
+            command_time: Controller time of the measurement that the newest command answers, s.
+        """
+        stop = self._stop
+        if stop is None:
+            stop = self._stop = self._fault(state, command, command_time)
+            if stop is None:
+                if command is None:
+                    return Decision(None, None)
+                return Decision(self._q[:], None)
+        else:
+            if not stop.sends:
+                return Decision(None, stop)
+            fault = self._robot_fault(state) or self._clock_fault(state)
+            if fault is not None:
+                stop = self._stop = stop._replace(sends=False)
+            else:
+                self._time = state.time
+        if not stop.sends:
+            return Decision(None, stop)
+        return Decision(self._brake(state.time), stop)
+
+    def _fault(
+        self, state: RobotState, command: Sequence[float] | None, command_time: float
+    ) -> Stop | None:
+        """The first limit that a cycle breaks; None if none, and then the command is taken."""
+        if not self._armed:
+            return Stop(
+                "not armed", "the layer was never armed", math.nan, math.nan, state.time, False
+            )
+        stop = self._robot_fault(state) or self._clock_fault(state)
+        if stop is not None:
+            return stop
+        self._time = time = state.time
+        stop = self._measurement_fault(state)
+        if stop is not None:
+            return stop
+        limits = self.limits
+        for j in range(6):
+            error = abs(self._q[j] - state.q[j])
+            if not error <= limits.tracking_error:
+                return self._breach(
+                    "tracking_error", f"joint {j + 1} is off its target", error,
+                    limits.tracking_error, "rad", time,
+                )  # fmt: skip
+        age = time - command_time
+        if not age <= limits.command_age + _ROUNDING:
+            return self._breach(
+                "command_age", "no new command in time", age, limits.command_age, "s", time
+            )
+        return None if command is None else self._take(command, time)
+
+    def _robot_fault(self, state: RobotState) -> Stop | None:
+        bits = state.safety_bits
+        if bits & ~SAFE_BITS or not bits & SAFE_BITS:
+            detail = f"the robot reports {safety_text(bits)}"
+            return Stop("safety_status", detail, bits, SAFE_BITS, state.time, False)
+        runtime = state.runtime_state
+        if runtime != PLAYING:
+            known = 0 <= runtime < len(RUNTIME_STATES)
+            name = RUNTIME_STATES[runtime] if known else "in an unknown state"
+            detail = f"the robot's program is {name}"
+            return Stop("program", detail, runtime, PLAYING, state.time, False)
+        return None
+
+    def _clock_fault(self, state: RobotState) -> Stop | None:
+        gap = state.time - self._time
+        if 0.0 < gap <= self.limits.state_age + _ROUNDING:
+            return None
+        if gap > 0.0:
+            detail = f"no data for {gap:.4g} s of controller time"
+        else:
+            detail = f"the controller's clock went from {self._time:.6g} to {state.time:.6g} s"
+        return Stop("state_age", detail, gap, self.limits.state_age, state.time, False)
+
+    def _measurement_fault(self, state: RobotState) -> Stop | None:
+        total = sum(state.q) + sum(state.qd) + sum(state.wrench) + state.time
+        sizes = len(state.q), len(state.qd), len(state.wrench)
+        if sizes != (6, 6, 6) or not math.isfinite(total):
+            detail = "the robot's data are no 6 finite numbers each"
+            return Stop("measurement", detail, math.nan, math.nan, state.time, True)
+        fx, fy, fz, tx, ty, tz = state.wrench
+        force, torque = math.hypot(fx, fy, fz), math.hypot(tx, ty, tz)
+        if force > self.limits.force:
+            return self._breach(
+                "force", "the tool meets a force", force, self.limits.force, "N", state.time
+            )
+        if torque > self.limits.torque:
+            return self._breach(
+                "torque", "the tool meets a torque", torque, self.limits.torque, "Nm", state.time
+            )
+        return None
+
+    def _take(self, command: Sequence[float], time: float) -> Stop | None:
+        """Judges a command against the target sent before; takes it if it keeps the limits."""
+        try:
+            q = [float(x) for x in command]
+        except (TypeError, ValueError):
+            q = []
+        if len(q) != 6:
+            detail = "the command is no list of 6 numbers"
+            return Stop("command", detail, len(q), 6, time, True)
+        dt = time - self._sent_time
+        limits, before, speed_before = self.limits, self._q, self._v
+        v, brake_time, way = [0.0] * 6, 0.0, 0.0
+        for j in range(6):
+            change = q[j] - before[j]
+            # Written so that a NaN fails.
+            if not abs(change) <= limits.joint_step:
+                if not math.isfinite(change):
+                    detail = f"joint {j + 1} of the command is {q[j]}"
+                    return Stop("command", detail, q[j], math.nan, time, True)
+                return self._breach(
+                    "joint_step", f"joint {j + 1} would jump", abs(change), limits.joint_step,
+                    "rad", time,
+                )  # fmt: skip
+            way += abs(change)
+            v[j] = speed = change / dt
+            if abs(speed) > self._speed[j]:
+                return self._breach(
+                    "joint_speed", f"joint {j + 1} would move", abs(speed), self._speed[j],
+                    "rad/s", time,
+                )  # fmt: skip
+            most = self._acceleration[j]
+            acceleration = abs(speed - speed_before[j]) / dt
+            if acceleration > most:
+                return self._breach(
+                    "joint_acceleration", f"joint {j + 1} would accelerate", acceleration, most,
+                    "rad/s2", time,
+                )  # fmt: skip
+            if abs(speed) > most * brake_time:
+                brake_time = abs(speed) / most
+        edge = self._kinematics.edge(q)
+        fastest = max(math.dist(edge[0], self._edge[0]), math.dist(edge[1], self._edge[1])) / dt
+        if fastest > limits.knife_speed:
+            return self._breach(
+                "knife_speed", "the knife would move", fastest, limits.knife_speed, "m/s", time
+            )
+        stop = self._position_fault(q, edge, "the command", time)
+        if stop is None and brake_time > 0.0:
+            # In steps the way is less than v T / 2, by half a step. On it a point leaves the
+            # straight line by at most reach / 8 times the square of the angles turned.
+            share = 0.5 * brake_time
+            rest = [q[j] + share * v[j] for j in range(6)]
+            turned = way * share / dt
+            stop = self._position_fault(
+                rest,
+                self._kinematics.edge(rest),
+                "where the arm could stop",
+                time,
+                _REACH / 8.0 * turned * turned,
+            )
+        if stop is None:
+            self._q, self._v, self._edge, self._sent_time = q, v, edge, time
+        return stop
+
+    def _position_fault(
+        self, q: Sequence[float], edge: Edge, what: str, time: float, margin: float = 0.0
+    ) -> Stop | None:
+        for j in range(6):
+            if q[j] > self._upper[j]:
+                return self._breach(
+                    "joint_upper", f"joint {j + 1} of {what}", q[j], self._upper[j], "rad", time
+                )
+            if q[j] < self._lower[j]:
+                return self._breach(
+                    "joint_lower", f"joint {j + 1} of {what}", q[j], self._lower[j], "rad", time
+                )
+        heel, tip, down = edge
+        low, high = self._low, self._high
+        for k in range(3):
+            a, b = (heel[k], tip[k]) if heel[k] < tip[k] else (tip[k], heel[k])
+            if a < low[k] + margin:
+                return self._breach(
+                    "workspace_lower", f"the edge's {'xyz'[k]} at {what}", a, low[k], "m", time
+                )
+            if b > high[k] - margin:
+                return self._breach(
+                    "workspace_upper", f"the edge's {'xyz'[k]} at {what}", b, high[k], "m", time
+                )
+        lowest = min(heel[2], tip[2])
+        if lowest < self._floor + margin:
+            return self._breach(
+                "board_depth", f"the edge's height at {what}", lowest, self._floor, "m", time
+            )
+        if down < self._down + margin:
+            angle = math.acos(max(-1.0, min(1.0, down)))
+            return self._breach(
+                "tilt", f"the blade's tilt at {what}", angle, self.limits.tilt, "rad", time
+            )
+        return None
+
+    def _brake(self, time: float) -> list[float]:
+        """The next target of a stop: slower along the last motion, then the same."""
+        v, dt = self._v, time - self._sent_time
+        brake_time = max(abs(v[j]) / self._acceleration[j] for j in range(6))
+        share = 0.0 if brake_time <= dt else 1.0 - dt / brake_time
+        v = [share * x for x in v]
+        self._q = [self._q[j] + dt * v[j] for j in range(6)]
+        self._v, self._sent_time = v, time
+        return self._q[:]
+
+    @staticmethod
+    def _breach(
+        limit: str, detail: str, value: float, bound: float, unit: str, time: float
+    ) -> Stop:
+        text = f"{detail}: {value:.6g} {unit}, allowed {bound:.6g}"
+        return Stop(limit, text, value, bound, time, True)
