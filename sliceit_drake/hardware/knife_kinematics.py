@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["Edge", "KnifeKinematics"]
+__all__ = ["Edge", "KnifeKinematics", "flange_pose"]
 
 # Universal Robots, "DH parameters for calculations of kinematics and dynamics", UR5e, metres.
 D1, A2, A3, D4, D5, D6 = 0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996
@@ -31,6 +31,37 @@ class Edge(NamedTuple):
     heel: tuple[float, float, float]
     tip: tuple[float, float, float]
     down: float
+
+
+def flange_pose(q: Sequence[float]) -> tuple[float, ...]:
+    """Pose of the flange in the base at joint positions `q` [6], rad.
+
+    Returns:
+        The columns of the rotation one after the other, then the position, m: 12 numbers.
+    """
+    q1, q2, q3, q4, q5, q6 = q
+    q23 = q2 + q3
+    q234 = q23 + q4
+    s1, c1, s5, c5 = math.sin(q1), math.cos(q1), math.sin(q5), math.cos(q5)
+    s6, c6, s, c = math.sin(q6), math.cos(q6), math.sin(q234), math.cos(q234)
+    ux, uy, uz = s1 * s5 + c1 * c * c5, c * c5 * s1 - c1 * s5, c5 * s
+    vx, vy, vz = -c1 * s, -s1 * s, c
+    ax, ay, az = c5 * s1 - c1 * c * s5, -c1 * c5 - c * s1 * s5, -s * s5
+    reach = A2 * math.cos(q2) + A3 * math.cos(q23) + D5 * s
+    return (
+        c6 * ux + s6 * vx,
+        c6 * uy + s6 * vy,
+        c6 * uz + s6 * vz,
+        c6 * vx - s6 * ux,
+        c6 * vy - s6 * uy,
+        c6 * vz - s6 * uz,
+        ax,
+        ay,
+        az,
+        D6 * ax + D4 * s1 + c1 * reach,
+        D6 * ay - D4 * c1 + s1 * reach,
+        D1 + D6 * az + A2 * math.sin(q2) + A3 * math.sin(q23) - D5 * c,
+    )
 
 
 class KnifeKinematics:
@@ -53,20 +84,7 @@ class KnifeKinematics:
 
     def edge(self, q: Sequence[float]) -> Edge:
         """The edge at joint positions `q` [6], rad."""
-        q1, q2, q3, q4, q5, q6 = q
-        q23 = q2 + q3
-        q234 = q23 + q4
-        s1, c1, s5, c5 = math.sin(q1), math.cos(q1), math.sin(q5), math.cos(q5)
-        s6, c6, s, c = math.sin(q6), math.cos(q6), math.sin(q234), math.cos(q234)
-        ux, uy, uz = s1 * s5 + c1 * c * c5, c * c5 * s1 - c1 * s5, c5 * s
-        vx, vy, vz = -c1 * s, -s1 * s, c
-        ax, ay, az = c5 * s1 - c1 * c * s5, -c1 * c5 - c * s1 * s5, -s * s5
-        nx, ny, nz = c6 * ux + s6 * vx, c6 * uy + s6 * vy, c6 * uz + s6 * vz
-        ox, oy, oz = c6 * vx - s6 * ux, c6 * vy - s6 * uy, c6 * vz - s6 * uz
-        reach = A2 * math.cos(q2) + A3 * math.cos(q23) + D5 * s
-        px = D6 * ax + D4 * s1 + c1 * reach
-        py = D6 * ay - D4 * c1 + s1 * reach
-        pz = D1 + D6 * az + A2 * math.sin(q2) + A3 * math.sin(q23) - D5 * c
+        nx, ny, nz, ox, oy, oz, ax, ay, az, px, py, pz = flange_pose(q)
         (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self._R
         wx, wy, wz = self._p
         ends = []

@@ -110,6 +110,11 @@ class SafetyLayer:
         self._sent_time = -math.inf
 
     @property
+    def is_still(self) -> bool:
+        """Whether the target sent last repeats the one before it."""
+        return not any(self._v)
+
+    @property
     def stop(self) -> Stop | None:
         """Why the layer is latched, or None."""
         return self._stop
@@ -160,18 +165,26 @@ class SafetyLayer:
         return self.arm(state)
 
     def latch(
-        self, limit: str, detail: str, value: float = math.nan, bound: float = math.nan
+        self,
+        limit: str,
+        detail: str,
+        value: float = math.nan,
+        bound: float = math.nan,
+        *,
+        sends: bool = False,
     ) -> Stop:
-        """Stops for a fault that another part found, after which nothing is sent.
+        """Stops for what another part found.
+
+        Args:
+            limit, detail, value, bound, sends: As in `Stop`.
 
         Returns:
-            The first stop, which may be an earlier one.
+            The first stop, which may be an earlier one; it sends no more if this one does not.
         """
-        if self._stop is None or self._stop.sends:
-            first = self._stop
-            self._stop = Stop(limit, detail, value, bound, self._time, False)
-            if first is not None:  # What came first stays the reason.
-                self._stop = first._replace(sends=False)
+        if self._stop is None:
+            self._stop = Stop(limit, detail, value, bound, self._time, sends)
+        elif not sends:
+            self._stop = self._stop._replace(sends=False)
         return self._stop
 
     def step(

@@ -1,0 +1,81 @@
+"""What the link needs of a robot: an interface, so that tests and other libraries can stand in."""
+
+import dataclasses as dc
+from typing import Protocol
+
+from sliceit_drake.hardware.robot_state import RobotState
+
+__all__ = ["RobotClient", "RobotFacts", "RobotUnavailableError"]
+
+
+class RobotUnavailableError(RuntimeError):
+    """There is no robot to talk to, or it refuses; the message says what to do."""
+
+
+@dc.dataclass
+class RobotFacts:
+    """What a robot says of itself before it is used.
+
+    Attributes:
+        model: As the dashboard has it, such as "UR5".
+        serial: Serial number.
+        software: PolyScope's version, as "5.11.1".
+        robot_mode: As the dashboard has it, such as "RUNNING".
+        safety_mode: Likewise, such as "NORMAL".
+        remote_control: Whether it is in remote control; None where the robot cannot say.
+        payload: Mass that the controller was told, kg.
+        payload_cog: Its centre of gravity in the flange's frame [3], m.
+        tcp: Tool centre point in the flange's frame, position and rotation vector [6], m, rad.
+        speed_scaling: The speed slider, 1 for 100 %.
+    """
+
+    model: str
+    serial: str
+    software: str
+    robot_mode: str
+    safety_mode: str
+    remote_control: bool | None
+    payload: float
+    payload_cog: list[float]
+    tcp: list[float]
+    speed_scaling: float
+
+
+class RobotClient(Protocol):
+    """A connected robot. Only `RobotLink`'s thread calls `timestamp` to `servo` during a run."""
+
+    def timestamp(self) -> float:
+        """The controller's time in the newest data, s; the same again if nothing came."""
+
+    def read(self) -> RobotState:
+        """The newest data, all of one cycle."""
+
+    def is_connected(self) -> bool:
+        """Whether no connection is known to be lost; True proves nothing."""
+
+    def servo(self, q: list[float]) -> bool:
+        """Sends a joint target [6], rad; False if it was refused. True proves nothing."""
+
+    def kick(self) -> None:
+        """Tells the watchdog that the program lives, where no target is sent."""
+
+    def set_watchdog(self, frequency: float) -> bool:
+        """Lets the controller stop the program if less than `frequency` inputs a second come."""
+
+    def stop(self) -> None:
+        """Stops the motion and the program on the robot; may block while a link is dead."""
+
+    def facts(self) -> RobotFacts:
+        """What the robot says of itself."""
+
+    def zero_sensor(self) -> None:
+        """Subtracts what the force sensor shows now from all that it shows later."""
+
+    def allows_joints(self, q: list[float]) -> bool:
+        """Whether the robot's own safety limits and planes allow joint positions [6], rad."""
+
+    def move_to(self, q: list[float], speed: float, acceleration: float) -> bool:
+        """Moves all joints to `q` [6], rad, along a line in joint space; blocks. rad/s, rad/s2."""
+
+    def close(self) -> None:
+        """Disconnects."""

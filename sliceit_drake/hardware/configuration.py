@@ -1,0 +1,82 @@
+"""The robot that a user has: one YAML file in hardware/, which every run reads."""
+
+import dataclasses as dc
+from pathlib import Path
+
+from sliceit_drake.configuration import ConfigurationError, choice, load_yaml, quantity
+from sliceit_drake.hardware.limits import SafetyLimits
+
+__all__ = ["HardwareConfig", "load_hardware_config"]
+
+
+@dc.dataclass
+class HardwareConfig:
+    """A robot, its tool, how it is driven and within which limits.
+
+    Attributes:
+        serial: Serial number of the one robot that this file is for; empty accepts any.
+        limits: What may be sent; every limit has a default (hardware.limits).
+    """
+
+    model: str = choice("UR5", ("UR5",), doc="As the dashboard names it; a UR5e says UR5.")
+    serial: str = ""
+    software: str = "5.6"
+    """Least version of PolyScope."""
+    payload: float | None = quantity(
+        None, "kg", low=0.0, high=5.0, doc="Mass beyond the flange: gripper, adapter and knife."
+    )
+    payload_cog: list[float] | None = quantity(
+        None, "m", low=-0.5, high=0.5, size=3, doc="Its centre of gravity, from the flange."
+    )
+    payload_tolerance: float = quantity(
+        0.05, "kg", low=0.0, high=1.0, doc="How far the controller's payload may be off."
+    )
+    cog_tolerance: float = quantity(
+        0.01, "m", low=0.0, high=0.2, doc="How far its centre of gravity may be off."
+    )
+    board_height: float | None = quantity(
+        None,
+        "m",
+        low=-1.0,
+        high=2.0,
+        doc="Of the board's surface in the world, measured; null: not known, and nothing moves.",
+    )
+    sensor_force: float = quantity(
+        3.0, "N", low=0.1, high=20.0, doc="Most that the sensor may show in the air after zeroing."
+    )
+    sensor_torque: float = quantity(
+        0.5, "Nm", low=0.01, high=5.0, doc="Most that the sensor may show in the air after zeroing."
+    )
+    start_tolerance: float = quantity(
+        0.01, "rad", low=1e-4, high=0.2, doc="How far a joint may be off the start."
+    )
+    singularity: float = quantity(
+        0.05,
+        "",
+        low=0.0,
+        high=0.5,
+        doc="Least singular value of the knife's Jacobian (m and rad) on the plan.",
+    )
+    lookahead_time: float = quantity(0.03, "s", low=0.03, high=0.2, doc="Of servoj.")
+    gain: float = quantity(2000.0, "1/s2", low=100.0, high=2000.0, doc="Of servoj.")
+    watchdog: float = quantity(
+        50.0, "Hz", low=5.0, high=250.0, doc="Inputs a second below which the controller stops."
+    )
+    limits: SafetyLimits = dc.field(default_factory=SafetyLimits)
+
+    def check(self, where: str) -> None:
+        if not all(part.isdigit() for part in self.software.split(".")):
+            raise ConfigurationError(
+                f"{self.software!r} is no version", field=f"{where}.software", fix="Write 5.11."
+            )
+
+
+def load_hardware_config(file: str | Path, overrides: str | None = None) -> HardwareConfig:
+    """Reads and validates a robot's file; what it does not name keeps its default.
+
+    Raises:
+        ConfigurationError: Naming file, field and fix.
+    """
+    config = load_yaml(HardwareConfig, file, defaults=HardwareConfig(), overrides_text=overrides)
+    assert isinstance(config, HardwareConfig)
+    return config

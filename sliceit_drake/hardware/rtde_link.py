@@ -1,0 +1,262 @@
+"""The robot's own thread: reads each cycle of the controller, judges, and sends.
+
+The diagram and this thread exchange only their newest values: neither waits for the other.
+"""
+
+import threading
+import time as clock
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from sliceit_drake.hardware.client import RobotClient, RobotUnavailableError
+from sliceit_drake.hardware.robot_state import RobotState
+from sliceit_drake.hardware.safety import SafetyLayer, Stop
+
+__all__ = ["LinkStatus", "RobotLink"]
+
+POLL = 1e-4
+"""Pause between two looks for new data, s."""
+SLOW_CALL = 0.05
+"""A call that sends a target and takes longer has reconnected or stands, s."""
+FIRST_DATA = 3.0
+STOP_TIME = 2.0
+"""How long a stop at the end may take, s."""
+
+
+class _Command(NamedTuple):
+    number: int
+    q: list[float]
+    time: float
+
+
+class LinkStatus(NamedTuple):
+    """The newest of the link.
+
+    Attributes:
+        state: Of the controller.
+        arrival: Wall time at which it was seen, s (`time.perf_counter`).
+        period: Controller time since the state before, s.
+        lateness: Wall time since the state before, less the period at the link's pace, s.
+        cycles: States seen.
+        missed: Cycles of the controller of which no state was seen.
+        sent: Targets sent.
+        stop: Why the safety layer is latched, or None.
+    """
+
+    state: RobotState
+    arrival: float
+    period: float
+    lateness: float
+    cycles: int
+    missed: int
+    sent: int
+    stop: Stop | None
+
+
+class RobotLink:
+    """Owns a robot client and a safety layer during a run.
+
+    The thread watches from `start` on; from `arm` on it sends. It latches by itself when the
+    controller's clock stands, jumps or goes back, when the robot's program does not play, when a
+    safety bit is set, when a connection is lost even for a moment, and when a call that sends is
+    refused, fails or takes long: traces of a link that came back, and of a program that was
+    uploaded anew. After such a fault nothing is sent again.
+
+    Args:
+        client: Connected.
+        safety: Not armed yet.
+        watchdog: Least rate of inputs that the controller shall demand, Hz; set before the first
+            target.
+        pace: Controller seconds in a second; 1 for all robots, less for an emulated one.
+
+    Attributes:
+        stop_error: What the client said when it could not stop the robot's program, or None.
+    """
+
+    def __init__(
+        self, client: RobotClient, safety: SafetyLayer, watchdog: float = 50.0, pace: float = 1.0
+    ) -> None:
+        self._client, self._safety = client, safety
+        self._watchdog, self._pace = watchdog, pace
+        self._command: _Command | None = None
+        self._judged = 0
+        self._armed = self._ending = False
+        self._status: LinkStatus | None = None
+        self._changed = threading.Condition()
+        self._halted = False
+        self._halt_thread: threading.Thread | None = None
+        self.stop_error: str | None = None
+        self._thread = threading.Thread(target=self._guarded, name="robot link", daemon=True)
+
+    def start(self) -> LinkStatus:
+        """Begins to watch, without sending anything.
+
+        Raises:
+            RobotUnavailableError: No data came.
+        """
+        self._thread.start()
+        status = self.wait(None, FIRST_DATA)
+        if status is None:
+            self._ending = True
+            raise RobotUnavailableError(
+                f"The robot is connected but sends no data within {FIRST_DATA:g} s. Check the "
+                "network, and that the robot has started up."
+            )
+        return status
+
+    def arm(self) -> Stop | None:
+        """Sets the watchdog and begins to send, from the arm's actual position on.
+
+        Returns:
+            Why it latched instead.
+
+        Raises:
+            LatchedError: It is latched.
+        """
+        status = self.latest()
+        if not self._client.set_watchdog(self._watchdog):
+            return self._safety.latch("watchdog", "the controller did not accept the watchdog")
+        newer = self.wait(status, FIRST_DATA)
+        if newer is None:
+            return self._safety.latch("state_age", "no data after the watchdog was set")
+        with self._changed:
+            assert self._status is not None
+            stop = self._safety.arm(self._status.state)
+            self._command, self._armed = None, stop is None
+        return stop
+
+    def latest(self) -> LinkStatus:
+        """The newest status."""
+        assert self._status is not None, "start() first"
+        return self._status
+
+    def wait(self, seen: LinkStatus | None, timeout: float) -> LinkStatus | None:
+        """Waits for a status newer than `seen`, a latched stop included; None after `timeout` s."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._status is not seen, timeout)
+            return None if self._status is seen else self._status
+
+    def put(self, q: Sequence[float], time: float) -> None:
+        """Hands over the newest target.
+
+        Args:
+            q: Joint positions [6], rad.
+            time: Controller time of the measurement that it answers, s.
+        """
+        number = self._command.number + 1 if self._command else self._judged + 1
+        self._command = _Command(number, list(q), time)
+
+    def finish(self, reason: str) -> Stop:
+        """Brakes, holds, stops the program on the robot and ends the thread.
+
+        Returns:
+            Why the robot stopped: `reason`, or what stopped it before.
+        """
+        with self._changed:
+            stop = self._safety.latch("end", reason, sends=self._armed)
+        deadline = clock.perf_counter() + STOP_TIME / self._pace
+        while self._thread.is_alive() and clock.perf_counter() < deadline:
+            if not stop.sends or self._safety.is_still:
+                break
+            clock.sleep(0.005)
+            stop = self._safety.stop or stop
+        self._ending = True
+        self._thread.join(STOP_TIME)
+        self._halt()
+        if self._halt_thread is not None:
+            # A dead link makes the library wait for minutes; the watchdog has stopped the robot.
+            self._halt_thread.join(STOP_TIME)
+        return self._safety.stop or stop
+
+    def _guarded(self) -> None:
+        try:
+            self._run()
+        except Exception as error:  # Whatever it is, the operator must hear of it.
+            with self._changed:
+                self._latch("link", f"{type(error).__name__}: {str(error).strip()}")
+            self._halt()
+
+    def _run(self) -> None:
+        client, pace = self._client, self._pace
+        longest = self._safety.limits.state_age / pace
+        first = clock.perf_counter()
+        last_time, last_arrival = client.timestamp(), first
+        cycles = missed = sent = 0
+        while not self._ending:
+            time = client.timestamp()
+            if time == last_time:
+                silence = clock.perf_counter() - last_arrival
+                if self._armed and silence > longest and not self._halted:
+                    self._latch_fault(
+                        "state_age", f"the controller's clock stands for {silence:.4g} s"
+                    )
+                clock.sleep(POLL)
+                continue
+            state = client.read()
+            arrival = clock.perf_counter()
+            period = state.time - last_time
+            cycles += 1
+            missed += max(0, round(period / self._safety.period) - 1)
+            if self._armed:
+                sent += self._cycle(state)
+            with self._changed:
+                self._status = LinkStatus(
+                    state, arrival, period, arrival - last_arrival - period / pace,
+                    cycles, missed, sent, self._safety.stop,
+                )  # fmt: skip
+                self._changed.notify_all()
+            last_time, last_arrival = state.time, arrival
+
+    def _cycle(self, state: RobotState) -> bool:
+        """Judges a state and the newest command, and sends; whether a target went out."""
+        client, safety, command = self._client, self._safety, self._command
+        if not client.is_connected():
+            self._latch_fault("link", "a connection to the robot was lost")
+        is_new = command is not None and command.number != self._judged
+        # Until the first command comes nothing moves, and nothing can be late.
+        answered = state.time if command is None else command.time
+        with self._changed:
+            decision = safety.step(state, command.q if command and is_new else None, answered)
+        if command is not None:
+            self._judged = command.number
+        if decision.q is None:
+            if decision.stop is not None:
+                self._halt()
+            elif command is None:
+                client.kick()
+            return False
+        begin = clock.perf_counter()
+        accepted = client.servo(decision.q)
+        took = clock.perf_counter() - begin
+        if not accepted:
+            self._latch_fault("link", "the robot's program did not take a target")
+        elif took > SLOW_CALL:
+            self._latch_fault("link", f"sending a target took {took:.3g} s: the link reconnected")
+        return True
+
+    def _latch_fault(self, limit: str, detail: str) -> None:
+        with self._changed:
+            self._latch(limit, detail)
+        self._halt()
+
+    def _latch(self, limit: str, detail: str) -> None:
+        stop = self._safety.latch(limit, detail)
+        if self._status is not None:
+            self._status = self._status._replace(stop=stop)
+        self._changed.notify_all()
+
+    def _halt(self) -> None:
+        """Asks the robot once to stop its program, beside the thread: the call may block."""
+        if self._halted:
+            return
+        self._halted = True
+        self._halt_thread = threading.Thread(target=self._ask_to_stop, daemon=True)
+        self._halt_thread.start()
+
+    def _ask_to_stop(self) -> None:
+        try:
+            self._client.stop()
+        except RuntimeError as error:
+            # The link is gone; the robot's watchdog stops it. Latched already.
+            with self._changed:
+                self.stop_error = str(error)

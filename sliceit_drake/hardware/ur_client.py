@@ -1,0 +1,145 @@
+"""A UR robot through ur_rtde.
+
+ur_rtde 1.6.5 keeps silent about much (docs/hardware.md): its getters return the last values for
+ever when the link is gone, servoJ returns True on a dead link, and a lost control link is taken up
+again, with the program uploaded anew. So freshness comes from the controller's timestamp alone,
+and `RobotLink` latches on what a program that restarts leaves as traces.
+"""
+
+import contextlib
+import re
+import time
+from typing import Any
+
+from sliceit_drake.hardware.client import RobotFacts, RobotUnavailableError
+from sliceit_drake.hardware.robot_state import RobotState
+
+__all__ = ["UrClient"]
+
+RATE = 500.0
+
+
+class UrClient:
+    """Connects to a UR e-Series robot; implements `RobotClient`.
+
+    Args:
+        host: Name or address.
+        lookahead_time: Of servoj, s, 0.03 to 0.2.
+        gain: Of servoj, 100 to 2000.
+        controls: Whether to take control; else it only reads, and `servo` refuses.
+
+    Raises:
+        RobotUnavailableError: Nothing answers there, or it refuses, or ur_rtde is not installed.
+    """
+
+    def __init__(
+        self, host: str, lookahead_time: float, gain: float, *, controls: bool = True
+    ) -> None:
+        try:
+            import dashboard_client
+            import rtde_control
+            import rtde_receive
+        except ImportError as error:
+            raise RobotUnavailableError(
+                f"ur_rtde is not installed ({error}). Install sliceit_drake[hardware]."
+            ) from None
+        self._host, self._lookahead, self._gain = host, lookahead_time, gain
+        self._control: Any = None
+        step = "the dashboard server (port 29999)"
+        try:
+            self._dashboard = dashboard_client.DashboardClient(host)
+            self._dashboard.connect(2000)
+            step = "RTDE (port 30004)"
+            self._receive = rtde_receive.RTDEReceiveInterface(host, RATE)
+            if not self._receive.isConnected():
+                raise RuntimeError("it refuses to stream at 500 Hz; is it an e-Series robot?")
+            if controls:
+                step = "taking control (ports 30003 and 30004)"
+                self._control = rtde_control.RTDEControlInterface(host, RATE)
+        except RuntimeError as error:
+            raise RobotUnavailableError(
+                f"{host}: {step} failed: {str(error).strip()}. Check the address, that the robot "
+                "is on, in remote control, and that no other program controls it."
+            ) from None
+
+    def timestamp(self) -> float:
+        return self._receive.getTimestamp()
+
+    def read(self) -> RobotState:
+        receive = self._receive
+        # Each getter takes the newest package; a package may come in between.
+        for _ in range(5):
+            before = receive.getTimestamp()
+            state = RobotState(
+                before,
+                receive.getActualQ(),
+                receive.getActualQd(),
+                receive.getActualTCPForce(),
+                receive.getRuntimeState(),
+                receive.getSafetyStatusBits(),
+            )
+            if receive.getTimestamp() == before:
+                break
+        return state
+
+    def is_connected(self) -> bool:
+        control = self._control
+        return self._receive.isConnected() and (control is None or control.isConnected())
+
+    def servo(self, q: list[float]) -> bool:
+        if self._control is None:
+            return False
+        return self._control.servoJ(q, 0.0, 0.0, 1.0 / RATE, self._lookahead, self._gain)
+
+    def kick(self) -> None:
+        if self._control is not None:
+            self._control.kickWatchdog()
+
+    def set_watchdog(self, frequency: float) -> bool:
+        return self._control is not None and self._control.setWatchdog(frequency)
+
+    def stop(self) -> None:
+        if self._control is not None:
+            self._control.servoStop()
+            self._control.stopScript()
+
+    def facts(self) -> RobotFacts:
+        dashboard, receive = self._dashboard, self._receive
+        version = re.search(r"\d+\.\d+(\.\d+)*", dashboard.polyscopeVersion())
+        remote: bool | None = None
+        # CB3 and old software do not know the question.
+        with contextlib.suppress(RuntimeError):
+            remote = dashboard.isInRemoteControl()
+        tcp = [float("nan")] * 6
+        if self._control is not None:
+            tcp = self._control.getTCPOffset()
+        return RobotFacts(
+            model=dashboard.getRobotModel().strip(),
+            serial=dashboard.getSerialNumber().strip(),
+            software=version.group() if version else "",
+            robot_mode=dashboard.robotmode().partition(":")[2].strip(),
+            safety_mode=dashboard.safetymode().partition(":")[2].strip(),
+            remote_control=remote,
+            payload=receive.getPayload(),
+            payload_cog=receive.getPayloadCog(),
+            tcp=tcp,
+            speed_scaling=receive.getSpeedScaling(),
+        )
+
+    def zero_sensor(self) -> None:
+        if self._control is None or not self._control.zeroFtSensor():
+            raise RobotUnavailableError(f"{self._host}: the force sensor cannot be zeroed")
+        time.sleep(0.1)  # The next readings are of after it.
+
+    def allows_joints(self, q: list[float]) -> bool:
+        return self._control is not None and self._control.isJointsWithinSafetyLimits(q)
+
+    def move_to(self, q: list[float], speed: float, acceleration: float) -> bool:
+        return self._control is not None and self._control.moveJ(q, speed, acceleration)
+
+    def close(self) -> None:
+        for part in (self._control, self._receive, self._dashboard):
+            if part is not None:
+                # A link that is gone already cannot be closed better.
+                with contextlib.suppress(RuntimeError):
+                    part.disconnect()

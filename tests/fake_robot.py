@@ -1,0 +1,99 @@
+"""A robot without a network: a thread that is the controller's clock, and faults on demand."""
+
+import threading
+import time as clock
+
+from sliceit_drake.hardware.client import RobotFacts
+from sliceit_drake.hardware.robot_state import PLAYING, RobotState
+
+
+class FakeRobot:
+    """Implements `RobotClient`; the arm is where the last target was, one cycle later.
+
+    Args:
+        q: Joint positions at the start [6], rad.
+        pace: Controller seconds in a second.
+    """
+
+    def __init__(self, q, pace=0.2):
+        self.q, self.target, self.pace = list(q), list(q), pace
+        self.wrench = [0.0] * 6
+        self.runtime, self.bits, self.connected, self.accepts = PLAYING, 1, True, True
+        self.call_time = 0.0
+        self.frozen = False
+        self.time = 100.0
+        self.sent = []  # (time, target)
+        self.log = []
+        self.watchdog = None
+        self.stopped = threading.Event()
+        self._running = True
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self):
+        due = clock.perf_counter()
+        while self._running:
+            due += 0.002 / self.pace
+            clock.sleep(max(0.0, due - clock.perf_counter()))
+            if not self.frozen:
+                self.q = self.target
+                self.time += 0.002
+
+    def timestamp(self):
+        return self.time
+
+    def read(self):
+        return RobotState(self.time, self.q, [0.0] * 6, self.wrench, self.runtime, self.bits)
+
+    def is_connected(self):
+        return self.connected
+
+    def servo(self, q):
+        if self.watchdog is None:
+            raise RuntimeError("a target before the watchdog")
+        clock.sleep(self.call_time)
+        if self.accepts:
+            self.sent.append((self.time, list(q)))
+            self.target = list(q)
+        return self.accepts
+
+    def kick(self):
+        self.log.append("kick")
+
+    def set_watchdog(self, frequency):
+        self.watchdog = frequency
+        self.log.append("watchdog")
+        return True
+
+    def stop(self):
+        self.log.append("stop")
+        self.stopped.set()
+
+    def facts(self):
+        return RobotFacts(
+            model="UR5",
+            serial="20205500001",
+            software="5.11.1",
+            robot_mode="RUNNING",
+            safety_mode="NORMAL",
+            remote_control=True,
+            payload=1.2,
+            payload_cog=[0.0, 0.0, 0.06],
+            tcp=[0.0] * 6,
+            speed_scaling=1.0,
+        )
+
+    def zero_sensor(self):
+        self.log.append("zero")
+
+    def allows_joints(self, q):
+        return True
+
+    def move_to(self, q, speed, acceleration):
+        self.log.append("move")
+        self.q = self.target = list(q)
+        return True
+
+    def close(self):
+        self._running = False
+        self._thread.join()
