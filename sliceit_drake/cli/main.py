@@ -5,11 +5,21 @@ import os
 import sys
 from collections.abc import Sequence
 
-from sliceit_drake.cli import calibrate, diagnose, diagram, record, records, score, simulate, study
+from sliceit_drake.cli import (
+    calibrate,
+    diagnose,
+    diagram,
+    emulate,
+    record,
+    records,
+    score,
+    simulate,
+    study,
+)
 
 __all__ = ["main"]
 
-COMMANDS = (simulate, diagram, record, records, calibrate, diagnose, study, score)
+COMMANDS = (simulate, emulate, diagram, record, records, calibrate, diagnose, study, score)
 BAD_INPUT = 2
 INTERRUPTED = 130
 

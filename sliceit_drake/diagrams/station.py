@@ -8,7 +8,7 @@ from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import Demultiplexer
 
 from sliceit_drake.cutting.food import Food, make_food_model, start_pose
@@ -62,7 +62,7 @@ class SlicingStation(Diagram):
         scenario: What it was made from.
         plant: The arm with gripper and knife, and the board.
         cutting: The food: finite elements, analytic, or the spring of the baseline.
-        controller: The compliance controller.
+        controller: The compliance controller, or what was given in its place.
         sensor: The wrench sensor.
         motion_plan: The scenario's segments, or those of its sequence.
         start_pose: X_WK at the start.
@@ -79,6 +79,7 @@ class SlicingStation(Diagram):
         scenario: Scenario,
         meshcat: Meshcat | None = None,
         make_cutting: Callable[[RigidBody], KnifeForceSystem] | None = None,
+        make_controller: Callable[[Scenario], LeafSystem] | None = None,
     ) -> None:
         super().__init__()
         self.scenario = scenario
@@ -110,9 +111,7 @@ class SlicingStation(Diagram):
         self._arm: ArmController = connect_arm_controller(
             builder, self.plant, self.robot, scenario.robot
         )
-        self.controller = ComplianceController(
-            scenario.controller, ur5e_chain(scenario.robot.X_TK()), X_WB=scenario.robot.X_WB()
-        )
+        self.controller = (make_controller or _compliance_controller)(scenario)
         self.sensor = sensor = WrenchSensor(
             self.plant, self.robot.sensor_weld, scenario.exchange_period, scenario.sensor
         )
@@ -278,6 +277,7 @@ def MakeSlicingStation(
     scenario: Scenario,
     meshcat: Meshcat | None = None,
     make_cutting: Callable[[RigidBody], KnifeForceSystem] | None = None,
+    make_controller: Callable[[Scenario], LeafSystem] | None = None,
 ) -> SlicingStation:
     """The simulated station of a scenario; connect a source of targets to its input ports.
 
@@ -286,11 +286,18 @@ def MakeSlicingStation(
         meshcat: Viewer to draw in, or None.
         make_cutting: Makes a cutting system of your own, given the knife's body; None for that of
             the scenario's food, which still says where the knife starts.
+        make_controller: Makes what commands the joints in place of the compliance controller, with
+            the same ports; None for the latter.
 
     Raises:
         ConfigurationError, MeshError, TimeStepError: The scenario cannot be built.
     """
-    return SlicingStation(scenario, meshcat, make_cutting)
+    return SlicingStation(scenario, meshcat, make_cutting, make_controller)
+
+
+def _compliance_controller(scenario: Scenario) -> ComplianceController:
+    robot = scenario.robot
+    return ComplianceController(scenario.controller, ur5e_chain(robot.X_TK()), X_WB=robot.X_WB())
 
 
 def _food_solvers(scenario: Scenario) -> list[CuttingSolver]:

@@ -1,0 +1,140 @@
+"""`sliceit emulate`: an emulated UR5e controller, for everything that talks to a real one."""
+
+import argparse
+import gc
+import logging
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from sliceit_drake.cli.scenario_argument import add_scenario_arguments, scenario_of
+from sliceit_drake.emulator.fault_table import faults_as_text
+
+if TYPE_CHECKING:
+    from sliceit_drake.emulator.robot_model import RobotModel
+
+__all__ = ["add_parser"]
+
+DESCRIPTION = f"""\
+Emulate the controller of a UR5e on the loopback interface: RTDE (port 30004), dashboard (29999),
+script upload (30003, 30001, 30002) and the register protocol of ur_rtde's control script. Behind it
+the scenario's arm, knife and food are simulated, as by `sliceit simulate`.
+
+The emulator is the clock. One cycle is 2 ms of controller time; --pace says how much controller
+time passes per wall time. With --lockstep a cycle waits for the client's servoJ instead: the same
+run every time, on any machine.
+
+Port 30099 takes lines of JSON, as {{"inject": "silence:0.1", "at": 2.5}}, {{"status": true}} or
+{{"stop": true}}. --inject does the same from the start. Times are the controller's. What can be
+injected:
+{faults_as_text()}
+"""
+
+
+def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        "emulate",
+        help="emulate a UR5e's controller that ur_rtde talks to, with the scenario behind it",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_scenario_arguments(parser)
+    parser.add_argument(
+        "--address",
+        default="127.0.0.1",
+        help="where to listen (default 127.0.0.1); 127.0.0.2 and so on for more emulators",
+    )
+    parser.add_argument(
+        "--pace", type=float, default=1.0, metavar="X", help="times real time (default 1)"
+    )
+    parser.add_argument(
+        "--lockstep", action="store_true", help="while a client servos, wait for its commands"
+    )
+    parser.add_argument(
+        "--arm-alone",
+        action="store_true",
+        help="no scenario: an arm without dynamics that touches nothing",
+    )
+    parser.add_argument(
+        "--inject",
+        action="append",
+        default=[],
+        metavar="FAULT[@TIME]",
+        help="as protective_stop@2.5; may be given several times",
+    )
+    parser.add_argument(
+        "--version",
+        default="5.11.1.108318",
+        metavar="A.B.C.D",
+        help="software that the controller reports (default 5.11.1.108318)",
+    )
+    parser.add_argument("--end-with-stdin", action="store_true", help=argparse.SUPPRESS)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the command."""
+    logging.getLogger("drake").setLevel(logging.WARNING)
+
+    from sliceit_drake.configuration import ConfigurationError
+    from sliceit_drake.emulator.controller import ControllerConfig
+    from sliceit_drake.emulator.emulator import Clock, Emulator
+
+    clock = Clock(pace=options.pace, lockstep=options.lockstep)
+    config = ControllerConfig(version=_version(options.version))
+    robot = _robot(options)
+    try:
+        emulator = Emulator(robot, options.address, clock, config)
+    except OSError as error:
+        raise ConfigurationError(str(error), field="--address") from None
+    try:
+        for text in options.inject:
+            fault, _, at = text.partition("@")
+            emulator.faults.inject(fault, float(at) if at else None)
+    except ValueError as error:
+        emulator.close()
+        raise ConfigurationError(str(error), field="--inject") from None
+    signal.signal(signal.SIGTERM, lambda *_: emulator.stop())
+    if options.end_with_stdin:
+        threading.Thread(target=_stop_with_stdin, args=(emulator.stop,), daemon=True).start()
+    how = "in lockstep with servoJ" if options.lockstep else f"at {options.pace:g} x real time"
+    # Walking through all imported modules for garbage would make a cycle late.
+    gc.collect()
+    gc.freeze()
+    print(f"Emulated UR5e at {options.address}, {how}. Ctrl-C ends it.", flush=True)
+    emulator.run()
+    return 0
+
+
+def _robot(options: argparse.Namespace) -> "RobotModel":
+    if options.arm_alone:
+        from sliceit_drake.emulator.robot_model import KinematicRobot
+
+        return KinematicRobot()
+    from sliceit_drake.emulator.station_robot import StationRobot
+
+    print("Preparing (the first run on a machine compiles the kernels, about 8 s)", flush=True)
+    return StationRobot(scenario_of(options))
+
+
+def _version(text: str) -> tuple[int, ...]:
+    from sliceit_drake.configuration import ConfigurationError
+
+    try:
+        parts = tuple(int(part) for part in text.split("."))
+    except ValueError:
+        parts = ()
+    if len(parts) != 4 or min(parts) < 0:
+        raise ConfigurationError(
+            f"{text!r} is no software version", field="--version", fix="Write 5.11.1.108318."
+        )
+    return parts
+
+
+def _stop_with_stdin(stop: Callable[[], None]) -> None:
+    """Ends the emulator when the process that started it has gone."""
+    sys.stdin.buffer.read()
+    stop()

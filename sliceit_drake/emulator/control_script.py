@@ -1,0 +1,384 @@
+"""The control script of ur_rtde, as far as a slicing robot needs it.
+
+The real client uploads a program in URScript that polls a register for commands. That program is
+not interpreted here: its side of the register protocol is written out again. Input integer register
+0 has the number of a command, output integer register 0 answers 1 (ready) or 2 (done), and doubles
+carry the arguments. What is not emulated stops the program with a message that says so.
+"""
+
+import re
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from sliceit_drake.emulator.controller import Controller
+from sliceit_drake.emulator.kinematics import forward, inverse, matrix_of_pose, pose_of_matrix
+from sliceit_drake.emulator.modes import SafetyMode
+from sliceit_drake.emulator.motions import ScriptError, joint_motion, line_motion, slow_down
+from sliceit_drake.emulator.robot_model import CYCLE
+from sliceit_drake.systems.servo import ServoConfig
+
+__all__ = ["COMMAND_NAMES", "SERVO_COMMAND", "ControlScript", "register_offset"]
+
+_MAIN_LOOP = "RTDE Control script - Main loop"
+_READY, _DONE = 1, 2
+_STOP_SCRIPT = 255
+
+SERVO_COMMAND = 11
+"""Command number of ``servoJ``."""
+
+# Commands that the script runs again in every cycle while they stay in the register.
+_REPEATED = {6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71}
+
+COMMAND_NAMES = {
+    1: "moveJ", 2: "moveJ_IK", 3: "moveL", 4: "moveL_FK", 6: "forceMode", 7: "forceModeStop",
+    8: "zeroFtSensor", 9: "speedJ", 10: "speedL", 11: "servoJ", 12: "servoC", 15: "speedStop",
+    16: "servoStop", 17: "setPayload", 18: "teachMode", 19: "endTeachMode",
+    20: "forceModeSetDamping", 21: "forceModeSetGainScaling", 24: "servoL", 25: "toolContact",
+    26: "getStepTime", 27: "getActualJointPositionsHistory", 28: "getTargetWaypoint",
+    29: "setTcp", 30: "getInverseKinematics", 31: "triggerProtectiveStop", 33: "stopL",
+    34: "stopJ", 35: "setWatchdog", 36: "isPoseWithinSafetyLimits",
+    37: "isJointsWithinSafetyLimits", 38: "getJointTorques", 39: "poseTrans", 40: "getTCPOffset",
+    41: "jogStart", 42: "jogStop", 43: "getForwardKinematics", 44: "getForwardKinematics",
+    45: "movePath", 46: "getInverseKinematics", 47: "isSteady", 51: "moveUntilContact",
+    52: "freedriveMode", 53: "endFreedriveMode", 54: "getFreedriveStatus",
+    56: "ftRtdeInputEnable", 57: "enableExternalFtSensor",
+    58: "getActualToolFlangePose", 59: "setGravity", 60: "getInverseKinematicsHasSolution",
+    61: "getInverseKinematicsHasSolution", 62: "startContactDetection",
+    63: "stopContactDetection", 64: "readContactDetection", 65: "setTargetPayload",
+    66: "directTorque", 67: "getMassMatrix", 68: "getCoriolisAndCentrifugalTorques",
+    69: "getTargetJointAccelerations", 70: "getJacobian", 71: "getJacobianTimeDerivative",
+}  # fmt: skip
+"""ur_rtde's name of each command of the protocol."""
+
+_ASYNC_STARTED, _ASYNC_FINISHED = 0, -1
+
+# What stopL brakes a joint with, for want of its Cartesian meaning: a fifth of a metre of arm.
+_RADIANS_PER_METRE = 5.0
+_TOLERANCE = 1e-6
+
+
+def register_offset(text: str) -> int | None:
+    """First register that an uploaded program uses: 0 or 24; None if it is no control script."""
+    if _MAIN_LOOP not in text:
+        return None
+    match = re.search(r"# float register offset\s*\n\D*(\d+)", text)
+    return int(match.group(1)) if match else 0
+
+
+class ControlScript:
+    """The program, one `step` a cycle."""
+
+    def __init__(self, controller: Controller, offset: int = 0) -> None:
+        """Prepares to answer commands.
+
+        Args:
+            controller: Whose registers and arm it uses.
+            offset: First register.
+        """
+        self._controller = controller
+        self._offset = offset
+        self._main = self._main_loop()
+        self._motion: Iterator[np.ndarray] | None = None
+        self._servo: tuple[np.ndarray, ServoConfig] | None = None
+        self._speed: tuple[np.ndarray, float] | None = None
+        self._async_writes = self._async_operation = 0
+
+    def step(self) -> bool:
+        """See `controller.Program`."""
+        # A command to stop that begins in this cycle also ends what would move the arm in it.
+        if next(self._main, _END) is _END:
+            return False
+        controller = self._controller
+        if self._motion is not None:
+            target = next(self._motion, None)
+            if target is None:
+                self._end_motion()
+            else:
+                controller.command(target)
+        if self._servo is not None:
+            controller.command(*self._servo)
+        if self._speed is not None:
+            self._run_speed(*self._speed)
+        return True
+
+    def _main_loop(self) -> Iterator[None]:
+        is_executing = False
+        self._report_async(_ASYNC_FINISHED)
+        self._answer(_READY)
+        while True:
+            command = self._integer(0)
+            if command == _STOP_SCRIPT:
+                return
+            if command in _REPEATED:
+                yield from self._run(command)
+                self._answer(_READY)
+            elif command == 0:
+                is_executing = False
+                self._answer(_READY)
+            elif not is_executing:
+                yield from self._run(command)
+                self._answer(_DONE)
+                is_executing = True
+            yield
+
+    def _run(self, command: int) -> Iterator[None]:
+        """Runs a command to its end; each `yield` is the end of a cycle."""
+        method = _METHODS.get(command)
+        if method is None:
+            name = COMMAND_NAMES.get(command, "of no known name")
+            raise ScriptError(f"command {command} ({name}) is not emulated")
+        steps = method(self)
+        if steps is not None:
+            for target in steps:
+                if target is not None:
+                    self._controller.command(target)
+                yield
+
+    # Registers.
+
+    def _integer(self, index: int) -> int:
+        return self._controller.registers.integer(self._offset + index)
+
+    def _double(self, index: int) -> float:
+        return self._doubles(index, 1)[0]
+
+    def _doubles(self, index: int, count: int = 6) -> list[float]:
+        return self._controller.registers.doubles(self._offset + index, count)
+
+    def _answer(self, state: int) -> None:
+        self._controller.write_integer(self._offset, state)
+
+    def _return_integer(self, value: int) -> None:
+        self._controller.write_integer(self._offset + 1, value)
+
+    def _return(self, values: "np.ndarray | list[float]") -> None:
+        self._controller.write_doubles(self._offset, values)
+
+    def _report_async(self, progress: int) -> None:
+        """Status word of asynchronous motions: running flag, number of operation and of writes."""
+        self._async_writes = (self._async_writes + 1) % 128
+        if progress == _ASYNC_STARTED:
+            self._async_operation = (self._async_operation + 1) % 128
+        word = self._async_writes << 16 | self._async_operation << 24
+        if progress >= 0:
+            word |= 1 << 15 | min(progress, 0x7FFF)
+        self._controller.write_integer(self._offset + 2, word)
+
+    # Motions.
+
+    def _end_motion(self) -> None:
+        if self._motion is not None:
+            self._motion = None
+            self._report_async(_ASYNC_FINISHED)
+
+    def _move(self, motion: Iterator[np.ndarray]) -> Iterator[np.ndarray] | None:
+        """Runs a motion now, or beside the main loop if it is asynchronous."""
+        self._end_motion()
+        if self._integer(1):
+            self._motion = motion
+            self._report_async(_ASYNC_STARTED)
+            return None
+        return motion
+
+    def _move_joints(self) -> Iterator[np.ndarray] | None:
+        return self._joint_motion(np.array(self._doubles(0)))
+
+    def _move_joints_to_pose(self) -> Iterator[np.ndarray] | None:
+        return self._joint_motion(self._inverse(self._controller.target))
+
+    def _joint_motion(self, end: np.ndarray) -> Iterator[np.ndarray] | None:
+        start, scale = self._controller.target, lambda: self._controller.speed_scale
+        return self._move(joint_motion(start, end, self._double(6), self._double(7), scale))
+
+    def _move_line(self) -> Iterator[np.ndarray] | None:
+        return self._line_motion(matrix_of_pose(self._doubles(0)))
+
+    def _move_line_to_joints(self) -> Iterator[np.ndarray] | None:
+        return self._line_motion(forward(self._doubles(0), self._controller.X_FT))
+
+    def _line_motion(self, end: np.ndarray) -> Iterator[np.ndarray] | None:
+        controller = self._controller
+        return self._move(
+            line_motion(
+                controller.target,
+                end,
+                controller.X_FT,
+                self._double(6),
+                self._double(7),
+                lambda: controller.speed_scale,
+            )
+        )
+
+    def _stop(self, deceleration: float) -> Iterator[np.ndarray]:
+        state = self._controller.robot.state
+        return slow_down(state.positions, state.velocities, deceleration)
+
+    def _servo_joints(self) -> None:
+        lookahead_time, gain = self._doubles(9, 2)
+        if not (lookahead_time > 0.0 and gain > 0.0):
+            raise ScriptError(f"servoj: lookahead {lookahead_time} s, gain {gain} not positive")
+        servo = ServoConfig(lookahead_time=lookahead_time, gain=gain)
+        self._servo = (np.array(self._doubles(0)), servo)
+
+    def _stop_servo(self) -> Iterator[np.ndarray]:
+        self._servo = None
+        return self._stop(self._double(0))
+
+    def _speed_joints(self) -> None:
+        # The real script keeps the speed until told otherwise, whatever the time sent.
+        self._speed = (np.array(self._doubles(0)), self._double(6))
+
+    def _run_speed(self, speed: np.ndarray, acceleration: float) -> None:
+        controller = self._controller
+        now = controller.robot.state.velocities
+        change = np.clip(speed - now, -acceleration * CYCLE, acceleration * CYCLE)
+        controller.command(controller.target + CYCLE * (now + change))
+
+    def _stop_speed(self) -> Iterator[np.ndarray]:
+        self._speed = None
+        return self._stop(self._double(0))
+
+    def _stop_line(self) -> Iterator[np.ndarray]:
+        self._end_motion()
+        return self._stop(_RADIANS_PER_METRE * self._double(0))
+
+    def _stop_joints(self) -> Iterator[np.ndarray]:
+        self._end_motion()
+        return self._stop(self._double(0))
+
+    # Settings.
+
+    def _zero_sensor(self) -> Iterator[None]:
+        self._controller.zero_sensor()
+        yield
+
+    def _set_payload(self) -> Iterator[None]:
+        mass, *cog = self._doubles(0, 4)
+        if not mass >= 0.0:
+            raise ScriptError(f"set_payload: a mass of {mass} kg")
+        # The client sends zeros for "keep the centre".
+        self._controller.set_payload(mass, cog if any(cog) else None)
+        yield
+
+    def _set_tcp(self) -> Iterator[None]:
+        self._controller.tcp = np.array(self._doubles(0))
+        yield
+
+    def _set_watchdog(self) -> Iterator[None]:
+        frequency = self._double(0)
+        if not frequency > 0.0:
+            raise ScriptError(f"rtde_set_watchdog: a frequency of {frequency} Hz")
+        name = f"input_int_register_{self._offset}"
+        self._controller.set_watchdog(name, 1.0 / frequency)
+        yield
+
+    def _trigger_protective_stop(self) -> Iterator[None]:
+        self._controller.set_safety(SafetyMode.PROTECTIVE_STOP, "asked by the program")
+        yield
+
+    # Questions.
+
+    def _inverse(self, guess: np.ndarray) -> np.ndarray:
+        found = inverse(matrix_of_pose(self._doubles(0)), guess, self._controller.X_FT)
+        if found is None:
+            raise ScriptError("get_inverse_kin: no solution")
+        return found
+
+    def _get_inverse(self) -> None:
+        self._return(self._inverse(self._controller.target))
+
+    def _get_inverse_near(self) -> None:
+        self._return(self._inverse(np.array(self._doubles(6))))
+
+    def _has_inverse(self) -> None:
+        self._has_inverse_from(self._controller.target)
+
+    def _has_inverse_near(self) -> None:
+        self._has_inverse_from(np.array(self._doubles(6)))
+
+    def _has_inverse_from(self, guess: np.ndarray) -> None:
+        X = matrix_of_pose(self._doubles(0))
+        self._return_integer(inverse(X, guess, self._controller.X_FT) is not None)
+
+    def _is_reachable(self, q: np.ndarray | None) -> bool:
+        return q is not None and bool(
+            np.abs(q).max() <= self._controller.config.position_limit + _TOLERANCE
+        )
+
+    def _pose_is_safe(self) -> None:
+        X = matrix_of_pose(self._doubles(0))
+        q = inverse(X, self._controller.target, self._controller.X_FT)
+        self._return_integer(self._is_reachable(q))
+
+    def _joints_are_safe(self) -> None:
+        self._return_integer(self._is_reachable(np.array(self._doubles(0))))
+
+    def _get_forward(self) -> None:
+        positions = self._controller.robot.state.positions
+        self._return(pose_of_matrix(forward(positions, self._controller.X_FT)))
+
+    def _get_forward_of(self) -> None:
+        X_FT = matrix_of_pose(self._doubles(6))
+        self._return(pose_of_matrix(forward(self._doubles(0), X_FT)))
+
+    def _get_flange_pose(self) -> None:
+        self._return(pose_of_matrix(forward(self._controller.robot.state.positions)))
+
+    def _get_tcp(self) -> None:
+        self._return(self._controller.tcp)
+
+    def _get_step_time(self) -> None:
+        self._return([CYCLE])
+
+    def _get_positions(self) -> None:
+        if self._integer(1) != 0:
+            raise ScriptError("get_actual_joint_positions_history: only 0 steps are emulated")
+        self._return(self._controller.robot.state.positions)
+
+    def _get_torques(self) -> None:
+        self._return(self._controller.robot.state.torques)
+
+    def _multiply_poses(self) -> None:
+        X = matrix_of_pose(self._doubles(0)) @ matrix_of_pose(self._doubles(6))
+        self._return(pose_of_matrix(X))
+
+    def _is_steady(self) -> None:
+        self._return_integer(self._controller.is_steady)
+
+
+_END = object()
+
+_METHODS: dict[int, Callable[[ControlScript], Iterator | None]] = {
+    1: ControlScript._move_joints,
+    2: ControlScript._move_joints_to_pose,
+    3: ControlScript._move_line,
+    4: ControlScript._move_line_to_joints,
+    8: ControlScript._zero_sensor,
+    9: ControlScript._speed_joints,
+    SERVO_COMMAND: ControlScript._servo_joints,
+    15: ControlScript._stop_speed,
+    16: ControlScript._stop_servo,
+    17: ControlScript._set_payload,
+    26: ControlScript._get_step_time,
+    27: ControlScript._get_positions,
+    29: ControlScript._set_tcp,
+    30: ControlScript._get_inverse_near,
+    31: ControlScript._trigger_protective_stop,
+    33: ControlScript._stop_line,
+    34: ControlScript._stop_joints,
+    35: ControlScript._set_watchdog,
+    36: ControlScript._pose_is_safe,
+    37: ControlScript._joints_are_safe,
+    38: ControlScript._get_torques,
+    39: ControlScript._multiply_poses,
+    40: ControlScript._get_tcp,
+    43: ControlScript._get_forward,
+    44: ControlScript._get_forward_of,
+    46: ControlScript._get_inverse,
+    47: ControlScript._is_steady,
+    58: ControlScript._get_flange_pose,
+    60: ControlScript._has_inverse,
+    61: ControlScript._has_inverse_near,
+    65: ControlScript._set_payload,
+}

@@ -1,0 +1,398 @@
+"""The emulated controller: modes, program, supervision, and the values that RTDE shows.
+
+It knows no sockets and no wall clock. One `step` is one cycle of controller time.
+"""
+
+import collections
+import dataclasses as dc
+from collections.abc import Iterator
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sliceit_drake.emulator.kinematics import forward, jacobian, matrix_of_pose, pose_of_matrix
+from sliceit_drake.emulator.modes import (
+    SAFETY_BITS,
+    RobotMode,
+    RuntimeState,
+    SafetyMode,
+    joint_mode,
+    robot_status_bits,
+)
+from sliceit_drake.emulator.motions import ScriptError, slow_down
+from sliceit_drake.emulator.registers import InputRegisters
+from sliceit_drake.emulator.robot_model import CYCLE, RobotModel, SimulationStopped
+from sliceit_drake.emulator.variables import OUTPUTS, zero
+from sliceit_drake.systems.servo import ServoConfig
+
+__all__ = ["Controller", "ControllerConfig", "Program"]
+
+_ERROR, _WARNING, _INFORMATION = 1, 2, 3
+_LOG_LENGTH = 1000
+# Joint speed below which the arm counts as standing still, rad/s.
+_STEADY = 1e-4
+
+
+@dc.dataclass
+class ControllerConfig:
+    """What kind of controller is emulated.
+
+    Attributes:
+        version: Software version: major, minor, bugfix, build.
+        serial_number: Digits only, as a UR's.
+        model: Answer to the dashboard's ``get robot model``.
+        protective_stop: Whether a protective stop pauses ("pause") or stops ("stop") the program;
+            which one a real PolyScope does was not checked.
+        unlock_delay: Controller time before a protective stop can be unlocked, s.
+        deceleration: With which the arm stops when its program does, rad/s2; of the order of what
+            Universal Robots publish as stopping times.
+        speed_limit: Joint speed that raises a protective stop, rad/s; 191 degrees a second.
+        position_limit: Joint position that raises a protective stop, rad; 363 degrees.
+        force_limit: Force of the tool that raises a protective stop, N; None for no limit.
+    """
+
+    version: tuple[int, ...] = (5, 11, 1, 108318)
+    serial_number: str = "20205500001"
+    model: str = "UR5"
+    protective_stop: str = "pause"
+    unlock_delay: float = 5.0
+    deceleration: float = 10.0
+    speed_limit: float = 3.3336
+    position_limit: float = 6.3355
+    force_limit: float | None = None
+
+
+class Program(Protocol):
+    """A program that the controller plays."""
+
+    def step(self) -> bool:
+        """Runs one cycle; False once it has ended.
+
+        Raises:
+            ScriptError: It cannot go on.
+        """
+
+
+class Controller:
+    """State of the controller.
+
+    Attributes:
+        config: What is emulated.
+        robot: What moves.
+        registers: What the clients have written.
+        outputs: Value of each output variable at the end of the last cycle.
+        time: Controller time, s.
+        cycle: Cycles done.
+        runtime: What the program does.
+        safety: Mode of the safety system.
+        mode: How far the arm is powered.
+        is_remote: Whether the pendant is set to remote control.
+        payload: Mass that is set, kg.
+        payload_cog: Its centre in the flange [3], m.
+        payload_is_locked: Whether clients' changes of the payload are ignored (a fault).
+        sensor_bias: Added to what the sensor feels [6], a fault.
+        tcp: Pose of the tool in the flange [6].
+        messages: Level and text of messages for the clients, taken from the left.
+        log: Controller time and words of what happened.
+    """
+
+    def __init__(self, robot: RobotModel, config: ControllerConfig | None = None) -> None:
+        self.config = config or ControllerConfig()
+        self.robot = robot
+        self.registers = InputRegisters()
+        self.outputs: dict[str, object] = {
+            name: zero(kind) for name, kind in OUTPUTS.items() if name not in self.registers.values
+        }
+        self.time, self.cycle = 0.0, 0
+        self.runtime = RuntimeState.STOPPED
+        self.safety = SafetyMode.NORMAL
+        self.mode = RobotMode.RUNNING
+        self.is_remote = True
+        self.payload = 0.0
+        self.payload_cog = np.zeros(3)
+        self.payload_is_locked = False
+        self.sensor_bias = np.zeros(6)
+        self.tcp = np.zeros(6)
+        self.messages: collections.deque[tuple[int, str]] = collections.deque(maxlen=100)
+        self.log: collections.deque[tuple[float, str]] = collections.deque(maxlen=_LOG_LENGTH)
+        self._program: Program | None = None
+        self._watchdog: tuple[str, float] | None = None
+        self._stopped_at = -np.inf
+        self._target = self._last_target = robot.state.positions
+        self._target_velocity = np.zeros(6)
+        self._servo: ServoConfig | None = None
+        self._braking: Iterator[np.ndarray] | None = None
+        self._sensor_zero = np.zeros(6)
+        self._simulation_has_stopped = False
+        self._show()
+
+    # What a program uses.
+
+    @property
+    def target(self) -> np.ndarray:
+        """Joint positions that the arm was last told to go to [6], rad."""
+        return self._target
+
+    @property
+    def X_FT(self) -> np.ndarray:
+        """Tool in the flange [4, 4]."""
+        return matrix_of_pose(self.tcp)
+
+    @property
+    def speed_scale(self) -> float:
+        """Share of the planned speeds that the speed slider allows."""
+        if self.registers.values["speed_slider_mask"]:
+            fraction = float(self.registers.values["speed_slider_fraction"])  # type: ignore[arg-type]
+            return min(max(fraction, 0.0), 1.0)
+        return 1.0
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether the arm stands still."""
+        return float(np.abs(self.robot.state.velocities).max()) < _STEADY
+
+    def command(self, targets: ArrayLike, servo: ServoConfig | None = None) -> None:
+        """Tells the arm where to go in this cycle, see `RobotModel.step`.
+
+        Raises:
+            ScriptError: A target is not finite.
+        """
+        q = np.array(targets, float)
+        if not np.isfinite(q).all():
+            raise ScriptError(f"joint targets {q.tolist()} are not finite")
+        self._target, self._servo = q, servo
+
+    def set_watchdog(self, name: str, period: float) -> None:
+        """Stops the program when input `name` is not written for `period` s from now on."""
+        self._watchdog = (name, period)
+        self.registers.written_at[name] = self.time
+
+    def set_payload(self, mass: float, cog: ArrayLike | None) -> None:
+        """Sets mass, kg, and centre [3], m, of the payload; a centre of None stays as it was."""
+        if self.payload_is_locked:
+            return
+        self.payload = float(mass)
+        if cog is not None:
+            self.payload_cog = np.array(cog, float)
+
+    def zero_sensor(self) -> None:
+        """Subtracts what the sensor shows now from all that follows."""
+        self.robot.zero_sensor()
+        self._sensor_zero = self.sensor_bias - self._payload_wrench()
+
+    def write_integer(self, index: int, value: int) -> None:
+        """Sets output_int_register_<index>."""
+        self.outputs[f"output_int_register_{index}"] = int(value)
+
+    def write_doubles(self, index: int, values: ArrayLike) -> None:
+        """Sets output_double_registers from `index` on."""
+        for i, value in enumerate(np.asarray(values, float).tolist()):
+            self.outputs[f"output_double_register_{index + i}"] = value
+
+    # What pendant and dashboard do.
+
+    def start_program(self, program: Program, what: str) -> None:
+        """Plays a program in place of the one that runs; refused with a message if it cannot."""
+        if not self.safety.may_move or self.mode != RobotMode.RUNNING:
+            self.tell(
+                _ERROR,
+                f"program refused: safety mode {self.safety.name}, robot mode {self.mode.name}",
+            )
+            return
+        self.stop_program("replaced by another program")
+        self._program, self.runtime = program, RuntimeState.PLAYING
+        self._note(f"program started: {what}")
+
+    def stop_program(self, why: str) -> None:
+        """Stops the program, if there is one, and the arm."""
+        if self._program is not None:
+            self._note(f"program stopped: {why}")
+        self._program, self._watchdog = None, None
+        self.runtime = RuntimeState.STOPPED
+
+    def pause(self, why: str) -> bool:
+        """Pauses the program; False if none plays."""
+        if self.runtime != RuntimeState.PLAYING:
+            return False
+        self._note(f"program paused: {why}")
+        self.runtime = RuntimeState.PAUSED
+        return True
+
+    def play(self) -> bool:
+        """Resumes a paused program; False if it cannot."""
+        if self.runtime != RuntimeState.PAUSED or not self.safety.may_move:
+            return False
+        self._note("program resumed")
+        if self._watchdog is not None:
+            self.registers.written_at[self._watchdog[0]] = self.time
+        self.runtime = RuntimeState.PLAYING
+        return True
+
+    def set_safety(self, mode: SafetyMode, why: str, program: str | None = None) -> None:
+        """Enters a safety mode, with what it does to program and power.
+
+        Args:
+            mode: The new mode.
+            why: For the log.
+            program: For a protective stop "pause" or "stop"; None for `ControllerConfig`'s.
+        """
+        if mode == self.safety:
+            return
+        self.safety = mode
+        self._note(f"safety mode {mode.name}: {why}")
+        if mode.may_move:
+            return
+        self.tell(_ERROR, f"{mode.name}: {why}")
+        self._stopped_at = self.time
+        if mode == SafetyMode.PROTECTIVE_STOP:
+            if (program or self.config.protective_stop) == "stop":
+                self.stop_program("protective stop")
+            else:
+                self.pause("protective stop")
+        elif mode == SafetyMode.SAFEGUARD_STOP:
+            self.pause("safeguard stop")
+        else:
+            self.stop_program(mode.name)
+            self.mode = RobotMode.POWER_OFF
+
+    def unlock_protective_stop(self) -> bool:
+        """Ends a protective stop; False if it is too early. True also if there is none."""
+        if self.safety == SafetyMode.PROTECTIVE_STOP:
+            if self.time - self._stopped_at < self.config.unlock_delay:
+                return False
+            self.set_safety(SafetyMode.NORMAL, "unlocked")
+        return True
+
+    def tell(self, level: int, text: str) -> None:
+        """Sends a text message to all clients, and notes it."""
+        self._note(text)
+        self.messages.append((level, text))
+
+    # One cycle.
+
+    def step(self) -> None:
+        """Advances one cycle of controller time."""
+        self.cycle += 1
+        self.time = self.cycle * CYCLE
+        if self.runtime == RuntimeState.PLAYING:
+            self._check_watchdog()
+        if self.runtime == RuntimeState.PLAYING and self._program is not None:
+            self._play()
+        self._brake_if_uncommanded()
+        self._target_velocity = (self._target - self._last_target) / CYCLE
+        self._last_target = self._target
+        self._move()
+        while self.robot.warnings:
+            self.tell(_WARNING, self.robot.warnings.pop(0))
+        self._show()
+        self._supervise()
+
+    def _move(self) -> None:
+        if self._simulation_has_stopped:
+            return
+        try:
+            self.robot.step(self._target, self._servo)
+        except SimulationStopped as error:
+            # A robot has no such state; a fault is the nearest that clients understand.
+            self._simulation_has_stopped = True
+            self.robot.state.velocities = np.zeros(6)
+            self.set_safety(SafetyMode.FAULT, f"the simulation stopped: {error}")
+
+    def _play(self) -> None:
+        assert self._program is not None
+        try:
+            if not self._program.step():
+                self.stop_program("it ended")
+        except ScriptError as error:
+            self.tell(_ERROR, f"program error: {error}")
+            self.stop_program(f"error: {error}")
+
+    def _check_watchdog(self) -> None:
+        if self._watchdog is None:
+            return
+        name, period = self._watchdog
+        silent = self.time - self.registers.written_at[name]
+        if silent > period:
+            self.tell(_ERROR, f"RTDE watchdog: no {name} for {silent:.3f} s")
+            self.stop_program("RTDE watchdog")
+
+    def _brake_if_uncommanded(self) -> None:
+        """Holds the last target while a program plays; else the arm comes to rest."""
+        if self.runtime == RuntimeState.PLAYING:
+            self._braking = None
+            return
+        if self._braking is None:
+            state = self.robot.state
+            self._braking = slow_down(state.positions, state.velocities, self.config.deceleration)
+            if not self.is_steady:
+                self._target, self._servo = state.positions, None
+        self._target = next(self._braking, self._target)
+
+    def _supervise(self) -> None:
+        if not self.safety.may_move or self.mode != RobotMode.RUNNING:
+            return
+        state, config = self.robot.state, self.config
+        speed, reach = np.abs(state.velocities), np.abs(state.positions)
+        force = float(self.outputs["tcp_force_scalar"])  # type: ignore[arg-type]
+        if speed.max() > config.speed_limit:
+            joint = int(speed.argmax())
+            why = f"joint {joint} at {speed[joint]:.2f} rad/s, limit {config.speed_limit:.2f}"
+        elif reach.max() > config.position_limit:
+            joint = int(reach.argmax())
+            why = f"joint {joint} at {state.positions[joint]:.2f} rad"
+        elif config.force_limit is not None and force > config.force_limit:
+            why = f"force of {force:.0f} N at the tool, limit {config.force_limit:.0f}"
+        else:
+            return
+        self.set_safety(SafetyMode.PROTECTIVE_STOP, why)
+
+    def _note(self, text: str) -> None:
+        self.log.append((self.time, text))
+
+    # What RTDE shows.
+
+    def _payload_wrench(self) -> np.ndarray:
+        """Weight of the payload that is set, about the flange in its axes [6]."""
+        R_BF = forward(self.robot.state.positions)[:3, :3]
+        force = self.payload * (R_BF.T @ self.robot.gravity)
+        return np.concatenate([force, np.cross(self.payload_cog, force)])
+
+    def _show(self) -> None:
+        state, X_FT = self.robot.state, self.X_FT
+        X_BF = forward(state.positions)
+        X_BT = X_BF @ X_FT
+        raw = state.wrench + self.sensor_bias
+        wrench = raw - self._payload_wrench() - self._sensor_zero
+        force, moment = wrench[:3], wrench[3:] - np.cross(X_FT[:3, 3], wrench[:3])
+        R = X_BF[:3, :3]
+        safety, runtime, mode = self.safety, self.runtime, self.mode
+        self.outputs |= {
+            "timestamp": self.time,
+            "actual_q": state.positions.tolist(),
+            "actual_qd": state.velocities.tolist(),
+            "target_q": self._target.tolist(),
+            "target_qd": self._target_velocity.tolist(),
+            "target_moment": state.torques.tolist(),
+            "actual_current_as_torque": state.torques.tolist(),
+            "actual_TCP_pose": pose_of_matrix(X_BT).tolist(),
+            "actual_TCP_speed": (jacobian(state.positions, X_FT) @ state.velocities).tolist(),
+            "actual_TCP_force": np.concatenate([R @ force, R @ moment]).tolist(),
+            "tcp_force_scalar": float(np.linalg.norm(force)),
+            "ft_raw_wrench": raw.tolist(),
+            "target_TCP_pose": pose_of_matrix(forward(self._target, X_FT)).tolist(),
+            "tcp_offset": self.tcp.tolist(),
+            "payload": self.payload,
+            "payload_cog": self.payload_cog.tolist(),
+            "robot_mode": int(mode),
+            "joint_mode": [joint_mode(mode)] * 6,
+            "safety_mode": int(safety),
+            "safety_status": int(safety),
+            "safety_status_bits": SAFETY_BITS[safety],
+            "runtime_state": int(runtime),
+            "robot_status_bits": robot_status_bits(mode, runtime),
+            "speed_scaling": self.speed_scale if runtime == RuntimeState.PLAYING else 0.0,
+            "target_speed_fraction": self.speed_scale,
+            "actual_main_voltage": 48.0,
+            "actual_robot_voltage": 48.0,
+        }

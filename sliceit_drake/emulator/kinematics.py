@@ -1,0 +1,119 @@
+"""Kinematics of the UR5e as its controller computes them: poses in UR's "Base", as 6 numbers.
+
+A pose [6] is the position, m, and the rotation vector (axis times angle), rad. This is written from
+the published Denavit-Hartenberg parameters, apart from the Drake model that the simulation moves,
+so that a test can compare the two.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+__all__ = ["forward", "inverse", "jacobian", "matrix_of_pose", "pose_of_matrix"]
+
+# d [m], a [m], alpha [rad] of each joint: Universal Robots, "DH parameters for calculations of
+# kinematics and dynamics", UR5e.
+_DH = (
+    (0.1625, 0.0, 0.5 * math.pi),
+    (0.0, -0.425, 0.0),
+    (0.0, -0.3922, 0.0),
+    (0.1333, 0.0, 0.5 * math.pi),
+    (0.0997, 0.0, -0.5 * math.pi),
+    (0.0996, 0.0, 0.0),
+)
+_ITERATIONS = 60
+_TOLERANCE = 1e-9
+_DAMPING = 1e-8
+_LARGEST_STEP = 0.5
+
+
+def matrix_of_pose(pose: ArrayLike) -> np.ndarray:
+    """Homogeneous matrix [4, 4] of a pose [6]."""
+    p = np.asarray(pose, float)
+    X = np.eye(4)
+    X[:3, :3] = Rotation.from_rotvec(p[3:]).as_matrix()
+    X[:3, 3] = p[:3]
+    return X
+
+
+def pose_of_matrix(X: np.ndarray) -> np.ndarray:
+    """Pose [6] of a homogeneous matrix [4, 4]."""
+    return np.concatenate([X[:3, 3], Rotation.from_matrix(X[:3, :3]).as_rotvec()])
+
+
+def forward(q: ArrayLike, X_FT: np.ndarray | None = None) -> np.ndarray:
+    """Pose of the tool in the base.
+
+    Args:
+        q: Joint positions [6], rad.
+        X_FT: Tool in the flange [4, 4]; None for the flange itself.
+
+    Returns:
+        Homogeneous matrix [4, 4].
+    """
+    X = _links(q)[-1]
+    return X if X_FT is None else X @ X_FT
+
+
+def jacobian(q: ArrayLike, X_FT: np.ndarray | None = None) -> np.ndarray:
+    """Matrix [6, 6] from joint velocities to the tool's velocity and angular velocity, in the base.
+
+    Args:
+        q: Joint positions [6], rad.
+        X_FT: Tool in the flange [4, 4]; None for the flange itself.
+    """
+    links = _links(q)
+    tip = links[-1][:3, 3] if X_FT is None else (links[-1] @ X_FT)[:3, 3]
+    J = np.empty((6, 6))
+    for i, X in enumerate(links[:-1]):
+        axis, arm = X[:3, 2], tip - X[:3, 3]
+        J[:3, i] = (
+            axis[1] * arm[2] - axis[2] * arm[1],
+            axis[2] * arm[0] - axis[0] * arm[2],
+            axis[0] * arm[1] - axis[1] * arm[0],
+        )
+        J[3:, i] = axis
+    return J
+
+
+def inverse(X_BT: np.ndarray, q: ArrayLike, X_FT: np.ndarray | None = None) -> np.ndarray | None:
+    """Joint positions near `q` that put the tool at a pose, by damped Newton steps.
+
+    Args:
+        X_BT: Wanted pose of the tool [4, 4].
+        q: Where to start [6], rad.
+        X_FT: Tool in the flange [4, 4]; None for the flange itself.
+
+    Returns:
+        Joint positions [6], rad; None where the steps do not arrive.
+    """
+    q = np.array(q, float)
+    for _ in range(_ITERATIONS):
+        X = forward(q, X_FT)
+        turn = Rotation.from_matrix(X_BT[:3, :3] @ X[:3, :3].T).as_rotvec()
+        error = np.concatenate([X_BT[:3, 3] - X[:3, 3], turn])
+        if np.abs(error).max() < _TOLERANCE:
+            return q
+        J = jacobian(q, X_FT)
+        step = J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(6), error)
+        q += step * min(1.0, _LARGEST_STEP / max(float(np.abs(step).max()), 1e-12))
+    return None
+
+
+def _links(q: ArrayLike) -> list[np.ndarray]:
+    """Frames [4, 4] of base, links and flange; joint i turns about the z axis of frame i."""
+    frames = [np.eye(4)]
+    for (d, a, alpha), angle in zip(_DH, np.asarray(q, float).tolist(), strict=True):
+        c, s, ca, sa = math.cos(angle), math.sin(angle), math.cos(alpha), math.sin(alpha)
+        step = np.array(
+            [
+                [c, -s * ca, s * sa, a * c],
+                [s, c * ca, -c * sa, a * s],
+                [0.0, sa, ca, d],
+                [0.0, 0.0, 0.0, 1.0],
+            ]
+        )
+        frames.append(frames[-1] @ step)
+    return frames

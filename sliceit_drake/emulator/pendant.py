@@ -1,0 +1,64 @@
+"""The emulator's own port, 30099, in place of a person at the pendant: a line of JSON in, one out.
+
+Requests: ``{"inject": FAULT, "at": TIME}`` (`at` may be left out), ``{"status": true}``,
+``{"stop": true}``. Answers have ``"ok"``, and ``"error"`` where it is false.
+"""
+
+import json
+from collections.abc import Callable
+
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.emulator.connections import Connection
+from sliceit_drake.emulator.faults import FaultInjector
+
+__all__ = ["PENDANT_PORT", "Pendant"]
+
+PENDANT_PORT = 30099
+
+
+class Pendant:
+    """Takes faults from another process and tells it how the controller does."""
+
+    def __init__(
+        self,
+        faults: FaultInjector,
+        status: Callable[[], dict[str, object]],
+        stop: Callable[[], None],
+    ) -> None:
+        self._faults, self._status, self._stop = faults, status, stop
+        self._buffers: dict[Connection, bytearray] = {}
+
+    def opened(self, connection: Connection) -> None:
+        """See `connections.Service`."""
+        self._buffers[connection] = bytearray()
+
+    def closed(self, connection: Connection) -> None:
+        """See `connections.Service`."""
+        del self._buffers[connection]
+
+    def received(self, connection: Connection, data: bytes) -> None:
+        """See `connections.Service`."""
+        buffer = self._buffers[connection]
+        buffer += data
+        while (end := buffer.find(b"\n")) >= 0:
+            line = bytes(buffer[:end])
+            del buffer[: end + 1]
+            connection.send(json.dumps(self._answer(line)).encode() + b"\n")
+
+    def _answer(self, line: bytes) -> dict[str, object]:
+        try:
+            request = json.loads(line)
+            if not isinstance(request, dict):
+                raise ValueError("a request is an object")
+            if "inject" in request:
+                at = request.get("at")
+                self._faults.inject(str(request["inject"]), None if at is None else float(at))
+                return {"ok": True}
+            if "status" in request:
+                return {"ok": True, **self._status()}
+            if "stop" in request:
+                self._stop()
+                return {"ok": True}
+            raise ValueError("a request has one of inject, status, stop")
+        except (ValueError, TypeError, ConfigurationError) as error:
+            return {"ok": False, "error": str(error)}

@@ -1,0 +1,197 @@
+"""An emulator in a process of its own, and the hand on its pendant: for tests and benchmarks.
+
+The constructors of the real client hold Python's lock while they wait for the controller, so the
+two cannot share a process.
+"""
+
+import contextlib
+import json
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+
+from sliceit_drake.emulator.pendant import PENDANT_PORT
+
+__all__ = ["EmulatorError", "EmulatorProcess", "PendantClient"]
+
+
+class EmulatorError(RuntimeError):
+    """The emulator did not start, refused a request, or does not answer."""
+
+
+class PendantClient:
+    """A connection to the own port of a running emulator."""
+
+    def __init__(self, address: str, timeout: float = 5.0) -> None:
+        """Connects.
+
+        Args:
+            address: Of the emulator.
+            timeout: Wall time to wait for an answer, s.
+
+        Raises:
+            OSError: Nothing answers there.
+        """
+        self._socket = socket.create_connection((address, PENDANT_PORT), timeout)
+        self._file = self._socket.makefile("rwb")
+
+    def request(self, **request: object) -> dict:
+        """Sends a request of `pendant` and returns the answer.
+
+        Raises:
+            EmulatorError: It was refused, or no answer came in time.
+        """
+        try:
+            self._file.write(json.dumps(request).encode() + b"\n")
+            self._file.flush()
+            line = self._file.readline()
+        except OSError as error:
+            raise EmulatorError(f"the emulator does not answer {request}: {error}") from error
+        if not line:
+            raise EmulatorError(f"the emulator has closed its port before it answered {request}")
+        answer = json.loads(line)
+        if not answer.pop("ok"):
+            raise EmulatorError(answer["error"])
+        return answer
+
+    def inject(self, fault: str, at: float | None = None) -> None:
+        """Injects a fault of `faults.FAULTS`, at a controller time, s, or now."""
+        self.request(inject=fault, at=at)
+
+    def status(self) -> dict:
+        """What `emulator.Emulator.status` says."""
+        return self.request(status=True)
+
+    def wait_until(self, time_: float, timeout: float = 30.0) -> dict:
+        """Waits for a controller time, s, and returns the status then.
+
+        Raises:
+            EmulatorError: It is not reached within `timeout` s of wall time.
+        """
+        end = time.monotonic() + timeout
+        while (status := self.status())["time"] < time_:
+            if time.monotonic() > end:
+                raise EmulatorError(
+                    f"controller time {time_:.3f} s was not reached in {timeout:.3g} s; it is "
+                    f"{status['time']:.3f} s"
+                )
+            time.sleep(0.002)
+        return status
+
+    def close(self) -> None:
+        """Closes the connection."""
+        self._file.close()
+        self._socket.close()
+
+
+class EmulatorProcess:
+    """``sliceit emulate`` as a child process; a context manager.
+
+    The child ends with this process, however that ends.
+
+    Attributes:
+        address: Where it listens.
+        pendant: To inject faults and ask how it does.
+    """
+
+    def __init__(
+        self,
+        scenario: str | Path | None = None,
+        address: str = "127.0.0.1",
+        pace: float = 1.0,
+        lockstep: bool = False,
+        options: Sequence[str] = (),
+        timeout: float = 60.0,
+    ) -> None:
+        """Starts it and waits until it answers.
+
+        Args:
+            scenario: What is on the table; None for an arm alone that follows without dynamics.
+            address: Loopback address; one emulator each.
+            pace: Controller time per wall time.
+            lockstep: See `emulator.Clock`.
+            options: More options of the command.
+            timeout: Wall time that it may take to start, s.
+
+        Raises:
+            EmulatorError: It did not start; the message has what it said.
+        """
+        self.address = address
+        command = [sys.executable, "-m", "sliceit_drake.cli.main", "emulate"]
+        command += ["--arm-alone"] if scenario is None else [str(scenario)]
+        command += ["--address", address, "--pace", str(pace), "--end-with-stdin"]
+        command += ["--lockstep"] if lockstep else []
+        self._process = subprocess.Popen(
+            [*command, *options],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        )
+        try:
+            self.pendant = self._connect(timeout)
+        except BaseException:
+            self._end()
+            raise
+
+    def _connect(self, timeout: float) -> PendantClient:
+        end = time.monotonic() + timeout
+        while True:
+            if self._process.poll() is not None:
+                assert self._process.stdout is not None
+                said = self._process.stdout.read().decode("utf-8", "replace").strip()
+                raise EmulatorError(f"the emulator did not start: {said}")
+            try:
+                return PendantClient(self.address)
+            except OSError:
+                if time.monotonic() > end:
+                    raise EmulatorError(
+                        f"the emulator did not open {self.address}:{PENDANT_PORT} in {timeout:g} s"
+                    ) from None
+                time.sleep(0.02)
+
+    @property
+    def pid(self) -> int:
+        """Of the child process."""
+        return self._process.pid
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the child still runs."""
+        return self._process.poll() is None
+
+    def kill(self) -> None:
+        """Ends it at once, as a controller that loses power."""
+        self._process.kill()
+        self._process.wait()
+
+    def close(self) -> None:
+        """Ends it and waits for that."""
+        if self.is_running:
+            with contextlib.suppress(EmulatorError):
+                self.pendant.request(stop=True)
+        self.pendant.close()
+        self._end()
+
+    def _end(self) -> None:
+        for stream in (self._process.stdin, self._process.stdout):
+            if stream is not None:
+                stream.close()
+        try:
+            self._process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            self.kill()
+
+    def __enter__(self) -> "EmulatorProcess":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()

@@ -1,0 +1,108 @@
+"""What moves when the emulated controller moves: the interface, and an arm without dynamics."""
+
+import dataclasses as dc
+import functools
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sliceit_drake.systems.servo import JOINTS, ServoConfig, ServoLaw
+
+__all__ = ["CYCLE", "START", "KinematicRobot", "RobotModel", "RobotState", "SimulationStopped"]
+
+CYCLE = 0.002
+"""Controller time of one cycle of an e-Series controller, s."""
+
+START = (1.3524, -1.5555, 1.7697, -1.7785, -1.5644, 1.3493)
+"""Joints at the start of SliceIt!, rad."""
+
+GRAVITY = (0.0, 0.0, -9.81)
+
+
+class SimulationStopped(RuntimeError):
+    """The model cannot go on; its state stays as it is."""
+
+
+@dc.dataclass
+class RobotState:
+    """An arm at the end of a cycle.
+
+    Attributes:
+        positions: Measured joint positions [6], rad.
+        velocities: Measured joint velocities [6], rad/s.
+        wrench: What the sensor at the flange feels [6]: force, N, and moment about the flange, Nm,
+            of all beyond it on the arm, in the flange's axes.
+        torques: Torques of the joints [6], Nm.
+    """
+
+    positions: np.ndarray
+    velocities: np.ndarray
+    wrench: np.ndarray
+    torques: np.ndarray
+
+
+class RobotModel(Protocol):
+    """An arm that follows joint targets, one cycle at a time.
+
+    Attributes:
+        state: At the end of the last cycle.
+        gravity: Acceleration of gravity in the robot's base [3], m/s2.
+        warnings: What the model could not do as asked, in words; the controller tells its clients.
+    """
+
+    state: RobotState
+    gravity: np.ndarray
+    warnings: list[str]
+
+    def step(self, targets: ArrayLike, servo: ServoConfig | None) -> RobotState:
+        """Advances one cycle.
+
+        Args:
+            targets: Joint positions [6], rad.
+            servo: Parameters of the ``servoj`` that gave them; None if they are points of a motion
+                that the controller itself has planned.
+
+        Returns:
+            The state afterwards.
+
+        Raises:
+            SimulationStopped: There is no state afterwards.
+        """
+
+    def zero_sensor(self) -> None:
+        """Subtracts what the sensor feels now from all that follows."""
+
+
+class KinematicRobot:
+    """An arm without mass: planned motions are followed exactly, ``servoj`` with its lag.
+
+    The sensor feels nothing.
+    """
+
+    def __init__(self, positions: ArrayLike = START) -> None:
+        """Puts the arm at rest at `positions` [6], rad."""
+        q = np.array(positions, float)
+        none = np.zeros(JOINTS)
+        self.state = RobotState(q, none, np.zeros(6), none)
+        self.gravity = np.array(GRAVITY)
+        self.warnings: list[str] = []
+
+    def step(self, targets: ArrayLike, servo: ServoConfig | None) -> RobotState:
+        """See `RobotModel`."""
+        q, v = self.state.positions, self.state.velocities
+        if servo is None:
+            target = np.array(targets, float)
+            q, v = target, (target - q) / CYCLE
+        else:
+            q, v = _servo_law(servo.lookahead_time, servo.gain).step(np.vstack([q, v]), targets)
+        self.state = dc.replace(self.state, positions=q, velocities=v)
+        return self.state
+
+    def zero_sensor(self) -> None:
+        """See `RobotModel`."""
+
+
+@functools.lru_cache(maxsize=32)
+def _servo_law(lookahead_time: float, gain: float) -> ServoLaw:
+    return ServoLaw(ServoConfig(lookahead_time=lookahead_time, gain=gain), CYCLE)

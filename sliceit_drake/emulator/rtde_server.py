@@ -1,0 +1,208 @@
+"""The RTDE service, port 30004: protocol 2, several clients."""
+
+import collections
+import dataclasses as dc
+import random
+import struct
+
+from sliceit_drake.emulator.connections import Connection, SocketHub
+from sliceit_drake.emulator.controller import Controller
+from sliceit_drake.emulator.frames import (
+    FrameError,
+    FrameReader,
+    PackageType,
+    Recipe,
+    encode_frame,
+    encode_text,
+    split_names,
+)
+from sliceit_drake.emulator.registers import IN_USE
+from sliceit_drake.emulator.robot_model import CYCLE
+from sliceit_drake.emulator.variables import NOT_FOUND, output_type
+
+__all__ = ["RATE", "RtdeServer"]
+
+RATE = 1.0 / CYCLE
+"""Highest frequency of data packages, Hz."""
+
+_PROTOCOL = 2
+# Above this backlog a client gets no further packages: only whole ones are ever dropped.
+_FULL = 65536
+_ERROR = 1
+
+
+@dc.dataclass
+class _Session:
+    """What has been agreed with a client."""
+
+    reader: FrameReader = dc.field(default_factory=FrameReader)
+    inputs: list[Recipe] = dc.field(default_factory=list)
+    outputs: Recipe | None = None
+    frequency: float = 0.0
+    due: float = 0.0
+    is_started: bool = False
+    skipped: int = 0
+    late: collections.deque[tuple[float, bytes]] = dc.field(default_factory=collections.deque)
+
+
+class RtdeServer:
+    """Answers RTDE clients, sends them the controller's outputs and takes their inputs.
+
+    Attributes:
+        frequency_limit: Highest frequency that clients get, Hz.
+        drop_share: Share of the data packages, in and out, that gets lost (a fault).
+        delay: Controller time by which data packages come late, in and out, s (a fault).
+        packages_in: Data packages that have been taken.
+        command_counts: Number of them by the value that they wrote to the command register.
+    """
+
+    def __init__(self, hub: SocketHub, controller: Controller, seed: int = 0) -> None:
+        self.frequency_limit = RATE
+        self.drop_share = self.delay = 0.0
+        self.packages_in = 0
+        self.command_counts: collections.Counter[int] = collections.Counter()
+        self._hub, self._controller = hub, controller
+        self._random = random.Random(seed)
+        self._sessions: dict[Connection, _Session] = {}
+        self._late_inputs: collections.deque[tuple[float, Connection, bytes]] = collections.deque()
+
+    # Service.
+
+    def opened(self, connection: Connection) -> None:
+        """See `connections.Service`."""
+        self._sessions[connection] = _Session()
+
+    def closed(self, connection: Connection) -> None:
+        """See `connections.Service`."""
+        del self._sessions[connection]
+        self._controller.registers.release(connection)
+
+    def received(self, connection: Connection, data: bytes) -> None:
+        """See `connections.Service`."""
+        session = self._sessions[connection]
+        try:
+            for kind, payload in session.reader.feed(data):
+                self._answer(connection, session, kind, payload)
+                if not connection.is_open:
+                    return
+        except (FrameError, struct.error) as error:
+            # What follows cannot be told from garbage.
+            connection.send(encode_text(f"connection closed: {error}", _ERROR))
+            connection.close()
+
+    # Every cycle.
+
+    def take_late_inputs(self) -> None:
+        """Takes the inputs whose delay is over; before a cycle."""
+        while self._late_inputs and self._late_inputs[0][0] <= self._controller.time:
+            _, connection, payload = self._late_inputs.popleft()
+            if connection.is_open:
+                self._take_input(connection, self._sessions[connection], payload)
+
+    def publish(self) -> None:
+        """After a cycle: sends each client its data package, if due, and all text messages."""
+        controller = self._controller
+        texts = [encode_text(text, level) for level, text in controller.messages]
+        controller.messages.clear()
+        inputs: dict[str, object] = dict(controller.registers.values)
+        values = controller.outputs | inputs
+        for connection, session in list(self._sessions.items()):
+            for text in texts:
+                connection.send(text)
+            while session.late and session.late[0][0] <= controller.time:
+                self._send_data(connection, session, session.late.popleft()[1])
+            if session.outputs is None or not session.is_started:
+                continue
+            session.due += min(session.frequency, self.frequency_limit) * CYCLE
+            if session.due < 1.0 - 1e-9:
+                continue
+            session.due -= 1.0
+            if self._is_lost():
+                continue
+            data = encode_frame(PackageType.DATA, b"\x01" + session.outputs.pack(values))
+            if self.delay > 0.0 or session.late:
+                session.late.append((controller.time + self.delay, data))
+            else:
+                self._send_data(connection, session, data)
+
+    def statistics(self) -> dict[str, object]:
+        """Numbers for people."""
+        return {
+            "clients": len(self._sessions),
+            "packages_in": self.packages_in,
+            "commands": dict(self.command_counts),
+            "skipped": sum(s.skipped for s in self._sessions.values()),
+        }
+
+    # Packages.
+
+    def _is_lost(self) -> bool:
+        return self.drop_share > 0.0 and self._random.random() < self.drop_share
+
+    def _send_data(self, connection: Connection, session: _Session, data: bytes) -> None:
+        if connection.backlog > _FULL:
+            session.skipped += 1
+        else:
+            connection.send(data)
+
+    def _answer(self, connection: Connection, session: _Session, kind: int, payload: bytes) -> None:
+        if kind == PackageType.DATA:
+            if self._is_lost():
+                return
+            if self.delay > 0.0 or self._late_inputs:
+                due = self._controller.time + self.delay
+                self._late_inputs.append((due, connection, payload))
+            else:
+                self._take_input(connection, session, payload)
+        elif kind == PackageType.TEXT:
+            self._controller.log.append((self._controller.time, f"client says {payload!r}"))
+        elif kind in (PackageType.START, PackageType.PAUSE):
+            is_start = kind == PackageType.START
+            accepted = session.outputs is not None or not is_start
+            session.is_started = is_start and accepted
+            connection.send(encode_frame(kind, bytes([accepted])))
+        elif kind == PackageType.PROTOCOL_VERSION:
+            (version,) = struct.unpack(">H", payload)
+            connection.send(encode_frame(kind, bytes([version == _PROTOCOL])))
+        elif kind == PackageType.CONTROL_VERSION:
+            version = struct.pack(">IIII", *self._controller.config.version)
+            connection.send(encode_frame(kind, version))
+        elif kind == PackageType.SETUP_OUTPUTS:
+            connection.send(encode_frame(kind, self._set_outputs(session, payload)))
+        elif kind == PackageType.SETUP_INPUTS:
+            connection.send(encode_frame(kind, self._set_inputs(connection, session, payload)))
+        else:
+            connection.send(encode_text(f"unknown type of package {kind}", _ERROR))
+
+    def _set_outputs(self, session: _Session, payload: bytes) -> bytes:
+        (frequency,) = struct.unpack_from(">d", payload)
+        names = split_names(payload[8:])
+        types = [output_type(name, self._controller.config.version) for name in names]
+        accepted = NOT_FOUND not in types and 0.0 < frequency <= self.frequency_limit
+        session.outputs = Recipe(names, types) if accepted else None
+        session.frequency, session.due = frequency, 0.0
+        return bytes([accepted]) + ",".join(types).encode()
+
+    def _set_inputs(self, connection: Connection, session: _Session, payload: bytes) -> bytes:
+        names = split_names(payload)
+        types = self._controller.registers.claim(connection, names)
+        number = 0
+        if not {NOT_FOUND, IN_USE} & set(types):
+            session.inputs.append(Recipe(names, types))
+            number = len(session.inputs)
+        return bytes([number]) + ",".join(types).encode()
+
+    def _take_input(self, connection: Connection, session: _Session, payload: bytes) -> None:
+        number = payload[0] if payload else 0
+        try:
+            if not 1 <= number <= len(session.inputs):
+                raise FrameError(f"there is no input recipe {number}")
+            values = session.inputs[number - 1].unpack(payload[1:])
+        except FrameError as error:
+            connection.send(encode_text(f"input package ignored: {error}", _ERROR))
+            return
+        self.packages_in += 1
+        for name in ("input_int_register_0", "input_int_register_24"):
+            if name in values:
+                self.command_counts[int(values[name])] += 1  # type: ignore[arg-type]
+        self._controller.registers.write(values, self._controller.time)
