@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-__all__ = ["forward", "inverse", "jacobian", "matrix_of_pose", "pose_of_matrix"]
+__all__ = ["Posture", "forward", "inverse", "matrix_of_pose", "pose_of_matrix"]
 
 # d [m], a [m], alpha [rad] of each joint: Universal Robots, "DH parameters for calculations of
 # kinematics and dynamics", UR5e.
@@ -43,6 +43,41 @@ def pose_of_matrix(X: np.ndarray) -> np.ndarray:
     return np.concatenate([X[:3, 3], Rotation.from_matrix(X[:3, :3]).as_rotvec()])
 
 
+class Posture:
+    """The arm at some joint positions.
+
+    Attributes:
+        X_BF: Pose of the flange in the base [4, 4].
+    """
+
+    def __init__(self, q: ArrayLike) -> None:
+        """Places the links for joint positions `q` [6], rad."""
+        # Frames of base, links and flange; joint i turns about the z axis of frame i.
+        self._frames = [np.eye(4)]
+        for (d, a, alpha), angle in zip(_DH, np.asarray(q, float).tolist(), strict=True):
+            c, s, ca, sa = math.cos(angle), math.sin(angle), math.cos(alpha), math.sin(alpha)
+            step = np.array(
+                [
+                    [c, -s * ca, s * sa, a * c],
+                    [s, c * ca, -c * sa, a * s],
+                    [0.0, sa, ca, d],
+                    [0.0, 0.0, 0.0, 1.0],
+                ]
+            )
+            self._frames.append(self._frames[-1] @ step)
+        self.X_BF = self._frames[-1]
+
+    def jacobian(self, p_B: np.ndarray) -> np.ndarray:
+        """Matrix [6, 6] from joint velocities to velocity and angular velocity, in the base.
+
+        Args:
+            p_B: The point of the tool whose velocity is meant, in the base [3], m.
+        """
+        origins = np.array([X[:3, 3] for X in self._frames[:-1]])
+        axes = np.array([X[:3, 2] for X in self._frames[:-1]])
+        return np.vstack([np.cross(axes, p_B - origins).T, axes.T])
+
+
 def forward(q: ArrayLike, X_FT: np.ndarray | None = None) -> np.ndarray:
     """Pose of the tool in the base.
 
@@ -53,29 +88,8 @@ def forward(q: ArrayLike, X_FT: np.ndarray | None = None) -> np.ndarray:
     Returns:
         Homogeneous matrix [4, 4].
     """
-    X = _links(q)[-1]
+    X = Posture(q).X_BF
     return X if X_FT is None else X @ X_FT
-
-
-def jacobian(q: ArrayLike, X_FT: np.ndarray | None = None) -> np.ndarray:
-    """Matrix [6, 6] from joint velocities to the tool's velocity and angular velocity, in the base.
-
-    Args:
-        q: Joint positions [6], rad.
-        X_FT: Tool in the flange [4, 4]; None for the flange itself.
-    """
-    links = _links(q)
-    tip = links[-1][:3, 3] if X_FT is None else (links[-1] @ X_FT)[:3, 3]
-    J = np.empty((6, 6))
-    for i, X in enumerate(links[:-1]):
-        axis, arm = X[:3, 2], tip - X[:3, 3]
-        J[:3, i] = (
-            axis[1] * arm[2] - axis[2] * arm[1],
-            axis[2] * arm[0] - axis[0] * arm[2],
-            axis[0] * arm[1] - axis[1] * arm[0],
-        )
-        J[3:, i] = axis
-    return J
 
 
 def inverse(X_BT: np.ndarray, q: ArrayLike, X_FT: np.ndarray | None = None) -> np.ndarray | None:
@@ -91,29 +105,13 @@ def inverse(X_BT: np.ndarray, q: ArrayLike, X_FT: np.ndarray | None = None) -> n
     """
     q = np.array(q, float)
     for _ in range(_ITERATIONS):
-        X = forward(q, X_FT)
+        posture = Posture(q)
+        X = posture.X_BF if X_FT is None else posture.X_BF @ X_FT
         turn = Rotation.from_matrix(X_BT[:3, :3] @ X[:3, :3].T).as_rotvec()
         error = np.concatenate([X_BT[:3, 3] - X[:3, 3], turn])
         if np.abs(error).max() < _TOLERANCE:
             return q
-        J = jacobian(q, X_FT)
+        J = posture.jacobian(X[:3, 3])
         step = J.T @ np.linalg.solve(J @ J.T + _DAMPING * np.eye(6), error)
         q += step * min(1.0, _LARGEST_STEP / max(float(np.abs(step).max()), 1e-12))
     return None
-
-
-def _links(q: ArrayLike) -> list[np.ndarray]:
-    """Frames [4, 4] of base, links and flange; joint i turns about the z axis of frame i."""
-    frames = [np.eye(4)]
-    for (d, a, alpha), angle in zip(_DH, np.asarray(q, float).tolist(), strict=True):
-        c, s, ca, sa = math.cos(angle), math.sin(angle), math.cos(alpha), math.sin(alpha)
-        step = np.array(
-            [
-                [c, -s * ca, s * sa, a * c],
-                [s, c * ca, -c * sa, a * s],
-                [0.0, sa, ca, d],
-                [0.0, 0.0, 0.0, 1.0],
-            ]
-        )
-        frames.append(frames[-1] @ step)
-    return frames
