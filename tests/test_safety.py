@@ -175,6 +175,19 @@ def test_no_hostile_command_makes_anything_go_out_of_limits():
     assert expected <= set(reasons), reasons
 
 
+def test_one_target_goes_out_in_a_cycle_however_many_commands_come():
+    layer, now = make_layer(), state(1.002, START)
+    layer.arm(state(1.0, START))
+    assert layer.step(now, None, 1.0).q is None
+    first = [START[0] + 1e-5, *START[1:]]
+    assert layer.step(now, first, 1.002).q == first
+    second = [START[0] + 2e-5, *START[1:]]
+    assert layer.step(now, second, 1.002) == (None, None)
+    layer.latch("end", "done", sends=True)
+    assert layer.step(now, second, 1.002).q is None, "the braking target is for the next cycle"
+    assert layer.step(state(1.004, START), second, 1.002).q is not None
+
+
 @pytest.mark.parametrize(
     ("reason", "changes"),
     [

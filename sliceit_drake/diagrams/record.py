@@ -19,7 +19,7 @@ from pydrake.systems.primitives import (
 from scipy.spatial.transform import Rotation
 
 from sliceit_drake.cutting.motion import Motion
-from sliceit_drake.diagrams.station import SlicingStation
+from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.systems.cutting_system import ENERGY_NAMES, LEDGER_NAMES, CuttingSystem
 
 __all__ = ["Record", "Recorder", "add_recorder"]
@@ -75,7 +75,7 @@ class Recorder:
 
     log: VectorLogSink
     columns: list[str]
-    station: SlicingStation
+    station: Station
     motion: Motion
 
     def record(self, root_context: Context) -> Record:
@@ -141,7 +141,7 @@ def _wrench_columns(name: str) -> list[str]:
 
 def add_recorder(
     builder: DiagramBuilder,
-    station: SlicingStation,
+    station: Station,
     motion: Motion,
     sources: Mapping[str, OutputPort],
 ) -> Recorder:
@@ -161,7 +161,7 @@ def add_recorder(
         "cut_progress": ["cut_progress"],
         "food_wrench_vector": _wrench_columns("food_wrench"),
         "board_wrench_vector": _wrench_columns("board_wrench"),
-        "sensor_state": station.sensor.state_columns(_wrench_columns("sensor_wrench")),
+        "sensor_state": station.sensor_columns(_wrench_columns("sensor_wrench")),
         **_COMMANDS,
     }
     if isinstance(station.cutting, CuttingSystem):
@@ -185,7 +185,7 @@ def add_recorder(
 
 
 def _vector_source(
-    builder: DiagramBuilder, station: SlicingStation, sources: Mapping[str, OutputPort], name: str
+    builder: DiagramBuilder, station: Station, sources: Mapping[str, OutputPort], name: str
 ) -> OutputPort:
     """Where a recorded vector comes from: the station, a command source, or the configuration."""
     if name not in _COMMANDS:

@@ -30,11 +30,12 @@ from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram, Scenari
 from sliceit_drake.diagrams.sequence_report import plot_sequence, slice_reports
 from sliceit_drake.diagrams.snapshot import Snapshot, take_snapshot
 from sliceit_drake.diagrams.station import CAMERA_OFFSET, SlicingStation
+from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.cutting_system import ENERGY_NAMES, LEDGER_NAMES, CuttingSystem
 
-__all__ = ["Run", "prepare_run", "simulate", "write_outputs"]
+__all__ = ["Run", "make_meshcat", "measured_profile", "prepare_run", "simulate", "write_outputs"]
 
 CHUNK = 0.02
 SNAPSHOT_PROGRESS = 0.5
@@ -71,7 +72,7 @@ class Run:
         return self.diagram.record(self.simulator.get_context())
 
     @property
-    def station(self) -> SlicingStation:
+    def station(self) -> Station:
         """The station in the diagram."""
         return self.diagram.station
 
@@ -87,9 +88,10 @@ def prepare_run(scenario: Scenario, meshcat: Meshcat | None = None) -> Run:
     Raises:
         ConfigurationError, MeshError, TimeStepError, CuttingError: The scenario cannot start.
     """
-    profile = _measured_profile(scenario)
+    profile = measured_profile(scenario)
     diagram = MakeScenarioDiagram(scenario, meshcat)
     station = diagram.station
+    assert isinstance(station, SlicingStation)
     margin = check_contact_margin(station)
     simulator = Simulator(diagram)
     diagram.SetStart(simulator.get_mutable_context())
@@ -196,7 +198,7 @@ def _top_height(run: Run) -> float:
     return float(run.station.start_pose.translation()[2] - run.scenario.start.clearance)
 
 
-def _measured_profile(scenario: Scenario) -> ForceProfile | None:
+def measured_profile(scenario: Scenario) -> ForceProfile | None:
     if scenario.measurement is None:
         return None
     file = Path(scenario.measurement.file)

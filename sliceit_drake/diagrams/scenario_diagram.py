@@ -6,7 +6,8 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from sliceit_drake.cutting.motion import Motion
 from sliceit_drake.diagrams.record import Record, Recorder, add_recorder
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.diagrams.station import MakeSlicingStation, SlicingStation
+from sliceit_drake.diagrams.station import MakeSlicingStation
+from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.systems.motion_sources import MotionSource
 
 __all__ = ["MakeScenarioDiagram", "ScenarioDiagram"]
@@ -16,15 +17,17 @@ class ScenarioDiagram(Diagram):
     """A station driven by its scenario's motion, with a log of all ports.
 
     Attributes:
-        station: The slicing station.
+        station: The slicing station, simulated or hardware.
         motion: The prescribed targets of the knife.
     """
 
-    def __init__(self, scenario: Scenario, meshcat: Meshcat | None = None) -> None:
+    def __init__(
+        self, scenario: Scenario, meshcat: Meshcat | None = None, station: Station | None = None
+    ) -> None:
         super().__init__()
         builder = DiagramBuilder()
-        self.station: SlicingStation = builder.AddNamedSystem(
-            "station", MakeSlicingStation(scenario, meshcat)
+        self.station: Station = builder.AddNamedSystem(
+            "station", station or MakeSlicingStation(scenario, meshcat)
         )
         source = builder.AddNamedSystem(
             "motion", MotionSource(self.station.motion_plan, self.station.start_pose)
@@ -45,14 +48,17 @@ class ScenarioDiagram(Diagram):
         return self._recorder.record(context)
 
 
-def MakeScenarioDiagram(scenario: Scenario, meshcat: Meshcat | None = None) -> ScenarioDiagram:
+def MakeScenarioDiagram(
+    scenario: Scenario, meshcat: Meshcat | None = None, station: Station | None = None
+) -> ScenarioDiagram:
     """The diagram of a scenario, ready for a Simulator.
 
     Args:
         scenario: What to simulate.
         meshcat: Viewer to draw in, or None.
+        station: What to drive; None for a simulated station of the scenario.
 
     Raises:
         ConfigurationError, MeshError, TimeStepError: The scenario cannot be built.
     """
-    return ScenarioDiagram(scenario, meshcat)
+    return ScenarioDiagram(scenario, meshcat, station)

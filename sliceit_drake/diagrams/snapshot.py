@@ -8,7 +8,7 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.diagrams.station import SlicingStation
+from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.systems.cutting_system import CuttingSystem
 from sliceit_drake.systems.food_visualizer import FLESH, SKIN
 
@@ -37,7 +37,7 @@ class Snapshot:
     blade: list[np.ndarray]
 
 
-def take_snapshot(station: SlicingStation, root_context: Context) -> Snapshot | None:
+def take_snapshot(station: Station, root_context: Context) -> Snapshot | None:
     """Knife and food as they are in the context of the diagram; None for an analytic food."""
     cutting = station.cutting
     if not isinstance(cutting, CuttingSystem):

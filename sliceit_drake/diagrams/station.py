@@ -1,14 +1,14 @@
 """The simulated slicing station: a Scenario becomes a Diagram."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import Demultiplexer
 
 from sliceit_drake.cutting.food import Food, make_food_model, start_pose
@@ -27,6 +27,7 @@ from sliceit_drake.diagrams.robot import (
 )
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.start import solve_start_joints
+from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.diagrams.workspace import add_board, add_holder, add_table
 from sliceit_drake.systems.analytic_cutter import AnalyticCutter, AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceController
@@ -55,7 +56,7 @@ FINGER = 0.015
 CAMERA_OFFSET = np.array([0.17, 0.23, 0.17])
 
 
-class SlicingStation(Diagram):
+class SlicingStation(Station):
     """Arm, knife, controller, sensor, board and food behind the ports of `ports.STATION_PORTS`.
 
     Attributes:
@@ -267,6 +268,10 @@ class SlicingStation(Diagram):
         frames = FrameVisualizer(meshcat, fixed, carried, self.start_pose, CAMERA_OFFSET, period)
         builder.AddNamedSystem("frame_visualizer", frames)
         builder.Connect(knife_pose, frames.GetInputPort("knife_pose"))
+
+    def sensor_columns(self, reading: Sequence[str]) -> list[str]:
+        """Names for the port `sensor_state`: `reading` [6] for the moment and force."""
+        return self.sensor.state_columns(reading)
 
     def SetStart(self, root_context: Context) -> None:
         """Puts arm and controller at rest at the start, in the context of the whole diagram."""

@@ -106,6 +106,7 @@ class SafetyLayer:
         self._q = [0.0] * 6
         self._v = [0.0] * 6
         self._edge = kinematics.edge(self._q)
+        self._last: RobotState | None = None
         self._time = -math.inf  # Of the last state.
         self._sent_time = -math.inf
 
@@ -134,6 +135,7 @@ class SafetyLayer:
         stop = self._robot_fault(state) or self._measurement_fault(state)
         if stop is None:
             self._q, self._v = list(state.q), [0.0] * 6
+            self._last = state
             self._time = self._sent_time = state.time
             edge = self._kinematics.edge(self._q)
             stop = self._position_fault(self._q, edge, "the arm's actual position", state.time)
@@ -190,29 +192,31 @@ class SafetyLayer:
     def step(
         self, state: RobotState, command: Sequence[float] | None, command_time: float
     ) -> Decision:
-        """Judges one cycle.
+        """Judges one cycle, or a command that comes later in it.
+
+        One target goes out in a cycle; further commands in it are left out.
 
         Args:
-            state: New data of the controller.
+            state: Data of the controller; the same object again for a later command in its cycle.
             command: The target wanted [6], rad; None where there is none that was not judged yet.
             command_time: Controller time of the measurement that the newest command answers, s.
         """
-        stop = self._stop
+        stop, sent_before = self._stop, self._sent_time
         if stop is None:
             stop = self._stop = self._fault(state, command, command_time)
             if stop is None:
-                if command is None:
-                    return Decision(None, None)
-                return Decision(self._q[:], None)
+                is_taken = command is not None and self._sent_time != sent_before
+                return Decision(self._q[:] if is_taken else None, None)
         else:
             if not stop.sends:
                 return Decision(None, stop)
-            fault = self._robot_fault(state) or self._clock_fault(state)
-            if fault is not None:
-                stop = self._stop = stop._replace(sends=False)
-            else:
-                self._time = state.time
-        if not stop.sends:
+            if state is not self._last:
+                fault = self._robot_fault(state) or self._clock_fault(state)
+                if fault is not None:
+                    stop = self._stop = stop._replace(sends=False)
+                else:
+                    self._last, self._time = state, state.time
+        if not stop.sends or state.time <= self._sent_time:
             return Decision(None, stop)
         return Decision(self._brake(state.time), stop)
 
@@ -224,27 +228,30 @@ class SafetyLayer:
             return Stop(
                 "not armed", "the layer was never armed", math.nan, math.nan, state.time, False
             )
-        stop = self._robot_fault(state) or self._clock_fault(state)
-        if stop is not None:
-            return stop
-        self._time = time = state.time
-        stop = self._measurement_fault(state)
-        if stop is not None:
-            return stop
-        limits = self.limits
-        for j in range(6):
-            error = abs(self._q[j] - state.q[j])
-            if not error <= limits.tracking_error:
-                return self._breach(
-                    "tracking_error", f"joint {j + 1} is off its target", error,
-                    limits.tracking_error, "rad", time,
-                )  # fmt: skip
+        limits, time = self.limits, state.time
+        if state is not self._last:
+            stop = self._robot_fault(state) or self._clock_fault(state)
+            if stop is not None:
+                return stop
+            self._last, self._time = state, time
+            stop = self._measurement_fault(state)
+            if stop is not None:
+                return stop
+            for j in range(6):
+                error = abs(self._q[j] - state.q[j])
+                if not error <= limits.tracking_error:
+                    return self._breach(
+                        "tracking_error", f"joint {j + 1} is off its target", error,
+                        limits.tracking_error, "rad", time,
+                    )  # fmt: skip
         age = time - command_time
         if not age <= limits.command_age + _ROUNDING:
             return self._breach(
                 "command_age", "no new command in time", age, limits.command_age, "s", time
             )
-        return None if command is None else self._take(command, time)
+        if command is None or time <= self._sent_time:
+            return None
+        return self._take(command, time)
 
     def _robot_fault(self, state: RobotState) -> Stop | None:
         bits = state.safety_bits

@@ -1,0 +1,245 @@
+"""The hardware station: the ports of the simulated one, with a real robot behind them."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from pydrake.common.value import AbstractValue, Value
+from pydrake.math import RigidTransform
+from pydrake.multibody.math import SpatialForce, SpatialVelocity
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import RigidBody
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiagramBuilder,
+    LeafSystem,
+    ValueProducer,
+)
+from pydrake.systems.primitives import ConstantVectorSource
+
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.diagrams.ports import STATION_PORTS
+from sliceit_drake.diagrams.station import SlicingStation
+from sliceit_drake.diagrams.station_interface import Station
+from sliceit_drake.hardware.knife_kinematics import KnifeKinematics
+from sliceit_drake.hardware.limits import SafetyLimits
+from sliceit_drake.hardware.rtde_link import RobotLink
+from sliceit_drake.hardware.rtde_system import RtdeSystem
+from sliceit_drake.hardware.safety import SafetyLayer
+from sliceit_drake.systems.compliance_controller import ComplianceController
+from sliceit_drake.systems.contact_monitor import ContactMonitor
+from sliceit_drake.systems.servo import JOINTS
+from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
+
+__all__ = ["HardwareStation", "MakeHardwareStation", "make_safety_layer"]
+
+PERIOD = 0.002
+"""Of an e-Series controller, s."""
+
+
+class KnifeEstimate(LeafSystem):
+    """What a robot does not measure itself, from what it does.
+
+    Inputs:
+        joint_positions, joint_velocities: Measured [6].
+        sensor_wrench: SpatialForce at So, in S.
+
+    Outputs:
+        knife_pose, knife_velocity: By forward kinematics.
+        food_wrench: The sensor's wrench at Ko in W: food and board together, and what taring left
+            of the tool's weight and inertia. No sensor of a wrist tells these apart.
+        food_wrench_vector: The same as moment and force [6].
+        board_wrench: Zero, for the same reason.
+        cut_progress: Depth of the edge's middle as a share of the food's height [1], the most so
+            far not counted; not the share of the section.
+
+    Args:
+        plant: Model of the arm alone.
+        knife: Its body K.
+        top: Height of the food's top in W, m.
+        board: Height of the board, m.
+    """
+
+    def __init__(self, plant: MultibodyPlant, knife: RigidBody, top: float, board: float) -> None:
+        super().__init__()
+        self._plant, self._knife, self._top, self._board = plant, knife, top, board
+        self._flange = plant.GetFrameByName("tool0")
+        q = self._q = self.DeclareVectorInputPort("joint_positions", JOINTS)
+        qd = self._qd = self.DeclareVectorInputPort("joint_velocities", JOINTS)
+        wrench = self._wrench = self.DeclareAbstractInputPort(
+            "sensor_wrench", Value(SpatialForce.Zero())
+        )
+        # Scratch paper, as in the compliance controller: every use overwrites it first.
+        self._scratch = self.DeclareCacheEntry(
+            "model",
+            ValueProducer(
+                allocate=lambda: Value(object()),
+                calc=lambda context, value: value.set_value(plant.CreateDefaultContext()),
+            ),
+            {self.nothing_ticket()},
+        )
+        self._declare("knife_pose", RigidTransform(), self._calc_pose, {q.ticket()})
+        self._declare(
+            "knife_velocity", SpatialVelocity.Zero(), self._calc_velocity, {q.ticket(), qd.ticket()}
+        )
+        contact = {q.ticket(), wrench.ticket()}
+        self._declare("food_wrench", SpatialForce.Zero(), self._contact, contact)
+        self._declare("board_wrench", SpatialForce.Zero(), lambda _: SpatialForce.Zero(), set())
+        self.DeclareVectorOutputPort("food_wrench_vector", 6, self._calc_vector, contact)
+        self.DeclareVectorOutputPort("cut_progress", 1, self._calc_progress, {q.ticket()})
+
+    def _declare(
+        self, name: str, example: object, calc: Callable[[Context], object], depends: set
+    ) -> None:
+        def set_output(context: Context, output: AbstractValue) -> None:
+            output.set_value(calc(context))
+
+        self.DeclareAbstractOutputPort(
+            name, lambda: Value(example), set_output, depends or {self.nothing_ticket()}
+        )
+
+    def _model(self, context: Context) -> Context:
+        scratch = self._scratch.Eval(context)
+        self._plant.SetPositions(scratch, self._q.Eval(context))
+        return scratch
+
+    def _calc_pose(self, context: Context) -> RigidTransform:
+        return self._plant.EvalBodyPoseInWorld(self._model(context), self._knife)
+
+    def _calc_velocity(self, context: Context) -> SpatialVelocity:
+        scratch = self._model(context)
+        self._plant.SetVelocities(scratch, self._qd.Eval(context))
+        return self._plant.EvalBodySpatialVelocityInWorld(scratch, self._knife)
+
+    def _contact(self, context: Context) -> SpatialForce:
+        scratch = self._model(context)
+        X_WS = self._flange.CalcPoseInWorld(scratch)
+        p_WK = self._plant.EvalBodyPoseInWorld(scratch, self._knife).translation()
+        wrench, R = self._wrench.Eval(context), X_WS.rotation()
+        force = R @ wrench.translational()
+        moment = R @ wrench.rotational() + np.cross(X_WS.translation() - p_WK, force)
+        return SpatialForce(moment, force)
+
+    def _calc_vector(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._contact(context).get_coeffs())
+
+    def _calc_progress(self, context: Context, output: BasicVector) -> None:
+        depth = self._top - self._calc_pose(context).translation()[2]
+        output.SetAtIndex(0, float(np.clip(depth / (self._top - self._board), 0.0, 1.0)))
+
+
+class HardwareStation(Station):
+    """A real robot behind `ports.STATION_PORTS`; `hardware_run` advances it.
+
+    Its additional outputs are those of `RtdeSystem` about the link: period, lateness, age,
+    missed_cycles, latched, stop_reason.
+
+    Args:
+        twin: The simulated station of the same scenario: its model, start and plan are used, its
+            plant does not move.
+        link: To the robot.
+        pace: Controller seconds in a second; 1 for all robots.
+
+    Attributes:
+        rtde: The robot's system.
+    """
+
+    def __init__(self, twin: SlicingStation, link: RobotLink, pace: float = 1.0) -> None:
+        super().__init__()
+        scenario = self.scenario = twin.scenario
+        if abs(scenario.exchange_period - PERIOD) > 1e-12:
+            raise ConfigurationError(
+                f"{scenario.exchange_period:.6g} s is not the cycle of the robot's controller",
+                field="scenario.exchange_period",
+                fix=f"Write {PERIOD:g}.",
+            )
+        self.plant, self.robot = twin.plant, twin.robot
+        self.motion_plan, self.board_peak_loss = twin.motion_plan, twin.board_peak_loss
+        self.start_pose, self.start_joints = twin.start_pose, twin.start_joints
+        self.meshcat = self.visualizer = self.food_visualizer = None
+        builder = DiagramBuilder()
+        self.rtde = builder.AddNamedSystem("robot", RtdeSystem(link, pace))
+        controller = builder.AddNamedSystem(
+            "controller",
+            ComplianceController(
+                scenario.controller,
+                ur5e_chain(scenario.robot.X_TK()),
+                X_WB=scenario.robot.X_WB(),
+            ),
+        )
+        top = float(twin.start_pose.translation()[2]) - scenario.start.clearance
+        estimate = builder.AddNamedSystem(
+            "knife_estimate",
+            KnifeEstimate(twin.plant, twin.robot.knife, top, scenario.board.height),
+        )
+        self.cutting = estimate
+        monitor = builder.AddNamedSystem(
+            "contact_monitor", ContactMonitor(scenario.monitor, PERIOD, scenario.sensor)
+        )
+        rtde = self.rtde
+        for source, targets in (
+            (rtde.GetOutputPort("joint_positions"), (controller, estimate)),
+            (rtde.GetOutputPort("joint_velocities"), (estimate,)),
+            (rtde.GetOutputPort("sensor_wrench"), (controller, estimate, monitor)),
+            (controller.GetOutputPort("joint_positions_command"), (rtde,)),
+        ):
+            for target in targets:
+                builder.Connect(source, target.GetInputPort(source.get_name()))
+        homes = {
+            "joint_positions": rtde,
+            "joint_velocities": rtde,
+            "sensor_wrench": rtde,
+            "joint_positions_command": controller,
+            "commanded_pose": controller,
+        }
+        for port in STATION_PORTS:
+            if port.direction == "input":
+                builder.ExportInput(controller.GetInputPort(port.name), port.name)
+            else:
+                home = homes.get(port.name, estimate)
+                builder.ExportOutput(home.GetOutputPort(port.name), port.name)
+        for name in ("period", "lateness", "age", "missed_cycles", "latched", "stop_reason"):
+            builder.ExportOutput(rtde.GetOutputPort(name), name)
+        # For records: what the contract gives as typed values, as vectors.
+        no_board = builder.AddNamedSystem("no_board", ConstantVectorSource(np.zeros(6)))
+        builder.ExportOutput(no_board.get_output_port(), "board_wrench_vector")
+        builder.ExportOutput(estimate.GetOutputPort("food_wrench_vector"), "food_wrench_vector")
+        builder.ExportOutput(rtde.GetOutputPort("wrench_vector"), "sensor_state")
+        builder.ExportOutput(monitor.GetOutputPort("unstable_gains"), "unstable_gains")
+        builder.BuildInto(self)
+        self.set_name("station")
+
+    def SetStart(self, root_context: Context) -> None:
+        """Takes in where the robot is; it is moved to the start before."""
+        self.rtde.receive(self.rtde.GetMyMutableContextFromRoot(root_context))
+
+    def sensor_columns(self, reading: Sequence[str]) -> list[str]:
+        """Names for the port `sensor_state`: `reading` [6] for the moment and force."""
+        return list(reading)
+
+
+def MakeHardwareStation(
+    twin: SlicingStation, link: RobotLink, pace: float = 1.0
+) -> HardwareStation:
+    """The hardware station of a scenario, with the ports of the simulated one.
+
+    Args:
+        twin: `MakeSlicingStation` of the scenario.
+        link: To the robot, watching.
+        pace: Controller seconds in a second; 1 for all robots.
+
+    Raises:
+        ConfigurationError: The scenario does not fit a robot.
+    """
+    return HardwareStation(twin, link, pace)
+
+
+def make_safety_layer(twin: SlicingStation, limits: SafetyLimits) -> SafetyLayer:
+    """The safety layer for a scenario's knife, board and start."""
+    robot, knife = twin.scenario.robot, twin.scenario.knife
+    kinematics = KnifeKinematics(
+        robot.X_WB().GetAsMatrix34(), robot.X_TK().GetAsMatrix34(), knife.length
+    )
+    return SafetyLayer(
+        limits, kinematics, twin.scenario.board.height, twin.start_joints.tolist(), PERIOD
+    )

@@ -1,0 +1,53 @@
+"""What all that surrounds a station may ask of it besides its ports, simulated or hardware."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from pydrake.geometry import Meshcat, MeshcatVisualizer
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import Context, Diagram, LeafSystem
+
+from sliceit_drake.cutting.motion import MotionPlan
+from sliceit_drake.diagrams.robot import Robot
+from sliceit_drake.diagrams.scenario import Scenario
+from sliceit_drake.systems.food_visualizer import FoodVisualizer
+
+__all__ = ["Station"]
+
+
+class Station(Diagram):
+    """A slicing station: a diagram with `ports.STATION_PORTS`.
+
+    Attributes:
+        scenario: What it was made from.
+        plant: Model of arm, gripper and knife; what moves in a simulated station alone.
+        robot: Handles of the robot in it.
+        cutting: What says how far the cut is.
+        motion_plan: The scenario's segments, or those of its sequence.
+        start_pose: X_WK at the start.
+        start_joints: Joint positions there [6], rad.
+        board_peak_loss: Estimated share of an impact's peak force on a simulated board that the
+            plant's steps take.
+        meshcat, visualizer, food_visualizer: The viewer, or None.
+    """
+
+    scenario: Scenario
+    plant: MultibodyPlant
+    robot: Robot
+    cutting: LeafSystem
+    motion_plan: MotionPlan
+    start_pose: RigidTransform
+    start_joints: np.ndarray
+    board_peak_loss: float
+    meshcat: Meshcat | None
+    visualizer: MeshcatVisualizer | None
+    food_visualizer: FoodVisualizer | None
+
+    def SetStart(self, root_context: Context) -> None:
+        """Puts the station at its start, in the context of the whole diagram."""
+        raise NotImplementedError
+
+    def sensor_columns(self, reading: Sequence[str]) -> list[str]:
+        """Names for the port `sensor_state`: `reading` [6] for the moment and force."""
+        raise NotImplementedError
