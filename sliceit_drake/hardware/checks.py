@@ -1,0 +1,159 @@
+"""What must be true before a robot may move: each check says what it found and what to do."""
+
+import dataclasses as dc
+import math
+from collections.abc import Sequence
+
+from sliceit_drake.hardware.client import RobotFacts
+from sliceit_drake.hardware.configuration import HardwareConfig
+from sliceit_drake.hardware.robot_state import RobotState
+
+__all__ = ["Check", "check_facts", "check_sensor", "check_start"]
+
+
+@dc.dataclass(frozen=True)
+class Check:
+    """One check.
+
+    Attributes:
+        name: What is checked.
+        passed: Whether it allows motion.
+        found: What was found, with what was wanted.
+        fix: What to do if it did not pass.
+    """
+
+    name: str
+    passed: bool
+    found: str
+    fix: str = ""
+
+    def __str__(self) -> str:
+        line = f"[{'ok' if self.passed else 'NO'}] {self.name}: {self.found}"
+        return line if self.passed or not self.fix else f"{line}. {self.fix}"
+
+
+def check_facts(facts: RobotFacts, config: HardwareConfig) -> list[Check]:
+    """The robot itself: model, serial, software, state, payload, tool, speed slider."""
+    checks = [
+        Check(
+            "model",
+            facts.model == config.model,
+            f"{facts.model or 'unknown'}, wanted {config.model}",
+            "The plan is for another arm. Give the address of the right robot.",
+        ),
+        Check(
+            "serial number",
+            not config.serial or facts.serial == config.serial,
+            f"{facts.serial}, wanted {config.serial or 'any'}",
+            "This is not the robot that the file is for.",
+        ),
+        Check(
+            "software",
+            _version(facts.software) >= _version(config.software),
+            f"{facts.software or 'unknown'}, wanted {config.software} or later",
+            "Update PolyScope.",
+        ),
+        Check(
+            "robot mode",
+            facts.robot_mode == "RUNNING",
+            f"{facts.robot_mode}, wanted RUNNING",
+            "Switch the arm on and release its brakes on the pendant.",
+        ),
+        Check(
+            "safety mode",
+            facts.safety_mode in ("NORMAL", "REDUCED"),
+            f"{facts.safety_mode}, wanted NORMAL",
+            "Clear the stop on the pendant, after finding its cause.",
+        ),
+        Check(
+            "remote control",
+            facts.remote_control is not False,
+            {True: "on", False: "off", None: "the robot cannot say"}[facts.remote_control],
+            "Switch the pendant to remote control.",
+        ),
+        Check(
+            "speed slider",
+            facts.speed_scaling >= 0.999,
+            f"{100.0 * facts.speed_scaling:.0f} %, wanted 100 %",
+            "Below it the controller stretches time and the arm trails its targets.",
+        ),
+        Check(
+            "tool centre point",
+            all(abs(x) < 1e-4 for x in facts.tcp),
+            f"{[round(x, 4) for x in facts.tcp]}, wanted zero",
+            "Set it to the flange on the pendant: the wrench is taken there.",
+        ),
+    ]
+    if config.payload is None or config.payload_cog is None:
+        checks.append(
+            Check(
+                "payload",
+                False,
+                f"the controller has {facts.payload:.3f} kg; the robot's file gives none",
+                "Weigh all beyond the flange; write payload and payload_cog in the file.",
+            )
+        )
+        return checks
+    distance = math.dist(facts.payload_cog, config.payload_cog)
+    checks += [
+        Check(
+            "payload",
+            abs(facts.payload - config.payload) <= config.payload_tolerance,
+            f"{facts.payload:.3f} kg, wanted {config.payload:.3f}",
+            "Set it on the pendant (Installation, Payload): the force readings depend on it.",
+        ),
+        Check(
+            "centre of gravity",
+            distance <= config.cog_tolerance,
+            f"{1e3 * distance:.1f} mm from the robot's file, allowed "
+            f"{1e3 * config.cog_tolerance:.1f}",
+            "Set it on the pendant (Installation, Payload).",
+        ),
+    ]
+    return checks
+
+
+def check_sensor(states: Sequence[RobotState], config: HardwareConfig) -> list[Check]:
+    """The force sensor, zeroed, in the air, by the mean of some states."""
+    count = len(states)
+    mean = [math.fsum(state.wrench[k] for state in states) / count for k in range(6)]
+    force, torque = math.hypot(*mean[:3]), math.hypot(*mean[3:])
+    fix = "Does the knife touch something? Is the payload right? Then zero it again."
+    return [
+        Check(
+            "force after zeroing",
+            force <= config.sensor_force,
+            f"{force:.2f} N, allowed {config.sensor_force:g}",
+            fix,
+        ),
+        Check(
+            "torque after zeroing",
+            torque <= config.sensor_torque,
+            f"{torque:.3f} Nm, allowed {config.sensor_torque:g}",
+            fix,
+        ),
+    ]
+
+
+def check_start(state: RobotState, start: Sequence[float], config: HardwareConfig) -> list[Check]:
+    """Whether the arm is at the start, with its cables on the side that the plan assumes."""
+    off = [a - b for a, b in zip(state.q, start, strict=True)]
+    worst = max(range(6), key=lambda j: abs(off[j]))
+    turns = [j + 1 for j in range(6) if abs(abs(off[j]) - 2.0 * math.pi) < 0.5]
+    fix = "Move it there with --move-to-start, or on the pendant."
+    if turns:
+        fix = f"Joint {turns[0]} is a whole turn off: turn it back by hand, and look at the cables."
+    fastest = max(map(abs, state.qd))
+    return [
+        Check(
+            "start pose",
+            abs(off[worst]) <= config.start_tolerance,
+            f"joint {worst + 1} is {off[worst]:+.4f} rad off, allowed {config.start_tolerance:g}",
+            fix,
+        ),
+        Check("at rest", fastest < 0.01, f"fastest joint {fastest:.4f} rad/s", "Wait."),
+    ]
+
+
+def _version(text: str) -> list[int]:
+    return [int(part) for part in text.split(".") if part.isdigit()]
