@@ -182,7 +182,7 @@ class Emulator:
                 self._in_step = False
                 self._serve_until(due)
                 break
-            self._poll(left)
+            self.serve(left)
         self._served = self._servo_packages()
 
     def _is_servoing(self) -> bool:
@@ -198,11 +198,11 @@ class Emulator:
     def _serve_until(self, due: float) -> None:
         while True:
             left = due - time.monotonic()
-            self._poll(max(0.0, left))
+            self.serve(max(0.0, left))
             if left <= 0.0 or self._stopped:
                 return
 
-    def _poll(self, timeout: float) -> None:
+    def serve(self, timeout: float) -> None:
         """Serves all ports for up to `timeout` s, or until something has come."""
         self._own_hub.poll(0.0)
         # Short enough for the emulator's own port, which has a selector of its own.
