@@ -10,6 +10,7 @@ from sliceit_drake.cli import (
     diagnose,
     diagram,
     emulate,
+    hardware,
     record,
     records,
     score,
@@ -19,7 +20,18 @@ from sliceit_drake.cli import (
 
 __all__ = ["main"]
 
-COMMANDS = (simulate, emulate, diagram, record, records, calibrate, diagnose, study, score)
+COMMANDS = (
+    simulate,
+    emulate,
+    hardware,
+    diagram,
+    record,
+    records,
+    calibrate,
+    diagnose,
+    study,
+    score,
+)
 BAD_INPUT = 2
 INTERRUPTED = 130
 
@@ -67,8 +79,12 @@ def _is_bad_input(error: Exception) -> bool:
     from sliceit_drake.cutting.mesh import MeshError
     from sliceit_drake.cutting.model import TimeStepError
     from sliceit_drake.cutting.solver import CuttingError
+    from sliceit_drake.hardware.client import RobotUnavailableError
 
-    return isinstance(error, ConfigurationError | MeshError | TimeStepError | CuttingError)
+    return isinstance(
+        error,
+        ConfigurationError | MeshError | TimeStepError | CuttingError | RobotUnavailableError,
+    )
 
 
 if __name__ == "__main__":

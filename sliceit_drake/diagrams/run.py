@@ -141,13 +141,16 @@ def simulate(
         gc.unfreeze()
 
 
-def write_outputs(run: Run, directory: Path, meshcat: Meshcat | None) -> dict:
+def write_outputs(
+    run: Run, directory: Path, meshcat: Meshcat | None, extra: dict | None = None
+) -> dict:
     """Writes record.csv, summary.json, force.png, scenario.yaml and, with a viewer, replay.html.
 
     Args:
         run: After `simulate`.
         directory: Made if absent.
         meshcat: The viewer that recorded the run, or None.
+        extra: What else the summary shall say.
 
     Returns:
         The summary.
@@ -157,7 +160,7 @@ def write_outputs(run: Run, directory: Path, meshcat: Meshcat | None) -> dict:
     record.write_csv(directory / "record.csv")
     dump_yaml(run.scenario, directory / "scenario.yaml")
     comparison = _comparison(run, record)
-    summary = _summary(run, record, comparison)
+    summary = _summary(run, record, comparison) | (extra or {})
     (directory / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     title, caption = _title(run), _caption(run, comparison, summary)
     figure, cutting = directory / "force.png", run.station.cutting

@@ -3,9 +3,11 @@
 The diagram and this thread exchange only their newest values: neither waits for the other.
 """
 
+import csv
 import threading
 import time as clock
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 from sliceit_drake.hardware.client import RobotClient, RobotUnavailableError
@@ -81,6 +83,8 @@ class RobotLink:
         self._command: _Command | None = None
         self._judged = 0
         self._armed = self._ending = False
+        # What came and went out in each cycle: state, lateness, target, judged last in it.
+        self._log: list[tuple[RobotState, float, list[float] | None]] = []
         self._status: LinkStatus | None = None
         self._changed = threading.Condition()
         self._halted = False
@@ -168,6 +172,38 @@ class RobotLink:
             self._halt_thread.join(STOP_TIME)
         return self._safety.stop or stop
 
+    def timing(self) -> dict[str, float]:
+        """How the cycles came: counts, and percentiles of lateness, s; after `finish`."""
+        lateness = sorted(late for _, late, _ in self._log) or [0.0]
+        status = self.latest()
+
+        def percentile(share: float) -> float:
+            return lateness[round(share * (len(lateness) - 1))]
+
+        return {
+            "pace": self._pace,
+            "cycles": status.cycles,
+            "missed_cycles": status.missed,
+            "targets_sent": sum(q is not None for _, _, q in self._log),
+            "lateness_median_s": percentile(0.5),
+            "lateness_99_s": percentile(0.99),
+            "lateness_max_s": percentile(1.0),
+        }
+
+    def write_log(self, file: Path) -> None:
+        """Writes what came and went out in every cycle as CSV; after `finish`."""
+        names = ["time", "lateness"]
+        for part in ("q", "qd", "wrench", "sent"):
+            names += [f"{part}_{k}" for k in range(1, 7)]
+        with file.open("w", newline="") as stream:
+            writer = csv.writer(stream)
+            writer.writerow([*names, "runtime_state", "safety_bits"])
+            for state, late, sent in self._log:
+                row: list = [state.time, late, *state.q, *state.qd, *state.wrench]
+                shown = [f"{x:.9g}" for x in row]
+                shown += [f"{x:.9g}" for x in sent] if sent else [""] * 6
+                writer.writerow([*shown, state.runtime_state, state.safety_bits])
+
     def _guarded(self) -> None:
         try:
             self._run()
@@ -202,12 +238,13 @@ class RobotLink:
             period = state.time - last_time
             cycles += 1
             missed += max(0, round(period / self._safety.period) - 1)
+            lateness = arrival - last_arrival - period / pace
+            self._log.append((state, lateness, None))
             if self._armed:
                 sent += self._cycle(state)
             with self._changed:
                 self._status = LinkStatus(
-                    state, arrival, period, arrival - last_arrival - period / pace,
-                    cycles, missed, sent, self._safety.stop,
+                    state, arrival, period, lateness, cycles, missed, sent, self._safety.stop,
                 )  # fmt: skip
                 self._changed.notify_all()
             last_time, last_arrival = state.time, arrival
@@ -230,6 +267,7 @@ class RobotLink:
             elif command is None:
                 client.kick()
             return False
+        self._log[-1] = (*self._log[-1][:2], decision.q)
         begin = clock.perf_counter()
         accepted = client.servo(decision.q)
         took = clock.perf_counter() - begin

@@ -1,0 +1,239 @@
+"""`sliceit hardware`: run a scenario on a UR5e."""
+
+import argparse
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sliceit_drake.cli.scenario_argument import add_scenario_arguments, find_file, scenario_of
+
+if TYPE_CHECKING:
+    from sliceit_drake.diagrams.hardware_run import HardwareRun
+    from sliceit_drake.hardware.checks import Check
+    from sliceit_drake.hardware.client import RobotClient
+    from sliceit_drake.hardware.configuration import HardwareConfig
+
+__all__ = ["add_parser", "ask", "connect"]
+
+DEFAULT_ROBOT = "hardware/ur5e.yaml"
+WORD = "slice"
+MOVE_WORD = "move"
+WATCHED = 1.0
+
+DESCRIPTION = """\
+Run a scenario on a UR5e, through RTDE, with the same controller and plan as `sliceit simulate`.
+
+THIS SOFTWARE IS NOT A SAFETY FUNCTION, and no physical robot has run it yet. Read docs/hardware.md
+first. Stay out of the arm's reach, with the emergency stop in your hand.
+
+In this order: connects; checks the robot, the plan and the start; zeroes the force sensor; shows
+the plan; waits until you type the word "slice"; runs; stops the program on the robot. At the first
+limit that is broken it stops for good and says why. With --dry-run it does all of this but move:
+it watches the robot's data for a second instead.
+
+Writes to DIR what `sliceit simulate` writes, and
+  robot.csv          what came from the robot and what was sent, in every cycle
+  slice.csv, .yaml   the slice record, for `sliceit records` and `sliceit diagnose`
+
+--robot names the file with your robot's payload, board height and limits. Copy hardware/ur5e.yaml.
+"""
+
+
+def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        "hardware",
+        help="run a scenario on a UR5e: checks, plan, your word, motion, record",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_scenario_arguments(parser)
+    add_robot_arguments(parser)
+    parser.add_argument("--dry-run", action="store_true", help="all but moving")
+    parser.add_argument(
+        "--move-to-start",
+        action="store_true",
+        help='first move the joints straight to the start, after you typed "move"; nothing looks '
+        "for obstacles on the way",
+    )
+    parser.add_argument(
+        "--output", metavar="DIR", type=Path, default=None, help="default: output/NAME_robot"
+    )
+    parser.add_argument("--duration", metavar="S", type=float, help="default: the motion's")
+    parser.add_argument("--no-replay", action="store_true", help="do not write replay.html")
+    parser.set_defaults(run=run)
+
+
+def add_robot_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds --host, --robot and --pace."""
+    parser.add_argument("--host", help="address of the robot")
+    parser.add_argument(
+        "--robot",
+        metavar="FILE",
+        default=DEFAULT_ROBOT,
+        help=f"YAML with your robot (default {DEFAULT_ROBOT})",
+    )
+    parser.add_argument(
+        "--set-robot", metavar="YAML", help="fields that replace those of the robot's file"
+    )
+    parser.add_argument(
+        "--pace",
+        type=float,
+        default=1.0,
+        metavar="X",
+        help="of an emulated controller, as given to `sliceit emulate`",
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the command."""
+    logging.getLogger("drake").setLevel(logging.WARNING)
+    scenario = scenario_of(options)
+    config = robot_config(options)
+
+    from sliceit_drake.diagrams.hardware_run import prepare_hardware_run
+    from sliceit_drake.diagrams.run import make_meshcat
+
+    client = connect(options, config)
+    try:
+        meshcat = None if options.no_replay or options.dry_run else make_meshcat()
+        hardware = prepare_hardware_run(scenario, config, client, options.pace, meshcat)
+        return _run(options, hardware)
+    finally:
+        client.close()
+
+
+def _run(options: argparse.Namespace, hardware: "HardwareRun") -> int:
+    if not _report("Robot and plan", hardware.check_before()):
+        return 1
+    if options.move_to_start and not options.dry_run:
+        print("The joints will turn straight to:", hardware.twin.start_joints.round(4).tolist())
+        if not ask(MOVE_WORD):
+            return 1
+        if not hardware.move_to_start():
+            print("The robot did not move to the start. Nothing else was done.")
+            return 1
+    if not _report("Start", hardware.check_at_start()):
+        return 1
+    duration = options.duration or hardware.motion.duration
+    print(plan_text(hardware, duration))
+    if options.dry_run:
+        hardware.execute(min(WATCHED, duration), moves=False)
+        assert hardware.link is not None
+        timing = ", ".join(f"{k} {v:.4g}" for k, v in hardware.link.timing().items())
+        print(f"Dry run: nothing was sent to the joints. {timing}")
+        return 0
+    if not ask(WORD):
+        return 1
+    return slice_now(options, hardware, duration)
+
+
+def slice_now(options: argparse.Namespace, hardware: "HardwareRun", duration: float) -> int:
+    """Runs, writes and reports; 0 if the motion was completed."""
+    from tqdm import tqdm
+
+    from sliceit_drake.diagrams.hardware_run import write_hardware_outputs
+    from sliceit_drake.diagrams.run_record import slice_record_of
+    from sliceit_drake.records.slice_record import write_record
+
+    with tqdm(total=duration, desc=hardware.scenario.name, unit="s") as bar:
+        run = hardware.execute(duration, lambda time, wall: bar.update(time - bar.n) and None)
+    directory = options.output or Path("output") / f"{hardware.scenario.name}_robot"
+    summary = write_hardware_outputs(hardware, directory)
+    write_record(slice_record_of(run, "UR5e through RTDE"), directory / "slice")
+    if run.stopped:
+        print(f"STOPPED: {run.stopped}")
+        print("The robot's program is stopped. Find the cause before you start again.")
+    robot = summary["robot"]
+    print(
+        f"Peak force {summary['peak_force_N']:.1f} N; {robot['cycles']:.0f} cycles, "
+        f"{robot['missed_cycles']:.0f} missed, lateness {1e3 * robot['lateness_99_s']:.2f} ms "
+        f"(99 %), {1e3 * robot['lateness_max_s']:.2f} ms at most"
+    )
+    print(f"Results in {directory}/: {', '.join(sorted(p.name for p in directory.iterdir()))}")
+    return 1 if run.stopped else 0
+
+
+def robot_config(options: argparse.Namespace) -> "HardwareConfig":
+    """The robot's file.
+
+    Raises:
+        ConfigurationError: It is missing or wrong, or there is no address.
+    """
+    from sliceit_drake.configuration import ConfigurationError
+    from sliceit_drake.hardware.configuration import load_hardware_config
+
+    if not options.host:
+        raise ConfigurationError(
+            "is missing", field="--host", fix="Give the address of the robot, as on its pendant."
+        )
+    loopback = options.host == "localhost" or options.host.startswith("127.")
+    if options.pace != 1.0 and (not loopback or not 0.0 < options.pace <= 10.0):
+        raise ConfigurationError(
+            f"{options.pace:g} is for an emulated controller on this machine",
+            field="--pace",
+            fix="Leave it out: a robot's clock has the pace 1.",
+        )
+    file = find_file(options.robot, "robot file", DEFAULT_ROBOT)
+    return load_hardware_config(file, options.set_robot)
+
+
+def connect(options: argparse.Namespace, config: "HardwareConfig") -> "RobotClient":
+    """Connects to the robot and takes control.
+
+    Raises:
+        RobotUnavailableError: It does not answer, or refuses.
+    """
+    from sliceit_drake.hardware.ur_client import UrClient
+
+    print(f"Connecting to {options.host}", flush=True)
+    return UrClient(options.host, config.lookahead_time, config.gain)
+
+
+def ask(word: str) -> bool:
+    """Whether the operator types the word; Enter alone, an end of input or Ctrl-C do not."""
+    try:
+        answer = input(f'Type "{word}" to go on, anything else to leave: ')
+    except EOFError:
+        answer = ""
+    if answer.strip() == word:
+        return True
+    print("Not confirmed. Nothing was moved.")
+    return False
+
+
+def plan_text(hardware: "HardwareRun", duration: float) -> str:
+    """What is about to happen, for the operator to read."""
+    from sliceit_drake.hardware.limits import loosened
+
+    scenario, plan, limits = hardware.scenario, hardware.plan, hardware.config.limits
+    board = scenario.board.height
+    changed = loosened(limits)
+    phases = ", ".join(
+        f"{label} {end - begin:.2f} s" for label, begin, end in hardware.motion.phases
+    )
+    lines = [
+        "",
+        f"PLAN: {scenario.name}, {duration:.2f} s: {phases}",
+        f"  knife up to {1e3 * plan.fastest:.0f} mm/s; edge between "
+        f"{1e3 * (plan.lowest - board):+.2f} and {1e3 * (plan.edge_high[2] - board):+.1f} mm over "
+        f"the board at {board:.4f} m",
+        f"  stops at {limits.force:g} N, {limits.torque:g} Nm, {limits.knife_speed:g} m/s of the "
+        f"knife, {1e3 * limits.board_depth:g} mm below the board, {limits.tracking_error:g} rad "
+        "off the target",
+        f"  limits that differ from the defaults: {'; '.join(changed) if changed else 'none'}",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _report(title: str, checks: "Sequence[Check]") -> bool:
+    """Prints checks; whether all passed."""
+    print(f"{title}:")
+    for check in checks:
+        print(f"  {check}")
+    failed = [check.name for check in checks if not check.passed]
+    if failed:
+        print(f"Not ready: {', '.join(failed)}. Nothing was moved.")
+    return not failed
