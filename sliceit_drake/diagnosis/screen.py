@@ -18,6 +18,8 @@ UNUSUAL = 0.98
 LEAST_DEVIATION = 0.5
 """Least standard deviation of a gain where nothing is wrong: one that is always nought there is no
 proof of anything by being a little more."""
+PRESENT = 5.0
+"""Gain for each number of a cause from which on it shows in a record."""
 JITTER = 1e-9
 """Added to the diagonal of Gram matrices of unit columns, some of which are the same."""
 BATCH = 100
@@ -42,6 +44,9 @@ class CauseEvidence:
         sizes: Of the columns: a coefficient times its size is the parameter's distance from null.
         units: Of the parameters.
         per_record: Whether each record has coefficients of its own.
+        by_record: These [R, n]; empty where they are shared.
+        presence: Share of the records that it could show in in which it does; 1 where coefficients
+            are shared.
     """
 
     name: str
@@ -56,6 +61,8 @@ class CauseEvidence:
     sizes: list[float]
     units: list[str]
     per_record: bool
+    by_record: list[list[float]] = dc.field(default_factory=list)
+    presence: float = 1.0
 
     @property
     def score(self) -> float:
@@ -284,15 +291,23 @@ class _Statistics:
         if not kinds[columns[0]].per_record:
             _, value, error = self._bounded(self.project(reduced), columns)
             return value[0], error[0]
-        own = []
-        for A, y in zip(self.reduced, reduced[0], strict=True):
-            A = A[np.ix_(columns, columns)]
-            if np.diag(A).min() > 1e-9:
-                own.append(np.linalg.lstsq(A, y[columns], rcond=1e-9)[0])
-        if not own:
+        own = self.own_fits(b, columns)[0]
+        own = own[np.abs(own).max(1) > 0.0]
+        if not len(own):
             return np.zeros(len(columns)), np.full(len(columns), np.inf)
         spread = np.std(own, axis=0, ddof=1) if len(own) > 1 else np.full(len(columns), np.inf)
         return np.mean(own, axis=0), spread / np.sqrt(len(own))
+
+    def own_fits(self, b: np.ndarray, columns: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Coefficients of columns for each record by itself [R, n], and what they gain there [R];
+        0 where a record knows nothing of them."""
+        out, gains = np.zeros((b.shape[1], len(columns))), np.zeros(b.shape[1])
+        for r, (A, y) in enumerate(zip(self.reduced, self.products(b)[0], strict=True)):
+            inner = A[np.ix_(columns, columns)]
+            if np.diag(inner).min() > 1e-9:
+                out[r] = np.linalg.lstsq(inner, y[columns], rcond=1e-9)[0]
+                gains[r] = float(out[r] @ y[columns])
+        return out, gains
 
 
 @dc.dataclass
@@ -380,6 +395,11 @@ def screen(
         columns = problem.found.index("cause", name, scan)
         value, error = statistics.coefficients(measured, columns)
         kinds = [problem.found.columns[c] for c in columns]
+        fits, presence = np.zeros((0, 0)), 1.0
+        if statistics.per_record[name]:
+            fits, own_gains = statistics.own_fits(measured, columns)
+            shown = own_gains > kinds[0].searched + PRESENT * len(columns)
+            presence = float(shown.sum() / max((own_gains > 0.0).sum(), 1))
         searched = _searched(problem, columns)
         null_gains[name] = [g + searched for g in null_gains[name]]
         null = np.array(null_gains[name])
@@ -397,6 +417,8 @@ def screen(
                 sizes=[c.size for c in kinds],
                 units=[c.unit for c in kinds],
                 per_record=statistics.per_record[name],
+                by_record=fits.tolist(),
+                presence=presence,
             )
         )
     means = np.array([[e.expected] for e in evidence])

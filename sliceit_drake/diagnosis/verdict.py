@@ -18,14 +18,26 @@ LEAST_SIZE = 0.7
 are as large."""
 LEAST_MISFIT = 0.55
 """Least misfit against the in-contact noise that calls for a cause."""
+MISFIT_FACTOR = 2.5
+"""Least gain by a free correction that calls for a cause, of that where nothing is wrong: the noise
+itself is only known to within its replicates."""
 TOLERATED = 0.4
 """Misfit against the in-contact noise that the simulation leaves where nothing is wrong."""
 EXPLAINED = 0.6
 """Least share of what could be gained that a named cause explains."""
-SECOND_SHARE = 0.2
-"""Least share that a second cause adds."""
+SECOND_SHARE = 0.15
+"""Least share of a second cause in the squares of the sizes of both."""
+SECOND_GAIN = 0.1
+"""Least share of a second cause in what both gain."""
+OF_THE_REST = 0.5
+"""Least share of what the first cause leaves that a second one explains."""
+PRESENCE = 0.4
+"""Least share of the records in which a cause shows that has numbers of its own in each."""
 CLASS_ANGLE = 15.0
 """Causes that can do what was found to within this, degrees, are one class."""
+ONE_CONDITION_ANGLE = 22.0
+"""The same where all cuts are of one condition: what one motion shows depends more on the form that
+a cause is given here."""
 CLASS_GAIN = 0.2
 """A member of the class is kept where its gain falls short by less than this share."""
 LEAST_REPLICATES = 3
@@ -41,7 +53,8 @@ class Finding:
         evidence: Of the cause that explains most.
         size: What is left of its effect after a refit of all else, over the in-contact noise.
         spread: The same without what is each slice's own being refitted: an effect that differs
-            between records as slices may differ is large here alone.
+            between records as slices may differ is large here alone. Of a cause with numbers of
+            its own in each record at least as large as its gain is.
         share: Of what could be gained that it explains.
         others: Names of the causes that would explain as much.
     """
@@ -107,9 +120,10 @@ def reach_verdict(
     unexplained = max(first.misfit - first.expected_misfit, 0.0)
     findings = [_finding(problem, first, e, unexplained) for e in first.causes[:CANDIDATES]]
     misfit = _misfit_size(problem, findings, unexplained)
-    large = [f for f in findings if f.spread >= LEAST_SIZE]
+    large = [f for f in findings if f.spread >= LEAST_SIZE and f.evidence.presence >= PRESENCE]
     if first.p_value > ALARM or not large:
-        if first.misfit_p_value <= ALARM and misfit >= LEAST_MISFIT:
+        wrong = first.misfit >= MISFIT_FACTOR * first.expected_misfit
+        if first.misfit_p_value <= ALARM and misfit >= LEAST_MISFIT and wrong:
             reason = "the records differ from the simulation, but no cause of the list explains it"
             return Verdict("unknown", [], first, None, misfit, reason, needed)
         reason = "nothing beyond the noise and what the simulation itself is unsure of"
@@ -136,7 +150,11 @@ def reach_verdict(
         f
         for f in added
         if f.spread >= LEAST_SIZE
-        and f.share >= SECOND_SHARE
+        and f.spread**2 >= SECOND_SHARE * (f.spread**2 + best.size**2)
+        and f.evidence.gain - f.evidence.expected >= OF_THE_REST * left
+        # Fast waves gain out of proportion: beside them all else is little.
+        and (f.share >= SECOND_GAIN or best.evidence.per_record)
+        and f.evidence.presence >= PRESENCE
         and f.evidence.score > 0.0
         and second.p_value <= ALARM
     ]
@@ -163,20 +181,21 @@ def _finding(
     problem: LinearProblem, screening: Screening, evidence: CauseEvidence, total: float
 ) -> Finding:
     columns = problem.found.index("cause", evidence.name, evidence.scan)
-    coefficients = np.array(evidence.coefficients)
+    coefficients = np.array(evidence.by_record if evidence.per_record else evidence.coefficients)
     size, _ = effect_in_noise(problem, columns, coefficients)
     spread, _ = effect_in_noise(problem, columns, coefficients, refit_slices=False)
     if evidence.per_record:
-        # The mean of signed amplitudes says nothing of their size; the gain does.
-        size = spread = _size_of_gain(problem, evidence.gain - evidence.expected)
+        # An event is short: in the mean over all samples it is less than it is.
+        spread = max(spread, _size_of_gain(problem, evidence.gain - evidence.expected))
     share = max(evidence.gain - evidence.expected, 0.0) / max(total, 1e-9)
     floor = evidence.score - CLASS_GAIN * evidence.gain
+    angle = CLASS_ANGLE if len(problem.conditions) > 1 else ONE_CONDITION_ANGLE
     others = [
         e.name
         for e in screening.causes
         if e.name != evidence.name
         and not (evidence.per_record or e.per_record)
-        and screening.angle_to(problem, evidence, e.name) <= CLASS_ANGLE
+        and screening.angle_to(problem, evidence, e.name) <= angle
         and e.score >= floor
     ]
     return Finding(evidence, size, spread, share, others)

@@ -30,12 +30,12 @@ STRENGTHS = (2.0, 3.0)
 """Range of what is drawn for delta."""
 
 PAIRS: tuple[tuple[str, str, str], ...] = (
-    ("rich", "skin", "sensor_delay"),
+    ("rich", "skin", "sensor_tilt"),
     ("full", "bulk_relaxation", "board_height"),
     ("rich", "rate_toughness", "sensor_tilt"),
     ("full", "arm_compliance", "blunt_edge"),
     ("rich", "flank_adhesion", "drive_vibration"),
-    ("full", "dulling_edge", "sensor_delay"),
+    ("full", "dulling_edge", "sensor_drift"),
     ("rich", "holder_compliance", "section_shape"),
     ("full", "stick_slip", "rate_toughness"),
     ("rich", "food_slip", "bulk_relaxation"),

@@ -23,6 +23,7 @@ AS_WELL = 3.0
 NOT_ITSELF = 60.0
 """Angle from which on an effect has nothing in common with its cause's sensitivities, degrees."""
 Near = Mapping[str, Mapping[str, Mapping[str, float]]]
+Classes = Mapping[str, Mapping[str, Sequence[str]]]
 Z = 1.6448536269514722
 """Of a one-sided bound of 95 %."""
 
@@ -98,6 +99,7 @@ def judge(
     near: Near,
     following: Mapping[str, Any] | None = None,
     seconds: float = math.nan,
+    classes: Classes | None = None,
 ) -> Judgement:
     """Judges a run.
 
@@ -107,13 +109,15 @@ def judge(
         near: By protocol and effect the angles to all causes, degrees (`sizes.angles_for`).
         following: The same of the diagnosis after the next experiment; None if none was made.
         seconds: That the diagnosis took.
+        classes: By protocol and cause all that its slices cannot tell from it.
     """
     if facts is None:
         resolved = False if case.kind == "poor" else None
         return Judgement(case, "failed", [], False, [], None, None, resolved, {}, seconds)
     verdict, named = facts["verdict"], facts["classes"]
     truth = [CAUSE_OF[h.effect] for h in case.hidden if h.effect in CAUSE_OF]
-    allowed = set(truth)
+    known = (classes or {}).get(case.protocol, {})
+    allowed = {member for cause in truth for member in known.get(cause, [cause])}
     for h in case.hidden:
         angles = near.get(case.protocol, {}).get(h.effect, {})
         # What explains the effect as well as the cause itself, as it is modelled, is no other.
@@ -183,6 +187,8 @@ def judge_study(output: Path) -> list[Judgement]:
         ConfigurationError: There is no study.
     """
     near = load_near(output)
+    found = json.loads((output / "classes.json").read_text(encoding="utf-8"))
+    classes = {name: facts["classes"] for name, facts in found.items()}
     out = []
     for case in load_cases(output):
         if is_done(output, case.name):
@@ -194,6 +200,7 @@ def judge_study(output: Path) -> list[Judgement]:
                 near,
                 _read(folder / "diagnosis_next.json"),
                 timing.get("diagnosis_s", math.nan),
+                classes,
             )
             out.append(dc.replace(judgement, code=timing.get("code", "")))
     return out
