@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from sliceit_drake.configuration import dump_yaml
+from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.effects import Effects
 from sliceit_drake.diagnosis.registry import all_causes
 from sliceit_drake.diagrams.calibrated_food import load_calibrated_food
 from sliceit_drake.hidden_study import runner
+from sliceit_drake.hidden_study.archive import pack, unpack
 from sliceit_drake.hidden_study.bench import PROTOCOLS, QuietBench, model_food, protocol_named
 from sliceit_drake.hidden_study.cases import KINDS, PAIRS, Case, Hidden, make_cases
 from sliceit_drake.hidden_study.classes import protocol_classes
@@ -230,7 +231,7 @@ def test_the_report_shows_wrong_names_and_curves(tmp_path):
     curve = Case("y", "curve", "rich", (Hidden("skin", 1.0, 0.5),), 1)
     facts = {"verdict": "nothing", "classes": [], "evidence": [], "shifts": {}}
     judgements = [said("single", ("skin",), "cause", ["dulling"]), judge(curve, facts, NEAR)]
-    text = report(judgements, "output/hidden", "figures/hidden_effects.png")
+    text = report(judgements, "figures/hidden_effects.png")
     assert "| single: skin | {dulling} | 1 |" in text
     assert "| skin | 0 of 1 (0) |" in text
     plot_curves(judgements, tmp_path / "curves.png")
@@ -240,6 +241,43 @@ def test_the_report_shows_wrong_names_and_curves(tmp_path):
 def test_pairs_are_of_effects_that_are_listed():
     for protocol, *effects in PAIRS:
         assert protocol in PROTOCOLS and set(effects) <= set(CAUSE_OF)
+
+
+def test_a_study_is_judged_alike_from_its_runs_in_one_file(tmp_path):
+    study = tmp_path / "study"
+    case = Case("c0ffee", "single", "rich", (Hidden("skin", 0.7, 2.4),), 1)
+    other = Case("decaf0", "poor", "poor", (Hidden("core", 0.3, 2.1),), 2)
+    evidence = [{"cause": "skin", "held_out_share": 0.8, "gain": 12.0}]
+    facts = {"verdict": "cause", "classes": [["skin"]], "evidence": evidence, "shifts": {}}
+    for one in (case, other):
+        for folder, file, values in (
+            ("truth", f"{one.name}.json", dc.asdict(one)),
+            (f"runs/{one.name}", "timing.json", {"diagnosis_s": 3.0, "code": "a"}),
+        ):
+            (study / folder).mkdir(parents=True, exist_ok=True)
+            (study / folder / file).write_text(json.dumps(values))
+    (study / "runs" / case.name / "diagnosis.json").write_text(json.dumps(facts))
+    for name, values in (("study", {"seed": 1}), ("near", NEAR), ("classes", {})):
+        (study / f"{name}.json").write_text(json.dumps(values))
+    assert pack(study, tmp_path / "runs.jsonl") == 2
+    unpack(tmp_path / "runs.jsonl", tmp_path / "again")
+    first, again = (judge_study(folder) for folder in (study, tmp_path / "again"))
+    assert repr(first) == repr(again)
+    assert [j.verdict for j in again] == ["cause", "failed"]
+    assert again[0].right and again[0].oracle == 0.8
+    # What was run since then stays.
+    (tmp_path / "again" / "runs" / case.name / "diagnosis.json").write_text(
+        json.dumps(facts | {"verdict": "unknown"})
+    )
+    unpack(tmp_path / "runs.jsonl", tmp_path / "again")
+    assert judge_study(tmp_path / "again")[0].verdict == "unknown"
+
+
+def test_a_file_that_holds_no_runs_is_refused(tmp_path):
+    file = tmp_path / "other.jsonl"
+    file.write_text("{}\n[1]\n")
+    with pytest.raises(ConfigurationError, match="no file of a study's runs"):
+        unpack(file, tmp_path / "study")
 
 
 SHARES = {"single": 0.95, "nothing": 0.92, "unknown": 0.90, "pairs": 0.80, "poor": 0.90}

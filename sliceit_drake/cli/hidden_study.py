@@ -21,6 +21,7 @@ Kinds of runs
   base     a shift of a base parameter            curve    one effect at several strengths
 
   sliceit study hidden --output output/hidden --minutes 120
+  sliceit study hidden --output output/hidden --runs-from docs/hidden_effects.jsonl --seed 1
 """
 
 SIZES = """\
@@ -37,6 +38,9 @@ def add_hidden_study(studies: "argparse._SubParsersAction[argparse.ArgumentParse
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     hidden.add_argument("--output", metavar="DIR", type=Path, required=True)
+    hidden.add_argument(
+        "--runs-from", metavar="FILE", type=Path, help="go on with the runs that are in this file"
+    )
     hidden.add_argument("--kinds", nargs="+", metavar="KIND", help="only these (default: all)")
     hidden.add_argument(
         "--protocols", nargs="+", metavar="NAME", help="only these (default: rich full poor)"
@@ -67,6 +71,7 @@ def run_hidden(options: argparse.Namespace) -> int:
     """Runs the study."""
     _quiet()
     from sliceit_drake.configuration import ConfigurationError
+    from sliceit_drake.hidden_study.archive import unpack
     from sliceit_drake.hidden_study.cases import KINDS
     from sliceit_drake.hidden_study.study import StudyOptions, prepare, run_study
     from sliceit_drake.stand_in.registry import make_effect
@@ -84,6 +89,8 @@ def run_hidden(options: argparse.Namespace) -> int:
             )
     effects = None if options.effects is None else tuple(options.effects)
     options.output.mkdir(parents=True, exist_ok=True)
+    if options.runs_from is not None:
+        unpack(options.runs_from, options.output)
     settings = StudyOptions(kinds, options.seed, options.replicates, protocols, effects)
     with StageBars() as bars:
         cases = prepare(options.output, settings, bars.show)[: options.runs]

@@ -10,10 +10,12 @@ Judge the diagnoses of `sliceit study hidden`: what was said against what was hi
 
 Prints rates with Wilson's lower bounds, what is asked for, rates by cause, detection curves and
 what was said where it was not right. With --output FOLDER it also writes hidden_effects.md,
-hidden_effects.json and figures/hidden_effects.png there. A study that is not done is judged by
-what there is.
+hidden_effects.json, hidden_effects.jsonl (the runs, from which the study can be judged again and
+gone on with) and figures/hidden_effects.png there. A study that is not done is judged by what there
+is. In place of its folder such a file of runs will do.
 
   sliceit score output/hidden --output docs
+  sliceit score docs/hidden_effects.jsonl
 """
 
 
@@ -25,7 +27,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("study", metavar="DIR", type=Path, help="folder of the study")
+    parser.add_argument("study", metavar="DIR", type=Path, help="folder of the study, or its runs")
     parser.add_argument("--output", metavar="FOLDER", type=Path, help="also write the report there")
     parser.set_defaults(run=run)
 
@@ -33,13 +35,22 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     import json
+    import tempfile
 
+    from sliceit_drake.hidden_study.archive import pack, unpack
     from sliceit_drake.hidden_study.report import numbers, plot_curves, report
     from sliceit_drake.hidden_study.score import judge_study
 
-    judgements = judge_study(options.study)
+    with tempfile.TemporaryDirectory() as folder:
+        study = options.study
+        if study.is_file():
+            unpack(study, Path(folder))
+            study = Path(folder)
+        judgements = judge_study(study)
+        if options.output is not None:
+            pack(study, options.output / "hidden_effects.jsonl")
     figure = "figures/hidden_effects.png" if options.output is not None else None
-    text = report(judgements, str(options.study), figure)
+    text = report(judgements, figure)
     print(text)
     if options.output is not None:
         options.output.mkdir(parents=True, exist_ok=True)

@@ -22,8 +22,12 @@ another step than the diagnosis, by laws that are written otherwise. `sliceit di
 process of its own and is given the folder of records and the food without any effect, nothing else.
 Then its diagnosis.json is compared with what was hidden. Everything here is simulated.
 
-    sliceit study hidden --output {folder}
-    sliceit score {folder} --output docs
+    sliceit study hidden --output output/hidden --seed 1
+    sliceit score output/hidden --output docs
+
+Many runs take hours; the study can be stopped, and goes on. `hidden_effects.jsonl` beside this page
+has what was said in each run: `sliceit score docs/hidden_effects.jsonl` judges it again,
+`sliceit study hidden --runs-from docs/hidden_effects.jsonl` goes on from there.
 
 An effect has the size at which its strength delta is a number drawn from 2 to 3: the root mean
 square, over samples in contact, of what is left of its noise-free change of the forces once the
@@ -176,15 +180,14 @@ def _percent(value: float | None) -> str:
     return "" if value is None or math.isnan(value) else f"{100 * value:.0f} %"
 
 
-def report(judgements: Sequence[Judgement], folder: str, figure: str | None) -> str:
+def report(judgements: Sequence[Judgement], figure: str | None) -> str:
     """The report in Markdown.
 
     Args:
         judgements: All runs that are done.
-        folder: Of the study, as the command line names it.
         figure: Of the detection curves, relative to the report; None for none.
     """
-    lines = [HEAD.format(folder=folder), f"{len(judgements)} runs.", ""]
+    lines = [HEAD, f"{len(judgements)} runs.", ""]
     lines += [
         "| what | asked for | reached | share | lower bound, 95 % | met |",
         "|---|---|---|---|---|---|",
