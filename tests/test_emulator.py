@@ -545,6 +545,17 @@ def test_after_silence_everything_arrives_at_once():
         assert bench.controller.registers.integer(0) == 9
 
 
+def test_a_silence_that_fills_the_buffers_ends_too():
+    with Bench() as bench:
+        client, recipe = watched(bench)
+        bench.inject("silence:4")
+        bench.cycles(2001)
+        client.frames()
+        bench.cycles(5)
+        assert client.data(recipe)[-1]["timestamp"] == pytest.approx(bench.controller.time)
+        assert bench.emulator.rtde.statistics()["skipped"] > 0
+
+
 def test_packages_are_lost_and_late():
     with Bench() as bench:
         client, recipe = watched(bench)

@@ -100,16 +100,27 @@ class SocketHub:
     """All ports of one address.
 
     Attributes:
-        is_silent: While set, nothing is read, sent or accepted: a network that is cut.
         refuses: While set, new clients are turned away.
     """
 
     def __init__(self, address: str) -> None:
-        self.is_silent = self.refuses = False
+        self.refuses = self._is_silent = False
         self._address = address
         self._selector = selectors.DefaultSelector()
         self._listeners: dict[socket.socket, Service] = {}
         self._connections: dict[Connection, Service] = {}
+
+    @property
+    def is_silent(self) -> bool:
+        """While set, nothing is read, sent or accepted: a network that is cut."""
+        return self._is_silent
+
+    @is_silent.setter
+    def is_silent(self, value: bool) -> None:
+        self._is_silent = value
+        if not value:
+            for connection in list(self._connections):
+                connection.flush()
 
     def listen(self, port: int, service: Service) -> None:
         """Opens a port.

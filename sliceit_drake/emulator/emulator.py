@@ -2,6 +2,7 @@
 
 import collections
 import dataclasses as dc
+import os
 import time
 
 from sliceit_drake.configuration import ConfigurationError
@@ -24,6 +25,8 @@ _SCRIPT_PORTS = (30003, 30001, 30002)
 # Wall time beyond which the clock gives up catching up, in cycles.
 _LATE_CYCLES = 5
 _STATUS_LOG = 50
+# Wall time without a command after which a client has nothing more to answer, s.
+_SETTLING = 0.05
 
 
 @dc.dataclass
@@ -112,6 +115,7 @@ class Emulator:
         period = CYCLE / self._clock.pace
         due = time.monotonic() + period
         try:
+            self.faults.apply()
             while not self._stopped:
                 self._wait(due)
                 late = time.monotonic() - due
@@ -147,6 +151,7 @@ class Emulator:
         state = controller.robot.state
         busy = sorted(self._busy) or [0.0]
         return {
+            "pid": os.getpid(),
             "time": controller.time,
             "runtime_state": controller.runtime.name,
             "safety_mode": controller.safety.name,
@@ -168,28 +173,48 @@ class Emulator:
 
     def _wait(self, due: float) -> None:
         """Serves the sockets until the next cycle is due."""
+        was_in_step, self._in_step = self._in_step, False
         if not self._is_servoing():
-            self._in_step = False
             self._serve_until(due)
             return
-        in_step_before = self._in_step
-        self._in_step = True
-        limit = time.monotonic() + self._clock.patience if in_step_before else due
-        while self._servo_packages() == self._served:
+        if not was_in_step:
+            self._serve_until(due)
+            if self._servo_packages() > self._served:
+                self._await_silence()
+                self._in_step = True
+        elif self._await_command():
+            self._in_step = True
+        else:
+            self.missed_cycles += 1
+            self._serve_until(due)
+        self._served = self._servo_packages()
+
+    def _await_command(self) -> bool:
+        """Waits for the next servo command, or the end of servoing; False if none comes in time."""
+        limit = time.monotonic() + self._clock.patience
+        while self._servo_packages() == self._served and self._is_servoing():
             left = limit - time.monotonic()
             if left <= 0.0 or self._stopped or self._hub.is_silent:
-                self.missed_cycles += in_step_before
-                self._in_step = False
-                self._serve_until(due)
-                break
+                return False
             self.serve(left)
-        self._served = self._servo_packages()
+        return True
+
+    def _await_silence(self) -> None:
+        """Waits until the client has answered all that it was sent while the pace held.
+
+        Otherwise each of its commands would stay a fixed but random number of cycles on the way.
+        """
+        seen, quiet_since = self._servo_packages(), time.monotonic()
+        while time.monotonic() - quiet_since < _SETTLING and not self._stopped:
+            self.serve(_SETTLING)
+            if self._servo_packages() > seen:
+                seen, quiet_since = self._servo_packages(), time.monotonic()
 
     def _is_servoing(self) -> bool:
         return (
             self._clock.lockstep
             and self.controller.runtime == RuntimeState.PLAYING
-            and SERVO_COMMAND in self.rtde.command_counts
+            and self.rtde.last_command == SERVO_COMMAND
         )
 
     def _servo_packages(self) -> int:

@@ -144,14 +144,17 @@ class EmulatorProcess:
                 assert self._process.stdout is not None
                 said = self._process.stdout.read().decode("utf-8", "replace").strip()
                 raise EmulatorError(f"the emulator did not start: {said}")
-            try:
-                return PendantClient(self.address)
-            except OSError:
-                if time.monotonic() > end:
-                    raise EmulatorError(
-                        f"the emulator did not open {self.address}:{PENDANT_PORT} in {timeout:g} s"
-                    ) from None
-                time.sleep(0.02)
+            # An emulator that had the address before may answer too.
+            with contextlib.suppress(OSError, EmulatorError):
+                pendant = PendantClient(self.address)
+                if pendant.status()["pid"] == self._process.pid:
+                    return pendant
+                pendant.close()
+            if time.monotonic() > end:
+                raise EmulatorError(
+                    f"the emulator did not open {self.address}:{PENDANT_PORT} in {timeout:g} s"
+                )
+            time.sleep(0.02)
 
     @property
     def pid(self) -> int:

@@ -54,6 +54,7 @@ class RtdeServer:
         delay: Controller time by which data packages come late, in and out, s (a fault).
         packages_in: Data packages that have been taken.
         command_counts: Number of them by the value that they wrote to the command register.
+        last_command: Last such value that was not 0, which clears a command or feeds the watchdog.
     """
 
     def __init__(self, hub: SocketHub, controller: Controller, seed: int = 0) -> None:
@@ -61,6 +62,7 @@ class RtdeServer:
         self.drop_share = self.delay = 0.0
         self.packages_in = 0
         self.command_counts: collections.Counter[int] = collections.Counter()
+        self.last_command = 0
         self._hub, self._controller = hub, controller
         self._random = random.Random(seed)
         self._sessions: dict[Connection, _Session] = {}
@@ -204,5 +206,7 @@ class RtdeServer:
         self.packages_in += 1
         for name in ("input_int_register_0", "input_int_register_24"):
             if name in values:
-                self.command_counts[int(values[name])] += 1  # type: ignore[arg-type]
+                command = int(values[name])  # type: ignore[arg-type]
+                self.command_counts[command] += 1
+                self.last_command = command or self.last_command
         self._controller.registers.write(values, self._controller.time)
