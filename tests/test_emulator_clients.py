@@ -14,11 +14,16 @@ import rtde_control
 import rtde_io
 import rtde_receive
 from emulator_bench import free_address
+from pydrake.systems.analysis import Simulator
 from urpy.rtde import rtde as universal_robots
 
 from sliceit_drake.cli.main import main
+from sliceit_drake.diagrams.scenario import load_scenario
+from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
+from sliceit_drake.emulator.kinematics import forward
 from sliceit_drake.emulator.process import EmulatorError, EmulatorProcess
 from sliceit_drake.emulator.robot_model import CYCLE, START
+from sliceit_drake.resources import resource_path
 
 SERVO = (0.0, 0.0, 0.002, 0.03, 2000.0)
 
@@ -247,6 +252,58 @@ def test_in_lockstep_a_run_is_the_same_every_time_however_slow_the_client():
         runs.append(joints[begin : begin + 300])
     assert np.ptp(runs[0][:, 0]) > 0.05
     assert np.array_equal(*runs)
+
+
+def commands_and_record(scenario, cycles):
+    """What the simulated station commands, and its joints and force in the robot's base."""
+    diagram = MakeScenarioDiagram(scenario)
+    simulator = Simulator(diagram)
+    diagram.SetStart(simulator.get_mutable_context())
+    simulator.Initialize()
+    context = diagram.station.GetMyContextFromRoot(simulator.get_context())
+
+    def value(port):
+        return diagram.station.GetOutputPort(port).Eval(context)
+
+    commands, record = [], []
+    for cycle in range(cycles):
+        simulator.AdvanceTo(cycle * CYCLE)
+        joints, wrench = value("joint_positions"), value("sensor_wrench")
+        force = forward(joints)[:3, :3] @ wrench.translational()
+        record.append(np.concatenate([joints, force]))
+        simulator.AdvancePendingEvents()
+        commands.append(value("joint_positions_command").copy())
+    return commands, np.array(record)
+
+
+def test_a_slice_over_the_network_has_the_force_of_the_simulated_one():
+    overrides = "{start: {clearance: 0.001}}"
+    scenario = load_scenario(resource_path("scenarios/cucumber.yaml"), overrides)
+    commands, simulated = commands_and_record(scenario, 250)
+    with EmulatorProcess(
+        resource_path("scenarios/cucumber.yaml"),
+        free_address(),
+        lockstep=True,
+        options=["--set", overrides],
+    ) as emulator:
+        with receiver(emulator) as receive, control(emulator) as ctrl:
+            last, rows = None, []
+            while len(rows) < len(commands):
+                now = receive.getTimestamp()
+                if now == last:
+                    time.sleep(1e-4)
+                    continue
+                last = now
+                rows.append([*receive.getActualQ(), *receive.getActualTCPForce()[:3]])
+                assert ctrl.servoJ(commands[len(rows) - 1].tolist(), *SERVO)
+            status = emulator.pendant.status()
+    assert status["missed_cycles"] == 0
+    # The first few commands may each have stood for some cycles, in the air.
+    joints, force = np.array(rows)[:, :6], np.array(rows)[:, 6:]
+    assert joints == pytest.approx(simulated[:, :6], abs=2e-5)
+    error = np.sqrt(np.mean((force - simulated[:, 6:]) ** 2))
+    assert np.abs(simulated[:, 6:]).max() > 2.0
+    assert error < 0.01 * np.sqrt(np.mean(simulated[:, 6:] ** 2))
 
 
 def test_the_emulator_ends_with_the_process_that_started_it(tmp_path):

@@ -253,7 +253,7 @@ class Controller:
         self._note(f"safety mode {mode.name}: {why}")
         if mode.may_move:
             return
-        self.tell(_ERROR, f"{mode.name}: {why}")
+        self.messages.append((_ERROR, f"{mode.name}: {why}"))
         self._stopped_at = self.time
         if mode == SafetyMode.PROTECTIVE_STOP:
             if (program or self.config.protective_stop) == "stop":
@@ -315,7 +315,7 @@ class Controller:
             if not self._program.step():
                 self.stop_program("it ended")
         except ScriptError as error:
-            self.tell(_ERROR, f"program error: {error}")
+            self.messages.append((_ERROR, f"program error: {error}"))
             self.stop_program(f"error: {error}")
 
     def _check_watchdog(self) -> None:

@@ -182,6 +182,10 @@ class Emulator:
             if self._servo_packages() > self._served:
                 self._await_silence()
                 self._in_step = True
+        elif not self.rtde.has_reached_all:
+            # Nothing to answer: a lost or late package, or a client at a lower frequency.
+            self._in_step = True
+            self._serve_until(due)
         elif self._await_command():
             self._in_step = True
         else:

@@ -31,6 +31,9 @@ _FULL = 65536
 _ERROR = 1
 
 
+_Values = dict[str, int | float | bool | tuple]
+
+
 @dc.dataclass
 class _Session:
     """What has been agreed with a client."""
@@ -42,7 +45,7 @@ class _Session:
     due: float = 0.0
     is_started: bool = False
     skipped: int = 0
-    late: collections.deque[tuple[float, bytes]] = dc.field(default_factory=collections.deque)
+    ready: collections.deque[tuple[float, bytes]] = dc.field(default_factory=collections.deque)
 
 
 class RtdeServer:
@@ -52,9 +55,10 @@ class RtdeServer:
         frequency_limit: Highest frequency that clients get, Hz.
         drop_share: Share of the data packages, in and out, that gets lost (a fault).
         delay: Controller time by which data packages come late, in and out, s (a fault).
-        packages_in: Data packages that have been taken.
-        command_counts: Number of them by the value that they wrote to the command register.
+        packages_in: Data packages that have arrived and fit their recipe, lost and late ones too.
+        command_counts: Number of them by the value that they had for the command register.
         last_command: Last such value that was not 0, which clears a command or feeds the watchdog.
+        has_reached_all: Whether all clients that want data got a package after the last cycle.
     """
 
     def __init__(self, hub: SocketHub, controller: Controller, seed: int = 0) -> None:
@@ -63,10 +67,11 @@ class RtdeServer:
         self.packages_in = 0
         self.command_counts: collections.Counter[int] = collections.Counter()
         self.last_command = 0
+        self.has_reached_all = False
         self._hub, self._controller = hub, controller
         self._random = random.Random(seed)
         self._sessions: dict[Connection, _Session] = {}
-        self._late_inputs: collections.deque[tuple[float, Connection, bytes]] = collections.deque()
+        self._late_inputs: collections.deque[tuple[float, _Values]] = collections.deque()
 
     # Service.
 
@@ -97,9 +102,8 @@ class RtdeServer:
     def take_late_inputs(self) -> None:
         """Takes the inputs whose delay is over; before a cycle."""
         while self._late_inputs and self._late_inputs[0][0] <= self._controller.time:
-            _, connection, payload = self._late_inputs.popleft()
-            if connection.is_open:
-                self._take_input(connection, self._sessions[connection], payload)
+            _, values = self._late_inputs.popleft()
+            self._controller.registers.write(values, self._controller.time)
 
     def publish(self) -> None:
         """After a cycle: sends each client its data package, if due, and all text messages."""
@@ -108,24 +112,23 @@ class RtdeServer:
         controller.messages.clear()
         inputs: dict[str, object] = dict(controller.registers.values)
         values = controller.outputs | inputs
+        self.has_reached_all = True
         for connection, session in list(self._sessions.items()):
             for text in texts:
                 connection.send(text)
-            while session.late and session.late[0][0] <= controller.time:
-                self._send_data(connection, session, session.late.popleft()[1])
             if session.outputs is None or not session.is_started:
                 continue
             session.due += min(session.frequency, self.frequency_limit) * CYCLE
-            if session.due < 1.0 - 1e-9:
-                continue
-            session.due -= 1.0
-            if self._is_lost():
-                continue
-            data = encode_frame(PackageType.DATA, b"\x01" + session.outputs.pack(values))
-            if self.delay > 0.0 or session.late:
-                session.late.append((controller.time + self.delay, data))
-            else:
-                self._send_data(connection, session, data)
+            if session.due > 1.0 - 1e-9:
+                session.due -= 1.0
+                if not self._is_lost():
+                    data = encode_frame(PackageType.DATA, b"\x01" + session.outputs.pack(values))
+                    session.ready.append((controller.time + self.delay, data))
+            has_sent = False
+            while session.ready and session.ready[0][0] <= controller.time:
+                self._send_data(connection, session, session.ready.popleft()[1])
+                has_sent = True
+            self.has_reached_all &= has_sent
 
     def statistics(self) -> dict[str, object]:
         """Numbers for people."""
@@ -149,13 +152,7 @@ class RtdeServer:
 
     def _answer(self, connection: Connection, session: _Session, kind: int, payload: bytes) -> None:
         if kind == PackageType.DATA:
-            if self._is_lost():
-                return
-            if self.delay > 0.0 or self._late_inputs:
-                due = self._controller.time + self.delay
-                self._late_inputs.append((due, connection, payload))
-            else:
-                self._take_input(connection, session, payload)
+            self._take_input(connection, session, payload)
         elif kind == PackageType.TEXT:
             self._controller.log.append((self._controller.time, f"client says {payload!r}"))
         elif kind in (PackageType.START, PackageType.PAUSE):
@@ -209,4 +206,9 @@ class RtdeServer:
                 command = int(values[name])  # type: ignore[arg-type]
                 self.command_counts[command] += 1
                 self.last_command = command or self.last_command
-        self._controller.registers.write(values, self._controller.time)
+        if self._is_lost():
+            return
+        if self.delay > 0.0 or self._late_inputs:
+            self._late_inputs.append((self._controller.time + self.delay, values))
+        else:
+            self._controller.registers.write(values, self._controller.time)
