@@ -5,10 +5,11 @@ import time as clock
 
 from sliceit_drake.hardware.client import RobotFacts
 from sliceit_drake.hardware.robot_state import PLAYING, RobotState
+from sliceit_drake.systems.servo import ServoConfig, ServoLaw
 
 
 class FakeRobot:
-    """Implements `RobotClient`; the arm is where the last target was, one cycle later.
+    """Implements `RobotClient`; the arm follows the last target as the simulated servo does.
 
     Args:
         q: Joint positions at the start [6], rad.
@@ -16,7 +17,9 @@ class FakeRobot:
     """
 
     def __init__(self, q, pace=0.2):
-        self.q, self.target, self.pace = list(q), list(q), pace
+        self.q, self.qd, self.target, self.pace = list(q), [0.0] * 6, list(q), pace
+        self._law = ServoLaw(ServoConfig(), 0.002)
+        self._state = self._law.state_at_rest(q)
         self.wrench = [0.0] * 6
         self.runtime, self.bits, self.connected, self.accepts = PLAYING, 1, True, True
         self.call_time = 0.0
@@ -36,14 +39,15 @@ class FakeRobot:
             due += 0.002 / self.pace
             clock.sleep(max(0.0, due - clock.perf_counter()))
             if not self.frozen:
-                self.q = self.target
+                self._state = self._law.step(self._state, self.target)
+                self.q, self.qd = self._state[0].tolist(), self._state[1].tolist()
                 self.time += 0.002
 
     def timestamp(self):
         return self.time
 
     def read(self):
-        return RobotState(self.time, self.q, [0.0] * 6, self.wrench, self.runtime, self.bits)
+        return RobotState(self.time, self.q, self.qd, self.wrench, self.runtime, self.bits)
 
     def is_connected(self):
         return self.connected
@@ -92,6 +96,7 @@ class FakeRobot:
     def move_to(self, q, speed, acceleration):
         self.log.append("move")
         self.q = self.target = list(q)
+        self._state = self._law.state_at_rest(q)
         return True
 
     def close(self):

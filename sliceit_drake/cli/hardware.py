@@ -137,8 +137,16 @@ def slice_now(options: argparse.Namespace, hardware: "HardwareRun", duration: fl
     from sliceit_drake.diagrams.run_record import slice_record_of
     from sliceit_drake.records.slice_record import write_record
 
-    with tqdm(total=duration, desc=hardware.scenario.name, unit="s") as bar:
-        run = hardware.execute(duration, lambda time, wall: bar.update(time - bar.n) and None)
+    with tqdm(
+        total=duration,
+        desc=hardware.scenario.name,
+        bar_format="{desc}: {percentage:3.0f}%|{bar}| {n:.2f}/{total:.2f} s",
+    ) as bar:
+
+        def show(time: float, wall: float) -> None:
+            bar.update(time - bar.n)
+
+        run = hardware.execute(duration, show)
     directory = options.output or Path("output") / f"{hardware.scenario.name}_robot"
     summary = write_hardware_outputs(hardware, directory)
     write_record(slice_record_of(run, "UR5e through RTDE"), directory / "slice")

@@ -38,6 +38,9 @@ WARM_UP = 0.05
 NO_DATA = 1.0
 MOVE_SPEED = 0.3
 MOVE_ACCELERATION = 0.5
+SETTLING = 2.0
+AT_REST = 1e-3
+POLL = 5e-3
 FRAMES_PER_SECOND = 32
 
 
@@ -81,7 +84,14 @@ class HardwareRun:
     def move_to_start(self) -> bool:
         """Moves the joints straight to the start; the way is not checked for obstacles."""
         start = self.twin.start_joints.tolist()
-        return self.client.move_to(start, MOVE_SPEED, MOVE_ACCELERATION)
+        if not self.client.move_to(start, MOVE_SPEED, MOVE_ACCELERATION):
+            return False
+        deadline = clock.perf_counter() + SETTLING / self.pace
+        while clock.perf_counter() < deadline:
+            if max(map(abs, self.client.read().qd)) < AT_REST:
+                break
+            clock.sleep(POLL)
+        return True
 
     def check_at_start(self) -> list[Check]:
         """Checks the start pose, zeroes the force sensor there, and checks what it shows."""

@@ -12,6 +12,7 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     DiagramBuilder,
+    DiscreteValues,
     LeafSystem,
     ValueProducer,
 )
@@ -50,8 +51,8 @@ class KnifeEstimate(LeafSystem):
             of the tool's weight and inertia. No sensor of a wrist tells these apart.
         food_wrench_vector: The same as moment and force [6].
         board_wrench: Zero, for the same reason.
-        cut_progress: Depth of the edge's middle as a share of the food's height [1], the most so
-            far not counted; not the share of the section.
+        cut_progress: Greatest depth of the edge's middle so far as a share of the food's height
+            [1]; not the share of the section.
 
     Args:
         plant: Model of the arm alone.
@@ -86,7 +87,14 @@ class KnifeEstimate(LeafSystem):
         self._declare("food_wrench", SpatialForce.Zero(), self._contact, contact)
         self._declare("board_wrench", SpatialForce.Zero(), lambda _: SpatialForce.Zero(), set())
         self.DeclareVectorOutputPort("food_wrench_vector", 6, self._calc_vector, contact)
-        self.DeclareVectorOutputPort("cut_progress", 1, self._calc_progress, {q.ticket()})
+        self._deepest = self.DeclareDiscreteState(1)
+        self.DeclareVectorOutputPort(
+            "cut_progress",
+            1,
+            self._calc_progress,
+            {q.ticket(), self.discrete_state_ticket(self._deepest)},
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, 0.0, self._update)
 
     def _declare(
         self, name: str, example: object, calc: Callable[[Context], object], depends: set
@@ -123,9 +131,16 @@ class KnifeEstimate(LeafSystem):
     def _calc_vector(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._contact(context).get_coeffs())
 
-    def _calc_progress(self, context: Context, output: BasicVector) -> None:
+    def _progress(self, context: Context) -> float:
         depth = self._top - self._calc_pose(context).translation()[2]
-        output.SetAtIndex(0, float(np.clip(depth / (self._top - self._board), 0.0, 1.0)))
+        deepest = context.get_discrete_state(self._deepest).value()[0]
+        return max(float(deepest), min(1.0, depth / (self._top - self._board)))
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        discrete_state.set_value(self._deepest, [self._progress(context)])
+
+    def _calc_progress(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, self._progress(context))
 
 
 class HardwareStation(Station):

@@ -253,7 +253,7 @@ def _title(run: Run) -> str:
 def _caption(run: Run, comparison: Comparison | None, summary: dict) -> str:
     lines = []
     food = run.scenario.food
-    if isinstance(food, Food):
+    if isinstance(food, Food) and "elements" in summary:  # A robot's food has none.
         m, dt = food.material, run.scenario.numerics.time_step
         lines.append(
             f"Parameters set by hand: E = {m.youngs_modulus:.3g} Pa, toughness {m.toughness:.3g} "

@@ -63,6 +63,14 @@ class SafetyLimits:
         size=JOINTS,
         doc="Acceleration of a joint, and how it is stopped; ur_rtde allows 40 at most.",
     )
+    deviation: float = quantity(
+        5e-4,
+        "rad",
+        low=0.0,
+        high=5e-3,
+        doc="How far a target may be moved to keep joint_acceleration, before it is a breach: "
+        "cycles that come late and noise of the encoders ask for that.",
+    )
     joint_step: float = quantity(
         0.01,
         "rad",

@@ -82,6 +82,7 @@ class RobotLink:
         self._watchdog, self._pace = watchdog, pace
         self._command: _Command | None = None
         self._judged = 0
+        self._served: RobotState | None = None  # In whose cycle the last target went out.
         self._armed = self._ending = False
         # What came and went out in each cycle: state, lateness, target, judged last in it.
         self._log: list[tuple[RobotState, float, list[float] | None]] = []
@@ -223,7 +224,7 @@ class RobotLink:
             time = client.timestamp()
             if time == last_time:
                 command = self._command
-                if state and self._armed and command and command.number != self._judged:
+                if state and self._armed and self._is_new(command, state):
                     sent += self._cycle(state)  # The answer goes out at once, not a cycle later.
                     continue
                 silence = clock.perf_counter() - last_arrival
@@ -249,17 +250,23 @@ class RobotLink:
                 self._changed.notify_all()
             last_time, last_arrival = state.time, arrival
 
+    def _is_new(self, command: _Command | None, state: RobotState) -> bool:
+        """Whether a command waits and may go out: one goes in a cycle, the next in the next."""
+        if command is None or self._served is state:
+            return False
+        return command.number != self._judged
+
     def _cycle(self, state: RobotState) -> bool:
         """Judges a state and the newest command, and sends; whether a target went out."""
         client, safety, command = self._client, self._safety, self._command
         if not client.is_connected():
             self._latch_fault("link", "a connection to the robot was lost")
-        is_new = command is not None and command.number != self._judged
+        is_new = self._is_new(command, state)
         # Until the first command comes nothing moves, and nothing can be late.
         answered = state.time if command is None else command.time
         with self._changed:
             decision = safety.step(state, command.q if command and is_new else None, answered)
-        if command is not None:
+        if command is not None and is_new:
             self._judged = command.number
         if decision.q is None:
             if decision.stop is not None:
@@ -267,6 +274,7 @@ class RobotLink:
             elif command is None:
                 client.kick()
             return False
+        self._served = state
         self._log[-1] = (*self._log[-1][:2], decision.q)
         begin = clock.perf_counter()
         accepted = client.servo(decision.q)

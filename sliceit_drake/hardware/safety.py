@@ -75,6 +75,10 @@ class SafetyLayer:
     rest within the limits; braking goes along the line of the last motion in joint space, each
     joint within its acceleration. So all that is sent keeps the limits, the stop included.
 
+    A command that comes a cycle late is carried on at the speed of the commands to the time of its
+    sending, or the targets would stall and jump. What then still asks for too much acceleration is
+    moved, by at most `SafetyLimits.deviation`. Nothing else is changed on the way out.
+
     Args:
         limits: What is allowed.
         kinematics: Of the knife.
@@ -109,6 +113,9 @@ class SafetyLayer:
         self._last: RobotState | None = None
         self._time = -math.inf  # Of the last state.
         self._sent_time = -math.inf
+        # The newest command that was judged.
+        self._command, self._command_time = self._q, -math.inf
+        self._command_speed = [0.0] * 6
 
     @property
     def is_still(self) -> bool:
@@ -134,9 +141,10 @@ class SafetyLayer:
         self._armed = False
         stop = self._robot_fault(state) or self._measurement_fault(state)
         if stop is None:
-            self._q, self._v = list(state.q), [0.0] * 6
+            self._q, self._v = [float(x) for x in state.q], [0.0] * 6
             self._last = state
-            self._time = self._sent_time = state.time
+            self._time = self._sent_time = self._command_time = state.time
+            self._command, self._command_speed = self._q, [0.0] * 6
             edge = self._kinematics.edge(self._q)
             stop = self._position_fault(self._q, edge, "the arm's actual position", state.time)
             self._edge = edge
@@ -251,7 +259,7 @@ class SafetyLayer:
             )
         if command is None or time <= self._sent_time:
             return None
-        return self._take(command, time)
+        return self._take(command, command_time, time)
 
     def _robot_fault(self, state: RobotState) -> Stop | None:
         bits = state.safety_bits
@@ -294,7 +302,7 @@ class SafetyLayer:
             )
         return None
 
-    def _take(self, command: Sequence[float], time: float) -> Stop | None:
+    def _take(self, command: Sequence[float], command_time: float, time: float) -> Stop | None:
         """Judges a command against the target sent before; takes it if it keeps the limits."""
         try:
             q = [float(x) for x in command]
@@ -303,6 +311,7 @@ class SafetyLayer:
         if len(q) != 6:
             detail = "the command is no list of 6 numbers"
             return Stop("command", detail, len(q), 6, time, True)
+        q = self._carried_on(q, command_time, time)
         dt = time - self._sent_time
         limits, before, speed_before = self.limits, self._q, self._v
         v, brake_time, way = [0.0] * 6, 0.0, 0.0
@@ -325,12 +334,15 @@ class SafetyLayer:
                     "rad/s", time,
                 )  # fmt: skip
             most = self._acceleration[j]
-            acceleration = abs(speed - speed_before[j]) / dt
-            if acceleration > most:
-                return self._breach(
-                    "joint_acceleration", f"joint {j + 1} would accelerate", acceleration, most,
-                    "rad/s2", time,
-                )  # fmt: skip
+            excess = abs(speed - speed_before[j]) - most * dt
+            if excess > 0.0:
+                if excess * dt > limits.deviation:
+                    return self._breach(
+                        "joint_acceleration", f"joint {j + 1} would accelerate",
+                        most + excess / dt, most, "rad/s2", time,
+                    )  # fmt: skip
+                speed += excess if speed < speed_before[j] else -excess
+                v[j], q[j] = speed, before[j] + dt * speed
             if abs(speed) > most * brake_time:
                 brake_time = abs(speed) / most
         edge = self._kinematics.edge(q)
@@ -356,6 +368,17 @@ class SafetyLayer:
         if stop is None:
             self._q, self._v, self._edge, self._sent_time = q, v, edge, time
         return stop
+
+    def _carried_on(self, q: list[float], command_time: float, time: float) -> list[float]:
+        """Where commands that go on as fast as the last two will be at the time of sending."""
+        before, between = self._command, command_time - self._command_time
+        if between > _ROUNDING:
+            self._command_speed = [(a - b) / between for a, b in zip(q, before, strict=True)]
+            self._command, self._command_time = q, command_time
+        late = time - command_time
+        if late <= _ROUNDING:
+            return q[:]
+        return [a + late * v for a, v in zip(q, self._command_speed, strict=True)]
 
     def _position_fault(
         self, q: Sequence[float], edge: Edge, what: str, time: float, margin: float = 0.0

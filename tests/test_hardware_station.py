@@ -1,0 +1,177 @@
+"""The hardware station on a fake robot: the simulated station's ports, plan, checks and outputs."""
+
+import argparse
+import dataclasses as dc
+import json
+import threading
+
+import numpy as np
+import pytest
+from fake_robot import FakeRobot
+
+from sliceit_drake.cli import hardware as command
+from sliceit_drake.cli.main import main
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.diagrams.hardware_run import prepare_hardware_run, write_hardware_outputs
+from sliceit_drake.diagrams.hardware_station import MakeHardwareStation, make_safety_layer
+from sliceit_drake.diagrams.plan_check import check_plan, plan_joints
+from sliceit_drake.diagrams.ports import check_station_ports
+from sliceit_drake.diagrams.run_record import slice_record_of
+from sliceit_drake.diagrams.scenario import load_scenario
+from sliceit_drake.diagrams.station import MakeSlicingStation
+from sliceit_drake.hardware.checks import check_facts, check_start
+from sliceit_drake.hardware.configuration import HardwareConfig, load_hardware_config
+from sliceit_drake.hardware.limits import SafetyLimits
+from sliceit_drake.hardware.rtde_link import RobotLink
+from sliceit_drake.resources import resource_path
+
+PACE = 0.15
+# A machine that other tests keep busy may be late: these runs are about what is done, not when.
+PATIENT = SafetyLimits(state_age=0.04, command_age=0.04, joint_step=0.04)
+CONFIG = dict(payload=1.2, payload_cog=[0.0, 0.0, 0.06], board_height=0.05, limits=PATIENT)
+
+
+def spring_scenario():
+    return load_scenario(resource_path("scenarios/cucumber_spring.yaml"))
+
+
+@pytest.fixture(scope="module")
+def twin():
+    return MakeSlicingStation(spring_scenario())
+
+
+@pytest.fixture
+def robot(twin):
+    robot = FakeRobot(twin.start_joints.tolist(), PACE)
+    yield robot
+    robot.close()
+
+
+def hardware_run(robot, **changes):
+    return prepare_hardware_run(
+        spring_scenario(), HardwareConfig(**(CONFIG | changes)), robot, PACE
+    )
+
+
+def failed(checks):
+    return [check.name for check in checks if not check.passed]
+
+
+def test_it_keeps_the_port_contract_of_the_simulated_station(twin, robot):
+    link = RobotLink(robot, make_safety_layer(twin, HardwareConfig().limits), pace=PACE)
+    station = MakeHardwareStation(twin, link, PACE)
+    check_station_ports(station)
+    for name in ("period", "lateness", "age", "latched", "missed_cycles", "stop_reason"):
+        assert station.HasOutputPort(name)
+
+
+def test_a_scenario_runs_and_leaves_the_outputs_of_simulate(robot, tmp_path):
+    hardware = hardware_run(robot)
+    assert failed(hardware.check_before()) == []
+    assert failed(hardware.check_at_start()) == []
+    assert robot.log == ["zero"]
+    run = hardware.execute(0.3)
+    assert run.stopped is None
+    summary = write_hardware_outputs(hardware, tmp_path)
+    names = {"record.csv", "summary.json", "force.png", "scenario.yaml", "robot.csv"}
+    assert names <= {file.name for file in tmp_path.iterdir()}
+    assert json.loads((tmp_path / "summary.json").read_text())["robot"] == summary["robot"]
+    record = run.record()
+    assert record["time"][-1] == pytest.approx(0.3, abs=0.02)
+    # The arm went where the plan has it, one servo lag behind.
+    plan = hardware.plan
+    wanted = np.interp(0.3, plan.time, plan.q[:, 1])
+    assert record["q_2"][-1] == pytest.approx(wanted, abs=0.01)
+    assert abs(record["q_2"][-1] - record["q_2"][0]) > 0.003
+    log = np.genfromtxt(tmp_path / "robot.csv", delimiter=",", names=True)
+    assert np.isfinite(log["sent_1"]).sum() == summary["robot"]["targets_sent"] > 50
+    made = slice_record_of(run, "a test")
+    assert made.force.shape == (len(record["time"]), 3)
+
+
+def test_the_same_wrench_is_shown_at_the_knife_in_the_world(robot):
+    robot.wrench = [1.0, -2.0, 12.0, 0.0, 0.0, 0.0]  # In the base, which is the world here.
+    hardware = hardware_run(robot)
+    run = hardware.execute(0.05, moves=False)
+    record = run.record()
+    assert np.allclose(record.vector("food_wrench_f")[-1], robot.wrench[:3], atol=1e-6)
+    # From the flange, 0.21 m above Ko, to Ko.
+    moment = np.cross([0.0, 0.0, 0.21], robot.wrench[:3])
+    assert np.allclose(record.vector("food_wrench_m")[-1], moment, atol=1e-3)
+    made = slice_record_of(run, "a test")
+    assert np.allclose(made.force[-1], robot.wrench[:3], atol=1e-6)
+    assert np.allclose(made.torque[-1], moment, atol=1e-3)
+    assert robot.sent == [] and robot.watchdog is None, "a dry run sends nothing"
+
+
+def test_a_fault_ends_the_run_with_its_reason_and_keeps_the_record(robot, tmp_path):
+    hardware = hardware_run(robot)
+
+    def fail():
+        robot.bits = 1 << 2 | 1 << 10
+
+    timer = threading.Timer(0.1 / PACE, fail)
+    timer.start()
+    run = hardware.execute(3.0)
+    assert run.stopped.startswith("safety_status") and "protective stop" in run.stopped
+    assert robot.stopped.is_set()
+    summary = write_hardware_outputs(hardware, tmp_path)
+    assert summary["stopped"] == run.stopped
+    assert 0.01 < run.record()["time"][-1] < 1.0
+
+
+def test_it_begins_nothing_where_the_robot_is_not_ready(twin, robot):
+    config, facts = HardwareConfig(**CONFIG), robot.facts()
+    assert failed(check_facts(facts, config)) == []
+    for change, name in (
+        ({"model": "UR10"}, "model"),
+        ({"software": "3.15.8"}, "software"),
+        ({"robot_mode": "IDLE"}, "robot mode"),
+        ({"safety_mode": "PROTECTIVE_STOP"}, "safety mode"),
+        ({"remote_control": False}, "remote control"),
+        ({"payload": 0.0}, "payload"),
+        ({"payload_cog": [0.0, 0.0, 0.0]}, "centre of gravity"),
+        ({"tcp": [0.0, 0.0, 0.2, 0.0, 0.0, 0.0]}, "tool centre point"),
+        ({"tcp": [float("nan")] * 6}, "tool centre point"),
+        ({"speed_scaling": 0.5}, "speed slider"),
+    ):
+        assert failed(check_facts(dc.replace(facts, **change), config)) == [name]
+    other = dc.replace(config, serial="1")
+    assert failed(check_facts(facts, other)) == ["serial number"]
+    assert failed(check_facts(facts, HardwareConfig())) == ["payload"]
+    turned = robot.read()._replace(q=[*robot.q[:5], robot.q[5] - 2.0 * np.pi])
+    (check,) = [c for c in check_start(turned, robot.q, config) if not c.passed]
+    assert "whole turn" in check.fix
+
+
+def test_a_plan_out_of_limits_is_refused_before_the_word(twin, robot):
+    plan, config = plan_joints(twin), HardwareConfig(**CONFIG)
+    assert failed(check_plan(plan, twin, config, robot)) == []
+    low = dc.replace(config.limits, board_depth=0.0, knife_speed=0.05)
+    names = failed(check_plan(plan, twin, dc.replace(config, limits=low), robot))
+    assert "knife speed" in names
+    robot.allows_joints = lambda q: False
+    assert "the robot's own safety limits" in failed(check_plan(plan, twin, config, robot))
+    assert "board height" in failed(
+        check_plan(plan, twin, dc.replace(config, board_height=None), robot)
+    )
+
+
+@pytest.mark.parametrize("typed", ["", "\n", "y\n", "yes\n", "Slice\n"])
+def test_only_the_word_itself_moves_the_robot(typed, robot, monkeypatch, capsys):
+    import io
+
+    monkeypatch.setattr("sys.stdin", io.StringIO(typed))
+    options = argparse.Namespace(duration=0.1, dry_run=False, move_to_start=False, output=None)
+    assert command._run(options, hardware_run(robot)) == 1
+    assert "Nothing was moved" in capsys.readouterr().out
+    assert robot.sent == [] and robot.watchdog is None
+
+
+def test_the_files_for_users_are_read_and_an_absent_robot_is_named(capsys):
+    for file in resource_path("hardware").glob("*.yaml"):
+        load_hardware_config(file)
+    assert main(["hardware"]) == 2
+    assert "--host" in capsys.readouterr().err
+    with pytest.raises(ConfigurationError, match="pace 1"):
+        command.robot_config(argparse.Namespace(host="10.0.0.5", pace=0.2))
