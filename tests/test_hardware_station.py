@@ -158,12 +158,12 @@ def test_a_plan_out_of_limits_is_refused_before_the_word(twin, robot):
 
 
 @pytest.mark.parametrize("typed", ["", "\n", "y\n", "yes\n", "Slice\n"])
-def test_only_the_word_itself_moves_the_robot(typed, robot, monkeypatch, capsys):
+def test_only_the_word_itself_moves_the_robot(typed, robot, monkeypatch, capsys, tmp_path):
     import io
 
     monkeypatch.setattr("sys.stdin", io.StringIO(typed))
     options = argparse.Namespace(duration=0.1, dry_run=False, move_to_start=False, output=None)
-    assert command._run(options, hardware_run(robot)) == 1
+    assert command.checked_run(options, hardware_run(robot), tmp_path) is None
     assert "Nothing was moved" in capsys.readouterr().out
     assert robot.sent == [] and robot.watchdog is None
 

@@ -10,11 +10,13 @@ from sliceit_drake.cli.scenario_argument import add_scenario_arguments, find_fil
 
 if TYPE_CHECKING:
     from sliceit_drake.diagrams.hardware_run import HardwareRun
+    from sliceit_drake.diagrams.run import Run
+    from sliceit_drake.diagrams.scenario import Scenario
     from sliceit_drake.hardware.checks import Check
     from sliceit_drake.hardware.client import RobotClient
     from sliceit_drake.hardware.configuration import HardwareConfig
 
-__all__ = ["add_parser", "ask", "connect"]
+__all__ = ["add_parser", "add_robot_arguments", "robot_config", "run_confirmed"]
 
 DEFAULT_ROBOT = "hardware/ur5e.yaml"
 WORD = "slice"
@@ -50,13 +52,6 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     )
     add_scenario_arguments(parser)
     add_robot_arguments(parser)
-    parser.add_argument("--dry-run", action="store_true", help="all but moving")
-    parser.add_argument(
-        "--move-to-start",
-        action="store_true",
-        help='first move the joints straight to the start, after you typed "move"; nothing looks '
-        "for obstacles on the way",
-    )
     parser.add_argument(
         "--output", metavar="DIR", type=Path, default=None, help="default: output/NAME_robot"
     )
@@ -66,7 +61,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 
 def add_robot_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds --host, --robot and --pace."""
+    """Adds what says which robot, and how far to go with it."""
     parser.add_argument("--host", help="address of the robot")
     parser.add_argument(
         "--robot",
@@ -84,6 +79,13 @@ def add_robot_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="X",
         help="of an emulated controller, as given to `sliceit emulate`",
     )
+    parser.add_argument("--dry-run", action="store_true", help="all but moving")
+    parser.add_argument(
+        "--move-to-start",
+        action="store_true",
+        help='first move the joints straight to the start, after you typed "move"; nothing looks '
+        "for obstacles on the way",
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -92,50 +94,72 @@ def run(options: argparse.Namespace) -> int:
     scenario = scenario_of(options)
     config = robot_config(options)
 
+    from sliceit_drake.diagrams.run_record import slice_record_of
+    from sliceit_drake.records.slice_record import write_record
+
+    directory = options.output or Path("output") / f"{scenario.name}_robot"
+    made = run_confirmed(options, scenario, config, directory)
+    if made is None:
+        return 1
+    if options.dry_run:
+        return 0
+    write_record(slice_record_of(made, "UR5e through RTDE."), directory / "slice")
+    print(f"Results in {directory}/: {', '.join(sorted(p.name for p in directory.iterdir()))}")
+    return 1 if made.stopped else 0
+
+
+def run_confirmed(
+    options: argparse.Namespace, scenario: "Scenario", config: "HardwareConfig", directory: Path
+) -> "Run | None":
+    """Connects, checks, asks for the word, runs, and writes the outputs.
+
+    Returns:
+        The run; None if the robot was not ready or the operator did not confirm.
+    """
     from sliceit_drake.diagrams.hardware_run import prepare_hardware_run
     from sliceit_drake.diagrams.run import make_meshcat
 
     client = connect(options, config)
     try:
-        meshcat = None if options.no_replay or options.dry_run else make_meshcat()
+        is_drawn = not (getattr(options, "no_replay", True) or options.dry_run)
+        meshcat = make_meshcat() if is_drawn else None
         hardware = prepare_hardware_run(scenario, config, client, options.pace, meshcat)
-        return _run(options, hardware)
+        return checked_run(options, hardware, directory)
     finally:
         client.close()
 
 
-def _run(options: argparse.Namespace, hardware: "HardwareRun") -> int:
+def checked_run(
+    options: argparse.Namespace, hardware: "HardwareRun", directory: Path
+) -> "Run | None":
+    """The same with a robot that is connected already."""
     if not _report("Robot and plan", hardware.check_before()):
-        return 1
+        return None
     if options.move_to_start and not options.dry_run:
         print("The joints will turn straight to:", hardware.twin.start_joints.round(4).tolist())
         if not ask(MOVE_WORD):
-            return 1
+            return None
         if not hardware.move_to_start():
             print("The robot did not move to the start. Nothing else was done.")
-            return 1
+            return None
     if not _report("Start", hardware.check_at_start()):
-        return 1
-    duration = options.duration or hardware.motion.duration
+        return None
+    duration = getattr(options, "duration", None) or hardware.motion.duration
     print(plan_text(hardware, duration))
     if options.dry_run:
-        hardware.execute(min(WATCHED, duration), moves=False)
+        made = hardware.execute(min(WATCHED, duration), moves=False)
         assert hardware.link is not None
         timing = ", ".join(f"{k} {v:.4g}" for k, v in hardware.link.timing().items())
         print(f"Dry run: nothing was sent to the joints. {timing}")
-        return 0
-    if not ask(WORD):
-        return 1
-    return slice_now(options, hardware, duration)
+        return made
+    return _slice(hardware, duration, directory) if ask(WORD) else None
 
 
-def slice_now(options: argparse.Namespace, hardware: "HardwareRun", duration: float) -> int:
-    """Runs, writes and reports; 0 if the motion was completed."""
+def _slice(hardware: "HardwareRun", duration: float, directory: Path) -> "Run":
+    """Runs, writes and reports."""
     from tqdm import tqdm
 
     from sliceit_drake.diagrams.hardware_run import write_hardware_outputs
-    from sliceit_drake.diagrams.run_record import slice_record_of
-    from sliceit_drake.records.slice_record import write_record
 
     with tqdm(
         total=duration,
@@ -146,12 +170,10 @@ def slice_now(options: argparse.Namespace, hardware: "HardwareRun", duration: fl
         def show(time: float, wall: float) -> None:
             bar.update(time - bar.n)
 
-        run = hardware.execute(duration, show)
-    directory = options.output or Path("output") / f"{hardware.scenario.name}_robot"
+        made = hardware.execute(duration, show)
     summary = write_hardware_outputs(hardware, directory)
-    write_record(slice_record_of(run, "UR5e through RTDE"), directory / "slice")
-    if run.stopped:
-        print(f"STOPPED: {run.stopped}")
+    if made.stopped:
+        print(f"STOPPED: {made.stopped}")
         print("The robot's program is stopped. Find the cause before you start again.")
     robot = summary["robot"]
     print(
@@ -159,8 +181,7 @@ def slice_now(options: argparse.Namespace, hardware: "HardwareRun", duration: fl
         f"{robot['missed_cycles']:.0f} missed, lateness {1e3 * robot['lateness_99_s']:.2f} ms "
         f"(99 %), {1e3 * robot['lateness_max_s']:.2f} ms at most"
     )
-    print(f"Results in {directory}/: {', '.join(sorted(p.name for p in directory.iterdir()))}")
-    return 1 if run.stopped else 0
+    return made
 
 
 def robot_config(options: argparse.Namespace) -> "HardwareConfig":

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from sliceit_drake.cli import (
     calibrate,
+    collect,
     diagnose,
     diagram,
     emulate,
@@ -24,6 +25,7 @@ COMMANDS = (
     simulate,
     emulate,
     hardware,
+    collect,
     diagram,
     record,
     records,
