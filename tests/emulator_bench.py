@@ -98,7 +98,9 @@ class RawClient:
 
     def data(self, recipe: Recipe) -> list[dict]:
         """Data packages that have arrived, decoded."""
-        return [recipe.unpack(p[1:]) for kind, p in self.frames() if kind == PackageType.DATA]
+        packages = [p for kind, p in self.frames() if kind == PackageType.DATA]
+        assert all(p[0] == 1 for p in packages)  # The number of the only recipe.
+        return [recipe.unpack(p[1:]) for p in packages]
 
     def texts(self) -> list[str]:
         """Text messages that have arrived."""
