@@ -17,6 +17,8 @@ __all__ = ["evidence_figure", "records_figure", "report_html"]
 
 MEASURED, PREDICTED, EXTENDED = "#111827", "#2563eb", "#c2410c"
 SHOWN = 8
+CALM = 0.3
+"""Jump of the prediction, N, near which what is left does not set the scale of a plot."""
 
 STYLE = """
 body{font:15px/1.5 system-ui,sans-serif;color:#111827;
@@ -47,6 +49,11 @@ def records_figure(diagnosis: "Diagnosis") -> Figure:
         right.plot(record.time, record.residual[:, channel], color=MEASURED, lw=0.8)
         right.plot(record.time, changes[r][:, channel], color=EXTENDED, lw=1.2)
         right.set_ylabel("measured - simulated [N]")
+        # Where the force jumps a row too early is a peak that would dwarf all else.
+        calm = record.residual[record.kinks()[:, channel] < CALM, channel]
+        if calm.size:
+            low, high = float(calm.min()), float(calm.max())
+            right.set_ylim(low - 0.15 * (high - low) - 0.05, high + 0.25 * (high - low) + 0.05)
         for axis in (left, right):
             axis.grid(alpha=0.25)
             axis.set_xlabel("time [s]")
@@ -71,7 +78,7 @@ def evidence_figure(diagnosis: "Diagnosis") -> Figure:
     bars.set_yticks(places, [e.name for e in causes], fontsize=7)
     bars.set_xscale("log")
     bars.set_xlabel("twice the gain in log-likelihood")
-    bars.legend(frameon=False, fontsize=7, loc="lower right")
+    bars.legend(frameon=False, fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
     image = matrix.imshow(screening.angles, vmin=0.0, vmax=90.0, cmap="viridis")
     ticks = np.arange(len(screening.names))
     matrix.set_xticks(ticks, screening.names, rotation=90, fontsize=6)
