@@ -1,20 +1,22 @@
 """The emulated controller: its bytes, its program, its ports, and the true clients at them."""
 
 import random
+import socket
 import struct
+import threading
 
 import numpy as np
 import pytest
-from emulator_bench import Bench, RawClient, ScriptBench
+from emulator_bench import Bench, RawClient, ScriptBench, free_address
 from pydrake.systems.analysis import Simulator
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.robot import RobotConfig
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
-from sliceit_drake.emulator.control_script import COMMAND_NAMES
+from sliceit_drake.emulator.control_script import COMMAND_NAMES, ControlScript
 from sliceit_drake.emulator.controller import ControllerConfig
-from sliceit_drake.emulator.emulator import Clock
+from sliceit_drake.emulator.emulator import Clock, Emulator
 from sliceit_drake.emulator.fault_table import FAULTS
 from sliceit_drake.emulator.frames import (
     FrameError,
@@ -27,6 +29,7 @@ from sliceit_drake.emulator.frames import (
 from sliceit_drake.emulator.joint_targets import JointTargets
 from sliceit_drake.emulator.kinematics import Posture, forward, inverse, pose_of_matrix
 from sliceit_drake.emulator.modes import RobotMode, RuntimeState, SafetyMode
+from sliceit_drake.emulator.process import PendantClient
 from sliceit_drake.emulator.robot_model import CYCLE, START, KinematicRobot, SimulationStopped
 from sliceit_drake.emulator.station_robot import StationRobot
 from sliceit_drake.emulator.variables import INPUTS, OUTPUTS, TYPES
@@ -647,6 +650,43 @@ def test_every_fault_of_the_table_can_be_injected():
         for name in FAULTS:
             bench.inject(name + arguments.get(name, ""))
             bench.cycles(1)
+
+
+@pytest.mark.parametrize("fault", ["late_packets:0.02", "drop_packets:0.3", "frequency_125"])
+def test_lockstep_does_not_wait_for_the_answer_to_a_package_that_did_not_arrive(fault):
+    clock = Clock(lockstep=True, patience=1.0)
+    emulator = Emulator(KinematicRobot(), free_address(), clock)
+    controller = emulator.controller
+    controller.start_program(ControlScript(controller), "test")
+    thread = threading.Thread(target=emulator.run)
+    thread.start()
+    try:
+        pendant = PendantClient(emulator.address)
+        sock = socket.create_connection((emulator.address, 30004), 5.0)
+        doubles = "".join(f",input_double_register_{i}" for i in range(11))
+        for kind, payload in (
+            (PackageType.SETUP_OUTPUTS, struct.pack(">d", 500.0) + b"timestamp"),
+            (PackageType.SETUP_INPUTS, b"input_int_register_0" + doubles.encode()),
+            (PackageType.START, b""),
+        ):
+            sock.sendall(encode_frame(kind, payload))
+        servo = struct.pack(">Bi11d", 1, 11, *START, 0.0, 0.0, 0.002, 0.03, 2000.0)
+        reader, answered = FrameReader(), 0
+        while answered < 200:
+            for kind, _ in reader.feed(sock.recv(4096)):
+                if kind == PackageType.DATA:
+                    sock.sendall(encode_frame(PackageType.DATA, servo))
+                    answered += 1
+                    if answered == 50:
+                        pendant.inject(fault)
+        status = pendant.status()
+        sock.close()
+        pendant.close()
+    finally:
+        emulator.stop()
+        thread.join()
+    assert status["rtde"]["commands"]["11"] >= 190
+    assert status["missed_cycles"] == 0
 
 
 # The simulated station.

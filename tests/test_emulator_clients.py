@@ -229,7 +229,7 @@ def lockstep_run(address, hesitation):
     with EmulatorProcess(address=address, lockstep=True) as emulator:
         with receiver(emulator) as receive, control(emulator) as ctrl:
             last, rows = None, []
-            while len(rows) < 400:
+            while len(rows) < 300:
                 now = receive.getTimestamp()
                 if now == last:
                     time.sleep(1e-5)
@@ -237,7 +237,7 @@ def lockstep_run(address, hesitation):
                 last, q = now, np.array(receive.getActualQ())
                 if len(rows) < 4:
                     time.sleep(hesitation)
-                if len(rows) in (100, 200):
+                if len(rows) in (100, 150):
                     time.sleep(0.05)
                 assert ctrl.servoJ((q + 0.05 * (np.array(START) + 0.2 - q)).tolist(), *SERVO)
                 rows.append(q)
@@ -254,7 +254,7 @@ def test_in_lockstep_a_run_is_the_same_every_time_however_slow_the_client():
         assert missed == 0
         begin = int(np.argmax(joints[:, 0] > START[0]))
         assert 0 < begin < 80
-        runs.append(joints[begin : begin + 300])
+        runs.append(joints[begin : begin + 200])
     assert np.ptp(runs[0][:, 0]) > 0.05
     assert np.array_equal(*runs)
 

@@ -58,6 +58,7 @@ class Emulator:
     """One emulated robot on one address; ports are those of a UR.
 
     Attributes:
+        address: Where it listens.
         controller: The controller.
         faults: To inject faults.
         rtde: The RTDE service.
@@ -83,6 +84,7 @@ class Emulator:
         Raises:
             OSError: A port is taken.
         """
+        self.address = address
         self.controller = controller = Controller(robot, config)
         self.late_cycles = self.missed_cycles = 0
         self._clock = clock or Clock()
