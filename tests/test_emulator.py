@@ -576,11 +576,16 @@ def test_packages_are_lost_and_late():
         bench.cycles(1000)
         got = len(client.data(recipe))
         assert 650 < got < 850
+        client.ask(PackageType.SETUP_INPUTS, b"input_int_register_0")
+        bench.inject("drop_packets:1")
+        bench.cycles(1)
+        client.send(PackageType.DATA, b"\x01" + struct.pack(">i", 3))
+        bench.cycles(2)
+        assert bench.controller.registers.integer(0) == 0
         bench.inject("drop_packets:0")
         bench.inject("late_packets:0.05")
         bench.cycles(200)
         assert client.data(recipe)[-1]["timestamp"] == pytest.approx(bench.controller.time - 0.05)
-        client.ask(PackageType.SETUP_INPUTS, b"input_int_register_0")
         client.send(PackageType.DATA, b"\x01" + struct.pack(">i", 4))
         bench.cycles(20)
         assert bench.controller.registers.integer(0) == 0
