@@ -122,6 +122,13 @@ def test_ur_rtde_connects_moves_servos_and_sees_a_protective_stop():
         assert receive.getActualQ() == pytest.approx(target, abs=1e-6)
 
 
+def test_a_newer_controller_is_served_too():
+    # Another recipe, other registers' numbers, another script, no dashboard.
+    with arm_alone(options=["--version", "10.11.0.1"]) as emulator, control(emulator) as ctrl:
+        assert ctrl.moveJ((np.array(START) + 0.01).tolist(), 1.0, 4.0)
+        assert emulator.pendant.status()["positions"] == pytest.approx(np.array(START) + 0.01)
+
+
 def test_a_second_control_client_is_told_that_the_registers_are_in_use():
     with arm_alone() as emulator, control(emulator) as ctrl:
         with pytest.raises(RuntimeError, match="already in use"):
@@ -340,6 +347,14 @@ def test_what_the_emulator_cannot_do_is_said(capsys):
             emulator.pendant.inject("thunder")
         with pytest.raises(EmulatorError, match="cannot listen on.*Another emulator"):
             EmulatorProcess(address=emulator.address)
+    for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 0)):
+        command = [sys.executable, "-m", "sliceit_drake.cli.main", "emulate", "--arm-alone"]
+        command += ["--address", emulator.address]
+        child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        assert child.stdout is not None and b"Emulated UR5e" in child.stdout.readline()
+        child.send_signal(number)
+        _, said = child.communicate(timeout=10.0)
+        assert child.returncode == code and b"Traceback" not in said
     assert main(["emulate", "--arm-alone", "--pace", "0"]) == 2
     assert "pace" in capsys.readouterr().err
     assert main(["emulate", "--arm-alone", "--address", free_address(), "--inject", "rain"]) == 2
