@@ -54,13 +54,30 @@ class UrClient:
             if not self._receive.isConnected():
                 raise RuntimeError("it refuses to stream at 500 Hz; is it an e-Series robot?")
             if controls:
+                self._refuse_stopped_robot()
                 step = "taking control (ports 30003 and 30004)"
                 self._control = rtde_control.RTDEControlInterface(host, RATE)
         except RuntimeError as error:
+            if isinstance(error, RobotUnavailableError):
+                raise
             raise RobotUnavailableError(
-                f"{host}: {step} failed: {str(error).strip()}. Check the address, that the robot "
-                "is on, in remote control, and that no other program controls it."
+                f"{host}: {step} failed: {str(error).strip().rstrip('.')}. Check the address, that "
+                "the robot is on, in remote control, and that no other program controls it."
             ) from None
+
+    def _refuse_stopped_robot(self) -> None:
+        # Taking control of it would fail after 5 s, with no word about the reason.
+        for question, good in (
+            ("robotmode", ("RUNNING",)),
+            ("safetymode", ("NORMAL", "REDUCED")),
+        ):
+            answer = getattr(self._dashboard, question)()
+            if answer.partition(":")[2].strip() not in good:
+                raise RobotUnavailableError(
+                    f"{self._host}: the robot reports {answer.strip()}, wanted {good[0]}. Find the "
+                    "cause, clear it on the pendant, and see that the arm is on and its brakes are "
+                    "released."
+                )
 
     def timestamp(self) -> float:
         return self._receive.getTimestamp()
