@@ -36,7 +36,7 @@ from sliceit_drake.stand_in.session import record_session
 
 POOR = load_protocol(str(resource_path("calibration/protocols/poor.yaml")))
 SETUP = setup_of_food(CalibratedFood(food=POOR.food, knife=POOR.knife), 0.5)
-WORLD = FiniteElementSettings(refinement=0.7, time_step=1e-3, travel=2e-4)
+WORLD = FiniteElementSettings(refinement=0.85, time_step=2e-4, travel=2e-4)
 CAUSES = [
     c
     for c in open_causes([p.name for p in SETUP.parameters])
@@ -70,8 +70,9 @@ class Bench:
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    # A session in which the class is found; docs/hidden_effects.md says how often that is so.
     folder = tmp_path_factory.mktemp("bench")
-    records = load_sessions([cut(POOR, folder / "old", 5)])
+    records = load_sessions([cut(POOR, folder / "old", 21)])
     diagnosis = diagnosis_of(sensitivities(SETUP, records, CAUSES, workers=2))
     with pytest.MonkeyPatch.context() as patch:
         # The whole menu would take a minute.
