@@ -341,6 +341,8 @@ def test_runs_of_every_kind_are_diagnosed_rightly(tmp_path):
         for name, found in classes.items()
     }
     (tmp_path / "near.json").write_text(json.dumps(near), encoding="utf-8")
+    facts = {name: dc.asdict(found) for name, found in classes.items()}
+    (tmp_path / "classes.json").write_text(json.dumps(facts), encoding="utf-8")
     (tmp_path / "truth").mkdir()
     for case in cases:
         file = tmp_path / "truth" / f"{case.name}.json"
