@@ -3,7 +3,6 @@
 import dataclasses as dc
 import json
 import math
-import secrets
 import subprocess
 from pathlib import Path
 
@@ -19,12 +18,10 @@ from sliceit_drake.hidden_study import runner
 from sliceit_drake.hidden_study.archive import pack, unpack
 from sliceit_drake.hidden_study.bench import PROTOCOLS, QuietBench, model_food, protocol_named
 from sliceit_drake.hidden_study.cases import KINDS, PAIRS, Case, Hidden, make_cases
-from sliceit_drake.hidden_study.classes import protocol_classes
 from sliceit_drake.hidden_study.report import numbers, plot_curves, report
 from sliceit_drake.hidden_study.runner import food_file, is_done, run_case
 from sliceit_drake.hidden_study.score import Judgement, Rate, judge, judge_study
 from sliceit_drake.hidden_study.sizes import ProtocolSizes, SizeCurve
-from sliceit_drake.hidden_study.study import run_study
 from sliceit_drake.hidden_study.truth import BASE_OF, CAUSE_OF, UNKNOWN
 from sliceit_drake.stand_in.registry import EFFECTS, make_effect
 
@@ -278,81 +275,3 @@ def test_a_file_that_holds_no_runs_is_refused(tmp_path):
     file.write_text("{}\n[1]\n")
     with pytest.raises(ConfigurationError, match="no file of a study's runs"):
         unpack(file, tmp_path / "study")
-
-
-SHARES = {"single": 0.95, "nothing": 0.92, "unknown": 0.90, "pairs": 0.80, "poor": 0.90}
-"""Shares of right runs by kind that docs/hidden_effects.md has to show."""
-FALSE_FAILURE = 1e-3
-CLEAR = (
-    "skin",
-    "bulk_relaxation",
-    "rate_toughness",
-    "sensor_drift",
-    "sensor_tilt",
-    "sensor_delay",
-    "board_height",
-    "drive_vibration",
-)
-"""Effects that the rich protocol shows at their typical size."""
-CLEAR_PAIRS = (("skin", "sensor_tilt"), ("rate_toughness", "sensor_drift"))
-CLEAR_UNKNOWN = ("magnetic_board", "warm_wrist")
-
-
-def most_wrong(kinds: list[str]) -> int:
-    """So many wrong runs that more are seen less often than `FALSE_FAILURE` with `SHARES`."""
-    chance = np.ones(1)
-    for kind in kinds:
-        chance = np.convolve(chance, [SHARES[kind], 1.0 - SHARES[kind]])
-    return int(np.argmax(np.cumsum(chance) >= 1.0 - FALSE_FAILURE))
-
-
-def drawn_cases(rng: np.random.Generator) -> list[Case]:
-    """Runs of every kind, their effects, sizes and seeds drawn."""
-
-    def case(kind: str, protocol: str, *effects: str) -> Case:
-        hidden = tuple(
-            Hidden(e, float(EFFECTS[e].typical * rng.uniform(1.0, 1.2)), None) for e in effects
-        )
-        name = f"{rng.integers(16**10):010x}"
-        return Case(name, kind, protocol, hidden, int(rng.integers(1, 2**31)))
-
-    singles = rng.choice(CLEAR, 3, replace=False).tolist()
-    return [
-        case("poor", "poor", "skin"),
-        *(case("single", "rich", effect) for effect in singles),
-        case("nothing", "rich"),
-        case("nothing", "poor"),
-        case("pairs", "rich", *CLEAR_PAIRS[rng.integers(len(CLEAR_PAIRS))]),
-        case("unknown", "rich", CLEAR_UNKNOWN[rng.integers(len(CLEAR_UNKNOWN))]),
-    ]
-
-
-def test_runs_of_every_kind_are_diagnosed_rightly(tmp_path):
-    """Nothing was computed before; each run is a process that sees a folder of records."""
-    seed = secrets.randbits(31)
-    cases = drawn_cases(np.random.default_rng(seed))
-    study_folder(tmp_path)
-    classes = {name: protocol_classes(name, tmp_path / "cache") for name in ("rich", "poor")}
-    near = {
-        name: {
-            effect: dict.fromkeys(found.classes.get(cause, []), 0.0)
-            for effect, cause in CAUSE_OF.items()
-        }
-        for name, found in classes.items()
-    }
-    (tmp_path / "near.json").write_text(json.dumps(near), encoding="utf-8")
-    facts = {name: dc.asdict(found) for name, found in classes.items()}
-    (tmp_path / "classes.json").write_text(json.dumps(facts), encoding="utf-8")
-    (tmp_path / "truth").mkdir()
-    for case in cases:
-        file = tmp_path / "truth" / f"{case.name}.json"
-        file.write_text(json.dumps(dc.asdict(case)), encoding="utf-8")
-    run_study(cases, tmp_path, 100, workers=2)
-    judgements = judge_study(tmp_path)
-    assert len(judgements) == len(cases)
-    wrong = [j for j in judgements if not j.right or j.resolved is False]
-    said = "\n".join(f"{j.case}: {j.verdict} {j.classes}" for j in wrong)
-    assert len(wrong) <= most_wrong([c.kind for c in cases]), f"seed {seed}\n{said}"
-    # A confident wrong name is worse than a miss.
-    named = [j for j in wrong if j.verdict in ("cause", "causes") and j.wrong]
-    assert len(named) <= 1, f"seed {seed}\n{said}"
