@@ -1,0 +1,37 @@
+"""The pages on the diagnosis give the numbers by which it decides."""
+
+from pathlib import Path
+
+import pytest
+
+from sliceit_drake.diagnosis import next_experiment, verdict
+
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+
+
+@pytest.mark.parametrize(
+    ("page", "words"),
+    [
+        ("diagnosis", f"the alarm of {100 * verdict.ALARM:g} %"),
+        ("diagnosis", f"refitted to it, {verdict.LEAST_SIZE:g} of the noise in contact"),
+        ("diagnosis", f"must show in {100 * verdict.PRESENCE:g} % of those"),
+        ("diagnosis", f"can do what was found to within {verdict.CLASS_ANGLE:g} degrees"),
+        ("diagnosis", f"falls short of it by less than {100 * verdict.CLASS_GAIN:g} %"),
+        ("diagnosis", f"of one condition it is {verdict.ONE_CONDITION_ANGLE:g} degrees"),
+        ("diagnosis", f"nothing is wrong ({verdict.TOLERATED:g} of the noise) is taken off"),
+        ("diagnosis", f"Less than {100 * verdict.EXPLAINED:g} % is unknown"),
+        ("diagnosis", f"at least {100 * verdict.SECOND_SHARE:g} % of the squares"),
+        ("diagnosis", f"at least {100 * verdict.OF_THE_REST:g} % of what the first leaves"),
+        ("diagnosis", f"at least {100 * verdict.SECOND_GAIN:g} % of all that can be gained"),
+        ("diagnosis", f"an effect of {verdict.LEAST_MISFIT:g} of the noise or more"),
+        ("diagnosis", f"at least {verdict.MISFIT_FACTOR:g} times what it gains where nothing"),
+        (
+            "next_experiment",
+            f"least {100 * (1.0 - next_experiment.ALIKE_GAIN):g} % as much and are within "
+            f"{verdict.CLASS_ANGLE + next_experiment.MARGIN:g} degrees",
+        ),
+    ],
+)
+def test_the_page_gives_the_number_that_is_used(page, words):
+    text = (DOCS / f"{page}.md").read_text(encoding="utf-8")
+    assert words in " ".join(text.split())
