@@ -1,0 +1,100 @@
+"""`sliceit hardware` against `sliceit emulate`, over TCP with ur_rtde, beside `sliceit simulate`.
+
+The emulated controller is the clock and waits for each command (`--lockstep`), and the pace that
+the client is told lets the machine pause for two seconds: a slow machine makes these tests slow,
+not wrong.
+"""
+
+import faulthandler
+import io
+import json
+
+import numpy as np
+import pytest
+from emulator_bench import free_address
+
+from sliceit_drake.cli.main import main
+from sliceit_drake.emulator.process import EmulatorProcess
+from sliceit_drake.resources import resource_path
+
+ROBOT = resource_path("hardware/emulated.yaml")
+CUCUMBER = resource_path("scenarios/cucumber.yaml")
+# A whole slice, board included, of 432 tetrahedra, in 1.4 s.
+SLICE = """{
+  food: {shape: !Cylinder
+    {diameter: 0.027, length: 0.12, rings: 2, layers: [0.0, 0.0028, 0.0064, 0.012]}},
+  start: {clearance: 0.002}, measurement: null,
+  motion: {segments: [
+    !ConstantSpeed {distance: 0.0292, speed: 0.04, acceleration: 0.5, label: slice},
+    !Hold {duration: 0.1, label: hold},
+    !Retract {distance: 0.03, speed: 0.1, acceleration: 0.5, label: retract}]}}"""
+PATIENT = """{watchdog: 10.0,
+  limits: {state_age: 0.04, command_age: 0.04, joint_step: 0.04}}"""
+EMULATED_PACE, CLIENT_PACE = 0.1, 0.02
+
+
+@pytest.fixture(autouse=True)
+def no_test_hangs():
+    # The client's constructors hold Python's lock while they wait: only this ends them.
+    faulthandler.dump_traceback_later(300.0, exit=True)
+    yield
+    faulthandler.cancel_dump_traceback_later()
+
+
+def emulated(scenario=CUCUMBER, overrides=SLICE, **options):
+    return EmulatorProcess(
+        scenario,
+        free_address(),
+        EMULATED_PACE,
+        lockstep=True,
+        options=["--set", overrides],
+        **options,
+    )
+
+
+def run_hardware(emulator, directory, monkeypatch, typed, *options, overrides=SLICE):
+    """Exit code of `sliceit hardware` with the words that an operator types."""
+    monkeypatch.setattr("sys.stdin", io.StringIO("".join(f"{word}\n" for word in typed)))
+    arguments = ["hardware", str(CUCUMBER), "--set", overrides, "--host", emulator.address]
+    arguments += ["--pace", str(CLIENT_PACE), "--robot", str(ROBOT)]
+    arguments += ["--set-robot", PATIENT, "--no-replay", "--output", str(directory)]
+    return main([*arguments, *options])
+
+
+def read(directory):
+    return np.genfromtxt(directory / "record.csv", delimiter=",", names=True)
+
+
+def sensor_force(record):
+    return np.column_stack([record[f"sensor_wrench_f_{axis}"] for axis in "xyz"])
+
+
+def difference(real, simulated):
+    """RMS of the difference of two records' sensor forces over the RMS of the simulated one."""
+    time = real["time"]
+    assert abs(time[-1] - simulated["time"][-1]) < 0.01
+    wanted = np.column_stack(
+        [np.interp(time, simulated["time"], column) for column in sensor_force(simulated).T]
+    )
+    return np.linalg.norm(sensor_force(real) - wanted) / np.linalg.norm(wanted)
+
+
+def test_a_robot_slices_over_the_network_as_the_simulation_does(tmp_path, monkeypatch, capsys):
+    simulated = ["simulate", str(CUCUMBER), "--set", SLICE, "--output", str(tmp_path / "simulated")]
+    assert main([*simulated, "--no-replay"]) == 0
+    with emulated() as emulator:
+        assert run_hardware(emulator, tmp_path / "real", monkeypatch, ["slice"]) == 0
+        status = emulator.pendant.status()
+    assert not emulator.is_running
+    real, wanted = read(tmp_path / "real"), read(tmp_path / "simulated")
+    timing = json.loads((tmp_path / "real" / "summary.json").read_text())["robot"]
+    with capsys.disabled():
+        print(
+            f"\n{100 * difference(real, wanted):.2f} % RMS of force apart, "
+            f"{timing['missed_cycles']} of {timing['cycles']} cycles missed"
+        )
+    assert np.abs(sensor_force(wanted)).max() > 8.0
+    assert difference(real, wanted) < 0.05
+    # It ended on its own: the program is stopped, the arm stands.
+    assert status["runtime_state"] == "STOPPED" and status["safety_mode"] == "NORMAL"
+    assert np.abs(status["velocities"]).max() < 1e-3
