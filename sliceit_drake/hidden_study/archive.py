@@ -7,7 +7,7 @@ from typing import Any
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.hidden_study.runner import is_done
-from sliceit_drake.hidden_study.study import load_cases
+from sliceit_drake.hidden_study.study import load_cases, read_facts
 
 __all__ = ["pack", "unpack"]
 
@@ -27,17 +27,17 @@ def pack(output: Path, file: Path) -> int:
     Returns:
         The number of runs.
     """
-    shared = {name: _read(output / name) for name in SHARED}
+    shared = {name: read_facts(output / name) for name in SHARED}
     lines = [json.dumps(shared, sort_keys=True)]
     for case in load_cases(output):
         if not is_done(output, case.name):
             continue
         folder = output / "runs" / case.name
         run = {
-            "truth": _read(output / "truth" / f"{case.name}.json"),
-            "timing": _read(folder / "timing.json"),
-            "diagnosis": _said(_read(folder / "diagnosis.json")),
-            "diagnosis_next": _said(_read(folder / "diagnosis_next.json")),
+            "truth": read_facts(output / "truth" / f"{case.name}.json"),
+            "timing": read_facts(folder / "timing.json"),
+            "diagnosis": _said(read_facts(folder / "diagnosis.json")),
+            "diagnosis_next": _said(read_facts(folder / "diagnosis_next.json")),
         }
         lines.append(json.dumps(run, sort_keys=True))
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -80,13 +80,6 @@ def _said(facts: Mapping[str, Any] | None) -> dict[str, Any] | None:
     ]
     out = {name: facts.get(name) for name in SAID}
     return {**out, "evidence": shares}
-
-
-def _read(file: Path) -> dict[str, Any] | None:
-    if not file.exists():
-        return None
-    found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-    return found
 
 
 def _write(file: Path, facts: Mapping[str, Any]) -> None:

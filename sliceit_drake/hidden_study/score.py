@@ -1,7 +1,6 @@
 """Judges the runs of the study: what was said against what was hidden."""
 
 import dataclasses as dc
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.hidden_study.cases import Case
 from sliceit_drake.hidden_study.runner import is_done
-from sliceit_drake.hidden_study.study import load_cases
+from sliceit_drake.hidden_study.study import load_cases, read_facts
 from sliceit_drake.hidden_study.truth import CAUSE_OF
 
 __all__ = ["Judgement", "Rate", "judge", "judge_study", "load_near"]
@@ -169,14 +168,17 @@ def load_near(output: Path) -> Near:
     Raises:
         ConfigurationError: There is no study.
     """
-    file = output / "near.json"
-    if not file.exists():
+    return _shared(output, "near.json")
+
+
+def _shared(output: Path, name: str) -> dict[str, Any]:
+    found = read_facts(output / name)
+    if found is None:
         raise ConfigurationError(
-            "is no folder of a study: there is no near.json",
+            f"is no folder of a study: there is no {name}",
             source=str(output),
             fix="Give the --output of `sliceit study hidden`.",
         )
-    found: dict[str, dict[str, dict[str, float]]] = json.loads(file.read_text(encoding="utf-8"))
     return found
 
 
@@ -187,30 +189,23 @@ def judge_study(output: Path) -> list[Judgement]:
         ConfigurationError: There is no study.
     """
     near = load_near(output)
-    found = json.loads((output / "classes.json").read_text(encoding="utf-8"))
+    found = _shared(output, "classes.json")
     classes = {name: facts["classes"] for name, facts in found.items()}
     out = []
     for case in load_cases(output):
         if is_done(output, case.name):
             folder = output / "runs" / case.name
-            timing = _read(folder / "timing.json") or {}
+            timing = read_facts(folder / "timing.json") or {}
             judgement = judge(
                 case,
-                _read(folder / "diagnosis.json"),
+                read_facts(folder / "diagnosis.json"),
                 near,
-                _read(folder / "diagnosis_next.json"),
+                read_facts(folder / "diagnosis_next.json"),
                 timing.get("diagnosis_s", math.nan),
                 classes,
             )
             out.append(dc.replace(judgement, code=timing.get("code", "")))
     return out
-
-
-def _read(file: Path) -> dict[str, Any] | None:
-    if not file.exists():
-        return None
-    found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-    return found
 
 
 def rate(judgements: Sequence[Judgement]) -> Rate:

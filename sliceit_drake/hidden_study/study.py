@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import warp
 
@@ -18,7 +19,7 @@ from sliceit_drake.hidden_study.runner import food_file, is_done, run_case
 from sliceit_drake.hidden_study.sizes import angles_for, size_for
 from sliceit_drake.hidden_study.truth import CAUSE_OF
 
-__all__ = ["StudyOptions", "load_cases", "prepare", "run_study"]
+__all__ = ["StudyOptions", "load_cases", "prepare", "read_facts", "run_study"]
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage, what is done and what there is."""
@@ -51,14 +52,13 @@ def prepare(output: Path, options: StudyOptions, progress: Progress) -> list[Cas
     """
     file = output / "study.json"
     facts = {"seed": options.seed, "replicates": options.replicates}
-    if file.exists():
-        found = json.loads(file.read_text(encoding="utf-8"))
-        if found != facts:
-            raise ConfigurationError(
-                f"was begun with {found}, not {facts}",
-                source=str(file),
-                fix="Give the same options, or another --output.",
-            )
+    found = read_facts(file)
+    if found is not None and found != facts:
+        raise ConfigurationError(
+            f"was begun with {found}, not {facts}",
+            source=str(file),
+            fix="Give the same options, or another --output.",
+        )
     cache = output / "cache"
     calls = [0]
 
@@ -109,13 +109,19 @@ def _near(output: Path, cases: Sequence[Case], progress: Progress) -> None:
         {(c.protocol, h.effect) for c in cases for h in c.hidden if h.effect in CAUSE_OF}
     )
     file = output / "near.json"
-    near: dict[str, dict[str, dict[str, float]]] = {}
-    if file.exists():
-        near = json.loads(file.read_text(encoding="utf-8"))
+    near: dict[str, dict[str, dict[str, float]]] = read_facts(file) or {}
     for k, (protocol, effect) in enumerate(wanted):
         near.setdefault(protocol, {})[effect] = angles_for(protocol, effect, output / "cache")
         progress("classes of effects", k + 1, len(wanted))
     file.write_text(json.dumps(near, indent=1) + "\n", encoding="utf-8")
+
+
+def read_facts(file: Path) -> dict[str, Any] | None:
+    """What a JSON file of the study holds; None where it is not there."""
+    if not file.exists():
+        return None
+    found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    return found
 
 
 def load_cases(output: Path) -> list[Case]:
