@@ -12,7 +12,8 @@ Hide effects in records of the stand-in, have them diagnosed, and keep what the 
 
 Each run draws effects and their sizes (2 to 3 times the noise, after all else is refitted), makes
 the records of a session, and starts `sliceit diagnose` on that folder alone. What was hidden is
-kept apart, in DIR/truth. `sliceit score DIR` judges. A study that was stopped goes on.
+kept apart, in DIR/truth. `sliceit score DIR` judges. A study that was stopped goes on, given
+the --seed and --replicates that it was begun with.
 
 Kinds of runs
   single   one effect, rich or full protocol      nothing  nothing hidden, all protocols
@@ -21,7 +22,7 @@ Kinds of runs
   base     a shift of a base parameter            curve    one effect at several strengths
 
   sliceit study hidden --output output/hidden --minutes 120
-  sliceit study hidden --output output/hidden --runs-from docs/hidden_effects.jsonl --seed 1
+  sliceit study hidden --output output/hidden --runs-from FILE.jsonl --seed 1 --replicates 100
 """
 
 SIZES = """\

@@ -40,22 +40,26 @@ def run(options: argparse.Namespace) -> int:
     from sliceit_drake.hidden_study.archive import pack, unpack
     from sliceit_drake.hidden_study.report import numbers, plot_curves, report
     from sliceit_drake.hidden_study.score import judge_study
+    from sliceit_drake.hidden_study.study import read_facts
 
     with tempfile.TemporaryDirectory() as folder:
         study = options.study
         if study.is_file():
             unpack(study, Path(folder))
             study = Path(folder)
-        judgements = judge_study(study)
+        judgements, facts = judge_study(study), read_facts(study / "study.json")
         if options.output is not None:
             pack(study, options.output / "hidden_effects.jsonl")
     figure = "figures/hidden_effects.png" if options.output is not None else None
-    text = report(judgements, figure)
+    text = report(judgements, figure, facts)
     print(text)
     if options.output is not None:
         options.output.mkdir(parents=True, exist_ok=True)
         (options.output / "hidden_effects.md").write_text(text, encoding="utf-8")
-        facts = json.dumps(numbers(judgements), indent=2) + "\n"
-        (options.output / "hidden_effects.json").write_text(facts, encoding="utf-8")
-        plot_curves(judgements, options.output / "figures" / "hidden_effects.png")
+        found = numbers(judgements)
+        (options.output / "hidden_effects.json").write_text(
+            json.dumps(found, indent=2) + "\n", encoding="utf-8"
+        )
+        if found["curves"]:
+            plot_curves(judgements, options.output / "figures" / "hidden_effects.png")
     return 0

@@ -2,12 +2,13 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sliceit_drake.hidden_study.cases import KINDS
 from sliceit_drake.hidden_study.score import NAMING, Judgement, Rate, rate
 from sliceit_drake.hidden_study.truth import BASE_OF
 
@@ -22,12 +23,13 @@ another step than the diagnosis, by laws that are written otherwise. `sliceit di
 process of its own and is given the folder of records and the food without any effect, nothing else.
 Then its diagnosis.json is compared with what was hidden. Everything here is simulated.
 
-    sliceit study hidden --output output/hidden --seed 1
+    {command}
     sliceit score output/hidden --output docs
 
 Many runs take hours; the study can be stopped, and goes on. `hidden_effects.jsonl` beside this page
-has what was said in each run: `sliceit score docs/hidden_effects.jsonl` judges it again,
-`sliceit study hidden --runs-from docs/hidden_effects.jsonl` goes on from there.
+has what was said in each run: `sliceit score docs/hidden_effects.jsonl --output docs` judges it
+again and writes this page, the first command with `--runs-from docs/hidden_effects.jsonl` goes on
+from there.
 
 An effect has the size at which its strength delta is a number drawn from 2 to 3: the root mean
 square, over samples in contact, of what is left of its noise-free change of the forces once the
@@ -180,14 +182,30 @@ def _percent(value: float | None) -> str:
     return "" if value is None or math.isnan(value) else f"{100 * value:.0f} %"
 
 
-def report(judgements: Sequence[Judgement], figure: str | None) -> str:
+def _command(judgements: Sequence[Judgement], options: Mapping[str, Any]) -> str:
+    """What was run."""
+    kinds = [kind for kind in KINDS if _of(judgements, kind)]
+    words = ["sliceit study hidden --output output/hidden"]
+    words += [f"--{name} {options[name]}" for name in ("seed", "replicates") if name in options]
+    if len(kinds) < len(KINDS):
+        words.append(f"--kinds {' '.join(kinds)}")
+    return " ".join(words)
+
+
+def report(
+    judgements: Sequence[Judgement],
+    figure: str | None,
+    options: Mapping[str, Any] | None = None,
+) -> str:
     """The report in Markdown.
 
     Args:
         judgements: All runs that are done.
         figure: Of the detection curves, relative to the report; None for none.
+        options: Seed and replicates of the study, as its study.json has them.
     """
-    lines = [HEAD, f"{len(judgements)} runs.", ""]
+    head = HEAD.format(command=_command(judgements, options or {}))
+    lines = [head, f"{len(judgements)} runs.", ""]
     lines += [
         "| what | asked for | reached | share | lower bound, 95 % | met |",
         "|---|---|---|---|---|---|",
