@@ -33,6 +33,7 @@ from sliceit_drake.emulator.process import PendantClient
 from sliceit_drake.emulator.robot_model import CYCLE, START, KinematicRobot, SimulationStopped
 from sliceit_drake.emulator.station_robot import StationRobot
 from sliceit_drake.emulator.variables import INPUTS, OUTPUTS, TYPES
+from sliceit_drake.hardware.configuration import load_hardware_config
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.compliance_controller import make_virtual_model
 from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
@@ -368,6 +369,18 @@ def test_the_right_payload_takes_the_tools_weight_out_and_a_wrong_one_does_not()
     R = forward(turned)[:3, :3] @ forward(START)[:3, :3].T
     expected = 0.5 * 9.81 * (np.array([0, 0, 1.0]) - R @ [0, 0, 1.0])
     assert bench.controller.outputs["actual_TCP_force"][:3] == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_payload_set_from_the_start_with_a_zeroed_sensor_shows_nothing_in_any_posture():
+    robot = WeighedRobot()
+    robot.step(START, None)
+    robot.zero_sensor()
+    config = ControllerConfig(payload=robot.mass, payload_cog=tuple(robot.cog), is_zeroed=True)
+    bench = ScriptBench(robot, config)
+    assert bench.controller.outputs["payload"] == robot.mass
+    assert bench.controller.outputs["actual_TCP_force"] == pytest.approx(np.zeros(6), abs=1e-9)
+    bench.call(1, [*(np.array(START) + [0.0, 0.0, 0.0, 0.0, np.pi, 0.0]), 3.0, 20.0])
+    assert bench.controller.outputs["actual_TCP_force"] == pytest.approx(np.zeros(6), abs=1e-9)
 
 
 class BrokenRobot(KinematicRobot):
@@ -709,6 +722,9 @@ def test_the_emulated_station_moves_as_the_simulated_one_under_the_same_commands
     simulator.Initialize()
     robot = StationRobot(scenario)
     assert isinstance(robot._targets, JointTargets)
+    config = load_hardware_config(resource_path("hardware/emulated.yaml"))
+    assert robot.payload == pytest.approx(config.payload, abs=1e-3)
+    assert robot.payload_cog == pytest.approx(config.payload_cog, abs=1e-4)
     context = station.GetMyContextFromRoot(simulator.get_context())
     force = 0.0
     for cycle in range(1, 151):

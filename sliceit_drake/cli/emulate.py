@@ -13,6 +13,7 @@ from sliceit_drake.cli.scenario_argument import add_scenario_arguments, scenario
 from sliceit_drake.emulator.fault_table import faults_as_text
 
 if TYPE_CHECKING:
+    from sliceit_drake.emulator.controller import ControllerConfig
     from sliceit_drake.emulator.robot_model import RobotModel
 
 __all__ = ["add_parser"]
@@ -85,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
 
     clock = Clock(pace=options.pace, lockstep=options.lockstep)
     config = ControllerConfig(version=_version(options.version))
-    robot = _robot(options)
+    robot = _robot(options, config)
     try:
         emulator = Emulator(robot, options.address, clock, config)
     except OSError as error:
@@ -109,7 +110,8 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _robot(options: argparse.Namespace) -> "RobotModel":
+def _robot(options: argparse.Namespace, config: "ControllerConfig") -> "RobotModel":
+    """The arm that the options name; its tool's payload goes into `config`."""
     if options.arm_alone:
         from sliceit_drake.emulator.robot_model import KinematicRobot
 
@@ -117,7 +119,10 @@ def _robot(options: argparse.Namespace) -> "RobotModel":
     from sliceit_drake.emulator.station_robot import StationRobot
 
     print("Preparing (the first run on a machine compiles the kernels, about 8 s)", flush=True)
-    return StationRobot(scenario_of(options))
+    robot = StationRobot(scenario_of(options))
+    config.payload, config.payload_cog = robot.payload, robot.payload_cog
+    config.is_zeroed = robot.is_zeroed
+    return robot
 
 
 def _version(text: str) -> tuple[int, ...]:

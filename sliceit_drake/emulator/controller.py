@@ -50,6 +50,9 @@ class ControllerConfig:
         speed_limit: Joint speed that raises a protective stop, rad/s; 191 degrees a second.
         position_limit: Joint position that raises a protective stop, rad; 363 degrees.
         force_limit: Force of the tool that raises a protective stop, N; None for no limit.
+        payload: Mass that is set on the pendant, kg.
+        payload_cog: Its centre in the flange [3], m.
+        is_zeroed: Whether the sensor shows zero at first, with that payload set.
     """
 
     version: tuple[int, ...] = (5, 11, 1, 108318)
@@ -61,6 +64,9 @@ class ControllerConfig:
     speed_limit: float = 3.3336
     position_limit: float = 6.3355
     force_limit: float | None = None
+    payload: float = 0.0
+    payload_cog: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    is_zeroed: bool = False
 
 
 class Program(Protocol):
@@ -108,8 +114,8 @@ class Controller:
         self.safety = SafetyMode.NORMAL
         self.mode = RobotMode.RUNNING
         self.is_remote = True
-        self.payload = 0.0
-        self.payload_cog = np.zeros(3)
+        self.payload = self.config.payload
+        self.payload_cog = np.array(self.config.payload_cog, float)
         self.payload_is_locked = False
         self.sensor_bias = np.zeros(6)
         self.tcp = np.zeros(6)
@@ -123,6 +129,8 @@ class Controller:
         self._servo: ServoConfig | None = None
         self._braking: Iterator[np.ndarray] | None = None
         self._sensor_zero = np.zeros(6)
+        if self.config.is_zeroed:
+            self._sensor_zero = -self._payload_wrench(Posture(robot.state.positions).X_BF[:3, :3])
         self._simulation_has_stopped = False
         self._show()
 

@@ -19,6 +19,11 @@ class StationRobot:
 
     Only the compliance controller is missing: that is the client's. All targets go through the
     scenario's servo, planned motions too, which therefore lag by `ServoConfig.lag`.
+
+    Attributes:
+        payload: Mass of all beyond the flange, kg.
+        payload_cog: Its centre in the flange [3], m.
+        is_zeroed: Whether the sensor starts at zero, the tool's weight included.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -42,6 +47,15 @@ class StationRobot:
         self._arm_context = arm_controller.GetMyContextFromRoot(context)
         self._plant_context = station.plant.GetMyContextFromRoot(context)
         self._sensor_context = station.sensor.GetMyMutableContextFromRoot(context)
+        tool = station.plant.CalcSpatialInertia(
+            self._plant_context,
+            station.robot.sensor_weld.frame_on_parent(),
+            [station.robot.sensor_weld.child_body().index(), station.robot.knife.index()],
+        )
+        self.payload = float(tool.get_mass())
+        x, y, z = tool.get_com().tolist()
+        self.payload_cog = (x, y, z)
+        self.is_zeroed = scenario.sensor.tare_at_start
         self._cycles = 0
         self._other_servo: ServoConfig | None = None
         self.gravity = (
