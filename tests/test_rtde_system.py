@@ -84,7 +84,7 @@ def test_the_watchdog_is_set_before_the_first_target_and_the_arm_follows(robot):
         ({"time": 105.0}, "state_age", False),
         ({"connected": False}, "link", False),
         ({"accepts": False}, "link", False),
-        ({"call_time": 0.12}, "link", False),
+        ({"call_time": 0.3}, "link", False),
         ({"wrench": [0.0, 0.0, 60.0, 0.0, 0.0, 0.0]}, "force", True),
         ({"wrench": [np.nan] * 6}, "measurement", True),
     ],

@@ -19,7 +19,7 @@ __all__ = ["LinkStatus", "RobotLink"]
 POLL = 1e-4
 """Pause between two looks for new data, s."""
 SLOW_CALL = 0.05
-"""A call that sends a target and takes longer has reconnected or stands, s."""
+"""A call that sends a target and takes longer has reconnected or stands, controller s."""
 FIRST_DATA = 3.0
 STOP_TIME = 2.0
 """How long a stop at the end may take, s."""
@@ -281,7 +281,7 @@ class RobotLink:
         took = clock.perf_counter() - begin
         if not accepted:
             self._latch_fault("link", "the robot's program did not take a target")
-        elif took > SLOW_CALL:
+        elif took > SLOW_CALL / self._pace:
             self._latch_fault("link", f"sending a target took {took:.3g} s: the link reconnected")
         return True
 
