@@ -273,6 +273,15 @@ def test_only_what_adheres_pulls_the_knife_back_and_the_viscous_part_goes_with_t
     assert fast - slow == pytest.approx(5e4 * 0.02, rel=0.05)
 
 
+def test_what_adheres_grows_with_the_root_of_the_speed_where_its_exponent_is_a_half():
+    """By the formula of `Adhesion`; the slope at rest is finite."""
+    adhesion = Adhesion(viscosity=3e5, exponent=0.5)
+    for speed in (0.005, 0.02, 0.08):
+        expected = 3e5 * speed * ((speed / 0.02) ** 2 + 0.01) ** -0.25
+        assert -withdrawal(adhesion, speed)[0].mean() == pytest.approx(expected, rel=0.05)
+    assert adhesion.steepest == pytest.approx(0.01**-0.25)
+
+
 @pytest.mark.parametrize("exponent", [0.6, 1.5])
 @pytest.mark.parametrize("ratio", [0.0, 1.0, 3.0])
 def test_the_force_of_a_draw_has_the_exponent(exponent, ratio):

@@ -59,7 +59,7 @@ EFFECTS = Effects(
     core=Core(4e-3, 1e-3, 0.7, 0.8),
     centre=Centre(8e-3, 2e-3, 1.5),
     bluntness=Bluntness(50.0, 2e-3),
-    adhesion=Adhesion(300.0, 3000.0),
+    adhesion=Adhesion(300.0, 3000.0, 0.6),
     slice_push=SlicePush(0.8),
 )
 

@@ -10,6 +10,7 @@ import numpy as np
 from sliceit_drake.configuration import ConfigurationError, quantity
 
 __all__ = [
+    "LINEAR_BELOW",
     "Adhesion",
     "Bluntness",
     "Centre",
@@ -22,6 +23,10 @@ __all__ = [
     "Slip",
     "ToughnessRate",
 ]
+
+
+LINEAR_BELOW = 0.1
+"""Share of its reference speed below which adhesion goes linearly with the speed."""
 
 
 @dc.dataclass
@@ -151,11 +156,25 @@ class Bluntness:
 class Adhesion:
     """Shear of food that sticks to the flanks where it touches them, however light the pressure.
 
-    It holds like friction up to `stress`, then slides; `viscosity` adds to it while it slides.
+    It holds like friction up to `stress`, then slides; while it slides at speed v, `viscosity` adds
+    viscosity reference_speed (v / reference_speed)^exponent. Adhesion between soft solids grows
+    with a power of about a half of the speed (Maugis and Barquins, J. Phys. D 11, 1989, 1978: 0.6).
+    Below a tenth of the reference it is linear, so that it has a slope at rest.
     """
 
     stress: float = quantity(0.0, "Pa", low=0.0, high=1e6, doc="Shear at which it slides.")
-    viscosity: float = quantity(0.0, "Pa s/m", low=0.0, high=1e7, doc="Stress per sliding speed.")
+    viscosity: float = quantity(
+        0.0, "Pa s/m", low=0.0, high=1e7, doc="Stress per sliding speed, at the reference."
+    )
+    exponent: float = quantity(1.0, "", low=0.1, high=1.0, doc="Of the speed; 1 for linear.")
+    reference_speed: float = quantity(
+        0.02, "m/s", low=1e-4, high=1.0, doc="Speed at which the viscosity is meant."
+    )
+
+    @property
+    def steepest(self) -> float:
+        """Largest slope of the stress by the speed, over the viscosity."""
+        return float(LINEAR_BELOW ** (self.exponent - 1.0))
 
 
 @dc.dataclass

@@ -38,6 +38,8 @@ PARAMETERS = (
     "skin_toughness",
     "adhesion",
     "flank_viscosity",
+    "flank_exponent",
+    "flank_speed",
     "initiation",
     "initiation_depth",
 )

@@ -254,6 +254,8 @@ def _derived(
         "skin_toughness": effects.skin.toughness,
         "adhesion": effects.adhesion.stress,
         "flank_viscosity": effects.adhesion.viscosity,
+        "flank_exponent": effects.adhesion.exponent,
+        "flank_speed": effects.adhesion.reference_speed,
         "initiation": effects.bluntness.grown,
         "initiation_depth": effects.bluntness.depth,
     }
@@ -268,7 +270,7 @@ def _derived(
     per_point = tables.area * (2.0 * bond + 2.0 * flank) + 0.5 * unloading
     contact = 2.0 * parameters["board_stiffness"] * g.board_area
     viscous = 2.0 * material.damping_time * bulk
-    dragged = parameters["flank_viscosity"] * tables.area
+    dragged = effects.adhesion.viscosity * effects.adhesion.steepest * tables.area
     for side in range(2):
         for end in range(2):
             node, share = g.point_nodes[:, 2 * side + end], g.point_weights[:, end]

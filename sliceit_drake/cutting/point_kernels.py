@@ -5,6 +5,7 @@ from typing import Any
 
 import warp as wp
 
+from sliceit_drake.cutting.effects import LINEAR_BELOW
 from sliceit_drake.cutting.kernel_types import kernel_types
 
 __all__ = ["point_kernels"]
@@ -22,9 +23,11 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
     RATE_EXPONENT, REFERENCE_SPEED = t.RATE_EXPONENT, t.REFERENCE_SPEED
     SLICE_PUSH_EXPONENT, SKIN_TOUGHNESS = t.SLICE_PUSH_EXPONENT, t.SKIN_TOUGHNESS
     ADHESION, FLANK_VISCOSITY = t.ADHESION, t.FLANK_VISCOSITY
+    FLANK_EXPONENT, FLANK_SPEED = t.FLANK_EXPONENT, t.FLANK_SPEED
     INITIATION, INITIATION_DEPTH = t.INITIATION, t.INITIATION_DEPTH
     # Without gradients, an effect that is off costs nothing; with them its derivative is wanted.
     ALL = wp.constant(gradients)
+    LINEAR = wp.constant(real(LINEAR_BELOW**2))
 
     @wp.func
     def intact_share(parted: real, onset: real, failure: real):
@@ -119,6 +122,10 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
                 anchored, slid = slide(old, sliding * dt, stiffness * area, limit)
                 new_slip = anchored
                 viscosity = P[cut, FLANK_VISCOSITY] * area
+                if ALL or viscosity > real(0.0):
+                    ratio = wp.dot(sliding, sliding) / (P[cut, FLANK_SPEED] * P[cut, FLANK_SPEED])
+                    power = real(0.5) * (P[cut, FLANK_EXPONENT] - real(1.0))
+                    viscosity = viscosity * wp.pow(ratio + LINEAR, power)
                 friction_force = -stiffness * area * anchored - viscosity * sliding
                 lost = (
                     lost

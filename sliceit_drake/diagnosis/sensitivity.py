@@ -61,6 +61,8 @@ __all__ = [
 Progress = Callable[[int, int], None]
 """Called with the number of simulated slices, and of those that must be."""
 
+FINER = 1.5
+"""Elements along an edge of the mesh of the prediction, relative to that of its changes."""
 LOG_STEP = 0.05
 """Change of the logarithm of a base parameter."""
 LINEAR_STEP = 0.02
@@ -240,7 +242,7 @@ def sensitivities(
     causes: Sequence[Cause],
     point: Point | None = None,
     meshing: Meshing | None = None,
-    finer: float | None = float(__import__("os").environ.get("FINER", "1.5")),
+    finer: float | None = FINER,
     clock: Clock | None = None,
     cache: Path | None = None,
     workers: int | None = None,

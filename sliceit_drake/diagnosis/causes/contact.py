@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sliceit_drake.cutting.effects import Adhesion, Bluntness
+from sliceit_drake.cutting.effects import Bluntness
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan, SliceFacts
 from sliceit_drake.diagnosis.causes.material import tougher
@@ -43,7 +43,8 @@ class StaticFriction(Cause):
 
 
 class FlankAdhesion(Cause):
-    """Food that sticks to the flanks: a shear stress, and one that grows with the speed."""
+    """Food that sticks to the flanks: a shear stress, and one that grows with a power of the speed,
+    in proportion or as its root."""
 
     name = "adhesion"
     family = "knife and contact"
@@ -52,6 +53,7 @@ class FlankAdhesion(Cause):
         CauseParameter("stress", "Pa", 400.0, low=0.0, high=1e5),
         CauseParameter("viscosity", "Pa s/m", 1.5e4, low=0.0, high=1e6),
     )
+    scan = Scan("exponent", "", (0.5, 1.0))
     absorbed_by = ("effects.adhesion.stress", "effects.adhesion.viscosity")
     signature = "as friction without pressure; pulls at the end of a withdrawal, more the faster"
     experiment = "retract"
@@ -61,7 +63,12 @@ class FlankAdhesion(Cause):
     ) -> CuttingModel:
         """More adhesion."""
         old = model.effects.adhesion
-        adhesion = Adhesion(old.stress + values["stress"], old.viscosity + values["viscosity"])
+        adhesion = dc.replace(
+            old, stress=old.stress + values["stress"], viscosity=old.viscosity + values["viscosity"]
+        )
+        # At its null nothing may change, and the null has no exponent.
+        if values["viscosity"] != 0.0:
+            adhesion = dc.replace(adhesion, exponent=values["exponent"])
         return model.derive(effects=dc.replace(model.effects, adhesion=adhesion))
 
 
