@@ -2,7 +2,6 @@
 
 import argparse
 import logging
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -83,6 +82,7 @@ def run(options: argparse.Namespace) -> int:
 
     from sliceit_drake.diagrams.scenario import load_scenario
     from sliceit_drake.stand_in.protocol import load_protocol, schedule
+    from sliceit_drake.stand_in.session import is_recorded
     from sliceit_drake.stand_in.station_cuts import scenario_of_cut
 
     protocol = load_protocol(str(find_file(options.protocol, "protocol", DEFAULT)))
@@ -90,7 +90,9 @@ def run(options: argparse.Namespace) -> int:
     directory = options.output or Path("output") / protocol.name
     directory.mkdir(parents=True, exist_ok=True)
     specimens = schedule(protocol, np.random.default_rng([options.seed, 0]))[: options.first]
-    for specimen in _left(specimens, directory):
+    for specimen in specimens:
+        if is_recorded(specimen, directory):
+            continue
         scenario = scenario_of_cut(protocol, specimen, station)
         print(f"Slice {specimen.index + 1} of {len(specimens)}: {specimen.condition.label}")
         if options.host:
@@ -107,31 +109,6 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _name(index: int) -> str:
-    return f"slice_{index:03d}"
-
-
-def _left(specimens: "list[Specimen]", directory: Path) -> "Iterator[Specimen]":
-    """The slices that are not there yet.
-
-    Raises:
-        ConfigurationError: The folder holds another session.
-    """
-    from sliceit_drake.configuration import ConfigurationError, load_yaml
-    from sliceit_drake.records.metadata import SliceMetadata
-
-    for specimen in specimens:
-        file, label = directory / f"{_name(specimen.index)}.yaml", specimen.condition.label
-        if not file.exists():
-            yield specimen
-        elif (found := load_yaml(SliceMetadata, file).condition) != label:
-            raise ConfigurationError(
-                f"is a slice of {found!r}; this protocol and seed have {label!r} there",
-                source=str(file),
-                fix="Give another folder, or the protocol and --seed that it was begun with.",
-            )
-
-
 def _cut_simulated(scenario: "Scenario") -> "Run":
     from sliceit_drake.diagrams.run import prepare_run, simulate
 
@@ -144,6 +121,8 @@ def _cut_on_robot(
     options: argparse.Namespace, scenario: "Scenario", specimen: "Specimen", directory: Path
 ) -> "Run | None":
     """The run; None if the robot was not ready or the operator did not confirm."""
+    from sliceit_drake.records.metadata import slice_name
+
     condition = specimen.condition
     what = "nothing, the bare board" if condition.without_food else "a fresh piece of food"
     extra = [" peeled"] * condition.peeled
@@ -151,11 +130,12 @@ def _cut_on_robot(
     extra += [f" with {condition.weight:g} kg hung on the knife"] * (condition.weight > 0.0)
     print(f"Put under the knife: {what}{','.join(extra)}. Stand back.")
     config = robot_config(options)
-    return run_confirmed(options, scenario, config, directory / _name(specimen.index))
+    return run_confirmed(options, scenario, config, directory / slice_name(specimen.index))
 
 
 def _write(made: "Run", specimen: "Specimen", directory: Path, is_real: bool) -> None:
     from sliceit_drake.diagrams.run_record import slice_record_of
+    from sliceit_drake.records.metadata import slice_name
     from sliceit_drake.records.slice_record import write_record
 
     provenance = "UR5e through RTDE." if is_real else "Simulated station, sliceit collect."
@@ -163,5 +143,5 @@ def _write(made: "Run", specimen: "Specimen", directory: Path, is_real: bool) ->
         made, provenance, index=specimen.index, condition=specimen.condition.label
     )
     # A slice that ended early does not count as cut.
-    name = _name(specimen.index) + ("_stopped" if made.stopped else "")
+    name = slice_name(specimen.index) + ("_stopped" if made.stopped else "")
     write_record(record, directory / name)

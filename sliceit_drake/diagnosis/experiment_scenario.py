@@ -18,6 +18,7 @@ from sliceit_drake.cutting.food import Box, Cylinder, Ellipsoid, Food, make_food
 from sliceit_drake.cutting.motion import Motion, MotionPlan, Pose, Segment, Waypoints
 from sliceit_drake.diagnosis.motion_menu import Experiment, Scale
 from sliceit_drake.diagnosis.slices import is_bare
+from sliceit_drake.diagrams.record_facts import shape_facts
 from sliceit_drake.diagrams.scenario import Placement, Preparation, Scenario, Start
 from sliceit_drake.records.metadata import PHASE_LABELS, FoodFacts, NominalMotion, Phase, ToolFacts
 from sliceit_drake.records.slice_record import SliceRecord
@@ -281,19 +282,12 @@ def _food_facts(scenario: Scenario, facts: FoodFacts) -> FoodFacts:
     food, prepared = scenario.food, scenario.preparation or Preparation()
     if not isinstance(food, Food):
         return FoodFacts(name="none")
-    X_WF, shape = scenario.X_WF(), food.shape
-    size = None
-    if isinstance(shape, Cylinder):
-        size = [shape.diameter, shape.length, shape.diameter]
-    elif isinstance(shape, Box):
-        size = list(shape.size)
-    elif isinstance(shape, Ellipsoid):
-        size = list(shape.diameters)
+    X_WF, (shape, size) = scenario.X_WF(), shape_facts(food)
     x, y, _ = food.cut_point
     turn = float(np.arctan2(-food.cut_normal[0], food.cut_normal[1]))
     return dc.replace(
         facts,
-        shape=facts.shape if size is None else type(shape).__name__.lower(),
+        shape=facts.shape if size is None else shape,
         size=size,
         peeled=prepared.peeled,
         position=(X_WF.translation() + X_WF.rotation().matrix() @ [x, y, 0.0]).tolist(),

@@ -5,17 +5,18 @@ import datetime
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sliceit_drake.cutting.food import Box, Cylinder, Ellipsoid, Food
+from sliceit_drake.cutting.food import Food
+from sliceit_drake.diagrams.record_facts import food_support, knife_facts, shape_facts
 from sliceit_drake.diagrams.run import Run
 from sliceit_drake.records.metadata import (
     PHASE_LABELS,
     FoodFacts,
-    KnifeFacts,
     NominalMotion,
     Phase,
     SensorFacts,
     SliceMetadata,
     WrenchFacts,
+    slice_name,
 )
 from sliceit_drake.records.slice_record import SliceRecord
 
@@ -51,7 +52,6 @@ def slice_record_of(
     force = np.einsum("nij,nj->ni", R_WS, table.vector("sensor_wrench_f"))
     moment = np.einsum("nij,nj->ni", R_WS, table.vector("sensor_wrench_m"))
     arm = R_WK @ X_KS.translation()
-    knife = scenario.knife
     motion = NominalMotion(
         phases=[
             Phase(label if label in PHASE_LABELS else "other", begin, min(end, float(time[-1])))
@@ -65,20 +65,12 @@ def slice_record_of(
             motion.draw_ratio = getattr(segment, "draw_ratio", 0.0)
             break
     metadata = SliceMetadata(
-        name=f"slice_{index:03d}",
+        name=slice_name(index),
         date=datetime.date.today().isoformat(),
         provenance=provenance + (f" Ended early: {run.stopped}" if run.stopped else ""),
         food=_food_facts(run),
         board_height=scenario.board.height,
-        knife=KnifeFacts(
-            name="straight double bevel",
-            length=knife.length,
-            height=knife.height,
-            spine_thickness=knife.spine_thickness,
-            edge_thickness=knife.edge_thickness,
-            tip_height=knife.tip_height,
-            edge_radius=knife.edge_radius,
-        ),
+        knife=knife_facts(scenario.knife),
         motion=motion,
         wrench=WrenchFacts(includes=["food", "board", "inertia"], tared="yes"),
         sensor=SensorFacts(
@@ -109,19 +101,13 @@ def _food_facts(run: Run) -> FoodFacts:
     scenario, food = run.scenario, run.scenario.food
     if not isinstance(food, Food):
         return FoodFacts(name="none")
-    shape, size, kind = food.shape, None, "unknown"
-    if isinstance(shape, Cylinder):
-        kind, size = "cylinder", [shape.diameter, shape.length, shape.diameter]
-    elif isinstance(shape, Box):
-        kind, size = "box", list(shape.size)
-    elif isinstance(shape, Ellipsoid):
-        kind, size = "ellipsoid", list(shape.diameters)
+    shape, size = shape_facts(food)
     prepared = scenario.preparation
     return FoodFacts(
         name=food.name,
-        shape=kind,
+        shape=shape,
         size=size,
-        support="clamped_slab" if food.held_sides == "both" else "end_slice",
+        support=food_support(food),
         peeled=prepared.peeled if prepared else False,
         position=scenario.X_WF().translation().tolist(),
         yaw=scenario.placement.yaw,

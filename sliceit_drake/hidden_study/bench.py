@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sliceit_drake.diagrams.calibrated_food import CalibratedFood
+from sliceit_drake.records.metadata import slice_name
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.effect import Effect, Series
@@ -106,7 +107,7 @@ class QuietBench:
                 found[label] = session.record(k)
             metadata = dc.replace(
                 found[label].metadata,
-                name=f"slice_{k:03d}",
+                name=slice_name(k),
                 slice_index=k,
                 knife_slices=self.protocol.knife_slices + k,
             )

@@ -19,6 +19,7 @@ __all__ = [
     "SliceMetadata",
     "ToolFacts",
     "WrenchFacts",
+    "slice_name",
 ]
 
 PHASE_LABELS = (
@@ -259,3 +260,8 @@ class SliceMetadata:
                     fix="Sort the phases; they must not overlap.",
                 )
             previous = phase.end
+
+
+def slice_name(index: int) -> str:
+    """Name of a record by its order in the session."""
+    return f"slice_{index:03d}"

@@ -13,17 +13,17 @@ import numpy as np
 import warp
 
 from sliceit_drake.configuration import ConfigurationError, load_yaml
-from sliceit_drake.cutting.food import Box, Cylinder, Ellipsoid, Food
+from sliceit_drake.diagrams.record_facts import food_support, knife_facts, shape_facts
 from sliceit_drake.records.metadata import (
     PHASE_LABELS,
     FoodFacts,
-    KnifeFacts,
     NominalMotion,
     Phase,
     SensorFacts,
     SliceMetadata,
     ToolFacts,
     WrenchFacts,
+    slice_name,
 )
 from sliceit_drake.records.slice_record import SliceRecord, write_record
 from sliceit_drake.stand_in.curve_world import CurveWorld
@@ -34,7 +34,7 @@ from sliceit_drake.stand_in.registry import make_effect
 from sliceit_drake.stand_in.sensor import measured
 from sliceit_drake.stand_in.world import World
 
-__all__ = ["WORLDS", "Session", "record_session"]
+__all__ = ["WORLDS", "Session", "is_recorded", "record_session"]
 
 WORLDS = ("finite_elements", "curves")
 
@@ -139,21 +139,13 @@ def _food_pose(protocol: Protocol) -> tuple[np.ndarray, np.ndarray]:
 
 def _metadata(protocol: Protocol, specimen: Specimen, series: Series) -> SliceMetadata:
     """What the person at the bench knows."""
-    condition, knife, sensor = specimen.condition, protocol.knife, protocol.sensor
+    condition, sensor = specimen.condition, protocol.sensor
     metadata = SliceMetadata(
-        name=_name(specimen.index),
+        name=slice_name(specimen.index),
         provenance=PROVENANCE,
         food=_food_facts(protocol, specimen),
         board_height=protocol.board.height,
-        knife=KnifeFacts(
-            name="straight double bevel",
-            length=knife.length,
-            height=knife.height,
-            spine_thickness=knife.spine_thickness,
-            edge_thickness=knife.edge_thickness,
-            tip_height=knife.tip_height,
-            edge_radius=knife.edge_radius,
-        ),
+        knife=knife_facts(protocol.knife),
         motion=_nominal_motion(series),
         wrench=WrenchFacts(tared="yes"),
         sensor=SensorFacts(
@@ -179,16 +171,12 @@ def _metadata(protocol: Protocol, specimen: Specimen, series: Series) -> SliceMe
     return metadata
 
 
-def _name(index: int) -> str:
-    return f"slice_{index:03d}"
-
-
 def _food_facts(protocol: Protocol, specimen: Specimen) -> FoodFacts:
     condition = specimen.condition
     if condition.without_food:
         return FoodFacts(name="none")
     food = scaled_food(protocol.food, condition.width_scale)
-    shape, size = _shape(food)
+    shape, size = shape_facts(food)
     R_WF, p_WF = _food_pose(protocol)
     x, y, _ = food.cut_point
     normal = food.cut_normal
@@ -196,22 +184,11 @@ def _food_facts(protocol: Protocol, specimen: Specimen) -> FoodFacts:
         name=food.name,
         shape=shape,
         size=size,
-        support="clamped_slab" if food.held_sides == "both" else "end_slice",
+        support=food_support(food),
         peeled=condition.peeled,
         position=(p_WF + R_WF @ [x, y, 0.0]).tolist(),
         yaw=protocol.placement.yaw + float(np.arctan2(-normal[0], normal[1])),
     )
-
-
-def _shape(food: Food) -> tuple[str, list[float] | None]:
-    shape = food.shape
-    if isinstance(shape, Cylinder):
-        return "cylinder", [shape.diameter, shape.length, shape.diameter]
-    if isinstance(shape, Box):
-        return "box", list(shape.size)
-    if isinstance(shape, Ellipsoid):
-        return "ellipsoid", list(shape.diameters)
-    return "unknown", None
 
 
 def _nominal_motion(series: Series) -> NominalMotion:
@@ -273,7 +250,7 @@ def record_session(
     hidden = [make_effect(text) for text in effects]
     seed = secrets.randbits(62) if seed is None else seed
     session = Session(protocol, hidden, world, seed, settings)
-    left = [k for k in range(len(session)) if not _is_there(session, output, k)]
+    left = [k for k in range(len(session)) if not is_recorded(session.specimens[k], output)]
     done = len(session) - len(left)
     if progress is not None:
         progress(done, len(session))
@@ -281,14 +258,19 @@ def record_session(
         done += 1
         if progress is not None:
             progress(done, len(session))
-    return [output / f"{_name(k)}.csv" for k in range(len(session))]
+    return [output / f"{slice_name(k)}.csv" for k in range(len(session))]
 
 
-def _is_there(session: Session, output: FilePath, index: int) -> bool:
-    file = output / f"{_name(index)}.yaml"
+def is_recorded(specimen: Specimen, folder: FilePath) -> bool:
+    """Whether a folder has the record of a slice.
+
+    Raises:
+        ConfigurationError: It has that of another session.
+    """
+    file, label = folder / f"{slice_name(specimen.index)}.yaml", specimen.condition.label
     if not file.exists():
         return False
-    found, label = load_yaml(SliceMetadata, file), session.specimens[index].condition.label
+    found = load_yaml(SliceMetadata, file)
     if found.condition != label:
         raise ConfigurationError(
             f"is a slice of {found.condition!r}; this protocol and seed have {label!r} there",
@@ -301,7 +283,7 @@ def _is_there(session: Session, output: FilePath, index: int) -> bool:
 def _write(session: Session, output: FilePath, index: int) -> int:
     # Two files make a record; a run that is killed must not leave half of one.
     with tempfile.TemporaryDirectory(dir=output, prefix=".writing_") as folder:
-        made = write_record(session.record(index), FilePath(folder) / _name(index))
+        made = write_record(session.record(index), FilePath(folder) / slice_name(index))
         for file in (made, made.with_suffix(".yaml")):
             os.replace(file, output / file.name)
     return index
