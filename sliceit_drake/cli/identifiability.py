@@ -84,33 +84,12 @@ def nominal_records(protocol: "Protocol", prefix: str = "") -> "list[SliceRecord
         prefix: Of the records' names.
     """
     from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
-    from sliceit_drake.stand_in.protocol import Variation
+    from sliceit_drake.stand_in.quiet import records_of_conditions, without_noise
     from sliceit_drake.stand_in.session import Session
 
-    quiet = dc.replace(
-        protocol.sensor,
-        force_noise=0.0,
-        torque_noise=0.0,
-        force_bias=0.0,
-        torque_bias=0.0,
-        force_drift=0.0,
-        torque_drift=0.0,
-        delay=0.0,
-    )
-    same = Variation(toughness=0.0, stiffness=0.0, friction=0.0, height=0.0)
     settings = FiniteElementSettings(refinement=0.5, time_step=COARSE_STEP, travel=2e-4)
-    session = Session(dc.replace(protocol, sensor=quiet, variation=same), seed=0, settings=settings)
-    records: list[SliceRecord] = []
-    made: dict[str, SliceRecord] = {}
-    for k, specimen in enumerate(session.specimens):
-        label = specimen.condition.label
-        if label not in made:
-            made[label] = session.record(k)
-        metadata = dc.replace(
-            made[label].metadata, name=f"{prefix}{k:03d}", slice_index=k, knife_slices=k
-        )
-        records.append(dc.replace(made[label], metadata=metadata))
-    return records
+    session = Session(without_noise(protocol, delay=0.0), seed=0, settings=settings)
+    return records_of_conditions(session, name=lambda k: f"{prefix}{k:03d}")
 
 
 def study(

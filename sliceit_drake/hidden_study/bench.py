@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from sliceit_drake.diagrams.calibrated_food import CalibratedFood
-from sliceit_drake.records.metadata import slice_name
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.effect import Effect, Series
 from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
-from sliceit_drake.stand_in.protocol import Protocol, Specimen, Variation, load_protocol
+from sliceit_drake.stand_in.protocol import Protocol, Specimen, load_protocol
+from sliceit_drake.stand_in.quiet import records_of_conditions, without_noise
 from sliceit_drake.stand_in.session import Session
 from sliceit_drake.stand_in.world import World
 
@@ -67,19 +67,7 @@ class QuietBench:
     def __init__(
         self, protocol: Protocol, seed: int, settings: FiniteElementSettings = WORLD
     ) -> None:
-        sensor = dc.replace(
-            protocol.sensor,
-            force_noise=0.0,
-            torque_noise=0.0,
-            force_bias=0.0,
-            torque_bias=0.0,
-            force_drift=0.0,
-            torque_drift=0.0,
-            force_resolution=0.0,
-            torque_resolution=0.0,
-        )
-        alike = Variation(toughness=0.0, stiffness=0.0, friction=0.0, height=0.0)
-        self.protocol = dc.replace(protocol, sensor=sensor, variation=alike)
+        self.protocol = without_noise(protocol, force_resolution=0.0, torque_resolution=0.0)
         self.seed, self.settings = seed, settings
         self._untouched: dict[str, Series] = {}
 
@@ -98,21 +86,7 @@ class QuietBench:
         session = Session(self.protocol, effects, seed=self.seed, settings=self.settings)
         if all(_acts_afterwards(effect) for effect in effects):
             session.world = _Replay(session.world, self._untouched)
-        once = not set(names) & set(PER_SLICE)
-        found: dict[str, SliceRecord] = {}
-        out = []
-        for k, specimen in enumerate(session.specimens):
-            label = specimen.condition.label
-            if label not in found or not once:
-                found[label] = session.record(k)
-            metadata = dc.replace(
-                found[label].metadata,
-                name=slice_name(k),
-                slice_index=k,
-                knife_slices=self.protocol.knife_slices + k,
-            )
-            out.append(dc.replace(found[label], metadata=metadata))
-        return out
+        return records_of_conditions(session, once=not set(names) & set(PER_SLICE))
 
 
 def _acts_afterwards(effect: Effect) -> bool:

@@ -38,7 +38,7 @@ from sliceit_drake.hidden_study.bench import (
 )
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.stand_in import effect as effect_module
-from sliceit_drake.stand_in import finite_element_world, sensor, session, world
+from sliceit_drake.stand_in import finite_element_world, quiet, sensor, session, world
 from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
 from sliceit_drake.stand_in.registry import EFFECTS, make_effect
 from sliceit_drake.stand_in.session import Session
@@ -158,7 +158,7 @@ class ProtocolSizes:
         if self.cache is None:
             return None
         h = hashlib.sha256(cutting_source())
-        modules = (bench, effect_module, finite_element_world, sensor, session, world)
+        modules = (bench, effect_module, finite_element_world, quiet, sensor, session, world)
         sources = [inspect.getfile(m) for m in modules]
         for source in [*sources, inspect.getfile(EFFECTS[effect])]:
             h.update(Path(source).read_bytes())
