@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sliceit_drake.diagnosis.replicates import at_times, replicates
+
 if TYPE_CHECKING:
     from sliceit_drake.diagnosis.sensitivity import RecordSensitivity
 
@@ -48,23 +50,14 @@ def unlike_others(records: "Sequence[RecordSensitivity]") -> list[np.ndarray]:
 
     The median of three does not see what is in one of them. With fewer nothing is taken off.
     """
-    groups: dict[str, list[int]] = {}
-    for k, record in enumerate(records):
-        groups.setdefault(record.condition or record.name, []).append(k)
     out = [record.residual for record in records]
-    for members in groups.values():
+    for members in replicates(records).values():
         if len(members) < 3:
             continue
         first = records[members[0]]
         since = first.time - first.time[0]
-        common = np.median([_at(records[k], records[k].residual, since) for k in members], axis=0)
+        own = {k: records[k].time - records[k].time[0] for k in members}
+        common = np.median([at_times(records[k].residual, own[k], since) for k in members], axis=0)
         for k in members:
-            own = records[k].time - records[k].time[0]
-            taken = [np.interp(own, since, column) for column in common.T]
-            out[k] = out[k] - np.column_stack(taken)
+            out[k] = out[k] - at_times(common, since, own[k])
     return out
-
-
-def _at(record: "RecordSensitivity", values: np.ndarray, since: np.ndarray) -> np.ndarray:
-    own = record.time - record.time[0]
-    return np.column_stack([np.interp(since, own, column) for column in values.T])

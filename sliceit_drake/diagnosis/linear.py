@@ -17,12 +17,8 @@ from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
-from sliceit_drake.diagnosis.noise_levels import (
-    ChannelNoise,
-    differences,
-    estimate_noise,
-    replicates,
-)
+from sliceit_drake.diagnosis.noise_levels import ChannelNoise, differences, estimate_noise
+from sliceit_drake.diagnosis.replicates import replicates
 from sliceit_drake.diagnosis.sensitivity import RecordSensitivity, Sensitivities
 
 __all__ = ["LinearProblem", "Moments", "integrate_out", "scaled_inverse"]

@@ -12,9 +12,10 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from sliceit_drake.calibration.noise import MarkovCovariance
+from sliceit_drake.diagnosis.replicates import at_times, replicates
 from sliceit_drake.diagnosis.sensitivity import RecordSensitivity
 
-__all__ = ["ChannelNoise", "differences", "estimate_noise", "replicates"]
+__all__ = ["ChannelNoise", "differences", "estimate_noise"]
 
 LAGS = 40
 LEAST_ROWS = 60
@@ -53,14 +54,6 @@ class ChannelNoise:
         """
         white = np.hypot(self.white, model_error)
         return MarkovCovariance(np.diff(time), self.ar, self.tau, white).solve(columns)
-
-
-def replicates(records: Sequence[RecordSensitivity]) -> dict[str, list[int]]:
-    """Numbers of the records of each condition."""
-    out: dict[str, list[int]] = {}
-    for k, record in enumerate(records):
-        out.setdefault(record.condition or record.name, []).append(k)
-    return out
 
 
 def estimate_noise(
@@ -111,8 +104,8 @@ def differences(
             values.append(r.residual[:count])
             columns.append(r.columns[:count][:, :, own])
         else:
-            values.append(_on_grid(r.residual, r.time - r.time[0], grid))
-            columns.append(_on_grid(r.columns[:, :, own], r.time - r.time[0], grid))
+            values.append(at_times(r.residual, r.time - r.time[0], grid))
+            columns.append(at_times(r.columns[:, :, own], r.time - r.time[0], grid))
     mean = np.mean(values, axis=0)
     return [(grid, v - mean, c) for v, c in zip(values, columns, strict=True)]
 
@@ -131,12 +124,6 @@ def _deviations(
             rest = rest - (flat @ fitted).reshape(rest.shape)
         out.append((grid, rest, n / (n - 1.0)))
     return out
-
-
-def _on_grid(values: np.ndarray, time: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    flat = values.reshape(len(values), -1)
-    out = np.column_stack([np.interp(grid, time, column) for column in flat.T])
-    return out.reshape(len(grid), *values.shape[1:])
 
 
 def _roughness(record: RecordSensitivity) -> tuple[np.ndarray, np.ndarray, float]:
