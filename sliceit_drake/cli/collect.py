@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sliceit_drake.cli.hardware import add_robot_arguments, robot_config, run_confirmed
-from sliceit_drake.cli.scenario_argument import find_file
+from sliceit_drake.cli.scenario_argument import add_protocol_argument, find_file, protocol_file
 
 if TYPE_CHECKING:
     from sliceit_drake.diagrams.run import Run
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 __all__ = ["add_parser"]
 
-DEFAULT = "calibration/protocols/rich.yaml"
 STATION = "scenarios/cucumber.yaml"
 
 DESCRIPTION = """\
@@ -48,13 +47,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "protocol",
-        nargs="?",
-        default=DEFAULT,
-        metavar="PROTOCOL",
-        help=f"YAML of a protocol; default {DEFAULT}",
-    )
+    add_protocol_argument(parser)
     parser.add_argument(
         "--station",
         default=STATION,
@@ -85,7 +78,7 @@ def run(options: argparse.Namespace) -> int:
     from sliceit_drake.stand_in.session import is_recorded
     from sliceit_drake.stand_in.station_cuts import scenario_of_cut
 
-    protocol = load_protocol(str(find_file(options.protocol, "protocol", DEFAULT)))
+    protocol = load_protocol(str(protocol_file(options)))
     station = load_scenario(find_file(options.station, "scenario", STATION))
     directory = options.output or Path("output") / protocol.name
     directory.mkdir(parents=True, exist_ok=True)

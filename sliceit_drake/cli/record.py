@@ -4,14 +4,12 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sliceit_drake.cli.scenario_argument import find_file
+from sliceit_drake.cli.scenario_argument import add_protocol_argument, protocol_file
 
 if TYPE_CHECKING:
     from sliceit_drake.stand_in.protocol import Protocol
 
 __all__ = ["add_parser"]
-
-DEFAULT = "calibration/protocols/rich.yaml"
 
 DESCRIPTION = """\
 Record slices on a bench that stands in for a real one, on prescribed knife motions.
@@ -50,13 +48,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "protocol",
-        nargs="?",
-        default=DEFAULT,
-        metavar="PROTOCOL",
-        help=f"YAML of a protocol or a scenario; default {DEFAULT}",
-    )
+    add_protocol_argument(parser, "a protocol or a scenario")
     parser.add_argument(
         "--output", metavar="DIR", type=Path, help="folder of the records; default output/NAME"
     )
@@ -135,7 +127,7 @@ def _protocol(options: argparse.Namespace) -> "Protocol":
     from sliceit_drake.diagrams.scenario import load_scenario
     from sliceit_drake.stand_in.protocol import load_protocol, protocol_of_scenario
 
-    file = find_file(options.protocol, "protocol", DEFAULT)
+    file = protocol_file(options)
     try:
         root = yaml.compose(file.read_text(encoding="utf-8"))
     except yaml.YAMLError as error:

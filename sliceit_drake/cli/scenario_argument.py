@@ -1,4 +1,4 @@
-"""The scenario argument that several commands share."""
+"""The arguments that several commands share: a scenario, a protocol."""
 
 import argparse
 from pathlib import Path
@@ -7,9 +7,16 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from sliceit_drake.diagrams.scenario import Scenario
 
-__all__ = ["add_scenario_arguments", "find_file", "scenario_of"]
+__all__ = [
+    "add_protocol_argument",
+    "add_scenario_arguments",
+    "find_file",
+    "protocol_file",
+    "scenario_of",
+]
 
 DEFAULT = "scenarios/cucumber.yaml"
+PROTOCOL = "calibration/protocols/rich.yaml"
 
 
 def add_scenario_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,6 +54,31 @@ def scenario_of(options: argparse.Namespace) -> "Scenario":
     from sliceit_drake.diagrams.scenario import load_scenario
 
     return load_scenario(find_file(options.scenario, "scenario", DEFAULT), options.set)
+
+
+def add_protocol_argument(parser: argparse.ArgumentParser, kind: str = "a protocol") -> None:
+    """Adds PROTOCOL.
+
+    Args:
+        parser: Of the command.
+        kind: What it may be, for the help.
+    """
+    parser.add_argument(
+        "protocol",
+        nargs="?",
+        default=PROTOCOL,
+        metavar="PROTOCOL",
+        help=f"YAML of {kind}; default {PROTOCOL}",
+    )
+
+
+def protocol_file(options: argparse.Namespace) -> Path:
+    """The file that PROTOCOL names.
+
+    Raises:
+        ConfigurationError: There is none.
+    """
+    return find_file(options.protocol, "protocol", PROTOCOL)
 
 
 def find_file(name: str, kind: str, example: str) -> Path:
