@@ -38,10 +38,6 @@ class ProtocolClasses:
     classes: dict[str, list[str]]
     angles: dict[str, dict[str, float]]
 
-    def angle(self, a: str, b: str) -> float:
-        """Between two causes, the lesser of both directions, degrees."""
-        return min(self.angles[a][b], self.angles[b][a])
-
 
 def protocol_classes(name: str, cache: Path | None = None) -> ProtocolClasses:
     """Computes them from motions without any measurement, as `sliceit study identifiability` does.
