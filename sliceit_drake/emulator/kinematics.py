@@ -1,8 +1,10 @@
 """Kinematics of the UR5e as its controller computes them: poses in UR's "Base", as 6 numbers.
 
 A pose [6] is the position, m, and the rotation vector (axis times angle), rad. This is written from
-the published Denavit-Hartenberg parameters, apart from the Drake model that the simulation moves,
-so that a test can compare the two.
+the published Denavit-Hartenberg parameters, apart on purpose from the model that the simulation
+moves (`systems.ur5e_kinematics`) and from the safety layer's (`hardware.knife_kinematics`): a
+controller has a kinematics of its own, and a wrong length or sign in one of the three is found by
+the tests that hold it against another, not shared by all.
 """
 
 import math
