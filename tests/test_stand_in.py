@@ -228,6 +228,27 @@ def test_what_rubs_on_the_flanks_turns_its_sign_on_withdrawal_and_is_there_in_an
     assert np.abs(change[during(s, "air")]).max() < 1e-6
 
 
+@pytest.mark.parametrize("world", WORLDS)
+def test_what_sticks_to_the_flanks_pulls_where_the_food_is(world):
+    """Far along the blade its moment is that of a force in the middle of the section."""
+    with_it, without = (
+        series(e, "draw", world=world, offset=0.04) for e in ("flank_adhesion:400", "")
+    )
+    change = with_it.other - without.other
+    at = during(with_it, "slice") & (with_it.depth > 21e-3)
+    p_middle = (
+        with_it.p_true[at]
+        + np.cross(change[at, 3:], change[at, :3])
+        / np.einsum("nc,nc->n", change[at, 3:], change[at, 3:])[:, None]
+    )
+    # The point of the line of action that is nearest to Ko; the line runs through the food.
+    direction = change[at, 3:] / np.linalg.norm(change[at, 3:], axis=1)[:, None]
+    middle = np.array([0.0, 0.0, 0.5 * with_it.slice.height])
+    off = np.cross(middle - p_middle, direction)
+    assert with_it.p_true[at, 0].min() > 0.05
+    assert np.linalg.norm(off, axis=1).max() < 3e-3
+
+
 def test_adhesion_halves_when_a_knife_at_the_reference_speed_stops():
     change, s = added("flank_adhesion:400"), series()
     hold = np.flatnonzero(during(s, "hold"))

@@ -229,6 +229,7 @@ class CurveWorld:
             phase=path.phase,
             depth=depth,
             flank=2.0 * section.area * buried,
+            flank_arm=raised,
             cut=np.maximum.accumulate(buried),
             edge=wrenches[0],
             normal=wrenches[1],

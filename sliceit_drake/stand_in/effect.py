@@ -112,6 +112,7 @@ class Series:
         phase: Label of the motion's segment at each time.
         depth: Of the true edge below the top of the food [N], metres.
         flank: Area of both flanks in front of cut food [N], m^2.
+        flank_arm: From Ko to the middle of that area, in F [N, 3], metres.
         cut: Share of the section that is cut [N].
         edge, normal, friction: Of the food by mechanism.
         board: Of the board.
@@ -127,6 +128,7 @@ class Series:
     phase: list[str]
     depth: np.ndarray
     flank: np.ndarray
+    flank_arm: np.ndarray
     cut: np.ndarray
     edge: np.ndarray
     normal: np.ndarray

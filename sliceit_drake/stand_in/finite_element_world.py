@@ -80,7 +80,9 @@ class _Section:
         tables, s = model.tables, points[:, 1, None] - self._height
         grid = np.linspace(-tables.reach, tables.reach, tables.width.shape[1])
         above = [np.interp(at, grid, row) for at, row in zip(s, tables.fraction, strict=True)]
-        self._above = np.asarray(tables.area @ np.array(above))
+        part = tables.area[:, None] * np.array(above)
+        self._above = part.sum(0)
+        self._middle = (points.T @ part / np.maximum(self._above, 1e-9)).T
         carried = [
             np.interp(at, grid, row, left=0.0, right=0.0)
             for at, row in zip(s, tables.width, strict=True)
@@ -116,6 +118,12 @@ class _Section:
         """Area of the section above heights in C, m^2."""
         area = np.interp(height, self._height, self._above)
         return np.where(height < self.model.top, area, 0.0)
+
+    def middle_above(self, height: np.ndarray) -> np.ndarray:
+        """Middle of the section's part above heights in C [N], in F [N, 3], metres."""
+        x, z = (np.interp(height, self._height, self._middle[:, k]) for k in range(2))
+        p_C = np.stack([x, np.zeros_like(x), z], axis=1)
+        return np.asarray(p_C @ self.model.X_FC_rotation.T + self.model.X_FC_position)
 
 
 def _barycentric(n: int) -> np.ndarray:
@@ -349,9 +357,11 @@ class _Run:
         p_true = path.p[1:] + knife
         geometry = self.section.model
         height = geometry.to_cut_frame(p_true - food)[:, 2]
-        flank, other = np.zeros(len(time)), np.zeros((len(time), 6))
+        flank, arm = np.zeros(len(time)), np.zeros((len(time), 3))
         if self.model is not None:
             flank = 2.0 * self.section.above(height)
+            arm = self.section.middle_above(height) + food - p_true
+        other = np.zeros((len(time), 6))
         weighed = np.array([label == "weight" for label in path.phase])
         other[weighed, 5] -= GRAVITY * self.specimen.condition.weight
         start = path.p[:1] + knife[:1]
@@ -368,6 +378,7 @@ class _Run:
             phase=path.phase,
             depth=geometry.top - height,
             flank=flank,
+            flank_arm=arm,
             cut=resampled(cut, ends, time),
             edge=forces[:, 0],
             normal=forces[:, 1],

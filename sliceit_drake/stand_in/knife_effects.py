@@ -55,7 +55,9 @@ class FlankAdhesion(Effect):
                 keep = np.exp(-speed[k] * series.period / self.turn)
                 direction = keep * direction + (1.0 - keep) * series.v[k] / speed[k]
             stress = self.size * (1.0 + np.sqrt(speed[k] / self.reference))
-            series.other[k, 3:] -= stress * series.flank[k] * direction
+            force = -stress * series.flank[k] * direction
+            series.other[k, :3] += np.cross(series.flank_arm[k], force)
+            series.other[k, 3:] += force
 
 
 class BluntEdge(Effect):
