@@ -17,13 +17,9 @@ from sliceit_drake.configuration import dump_yaml
 from sliceit_drake.cutting.food import Cylinder, Food
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.causes.material import SkinToughness
-from sliceit_drake.diagnosis.one_slice import (
-    KIND,
-    LEVEL,
-    SliceEvidence,
-    estimate_slice_noise,
-    slice_evidence,
-)
+from sliceit_drake.diagnosis.one_slice_evidence import LEVEL, SliceEvidence, slice_evidence
+from sliceit_drake.diagnosis.one_slice_problem import estimate_slice_noise
+from sliceit_drake.diagnosis.one_slice_result import KIND
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.diagnosis.sensitivity import Column, Sensitivities
 from sliceit_drake.diagnosis.slice_fit import depth_blocks, fit_slice

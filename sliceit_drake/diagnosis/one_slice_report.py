@@ -9,7 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sliceit_drake.diagnosis.one_slice import LEVEL, OneSlice
+from sliceit_drake.diagnosis.one_slice_evidence import LEVEL
+from sliceit_drake.diagnosis.one_slice_result import OneSlice
 from sliceit_drake.diagnosis.report import STYLE
 
 __all__ = ["evidence_table", "report_html", "slice_figure"]

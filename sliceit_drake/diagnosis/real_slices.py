@@ -9,8 +9,9 @@ import numpy as np
 from sliceit_drake.diagnosis.cause import EXPERIMENTS
 from sliceit_drake.diagnosis.identifiability import ANGLE
 from sliceit_drake.diagnosis.identifiability_report import short
-from sliceit_drake.diagnosis.one_slice import LEAST_GAIN, LEVEL, REPLICATES, OneSlice
+from sliceit_drake.diagnosis.one_slice_evidence import LEVEL
 from sliceit_drake.diagnosis.one_slice_report import evidence_table, slice_figure
+from sliceit_drake.diagnosis.one_slice_result import LEAST_GAIN, REPLICATES, OneSlice
 
 __all__ = ["SIMULATIONS", "MeasuredSlice", "draw", "page"]
 
