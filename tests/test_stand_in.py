@@ -79,6 +79,7 @@ MOTIONS = {
     "slow": push(0.006),
     "fast": push(0.06),
     "draw": draw(1.0),
+    "far_draw": draw(1.0),
     "air": [
         Hold(0.2, label="air"),
         Waypoints(times=[0.4, 0.8], positions=[[0, 0, 0.0]] * 2, rotations=[[0.4, 0, 0.0]] * 2),
@@ -98,6 +99,7 @@ def bench(motion: str, **condition: object) -> Protocol:
         "board": {"clearance": -0.024, "without_food": True},
         "weight": {"clearance": 0.06, "without_food": True, "weight": 1.5},
         "draw": {"offset": -0.012},
+        "far_draw": {"offset": 0.04},
     }.get(motion, {})
     one = Condition(
         label=motion,
@@ -231,9 +233,7 @@ def test_what_rubs_on_the_flanks_turns_its_sign_on_withdrawal_and_is_there_in_an
 @pytest.mark.parametrize("world", WORLDS)
 def test_what_sticks_to_the_flanks_pulls_where_the_food_is(world):
     """Far along the blade its moment is that of a force in the middle of the section."""
-    with_it, without = (
-        series(e, "draw", world=world, offset=0.04) for e in ("flank_adhesion:400", "")
-    )
+    with_it, without = (series(e, "far_draw", world=world) for e in ("flank_adhesion:400", ""))
     change = with_it.other - without.other
     at = during(with_it, "slice") & (with_it.depth > 21e-3)
     p_middle = (
