@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from sliceit_drake.diagnosis import next_experiment, verdict
+from sliceit_drake.diagnosis import experiment_proposal, next_experiment, verdict
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 
@@ -28,7 +28,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
         (
             "next_experiment",
             f"least {100 * (1.0 - next_experiment.ALIKE_GAIN):g} % as much and are within "
-            f"{verdict.CLASS_ANGLE + next_experiment.MARGIN:g} degrees",
+            f"{verdict.CLASS_ANGLE + experiment_proposal.MARGIN:g} degrees",
         ),
     ],
 )

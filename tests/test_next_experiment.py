@@ -12,6 +12,7 @@ from sliceit_drake.cutting.effects import Effects
 from sliceit_drake.cutting.food import Cylinder
 from sliceit_drake.diagnosis import next_experiment as proposing
 from sliceit_drake.diagnosis.diagnose import Diagnosis, setup_of_food
+from sliceit_drake.diagnosis.experiment_proposal import NEEDED, NextExperiment
 from sliceit_drake.diagnosis.experiment_scenario import (
     experiment_of_record,
     planned_record,
@@ -20,7 +21,7 @@ from sliceit_drake.diagnosis.experiment_scenario import (
 )
 from sliceit_drake.diagnosis.linear import LinearProblem
 from sliceit_drake.diagnosis.motion_menu import Scale, menu
-from sliceit_drake.diagnosis.next_experiment import NEEDED, NextExperiment, next_experiment
+from sliceit_drake.diagnosis.next_experiment import next_experiment
 from sliceit_drake.diagnosis.registry import open_causes
 from sliceit_drake.diagnosis.sensitivity import Sensitivities, sensitivities
 from sliceit_drake.diagnosis.verdict import CLASS_ANGLE, reach_verdict

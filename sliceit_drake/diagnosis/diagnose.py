@@ -17,10 +17,10 @@ from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.clock import Clock
 from sliceit_drake.diagnosis.confirm import Confirmation, confirm
+from sliceit_drake.diagnosis.experiment_proposal import NextExperiment
 from sliceit_drake.diagnosis.held_out import HeldOutGain, held_out_gain, held_out_share
 from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
 from sliceit_drake.diagnosis.linear import LinearProblem
-from sliceit_drake.diagnosis.next_experiment import NextExperiment
 from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import is_users, open_causes
 from sliceit_drake.diagnosis.sensitivity import Sensitivities, sensitivities

@@ -27,6 +27,7 @@ from sliceit_drake.systems.analytic_cutter import AnalyticFood
 __all__ = [
     "experiment_of_record",
     "motion_of_record",
+    "next_knife_slice",
     "planned_record",
     "scale_of",
     "scenario_of",
@@ -44,6 +45,14 @@ GAINS = 200.0
 def template_of(records: Sequence[SliceRecord]) -> SliceRecord:
     """The record whose food, knife and sensor stand for all: the first with food."""
     return next((r for r in records if not is_bare(r)), records[0])
+
+
+def next_knife_slice(records: Sequence[SliceRecord]) -> int:
+    """Slices that the knife has cut since it was sharpened."""
+    return 1 + max(
+        r.metadata.slice_index if r.metadata.knife_slices is None else r.metadata.knife_slices
+        for r in records
+    )
 
 
 def scale_of(setup: CalibrationSetup, records: Sequence[SliceRecord]) -> Scale:
