@@ -8,6 +8,7 @@ not wrong.
 import faulthandler
 import io
 import json
+import re
 
 import numpy as np
 import pytest
@@ -28,8 +29,7 @@ SLICE = """{
     !ConstantSpeed {distance: 0.0292, speed: 0.04, acceleration: 0.5, label: slice},
     !Hold {duration: 0.1, label: hold},
     !Retract {distance: 0.03, speed: 0.1, acceleration: 0.5, label: retract}]}}"""
-PATIENT = """{watchdog: 10.0,
-  limits: {state_age: 0.04, command_age: 0.04, joint_step: 0.04}}"""
+PATIENT = "watchdog: 10.0, limits: {state_age: 0.04, command_age: 0.04, joint_step: 0.04}"
 EMULATED_PACE, CLIENT_PACE = 0.1, 0.02
 
 
@@ -52,13 +52,32 @@ def emulated(scenario=CUCUMBER, overrides=SLICE, **options):
     )
 
 
-def run_hardware(emulator, directory, monkeypatch, typed, *options, overrides=SLICE):
+def run_hardware(
+    emulator, directory, monkeypatch, typed, *options, overrides=SLICE, robot="serial: ''"
+):
     """Exit code of `sliceit hardware` with the words that an operator types."""
     monkeypatch.setattr("sys.stdin", io.StringIO("".join(f"{word}\n" for word in typed)))
     arguments = ["hardware", str(CUCUMBER), "--set", overrides, "--host", emulator.address]
     arguments += ["--pace", str(CLIENT_PACE), "--robot", str(ROBOT)]
-    arguments += ["--set-robot", PATIENT, "--no-replay", "--output", str(directory)]
+    arguments += [
+        "--set-robot",
+        f"{{{PATIENT}, {robot}}}",
+        "--no-replay",
+        "--output",
+        str(directory),
+    ]
     return main([*arguments, *options])
+
+
+BARE_BOARD = """food: !AnalyticFood {diameter: 0.006, toughness: 0.0}, start: {clearance: 0.003},
+  measurement: null, motion: {segments: [
+    !ConstantSpeed {distance: 0.009, speed: 0.03, acceleration: 0.5, label: board},
+    !Hold {duration: 0.2, label: hold},
+    !Retract {distance: 0.009, speed: 0.05, acceleration: 0.5, label: retract}]}"""
+
+
+def with_board_at(height):
+    return f"{{{BARE_BOARD}, board: {{height: {height}}}}}"
 
 
 def read(directory):
@@ -98,3 +117,62 @@ def test_a_robot_slices_over_the_network_as_the_simulation_does(tmp_path, monkey
     # It ended on its own: the program is stopped, the arm stands.
     assert status["runtime_state"] == "STOPPED" and status["safety_mode"] == "NORMAL"
     assert np.abs(status["velocities"]).max() < 1e-3
+
+
+def test_the_touch_finds_a_lifted_board_and_refuses_the_height_that_was_given(
+    tmp_path, monkeypatch, capsys
+):
+    with emulated(overrides=with_board_at(0.053)) as emulator:
+        code = run_hardware(
+            emulator, tmp_path, monkeypatch, ["move", "touch", "slice"], "--touch",
+            "--move-to-start", overrides=with_board_at(0.05),
+        )  # fmt: skip
+        status = emulator.pendant.status()
+    printed = capsys.readouterr()
+    assert code == 2
+    found = re.search(r"board_height: is 0.0500 m, but .* at ([\d.]+) m", printed.err)
+    assert found, printed.out + printed.err
+    assert float(found[1]) == pytest.approx(0.053, abs=5e-4)
+    # It is back where it began, and stopped.
+    assert status["runtime_state"] == "STOPPED" and status["safety_mode"] == "NORMAL"
+    assert not (tmp_path / "record.csv").exists()
+
+
+def test_a_board_found_near_the_expected_height_is_the_one_that_is_run_on(
+    tmp_path, monkeypatch, capsys
+):
+    with emulated(overrides=with_board_at(0.0496)) as emulator:
+        code = run_hardware(
+            emulator, tmp_path, monkeypatch, ["touch", "slice"], "--touch",
+            overrides=with_board_at(0.05),
+        )  # fmt: skip
+    printed = capsys.readouterr()
+    assert code == 0, printed.out + printed.err
+    with capsys.disabled():
+        print("\n" + re.search(r"The board is at.*", printed.out)[0])
+    lowest = read(tmp_path)["knife_pose_p_z"].min()
+    assert lowest == pytest.approx(0.0496, abs=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("board", "robot", "said"),
+    [
+        (0.04, "touch: {speed: 0.01}", "nothing was touched down to 0.045"),
+        # The board is where it should be: the force goes on rising while the arm comes to rest.
+        (0.05, "touch: {force_limit: 6.0}", "STOPPED: force .*the tool meets a force: [67]"),
+    ],
+    ids=["no board", "force"],
+)
+def test_a_touch_that_fails_stops_the_robot_and_says_why(
+    board, robot, said, tmp_path, monkeypatch, capsys
+):
+    with emulated(overrides=with_board_at(board)) as emulator:
+        code = run_hardware(
+            emulator, tmp_path, monkeypatch, ["move", "touch", "slice"], "--touch",
+            "--move-to-start", overrides=with_board_at(0.05), robot=robot,
+        )  # fmt: skip
+        status = emulator.pendant.status()
+    printed = capsys.readouterr().out
+    assert code == 1 and re.search(said, printed), printed
+    assert status["runtime_state"] == "STOPPED" and status["safety_mode"] == "NORMAL"
+    assert not (tmp_path / "record.csv").exists()

@@ -174,4 +174,4 @@ def test_the_files_for_users_are_read_and_an_absent_robot_is_named(capsys):
     assert main(["hardware"]) == 2
     assert "--host" in capsys.readouterr().err
     with pytest.raises(ConfigurationError, match="pace 1"):
-        command.robot_config(argparse.Namespace(host="10.0.0.5", pace=0.2))
+        command.robot_config(argparse.Namespace(host="10.0.0.5", pace=0.2, board_height=None))

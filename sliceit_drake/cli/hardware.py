@@ -21,6 +21,7 @@ __all__ = ["add_parser", "add_robot_arguments", "robot_config", "run_confirmed"]
 DEFAULT_ROBOT = "hardware/ur5e.yaml"
 WORD = "slice"
 MOVE_WORD = "move"
+TOUCH_WORD = "touch"
 WATCHED = 1.0
 
 DESCRIPTION = """\
@@ -33,6 +34,10 @@ In this order: connects; checks the robot, the plan and the start; zeroes the fo
 the plan; waits until you type the word "slice"; runs; stops the program on the robot. At the first
 limit that is broken it stops for good and says why. With --dry-run it does all of this but move:
 it watches the robot's data for a second instead.
+
+The board's height must be known: from the robot's file, from --board-height, or by --touch. With
+--touch the bare knife first goes down from the start, slowly, after you typed the word "touch",
+until it meets the board, and back up. A height that is not the expected one ends the program.
 
 Writes to DIR what `sliceit simulate` writes, and
   robot.csv          what came from the robot and what was sent, in every cycle
@@ -57,6 +62,9 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     )
     parser.add_argument("--duration", metavar="S", type=float, help="default: the motion's")
     parser.add_argument("--no-replay", action="store_true", help="do not write replay.html")
+    parser.add_argument(
+        "--touch", action="store_true", help="first find the board's height with the knife"
+    )
     parser.set_defaults(run=run)
 
 
@@ -78,6 +86,12 @@ def add_robot_arguments(parser: argparse.ArgumentParser) -> None:
         default=1.0,
         metavar="X",
         help="of an emulated controller, as given to `sliceit emulate`",
+    )
+    parser.add_argument(
+        "--board-height",
+        metavar="M",
+        type=float,
+        help="of the board's surface in the world, instead of the robot's file",
     )
     parser.add_argument("--dry-run", action="store_true", help="all but moving")
     parser.add_argument(
@@ -121,6 +135,12 @@ def run_confirmed(
 
     client = connect(options, config)
     try:
+        if getattr(options, "touch", False) and not options.dry_run:
+            if not touch_board(options, scenario, config, client):
+                return None
+            # The touch has stopped the program on the robot.
+            client.close()
+            client = connect(options, config)
         is_drawn = not (getattr(options, "no_replay", True) or options.dry_run)
         meshcat = make_meshcat() if is_drawn else None
         hardware = prepare_hardware_run(scenario, config, client, options.pace, meshcat)
@@ -129,20 +149,65 @@ def run_confirmed(
         client.close()
 
 
+def touch_board(
+    options: argparse.Namespace,
+    scenario: "Scenario",
+    config: "HardwareConfig",
+    client: "RobotClient",
+) -> bool:
+    """Finds the board after checks and the operator's word; `config` then has the height found.
+
+    Returns:
+        False if the robot was not ready, the operator did not confirm, or there was no board.
+
+    Raises:
+        ConfigurationError: The board is not where it is expected.
+    """
+    from sliceit_drake.diagrams.board_touch import BoardTouch, check_height
+    from sliceit_drake.diagrams.hardware_run import prepare_hardware_run
+    from sliceit_drake.hardware.guarded_touch import TouchError
+
+    field = "scenario.board.height" if config.board_height is None else "board_height"
+    if config.board_height is None:
+        config.board_height = scenario.board.height
+    hardware = prepare_hardware_run(scenario, config, client, options.pace)
+    touch = BoardTouch(hardware)
+    if not _report("Robot and touch", [*hardware.check_facts(), *touch.checks()]):
+        return False
+    if not _ready_at_start(options, hardware):
+        return False
+    print(
+        f"\nTOUCH: the knife goes straight down by up to {1e3 * touch.depth:.1f} mm at "
+        f"{1e3 * config.touch.speed:g} mm/s, until it meets {config.touch.force:g} N, and back up. "
+        f"It looks for the board between the start and {touch.expected - config.touch.below:.4f} "
+        "m. Take the food away: the knife would take it for the board.\n"
+    )
+    if not ask(TOUCH_WORD):
+        return False
+    try:
+        found = touch.execute()
+    except TouchError as error:
+        print(f"STOPPED: {error}")
+        print("The robot's program is stopped. Find the cause before you start again.")
+        return False
+    print(
+        f"The board is at {found.height:.4f} m (+- {1e3 * found.uncertainty:.2f} mm), expected at "
+        f"{touch.expected:.4f}. It is as stiff as {1e-3 * found.stiffness:.0f} N/mm, with the arm; "
+        f"the force rose to {found.peak_force:.1f} N."
+    )
+    check_height(found, touch.expected, config.touch.tolerance, field)
+    config.board_height = found.height
+    print("This run takes the height that was found.\n")
+    return True
+
+
 def checked_run(
     options: argparse.Namespace, hardware: "HardwareRun", directory: Path
 ) -> "Run | None":
     """The same with a robot that is connected already."""
     if not _report("Robot and plan", hardware.check_before()):
         return None
-    if options.move_to_start and not options.dry_run:
-        print("The joints will turn straight to:", hardware.twin.start_joints.round(4).tolist())
-        if not ask(MOVE_WORD):
-            return None
-        if not hardware.move_to_start():
-            print("The robot did not move to the start. Nothing else was done.")
-            return None
-    if not _report("Start", hardware.check_at_start()):
+    if not _ready_at_start(options, hardware):
         return None
     duration = getattr(options, "duration", None) or hardware.motion.duration
     print(plan_text(hardware, duration))
@@ -153,6 +218,18 @@ def checked_run(
         print(f"Dry run: nothing was sent to the joints. {timing}")
         return made
     return _slice(hardware, duration, directory) if ask(WORD) else None
+
+
+def _ready_at_start(options: argparse.Namespace, hardware: "HardwareRun") -> bool:
+    """Moves the arm to the start if asked to, and checks it there; whether all is well."""
+    if options.move_to_start and not options.dry_run:
+        print("The joints will turn straight to:", hardware.twin.start_joints.round(4).tolist())
+        if not ask(MOVE_WORD):
+            return False
+        if not hardware.move_to_start():
+            print("The robot did not move to the start. Nothing else was done.")
+            return False
+    return _report("Start", hardware.check_at_start())
 
 
 def _slice(hardware: "HardwareRun", duration: float, directory: Path) -> "Run":
@@ -190,7 +267,7 @@ def robot_config(options: argparse.Namespace) -> "HardwareConfig":
     Raises:
         ConfigurationError: It is missing or wrong, or there is no address.
     """
-    from sliceit_drake.configuration import ConfigurationError
+    from sliceit_drake.configuration import ConfigurationError, validate
     from sliceit_drake.hardware.configuration import load_hardware_config
 
     if not options.host:
@@ -205,7 +282,11 @@ def robot_config(options: argparse.Namespace) -> "HardwareConfig":
             fix="Leave it out: a robot's clock has the pace 1.",
         )
     file = find_file(options.robot, "robot file", DEFAULT_ROBOT)
-    return load_hardware_config(file, options.set_robot)
+    config = load_hardware_config(file, options.set_robot)
+    if options.board_height is not None:
+        config.board_height = options.board_height
+        validate(config, "robot")
+    return config
 
 
 def connect(options: argparse.Namespace, config: "HardwareConfig") -> "RobotClient":

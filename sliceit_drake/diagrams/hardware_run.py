@@ -31,7 +31,7 @@ from sliceit_drake.hardware.configuration import HardwareConfig
 from sliceit_drake.hardware.robot_state import RobotState
 from sliceit_drake.hardware.rtde_link import RobotLink
 
-__all__ = ["HardwareRun", "prepare_hardware_run", "write_hardware_outputs"]
+__all__ = ["HardwareRun", "prepare_hardware_run", "steady_python", "write_hardware_outputs"]
 
 SENSOR_SAMPLES = 50
 WARM_UP = 0.05
@@ -74,10 +74,14 @@ class HardwareRun:
         X_WK = self.twin.start_pose
         return Motion(self.twin.motion_plan, Pose(X_WK.rotation().matrix(), X_WK.translation()))
 
+    def check_facts(self) -> list[Check]:
+        """Checks of the robot itself."""
+        return check_facts(self.client.facts(), self.config)
+
     def check_before(self) -> list[Check]:
         """Checks that need nothing to be done to the robot."""
         return [
-            *check_facts(self.client.facts(), self.config),
+            *self.check_facts(),
             *check_plan(self.plan, self.twin, self.config, self.client),
         ]
 
@@ -127,7 +131,7 @@ class HardwareRun:
         reason = "the program ended by an error"
         try:
             run = self.run = self._prepare(link)
-            with _steady_python():
+            with steady_python():
                 self._follow(run, link, duration or run.motion.duration, progress, moves)
             reason = run.stopped or "the motion is complete"
         except KeyboardInterrupt:
@@ -273,7 +277,7 @@ def _draw(hardware: HardwareRun, meshcat: Meshcat) -> None:
 
 
 @contextmanager
-def _steady_python() -> Iterator[None]:
+def steady_python() -> Iterator[None]:
     """Keeps the interpreter from making a cycle late: no garbage walks, quick thread switches."""
     interval = sys.getswitchinterval()
     gc.collect()

@@ -32,7 +32,12 @@ from sliceit_drake.systems.contact_monitor import ContactMonitor
 from sliceit_drake.systems.servo import JOINTS
 from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
 
-__all__ = ["HardwareStation", "MakeHardwareStation", "make_safety_layer"]
+__all__ = [
+    "HardwareStation",
+    "MakeHardwareStation",
+    "make_knife_kinematics",
+    "make_safety_layer",
+]
 
 PERIOD = 0.002
 """Of an e-Series controller, s."""
@@ -249,12 +254,24 @@ def MakeHardwareStation(
     return HardwareStation(twin, link, pace)
 
 
-def make_safety_layer(twin: SlicingStation, limits: SafetyLimits) -> SafetyLayer:
-    """The safety layer for a scenario's knife, board and start."""
-    robot, knife = twin.scenario.robot, twin.scenario.knife
-    kinematics = KnifeKinematics(
-        robot.X_WB().GetAsMatrix34(), robot.X_TK().GetAsMatrix34(), knife.length
+def make_knife_kinematics(twin: SlicingStation) -> KnifeKinematics:
+    """Where the edge of a scenario's knife is."""
+    robot = twin.scenario.robot
+    return KnifeKinematics(
+        robot.X_WB().GetAsMatrix34(), robot.X_TK().GetAsMatrix34(), twin.scenario.knife.length
     )
-    return SafetyLayer(
-        limits, kinematics, twin.scenario.board.height, twin.start_joints.tolist(), PERIOD
-    )
+
+
+def make_safety_layer(
+    twin: SlicingStation, limits: SafetyLimits, board_height: float | None = None
+) -> SafetyLayer:
+    """The safety layer for a scenario's knife, board and start.
+
+    Args:
+        twin: The simulated station of the scenario.
+        limits: What is allowed.
+        board_height: That counts for the depth, m; None for the scenario's.
+    """
+    height = twin.scenario.board.height if board_height is None else board_height
+    start = twin.start_joints.tolist()
+    return SafetyLayer(limits, make_knife_kinematics(twin), height, start, PERIOD)

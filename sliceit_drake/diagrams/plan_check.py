@@ -48,11 +48,20 @@ class JointPlan:
     edge_high: np.ndarray
 
 
-def plan_joints(station: Station) -> JointPlan:
-    """Follows the scenario's motion by inverse kinematics from the start."""
-    X_WK = station.start_pose
-    motion = Motion(station.motion_plan, Pose(X_WK.rotation().matrix(), X_WK.translation()))
-    time = np.linspace(0.0, motion.duration, max(2, math.ceil(motion.duration / SAMPLE) + 1))
+def plan_joints(
+    station: Station, motion: Motion | None = None, sample: float = SAMPLE
+) -> JointPlan:
+    """Follows a motion by inverse kinematics from the start.
+
+    Args:
+        station: Whose arm, knife and start are used.
+        motion: From the start on; None for the scenario's.
+        sample: Longest time between two postures, s.
+    """
+    if motion is None:
+        X_WK = station.start_pose
+        motion = Motion(station.motion_plan, Pose(X_WK.rotation().matrix(), X_WK.translation()))
+    time = np.linspace(0.0, motion.duration, max(2, math.ceil(motion.duration / sample) + 1))
     R, p, _, _ = motion.sample(time)
     plant, knife = station.plant, station.robot.knife
     context, frame, world = plant.CreateDefaultContext(), knife.body_frame(), plant.world_frame()

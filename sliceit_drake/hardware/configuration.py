@@ -6,7 +6,35 @@ from pathlib import Path
 from sliceit_drake.configuration import ConfigurationError, choice, load_yaml, quantity
 from sliceit_drake.hardware.limits import SafetyLimits
 
-__all__ = ["HardwareConfig", "load_hardware_config"]
+__all__ = ["HardwareConfig", "TouchConfig", "load_hardware_config"]
+
+
+@dc.dataclass
+class TouchConfig:
+    """How the knife feels for the board (hardware.guarded_touch).
+
+    The force goes on rising while the arm comes to rest: by the stiffness of board and arm times
+    the way in some 50 ms, 8 N at the defaults on 30 kN/m.
+    """
+
+    speed: float = quantity(
+        0.005, "m/s", low=5e-4, high=0.02, doc="Of the knife, down and until it is clear again."
+    )
+    retract_speed: float = quantity(
+        0.02, "m/s", low=5e-4, high=0.1, doc="Of the knife, when it is clear again."
+    )
+    force: float = quantity(
+        5.0, "N", low=0.5, high=25.0, doc="Change of the force that means contact."
+    )
+    force_limit: float = quantity(
+        30.0, "N", low=1.0, high=50.0, doc="Force at the sensor that stops the robot in a touch."
+    )
+    below: float = quantity(
+        0.005, "m", low=0.0, high=0.02, doc="How far under the expected height it looks."
+    )
+    tolerance: float = quantity(
+        1e-3, "m", low=1e-4, high=5e-3, doc="How far the board may be from the expected height."
+    )
 
 
 @dc.dataclass
@@ -62,6 +90,7 @@ class HardwareConfig:
     watchdog: float = quantity(
         50.0, "Hz", low=5.0, high=250.0, doc="Inputs a second below which the controller stops."
     )
+    touch: TouchConfig = dc.field(default_factory=TouchConfig)
     limits: SafetyLimits = dc.field(default_factory=SafetyLimits)
 
     def check(self, where: str) -> None:
