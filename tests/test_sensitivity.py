@@ -62,7 +62,11 @@ def test_an_uneven_clock_gives_the_forces_and_rates_of_an_even_one():
     points = [
         Point(),
         Point(causes=(ActiveCause(ToughnessBySpeed(), {"exponent": 0.1}),)),
-        Point(causes=(ActiveCause(FlankAdhesion(), {"stress": 0.0, "viscosity": 3e4, "exponent": 1.0}),)),
+        Point(
+            causes=(
+                ActiveCause(FlankAdhesion(), {"stress": 0.0, "viscosity": 3e4, "exponent": 1.0}),
+            )
+        ),
         Point(causes=(ActiveCause(BulkRelaxation(), {"share": 0.3}),)),
     ]
     forces, exchanges = [], []

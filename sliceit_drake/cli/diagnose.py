@@ -68,9 +68,9 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument(
         "--refinement",
         type=float,
-        default=0.5,
+        default=0.75,
         help="elements along an edge for changes of the force, relative to the food's mesh; the"
-        " force itself is computed with twice as many (default 0.5)",
+        " force itself is computed with one and a half times as many (default 0.75)",
     )
     parser.add_argument("--no-report", action="store_true", help="write no report.html")
     parser.add_argument(

@@ -51,6 +51,7 @@ from sliceit_drake.records.preprocessing import as_measured
 from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = [
+    "FINER",
     "Column",
     "RecordSensitivity",
     "Sensitivities",

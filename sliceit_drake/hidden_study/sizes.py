@@ -165,7 +165,10 @@ class ProtocolSizes:
         h.update(inspect.getsource(ProtocolSizes.strengths).encode())
         h.update(
             repr(
-                (self.protocol, self.settings, effect, EFFECTS[effect].typical, LIMITS.get(effect))
+                (
+                    *(self.protocol, self.settings, DIAGNOSIS_REFINEMENT),
+                    *(effect, EFFECTS[effect].typical, LIMITS.get(effect)),
+                )
             ).encode()
         )
         return self.cache / "sizes" / f"{self.name}_{effect}_{h.hexdigest()[:12]}.json"
