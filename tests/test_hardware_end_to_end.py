@@ -9,6 +9,7 @@ import faulthandler
 import io
 import json
 import re
+import time
 
 import numpy as np
 import pytest
@@ -17,9 +18,11 @@ from emulator_bench import free_address
 from sliceit_drake.cli.main import main
 from sliceit_drake.emulator.process import EmulatorProcess
 from sliceit_drake.resources import resource_path
+from sliceit_drake.systems.policy import PressByForce
 
 ROBOT = resource_path("hardware/emulated.yaml")
 CUCUMBER = resource_path("scenarios/cucumber.yaml")
+CUCUMBER_POLICY = resource_path("scenarios/cucumber_policy.yaml")
 # A whole slice, board included, of 432 tetrahedra, in 1.4 s.
 SLICE = """{
   food: {shape: !Cylinder
@@ -53,11 +56,18 @@ def emulated(scenario=CUCUMBER, overrides=SLICE, **options):
 
 
 def run_hardware(
-    emulator, directory, monkeypatch, typed, *options, overrides=SLICE, robot="serial: ''"
+    emulator,
+    directory,
+    monkeypatch,
+    typed,
+    *options,
+    scenario=CUCUMBER,
+    overrides=SLICE,
+    robot="serial: ''",
 ):
     """Exit code of `sliceit hardware` with the words that an operator types."""
     monkeypatch.setattr("sys.stdin", io.StringIO("".join(f"{word}\n" for word in typed)))
-    arguments = ["hardware", str(CUCUMBER), "--set", overrides, "--host", emulator.address]
+    arguments = ["hardware", str(scenario), "--set", overrides, "--host", emulator.address]
     arguments += ["--pace", str(CLIENT_PACE), "--robot", str(ROBOT)]
     arguments += [
         "--set-robot",
@@ -69,6 +79,12 @@ def run_hardware(
     return main([*arguments, *options])
 
 
+POLICY = """{
+  food: {shape: !Cylinder
+    {diameter: 0.027, length: 0.12, rings: 2, layers: [0.0, 0.0028, 0.0064, 0.012]}},
+  start: {clearance: 0.002},
+  policy: {duration: 1.2, press: 0.0292, draw: 0.005, speed: 0.08, decide:
+    {fastest: 0.04, force: 25.0, draw_ratio: 0.2, cut_time: 0.8, lift_speed: 0.06}}}"""
 BARE_BOARD = """food: !AnalyticFood {diameter: 0.006, toughness: 0.0}, start: {clearance: 0.003},
   measurement: null, motion: {segments: [
     !ConstantSpeed {distance: 0.009, speed: 0.03, acceleration: 0.5, label: board},
@@ -90,10 +106,9 @@ def sensor_force(record):
 
 def difference(real, simulated):
     """RMS of the difference of two records' sensor forces over the RMS of the simulated one."""
-    time = real["time"]
-    assert abs(time[-1] - simulated["time"][-1]) < 0.01
+    assert abs(real["time"][-1] - simulated["time"][-1]) < 0.01
     wanted = np.column_stack(
-        [np.interp(time, simulated["time"], column) for column in sensor_force(simulated).T]
+        [np.interp(real["time"], simulated["time"], force) for force in sensor_force(simulated).T]
     )
     return np.linalg.norm(sensor_force(real) - wanted) / np.linalg.norm(wanted)
 
@@ -117,6 +132,54 @@ def test_a_robot_slices_over_the_network_as_the_simulation_does(tmp_path, monkey
     # It ended on its own: the program is stopped, the arm stands.
     assert status["runtime_state"] == "STOPPED" and status["safety_mode"] == "NORMAL"
     assert np.abs(status["velocities"]).max() < 1e-3
+
+
+def test_a_policy_drives_the_robot_as_it_drives_the_simulation(tmp_path, monkeypatch, capsys):
+    simulated = ["simulate", str(CUCUMBER_POLICY), "--set", POLICY]
+    assert main([*simulated, "--output", str(tmp_path / "simulated"), "--no-replay"]) == 0
+    with emulated(CUCUMBER_POLICY, POLICY) as emulator:
+        code = run_hardware(
+            emulator, tmp_path / "real", monkeypatch, ["slice"], scenario=CUCUMBER_POLICY,
+            overrides=POLICY,
+        )  # fmt: skip
+    assert code == 0
+    real, wanted = read(tmp_path / "real"), read(tmp_path / "simulated")
+    timing = json.loads((tmp_path / "real" / "summary.json").read_text())["robot"]
+    assert "PressByForce decides every 0.05 s" in capsys.readouterr().out
+    with capsys.disabled():
+        print(
+            f"\n{100 * difference(real, wanted):.2f} % RMS of force apart, "
+            f"{timing['missed_cycles']} of {timing['cycles']} cycles missed"
+        )
+    assert difference(real, wanted) < 0.05
+    # What it did followed from the force: in the food it slowed down.
+    depth = real["target_pose_p_z"][0] - real["target_pose_p_z"]
+    assert 0.01 < depth.max() < 0.9 * 0.04 * 0.8
+    assert np.abs(sensor_force(wanted)).max() > 8.0
+
+
+def test_a_policy_that_decides_too_late_stops_the_robot_and_is_named(tmp_path, monkeypatch, capsys):
+    decide = PressByForce.decide
+
+    def sometimes_slow(policy, observation):
+        # In lockstep the emulator waits for 1 s, and then goes on at its pace.
+        if observation.time > 0.19:
+            time.sleep(2.0)
+        return decide(policy, observation)
+
+    monkeypatch.setattr(PressByForce, "decide", sometimes_slow)
+    with emulated(CUCUMBER_POLICY, POLICY) as emulator:
+        code = run_hardware(
+            emulator, tmp_path, monkeypatch, ["slice"], scenario=CUCUMBER_POLICY, overrides=POLICY
+        )
+        status = emulator.pendant.status()
+    printed = capsys.readouterr().out
+    assert code == 1
+    assert re.search(r"STOPPED: policy at controller time .*: the policy takes 0\.04", printed)
+    assert status["runtime_state"] == "STOPPED" and status["safety_mode"] == "NORMAL"
+    assert np.abs(status["velocities"]).max() < 1e-3
+    # The record is kept, up to the decision that came too late.
+    assert read(tmp_path)["time"][-1] == pytest.approx(0.2, abs=0.02)
 
 
 def test_the_touch_finds_a_lifted_board_and_refuses_the_height_that_was_given(

@@ -165,8 +165,12 @@ class HardwareRun:
         progress: Callable[[float, float], None] | None,
         moves: bool,
     ) -> None:
-        station, simulator = run.station, run.simulator
+        station, simulator, policy = run.station, run.simulator, run.diagram.policy
         assert isinstance(station, HardwareStation)
+        if policy is not None:
+            assert self.scenario.policy is not None
+            period = self.scenario.policy.period
+            policy.watch = lambda: link.deadline("policy", period)
         context = simulator.get_mutable_context()
         rtde = station.rtde
         own = rtde.GetMyMutableContextFromRoot(context)

@@ -98,6 +98,9 @@ class Recorder:
         ):
             add(_pose_columns(name), self._knife_poses(q))
         R, p, _, _ = self.motion.sample(time)
+        if "_target_x" in self.columns:
+            R = np.repeat(R[:1], len(time), axis=0)
+            p = p[0] + raw.vector("_target", "xz") @ R[0][:, [0, 2]].T
         add(_pose_columns("target_pose"), np.column_stack([p, _quaternions(R)]))
         names = [f"knife_velocity_{part}_{a}" for part in ("v", "w") for a in _AXES]
         add(names, self._knife_velocities(joints, raw.vector("qd", "123456")))
@@ -152,7 +155,8 @@ def add_recorder(
         station: The station.
         motion: What drives its target pose.
         sources: Output ports that drive the station's vector inputs, by input name; for the others
-            the configured constants are recorded.
+            the configured constants are recorded. And "target_offset", the target's place along Kx
+            and Kz of the start, where a policy moves it.
     """
     vectors = {
         "joint_positions": [f"q_{i}" for i in range(1, 7)],
@@ -164,6 +168,8 @@ def add_recorder(
         "sensor_state": station.sensor_columns(_wrench_columns("sensor_wrench")),
         **_COMMANDS,
     }
+    if "target_offset" in sources:
+        vectors["target_offset"] = ["_target_x", "_target_z"]
     if isinstance(station.cutting, CuttingSystem):
         parts = [f"{part}_f_{a}" for part in ("edge", "flank", "friction") for a in "xyz"]
         vectors["force_components"] = parts
@@ -188,10 +194,10 @@ def _vector_source(
     builder: DiagramBuilder, station: Station, sources: Mapping[str, OutputPort], name: str
 ) -> OutputPort:
     """Where a recorded vector comes from: the station, a command source, or the configuration."""
-    if name not in _COMMANDS:
-        return station.GetOutputPort(name)
     if name in sources:
         return sources[name]
+    if name not in _COMMANDS:
+        return station.GetOutputPort(name)
     constant = np.atleast_1d(np.asarray(getattr(station.scenario.controller, name), float))
     return builder.AddNamedSystem(
         f"configured_{name}", ConstantVectorSource(constant)

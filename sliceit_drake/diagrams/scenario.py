@@ -19,6 +19,7 @@ from sliceit_drake.diagrams.sequence import SliceSequence
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
 from sliceit_drake.systems.contact_monitor import ContactMonitorConfig
+from sliceit_drake.systems.policy import PolicyConfig
 from sliceit_drake.systems.spring_food import SpringFood
 from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig
 
@@ -121,6 +122,8 @@ class Scenario:
     preparation: Preparation | None = None
     sequence: SliceSequence | None = None
     """Slices in a row; it places the cuts and makes the motion."""
+    policy: PolicyConfig | None = None
+    """Decides how the knife moves, in the place of a motion."""
 
     def check(self, where: str) -> None:
         if isinstance(self.food, Food):
@@ -132,6 +135,14 @@ class Scenario:
                         "the food's holder is rigid",
                         field=f"{where}.food.effects.{name}",
                         fix="Leave it out.",
+                    )
+        if self.policy is not None:
+            for name, default in (("motion", MotionPlan()), ("sequence", None)):
+                if getattr(self, name) != default:
+                    raise ConfigurationError(
+                        "cannot stand beside a policy, which moves the knife",
+                        field=f"{where}.{name}",
+                        fix=f"Leave out one of {name} and policy.",
                     )
         if self.sequence is None:
             return

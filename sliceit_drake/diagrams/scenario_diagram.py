@@ -1,24 +1,26 @@
-"""A whole scenario as a diagram: station, motion and record."""
+"""A whole scenario as a diagram: station, motion or policy, and record."""
 
 from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem, OutputPort
 
-from sliceit_drake.cutting.motion import Motion
+from sliceit_drake.cutting.motion import Motion, Pose
 from sliceit_drake.diagrams.record import Record, Recorder, add_recorder
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.station import MakeSlicingStation
 from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.systems.motion_sources import MotionSource
+from sliceit_drake.systems.policy import PolicySystem
 
 __all__ = ["MakeScenarioDiagram", "ScenarioDiagram"]
 
 
 class ScenarioDiagram(Diagram):
-    """A station driven by its scenario's motion, with a log of all ports.
+    """A station driven by its scenario's motion or policy, with a log of all ports.
 
     Attributes:
         station: The slicing station, simulated or hardware.
-        motion: The prescribed targets of the knife.
+        motion: The prescribed targets of the knife; of a policy, its bounds (`PolicyConfig`).
+        policy: The policy's system, or None.
     """
 
     def __init__(
@@ -29,13 +31,26 @@ class ScenarioDiagram(Diagram):
         self.station: Station = builder.AddNamedSystem(
             "station", station or MakeSlicingStation(scenario, meshcat)
         )
-        source = builder.AddNamedSystem(
-            "motion", MotionSource(self.station.motion_plan, self.station.start_pose)
-        )
-        self.motion: Motion = source.motion
-        target_pose = source.GetOutputPort("target_pose")
+        plan, start = self.station.motion_plan, self.station.start_pose
+        self.motion: Motion = Motion(plan, Pose(start.rotation().matrix(), start.translation()))
+        self.policy: PolicySystem | None = None
+        sources: dict[str, OutputPort] = {}
+        if scenario.policy is None:
+            driver: LeafSystem = builder.AddNamedSystem("motion", MotionSource(plan, start))
+        else:
+            gains = scenario.controller
+            driver = self.policy = builder.AddNamedSystem(
+                "policy", PolicySystem(scenario.policy, start, gains.stiffness, gains.p_gains)
+            )
+            wrench = self.station.GetOutputPort("sensor_wrench")
+            builder.Connect(wrench, driver.GetInputPort("sensor_wrench"))
+            for name in ("stiffness", "p_gains"):
+                sources[name] = driver.GetOutputPort(name)
+                builder.Connect(sources[name], self.station.GetInputPort(name))
+            sources["target_offset"] = driver.GetOutputPort("target_offset")
+        target_pose = driver.GetOutputPort("target_pose")
         builder.Connect(target_pose, self.station.GetInputPort("target_pose"))
-        self._recorder: Recorder = add_recorder(builder, self.station, self.motion, {})
+        self._recorder: Recorder = add_recorder(builder, self.station, self.motion, sources)
         builder.BuildInto(self)
         self.set_name(scenario.name)
 

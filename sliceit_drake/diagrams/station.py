@@ -65,7 +65,7 @@ class SlicingStation(Station):
         cutting: The food: finite elements, analytic, or the spring of the baseline.
         controller: The compliance controller, or what was given in its place.
         sensor: The wrench sensor.
-        motion_plan: The scenario's segments, or those of its sequence.
+        motion_plan: The scenario's segments, those of its sequence, or the bounds of its policy.
         start_pose: X_WK at the start.
         start_joints: Joint positions there [6], rad.
         board_peak_loss: Estimated share of an impact's peak force on the board that the plant's
@@ -319,6 +319,8 @@ def _food_solvers(scenario: Scenario) -> list[CuttingSolver]:
 
 
 def _motion_plan(scenario: Scenario, solvers: list[CuttingSolver]) -> MotionPlan:
+    if scenario.policy is not None:
+        return scenario.policy.envelope()
     if scenario.sequence is None:
         return scenario.motion
     tops = [solver.model.top for solver in solvers]

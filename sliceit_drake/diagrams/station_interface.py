@@ -24,7 +24,7 @@ class Station(Diagram):
         plant: Model of arm, gripper and knife; what moves in a simulated station alone.
         robot: Handles of the robot in it.
         cutting: What says how far the cut is.
-        motion_plan: The scenario's segments, or those of its sequence.
+        motion_plan: The scenario's segments, those of its sequence, or the bounds of its policy.
         start_pose: X_WK at the start.
         start_joints: Joint positions there [6], rad.
         board_peak_loss: Estimated share of an impact's peak force on a simulated board that the

@@ -6,7 +6,8 @@ The diagram and this thread exchange only their newest values: neither waits for
 import csv
 import threading
 import time as clock
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,6 +30,14 @@ class _Command(NamedTuple):
     number: int
     q: list[float]
     time: float
+
+
+class _Task(NamedTuple):
+    """What the diagram waits for: name, since when (controller time, s), and how long it may."""
+
+    limit: str
+    begin: float
+    allowed: float
 
 
 class LinkStatus(NamedTuple):
@@ -85,6 +94,7 @@ class RobotLink:
         self._served: RobotState | None = None  # In whose cycle the last target went out.
         self._armed = self._ending = False
         # What came and went out in each cycle: state, lateness, target, judged last in it.
+        self._task: _Task | None = None
         self._log: list[tuple[RobotState, float, list[float] | None]] = []
         self._status: LinkStatus | None = None
         self._changed = threading.Condition()
@@ -150,6 +160,24 @@ class RobotLink:
         """
         number = self._command.number + 1 if self._command else self._judged + 1
         self._command = _Command(number, list(q), time)
+
+    @contextmanager
+    def deadline(self, limit: str, allowed: float) -> Iterator[None]:
+        """Stops the robot, braking, if what is done inside takes longer.
+
+        It would be late as a command anyway (`SafetyLimits.command_age`), but the operator shall
+        read what was slow. So that this comes first, less is allowed where that limit is shorter.
+
+        Args:
+            limit: Name of the fault, and of what is done.
+            allowed: Controller time, s.
+        """
+        ages = self._safety.limits.command_age - self._safety.period
+        self._task = _Task(limit, self.latest().state.time, min(allowed, ages))
+        try:
+            yield
+        finally:
+            self._task = None
 
     def finish(self, reason: str) -> Stop:
         """Brakes, holds, stops the program on the robot and ends the thread.
@@ -264,6 +292,14 @@ class RobotLink:
         is_new = self._is_new(command, state)
         # Until the first command comes nothing moves, and nothing can be late.
         answered = state.time if command is None else command.time
+        task = self._task
+        if task is not None and self._armed and state.time - task.begin > task.allowed + 1e-9:
+            took = state.time - task.begin
+            with self._changed:
+                safety.latch(
+                    task.limit, f"the {task.limit} takes {took:.4g} s and more, allowed "
+                    f"{task.allowed:.4g}", took, task.allowed, sends=True,
+                )  # fmt: skip
         with self._changed:
             decision = safety.step(state, command.q if command and is_new else None, answered)
         if command is not None and is_new:

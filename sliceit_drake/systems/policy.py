@@ -1,0 +1,246 @@
+"""A policy that decides at 20 Hz how the knife's target moves: its port, and a scripted one.
+
+The port is the smallest that a controller of a station needs (docs/ports.md): a target pose that
+moves at decided speeds, and the stiffness and gains of the compliance controller, which a policy
+may leave alone. What a policy may do at most stands in the scenario, so that a run can be checked
+before it begins, whatever the policy decides.
+"""
+
+import dataclasses as dc
+import math
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from pydrake.common.value import AbstractValue, Value
+from pydrake.math import RigidTransform
+from pydrake.multibody.math import SpatialForce
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from sliceit_drake.configuration import ConfigurationError, quantity
+from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan, Segment
+
+__all__ = [
+    "Policy",
+    "PolicyAction",
+    "PolicyConfig",
+    "PolicyObservation",
+    "PolicySystem",
+    "PressByForce",
+]
+
+SIX = 6
+# Parts of the state.
+_OFFSET, _SPEED, _WANTED, _SINCE = slice(0, 2), slice(2, 4), slice(4, 6), 6
+_STIFFNESS, _GAINS, _HISTORY = slice(7, 13), slice(13, 19), 19
+
+
+class PolicyObservation(NamedTuple):
+    """What a policy sees.
+
+    Attributes:
+        time: Since the start, s.
+        offset: Of the target from the start, along Kx (draw) and Kz (press) there [2], m.
+        wrenches: Sensor wrench at this decision and those before, moment and force at So in S, the
+            newest last [history, 6], Nm and N; zero before the first.
+    """
+
+    time: float
+    offset: np.ndarray
+    wrenches: np.ndarray
+
+
+class PolicyAction(NamedTuple):
+    """What a policy decides.
+
+    Attributes:
+        draw, press: Speeds of the target along Kx and Kz of the start, m/s.
+        stiffness: Of the compliance controller [6], N/m and Nm/rad; None for the configured one.
+        p_gains: Likewise [6].
+    """
+
+    draw: float
+    press: float
+    stiffness: np.ndarray | None = None
+    p_gains: np.ndarray | None = None
+
+
+class Policy(Protocol):
+    """Decides; a configuration dataclass, whose fields are its parameters."""
+
+    def decide(self, observation: PolicyObservation) -> PolicyAction:
+        """Returns the action until the next decision; the same for the same observation."""
+
+
+@dc.dataclass
+class PressByForce:
+    """Presses the slower the more force it meets, then lifts. Scripted, for tests and to compare.
+
+    The speed falls from `fastest` in the air to zero where the mean of the force's history is
+    `force`, and turns round beyond.
+    """
+
+    fastest: float = quantity(0.03, "m/s", low=1e-4, high=0.5, doc="Speed without force.")
+    force: float = quantity(30.0, "N", low=0.1, high=200.0, doc="Force at which it stands still.")
+    draw_ratio: float = quantity(0.0, "", low=-10.0, high=10.0, doc="Draw over press.")
+    cut_time: float = quantity(2.0, "s", low=0.05, high=600.0, doc="When it begins to lift.")
+    lift_speed: float = quantity(0.05, "m/s", low=1e-4, high=0.5, doc="Of lifting.")
+
+    def decide(self, observation: PolicyObservation) -> PolicyAction:
+        """See `Policy`."""
+        if observation.time >= self.cut_time:
+            return PolicyAction(0.0, -self.lift_speed)
+        force = float(np.linalg.norm(observation.wrenches[:, 3:], axis=1).mean())
+        press = self.fastest * (1.0 - force / self.force)
+        return PolicyAction(self.draw_ratio * press, press)
+
+
+@dc.dataclass
+class PolicyConfig:
+    """A policy in a scenario, how often it decides, and what it may do at most."""
+
+    decide: PressByForce = dc.field(default_factory=PressByForce)
+    """The policy, by its parameters. One that a network decides joins here."""
+    period: float = quantity(0.05, "s", low=0.002, high=1.0, doc="Between two decisions.")
+    history: int = quantity(3, "", low=1, high=100, doc="Wrenches that it sees, one a decision.")
+    duration: float = quantity(3.0, "s", low=0.05, high=600.0, doc="Of the run.")
+    press: float = quantity(
+        0.0372, "m", low=1e-3, high=0.5, doc="Farthest that the target goes down from the start."
+    )
+    draw: float = quantity(
+        0.0, "m", low=0.0, high=0.2, doc="Farthest that it goes along the edge, either way."
+    )
+    speed: float = quantity(0.05, "m/s", low=1e-4, high=0.5, doc="Greatest of the target.")
+    acceleration: float = quantity(
+        0.5, "m/s2", low=0.01, high=20.0, doc="With which the speed follows a decision."
+    )
+
+    def check(self, where: str) -> None:
+        least = sum(_duration(segment) for segment in self._way())
+        if self.duration < least:
+            raise ConfigurationError(
+                f"{self.duration:.4g} s is less than the way through all that the policy may do "
+                f"takes at its greatest speed, {least:.4g} s",
+                field=f"{where}.duration",
+                fix="Lengthen it, or give press and draw less room.",
+            )
+
+    def envelope(self) -> MotionPlan:
+        """A motion of the run's duration through all corners of where the target may go."""
+        way = self._way()
+        left = self.duration - sum(_duration(segment) for segment in way)
+        return MotionPlan([*way, Hold(left, label="policy")] if left > 1e-9 else way)
+
+    def _way(self) -> list[Segment]:
+        corners = [(0.0, self.press), (self.draw, self.press), (-self.draw, self.press)]
+        if self.draw > 0.0:
+            corners += [(-self.draw, 0.0), (self.draw, 0.0)]
+        way: list[Segment] = []
+        x = z = 0.0
+        for a, b in corners:
+            dx, dz = a - x, b - z
+            if (distance := math.hypot(dx, dz)) > 0.0:
+                x, z = a, b
+                direction = [dx / distance, 0.0, dz / distance]
+                way.append(ConstantSpeed(self.speed, direction, distance, label="policy"))
+        return way
+
+
+def _duration(segment: Segment) -> float:
+    assert isinstance(segment, ConstantSpeed) and segment.distance is not None
+    return segment.distance / segment.speed
+
+
+class PolicySystem(LeafSystem):
+    """A policy as what drives a station.
+
+    It decides at multiples of its period, without a delay in the diagram's time; what it takes of
+    the wall clock counts on a robot alone, where `watch` sees it. Each decision changes the speeds
+    of the target, within the scenario's bounds; the target goes on at them until the next.
+
+    Inputs:
+        sensor_wrench: SpatialForce at So, in S.
+
+    Outputs:
+        target_pose: RigidTransform X_WK.
+        target_offset: Of the target from the start, along Kx and Kz there [2], m.
+        stiffness, p_gains: For the compliance controller [6].
+
+    Args:
+        config: Policy and bounds.
+        X_WK: Pose of the knife at the start.
+        stiffness, p_gains: What holds where the policy leaves them alone [6].
+
+    Attributes:
+        watch: Entered around each decision.
+    """
+
+    def __init__(
+        self, config: PolicyConfig, X_WK: RigidTransform, stiffness: object, p_gains: object
+    ) -> None:
+        super().__init__()
+        self._config, self._X_WK = config, X_WK
+        self._far = np.array([[-config.draw, 0.0], [config.draw, config.press]])
+        self._configured = np.array(stiffness, float), np.array(p_gains, float)
+        self.watch: Callable[[], AbstractContextManager] = nullcontext
+        wrench = Value(SpatialForce.Zero())
+        self._wrench = self.DeclareAbstractInputPort("sensor_wrench", wrench)
+        state = np.zeros(_HISTORY + SIX * config.history)
+        state[_STIFFNESS], state[_GAINS] = self._configured
+        index = self.DeclareDiscreteState(state)
+        self.DeclarePeriodicDiscreteUpdateEvent(config.period, 0.0, self._decide)
+        moving = {self.time_ticket(), self.discrete_state_ticket(index)}
+        self.DeclareAbstractOutputPort(
+            "target_pose", lambda: Value(RigidTransform()), self._calc_target_pose, moving
+        )
+        self.DeclareVectorOutputPort("target_offset", 2, self._calc_offset, moving)
+        held = {self.discrete_state_ticket(index)}
+        for name, part in (("stiffness", _STIFFNESS), ("p_gains", _GAINS)):
+            self.DeclareVectorOutputPort(name, SIX, self._copier(part), held)
+
+    def _decide(self, context: Context, discrete_state: DiscreteValues) -> None:
+        x, config = context.get_discrete_state_vector().value().copy(), self._config
+        offset, speed = self._moved(context)
+        wrench = self._wrench.Eval(context).get_coeffs()
+        history = np.vstack([x[_HISTORY:].reshape(-1, SIX)[1:], wrench])
+        with self.watch():
+            action = config.decide.decide(PolicyObservation(context.get_time(), offset, history))
+        wanted = np.array([action.draw, action.press], float)
+        if not np.isfinite(wanted).all():
+            raise RuntimeError(
+                f"{self.GetSystemPathname()}: at t = {context.get_time():.6g} s the policy decided "
+                f"for speeds of {wanted} m/s."
+            )
+        x[_OFFSET], x[_SPEED], x[_SINCE] = offset, speed, context.get_time()
+        x[_WANTED] = wanted * min(1.0, config.speed / max(1e-12, math.hypot(*wanted)))
+        given = (action.stiffness, action.p_gains)
+        for part, new, old in zip((_STIFFNESS, _GAINS), given, self._configured, strict=True):
+            x[part] = old if new is None else new
+        x[_HISTORY:] = history.ravel()
+        discrete_state.set_value(x)
+
+    def _moved(self, context: Context) -> tuple[np.ndarray, np.ndarray]:
+        """Offset [2], m, and speeds [2], m/s, at the context's time."""
+        x = context.get_discrete_state_vector().value()
+        t, before, change = context.get_time() - x[_SINCE], x[_SPEED], x[_WANTED] - x[_SPEED]
+        duration = math.hypot(*change) / self._config.acceleration
+        ramp = min(t, duration)
+        speed = before + change * (ramp / duration if duration > 0.0 else 0.0)
+        offset = x[_OFFSET] + 0.5 * (before + speed) * ramp + speed * (t - ramp)
+        inside = np.clip(offset, *self._far)
+        return inside, np.where(inside == offset, speed, 0.0)
+
+    def _calc_target_pose(self, context: Context, output: AbstractValue) -> None:
+        (x, z), _ = self._moved(context)
+        output.set_value(self._X_WK @ RigidTransform([x, 0.0, z]))
+
+    def _calc_offset(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._moved(context)[0])
+
+    @staticmethod
+    def _copier(part: slice) -> Callable[[Context, BasicVector], None]:
+        def calc(context: Context, output: BasicVector) -> None:
+            output.SetFromVector(context.get_discrete_state_vector().value()[part])
+
+        return calc
