@@ -227,14 +227,16 @@ class ProtocolSizes:
         found = sensitivities(setup, records, causes, cache=self.cache, workers=1)
         return found, LinearProblem(found)
 
-    def angles(self, effect: str, delta: float = MIDDLE) -> dict[str, float]:
-        """Angles in degrees between what an effect leaves and all that each cause of the list can
-        do, what is free in any case taken off both: a cause that is near can mimic it.
+    def size_about(self, effect: str, delta: float) -> float:
+        """The size of a strength if strength were in proportion to size, from one simulation at the
+        typical one; at most the largest that has a meaning."""
+        typical = EFFECTS[effect].typical
+        (there,) = self.strengths(effect, [typical])
+        return min(typical * delta / there, LARGEST * typical, LIMITS.get(effect, np.inf))
 
-        Args:
-            effect: Its name.
-            delta: Its strength; where it is never so strong, at its greatest.
-        """
+    def angles(self, effect: str) -> dict[str, float]:
+        """`angles_at` the size of strength `MIDDLE`; of an effect that is never so strong, at its
+        greatest."""
         file = self._file(effect)
         if file is not None:
             causes = open_causes([p.name for p in BASE])
@@ -244,23 +246,28 @@ class ProtocolSizes:
                 known: dict[str, float] = json.loads(file.read_text(encoding="utf-8"))
                 return known
         curve = self.curve(effect)
-        size = curve.size(delta) or (curve.sizes[-1] if curve.sizes else None)
+        size = curve.size(MIDDLE) or (curve.sizes[-1] if curve.sizes else None)
         if size is None:
             return {}
+        out = self.angles_at(effect, size)
+        if file is not None:
+            file.write_text(json.dumps(out, indent=2) + "\n", encoding="utf-8")
+        return out
+
+    def angles_at(self, effect: str, size: float) -> dict[str, float]:
+        """Angles in degrees between what an effect of a size leaves and all that each cause of the
+        list can do, what is free in any case taken off both: a cause that is near can mimic it."""
         found, null = self._full
         problem = LinearProblem(
             _with_column(found, self._change(effect, size)), null.noise, null.variation
         )
         screening = screen(problem, 2)
         hidden = dc.replace(screening.evidence("hidden"), coefficients=[1.0], scan=None)
-        out = {
+        return {
             name: screening.angle_to(problem, hidden, name)
             for name in screening.names
             if name != "hidden"
         }
-        if file is not None:
-            file.write_text(json.dumps(out, indent=2) + "\n", encoding="utf-8")
-        return out
 
     def _compute(self, effect: str) -> SizeCurve:
         typical = EFFECTS[effect].typical
