@@ -22,6 +22,7 @@ class FakeRobot:
         self._state = self._law.state_at_rest(q)
         self.wrench = [0.0] * 6
         self.runtime, self.bits, self.connected, self.accepts = PLAYING, 1, True, True
+        self.payload = (1.2, 0.0, 0.0, 0.06)
         self.call_time = 0.0
         self.frozen = False
         self.time = 100.0
@@ -47,7 +48,9 @@ class FakeRobot:
         return self.time
 
     def read(self):
-        return RobotState(self.time, self.q, self.qd, self.wrench, self.runtime, self.bits)
+        return RobotState(
+            self.time, self.q, self.qd, self.wrench, self.runtime, self.bits, self.payload
+        )
 
     def is_connected(self):
         return self.connected

@@ -64,11 +64,12 @@ def run_hardware(
     scenario=CUCUMBER,
     overrides=SLICE,
     robot="serial: ''",
+    pace=CLIENT_PACE,
 ):
     """Exit code of `sliceit hardware` with the words that an operator types."""
     monkeypatch.setattr("sys.stdin", io.StringIO("".join(f"{word}\n" for word in typed)))
     arguments = ["hardware", str(scenario), "--set", overrides, "--host", emulator.address]
-    arguments += ["--pace", str(CLIENT_PACE), "--robot", str(ROBOT)]
+    arguments += ["--pace", str(pace), "--robot", str(ROBOT)]
     arguments += [
         "--set-robot",
         f"{{{PATIENT}, {robot}}}",

@@ -87,6 +87,7 @@ def test_the_watchdog_is_set_before_the_first_target_and_the_arm_follows(robot):
         ({"call_time": 0.3}, "link", False),
         ({"wrench": [0.0, 0.0, 60.0, 0.0, 0.0, 0.0]}, "force", True),
         ({"wrench": [np.nan] * 6}, "measurement", True),
+        ({"payload": (2.0, 0.0, 0.0, 0.06)}, "payload", True),
     ],
     ids=lambda value: str(next(iter(value))) if isinstance(value, dict) else str(value),
 )

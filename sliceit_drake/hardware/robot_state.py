@@ -41,6 +41,8 @@ class RobotState(NamedTuple):
             the base [6], N and Nm (the controller's "TCP force" while its TCP is the flange).
         runtime_state: Index into `RUNTIME_STATES`.
         safety_bits: The controller's safety_status_bits.
+        payload: Mass that the controller subtracts, kg, and its centre in the flange, m [4]; None
+            where it is not read.
     """
 
     time: float
@@ -49,6 +51,7 @@ class RobotState(NamedTuple):
     wrench: list[float]
     runtime_state: int
     safety_bits: int
+    payload: tuple[float, ...] | None = None
 
 
 def safety_text(bits: int) -> str:

@@ -24,6 +24,8 @@ RESET_WORD = "reset"
 # Differences of the controller's times and of targets carry rounding errors of this order.
 _ROUNDING = 1e-9
 _REACH = 1.6  # Of the tool's farthest point from the first joint's axis, m, generously.
+# What a payload, kg, and its centre, m, may differ by and still be the same.
+_SAME_PAYLOAD = 1e-3
 _REST_SPEED = 0.02  # A joint slower than this counts as at rest, rad/s.
 
 
@@ -111,6 +113,7 @@ class SafetyLayer:
         self._v = [0.0] * 6
         self._edge = kinematics.edge(self._q)
         self._last: RobotState | None = None
+        self._payload: tuple[float, ...] | None = None
         self._time = -math.inf  # Of the last state.
         self._sent_time = -math.inf
         # The newest command that was judged.
@@ -138,11 +141,11 @@ class SafetyLayer:
         """
         if self._stop is not None:
             raise LatchedError(f"The safety layer is latched ({self._stop}); reset it first.")
-        self._armed = False
+        self._armed, self._payload = False, None
         stop = self._robot_fault(state) or self._measurement_fault(state)
         if stop is None:
             self._q, self._v = [float(x) for x in state.q], [0.0] * 6
-            self._last = state
+            self._last, self._payload = state, state.payload
             self._time = self._sent_time = self._command_time = state.time
             self._command, self._command_speed = self._q, [0.0] * 6
             edge = self._kinematics.edge(self._q)
@@ -300,7 +303,21 @@ class SafetyLayer:
             return self._breach(
                 "torque", "the tool meets a torque", torque, self.limits.torque, "Nm", state.time
             )
-        return None
+        return self._payload_fault(state)
+
+    def _payload_fault(self, state: RobotState) -> Stop | None:
+        """The force readings jump with the payload that the controller subtracts."""
+        before, now = self._payload, state.payload
+        if before is None or now is None:
+            return None
+        change = max(abs(a - b) for a, b in zip(now, before, strict=True))
+        if change <= _SAME_PAYLOAD:
+            return None
+        detail = (
+            f"the controller's payload was changed during the run: {_payload_text(before)} at its "
+            f"start, now {_payload_text(now)}"
+        )
+        return Stop("payload", detail, now[0], before[0], state.time, True)
 
     def _take(self, command: Sequence[float], command_time: float, time: float) -> Stop | None:
         """Judges a command against the target sent before; takes it if it keeps the limits."""
@@ -432,3 +449,8 @@ class SafetyLayer:
     ) -> Stop:
         text = f"{detail}: {value:.6g} {unit}, allowed {bound:.6g}"
         return Stop(limit, text, value, bound, time, True)
+
+
+def _payload_text(payload: Sequence[float]) -> str:
+    centre = ", ".join(f"{1e3 * x:.1f}" for x in payload[1:])
+    return f"{payload[0]:.3f} kg at ({centre}) mm"

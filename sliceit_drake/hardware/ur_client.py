@@ -94,6 +94,7 @@ class UrClient:
                 receive.getActualTCPForce(),
                 receive.getRuntimeState(),
                 receive.getSafetyStatusBits(),
+                (receive.getPayload(), *receive.getPayloadCog()),
             )
             if receive.getTimestamp() == before:
                 break

@@ -1,0 +1,72 @@
+"""What happens to the network and to the controller in the middle of a motion, over TCP.
+
+The faults without a network are in tests/test_rtde_system.py and tests/test_safety.py.
+"""
+
+import re
+import threading
+import time
+
+import numpy as np
+import pytest
+from test_hardware_end_to_end import emulated, no_test_hangs, run_hardware
+
+from sliceit_drake.resources import resource_path
+
+__all__ = ["no_test_hangs"]
+
+SPRING = resource_path("scenarios/cucumber_spring.yaml")
+# Two seconds in the air: no fault may come after the end.
+OVERRIDES = """{start: {clearance: 0.02}, measurement: null, motion: {segments: [
+  !ConstantSpeed {speed: 0.02, distance: 0.019, acceleration: 0.5, label: other},
+  !Retract {speed: 0.02, distance: 0.019, acceleration: 0.5, label: retract}]}}"""
+
+
+def injected_in_motion(emulator, fault):
+    """A thread that injects a fault as soon as the arm moves."""
+
+    def inject():
+        end = time.monotonic() + 60.0
+        while np.abs(emulator.pendant.status()["velocities"]).max() < 0.02:
+            if time.monotonic() > end:
+                return
+            time.sleep(0.02)
+        emulator.pendant.inject(fault)
+
+    thread = threading.Thread(target=inject)
+    thread.start()
+    return thread
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ("silence:0.1", "STOPPED: state_age"),
+        ("silence:1", "STOPPED: state_age"),
+        ("silence:4", "STOPPED: state_age"),
+        ("wrong_payload:2", r"STOPPED: payload .* 1\.199 kg at .* now 2\.000 kg"),
+    ],
+)
+def test_it_stops_the_robot_for_good(fault, said, tmp_path, monkeypatch, capsys):
+    with emulated(SPRING, OVERRIDES) as emulator:
+        thread = injected_in_motion(emulator, fault)
+        code = run_hardware(
+            emulator, tmp_path, monkeypatch, ["slice"], scenario=SPRING, overrides=OVERRIDES,
+            pace=0.05,
+        )  # fmt: skip
+        thread.join()
+        printed = capsys.readouterr().out
+        assert code == 1 and re.search(said, printed), printed
+        log = emulator.pendant.status()["log"]
+        at = next(when for when, text in log if text.startswith("injected"))
+        # When the network is there again nothing moves; after 4 s it did not either, in a minute.
+        silence = float(fault.partition(":")[2]) if fault.startswith("silence") else 0.0
+        status = emulator.pendant.wait_until(at + min(silence, 1.0) + 0.2, timeout=120.0)
+        stopped = re.search(r"STOPPED: \w+ at controller time ([\d.]+) s", printed)
+    assert status["runtime_state"] == "STOPPED" and status["safety_mode"] == "NORMAL"
+    assert np.abs(status["velocities"]).max() < 1e-3
+    assert float(stopped[1]) - at < 0.05
+    if silence > 0.1:
+        # Until the network is there again the controller's own watchdog, 10 Hz here, is all.
+        watchdog = next(when for when, text in status["log"] if "RTDE watchdog: no" in text)
+        assert watchdog - at < 0.1 + 0.02
