@@ -1,9 +1,13 @@
 """`sliceit collect`: a protocol's slices on a station, in random order, as records."""
 
+import io
+
 import numpy as np
 import pytest
+from test_hardware_end_to_end import CLIENT_PACE, PATIENT, ROBOT, emulated
 
 from sliceit_drake.cli.main import main
+from sliceit_drake.configuration import dump_yaml
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.records.validation import load_record
 from sliceit_drake.resources import resource_path
@@ -11,6 +15,7 @@ from sliceit_drake.stand_in.protocol import load_protocol, schedule
 from sliceit_drake.stand_in.station_cuts import scenario_of_cut
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 
+STATION = "scenarios/cucumber.yaml"
 PROTOCOL = """
 name: short
 food:
@@ -63,8 +68,40 @@ def test_it_cuts_all_slices_records_them_and_goes_on_where_it_was(protocol, tmp_
     assert "--seed" in capsys.readouterr().err
 
 
+def test_slices_on_a_robot_are_recorded_as_those_of_the_simulated_station(
+    protocol, tmp_path, monkeypatch, capsys
+):
+    slices = ["collect", str(protocol), "--seed", "3"]
+    assert main([*slices, "--output", str(tmp_path / "simulated"), "--first", "2"]) == 0
+    loaded, station = load_protocol(str(protocol)), load_scenario(resource_path(STATION))
+    for specimen in schedule(loaded, np.random.default_rng([3, 0]))[:2]:
+        # A controller of its own for each: nobody puts fresh food into one that runs.
+        file = tmp_path / f"{specimen.index}.yaml"
+        dump_yaml(scenario_of_cut(loaded, specimen, station), file)
+        with emulated(file, "{}") as emulator:
+            robot = ["--host", emulator.address, "--pace", str(CLIENT_PACE)]
+            robot += ["--robot", str(ROBOT), "--set-robot", f"{{{PATIENT}}}"]
+            robot += ["--output", str(tmp_path / "real"), "--first", str(specimen.index + 1)]
+            monkeypatch.setattr("sys.stdin", io.StringIO("go on\n"))
+            assert main([*slices, *robot]) == 1, "that was not the word"
+            monkeypatch.setattr("sys.stdin", io.StringIO("slice\n"))
+            assert main([*slices, *robot]) == 0
+    assert "a fresh piece of food" in capsys.readouterr().out
+    for name in ("slice_000", "slice_001"):
+        real = load_record(tmp_path / "real" / f"{name}.csv")
+        wanted = load_record(tmp_path / "simulated" / f"{name}.csv")
+        assert real.metadata.condition == wanted.metadata.condition
+        assert real.metadata.provenance == "UR5e through RTDE."
+        assert (tmp_path / "real" / name / "robot.csv").exists()
+        force = [np.interp(real.time, wanted.time, column) for column in wanted.force.T]
+        error = np.linalg.norm(real.force - np.transpose(force)) / np.linalg.norm(force)
+        with capsys.disabled():
+            print(f"\n{name}, {real.metadata.condition}: {100 * error:.2f} % RMS of force apart")
+        assert error < 0.05
+
+
 def test_every_shipped_protocol_makes_scenarios_of_a_station():
-    station = load_scenario(resource_path("scenarios/cucumber.yaml"))
+    station = load_scenario(resource_path(STATION))
     for file in resource_path("calibration/protocols").glob("*.yaml"):
         protocol = load_protocol(str(file))
         for specimen in schedule(protocol, np.random.default_rng(0)):
