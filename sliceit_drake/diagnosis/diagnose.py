@@ -21,6 +21,7 @@ from sliceit_drake.diagnosis.experiment_proposal import NextExperiment
 from sliceit_drake.diagnosis.held_out import HeldOutGain, held_out_gain, held_out_share
 from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
 from sliceit_drake.diagnosis.linear import LinearProblem
+from sliceit_drake.diagnosis.own_values import at_own_values
 from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import is_users, open_causes
 from sliceit_drake.diagnosis.sensitivity import Sensitivities, sensitivities
@@ -345,7 +346,7 @@ def diagnose(
         progress=lambda done, total: show("simulations", done, total),
     )
     remarks += found.warnings
-    problem = LinearProblem(found)
+    problem = LinearProblem(at_own_values(LinearProblem(found)))
     if not problem.repeated:
         remarks.append(
             "No condition was repeated: noise is from what is rough in the residuals, and how "

@@ -7,7 +7,7 @@ import numpy as np
 
 from sliceit_drake.diagnosis.linear import LinearProblem
 
-__all__ = ["HeldOutGain", "fitted_changes", "held_out_gain", "held_out_share"]
+__all__ = ["HeldOutGain", "fitted_changes", "held_out_gain", "held_out_share", "own_coefficients"]
 
 BOOTSTRAP = 1000
 LEAST_REDUCIBLE = 0.02
@@ -109,6 +109,22 @@ def fitted_changes(
     linear = _Linear(problem, causes)
     theta = linear.shared(linear.reduced.sum(0))
     return [linear.change(r, theta) for r in range(len(problem.found.records))]
+
+
+def own_coefficients(problem: LinearProblem, own: Sequence[int]) -> list[np.ndarray]:
+    """Coefficients of columns that are each record's own, where no cause is at work.
+
+    Args:
+        problem: The records' moments.
+        own: Numbers of columns [n].
+
+    Returns:
+        Of each record [n], in the columns' sizes.
+    """
+    linear = _Linear(problem, ())
+    theta = linear.shared(linear.reduced.sum(0))
+    at = [linear.own.index(k) for k in own]
+    return [linear.of_own(r, theta)[at] for r in range(len(problem.found.records))]
 
 
 def _errors(

@@ -41,6 +41,8 @@ DISCRETISATION = 0.5
 column."""
 FINE_MESH = 0.3
 """The same of each row by itself."""
+SECOND_ORDER = 0.5
+"""The same of a row by what is beyond the first order of a record's own values, in that."""
 RIDGE = 1e-8
 KEPT = 4
 """Sets of reduced Gram matrices that are kept."""
@@ -175,7 +177,9 @@ class LinearProblem:
         gram, force_gram = self.moments.gram.copy(), self.moments.force_gram.copy()
         records = []
         for r, (record, values) in enumerate(zip(self.found.records, predicted, strict=True)):
-            moved = dc.replace(record, predicted=values)
+            moved = dc.replace(
+                record, predicted=values if record.bent is None else values + record.bent
+            )
             records.append(moved)
             X, error, calm = self._table(moved), self.model_error(record), self._calm(record)
             b, inside = np.zeros(self.size + 1), X[calm][:, self.forces]
@@ -295,6 +299,8 @@ class LinearProblem:
         for k in self.numerical:
             if self.found.columns[k].name == "mesh":
                 out = np.hypot(out, FINE_MESH * record.columns[:, :, k])
+        if record.bent is not None:
+            out = np.hypot(out, SECOND_ORDER * record.bent)
         return np.asarray(out)
 
     def _weighted(self, time: np.ndarray, X: np.ndarray, model_error: np.ndarray) -> np.ndarray:

@@ -120,6 +120,8 @@ class RecordSensitivity:
         measured, predicted: [m, c], N and Nm.
         columns: Changes of the prediction [m, c, K].
         even: Even parts of the changes [m, c, K]; 0 where there is none.
+        bent: Part of the prediction that is beyond the first order of what is the record's own
+            (`own_values`) [m, c]; None where that was not looked at.
     """
 
     name: str
@@ -138,6 +140,7 @@ class RecordSensitivity:
     predicted: np.ndarray
     columns: np.ndarray
     even: np.ndarray
+    bent: np.ndarray | None = None
 
     @property
     def residual(self) -> np.ndarray:

@@ -1,0 +1,95 @@
+"""Slices that differ are each seen from their own height, not from the mean slice's."""
+
+import dataclasses as dc
+
+import numpy as np
+
+from sliceit_drake.diagnosis.linear import LinearProblem
+from sliceit_drake.diagnosis.own_values import at_own_values
+from sliceit_drake.diagnosis.sensitivity import Column, RecordSensitivity, Sensitivities
+
+HEIGHT = 3e-4
+DEVIATION = 0.1
+COLUMNS = [
+    Column("base", "material.toughness", size=0.05),
+    Column("record", "height", size=HEIGHT, unit="m", per_record=True),
+]
+
+
+def bend(depth: np.ndarray, height: float = 0.0) -> np.ndarray:
+    """A force that falls, and rises where the board is touched at 20 mm less the food's height."""
+    way = depth - 0.02 + height
+    return 12.0 - 400.0 * depth + 1.5 * np.logaddexp(0.0, way / 2e-4)
+
+
+def record(number: int, height: float, rng: np.random.Generator) -> RecordSensitivity:
+    depth = np.linspace(0.0, 0.021, 500)
+    force, high, low = (bend(depth, h) for h in (0.0, HEIGHT, -HEIGHT))
+    column = np.stack([force, 0.5 * (high - low)], axis=1)
+    even = np.stack([np.zeros_like(force), 0.5 * (high + low) - force], axis=1)
+    measured = bend(depth, height) + DEVIATION * rng.normal(size=len(depth))
+    return RecordSensitivity(
+        name=f"slice_{number}",
+        condition="press",
+        slice_index=number,
+        knife_slices=number,
+        speed=0.02,
+        draw_ratio=0.0,
+        channels=("force_z",),
+        time=depth / 0.02,
+        phase=np.full(len(depth), "slice"),
+        depth=depth,
+        path=depth,
+        in_contact=np.ones(len(depth), bool),
+        measured=measured[:, None],
+        predicted=force[:, None],
+        columns=column[:, None, :],
+        even=even[:, None, :],
+    )
+
+
+def session(heights: list[float]) -> LinearProblem:
+    rng = np.random.default_rng(4)
+    records = [record(k, h, rng) for k, h in enumerate(heights)]
+    return LinearProblem(Sensitivities(COLUMNS, records))
+
+
+def left(problem: LinearProblem) -> float:
+    """What a fit of each record's own leaves at the bend, in the mean over records, over its
+    standard error."""
+    own = problem.own
+    rest = []
+    for r in problem.found.records:
+        X = r.columns[:, 0, own]
+        y = r.residual[:, 0]
+        rest.append(y - X @ np.linalg.lstsq(X, y, rcond=None)[0])
+    bent = (r.depth > 0.0195) & (r.depth < 0.0205)
+    mean = np.mean(rest, axis=0)[bent]
+    return float(np.sqrt((mean**2).mean()) / (DEVIATION / np.sqrt(len(rest))))
+
+
+def test_a_bend_that_lies_higher_in_some_slices_is_not_taken_for_a_softer_one():
+    first = session([-4e-4, 3e-4, -2e-4, 4e-4, -3e-4, 2e-4])
+    again = LinearProblem(at_own_values(first))
+    assert left(first) > 4.0
+    assert left(again) < 2.0
+
+
+def test_slices_that_are_alike_stay_as_they_are():
+    first = session([0.0] * 6)
+    again = at_own_values(first)
+    for a, b in zip(first.found.records, again.records, strict=True):
+        assert b.bent is not None and np.abs(b.bent).max() < 0.1 * DEVIATION
+        np.testing.assert_array_equal(a.columns[:, :, 0], b.columns[:, :, 0])
+        np.testing.assert_allclose(a.predicted, b.predicted - b.bent)
+
+
+def test_what_is_beyond_the_first_order_stays_in_other_predictions_and_counts_for_less():
+    problem = LinearProblem(at_own_values(session([-4e-4, 4e-4, 2e-4])))
+    found = problem.found.records
+    raised = problem.predicting([r.predicted - r.bent + 1.0 for r in found])
+    for old, new in zip(found, raised.found.records, strict=True):
+        np.testing.assert_allclose(new.predicted, old.predicted + 1.0)
+    plain = dc.replace(found[0], bent=None)
+    more = problem.model_error(found[0]) ** 2 - problem.model_error(plain) ** 2
+    np.testing.assert_allclose(more, 0.25 * found[0].bent ** 2, atol=1e-12)
