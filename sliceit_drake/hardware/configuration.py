@@ -13,8 +13,8 @@ __all__ = ["HardwareConfig", "TouchConfig", "load_hardware_config"]
 class TouchConfig:
     """How the knife feels for the board (hardware.guarded_touch).
 
-    The force goes on rising while the arm comes to rest: by the stiffness of board and arm times
-    the way in some 50 ms, 8 N at the defaults on 30 kN/m.
+    The force goes on rising while the arm comes to rest, in proportion to speed and stiffness: 4 N at
+    the defaults on the emulated board of 30 kN/m (docs/hardware.md).
     """
 
     speed: float = quantity(
