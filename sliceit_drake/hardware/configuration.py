@@ -13,8 +13,8 @@ __all__ = ["HardwareConfig", "TouchConfig", "load_hardware_config"]
 class TouchConfig:
     """How the knife feels for the board (hardware.guarded_touch).
 
-    The force goes on rising while the arm comes to rest, in proportion to speed and stiffness: 4 N at
-    the defaults on the emulated board of 30 kN/m (docs/hardware.md).
+    The force goes on rising while the arm comes to rest, in proportion to speed and stiffness: 4 N
+    at the defaults on the emulated board of 30 kN/m (docs/hardware.md).
     """
 
     speed: float = quantity(
