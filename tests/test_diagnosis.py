@@ -14,7 +14,7 @@ from sliceit_drake.diagnosis.held_out import fitted_changes, held_out_gain
 from sliceit_drake.diagnosis.linear import LinearProblem
 from sliceit_drake.diagnosis.noise_levels import ChannelNoise
 from sliceit_drake.diagnosis.sensitivity import Column, RecordSensitivity, Sensitivities
-from sliceit_drake.diagnosis.verdict import reach_verdict
+from sliceit_drake.diagnosis.verdict import foretold, reach_verdict
 
 ROWS = 300
 NOISE = 0.1
@@ -156,6 +156,22 @@ def test_a_hidden_cause_is_named_with_its_size_and_its_class(hidden, name):
     gain = held_out_gain(problem(20, **hidden), [(finding.evidence.name, finding.evidence.scan)])
     assert gain.share > 0.8 and gain.after < gain.before
     assert gain.after == pytest.approx(NOISE, rel=0.3)
+    assert foretold(verdict, gain) is verdict
+
+
+def test_a_cause_that_foretells_no_other_record_is_unknown():
+    found = problem(20, rate=2.0)
+    verdict = reach_verdict(found, 60)
+    (finding,) = verdict.findings
+    gain = held_out_gain(found, [(finding.evidence.name, finding.evidence.scan)])
+    poor = dc.replace(gain, share=0.5, interval=(0.4, 0.7))
+    assert foretold(verdict, poor).kind == "unknown"
+    assert "50 %" in foretold(verdict, poor).reason
+    # What is not sure to be too little is enough.
+    assert foretold(verdict, dc.replace(poor, interval=(0.2, 1.1))) is verdict
+    # What differs from record to record cannot be foretold.
+    finding.evidence.per_record = True
+    assert foretold(verdict, poor) is verdict
 
 
 def test_two_hidden_causes_are_both_named():

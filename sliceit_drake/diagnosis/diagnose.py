@@ -26,7 +26,7 @@ from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import is_users, open_causes
 from sliceit_drake.diagnosis.sensitivity import Sensitivities, sensitivities
 from sliceit_drake.diagnosis.slices import Meshing
-from sliceit_drake.diagnosis.verdict import ALARM, Finding, Verdict, reach_verdict
+from sliceit_drake.diagnosis.verdict import ALARM, Finding, Verdict, foretold, reach_verdict
 from sliceit_drake.diagrams.calibrated_food import CalibratedFood
 from sliceit_drake.records.slice_record import SliceRecord
 
@@ -375,6 +375,8 @@ def diagnose(
         runs = None if cache is None else cache / "slices"
         predictor = SlicePredictor(setup, records, (Meshing(),), Clock(), runs, workers)
         result.confirm(predictor, seed, lambda done, total: show("confirmation", done, total))
+        assert result.gain is not None
+        result.verdict = foretold(result.verdict, result.gain)
     return result
 
 

@@ -6,10 +6,11 @@ from collections.abc import Callable
 import numpy as np
 
 from sliceit_drake.diagnosis.effect_size import effect_in_noise
+from sliceit_drake.diagnosis.held_out import HeldOutGain
 from sliceit_drake.diagnosis.linear import LinearProblem
 from sliceit_drake.diagnosis.screen import CauseEvidence, Screening, screen
 
-__all__ = ["Finding", "Verdict", "reach_verdict"]
+__all__ = ["Finding", "Verdict", "foretold", "reach_verdict"]
 
 ALARM = 0.02
 """Greatest p-value of the largest gain."""
@@ -31,6 +32,9 @@ SECOND_GAIN = 0.1
 """Least share of a second cause in what both gain."""
 OF_THE_REST = 0.5
 """Least share of what the first cause leaves that a second one explains."""
+LEAST_REMOVED = 0.8
+"""Least share of the reducible held-out error that what is named must remove, at the upper end of
+its interval: a flexible cause may explain each record and foretell none."""
 PRESENCE = 0.4
 """Least share of the records in which a cause shows that has numbers of its own in each."""
 CLASS_ANGLE = 15.0
@@ -98,6 +102,25 @@ class Verdict:
         """Classes that are named."""
         named = self.kind in ("cause", "causes", "too_few_replicates")
         return [f.names for f in self.findings] if named else []
+
+
+def foretold(verdict: Verdict, gain: HeldOutGain) -> Verdict:
+    """The verdict once its causes were tried on records that were left out: unknown where they
+    remove less of the error than causes that are the right ones.
+
+    Causes that have numbers of their own in each record foretell nothing, and are left out.
+    """
+    named = verdict.kind in ("cause", "causes")
+    if not named or any(f.evidence.per_record for f in verdict.findings):
+        return verdict
+    if gain.interval[1] >= LEAST_REMOVED:
+        return verdict
+    names = " and ".join(f.evidence.name for f in verdict.findings)
+    reason = (
+        f"{names} explains each record best, and removes {100 * gain.share:.0f} % of the reducible "
+        "error of records that were left out"
+    )
+    return dc.replace(verdict, kind="unknown", reason=reason)
 
 
 def reach_verdict(
