@@ -17,7 +17,11 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
         ("diagnosis", f"must show in {100 * verdict.PRESENCE:g} % of those"),
         ("diagnosis", f"can do what was found to within {verdict.CLASS_ANGLE:g} degrees"),
         ("diagnosis", f"falls short of it by less than {100 * verdict.CLASS_GAIN:g} %"),
-        ("diagnosis", f"of one condition it is {verdict.ONE_CONDITION_ANGLE:g} degrees"),
+        (
+            "diagnosis",
+            f"of one condition it is {verdict.ONE_CONDITION_ANGLE:g} degrees "
+            f"and {100 * verdict.ONE_CONDITION_GAIN:g} %",
+        ),
         ("diagnosis", f"nothing is wrong ({verdict.TOLERATED:g} of the noise) is taken off"),
         ("diagnosis", f"Less than {100 * verdict.EXPLAINED:g} % is unknown"),
         ("diagnosis", f"at least {100 * verdict.SECOND_SHARE:g} % of the squares"),

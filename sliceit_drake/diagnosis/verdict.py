@@ -44,6 +44,9 @@ ONE_CONDITION_ANGLE = 22.0
 a cause is given here."""
 CLASS_GAIN = 0.2
 """A member of the class is kept where its gain falls short by less than this share."""
+ONE_CONDITION_GAIN = 0.05
+"""The same where all cuts are of one condition: where more causes are near, what they gain has to
+tell them apart."""
 LEAST_REPLICATES = 3
 CANDIDATES = 8
 """Causes that are looked at more closely, those with most evidence."""
@@ -211,8 +214,9 @@ def _finding(
         # An event is short: in the mean over all samples it is less than it is.
         spread = max(spread, _size_of_gain(problem, evidence.gain - evidence.expected))
     share = max(evidence.gain - evidence.expected, 0.0) / max(total, 1e-9)
-    floor = evidence.score - CLASS_GAIN * evidence.gain
-    angle = CLASS_ANGLE if len(problem.conditions) > 1 else ONE_CONDITION_ANGLE
+    several = len(problem.conditions) > 1
+    angle = CLASS_ANGLE if several else ONE_CONDITION_ANGLE
+    floor = evidence.score - (CLASS_GAIN if several else ONE_CONDITION_GAIN) * evidence.gain
     others = [
         e.name
         for e in screening.causes
