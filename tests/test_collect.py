@@ -1,13 +1,14 @@
 """`sliceit collect`: a protocol's slices on a station, in random order, as records."""
 
 import io
+import re
 
 import numpy as np
 import pytest
+from emulator_bench import free_address
 from test_hardware_end_to_end import CLIENT_PACE, PATIENT, ROBOT, emulated
 
 from sliceit_drake.cli.main import main
-from sliceit_drake.configuration import dump_yaml
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.records.validation import load_record
 from sliceit_drake.resources import resource_path
@@ -68,28 +69,34 @@ def test_it_cuts_all_slices_records_them_and_goes_on_where_it_was(protocol, tmp_
     assert "--seed" in capsys.readouterr().err
 
 
-def test_slices_on_a_robot_are_recorded_as_those_of_the_simulated_station(
+def test_a_protocol_on_one_emulated_robot_is_recorded_as_on_the_simulated_station(
     protocol, tmp_path, monkeypatch, capsys
 ):
     slices = ["collect", str(protocol), "--seed", "3"]
-    assert main([*slices, "--output", str(tmp_path / "simulated"), "--first", "2"]) == 0
-    loaded, station = load_protocol(str(protocol)), load_scenario(resource_path(STATION))
-    for specimen in schedule(loaded, np.random.default_rng([3, 0]))[:2]:
-        # A controller of its own for each: nobody puts fresh food into one that runs.
-        file = tmp_path / f"{specimen.index}.yaml"
-        dump_yaml(scenario_of_cut(loaded, specimen, station), file)
-        with emulated(file, "{}") as emulator:
-            robot = ["--host", emulator.address, "--pace", str(CLIENT_PACE)]
-            robot += ["--robot", str(ROBOT), "--set-robot", f"{{{PATIENT}}}"]
-            robot += ["--output", str(tmp_path / "real"), "--first", str(specimen.index + 1)]
-            monkeypatch.setattr("sys.stdin", io.StringIO("go on\n"))
-            assert main([*slices, *robot]) == 1, "that was not the word"
-            monkeypatch.setattr("sys.stdin", io.StringIO("slice\n"))
-            assert main([*slices, *robot]) == 0
-    assert "a fresh piece of food" in capsys.readouterr().out
-    for name in ("slice_000", "slice_001"):
+    assert main([*slices, "--output", str(tmp_path / "simulated")]) == 0
+    with emulated() as emulator:
+        robot = ["--host", emulator.address, "--pace", str(CLIENT_PACE), "--robot", str(ROBOT)]
+        robot += ["--set-robot", f"{{{PATIENT}}}", "--output", str(tmp_path / "real")]
+        robot += ["--move-to-start", "--emulator-pendant", "30099"]
+        monkeypatch.setattr("sys.stdin", io.StringIO("move\ntouch\nmove\ngo on\n"))
+        assert main([*slices, *robot, "--touch"]) == 1, "that was not the word"
+        assert not (tmp_path / "real" / "slice_000.csv").exists()
+        printed = capsys.readouterr()
+        touched = re.search(r"The board is at ([\d.]+) m", printed.out)
+        assert touched, printed.out + printed.err
+        assert float(touched[1]) == pytest.approx(0.05, abs=2e-4)
+        monkeypatch.setattr("sys.stdin", io.StringIO("move\nslice\n" * 3))
+        assert main([*slices, *robot]) == 0
+        log = [text for _, text in emulator.pendant.status()["log"]]
+    # A bare board for the touch, food before the wrong word, and for each slice.
+    assert log.count("fresh food") == 5
+    printed = capsys.readouterr().out
+    assert printed.count("a fresh piece of food") == 2 and "the bare board" in printed
+    conditions = []
+    for name in ("slice_000", "slice_001", "slice_002"):
         real = load_record(tmp_path / "real" / f"{name}.csv")
         wanted = load_record(tmp_path / "simulated" / f"{name}.csv")
+        conditions.append(real.metadata.condition)
         assert real.metadata.condition == wanted.metadata.condition
         assert real.metadata.provenance == "UR5e through RTDE."
         assert (tmp_path / "real" / name / "robot.csv").exists()
@@ -98,6 +105,31 @@ def test_slices_on_a_robot_are_recorded_as_those_of_the_simulated_station(
         with capsys.disabled():
             print(f"\n{name}, {real.metadata.condition}: {100 * error:.2f} % RMS of force apart")
         assert error < 0.05
+    assert sorted(conditions) == ["board", "press", "press"]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--emulator-pendant", "30099"], "--emulator-pendant: .* on this machine"),
+        (["--emulator-pendant", "30099", "--host", "10.0.0.5"], "with a robot leave this out"),
+        (["--touch"], "--touch: is for a robot"),
+        (["--move-to-start"], "--move-to-start: is for a robot"),
+        (["--dry-run"], "--dry-run: is for a robot"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(options, said, protocol, tmp_path, capsys):
+    output = tmp_path / "records"
+    assert main(["collect", str(protocol), "--output", str(output), *options]) == 2
+    assert re.search(said, capsys.readouterr().err)
+    assert not output.exists()
+
+
+def test_food_is_renewed_only_where_an_emulator_answers(protocol, tmp_path, capsys):
+    address = free_address()
+    arguments = ["--host", address, "--robot", str(ROBOT), "--emulator-pendant", "30099"]
+    assert main(["collect", str(protocol), "--output", str(tmp_path), *arguments]) == 2
+    assert f"{address}:30099 puts no fresh food there" in capsys.readouterr().err
 
 
 def test_every_shipped_protocol_makes_scenarios_of_a_station():

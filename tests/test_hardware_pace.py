@@ -1,4 +1,4 @@
-"""The table of how a run keeps up with the controller's clock: what it counts, and where it goes."""
+"""How a run keeps up with the controller's clock: what the table counts, and where it goes."""
 
 import importlib.util
 import re

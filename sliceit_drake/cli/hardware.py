@@ -16,7 +16,15 @@ if TYPE_CHECKING:
     from sliceit_drake.hardware.client import RobotClient
     from sliceit_drake.hardware.configuration import HardwareConfig
 
-__all__ = ["add_parser", "add_robot_arguments", "robot_config", "run_confirmed"]
+__all__ = [
+    "add_parser",
+    "add_robot_arguments",
+    "is_loopback",
+    "move_confirmed",
+    "robot_config",
+    "run_confirmed",
+    "touch_confirmed",
+]
 
 DEFAULT_ROBOT = "hardware/ur5e.yaml"
 WORD = "slice"
@@ -133,19 +141,46 @@ def run_confirmed(
     from sliceit_drake.diagrams.hardware_run import prepare_hardware_run
     from sliceit_drake.diagrams.run import make_meshcat
 
+    if getattr(options, "touch", False) and not options.dry_run:
+        if not touch_confirmed(options, scenario, config):
+            return None
     client = connect(options, config)
     try:
-        if getattr(options, "touch", False) and not options.dry_run:
-            if not touch_board(options, scenario, config, client):
-                return None
-            # The touch has stopped the program on the robot.
-            client.close()
-            client = connect(options, config)
         is_drawn = not (getattr(options, "no_replay", True) or options.dry_run)
         meshcat = make_meshcat() if is_drawn else None
         hardware = prepare_hardware_run(scenario, config, client, options.pace, meshcat)
         return checked_run(options, hardware, directory)
     finally:
+        client.close()
+
+
+def touch_confirmed(
+    options: argparse.Namespace, scenario: "Scenario", config: "HardwareConfig"
+) -> bool:
+    """Connects and finds the board, see `touch_board`; the program on the robot is stopped then."""
+    client = connect(options, config)
+    try:
+        return touch_board(options, scenario, config, client)
+    finally:
+        client.close()
+
+
+def move_confirmed(
+    options: argparse.Namespace, scenario: "Scenario", config: "HardwareConfig"
+) -> bool:
+    """Connects, checks the robot, and moves it to the start after the operator's word.
+
+    Returns:
+        False if the robot was not ready or did not move, or the operator did not confirm.
+    """
+    from sliceit_drake.diagrams.hardware_run import prepare_hardware_run
+
+    client = connect(options, config)
+    try:
+        hardware = prepare_hardware_run(scenario, config, client, options.pace)
+        return _report("Robot", hardware.check_facts()) and _moved_to_start(hardware)
+    finally:
+        client.stop()
         client.close()
 
 
@@ -222,14 +257,20 @@ def checked_run(
 
 def _ready_at_start(options: argparse.Namespace, hardware: "HardwareRun") -> bool:
     """Moves the arm to the start if asked to, and checks it there; whether all is well."""
-    if options.move_to_start and not options.dry_run:
-        print("The joints will turn straight to:", hardware.twin.start_joints.round(4).tolist())
-        if not ask(MOVE_WORD):
-            return False
-        if not hardware.move_to_start():
-            print("The robot did not move to the start. Nothing else was done.")
-            return False
+    if options.move_to_start and not options.dry_run and not _moved_to_start(hardware):
+        return False
     return _report("Start", hardware.check_at_start())
+
+
+def _moved_to_start(hardware: "HardwareRun") -> bool:
+    """Moves the arm to the start after the operator's word; whether it is there."""
+    print("The joints will turn straight to:", hardware.twin.start_joints.round(4).tolist())
+    if not ask(MOVE_WORD):
+        return False
+    if not hardware.move_to_start():
+        print("The robot did not move to the start. Nothing else was done.")
+        return False
+    return True
 
 
 def _slice(hardware: "HardwareRun", duration: float, directory: Path) -> "Run":
@@ -274,8 +315,7 @@ def robot_config(options: argparse.Namespace) -> "HardwareConfig":
         raise ConfigurationError(
             "is missing", field="--host", fix="Give the address of the robot, as on its pendant."
         )
-    loopback = options.host == "localhost" or options.host.startswith("127.")
-    if options.pace != 1.0 and (not loopback or not 0.0 < options.pace <= 10.0):
+    if options.pace != 1.0 and (not is_loopback(options.host) or not 0.0 < options.pace <= 10.0):
         raise ConfigurationError(
             f"{options.pace:g} is for an emulated controller on this machine",
             field="--pace",
@@ -287,6 +327,11 @@ def robot_config(options: argparse.Namespace) -> "HardwareConfig":
         config.board_height = options.board_height
         validate(config, "robot")
     return config
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address is of this machine, as an emulated controller's is."""
+    return host == "localhost" or host.startswith("127.")
 
 
 def connect(options: argparse.Namespace, config: "HardwareConfig") -> "RobotClient":

@@ -5,7 +5,9 @@ import dataclasses as dc
 import os
 import time
 
-from sliceit_drake.configuration import ConfigurationError
+import numpy as np
+
+from sliceit_drake.configuration import ConfigurationError, load_yaml
 from sliceit_drake.emulator.connections import Service, SocketHub
 from sliceit_drake.emulator.control_script import SERVO_COMMAND
 from sliceit_drake.emulator.controller import Controller, ControllerConfig
@@ -25,6 +27,8 @@ _SCRIPT_PORTS = (30003, 30001, 30002)
 # Wall time beyond which the clock gives up catching up, in cycles.
 _LATE_CYCLES = 5
 _STATUS_LOG = 50
+# Joint speed below which somebody may reach under the knife, rad/s.
+_REST = 0.01
 # Wall time without a command after which a client has nothing more to answer, s.
 _SETTLING = 0.05
 
@@ -102,12 +106,13 @@ class Emulator:
             "script": [script],
         }
         self.faults = FaultInjector(controller, self._hub, self.rtde, services)
+        pendant = Pendant(self.faults, self.status, self.stop, self.put_fresh_food)
         try:
             self._hub.listen(_RTDE_PORT, self.rtde)
             self._hub.listen(_DASHBOARD_PORT, dashboard)
             for port in _SCRIPT_PORTS:
                 self._hub.listen(port, script)
-            self._own_hub.listen(PENDANT_PORT, Pendant(self.faults, self.status, self.stop))
+            self._own_hub.listen(PENDANT_PORT, pendant)
         except OSError:
             self.close()
             raise
@@ -172,6 +177,35 @@ class Emulator:
             "rtde": self.rtde.statistics(),
             "log": list(controller.log)[-_STATUS_LOG:],
         }
+
+    def put_fresh_food(self, scenario: str | None = None) -> None:
+        """Puts an uncut food under the knife, as a person does between two cuts.
+
+        The clock and the ports stand while the food is prepared.
+
+        Args:
+            scenario: YAML of the `Scenario` whose food is put there; None for the same again.
+
+        Raises:
+            ConfigurationError: A program plays, the arm moves, the knife is in the way, or there is
+                no such food.
+        """
+        controller = self.controller
+        speed = float(np.abs(controller.robot.state.velocities).max())
+        if controller.runtime != RuntimeState.STOPPED or speed > _REST:
+            raise ConfigurationError(
+                f"nobody reaches under a knife that may move: the program is "
+                f"{controller.runtime.name}, the fastest joint has {speed:.3g} rad/s",
+                field="fresh_food",
+                fix="Stop the program first.",
+            )
+        food = None
+        if scenario is not None:
+            from sliceit_drake.diagrams.scenario import Scenario
+
+            food = load_yaml(Scenario, None, defaults=Scenario(), overrides_text=scenario)
+        controller.robot.put_fresh_food(food)
+        controller.log.append((controller.time, "fresh food"))
 
     def _wait(self, due: float) -> None:
         """Serves the sockets until the next cycle is due."""

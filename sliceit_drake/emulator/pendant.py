@@ -1,7 +1,9 @@
 """The emulator's own port, 30099, in place of a person at the pendant: a line of JSON in, one out.
 
 Requests: ``{"inject": FAULT, "at": TIME}`` (`at` may be left out), ``{"status": true}``,
-``{"stop": true}``. Answers have ``"ok"``, and ``"error"`` where it is false.
+``{"fresh_food": true}`` for the same food uncut, ``{"fresh_food": SCENARIO}`` for that of a
+scenario, as YAML text, ``{"stop": true}``. Answers have ``"ok"``, and ``"error"`` where it is
+false.
 """
 
 import json
@@ -24,8 +26,10 @@ class Pendant:
         faults: FaultInjector,
         status: Callable[[], dict[str, object]],
         stop: Callable[[], None],
+        put_fresh_food: Callable[[str | None], None],
     ) -> None:
         self._faults, self._status, self._stop = faults, status, stop
+        self._put_fresh_food = put_fresh_food
         self._buffers: dict[Connection, bytearray] = {}
 
     def opened(self, connection: Connection) -> None:
@@ -59,6 +63,12 @@ class Pendant:
             if "stop" in request:
                 self._stop()
                 return {"ok": True}
-            raise ValueError("a request has one of inject, status, stop")
+            if "fresh_food" in request:
+                food = request["fresh_food"]
+                if food is not True and not isinstance(food, str):
+                    raise ValueError("fresh_food is true or a scenario as text")
+                self._put_fresh_food(None if food is True else food)
+                return {"ok": True}
+            raise ValueError("a request has one of inject, status, fresh_food, stop")
         except (ValueError, TypeError, ConfigurationError) as error:
             return {"ok": False, "error": str(error)}

@@ -26,17 +26,18 @@ class EmulatorError(RuntimeError):
 class PendantClient:
     """A connection to the own port of a running emulator."""
 
-    def __init__(self, address: str, timeout: float = 5.0) -> None:
+    def __init__(self, address: str, timeout: float = 5.0, port: int = PENDANT_PORT) -> None:
         """Connects.
 
         Args:
             address: Of the emulator.
             timeout: Wall time to wait for an answer, s.
+            port: Likewise.
 
         Raises:
             OSError: Nothing answers there.
         """
-        self._socket = socket.create_connection((address, PENDANT_PORT), timeout)
+        self._socket = socket.create_connection((address, port), timeout)
         self._file = self._socket.makefile("rwb")
 
     def request(self, **request: object) -> dict:
@@ -65,6 +66,17 @@ class PendantClient:
     def status(self) -> dict:
         """What `emulator.Emulator.status` says."""
         return self.request(status=True)
+
+    def put_fresh_food(self, scenario: str | None = None) -> None:
+        """Puts an uncut food under the knife.
+
+        Args:
+            scenario: YAML of the scenario whose food it is; None for the same again.
+
+        Raises:
+            EmulatorError: It was refused, or preparing it takes longer than the timeout.
+        """
+        self.request(fresh_food=True if scenario is None else scenario)
 
     def wait_until(self, time_: float, timeout: float = 30.0) -> dict:
         """Waits for a controller time, s, and returns the status then.

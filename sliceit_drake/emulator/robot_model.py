@@ -2,12 +2,16 @@
 
 import dataclasses as dc
 import functools
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.systems.servo import JOINTS, ServoConfig, ServoLaw
+
+if TYPE_CHECKING:
+    from sliceit_drake.diagrams.scenario import Scenario
 
 __all__ = ["CYCLE", "START", "KinematicRobot", "RobotModel", "RobotState", "SimulationStopped"]
 
@@ -73,6 +77,17 @@ class RobotModel(Protocol):
     def zero_sensor(self) -> None:
         """Subtracts what the sensor feels now from all that follows."""
 
+    def put_fresh_food(self, scenario: "Scenario | None" = None) -> None:
+        """Puts an uncut food in the place of the one that is there; the arm stays as it is.
+
+        Args:
+            scenario: Whose food, numerics and placement on the board are taken; None for the same
+                food again.
+
+        Raises:
+            ConfigurationError, MeshError, TimeStepError: It cannot be put there.
+        """
+
 
 class KinematicRobot:
     """An arm without mass: planned motions are followed exactly, ``servoj`` with its lag.
@@ -101,6 +116,14 @@ class KinematicRobot:
 
     def zero_sensor(self) -> None:
         """See `RobotModel`."""
+
+    def put_fresh_food(self, scenario: "Scenario | None" = None) -> None:
+        """See `RobotModel`."""
+        raise ConfigurationError(
+            "there is none under an arm alone",
+            field="fresh_food",
+            fix="Start the emulator with a scenario.",
+        )
 
 
 @functools.lru_cache(maxsize=32)

@@ -1,14 +1,22 @@
 """The simulated station as the robot behind the emulated controller."""
 
+import dataclasses as dc
+
 import numpy as np
 from numpy.typing import ArrayLike
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import Simulator, SimulatorStatus
+from pydrake.systems.framework import Context
 
+from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.diagrams.station import MakeSlicingStation
+from sliceit_drake.diagrams.station import MakeSlicingStation, SlicingStation
 from sliceit_drake.emulator.joint_targets import JointTargets
 from sliceit_drake.emulator.robot_model import CYCLE, RobotState, SimulationStopped
+from sliceit_drake.hardware.knife_kinematics import KnifeKinematics
+from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.servo import ServoConfig
 
 __all__ = ["StationRobot"]
@@ -32,21 +40,13 @@ class StationRobot:
         Raises:
             ConfigurationError, MeshError, TimeStepError: The scenario cannot be built.
         """
-        self._station = station = MakeSlicingStation(
-            scenario, make_controller=lambda s: JointTargets(s.robot)
-        )
-        assert isinstance(station.controller, JointTargets)
-        self._targets = station.controller
+        self._scenario = scenario
+        station = _station_of(scenario)
+        simulator = Simulator(station)
+        station.SetStart(simulator.get_mutable_context())
+        simulator.Initialize()
+        self._use(station, simulator)
         self._servo = scenario.robot.servo
-        self._simulator = Simulator(station)
-        context = self._simulator.get_mutable_context()
-        station.SetStart(context)
-        self._simulator.Initialize()
-        arm_controller = station.GetSubsystemByName("arm_controller")
-        self._torques = arm_controller.GetOutputPort("joint_torques")
-        self._arm_context = arm_controller.GetMyContextFromRoot(context)
-        self._plant_context = station.plant.GetMyContextFromRoot(context)
-        self._sensor_context = station.sensor.GetMyMutableContextFromRoot(context)
         tool = station.plant.CalcSpatialInertia(
             self._plant_context,
             station.robot.sensor_weld.frame_on_parent(),
@@ -85,6 +85,92 @@ class StationRobot:
         """See `robot_model.RobotModel`."""
         self._station.sensor.tare(self._sensor_context)
 
+    def put_fresh_food(self, scenario: Scenario | None = None) -> None:
+        """See `robot_model.RobotModel`."""
+        old = self._scenario
+        if scenario is not None:
+            if scenario.knife != old.knife:
+                raise ConfigurationError(
+                    "is another than the one on the arm",
+                    field="fresh_food.knife",
+                    fix="Start an emulator with this knife.",
+                )
+            scenario = dc.replace(
+                old,
+                food=scenario.food,
+                placement=scenario.placement,
+                numerics=scenario.numerics,
+                sequence=scenario.sequence,
+                start=scenario.start,
+                policy=None,
+                motion=scenario.motion,
+            )
+        scenario = scenario or old
+        station = _station_of(scenario)
+        self._check_room(station)
+        simulator = Simulator(station)
+        context = simulator.get_mutable_context()
+        context.SetTime(self._simulator.get_context().get_time())
+        self._copy_arm(station, context)
+        try:
+            simulator.Initialize()
+        except CuttingError as error:
+            raise ConfigurationError(
+                str(error), field="fresh_food", fix="Put it elsewhere, or move the knife first."
+            ) from error
+        # Initialization has put the targets to where the arm is.
+        self._copy_arm(station, context)
+        self._use(station, simulator)
+        self._scenario = scenario
+        self.state = self._read()
+
+    def _check_room(self, station: SlicingStation) -> None:
+        """Whether the knife is over the food of a station."""
+        food, start = station.scenario.food, station.scenario.start
+        if isinstance(food, AnalyticFood) and food.toughness == 0.0:
+            return
+        top = float(station.start_pose.translation()[2]) - start.clearance
+        robot = self._scenario.robot
+        kinematics = KnifeKinematics(
+            robot.X_WB().GetAsMatrix34(),
+            robot.X_TK().GetAsMatrix34(),
+            self._scenario.knife.length,
+        )
+        heel, tip, _ = kinematics.edge(self.state.positions.tolist())
+        lowest = min(heel[2], tip[2])
+        if lowest < top:
+            raise ConfigurationError(
+                f"the knife is {1e3 * (top - lowest):.1f} mm below the top of the food",
+                field="fresh_food",
+                fix="Lift it first.",
+            )
+
+    def _copy_arm(self, station: SlicingStation, context: Context) -> None:
+        """Copies all but the food from this robot's station to another."""
+        old, source = self._station, self._simulator.get_context()
+        for system in station.GetSystems():
+            # Geometry and bodies are the station's own: plants differ in what is drawn at the food.
+            if isinstance(system, SceneGraph | MultibodyPlant) or system is station.cutting:
+                continue
+            before = old.GetSubsystemByName(system.get_name()).GetMyContextFromRoot(source)
+            system.GetMyMutableContextFromRoot(context).SetStateAndParametersFrom(before)
+        x = old.plant.GetPositionsAndVelocities(self._plant_context, old.robot.arm)
+        plant = station.plant
+        plant.SetPositionsAndVelocities(
+            plant.GetMyMutableContextFromRoot(context), station.robot.arm, x
+        )
+
+    def _use(self, station: SlicingStation, simulator: Simulator) -> None:
+        """Goes on with a station in a simulator, initialized."""
+        assert isinstance(station.controller, JointTargets)
+        self._station, self._simulator, self._targets = station, simulator, station.controller
+        context = simulator.get_mutable_context()
+        arm_controller = station.GetSubsystemByName("arm_controller")
+        self._torques = arm_controller.GetOutputPort("joint_torques")
+        self._arm_context = arm_controller.GetMyContextFromRoot(context)
+        self._plant_context = station.plant.GetMyContextFromRoot(context)
+        self._sensor_context = station.sensor.GetMyMutableContextFromRoot(context)
+
     def _read(self) -> RobotState:
         plant, arm = self._station.plant, self._station.robot.arm
         port = self._station.sensor.GetOutputPort("sensor_wrench")
@@ -107,3 +193,7 @@ class StationRobot:
                 f"servoj asks for lookahead {servo.lookahead_time:g} s and gain {servo.gain:g}; "
                 f"the scenario's servo has {ours.lookahead_time:g} s and {ours.gain:g}, which stay"
             )
+
+
+def _station_of(scenario: Scenario) -> SlicingStation:
+    return MakeSlicingStation(scenario, make_controller=lambda s: JointTargets(s.robot))
