@@ -22,8 +22,8 @@ OVERRIDES = """{start: {clearance: 0.02}, measurement: null, motion: {segments: 
   !Retract {speed: 0.02, distance: 0.019, acceleration: 0.5, label: retract}]}}"""
 
 
-def injected_in_motion(emulator, fault):
-    """A thread that injects a fault as soon as the arm moves."""
+def injected_in_motion(emulator, *faults):
+    """A thread that injects faults as soon as the arm moves."""
 
     def inject():
         end = time.monotonic() + 60.0
@@ -31,7 +31,8 @@ def injected_in_motion(emulator, fault):
             if time.monotonic() > end:
                 return
             time.sleep(0.02)
-        emulator.pendant.inject(fault)
+        for fault in faults:
+            emulator.pendant.inject(fault)
 
     thread = threading.Thread(target=inject)
     thread.start()
@@ -70,3 +71,33 @@ def test_it_stops_the_robot_for_good(fault, said, tmp_path, monkeypatch, capsys)
         # Until the network is there again the controller's own watchdog, 10 Hz here, is all.
         watchdog = next(when for when, text in status["log"] if "RTDE watchdog: no" in text)
         assert watchdog - at < 0.1 + 0.02
+
+
+@pytest.mark.parametrize(
+    ("faults", "said"),
+    [
+        # The client has its connections: only who comes anew is turned away.
+        (["refuse:1"], None),
+        # It would take a lost one up again by itself, if it could.
+        (["refuse:1", "close:rtde"], "STOPPED: (state_age|link)"),
+    ],
+)
+def test_refused_connections_matter_only_to_who_connects_anew(
+    faults, said, tmp_path, monkeypatch, capsys
+):
+    with emulated(SPRING, OVERRIDES) as emulator:
+        thread = injected_in_motion(emulator, *faults)
+        code = run_hardware(
+            emulator, tmp_path, monkeypatch, ["slice"], scenario=SPRING, overrides=OVERRIDES,
+            pace=0.05,
+        )  # fmt: skip
+        thread.join()
+        status = emulator.pendant.status()
+    printed = capsys.readouterr().out
+    log = [text for _, text in status["log"] if text.startswith("injected")]
+    assert log == [f"injected: {fault}" for fault in faults]
+    assert status["safety_mode"] == "NORMAL" and np.abs(status["velocities"]).max() < 1e-3
+    if said is None:
+        assert code == 0, printed
+    else:
+        assert code == 1 and re.search(said, printed), printed

@@ -28,8 +28,8 @@ time passes per wall time. With --lockstep a cycle waits for the client's servoJ
 run every time, on any machine.
 
 Port 30099 takes lines of JSON, as {{"inject": "silence:0.1", "at": 2.5}}, {{"status": true}},
-{{"fresh_food": true}} (uncut food under the knife) or {{"stop": true}}. --inject does the same from the start. Times are the controller's. What can be
-injected:
+{{"fresh_food": true}} (uncut food under the knife) or {{"stop": true}}. --inject does the same
+from the start. Times are the controller's. What can be injected:
 {faults_as_text()}
 """
 
