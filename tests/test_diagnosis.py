@@ -165,11 +165,14 @@ def test_a_cause_that_foretells_no_other_record_is_unknown():
     (finding,) = verdict.findings
     gain = held_out_gain(found, [(finding.evidence.name, finding.evidence.scan)])
     poor = dc.replace(gain, share=0.5, interval=(0.4, 0.7))
+    assert gain.before > gain.floor
     assert foretold(verdict, poor).kind == "unknown"
     assert "50 %" in foretold(verdict, poor).reason
     # What is not sure to be too little is enough.
     assert foretold(verdict, dc.replace(poor, interval=(0.2, 1.1))) is verdict
-    # What differs from record to record cannot be foretold.
+    # Nothing of what is no larger than the noise can be foretold.
+    assert foretold(verdict, dc.replace(poor, before=0.9 * poor.floor)) is verdict
+    # Nor what differs from record to record.
     finding.evidence.per_record = True
     assert foretold(verdict, poor) is verdict
 

@@ -29,7 +29,12 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
         ("diagnosis", f"at least {100 * verdict.SECOND_GAIN:g} % of all that can be gained"),
         ("diagnosis", f"an effect of {verdict.LEAST_MISFIT:g} of the noise or more"),
         ("diagnosis", f"at least {verdict.MISFIT_FACTOR:g} times what it gains where nothing"),
-        ("diagnosis", f"ends below {100 * verdict.LEAST_REMOVED:g} % the verdict is unknown"),
+        (
+            "diagnosis",
+            f"of one condition: {verdict.ONE_CONDITION_MISFIT:g} of the noise, "
+            f"{verdict.ONE_CONDITION_FACTOR:g} times",
+        ),
+        ("diagnosis", f"Where it ends below {100 * verdict.LEAST_REMOVED:g} %, and"),
         (
             "next_experiment",
             f"least {100 * (1.0 - next_experiment.ALIKE_GAIN):g} % as much and are within "
