@@ -134,14 +134,42 @@ def test_it_begins_nothing_where_the_robot_is_not_ready(twin, robot):
         ({"tcp": [0.0, 0.0, 0.2, 0.0, 0.0, 0.0]}, "tool centre point"),
         ({"tcp": [float("nan")] * 6}, "tool centre point"),
         ({"speed_scaling": 0.5}, "speed slider"),
+        # What is missing has not been checked.
+        ({"remote_control": None}, "remote control"),
+        ({"tcp": []}, "tool centre point"),
+        ({"speed_scaling": float("nan")}, "speed slider"),
     ):
         assert failed(check_facts(dc.replace(facts, **change), config)) == [name]
     other = dc.replace(config, serial="1")
     assert failed(check_facts(facts, other)) == ["serial number"]
     assert failed(check_facts(facts, HardwareConfig())) == ["payload"]
+    for cog in ([], [0.0, 0.0], [float("nan")] * 3):
+        assert "centre of gravity" in failed(
+            check_facts(dc.replace(facts, payload_cog=cog), config)
+        )
+    assert "payload" in failed(check_facts(dc.replace(facts, payload=float("nan")), config))
     turned = robot.read()._replace(q=[*robot.q[:5], robot.q[5] - 2.0 * np.pi])
     (check,) = [c for c in check_start(turned, robot.q, config) if not c.passed]
     assert "whole turn" in check.fix
+
+
+@pytest.mark.parametrize("joint", range(6))
+def test_a_number_that_is_none_among_good_ones_is_not_at_the_start(joint, robot):
+    state, config = robot.read(), HardwareConfig(**CONFIG)
+    assert failed(check_start(state, robot.q, config)) == []
+    for name in ("q", "qd"):
+        values = list(getattr(state, name))
+        values[joint] = float("nan")
+        assert failed(check_start(state._replace(**{name: values}), robot.q, config))
+        assert failed(check_start(state._replace(**{name: values[:5]}), robot.q, config))
+
+
+def test_old_readings_of_the_sensor_are_not_taken_for_a_zero(robot):
+    hardware = hardware_run(robot)
+    robot.frozen = True
+    checks = hardware.check_at_start()
+    assert failed(checks) == ["force after zeroing"]
+    assert "0 of 50 readings" in checks[-1].found
 
 
 def test_a_plan_out_of_limits_is_refused_before_the_word(twin, robot):

@@ -334,3 +334,35 @@ def test_limits_change_only_by_name(tmp_path):
     file.write_text("joint_step: 0.001\n")
     with pytest.raises(ConfigurationError, match="less than a stop needs"):
         load_limits(file)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, -7.0, 1e6])
+def test_a_limit_that_nothing_breaks_is_refused(value):
+    for field in dc.fields(SafetyLimits):
+        default = getattr(SafetyLimits(), field.name)
+        wrong = value
+        if isinstance(default, list):
+            wrong = [*default[:-1], value]
+        with pytest.raises(ConfigurationError, match=field.name):
+            make_layer(**{field.name: wrong})
+        text = f"{field.name}: {wrong}".replace("nan", ".nan").replace("inf", ".inf")
+        with pytest.raises(ConfigurationError, match=field.name):
+            load_limits(None, f"{{{text}}}")
+
+
+@pytest.mark.parametrize(
+    ("start", "board"),
+    [(START, math.nan), (START, math.inf), ([*START[:5], math.nan], BOARD), (START[:5], BOARD)],
+)
+def test_no_layer_is_made_around_what_is_not_known(start, board):
+    with pytest.raises(ConfigurationError, match="not known"):
+        SafetyLayer(SafetyLimits(), KnifeKinematics(X_WB, X_TK, LENGTH), board, start, PERIOD)
+
+
+@pytest.mark.parametrize("now", [None, (1.2, 0.0, 0.0), (1.2, 0.0, math.nan, 0.06)])
+def test_a_payload_that_is_not_known_any_more_stops_the_robot(now):
+    layer = make_layer()
+    known = state(0.0, START)._replace(payload=(1.2, 0.0, 0.0, 0.06))
+    assert layer.arm(known) is None
+    decision = layer.step(known._replace(time=0.002, payload=now), START, 0.002)
+    assert decision.stop.limit == "payload"

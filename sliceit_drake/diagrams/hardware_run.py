@@ -103,7 +103,7 @@ class HardwareRun:
         checks = check_start(self.client.read(), start, self.config)
         if all(check.passed for check in checks):
             self.client.zero_sensor()
-            checks += check_sensor(self._some_states(), self.config)
+            checks += check_sensor(self._some_states(), self.config, SENSOR_SAMPLES)
         return checks
 
     def execute(
@@ -214,10 +214,13 @@ class HardwareRun:
                 progress(now, run.wall_time)
 
     def _some_states(self) -> list[RobotState]:
-        states, deadline = [self.client.read()], clock.perf_counter() + NO_DATA / self.pace
+        """States of as many cycles from now on; fewer if the data do not go on."""
+        states: list[RobotState] = []
+        before, deadline = self.client.timestamp(), clock.perf_counter() + NO_DATA / self.pace
         while len(states) < SENSOR_SAMPLES and clock.perf_counter() < deadline:
-            if self.client.timestamp() != states[-1].time:
+            if self.client.timestamp() != before:
                 states.append(self.client.read())
+                before = states[-1].time
             clock.sleep(1e-3)
         return states
 

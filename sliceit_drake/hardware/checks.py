@@ -8,7 +8,7 @@ from sliceit_drake.hardware.client import RobotFacts
 from sliceit_drake.hardware.configuration import HardwareConfig
 from sliceit_drake.hardware.robot_state import RobotState
 
-__all__ = ["Check", "check_facts", "check_sensor", "check_start"]
+__all__ = ["Check", "check_facts", "check_payload", "check_sensor", "check_start"]
 
 
 @dc.dataclass(frozen=True)
@@ -67,9 +67,9 @@ def check_facts(facts: RobotFacts, config: HardwareConfig) -> list[Check]:
         ),
         Check(
             "remote control",
-            facts.remote_control is not False,
+            facts.remote_control is True,
             {True: "on", False: "off", None: "the robot cannot say"}[facts.remote_control],
-            "Switch the pendant to remote control.",
+            "Switch the pendant to remote control; PolyScope 5.6 and later can say.",
         ),
         Check(
             "speed slider",
@@ -79,7 +79,7 @@ def check_facts(facts: RobotFacts, config: HardwareConfig) -> list[Check]:
         ),
         Check(
             "tool centre point",
-            all(abs(x) < 1e-4 for x in facts.tcp),
+            len(facts.tcp) == 6 and all(abs(x) < 1e-4 for x in facts.tcp),
             f"{[round(x, 4) for x in facts.tcp]}, wanted zero",
             "Set it to the flange on the pendant: the wrench is taken there.",
         ),
@@ -94,12 +94,21 @@ def check_facts(facts: RobotFacts, config: HardwareConfig) -> list[Check]:
             )
         )
         return checks
-    distance = math.dist(facts.payload_cog, config.payload_cog)
-    checks += [
+    return checks + check_payload((facts.payload, *facts.payload_cog), config)
+
+
+def check_payload(payload: Sequence[float] | None, config: HardwareConfig) -> list[Check]:
+    """What the controller subtracts from the force: mass, kg, and centre in the flange, m [4]."""
+    wanted, centre = config.payload, config.payload_cog
+    assert wanted is not None and centre is not None
+    mass = distance = math.nan
+    if payload is not None and len(payload) == 4:
+        mass, distance = payload[0], math.dist(payload[1:], centre)
+    return [
         Check(
             "payload",
-            abs(facts.payload - config.payload) <= config.payload_tolerance,
-            f"{facts.payload:.3f} kg, wanted {config.payload:.3f}",
+            abs(mass - wanted) <= config.payload_tolerance,
+            f"{mass:.3f} kg, wanted {wanted:.3f}",
             "Set it on the pendant (Installation, Payload): the force readings depend on it.",
         ),
         Check(
@@ -110,12 +119,22 @@ def check_facts(facts: RobotFacts, config: HardwareConfig) -> list[Check]:
             "Set it on the pendant (Installation, Payload).",
         ),
     ]
-    return checks
 
 
-def check_sensor(states: Sequence[RobotState], config: HardwareConfig) -> list[Check]:
-    """The force sensor, zeroed, in the air, by the mean of some states."""
+def check_sensor(
+    states: Sequence[RobotState], config: HardwareConfig, least: int = 1
+) -> list[Check]:
+    """The force sensor, zeroed, in the air, by the mean of some states.
+
+    Args:
+        states: Each of another cycle.
+        config: The robot's file.
+        least: Number of states without which the robot's data do not go on.
+    """
     count = len(states)
+    if count < least or any(len(state.wrench) != 6 for state in states):
+        fix = "Check the network; the readings may be old."
+        return [Check("force after zeroing", False, f"{count} of {least} readings came", fix)]
     mean = [math.fsum(state.wrench[k] for state in states) / count for k in range(6)]
     force, torque = math.hypot(*mean[:3]), math.hypot(*mean[3:])
     fix = "Does the knife touch something? Is the payload right? Then zero it again."
@@ -137,6 +156,10 @@ def check_sensor(states: Sequence[RobotState], config: HardwareConfig) -> list[C
 
 def check_start(state: RobotState, start: Sequence[float], config: HardwareConfig) -> list[Check]:
     """Whether the arm is at the start, with its cables on the side that the plan assumes."""
+    # A NaN among numbers is neither the least nor the greatest of them.
+    if (len(state.q), len(state.qd)) != (6, 6) or not all(map(math.isfinite, state.q + state.qd)):
+        found = "the robot's joint data are no 6 finite numbers each"
+        return [Check("start pose", False, found, "Check the network, and the robot's log.")]
     off = [a - b for a, b in zip(state.q, start, strict=True)]
     worst = max(range(6), key=lambda j: abs(off[j]))
     turns = [j + 1 for j in range(6) if abs(abs(off[j]) - 2.0 * math.pi) < 0.5]

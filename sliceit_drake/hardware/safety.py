@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from sliceit_drake.configuration import ConfigurationError, validate
 from sliceit_drake.hardware.knife_kinematics import Edge, KnifeKinematics
 from sliceit_drake.hardware.limits import SafetyLimits
 from sliceit_drake.hardware.robot_state import (
@@ -18,7 +19,7 @@ from sliceit_drake.hardware.robot_state import (
     safety_text,
 )
 
-__all__ = ["Decision", "LatchedError", "SafetyLayer", "Stop"]
+__all__ = ["Decision", "LatchedError", "SafetyLayer", "Stop", "robot_fault"]
 
 RESET_WORD = "reset"
 # Differences of the controller's times and of targets carry rounding errors of this order.
@@ -87,6 +88,9 @@ class SafetyLayer:
         board_height: Of the board's surface in the world, m.
         start: Joint positions around which `SafetyLimits.joint_window` lies [6], rad.
         period: Of the controller, s.
+
+    Raises:
+        ConfigurationError: A limit is out of its range, or a number is none.
     """
 
     def __init__(
@@ -97,6 +101,13 @@ class SafetyLayer:
         start: Sequence[float],
         period: float = 0.002,
     ) -> None:
+        # A NaN would be a limit that nothing breaks, wherever it came from.
+        validate(limits, "limits")
+        if len(start) != 6 or not all(map(math.isfinite, (*start, board_height))):
+            raise ConfigurationError(
+                f"start {list(start)} or board height {board_height} are not known",
+                fix="Give 6 finite numbers and one.",
+            )
         self.limits, self.period = limits, period
         self._kinematics = kinematics
         window = limits.joint_window
@@ -142,7 +153,7 @@ class SafetyLayer:
         if self._stop is not None:
             raise LatchedError(f"The safety layer is latched ({self._stop}); reset it first.")
         self._armed, self._payload = False, None
-        stop = self._robot_fault(state) or self._measurement_fault(state)
+        stop = robot_fault(state) or self._measurement_fault(state)
         if stop is None:
             self._q, self._v = [float(x) for x in state.q], [0.0] * 6
             self._last, self._payload = state, state.payload
@@ -222,7 +233,7 @@ class SafetyLayer:
             if not stop.sends:
                 return Decision(None, stop)
             if state is not self._last:
-                fault = self._robot_fault(state) or self._clock_fault(state)
+                fault = robot_fault(state) or self._clock_fault(state)
                 if fault is not None:
                     stop = self._stop = stop._replace(sends=False)
                 else:
@@ -241,7 +252,7 @@ class SafetyLayer:
             )
         limits, time = self.limits, state.time
         if state is not self._last:
-            stop = self._robot_fault(state) or self._clock_fault(state)
+            stop = robot_fault(state) or self._clock_fault(state)
             if stop is not None:
                 return stop
             self._last, self._time = state, time
@@ -263,19 +274,6 @@ class SafetyLayer:
         if command is None or time <= self._sent_time:
             return None
         return self._take(command, command_time, time)
-
-    def _robot_fault(self, state: RobotState) -> Stop | None:
-        bits = state.safety_bits
-        if bits & ~SAFE_BITS or not bits & SAFE_BITS:
-            detail = f"the robot reports {safety_text(bits)}"
-            return Stop("safety_status", detail, bits, SAFE_BITS, state.time, False)
-        runtime = state.runtime_state
-        if runtime != PLAYING:
-            known = 0 <= runtime < len(RUNTIME_STATES)
-            name = RUNTIME_STATES[runtime] if known else "in an unknown state"
-            detail = f"the robot's program is {name}"
-            return Stop("program", detail, runtime, PLAYING, state.time, False)
-        return None
 
     def _clock_fault(self, state: RobotState) -> Stop | None:
         gap = state.time - self._time
@@ -308,10 +306,12 @@ class SafetyLayer:
     def _payload_fault(self, state: RobotState) -> Stop | None:
         """The force readings jump with the payload that the controller subtracts."""
         before, now = self._payload, state.payload
-        if before is None or now is None:
+        if before is None:
             return None
-        change = max(abs(a - b) for a, b in zip(now, before, strict=True))
-        if change <= _SAME_PAYLOAD:
+        if now is None or len(now) != len(before):
+            detail = "the controller's payload is not in its data any more"
+            return Stop("payload", detail, math.nan, before[0], state.time, True)
+        if all(abs(a - b) <= _SAME_PAYLOAD for a, b in zip(now, before, strict=True)):
             return None
         detail = (
             f"the controller's payload was changed during the run: {_payload_text(before)} at its "
@@ -449,6 +449,21 @@ class SafetyLayer:
     ) -> Stop:
         text = f"{detail}: {value:.6g} {unit}, allowed {bound:.6g}"
         return Stop(limit, text, value, bound, time, True)
+
+
+def robot_fault(state: RobotState) -> Stop | None:
+    """Why nothing may be sent to a robot: its safety status, or a program that does not play."""
+    bits = state.safety_bits
+    if bits & ~SAFE_BITS or not bits & SAFE_BITS:
+        detail = f"the robot reports {safety_text(bits)}"
+        return Stop("safety_status", detail, bits, SAFE_BITS, state.time, False)
+    runtime = state.runtime_state
+    if runtime != PLAYING:
+        known = 0 <= runtime < len(RUNTIME_STATES)
+        name = RUNTIME_STATES[runtime] if known else "in an unknown state"
+        detail = f"the robot's program is {name}"
+        return Stop("program", detail, runtime, PLAYING, state.time, False)
+    return None
 
 
 def _payload_text(payload: Sequence[float]) -> str:
