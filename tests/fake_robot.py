@@ -29,6 +29,7 @@ class FakeRobot:
         self.sent = []  # (time, target)
         self.log = []
         self.watchdog = None
+        self.move = None  # Where a planned motion goes, and how fast.
         self.stopped = threading.Event()
         self._running = True
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -39,6 +40,11 @@ class FakeRobot:
         while self._running:
             due += 0.002 / self.pace
             clock.sleep(max(0.0, due - clock.perf_counter()))
+            if self.move is not None:
+                end, speed = self.move
+                way = [b - a for a, b in zip(self.target, end, strict=True)]
+                share = min(1.0, 0.002 * speed / max(1e-9, max(map(abs, way))))
+                self.target = [a + share * b for a, b in zip(self.target, way, strict=True)]
             if not self.frozen:
                 self._state = self._law.step(self._state, self.target)
                 self.q, self.qd = self._state[0].tolist(), self._state[1].tolist()
@@ -74,6 +80,7 @@ class FakeRobot:
 
     def stop(self):
         self.log.append("stop")
+        self.move = None
         self.stopped.set()
 
     def facts(self):
@@ -96,10 +103,11 @@ class FakeRobot:
     def allows_joints(self, q):
         return True
 
-    def move_to(self, q, speed, acceleration):
+    def start_move(self, q, speed, acceleration):
+        if self.watchdog is None:
+            raise RuntimeError("a motion before the watchdog")
         self.log.append("move")
-        self.q = self.target = list(q)
-        self._state = self._law.state_at_rest(q)
+        self.move = list(q), speed
         return True
 
     def close(self):

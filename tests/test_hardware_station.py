@@ -2,8 +2,11 @@
 
 import argparse
 import dataclasses as dc
+import io
 import json
+import os
 import threading
+import time as clock
 
 import numpy as np
 import pytest
@@ -20,7 +23,11 @@ from sliceit_drake.diagrams.run_record import slice_record_of
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.diagrams.station import MakeSlicingStation
 from sliceit_drake.hardware.checks import check_facts, check_start
-from sliceit_drake.hardware.configuration import HardwareConfig, load_hardware_config
+from sliceit_drake.hardware.configuration import (
+    HardwareConfig,
+    differing,
+    load_hardware_config,
+)
 from sliceit_drake.hardware.limits import SafetyLimits
 from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.resources import resource_path
@@ -29,6 +36,9 @@ PACE = 0.15
 # A machine that other tests keep busy may be late: these runs are about what is done, not when.
 PATIENT = SafetyLimits(state_age=0.04, command_age=0.04, joint_step=0.04)
 CONFIG = dict(payload=1.2, payload_cog=[0.0, 0.0, 0.06], board_height=0.05, limits=PATIENT)
+
+
+OPTIONS = argparse.Namespace(duration=0.1, dry_run=False, host="127.0.0.1")
 
 
 def spring_scenario():
@@ -187,13 +197,118 @@ def test_a_plan_out_of_limits_is_refused_before_the_word(twin, robot):
 
 @pytest.mark.parametrize("typed", ["", "\n", "y\n", "yes\n", "Slice\n"])
 def test_only_the_word_itself_moves_the_robot(typed, robot, monkeypatch, capsys, tmp_path):
-    import io
-
     monkeypatch.setattr("sys.stdin", io.StringIO(typed))
-    options = argparse.Namespace(duration=0.1, dry_run=False, move_to_start=False, output=None)
-    assert command.checked_run(options, hardware_run(robot), tmp_path) is None
+    assert command.checked_run(OPTIONS, hardware_run(robot), tmp_path) is None
     assert "Nothing was moved" in capsys.readouterr().out
     assert robot.sent == [] and robot.watchdog is None
+
+
+def test_a_pipe_moves_an_emulated_robot_but_no_other(robot, monkeypatch, capsys, tmp_path):
+    real = argparse.Namespace(**vars(OPTIONS) | {"host": "192.168.1.10"})
+    monkeypatch.setattr("sys.stdin", io.StringIO("slice\n"))
+    assert command.checked_run(real, hardware_run(robot), tmp_path) is None
+    assert "must be typed at a terminal" in capsys.readouterr().out
+    assert robot.sent == []
+    assert command.checked_run(OPTIONS, hardware_run(robot), tmp_path).stopped is None
+    assert len(robot.sent) > 20
+
+
+def test_a_word_typed_before_the_question_does_not_answer_it(monkeypatch):
+    ours, theirs = os.openpty()
+    with os.fdopen(theirs) as terminal:
+        monkeypatch.setattr("sys.stdin", terminal)
+        os.write(ours, b"slice\n")
+        timer = threading.Timer(0.5, lambda: os.write(ours, b"no\n"))
+        timer.start()
+        assert not command.ask("slice", OPTIONS)
+        timer = threading.Timer(0.5, lambda: os.write(ours, b"slice\n"))
+        timer.start()
+        assert command.ask("slice", OPTIONS)
+        timer.join()
+    os.close(ours)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"payload": (2.0, 0.0, 0.0, 0.06)}, "payload: 2.000 kg"),
+        ({"payload": None}, "payload: nan kg"),
+        ({"q": "moved"}, "start pose"),
+    ],
+)
+def test_what_changes_while_the_plan_is_read_is_found_before_it_moves(
+    change, said, robot, monkeypatch, capsys, tmp_path
+):
+    def typed(_):
+        for name, value in change.items():
+            if value == "moved":
+                robot.frozen = True
+                value = [*robot.q[:5], robot.q[5] + 0.05]
+                clock.sleep(0.1)
+            setattr(robot, name, value)
+        if robot.frozen:
+            robot.target = robot.q
+            robot._state = robot._law.state_at_rest(robot.q)
+            robot.frozen = False
+        return "slice"
+
+    monkeypatch.setattr("builtins.input", typed)
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    made = command.checked_run(OPTIONS, hardware_run(robot), tmp_path)
+    assert said in made.stopped
+    assert robot.sent == [] and robot.watchdog is None
+
+
+@pytest.mark.parametrize("duration", [0.0, -1.0, float("nan"), float("inf"), 100.0])
+def test_a_run_lasts_as_long_as_its_motion_at_most(duration, robot, tmp_path):
+    options = argparse.Namespace(**vars(OPTIONS) | {"duration": duration})
+    with pytest.raises(ConfigurationError, match="--duration"):
+        command.checked_run(options, hardware_run(robot), tmp_path)
+    assert robot.log == []
+
+
+def test_the_plan_names_each_setting_that_is_not_the_default(robot):
+    config = HardwareConfig(**CONFIG)
+    assert not [line for line in differing(config) if "payload" in line or "board" in line]
+    for name, value in (
+        ("payload_tolerance", 1.0), ("cog_tolerance", 0.2), ("sensor_force", 20.0),
+        ("start_tolerance", 0.2), ("singularity", 0.0), ("watchdog", 5.0), ("software", "1.0"),
+    ):  # fmt: skip
+        assert f"{name}: {value}" in differing(dc.replace(config, **{name: value}))
+    config.touch.force_limit = 50.0
+    config.limits = dc.replace(config.limits, force=200.0)
+    text = command.plan_text(hardware_run(robot, limits=config.limits, touch=config.touch), 1.0)
+    assert "touch.force_limit: 50.0" in text and "force: 200.0" in text
+
+
+def test_a_second_ctrl_c_does_not_keep_the_robot_from_stopping(robot, monkeypatch):
+    hardware = hardware_run(robot)
+
+    def impatient(_):
+        raise KeyboardInterrupt
+
+    def interrupt(now, wall):
+        monkeypatch.setattr("sliceit_drake.hardware.rtde_link.clock.sleep", impatient)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        hardware.execute(3.0, interrupt)
+    monkeypatch.undo()
+    assert robot.stopped.wait(2.0), "the program on the robot goes on"
+
+
+def test_a_robot_that_does_not_confirm_its_stop_is_named(robot, monkeypatch, capsys, tmp_path):
+    def stop():
+        raise RuntimeError("no answer")
+
+    robot.stop = stop
+    monkeypatch.setattr("sys.stdin", io.StringIO("slice\n"))
+    robot.wrench = [0.0, 0.0, 2.9, 0.0, 0.0, 0.0]
+    timer = threading.Timer(1.0, lambda: setattr(robot, "bits", 1 << 2))
+    timer.start()
+    options = argparse.Namespace(**vars(OPTIONS) | {"duration": 2.0})
+    assert command.checked_run(options, hardware_run(robot), tmp_path).stopped
+    assert "DID NOT CONFIRM THAT ITS PROGRAM IS STOPPED (no answer)" in capsys.readouterr().out
 
 
 def test_the_files_for_users_are_read_and_an_absent_robot_is_named(capsys):

@@ -171,6 +171,8 @@ def _touch(options: argparse.Namespace, scenario: "Scenario", config: "HardwareC
     """Finds the board's height on the bare board; `config` then has it."""
     from sliceit_drake.systems.analytic_cutter import AnalyticFood
 
+    if options.move_to_start and not move_confirmed(options, copy.deepcopy(scenario), config):
+        return False
     print("First the knife looks for the board. Take everything off it. Stand back.")
     if options.emulator_pendant is not None:
         bare = copy.deepcopy(scenario)

@@ -2,7 +2,12 @@
 
 import argparse
 import logging
-from collections.abc import Sequence
+import signal
+import sys
+import termios
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +20,7 @@ if TYPE_CHECKING:
     from sliceit_drake.hardware.checks import Check
     from sliceit_drake.hardware.client import RobotClient
     from sliceit_drake.hardware.configuration import HardwareConfig
+    from sliceit_drake.hardware.rtde_link import RobotLink
 
 __all__ = [
     "add_parser",
@@ -141,28 +147,25 @@ def run_confirmed(
     from sliceit_drake.diagrams.hardware_run import prepare_hardware_run
     from sliceit_drake.diagrams.run import make_meshcat
 
+    if options.move_to_start and not options.dry_run:
+        if not move_confirmed(options, scenario, config):
+            return None
     if getattr(options, "touch", False) and not options.dry_run:
         if not touch_confirmed(options, scenario, config):
             return None
-    client = connect(options, config)
-    try:
+    with connected(options, config) as client:
         is_drawn = not (getattr(options, "no_replay", True) or options.dry_run)
         meshcat = make_meshcat() if is_drawn else None
         hardware = prepare_hardware_run(scenario, config, client, options.pace, meshcat)
         return checked_run(options, hardware, directory)
-    finally:
-        client.close()
 
 
 def touch_confirmed(
     options: argparse.Namespace, scenario: "Scenario", config: "HardwareConfig"
 ) -> bool:
     """Connects and finds the board, see `touch_board`; the program on the robot is stopped then."""
-    client = connect(options, config)
-    try:
+    with connected(options, config) as client:
         return touch_board(options, scenario, config, client)
-    finally:
-        client.close()
 
 
 def move_confirmed(
@@ -174,14 +177,26 @@ def move_confirmed(
         False if the robot was not ready or did not move, or the operator did not confirm.
     """
     from sliceit_drake.diagrams.hardware_run import prepare_hardware_run
+    from sliceit_drake.diagrams.move_to_start import MoveToStart
 
-    client = connect(options, config)
-    try:
+    with connected(options, config) as client:
         hardware = prepare_hardware_run(scenario, config, client, options.pace)
-        return _report("Robot", hardware.check_facts()) and _moved_to_start(hardware)
-    finally:
-        client.stop()
-        client.close()
+        if not _report("Robot", hardware.check_facts()):
+            return False
+        move = MoveToStart(hardware)
+        if not _report("Move to the start", move.checks()):
+            return False
+        print(
+            f"\nMOVE: the joints turn straight to {hardware.twin.start_joints.round(4).tolist()}; "
+            f"the knife moves at up to {1e3 * move.knife_speed:.0f} mm/s, and nothing looks for "
+            "obstacles but the board. Stand back.\n"
+        )
+        if not ask(MOVE_WORD, options):
+            return False
+        problem = move.execute()
+        if problem is not None:
+            print(f"STOPPED on the way to the start: {problem}")
+        return problem is None
 
 
 def touch_board(
@@ -209,7 +224,7 @@ def touch_board(
     touch = BoardTouch(hardware)
     if not _report("Robot and touch", [*hardware.check_facts(), *touch.checks()]):
         return False
-    if not _ready_at_start(options, hardware):
+    if not _report("Start", hardware.check_at_start()):
         return False
     print(
         f"\nTOUCH: the knife goes straight down by up to {1e3 * touch.depth:.1f} mm at "
@@ -217,13 +232,13 @@ def touch_board(
         f"It looks for the board between the start and {touch.expected - config.touch.below:.4f} "
         "m. Take the food away: the knife would take it for the board.\n"
     )
-    if not ask(TOUCH_WORD):
+    if not ask(TOUCH_WORD, options):
         return False
     try:
         found = touch.execute()
     except TouchError as error:
         print(f"STOPPED: {error}")
-        print("The robot's program is stopped. Find the cause before you start again.")
+        print(stopped_text(touch.link))
         return False
     print(
         f"The board is at {found.height:.4f} m (+- {1e3 * found.uncertainty:.2f} mm), expected at "
@@ -242,9 +257,9 @@ def checked_run(
     """The same with a robot that is connected already."""
     if not _report("Robot and plan", hardware.check_before()):
         return None
-    if not _ready_at_start(options, hardware):
+    duration = run_duration(options, hardware)
+    if not _report("Start", hardware.check_at_start()):
         return None
-    duration = getattr(options, "duration", None) or hardware.motion.duration
     print(plan_text(hardware, duration))
     if options.dry_run:
         made = hardware.execute(min(WATCHED, duration), moves=False)
@@ -252,25 +267,37 @@ def checked_run(
         timing = ", ".join(f"{k} {v:.4g}" for k, v in hardware.link.timing().items())
         print(f"Dry run: nothing was sent to the joints. {timing}")
         return made
-    return _slice(hardware, duration, directory) if ask(WORD) else None
+    return _slice(hardware, duration, directory) if ask(WORD, options) else None
 
 
-def _ready_at_start(options: argparse.Namespace, hardware: "HardwareRun") -> bool:
-    """Moves the arm to the start if asked to, and checks it there; whether all is well."""
-    if options.move_to_start and not options.dry_run and not _moved_to_start(hardware):
-        return False
-    return _report("Start", hardware.check_at_start())
+def run_duration(options: argparse.Namespace, hardware: "HardwareRun") -> float:
+    """How long to run, s.
+
+    Raises:
+        ConfigurationError: The option is no part of the motion: the knife would stay where it is.
+    """
+    from sliceit_drake.configuration import ConfigurationError
+
+    longest, duration = hardware.motion.duration, getattr(options, "duration", None)
+    if duration is None:
+        return longest
+    if not 0.0 < duration <= longest + 1e-9:
+        raise ConfigurationError(
+            f"{duration:g} s is not within the motion",
+            field="--duration",
+            fix=f"Give up to {longest:g}, or leave it out.",
+        )
+    return duration
 
 
-def _moved_to_start(hardware: "HardwareRun") -> bool:
-    """Moves the arm to the start after the operator's word; whether it is there."""
-    print("The joints will turn straight to:", hardware.twin.start_joints.round(4).tolist())
-    if not ask(MOVE_WORD):
-        return False
-    if not hardware.move_to_start():
-        print("The robot did not move to the start. Nothing else was done.")
-        return False
-    return True
+def stopped_text(link: "RobotLink | None") -> str:
+    """What an operator must know about the robot after a stop."""
+    if link is None or link.stop_error is None:
+        return "The robot's program is stopped. Find the cause before you start again."
+    return (
+        f"THE ROBOT DID NOT CONFIRM THAT ITS PROGRAM IS STOPPED ({link.stop_error}). Use the "
+        "emergency stop before you go near it."
+    )
 
 
 def _slice(hardware: "HardwareRun", duration: float, directory: Path) -> "Run":
@@ -292,7 +319,7 @@ def _slice(hardware: "HardwareRun", duration: float, directory: Path) -> "Run":
     summary = write_hardware_outputs(hardware, directory)
     if made.stopped:
         print(f"STOPPED: {made.stopped}")
-        print("The robot's program is stopped. Find the cause before you start again.")
+        print(stopped_text(hardware.link))
     robot = summary["robot"]
     print(
         f"Peak force {summary['peak_force_N']:.1f} N; {robot['cycles']:.0f} cycles, "
@@ -334,6 +361,30 @@ def is_loopback(host: str) -> bool:
     return host == "localhost" or host.startswith("127.")
 
 
+@contextmanager
+def connected(options: argparse.Namespace, config: "HardwareConfig") -> "Iterator[RobotClient]":
+    """A client in control of the robot; at the end the robot's program is stopped, however it ends.
+
+    A terminal that is closed, and a polite kill, end it as Ctrl-C does.
+    """
+    caught = [signal.SIGTERM, signal.SIGHUP]
+    is_main = threading.current_thread() is threading.main_thread()
+    before = {s: signal.signal(s, _interrupt) for s in caught} if is_main else {}
+    try:
+        client = connect(options, config)
+        try:
+            yield client
+        finally:
+            client.close()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
 def connect(options: argparse.Namespace, config: "HardwareConfig") -> "RobotClient":
     """Connects to the robot and takes control.
 
@@ -343,11 +394,19 @@ def connect(options: argparse.Namespace, config: "HardwareConfig") -> "RobotClie
     from sliceit_drake.hardware.ur_client import UrClient
 
     print(f"Connecting to {options.host}", flush=True)
-    return UrClient(options.host, config.lookahead_time, config.gain)
+    return UrClient(options.host, config.lookahead_time, config.gain, pace=options.pace)
 
 
-def ask(word: str) -> bool:
-    """Whether the operator types the word; Enter alone, an end of input or Ctrl-C do not."""
+def ask(word: str, options: argparse.Namespace) -> bool:
+    """Whether the operator types the word; Enter alone, an end of input or Ctrl-C do not.
+
+    What was typed before the question does not count, and a robot is not moved by a pipe.
+    """
+    if sys.stdin.isatty():
+        termios.tcflush(sys.stdin, termios.TCIFLUSH)
+    elif not is_loopback(getattr(options, "host", None) or ""):
+        print(f'The word "{word}" must be typed at a terminal. Nothing was moved.')
+        return False
     try:
         answer = input(f'Type "{word}" to go on, anything else to leave: ')
     except EOFError:
@@ -360,11 +419,11 @@ def ask(word: str) -> bool:
 
 def plan_text(hardware: "HardwareRun", duration: float) -> str:
     """What is about to happen, for the operator to read."""
-    from sliceit_drake.hardware.limits import loosened
+    from sliceit_drake.hardware.configuration import differing
 
     scenario, plan, limits = hardware.scenario, hardware.plan, hardware.config.limits
     board = scenario.board.height
-    changed = loosened(limits)
+    changed = differing(hardware.config)
     phases = ", ".join(
         f"{label} {end - begin:.2f} s" for label, begin, end in hardware.motion.phases
     )
@@ -384,7 +443,7 @@ def plan_text(hardware: "HardwareRun", duration: float) -> str:
         f"  stops at {limits.force:g} N, {limits.torque:g} Nm, {limits.knife_speed:g} m/s of the "
         f"knife, {1e3 * limits.board_depth:g} mm below the board, {limits.tracking_error:g} rad "
         "off the target",
-        f"  limits that differ from the defaults: {'; '.join(changed) if changed else 'none'}",
+        f"  settings that differ from the defaults: {'; '.join(changed) if changed else 'none'}",
         "",
     ]
     return "\n".join(lines)

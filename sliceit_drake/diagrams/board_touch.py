@@ -10,7 +10,7 @@ from sliceit_drake.diagrams.hardware_run import HardwareRun, steady_python
 from sliceit_drake.diagrams.hardware_station import make_knife_kinematics, make_safety_layer
 from sliceit_drake.diagrams.plan_check import JointPlan, check_plan, plan_joints
 from sliceit_drake.hardware.checks import Check
-from sliceit_drake.hardware.guarded_touch import GuardedTouch, Touch
+from sliceit_drake.hardware.guarded_touch import GuardedTouch, Touch, TouchError
 from sliceit_drake.hardware.rtde_link import RobotLink
 
 __all__ = ["BoardTouch", "check_height"]
@@ -77,7 +77,7 @@ class BoardTouch:
             hardware.client, make_safety_layer(hardware.twin, limits, floor),
             hardware.config.watchdog, hardware.pace,
         )  # fmt: skip
-        link.start()
+        status = link.start()
         depths = touch.speed * self.plan.time
 
         def path(way: float) -> np.ndarray:
@@ -85,6 +85,9 @@ class BoardTouch:
 
         reason = "the touch ended by an error"
         try:
+            problem = hardware.not_ready(status.state)
+            if problem is not None:
+                raise TouchError(problem)
             with steady_python():
                 found = GuardedTouch(
                     link, path, self.depth, make_knife_kinematics(hardware.twin), touch,

@@ -25,7 +25,13 @@ from sliceit_drake.diagrams.run import Run, measured_profile, write_outputs
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
 from sliceit_drake.diagrams.station import MakeSlicingStation, SlicingStation
-from sliceit_drake.hardware.checks import Check, check_facts, check_sensor, check_start
+from sliceit_drake.hardware.checks import (
+    Check,
+    check_facts,
+    check_payload,
+    check_sensor,
+    check_start,
+)
 from sliceit_drake.hardware.client import RobotClient
 from sliceit_drake.hardware.configuration import HardwareConfig
 from sliceit_drake.hardware.robot_state import RobotState
@@ -36,11 +42,6 @@ __all__ = ["HardwareRun", "prepare_hardware_run", "steady_python", "write_hardwa
 SENSOR_SAMPLES = 50
 WARM_UP = 0.05
 NO_DATA = 1.0
-MOVE_SPEED = 0.3
-MOVE_ACCELERATION = 0.5
-SETTLING = 2.0
-AT_REST = 1e-3
-POLL = 5e-3
 FRAMES_PER_SECOND = 32
 
 
@@ -85,18 +86,6 @@ class HardwareRun:
             *check_plan(self.plan, self.twin, self.config, self.client),
         ]
 
-    def move_to_start(self) -> bool:
-        """Moves the joints straight to the start; the way is not checked for obstacles."""
-        start = self.twin.start_joints.tolist()
-        if not self.client.move_to(start, MOVE_SPEED, MOVE_ACCELERATION):
-            return False
-        deadline = clock.perf_counter() + SETTLING / self.pace
-        while clock.perf_counter() < deadline:
-            if max(map(abs, self.client.read().qd)) < AT_REST:
-                break
-            clock.sleep(POLL)
-        return True
-
     def check_at_start(self) -> list[Check]:
         """Checks the start pose, zeroes the force sensor there, and checks what it shows."""
         start = self.twin.start_joints.tolist()
@@ -105,6 +94,15 @@ class HardwareRun:
             self.client.zero_sensor()
             checks += check_sensor(self._some_states(), self.config, SENSOR_SAMPLES)
         return checks
+
+    def not_ready(self, state: RobotState) -> str | None:
+        """What has changed while the operator read the plan, or None: the arm, or the payload."""
+        start = self.twin.start_joints.tolist()
+        checks = [
+            *check_start(state, start, self.config),
+            *check_payload(state.payload, self.config),
+        ]
+        return next((str(check) for check in checks if not check.passed), None)
 
     def execute(
         self,
@@ -136,11 +134,11 @@ class HardwareRun:
             reason = run.stopped or "the motion is complete"
         except KeyboardInterrupt:
             reason = "interrupted by the user"
-            if self.run is not None:
-                self.run.stopped = reason
+            if self.run is None:
+                raise
+            self.run.stopped = reason
         finally:
             stop = link.finish(reason)
-        assert self.run is not None, "interrupted before the run began"
         if stop.limit != "end":
             self.run.stopped = str(stop)
         return self.run
@@ -175,7 +173,7 @@ class HardwareRun:
         rtde = station.rtde
         own = rtde.GetMyMutableContextFromRoot(context)
         if moves:
-            stop = link.arm()
+            stop = self.not_ready(link.latest().state) or link.arm()
             if stop is not None:
                 run.stopped = str(stop)
                 rtde.receive(own)

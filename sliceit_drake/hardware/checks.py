@@ -84,23 +84,15 @@ def check_facts(facts: RobotFacts, config: HardwareConfig) -> list[Check]:
             "Set it to the flange on the pendant: the wrench is taken there.",
         ),
     ]
-    if config.payload is None or config.payload_cog is None:
-        checks.append(
-            Check(
-                "payload",
-                False,
-                f"the controller has {facts.payload:.3f} kg; the robot's file gives none",
-                "Weigh all beyond the flange; write payload and payload_cog in the file.",
-            )
-        )
-        return checks
     return checks + check_payload((facts.payload, *facts.payload_cog), config)
 
 
 def check_payload(payload: Sequence[float] | None, config: HardwareConfig) -> list[Check]:
     """What the controller subtracts from the force: mass, kg, and centre in the flange, m [4]."""
     wanted, centre = config.payload, config.payload_cog
-    assert wanted is not None and centre is not None
+    if wanted is None or centre is None:
+        fix = "Weigh all beyond the flange; write payload and payload_cog in the file."
+        return [Check("payload", False, "the robot's file gives none", fix)]
     mass = distance = math.nan
     if payload is not None and len(payload) == 4:
         mass, distance = payload[0], math.dist(payload[1:], centre)

@@ -63,7 +63,11 @@ class RobotClient(Protocol):
         """Lets the controller stop the program if less than `frequency` inputs a second come."""
 
     def stop(self) -> None:
-        """Stops the motion and the program on the robot; may block while a link is dead."""
+        """Stops the motion and the program on the robot; may block while a link is dead.
+
+        Raises:
+            RuntimeError: The program does not stop, or nobody can tell.
+        """
 
     def facts(self) -> RobotFacts:
         """What the robot says of itself."""
@@ -74,8 +78,11 @@ class RobotClient(Protocol):
     def allows_joints(self, q: list[float]) -> bool:
         """Whether the robot's own safety limits and planes allow joint positions [6], rad."""
 
-    def move_to(self, q: list[float], speed: float, acceleration: float) -> bool:
-        """Moves all joints to `q` [6], rad, along a line in joint space; blocks. rad/s, rad/s2."""
+    def start_move(self, q: list[float], speed: float, acceleration: float) -> bool:
+        """Begins to move all joints to `q` [6], rad, along a line in joint space; rad/s, rad/s2.
+
+        Returns at once, with whether the robot took it. Only `stop` ends the motion before.
+        """
 
     def close(self) -> None:
-        """Disconnects."""
+        """Stops the program on the robot, if it was not stopped, and disconnects."""

@@ -4,9 +4,12 @@ import dataclasses as dc
 from pathlib import Path
 
 from sliceit_drake.configuration import ConfigurationError, choice, load_yaml, quantity
-from sliceit_drake.hardware.limits import SafetyLimits
+from sliceit_drake.hardware.limits import SafetyLimits, loosened
 
-__all__ = ["HardwareConfig", "TouchConfig", "load_hardware_config"]
+__all__ = ["HardwareConfig", "TouchConfig", "differing", "load_hardware_config"]
+
+FACTS = ("model", "serial", "payload", "payload_cog", "board_height")
+"""Fields that say what a robot is; the others say what is allowed, and how it is driven."""
 
 
 @dc.dataclass
@@ -109,3 +112,18 @@ def load_hardware_config(file: str | Path, overrides: str | None = None) -> Hard
     config = load_yaml(HardwareConfig, file, defaults=HardwareConfig(), overrides_text=overrides)
     assert isinstance(config, HardwareConfig)
     return config
+
+
+def differing(config: HardwareConfig) -> list[str]:
+    """Lines that say which limits, tolerances and settings differ from the defaults."""
+    default, lines = HardwareConfig(), []
+    for part, where, ours, theirs in (
+        (HardwareConfig, "", config, default),
+        (TouchConfig, "touch.", config.touch, default.touch),
+    ):
+        for field in dc.fields(part):
+            value = getattr(ours, field.name)
+            if field.name in (*FACTS, "touch", "limits") or value == getattr(theirs, field.name):
+                continue
+            lines.append(f"{where}{field.name}: {value}")
+    return lines + loosened(config.limits)

@@ -24,6 +24,10 @@ SLOW_CALL = 0.05
 FIRST_DATA = 3.0
 STOP_TIME = 2.0
 """How long a stop at the end may take, s."""
+HALT_TIME = 3.0
+"""How long the robot may take to end its program, s."""
+SLOWEST = 0.2
+"""Pace below which no more wall time is given for that."""
 
 
 class _Command(NamedTuple):
@@ -185,20 +189,26 @@ class RobotLink:
         Returns:
             Why the robot stopped: `reason`, or what stopped it before.
         """
-        with self._changed:
-            stop = self._safety.latch("end", reason, sends=self._armed)
-        deadline = clock.perf_counter() + STOP_TIME / self._pace
-        while self._thread.is_alive() and clock.perf_counter() < deadline:
-            if not stop.sends or self._safety.is_still:
-                break
-            clock.sleep(0.005)
-            stop = self._safety.stop or stop
-        self._ending = True
+        try:
+            with self._changed:
+                stop = self._safety.latch("end", reason, sends=self._armed)
+            deadline = clock.perf_counter() + STOP_TIME / self._pace
+            while self._thread.is_alive() and clock.perf_counter() < deadline:
+                if not stop.sends or self._safety.is_still:
+                    break
+                clock.sleep(0.005)
+                stop = self._safety.stop or stop
+        finally:
+            # Also for an operator who presses Ctrl-C again, because it does not brake at once.
+            self._ending = True
+            self._halt()
         self._thread.join(STOP_TIME)
-        self._halt()
         if self._halt_thread is not None:
             # A dead link makes the library wait for minutes; the watchdog has stopped the robot.
-            self._halt_thread.join(STOP_TIME)
+            patience = HALT_TIME / max(self._pace, SLOWEST)
+            self._halt_thread.join(patience)
+            if self._halt_thread.is_alive():
+                self.stop_error = f"it did not answer for {patience:g} s"
         return self._safety.stop or stop
 
     def timing(self) -> dict[str, float]:

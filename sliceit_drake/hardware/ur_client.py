@@ -8,15 +8,22 @@ and `RobotLink` latches on what a program that restarts leaves as traces.
 
 import contextlib
 import re
+import threading
 import time
 from typing import Any
 
 from sliceit_drake.hardware.client import RobotFacts, RobotUnavailableError
-from sliceit_drake.hardware.robot_state import RobotState
+from sliceit_drake.hardware.robot_state import PLAYING, RobotState
 
 __all__ = ["UrClient"]
 
 RATE = 500.0
+DECELERATION = 2.0
+"""Of the fastest joint when a planned motion is stopped, rad/s2."""
+STOP_TIME = 2.0
+"""In which a program ends that is asked to, s; longer means that the link is dead."""
+SLOWEST = 0.2
+"""Pace below which no more wall time is given for that."""
 
 
 class UrClient:
@@ -27,13 +34,20 @@ class UrClient:
         lookahead_time: Of servoj, s, 0.03 to 0.2.
         gain: Of servoj, 100 to 2000.
         controls: Whether to take control; else it only reads, and `servo` refuses.
+        pace: Controller seconds in a second; 1 for all robots.
 
     Raises:
         RobotUnavailableError: Nothing answers there, or it refuses, or ur_rtde is not installed.
     """
 
     def __init__(
-        self, host: str, lookahead_time: float, gain: float, *, controls: bool = True
+        self,
+        host: str,
+        lookahead_time: float,
+        gain: float,
+        *,
+        controls: bool = True,
+        pace: float = 1.0,
     ) -> None:
         try:
             import dashboard_client
@@ -45,6 +59,9 @@ class UrClient:
             ) from None
         self._host, self._lookahead, self._gain = host, lookahead_time, gain
         self._control: Any = None
+        self._is_moving = False
+        self._stop_time = STOP_TIME / max(pace, SLOWEST)
+        self._is_stopped = not controls
         step = "the dashboard server (port 29999)"
         try:
             self._dashboard = dashboard_client.DashboardClient(host)
@@ -55,6 +72,7 @@ class UrClient:
                 raise RuntimeError("it refuses to stream at 500 Hz; is it an e-Series robot?")
             if controls:
                 self._refuse_stopped_robot()
+                self._refuse_running_program()
                 step = "taking control (ports 30003 and 30004)"
                 self._control = rtde_control.RTDEControlInterface(host, RATE)
         except RuntimeError as error:
@@ -78,6 +96,17 @@ class UrClient:
                     "cause, clear it on the pendant, and see that the arm is on and its brakes are "
                     "released."
                 )
+
+    def _refuse_running_program(self) -> None:
+        # Taking control would replace it, and stop a robot that works for somebody else.
+        deadline = time.monotonic() + self._stop_time
+        while self._dashboard.running():
+            if time.monotonic() > deadline:
+                raise RobotUnavailableError(
+                    f"{self._host}: a program runs on the robot. Whosever it is: stop it on the "
+                    "pendant, and start again."
+                )
+            time.sleep(0.05)
 
     def timestamp(self) -> float:
         return self._receive.getTimestamp()
@@ -117,9 +146,21 @@ class UrClient:
         return self._control is not None and self._control.setWatchdog(frequency)
 
     def stop(self) -> None:
-        if self._control is not None:
-            self._control.servoStop()
+        if self._control is None:
+            return
+        self._is_stopped = True
+        try:
+            if self._is_moving:
+                self._control.stopJ(DECELERATION)
+            else:
+                self._control.servoStop()
+        finally:
             self._control.stopScript()
+        deadline = time.monotonic() + self._stop_time
+        while self._receive.getRuntimeState() == PLAYING:
+            if time.monotonic() > deadline:
+                raise RuntimeError("the robot's program still plays, or no data come")
+            time.sleep(0.01)
 
     def facts(self) -> RobotFacts:
         dashboard, receive = self._dashboard, self._receive
@@ -152,12 +193,22 @@ class UrClient:
     def allows_joints(self, q: list[float]) -> bool:
         return self._control is not None and self._control.isJointsWithinSafetyLimits(q)
 
-    def move_to(self, q: list[float], speed: float, acceleration: float) -> bool:
-        return self._control is not None and self._control.moveJ(q, speed, acceleration)
+    def start_move(self, q: list[float], speed: float, acceleration: float) -> bool:
+        self._is_moving = self._control is not None
+        return self._is_moving and self._control.moveJ(q, speed, acceleration, True)
 
     def close(self) -> None:
+        if not self._is_stopped:
+            # Left alone it would go on with what it does. A dead link may block for minutes.
+            stopping = threading.Thread(target=self._stop_quietly, daemon=True)
+            stopping.start()
+            stopping.join(1.5 * self._stop_time)
         for part in (self._control, self._receive, self._dashboard):
             if part is not None:
                 # A link that is gone already cannot be closed better.
                 with contextlib.suppress(RuntimeError):
                     part.disconnect()
+
+    def _stop_quietly(self) -> None:
+        with contextlib.suppress(RuntimeError):
+            self.stop()

@@ -1,0 +1,114 @@
+"""`sliceit hardware` in its own process, which ends or never begins: the robot stands, stopped."""
+
+import contextlib
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from emulator_bench import free_address
+from test_hardware_end_to_end import PATIENT, ROBOT, no_test_hangs
+
+from sliceit_drake.emulator.process import EmulatorProcess
+from sliceit_drake.resources import resource_path
+
+__all__ = ["no_test_hangs"]
+
+SPRING = resource_path("scenarios/cucumber_spring.yaml")
+PACE = 0.2
+LIMITS = PATIENT.replace("limits: {", "limits: {knife_speed: 0.02, ")
+
+
+@pytest.fixture
+def emulator():
+    """The arm 60 mm over the start."""
+    with EmulatorProcess(
+        SPRING, free_address(), PACE, options=["--set", "{start: {clearance: 0.07}}"]
+    ) as process:
+        yield process
+
+
+@contextlib.contextmanager
+def hardware(emulator, *options):
+    command = [sys.executable, "-m", "sliceit_drake.cli.main", "hardware", str(SPRING), *options]
+    command += ["--host", emulator.address, "--pace", str(PACE), "--robot", str(ROBOT)]
+    command += ["--set-robot", f"{{{LIMITS}}}", "--no-replay"]
+    process = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def read_until(process, text):
+    printed = ""
+    while text not in printed:
+        character = process.stdout.read(1)
+        assert character, printed
+        printed += character
+    return printed
+
+
+def type_(process, word):
+    process.stdin.write(word + "\n")
+    process.stdin.flush()
+
+
+def wait_for(emulator, condition, seconds=20.0):
+    end = time.monotonic() + seconds
+    while not condition(status := emulator.pendant.status()):
+        assert time.monotonic() < end, status
+        time.sleep(0.02)
+    return status
+
+
+def is_still(status):
+    return np.abs(status["velocities"]).max() < 1e-3
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+def test_a_program_that_ends_on_the_way_to_the_start_stops_the_arm(number, emulator):
+    with hardware(emulator, "--move-to-start") as process:
+        read_until(process, 'Type "move"')
+        type_(process, "move")
+        moving = wait_for(emulator, lambda status: np.abs(status["velocities"]).max() > 0.01)
+        process.send_signal(number)
+        status = wait_for(
+            emulator, lambda status: status["runtime_state"] == "STOPPED" and is_still(status)
+        )
+        process.wait(30.0)
+    # 60 mm take 3 s at that speed.
+    assert status["time"] - moving["time"] < 1.0
+    stopped = [text for _, text in status["log"] if text.startswith(("program stopped", "RTDE"))]
+    assert ("RTDE watchdog" in " ".join(stopped)) == (number == signal.SIGKILL), stopped
+
+
+@pytest.mark.parametrize("typed", ["no", None], ids=["another word", "closed terminal"])
+def test_a_robot_that_is_not_moved_is_left_without_a_program(typed, emulator):
+    with hardware(emulator, "--move-to-start") as process:
+        read_until(process, 'Type "move"')
+        assert emulator.pendant.status()["runtime_state"] == "PLAYING"
+        if typed is None:
+            process.send_signal(signal.SIGHUP)
+        else:
+            type_(process, typed)
+        assert process.wait(30.0) in (1, 130)
+        wait_for(emulator, lambda status: status["runtime_state"] == "STOPPED")
+
+
+def test_a_program_that_runs_on_the_robot_is_not_replaced(emulator):
+    with hardware(emulator, "--move-to-start") as first:
+        read_until(first, 'Type "move"')
+        with hardware(emulator, "--dry-run") as second:
+            printed = second.stdout.read()
+            assert second.wait(30.0) == 2
+        assert "a program runs on the robot" in printed
+        log = [text for _, text in emulator.pendant.status()["log"]]
+        assert not any("replaced" in text for text in log)
+        type_(first, "move")
+        wait_for(emulator, lambda status: np.abs(status["velocities"]).max() > 0.01)
