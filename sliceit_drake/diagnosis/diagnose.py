@@ -376,7 +376,7 @@ def diagnose(
         predictor = SlicePredictor(setup, records, (Meshing(),), Clock(), runs, workers)
         result.confirm(predictor, seed, lambda done, total: show("confirmation", done, total))
         assert result.gain is not None
-        result.verdict = foretold(result.verdict, result.gain)
+        result.verdict = foretold(result.verdict, result.gain, problem)
     return result
 
 

@@ -142,7 +142,7 @@ class LinearProblem:
         for r, record in enumerate(found.records):
             X = self._table(record)
             gram[r] = self._weighted(record.time, X, self.model_error(record))
-            calm = self._calm(record)
+            calm = self.calm(record)
             inside = X[calm][:, self.forces].reshape(-1, self.size + 1)
             force_gram[r] = inside.T @ inside
             force_rows[r] = int(calm.sum())
@@ -161,7 +161,7 @@ class LinearProblem:
             axis=2,
         )
 
-    def _calm(self, record: RecordSensitivity) -> np.ndarray:
+    def calm(self, record: RecordSensitivity) -> np.ndarray:
         """Rows in contact at which the force does not jump [m]."""
         deviation = np.array([noise.deviation for noise in self.noise])
         return np.asarray(record.in_contact & (record.kinks() < deviation).all(1))
@@ -181,7 +181,7 @@ class LinearProblem:
                 record, predicted=values if record.bent is None else values + record.bent
             )
             records.append(moved)
-            X, error, calm = self._table(moved), self.model_error(record), self._calm(record)
+            X, error, calm = self._table(moved), self.model_error(record), self.calm(record)
             b, inside = np.zeros(self.size + 1), X[calm][:, self.forces]
             for c, noise in enumerate(self.noise):
                 b += X[:, c].T @ noise.solve(record.time, X[:, c, -1:], error[:, c])[:, 0]

@@ -39,6 +39,8 @@ OF_THE_REST = 0.5
 LEAST_REMOVED = 0.8
 """Least share of the reducible held-out error that what is named must remove, at the upper end of
 its interval: a flexible cause may explain each record and foretell none."""
+LEAST_COUNTED = 0.5
+"""Least share of a cause's doing at the rows that this error counts, for it to be judged so."""
 PRESENCE = 0.4
 """Least share of the records in which a cause shows that has numbers of its own in each."""
 CLASS_ANGLE = 15.0
@@ -111,12 +113,13 @@ class Verdict:
         return [f.names for f in self.findings] if named else []
 
 
-def foretold(verdict: Verdict, gain: HeldOutGain) -> Verdict:
+def foretold(verdict: Verdict, gain: HeldOutGain, problem: LinearProblem) -> Verdict:
     """The verdict once its causes were tried on records that were left out: unknown where they
     remove less of the error than causes that are the right ones.
 
     Causes that have numbers of their own in each record foretell nothing, and are left out; so are
-    errors that are no larger than the noise.
+    errors that are no larger than the noise, and causes such as a delay whose doing is where the
+    force jumps, which that error does not count.
     """
     named = verdict.kind in ("cause", "causes")
     if not named or any(f.evidence.per_record for f in verdict.findings):
@@ -124,12 +127,26 @@ def foretold(verdict: Verdict, gain: HeldOutGain) -> Verdict:
     # Where hardly anything is above the noise, a share of it says nothing.
     if gain.before <= gain.floor or gain.interval[1] >= LEAST_REMOVED:
         return verdict
+    if any(_counted(problem, f.evidence) < LEAST_COUNTED for f in verdict.findings):
+        return verdict
     names = " and ".join(f.evidence.name for f in verdict.findings)
     reason = (
         f"{names} explains each record best, and removes {100 * gain.share:.0f} % of the reducible "
         "error of records that were left out"
     )
     return dc.replace(verdict, kind="unknown", reason=reason)
+
+
+def _counted(problem: LinearProblem, evidence: CauseEvidence) -> float:
+    """Share of a cause's doing, squared, at the rows that the held-out error counts."""
+    columns = problem.found.index("cause", evidence.name, evidence.scan)
+    inside = counted = 0.0
+    for record in problem.found.records:
+        change = record.columns[:, problem.forces][:, :, columns] @ np.array(evidence.coefficients)
+        squares = (change**2).sum(1)
+        inside += float(squares[record.in_contact].sum())
+        counted += float(squares[problem.calm(record)].sum())
+    return counted / max(inside, 1e-12)
 
 
 def reach_verdict(
