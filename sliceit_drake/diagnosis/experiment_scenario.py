@@ -87,11 +87,8 @@ def scenario_of(
     facts, scenario = template.metadata.food, Scenario(name=experiment.name)
     scenario.board = dc.replace(setup.board)
     if facts.position is not None and _in_reach(facts.position, scenario):
-        yaw = (facts.yaw or 0.0) - float(np.arctan2(-food.cut_normal[0], food.cut_normal[1]))
-        turn = Rotation.from_euler("z", yaw)
-        place = np.array(facts.position) - turn.apply([*food.cut_point[:2], 0.0])
-        scenario.placement = Placement(position=place[:2].tolist(), yaw=yaw)
-        scenario.board.height = float(place[2])
+        scenario.placement = Placement(position=facts.position[:2], yaw=facts.yaw or 0.0)
+        scenario.board.height = facts.position[2]
     scenario.controller.mode = "motion"
     scenario.controller.error_scale = 1.0
     scenario.controller.p_gains = [GAINS] * 6
@@ -164,12 +161,16 @@ def experiment_of_record(record: SliceRecord, setup: CalibrationSetup) -> Experi
     """The experiment that a record is a slice of, to be repeated."""
     facts = record.metadata.food
     bare = is_bare(record)
-    height = _section(food_of(setup.food, record), setup)[1]
-    R_FW = Rotation.from_euler("z", -(facts.yaw or 0.0))
+    food = food_of(setup.food, record)
+    height = _section(food, setup)[1]
     clearance, offset = 3e-3, 0.0
     if facts.position is not None:
-        first = R_FW.apply(record.position[0] - np.array(facts.position))
-        clearance, offset = float(first[2]) - height, float(first[0])
+        R_WF = Rotation.from_euler("z", facts.yaw or 0.0)
+        p_FK = R_WF.inv().apply(record.position[0] - np.array(facts.position))
+        model = make_food_model(food, setup.knife, setup.numerics, setup.refinement)
+        home = start_pose(model, 0.0)
+        offset = float(home.R[:, 0] @ (p_FK - home.p))
+        clearance = float(p_FK[2]) - height
     elif bare and record.metadata.board_height is not None:
         clearance = float(record.position[0, 2]) - record.metadata.board_height - height
     weight = record.metadata.tool.mass if "gravity" in record.metadata.wrench.includes else None
@@ -291,16 +292,14 @@ def _food_facts(scenario: Scenario, facts: FoodFacts) -> FoodFacts:
     food, prepared = scenario.food, scenario.preparation or Preparation()
     if not isinstance(food, Food):
         return FoodFacts(name="none")
-    X_WF, (shape, size) = scenario.X_WF(), shape_facts(food)
-    x, y, _ = food.cut_point
-    turn = float(np.arctan2(-food.cut_normal[0], food.cut_normal[1]))
+    shape, size = shape_facts(food)
     return dc.replace(
         facts,
         shape=facts.shape if size is None else shape,
         size=size,
         peeled=prepared.peeled,
-        position=(X_WF.translation() + X_WF.rotation().matrix() @ [x, y, 0.0]).tolist(),
-        yaw=scenario.placement.yaw + turn,
+        position=scenario.X_WF().translation().tolist(),
+        yaw=scenario.placement.yaw,
     )
 
 

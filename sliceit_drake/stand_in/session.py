@@ -177,17 +177,14 @@ def _food_facts(protocol: Protocol, specimen: Specimen) -> FoodFacts:
         return FoodFacts(name="none")
     food = scaled_food(protocol.food, condition.width_scale)
     shape, size = shape_facts(food)
-    R_WF, p_WF = _food_pose(protocol)
-    x, y, _ = food.cut_point
-    normal = food.cut_normal
     return FoodFacts(
         name=food.name,
         shape=shape,
         size=size,
         support=food_support(food),
         peeled=condition.peeled,
-        position=(p_WF + R_WF @ [x, y, 0.0]).tolist(),
-        yaw=protocol.placement.yaw + float(np.arctan2(-normal[0], normal[1])),
+        position=_food_pose(protocol)[1].tolist(),
+        yaw=protocol.placement.yaw,
     )
 
 
