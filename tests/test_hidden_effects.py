@@ -22,6 +22,7 @@ from sliceit_drake.hidden_study.report import numbers, plot_curves, report
 from sliceit_drake.hidden_study.runner import food_file, is_done, run_case
 from sliceit_drake.hidden_study.score import Judgement, Rate, judge, judge_study
 from sliceit_drake.hidden_study.sizes import ProtocolSizes, SizeCurve
+from sliceit_drake.hidden_study.study import StudyOptions, load_cases, prepare
 from sliceit_drake.hidden_study.truth import BASE_OF, CAUSE_OF, UNKNOWN
 from sliceit_drake.stand_in.registry import EFFECTS, make_effect
 
@@ -275,3 +276,30 @@ def test_a_file_that_holds_no_runs_is_refused(tmp_path):
     file.write_text("{}\n[1]\n")
     with pytest.raises(ConfigurationError, match="no file of a study's runs"):
         unpack(file, tmp_path / "study")
+
+
+def test_a_study_that_goes_on_has_the_runs_that_it_was_begun_with(tmp_path, monkeypatch):
+    """Without the sizes, which took a quarter of an hour, being computed again."""
+    begun, again = study_folder(tmp_path / "begun"), tmp_path / "again"
+    options = StudyOptions(kinds=("single",), seed=3, replicates=100, protocols=("poor",))
+    cases = [
+        Case("c0ffee", "single", "poor", (Hidden("skin", 0.7, 2.4),), 1),
+        Case("decaf0", "single", "poor", (Hidden("core", 0.3, 2.1),), 2),
+    ]
+    listed = {"kinds": ["single"], "protocols": ["poor"], "effects": None}
+    listed["cases"] = [dc.asdict(case) for case in cases]
+    facts = {"seed": 3, "replicates": 100}
+    for name, values in (("study", facts), ("near", {}), ("classes", {}), ("cases", listed)):
+        (begun / f"{name}.json").write_text(json.dumps(values))
+    monkeypatch.setattr("sliceit_drake.hidden_study.study.protocol_classes", refused)
+    assert prepare(begun, options, refused) == cases
+    assert pack(begun, tmp_path / "runs.jsonl") == 0
+    unpack(tmp_path / "runs.jsonl", again)
+    assert prepare(again, options, refused) == cases
+    assert load_cases(again) == cases
+    with pytest.raises(AssertionError, match="computed"):
+        prepare(again, dc.replace(options, effects=("skin",)), refused)
+
+
+def refused(*what: object) -> None:
+    raise AssertionError(f"{what} is computed")

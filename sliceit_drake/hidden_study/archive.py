@@ -7,11 +7,11 @@ from typing import Any
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.hidden_study.runner import is_done
-from sliceit_drake.hidden_study.study import load_cases, read_facts
+from sliceit_drake.hidden_study.study import CASES, load_cases, read_facts
 
 __all__ = ["pack", "unpack"]
 
-SHARED = ("study.json", "near.json", "classes.json")
+SHARED = ("study.json", CASES, "near.json", "classes.json")
 """What all runs of a study have in common."""
 SAID = ("verdict", "classes", "gain", "shifts", "misfit_over_noise")
 """What is kept of a diagnosis beside the held-out shares of its causes."""
@@ -61,7 +61,7 @@ def unpack(file: Path, output: Path) -> None:
             fix="Give the runs.jsonl that `sliceit score` wrote.",
         ) from error
     for name in SHARED:
-        if not (output / name).exists():
+        if shared.get(name) is not None and not (output / name).exists():
             _write(output / name, shared[name])
     for name, run in zip(names, runs, strict=True):
         if is_done(output, name):

@@ -19,10 +19,14 @@ from sliceit_drake.hidden_study.runner import food_file, is_done, run_case
 from sliceit_drake.hidden_study.sizes import angles_for, size_for
 from sliceit_drake.hidden_study.truth import CAUSE_OF
 
-__all__ = ["StudyOptions", "load_cases", "prepare", "read_facts", "run_study"]
+__all__ = ["CASES", "StudyOptions", "load_cases", "prepare", "read_facts", "run_study"]
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage, what is done and what there is."""
+
+
+CASES = "cases.json"
+"""The list of runs, done or not, and what it follows from."""
 
 
 @dc.dataclass(frozen=True)
@@ -47,6 +51,8 @@ class StudyOptions:
 def prepare(output: Path, options: StudyOptions, progress: Progress) -> list[Case]:
     """The list of runs; the foods that are given, and the truth, are written.
 
+    A study that goes on has the runs, sizes and angles that it was begun with.
+
     Raises:
         ConfigurationError: The folder holds another study.
     """
@@ -59,6 +65,42 @@ def prepare(output: Path, options: StudyOptions, progress: Progress) -> list[Cas
             source=str(file),
             fix="Give the same options, or another --output.",
         )
+    cases = _begun(output, options) or _made(output, options, progress)
+    for name in options.protocols:
+        food_file(output, name).parent.mkdir(parents=True, exist_ok=True)
+        dump_yaml(model_food(protocol_named(name)), food_file(output, name))
+    truth = output / "truth"
+    truth.mkdir(exist_ok=True)
+    for case in cases:
+        text = json.dumps(dc.asdict(case), indent=2) + "\n"
+        (truth / f"{case.name}.json").write_text(text, encoding="utf-8")
+    listed = {**_listed_by(options), "cases": [dc.asdict(case) for case in cases]}
+    (output / CASES).write_text(json.dumps(listed) + "\n", encoding="utf-8")
+    file.write_text(json.dumps(facts) + "\n", encoding="utf-8")
+    return cases
+
+
+def _listed_by(options: StudyOptions) -> dict[str, Any]:
+    """What the list of runs follows from, beside the seed."""
+    effects = None if options.effects is None else list(options.effects)
+    return {
+        "kinds": list(options.kinds),
+        "protocols": list(options.protocols),
+        "effects": effects,
+    }
+
+
+def _begun(output: Path, options: StudyOptions) -> list[Case] | None:
+    """The runs of a study that goes on; None where there is none, or one of other runs."""
+    known = read_facts(output / CASES)
+    if known is None or any(not (output / n).exists() for n in ("near.json", "classes.json")):
+        return None
+    cases = [Case.of(facts) for facts in known.pop("cases")]
+    return cases if known == _listed_by(options) else None
+
+
+def _made(output: Path, options: StudyOptions, progress: Progress) -> list[Case]:
+    """The runs of a study that begins; sizes and angles are computed."""
     cache = output / "cache"
     calls = [0]
 
@@ -79,15 +121,6 @@ def prepare(output: Path, options: StudyOptions, progress: Progress) -> list[Cas
         effects=options.effects,
     )
     _near(output, cases, progress)
-    for name in options.protocols:
-        food_file(output, name).parent.mkdir(parents=True, exist_ok=True)
-        dump_yaml(model_food(protocol_named(name)), food_file(output, name))
-    truth = output / "truth"
-    truth.mkdir(exist_ok=True)
-    for case in cases:
-        text = json.dumps(dc.asdict(case), indent=2) + "\n"
-        (truth / f"{case.name}.json").write_text(text, encoding="utf-8")
-    file.write_text(json.dumps(facts) + "\n", encoding="utf-8")
     return cases
 
 
