@@ -96,7 +96,8 @@ def load_cause(file: str | Path) -> Cause:
     # Where the source of a class is looked up.
     sys.modules[spec.name] = module
     try:
-        spec.loader.exec_module(module)
+        # Not by the loader: its bytecode is stale where a file was written twice in a second.
+        exec(compile(file.read_bytes(), str(file), "exec"), module.__dict__)
     except Exception as error:
         raise _broken(file, error, "cannot be read as Python") from error
     kinds = [

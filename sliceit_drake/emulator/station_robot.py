@@ -5,6 +5,7 @@ import dataclasses as dc
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import SceneGraph
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.framework import Context
@@ -14,8 +15,8 @@ from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.station import MakeSlicingStation, SlicingStation
 from sliceit_drake.emulator.joint_targets import JointTargets
+from sliceit_drake.emulator.kinematics import forward
 from sliceit_drake.emulator.robot_model import CYCLE, RobotState, SimulationStopped
-from sliceit_drake.hardware.knife_kinematics import KnifeKinematics
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.servo import ServoConfig
 
@@ -131,13 +132,10 @@ class StationRobot:
             return
         top = float(station.start_pose.translation()[2]) - start.clearance
         robot = self._scenario.robot
-        kinematics = KnifeKinematics(
-            robot.X_WB().GetAsMatrix34(),
-            robot.X_TK().GetAsMatrix34(),
-            self._scenario.knife.length,
-        )
-        heel, tip, _ = kinematics.edge(self.state.positions.tolist())
-        lowest = min(heel[2], tip[2])
+        X_BT = RigidTransform(forward(self.state.positions))
+        X_WK = robot.X_WB().multiply(X_BT).multiply(robot.X_TK())
+        reach = 0.5 * self._scenario.knife.length
+        lowest = min(float((X_WK @ np.array([x, 0.0, 0.0]))[2]) for x in (-reach, reach))
         if lowest < top:
             raise ConfigurationError(
                 f"the knife is {1e3 * (top - lowest):.1f} mm below the top of the food",

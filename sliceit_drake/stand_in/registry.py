@@ -103,7 +103,8 @@ def _from_file(file: Path) -> type[Effect]:
             "there is no such file", source=str(file), field="--effect", fix="Check the path."
         )
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    # Not by the loader: its bytecode is stale where a file was written twice in a second.
+    exec(compile(file.read_bytes(), str(file), "exec"), module.__dict__)
     kinds = [
         kind
         for _, kind in inspect.getmembers(module, inspect.isclass)
