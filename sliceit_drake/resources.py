@@ -4,13 +4,16 @@ In a checkout (or an editable install) they stand at the top of the repository; 
 stand inside the package, under ``_resources``. Everything else asks here and does not care.
 """
 
+import importlib.util
+import sys
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pydrake.multibody.parsing import Parser
 
-__all__ = ["MODEL_PACKAGE", "add_package_map", "named_yaml", "resource_path"]
+__all__ = ["MODEL_PACKAGE", "add_package_map", "load_module", "named_yaml", "resource_path"]
 
 MODEL_PACKAGE = "sliceit_drake_models"
 FOLDERS = ("calibration", "hardware", "models", "scenarios")
@@ -85,3 +88,19 @@ def _resource_root() -> Path:
         f"{_PACKAGE.parent} (checkout). Install the wheel, or run "
         '"pip install -e ." in a complete checkout.'
     )
+
+
+def load_module(name: str, file: Path) -> ModuleType | None:
+    """Runs a user's Python file as a module of a name; None where there is no such file.
+
+    What its code raises is not caught.
+    """
+    spec = importlib.util.spec_from_file_location(name, file)
+    if spec is None or spec.loader is None or not file.is_file():
+        return None
+    module = importlib.util.module_from_spec(spec)
+    # Where the source of a class is looked up.
+    sys.modules[name] = module
+    # Not by the loader: its bytecode is stale where a file was written twice in a second.
+    exec(compile(file.read_bytes(), str(file), "exec"), module.__dict__)
+    return module

@@ -67,7 +67,10 @@ def wait_for(condition, timeout=10.0):
 
 
 def servo_along(receive, ctrl, cycles, path):
-    """Sends `path(time)` with every new timestamp; returns times, commands and measured joints."""
+    """Sends `path(time)` with every new timestamp; returns times, commands and measured joints.
+
+    A row is kept where the robot's time did not go on between the command and the measurement.
+    """
     last, begin, rows = None, receive.getTimestamp(), []
     while len(rows) < cycles:
         now = receive.getTimestamp()
@@ -77,7 +80,9 @@ def servo_along(receive, ctrl, cycles, path):
         last = now
         target = path(now - begin)
         assert ctrl.servoJ(target.tolist(), *SERVO)
-        rows.append((now, target, receive.getActualQ()))
+        measured = receive.getActualQ()
+        if receive.getTimestamp() == now:
+            rows.append((now, target, measured))
     return tuple(np.array(column) for column in zip(*rows, strict=True))
 
 
@@ -104,9 +109,10 @@ def test_ur_rtde_connects_moves_servos_and_sees_a_protective_stop():
         start = np.array(receive.getActualQ())
         speed = np.array([0.1, 0.0, 0.0, -0.1, 0.0, 0.0])
         times, commands, measured = servo_along(receive, ctrl, 500, lambda t: start + speed * t)
-        # The measured joints trail by the lookahead time, and by the cycle that is on its way.
+        # The measured joints trail by the lookahead time, never by less, and by the cycles that a
+        # command is on its way: how many depends on when the client's threads wake.
         lag = (commands - measured)[250:, 0] / speed[0]
-        assert np.median(lag) == pytest.approx(0.03 + 0.5 * CYCLE, abs=CYCLE)
+        assert 0.03 <= lag.min() <= 0.03 + 4 * CYCLE
         assert ctrl.servoStop(5.0)
 
         emulator.pendant.inject("protective_stop:stop")

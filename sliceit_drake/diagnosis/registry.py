@@ -1,8 +1,6 @@
 """Causes by name, and causes that a user wrote."""
 
-import importlib.util
 import inspect
-import sys
 import traceback
 from collections.abc import Sequence
 from importlib.metadata import entry_points
@@ -12,6 +10,7 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagnosis.cause import Cause, check_cause
 from sliceit_drake.diagnosis.causes import BUILT_IN
 from sliceit_drake.diagnosis.rehearsal import rehearse
+from sliceit_drake.resources import load_module
 
 __all__ = [
     "ENTRY_POINTS",
@@ -87,19 +86,14 @@ def load_cause(file: str | Path) -> Cause:
             that is incomplete or fails on a made-up slice.
     """
     file = Path(file)
-    spec = importlib.util.spec_from_file_location(f"sliceit_cause_{file.stem}", file)
-    if spec is None or spec.loader is None or not file.is_file():
+    try:
+        module = load_module(f"sliceit_cause_{file.stem}", file)
+    except Exception as error:
+        raise _broken(file, error, "cannot be read as Python") from error
+    if module is None:
         raise ConfigurationError(
             "there is no such file", source=str(file), field="--cause", fix="Check the path."
         )
-    module = importlib.util.module_from_spec(spec)
-    # Where the source of a class is looked up.
-    sys.modules[spec.name] = module
-    try:
-        # Not by the loader: its bytecode is stale where a file was written twice in a second.
-        exec(compile(file.read_bytes(), str(file), "exec"), module.__dict__)
-    except Exception as error:
-        raise _broken(file, error, "cannot be read as Python") from error
     kinds = [
         kind
         for _, kind in inspect.getmembers(module, inspect.isclass)

@@ -5,13 +5,14 @@ import dataclasses as dc
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan, Pose
+from sliceit_drake.cutting.motion import ConstantSpeed, MotionPlan
 from sliceit_drake.diagrams.hardware_run import HardwareRun, steady_python
 from sliceit_drake.diagrams.hardware_station import make_knife_kinematics, make_safety_layer
 from sliceit_drake.diagrams.plan_check import JointPlan, check_plan, plan_joints
 from sliceit_drake.hardware.checks import Check
 from sliceit_drake.hardware.guarded_touch import GuardedTouch, Touch, TouchError
 from sliceit_drake.hardware.rtde_link import RobotLink
+from sliceit_drake.systems.motion_sources import placed_motion
 
 __all__ = ["BoardTouch", "check_height"]
 
@@ -41,8 +42,7 @@ class BoardTouch:
         start = twin.start_pose
         self.depth = float(start.translation()[2]) - self.expected + touch.below
         way = MotionPlan([ConstantSpeed(distance=self.depth, speed=touch.speed)])
-        motion = Motion(way, Pose(start.rotation().matrix(), start.translation()))
-        self.plan = plan_joints(twin, motion, SAMPLE / touch.speed)
+        self.plan = plan_joints(twin, placed_motion(way, start), SAMPLE / touch.speed)
 
     @property
     def expected(self) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 
-from sliceit_drake.cutting.motion import Motion, Pose
+from sliceit_drake.cutting.motion import Motion
 from sliceit_drake.diagrams.contact_margin import check_contact_margin
 from sliceit_drake.diagrams.hardware_station import (
     PERIOD,
@@ -36,6 +36,7 @@ from sliceit_drake.hardware.client import RobotClient
 from sliceit_drake.hardware.configuration import HardwareConfig
 from sliceit_drake.hardware.robot_state import RobotState
 from sliceit_drake.hardware.rtde_link import RobotLink
+from sliceit_drake.systems.motion_sources import placed_motion
 
 __all__ = ["HardwareRun", "prepare_hardware_run", "steady_python", "write_hardware_outputs"]
 
@@ -72,8 +73,7 @@ class HardwareRun:
     @property
     def motion(self) -> Motion:
         """What the knife shall do."""
-        X_WK = self.twin.start_pose
-        return Motion(self.twin.motion_plan, Pose(X_WK.rotation().matrix(), X_WK.translation()))
+        return placed_motion(self.twin.motion_plan, self.twin.start_pose)
 
     def check_facts(self) -> list[Check]:
         """Checks of the robot itself."""

@@ -254,7 +254,7 @@ def MakeHardwareStation(
     return HardwareStation(twin, link, pace)
 
 
-def make_knife_kinematics(twin: SlicingStation) -> KnifeKinematics:
+def make_knife_kinematics(twin: Station) -> KnifeKinematics:
     """Where the edge of a scenario's knife is."""
     robot = twin.scenario.robot
     return KnifeKinematics(

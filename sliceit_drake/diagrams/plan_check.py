@@ -7,12 +7,13 @@ import numpy as np
 from pydrake.multibody.tree import JacobianWrtVariable
 from scipy.spatial.transform import Rotation
 
-from sliceit_drake.cutting.motion import Motion, Pose
+from sliceit_drake.cutting.motion import Motion
+from sliceit_drake.diagrams.hardware_station import make_knife_kinematics
 from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.hardware.checks import Check
 from sliceit_drake.hardware.client import RobotClient
 from sliceit_drake.hardware.configuration import HardwareConfig
-from sliceit_drake.hardware.knife_kinematics import KnifeKinematics
+from sliceit_drake.systems.motion_sources import placed_motion
 
 __all__ = ["JointPlan", "check_plan", "plan_joints"]
 
@@ -59,18 +60,12 @@ def plan_joints(
         sample: Longest time between two postures, s.
     """
     if motion is None:
-        X_WK = station.start_pose
-        motion = Motion(station.motion_plan, Pose(X_WK.rotation().matrix(), X_WK.translation()))
+        motion = placed_motion(station.motion_plan, station.start_pose)
     time = np.linspace(0.0, motion.duration, max(2, math.ceil(motion.duration / sample) + 1))
     R, p, _, _ = motion.sample(time)
     plant, knife = station.plant, station.robot.knife
     context, frame, world = plant.CreateDefaultContext(), knife.body_frame(), plant.world_frame()
-    scenario = station.scenario
-    kinematics = KnifeKinematics(
-        scenario.robot.X_WB().GetAsMatrix34(),
-        scenario.robot.X_TK().GetAsMatrix34(),
-        scenario.knife.length,
-    )
+    kinematics = make_knife_kinematics(station)
     q, path, ends = np.array(station.start_joints, float), [], []
     least, miss, tilt = math.inf, 0.0, 0.0
     for R_WK, p_WK in zip(R, p, strict=True):

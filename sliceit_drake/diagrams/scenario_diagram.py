@@ -3,12 +3,12 @@
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem, OutputPort
 
-from sliceit_drake.cutting.motion import Motion, Pose
+from sliceit_drake.cutting.motion import Motion
 from sliceit_drake.diagrams.record import Record, Recorder, add_recorder
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.station import MakeSlicingStation
 from sliceit_drake.diagrams.station_interface import Station
-from sliceit_drake.systems.motion_sources import MotionSource
+from sliceit_drake.systems.motion_sources import MotionSource, placed_motion
 from sliceit_drake.systems.policy import PolicySystem
 
 __all__ = ["MakeScenarioDiagram", "ScenarioDiagram"]
@@ -32,7 +32,7 @@ class ScenarioDiagram(Diagram):
             "station", station or MakeSlicingStation(scenario, meshcat)
         )
         plan, start = self.station.motion_plan, self.station.start_pose
-        self.motion: Motion = Motion(plan, Pose(start.rotation().matrix(), start.translation()))
+        self.motion: Motion = placed_motion(plan, start)
         self.policy: PolicySystem | None = None
         sources: dict[str, OutputPort] = {}
         if scenario.policy is None:

@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import Demultiplexer
 
 from sliceit_drake.cutting.food import Food, make_food_model, start_pose
-from sliceit_drake.cutting.motion import Motion, MotionPlan, Pose
+from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.holder_arm import add_holding_arm
 from sliceit_drake.diagrams.knife_body import check_plant_step, effective_mass
@@ -37,6 +37,7 @@ from sliceit_drake.systems.food_visualizer import FoodVisualizer, frame_size
 from sliceit_drake.systems.frame_visualizer import FrameVisualizer
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 from sliceit_drake.systems.knife_kinematics import BoardContact, KnifeKinematics
+from sliceit_drake.systems.motion_sources import placed_motion
 from sliceit_drake.systems.servo import JOINTS
 from sliceit_drake.systems.spring_food import SpringCutter, SpringFood
 from sliceit_drake.systems.spring_visualizer import SpringVisualizer
@@ -237,9 +238,7 @@ class SlicingStation(Station):
         size = SCENE_FRAME_SIZE
         if isinstance(self.cutting, CuttingSystem):
             size += frame_size(self.cutting)
-        X_WK = self.start_pose
-        start = Pose(X_WK.rotation().matrix(), X_WK.translation())
-        frames = FRAMES_PER_SECOND * Motion(self.motion_plan, start).duration
+        frames = FRAMES_PER_SECOND * placed_motion(self.motion_plan, self.start_pose).duration
         return math.ceil(frames * size / REPLAY_SIZE) / FRAMES_PER_SECOND
 
     def _add_arrows_and_frames(self, builder: DiagramBuilder, meshcat: Meshcat) -> None:

@@ -1,10 +1,10 @@
 """Effects by name, and effects that a user wrote."""
 
-import importlib.util
 import inspect
 from pathlib import Path
 
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.resources import load_module
 from sliceit_drake.stand_in import (
     knife_effects,
     mounting_effects,
@@ -97,14 +97,11 @@ def make_effect(text: str) -> Effect:
 
 
 def _from_file(file: Path) -> type[Effect]:
-    spec = importlib.util.spec_from_file_location(f"stand_in_effect_{file.stem}", file)
-    if spec is None or spec.loader is None or not file.is_file():
+    module = load_module(f"stand_in_effect_{file.stem}", file)
+    if module is None:
         raise ConfigurationError(
             "there is no such file", source=str(file), field="--effect", fix="Check the path."
         )
-    module = importlib.util.module_from_spec(spec)
-    # Not by the loader: its bytecode is stale where a file was written twice in a second.
-    exec(compile(file.read_bytes(), str(file), "exec"), module.__dict__)
     kinds = [
         kind
         for _, kind in inspect.getmembers(module, inspect.isclass)

@@ -7,7 +7,12 @@ from pydrake.systems.framework import Context, LeafSystem
 
 from sliceit_drake.cutting.motion import Motion, MotionPlan, Pose
 
-__all__ = ["MotionSource"]
+__all__ = ["MotionSource", "placed_motion"]
+
+
+def placed_motion(plan: MotionPlan, X_WK: RigidTransform) -> Motion:
+    """A plan from a start pose of the knife on, as `Motion`."""
+    return Motion(plan, Pose(X_WK.rotation().matrix(), X_WK.translation()))
 
 
 class MotionSource(LeafSystem):
@@ -35,7 +40,7 @@ class MotionSource(LeafSystem):
             ConfigurationError: If the plan is invalid, or a record in it is.
         """
         super().__init__()
-        self.motion = Motion(plan, Pose(X_WK.rotation().matrix(), X_WK.translation()))
+        self.motion = placed_motion(plan, X_WK)
         self.DeclareAbstractOutputPort(
             "target_pose",
             lambda: Value(RigidTransform()),
