@@ -50,8 +50,8 @@ def add_identifiability(studies: "argparse._SubParsersAction[argparse.ArgumentPa
         "--refinement",
         metavar="X",
         type=float,
-        default=0.5,
-        help="elements along an edge, relative to the food's mesh (default: 0.5)",
+        default=0.75,
+        help="elements along an edge, relative to the food's mesh (default: 0.75)",
     )
     parser.add_argument(
         "--cache", metavar="FOLDER", type=Path, help="keep finished simulations there"
@@ -95,7 +95,7 @@ def nominal_records(protocol: "Protocol", prefix: str = "") -> "list[SliceRecord
 def study(
     protocols: "Sequence[Protocol]",
     causes: "Sequence[Cause]",
-    refinement: float = 0.5,
+    refinement: float = 0.75,
     cache: Path | None = None,
     workers: int | None = None,
     progress: "Callable[[int, int], None] | None" = None,
