@@ -429,11 +429,7 @@ def plan_text(hardware: "HardwareRun", duration: float) -> str:
     )
     policy = scenario.policy
     if policy is not None:
-        phases = (
-            f"{type(policy.decide).__name__} decides every {policy.period:g} s, at most "
-            f"{1e3 * policy.press:.1f} mm down, {1e3 * policy.draw:.1f} mm along the edge, "
-            f"{1e3 * policy.speed:g} mm/s; up to there"
-        )
+        phases = f"{policy.describe()}; up to there"
     lines = [
         "",
         f"PLAN: {scenario.name}, {duration:.2f} s: {phases}",

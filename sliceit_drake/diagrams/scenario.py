@@ -16,6 +16,7 @@ from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.diagrams.calibrated_food import load_calibrated_food
 from sliceit_drake.diagrams.robot import RobotConfig
 from sliceit_drake.diagrams.sequence import SliceSequence
+from sliceit_drake.systems.agent import AgentConfig
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
 from sliceit_drake.systems.contact_monitor import ContactMonitorConfig
@@ -122,7 +123,7 @@ class Scenario:
     preparation: Preparation | None = None
     sequence: SliceSequence | None = None
     """Slices in a row; it places the cuts and makes the motion."""
-    policy: PolicyConfig | None = None
+    policy: PolicyConfig | AgentConfig | None = None
     """Decides how the knife moves, in the place of a motion."""
 
     def check(self, where: str) -> None:

@@ -4,11 +4,14 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem, OutputPort
 
 from sliceit_drake.cutting.motion import Motion
+from sliceit_drake.diagrams.agent_station import add_agent
 from sliceit_drake.diagrams.record import Record, Recorder, add_recorder
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.station import MakeSlicingStation
 from sliceit_drake.diagrams.station_interface import Station
+from sliceit_drake.systems.agent import AgentConfig, AgentSystem
 from sliceit_drake.systems.motion_sources import MotionSource, placed_motion
+from sliceit_drake.systems.network import load_network
 from sliceit_drake.systems.policy import PolicySystem
 
 __all__ = ["MakeScenarioDiagram", "ScenarioDiagram"]
@@ -33,10 +36,15 @@ class ScenarioDiagram(Diagram):
         )
         plan, start = self.station.motion_plan, self.station.start_pose
         self.motion: Motion = placed_motion(plan, start)
-        self.policy: PolicySystem | None = None
+        self.policy: PolicySystem | AgentSystem | None = None
         sources: dict[str, OutputPort] = {}
         if scenario.policy is None:
             driver: LeafSystem = builder.AddNamedSystem("motion", MotionSource(plan, start))
+        elif isinstance(scenario.policy, AgentConfig):
+            network = load_network(scenario.policy)
+            driver = self.policy = add_agent(builder, self.station, scenario.policy, network)
+            for name in ("stiffness", "p_gains", "error_scale", "target_offset"):
+                sources[name] = driver.GetOutputPort(name)
         else:
             gains = scenario.controller
             driver = self.policy = builder.AddNamedSystem(
@@ -48,8 +56,9 @@ class ScenarioDiagram(Diagram):
                 sources[name] = driver.GetOutputPort(name)
                 builder.Connect(sources[name], self.station.GetInputPort(name))
             sources["target_offset"] = driver.GetOutputPort("target_offset")
-        target_pose = driver.GetOutputPort("target_pose")
-        builder.Connect(target_pose, self.station.GetInputPort("target_pose"))
+        if not isinstance(driver, AgentSystem):
+            target_pose = driver.GetOutputPort("target_pose")
+            builder.Connect(target_pose, self.station.GetInputPort("target_pose"))
         self._recorder: Recorder = add_recorder(builder, self.station, self.motion, sources)
         builder.BuildInto(self)
         self.set_name(scenario.name)

@@ -244,9 +244,7 @@ class SlicingStation(Station):
     def _add_arrows_and_frames(self, builder: DiagramBuilder, meshcat: Meshcat) -> None:
         """Wrenches on knife and sensor as arrows; triads of W, B, F, S, K."""
         period = self.frame_period
-        knife, frame_S = self.robot.knife, self.robot.sensor_weld.frame_on_parent()
-        # Rigid, so the same in any context.
-        X_KS = frame_S.CalcPose(self.plant.CreateDefaultContext(), knife.body_frame())
+        X_KS = self.X_KS()
         knife_pose = builder.GetSubsystemByName("kinematics").GetOutputPort("knife_pose")
         arrows = builder.AddNamedSystem(
             "wrench_visualizer", WrenchVisualizer(meshcat, X_KS, period)
@@ -272,9 +270,15 @@ class SlicingStation(Station):
         """Names for the port `sensor_state`: `reading` [6] for the moment and force."""
         return self.sensor.state_columns(reading)
 
-    def SetStart(self, root_context: Context) -> None:
-        """Puts arm and controller at rest at the start, in the context of the whole diagram."""
-        set_joint_positions(root_context, self.plant, self.robot, self._arm, self.start_joints)
+    def SetStart(self, root_context: Context, joints: np.ndarray | None = None) -> None:
+        """Puts arm and controller at rest at the start, in the context of the whole diagram.
+
+        Args:
+            root_context: Of the whole diagram.
+            joints: Joint positions [6], rad; None for `start_joints`.
+        """
+        start = self.start_joints if joints is None else joints
+        set_joint_positions(root_context, self.plant, self.robot, self._arm, start)
 
 
 def MakeSlicingStation(

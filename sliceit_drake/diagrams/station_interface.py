@@ -51,3 +51,9 @@ class Station(Diagram):
     def sensor_columns(self, reading: Sequence[str]) -> list[str]:
         """Names for the port `sensor_state`: `reading` [6] for the moment and force."""
         raise NotImplementedError
+
+    def X_KS(self) -> RigidTransform:
+        """Pose of the wrench sensor's frame in the knife's; rigid, so the same in any context."""
+        context = self.plant.CreateDefaultContext()
+        frame_S = self.robot.sensor_weld.frame_on_parent()
+        return frame_S.CalcPose(context, self.robot.knife.body_frame())

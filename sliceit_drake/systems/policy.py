@@ -132,6 +132,14 @@ class PolicyConfig:
         left = self.duration - sum(_duration(segment) for segment in way)
         return MotionPlan([*way, Hold(left, label="policy")] if left > 1e-9 else way)
 
+    def describe(self) -> str:
+        """Who decides and what it may do at most, for an operator to read."""
+        return (
+            f"{type(self.decide).__name__} decides every {self.period:g} s, at most "
+            f"{1e3 * self.press:.1f} mm down, {1e3 * self.draw:.1f} mm along the edge, "
+            f"{1e3 * self.speed:g} mm/s"
+        )
+
     def _way(self) -> list[Segment]:
         corners = [(0.0, self.press), (self.draw, self.press), (-self.draw, self.press)]
         if self.draw > 0.0:

@@ -1,0 +1,173 @@
+"""The slicing station as a Gymnasium environment.
+
+A plain `gymnasium.Env` around a Drake Simulator, not `pydrake.gym.DrakeGymEnv`: that one turns a
+RuntimeError into a truncated step of reward 0, from which an agent learns to fail, and lets all
+other errors end the process (1.51).
+"""
+
+import copy
+from typing import Any
+
+import gymnasium
+import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.analysis import Simulator
+
+from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.diagrams.agent_station import AgentStation
+from sliceit_drake.learning.reward import TERMS, reward_terms, reward_weights
+from sliceit_drake.learning.task import TaskConfig, make_agent_station
+
+__all__ = ["SlicingEnv"]
+
+JERK = slice(6, 9)
+VARIANT_SEED = 1
+
+
+class SlicingEnv(gymnasium.Env):
+    """One slice an episode; observation and action as `systems.agent.AgentSystem`.
+
+    `step` returns in `info`: `reward_terms` (before their weights), `cut_progress`, `height` of the
+    edge over the board, m, `force`: the norm of food's and board's force on the knife at the
+    decision, N, and at an episode's end `end`: goal, collision, workspace, guard or time. A guard
+    of the simulation that ends an episode (an inverted element, say) is `guard_error`, its kind.
+
+    A seed given to `reset` fixes all that follows. The variants of the foods come from a seed of
+    their own, the same in every environment of a task.
+
+    Args:
+        task: What to cut, and how.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}
+
+    def __init__(self, task: TaskConfig | None = None) -> None:
+        self.task = task or TaskConfig()
+        self.progress = 0.0
+        size = self.task.agent.observation_size()
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float32)
+        self._built: dict[str, tuple[AgentStation, Simulator]] = {}
+        self._current: tuple[AgentStation, Simulator] | None = None
+        self._decisions = 0
+        self._before_reset: dict | None = None
+
+    def set_progress(self, progress: float) -> None:
+        """Says which share of the training is done, for the reward's schedule."""
+        self.progress = progress
+
+    def random_state(self) -> dict | None:
+        """State of the random numbers before the last reset; for `set_random_state`."""
+        return self._before_reset
+
+    def set_random_state(self, state: dict) -> None:
+        """Lets the next reset repeat that before which the state was taken."""
+        self.np_random.bit_generator.state = copy.deepcopy(state)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begins a slice.
+
+        Args:
+            seed: Of all random numbers from here on.
+            options: "food": one of the task's foods, instead of a random one.
+        """
+        super().reset(seed=seed)
+        rng = self.np_random
+        self._before_reset = copy.deepcopy(rng.bit_generator.state)
+        foods, randomization = self.task.foods, self.task.randomization
+        food = foods[int(rng.integers(len(foods)))]
+        low, high = randomization.height
+        up = float(rng.uniform(low, high))
+        along = float(rng.uniform(-1.0, 1.0)) * randomization.offset
+        turn = float(rng.uniform(-1.0, 1.0)) * randomization.tilt
+        food = (options or {}).get("food", food)
+        self._current = station, simulator = self._station(food)
+        shift = RigidTransform(RotationMatrix.MakeYRotation(turn), [along, 0.0, -up])
+        station.begin(simulator, rng, shift)
+        self._decisions = 0
+        return self._observation(), {"food": food}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Takes a decision and advances by its period.
+
+        Raises:
+            ValueError: The action is not six finite numbers.
+            RuntimeError: The environment was not reset.
+        """
+        if self._current is None:
+            raise RuntimeError("step() before reset(): call reset() first.")
+        action = np.asarray(action, float)
+        if action.shape != (6,) or not np.isfinite(action).all():
+            raise ValueError(f"an action is six finite numbers within [-1, 1]; this is {action}.")
+        station, simulator = self._current
+        context = simulator.get_mutable_context()
+        station.GetInputPort("action").FixValue(context, action)
+        self._decisions += 1
+        config, end, guard, message = self.task.reward, "", "", ""
+        try:
+            simulator.AdvanceTo(self._decisions * self.task.agent.period)
+        except CuttingError as failure:
+            end, guard, message = "guard", type(failure).__name__, str(failure)
+        observation = self._observation()
+        error = station.GetOutputPort("error").Eval(context)
+        wrench = station.GetOutputPort("wrench").Eval(context)
+        terms = reward_terms(float(error[1]), wrench[:2], observation[JERK])
+        reward = float(reward_weights(config, self.progress) @ terms)
+        end = end or self._end(error)
+        if end == "goal":
+            reward += config.goal
+        elif end:
+            reward += config.collision
+        info: dict[str, Any] = {
+            "reward_terms": dict(zip(TERMS, terms.tolist(), strict=True)),
+            "cut_progress": float(station.GetOutputPort("cut_progress").Eval(context)[0]),
+            "height": float(error[1]),
+            "force": self._force(),
+        }
+        if guard:
+            info["guard_error"], info["guard_message"] = guard, message
+        truncated = not end and self._decisions >= self.task.decisions
+        if end or truncated:
+            info["end"] = end or "time"
+            info["is_success"] = end == "goal"
+        return observation, reward, bool(end), truncated, info
+
+    def _station(self, food: str) -> tuple[AgentStation, Simulator]:
+        if food not in self._built:
+            rng = np.random.default_rng([VARIANT_SEED, self.task.foods.index(food)])
+            station = make_agent_station(self.task, food, rng)
+            simulator = Simulator(station)
+            self._built[food] = station, simulator
+        return self._built[food]
+
+    def _observation(self) -> np.ndarray:
+        assert self._current is not None
+        station, simulator = self._current
+        values = station.GetOutputPort("observation").Eval(simulator.get_context())
+        return values.astype(np.float32)
+
+    def _force(self) -> float:
+        assert self._current is not None
+        station, simulator = self._current
+        context = simulator.get_context()
+        food = station.GetOutputPort("food_wrench_vector").Eval(context)
+        board = station.GetOutputPort("board_wrench_vector").Eval(context)
+        return float(np.linalg.norm(food[3:] + board[3:]))
+
+    def _end(self, error: np.ndarray) -> str:
+        """Why the episode ends, or nothing."""
+        assert self._current is not None
+        station, simulator = self._current
+        context, task = simulator.get_context(), self.task
+        if station.GetOutputPort("at_goal").Eval(context)[0] > task.agent.goal_decisions:
+            return "goal"
+        # A run that the station's monitor ended shakes.
+        wrench = station.GetOutputPort("sensor_wrench").Eval(context).get_coeffs()
+        largest = np.abs(wrench).reshape(2, 3).max(axis=1)
+        if largest[0] > task.torque_limit or largest[1] > task.force_limit:
+            return "collision"
+        if context.get_time() < self._decisions * task.agent.period - 1e-6:
+            return "collision"
+        return "workspace" if (np.abs(error) > task.workspace).any() else ""

@@ -1,0 +1,47 @@
+"""Writes an actor as a network that runs without the library that trained it."""
+
+from pathlib import Path
+
+import onnx
+import torch
+from stable_baselines3.sac.policies import Actor
+from torch import nn
+
+from sliceit_drake.systems.agent import AgentConfig
+from sliceit_drake.systems.network import LAYOUT, layout_of
+
+__all__ = ["export_policy"]
+
+
+class _Deterministic(nn.Module):
+    """The middle of the actor's distribution."""
+
+    def __init__(self, actor: Actor) -> None:
+        super().__init__()
+        self.features, self.latent, self.mean = actor.features_extractor, actor.latent_pi, actor.mu
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        return torch.tanh(self.mean(self.latent(self.features(observation))))
+
+
+def export_policy(actor: Actor, config: AgentConfig, file: Path) -> None:
+    """Writes the actor's decisions, without its randomness, as ONNX with the layout it needs.
+
+    Args:
+        actor: Of a Stable-Baselines3 SAC.
+        config: The agent's.
+        file: To write.
+    """
+    network = _Deterministic(actor).eval()
+    example = torch.zeros(1, config.observation_size())
+    torch.onnx.export(
+        network,
+        (example,),
+        str(file),
+        input_names=["observation"],
+        output_names=["action"],
+        dynamo=False,
+    )
+    model = onnx.load(str(file))
+    onnx.helper.set_model_props(model, {LAYOUT: layout_of(config)})
+    onnx.save(model, str(file))

@@ -1,0 +1,121 @@
+"""Prioritised replay for Stable-Baselines3, on torchrl's sum tree."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from torchrl.data.replay_buffers.samplers import PrioritizedSampler
+
+__all__ = ["PrioritizedReplayBuffer", "PrioritizedSamples"]
+
+
+class PrioritizedSamples(NamedTuple):
+    """A batch.
+
+    Attributes:
+        transitions: As Stable-Baselines3 has them.
+        places: In the buffer [batch].
+        weights: Importance weights [batch, 1], the greatest of a batch 1.
+    """
+
+    transitions: ReplayBufferSamples
+    places: np.ndarray
+    weights: torch.Tensor
+
+
+class _Filled:
+    """What the sampler asks of a storage: how much of it is filled."""
+
+    ndim = 1
+
+    def __init__(self) -> None:
+        self.size = 0
+
+    def __len__(self) -> int:
+        return self.size
+
+
+class PrioritizedReplayBuffer(ReplayBuffer):
+    """Transitions drawn in proportion to a power of their last error.
+
+    Schaul et al., "Prioritized Experience Replay" (2016), proportional variant. Weights are divided
+    by the greatest of their batch: by that of the whole buffer a single transition with a small
+    error would make all others' steps small.
+
+    Args:
+        alpha: Power of the priority; 0 draws uniformly.
+        beta: Power of the importance weights at the start; `set_beta` raises it.
+        floor: Added to each error.
+    """
+
+    def __init__(
+        self,
+        *arguments: Any,
+        alpha: float = 0.6,
+        beta: float = 0.4,
+        floor: float = 0.01,
+        **options: Any,
+    ) -> None:
+        super().__init__(*arguments, **options)
+        self.alpha, self.beta = alpha, beta
+        self._filled = _Filled()
+        self._sampler = PrioritizedSampler(self.buffer_size, alpha=alpha, beta=beta, eps=floor)
+        self._generator = torch.Generator().manual_seed(0)
+        self._sampler._rng = self._generator
+
+    def seed(self, seed: int) -> None:
+        """Seeds the draws."""
+        self._generator.manual_seed(seed)
+
+    def set_beta(self, beta: float) -> None:
+        """Sets the power of the importance weights."""
+        self.beta = beta
+        self._sampler.beta = beta
+
+    def add(self, *arguments: Any, **options: Any) -> None:
+        place = self.pos
+        super().add(*arguments, **options)
+        self._filled.size = self.buffer_size if self.full else self.pos
+        # With the greatest priority so far, so that each is seen once.
+        self._sampler.extend(torch.tensor([place]))
+        self._sampler.mark_update(torch.tensor([place]), storage=self._filled)
+
+    def sample_prioritized(self, batch_size: int) -> PrioritizedSamples:
+        """Draws a batch."""
+        found, info = self._sampler.sample(self._filled, batch_size)
+        places = np.asarray(found if not isinstance(found, tuple) else found[0])
+        weights = torch.as_tensor(info["priority_weight"]).float().reshape(-1, 1)
+        return PrioritizedSamples(self._get_samples(places), places, weights / weights.max())
+
+    def update(self, places: np.ndarray, errors: np.ndarray) -> None:
+        """Takes the errors [batch] of transitions for their priorities."""
+        self._sampler.update_priority(
+            torch.as_tensor(places), torch.as_tensor(np.abs(errors)), storage=self._filled
+        )
+
+    def state(self) -> dict[str, Any]:
+        """All that is needed to go on as if nothing had happened."""
+        size = self._filled.size
+        names = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+        arrays = {name: getattr(self, name)[:size].copy() for name in names if hasattr(self, name)}
+        return {
+            "arrays": arrays,
+            "size": size,
+            "pos": self.pos,
+            "full": self.full,
+            "beta": self.beta,
+            "sampler": self._sampler.state_dict(),
+            "generator": self._generator.get_state(),
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Takes what `state` gave."""
+        for name, values in state["arrays"].items():
+            getattr(self, name)[: state["size"]] = values
+        self.pos, self.full = state["pos"], state["full"]
+        self._filled.size = state["size"]
+        self._sampler.load_state_dict(state["sampler"])
+        self.set_beta(state["beta"])
+        self._generator.set_state(state["generator"])

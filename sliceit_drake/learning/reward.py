@@ -1,0 +1,80 @@
+"""The reward of SliceIt!, term by term.
+
+Beltran-Hernandez et al., SliceIt! (2024), and its code; where the two differ the code is followed:
+as printed the force term rewards force.
+"""
+
+import dataclasses as dc
+
+import numpy as np
+
+from sliceit_drake.configuration import ConfigurationError, choice, quantity
+
+__all__ = ["TERMS", "RewardConfig", "reward_terms", "reward_weights"]
+
+TERMS = ("distance", "force", "jerk", "step")
+HEIGHT = 0.06
+"""Scale of the height over the board, metres."""
+WIDTH, FLOOR = 0.25, 0.1
+"""Of the Gaussians by which a schedule moves weight, as shares of the training, and their least."""
+
+
+@dc.dataclass
+class RewardConfig:
+    """Weights of the terms, and what an episode's end gives."""
+
+    weights: list[float] = quantity(
+        [1.0, 1.0, 1.0, 1.0],
+        "",
+        low=0.0,
+        size=4,
+        doc="Of distance, force, jerk and step; only their ratios count.",
+    )
+    schedule: str = choice(
+        "constant",
+        ("constant", "gaussian"),
+        doc="gaussian: the weight moves from distance to force to jerk during the training.",
+    )
+    goal: float = quantity(100.0, "", low=0.0, doc="For a slice that is done.")
+    collision: float = quantity(
+        -100.0, "", high=0.0, doc="For a force over the limit, leaving the workspace, or a failure."
+    )
+
+    def check(self, where: str) -> None:
+        if sum(self.weights) <= 0.0:
+            raise ConfigurationError(
+                "are all zero", field=f"{where}.weights", fix="Give one above zero."
+            )
+
+
+def reward_terms(height: float, force: np.ndarray, jerk: np.ndarray) -> np.ndarray:
+    """Distance, force, jerk and step, each from -1 to 0 [4].
+
+    Args:
+        height: Of the edge over its final pose, metres.
+        force: Mean of the readings seen, along Kx and Kz [2], N.
+        jerk: Scaled as it is observed [3].
+    """
+    return np.array(
+        [
+            -np.tanh(5.0 * abs(height) / HEIGHT),
+            -1.0 / (1.0 + np.exp(3.0 - 0.5 * np.linalg.norm(force))),
+            -min(float(np.linalg.norm(jerk)), 1.0),
+            -1.0,
+        ]
+    )
+
+
+def reward_weights(config: RewardConfig, progress: float = 0.0) -> np.ndarray:
+    """Weights of the terms [4], which sum to 1.
+
+    Args:
+        config: Weights and schedule.
+        progress: Share of the training that is done.
+    """
+    weights = np.array(config.weights)
+    if config.schedule == "gaussian":
+        away = progress - np.array([0.0, 0.5, 1.0])
+        bell = np.exp(-0.5 * (away / WIDTH) ** 2)
+        weights[:3] *= np.where(away < 0.0, np.maximum(bell, FLOOR), 1.0)
+    return weights / weights.sum()

@@ -1,0 +1,204 @@
+"""What an agent is trained on: foods, how they vary, the robot, the reward."""
+
+import copy
+import dataclasses as dc
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sliceit_drake.configuration import ConfigurationError, choice, load_yaml, quantity
+from sliceit_drake.cutting.board import Board
+from sliceit_drake.cutting.food import Cylinder, Food, make_food_model
+from sliceit_drake.cutting.model import Numerics
+from sliceit_drake.cutting.parameters import with_parameters
+from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.diagrams.agent_gains import AgentGains
+from sliceit_drake.diagrams.agent_station import AgentStation
+from sliceit_drake.diagrams.calibrated_food import CalibratedFood, load_calibrated_food
+from sliceit_drake.diagrams.scenario import Scenario, Start
+from sliceit_drake.diagrams.station import MakeSlicingStation
+from sliceit_drake.learning.reward import RewardConfig
+from sliceit_drake.systems.agent import AgentConfig
+from sliceit_drake.systems.cutting_system import CuttingSystem
+from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig
+
+__all__ = [
+    "RandomizationConfig",
+    "TaskConfig",
+    "load_task",
+    "make_agent_station",
+    "station_scenario",
+]
+
+VARIED = ("material.toughness", "material.youngs_modulus", "material.friction")
+
+
+@dc.dataclass
+class RandomizationConfig:
+    """How episodes differ."""
+
+    foods: str = choice(
+        "posterior",
+        ("posterior", "uniform", "none"),
+        doc="Where a food's parameters are drawn from: its calibration, a uniform relative noise "
+        "on toughness, modulus and friction, or nowhere. The spring's ERP has its own noise.",
+    )
+    variants: int = quantity(
+        8, "", low=1, high=1000, doc="Draws prepared of each food; an episode takes one."
+    )
+    noise: float = quantity(
+        0.3, "", low=0.0, high=0.9, doc="Half width of the uniform noise, and of that on ERP."
+    )
+    height: list[float] = quantity(
+        [0.0, 0.01], "m", low=-0.01, high=0.1, size=2, doc="Range of the start, above its place."
+    )
+    offset: float = quantity(
+        0.01, "m", low=0.0, high=0.05, doc="Half width of the start's place along the edge."
+    )
+    tilt: float = quantity(
+        0.01, "rad", low=0.0, high=0.1, doc="Half width of the blade's turn about Ky."
+    )
+
+    def check(self, where: str) -> None:
+        if not self.height[0] <= self.height[1]:
+            raise ConfigurationError(
+                f"{self.height} is no range", field=f"{where}.height", fix="Swap the two."
+            )
+
+
+def _sensor() -> WrenchSensorConfig:
+    return WrenchSensorConfig()
+
+
+@dc.dataclass
+class TaskConfig:
+    """A training's task; the same but for `simulator` for an agent and its baseline."""
+
+    simulator: str = choice(
+        "cutting",
+        ("cutting", "spring"),
+        doc="cutting: finite elements. spring: the spring-only baseline of SliceIt!.",
+    )
+    foods: list[str] = dc.field(default_factory=lambda: ["cucumber", "tomato", "potato"])
+    """Calibrated foods, by name or file; an episode takes one."""
+    randomization: RandomizationConfig = dc.field(default_factory=RandomizationConfig)
+    refinement: float = quantity(
+        0.75, "", low=0.3, high=4.0, doc="Elements along an edge, relative to the food's mesh."
+    )
+    time_step: float = quantity(2.5e-4, "s", low=1e-6, high=2e-3, doc="Sub-step of the food.")
+    board: Board = dc.field(default_factory=Board)
+    sensor: WrenchSensorConfig = dc.field(default_factory=_sensor)
+    start: Start = dc.field(default_factory=Start)
+    agent: AgentConfig = dc.field(default_factory=AgentConfig)
+    """`descent` follows from the food and `start`, and `network` and `duration` are not used."""
+    reward: RewardConfig = dc.field(default_factory=RewardConfig)
+    decisions: int = quantity(500, "", low=1, high=100_000, doc="Most in an episode.")
+    workspace: list[float] = quantity(
+        [0.05, 0.1, 0.1745], "m, m, rad", low=0.0, size=3, doc="Errors that end an episode."
+    )
+    force_limit: float = quantity(50.0, "N", low=0.1, doc="Of each component; ends an episode.")
+    torque_limit: float = quantity(10.0, "Nm", low=0.1, doc="Likewise.")
+
+    def check(self, where: str) -> None:
+        if not self.foods:
+            raise ConfigurationError(
+                "names no food", field=f"{where}.foods", fix='Write "[cucumber]".'
+            )
+
+
+def load_task(file: str | Path, overrides: str | None = None) -> TaskConfig:
+    """Reads and validates a task.
+
+    Raises:
+        ConfigurationError: Naming file, field and fix.
+    """
+    task = load_yaml(TaskConfig, file, defaults=TaskConfig(), overrides_text=overrides)
+    assert isinstance(task, TaskConfig)
+    return task
+
+
+def station_scenario(task: TaskConfig, calibrated: CalibratedFood, food: str) -> Scenario:
+    """The scenario of a food's station.
+
+    Raises:
+        ConfigurationError: The food has no spring, and the task asks for one.
+    """
+    scenario = Scenario(
+        name=f"{food}_{task.simulator}",
+        controller=AgentGains().controller(),
+        knife=copy.deepcopy(calibrated.knife),
+        board=copy.deepcopy(task.board),
+        sensor=copy.deepcopy(task.sensor),
+        start=copy.deepcopy(task.start),
+        numerics=Numerics(flank_stiffness=calibrated.flank_stiffness, time_step=task.time_step),
+    )
+    if task.simulator == "cutting":
+        scenario.food = _meshed(calibrated.apply_to(calibrated.food), task.refinement)
+        return scenario
+    if calibrated.spring is None:
+        raise ConfigurationError(
+            f"the calibration of {food} has no spring", field="task.foods", fix="Calibrate it."
+        )
+    noise = task.randomization.noise if task.randomization.foods != "none" else 0.0
+    scenario.food = dc.replace(calibrated.spring, erp_noise=noise)
+    return scenario
+
+
+def make_agent_station(task: TaskConfig, food: str, rng: np.random.Generator) -> AgentStation:
+    """A food's station with all its prepared variants, and the agent on it.
+
+    Args:
+        task: What is trained.
+        food: Of its foods.
+        rng: Draws the variants.
+
+    Raises:
+        ConfigurationError: The food cannot be loaded or cut.
+    """
+    calibrated = load_calibrated_food(food)
+    scenario = station_scenario(task, calibrated, food)
+    make_cutting = None
+    if isinstance(scenario.food, Food):
+        solvers = _variants(task, calibrated, scenario, rng)
+        X_WF, period = scenario.X_WF(), scenario.exchange_period
+
+        def make_cutting(knife):  # type: ignore[no-untyped-def]
+            return CuttingSystem(
+                [CuttingSolver(model, period) for model in solvers], X_WF, knife.index()
+            )
+
+    station = MakeSlicingStation(scenario, make_cutting=make_cutting)
+    descent = float(station.start_pose.translation()[2]) - scenario.board.height
+    return AgentStation(station, dc.replace(task.agent, descent=descent))
+
+
+def _meshed(food: Food, refinement: float) -> Food:
+    shape = food.shape
+    if isinstance(shape, Cylinder):
+        shape = dc.replace(shape, rings=max(2, round(shape.rings * refinement)))
+    return dc.replace(food, shape=shape)
+
+
+def _variants(
+    task: TaskConfig, calibrated: CalibratedFood, scenario: Scenario, rng: np.random.Generator
+) -> list:
+    assert isinstance(scenario.food, Food)
+    model = make_food_model(scenario.food, scenario.knife, scenario.numerics)
+    randomization = task.randomization
+    if randomization.foods == "none":
+        return [model]
+    if randomization.foods == "posterior":
+        draws: Sequence[dict[str, float]] = calibrated.distribution.draw(
+            rng, randomization.variants
+        )
+    else:
+        names = VARIED
+        factors = 1.0 + randomization.noise * rng.uniform(
+            -1.0, 1.0, (randomization.variants, len(names))
+        )
+        at = {n: getattr(scenario.food.material, n.split(".")[1]) for n in names}
+        draws = [
+            {n: at[n] * f for n, f in zip(names, row, strict=True)} for row in factors.tolist()
+        ]
+    return [with_parameters(model, draw) for draw in draws]

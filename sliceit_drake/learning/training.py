@@ -1,0 +1,317 @@
+"""A training: its configuration, its run with checkpoints, and what it leaves."""
+
+import contextlib
+import dataclasses as dc
+import functools
+import json
+import os
+import time as clock
+from collections import Counter, deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+from sliceit_drake.configuration import ConfigurationError, dump_yaml, quantity
+from sliceit_drake.learning.environment import SlicingEnv
+from sliceit_drake.learning.export import export_policy
+from sliceit_drake.learning.network import HistoryExtractor
+from sliceit_drake.learning.sac import OverlapVecEnv, PrioritizedSAC
+from sliceit_drake.learning.task import TaskConfig
+
+__all__ = ["CHECKPOINT", "Outcome", "TrainingConfig", "train"]
+
+CHECKPOINT, CONFIGURATION, POLICY, EPISODES = (
+    "checkpoint.pt",
+    "training.yaml",
+    "policy.onnx",
+    "episodes.jsonl",
+)
+GUARD_SHARE = 1e-3
+"""Of episodes that guards of the simulation may end."""
+
+
+@dc.dataclass
+class TrainingConfig:
+    """How an agent is trained, and on what."""
+
+    task: TaskConfig = dc.field(default_factory=TaskConfig)
+    steps: int = quantity(80_000, "", low=1, high=10**9, doc="Decisions.")
+    seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Of everything random.")
+    learning_rate: float = quantity(1e-3, "", low=1e-7, high=1.0, doc="Of all networks.")
+    batch: int = quantity(256, "", low=1, high=10**6, doc="Transitions in an update.")
+    warm_up: int = quantity(1000, "", low=1, high=10**9, doc="Random decisions at the start.")
+    gamma: float = quantity(0.99, "", low=0.0, high=1.0, doc="Discount of a decision.")
+    tau: float = quantity(0.005, "", low=0.0, high=1.0, doc="Of the targets' moving average.")
+    layers: list[int] = dc.field(default_factory=lambda: [128, 128])
+    """Widths of the fully connected layers behind the joined features."""
+    priority: float = quantity(
+        0.6, "", low=0.0, high=1.0, doc="Power of the priorities; 0 replays uniformly."
+    )
+    history: bool = True
+    """Whether the network sees the force/torque history."""
+    checkpoint_interval: int = quantity(
+        5000, "", low=1, high=10**9, doc="Decisions between checkpoints, at episodes' ends."
+    )
+
+
+@dc.dataclass
+class Outcome:
+    """What a training came to.
+
+    Attributes:
+        steps: Decisions taken, those before a resumption included.
+        episodes: Likewise.
+        wall_time: Of this run, s.
+        guard_errors: Episodes that guards ended, by kind.
+        ends: Episodes by how they ended.
+        failed: Why the result cannot be used, or None.
+    """
+
+    steps: int
+    episodes: int
+    wall_time: float
+    guard_errors: dict[str, int]
+    ends: dict[str, int]
+    failed: str | None = None
+
+
+def train(
+    config: TrainingConfig,
+    output: Path,
+    progress: Callable[[int, str], None] | None = None,
+    stop_after: int | None = None,
+) -> Outcome:
+    """Trains, or goes on where the checkpoint in `output` is.
+
+    A run that goes on gives the same numbers as one that was never interrupted.
+
+    Args:
+        config: Training; of a run that goes on, that which it was begun with.
+        output: Folder for checkpoint, training.yaml, episodes.jsonl, TensorBoard and policy.onnx.
+        progress: Called with the steps so far and a line about the last episodes.
+        stop_after: Ends at the first checkpoint after so many steps; None to go on to the end.
+
+    Raises:
+        ConfigurationError: `output` has a checkpoint of another configuration.
+    """
+    output.mkdir(parents=True, exist_ok=True)
+    described = json.dumps(dc.asdict(config), sort_keys=True)
+    saved = _load(output / CHECKPOINT, described)
+    dump_yaml(config, output / CONFIGURATION)
+    torch.set_num_threads(1)
+    processes = SubprocVecEnv([functools.partial(SlicingEnv, config.task)], "forkserver")
+    environments = OverlapVecEnv(processes)
+    try:
+        model = _make_model(config, environments)
+        model.set_logger(configure(str(output), ["tensorboard"]))
+        environments.meanwhile = model.update_once
+        callback = _Watch(config, output, described, progress, stop_after)
+        if saved is not None:
+            # The first reset takes the seed; the next repeats the one of the checkpoint.
+            environments.reset()
+            environments.env_method("set_random_state", saved["environment"])
+            model.set_training_state(saved["model"])
+            model._current_progress_remaining = 1.0 - model.num_timesteps / config.steps
+            callback.restore(saved["watch"])
+            _cut_log(output / EPISODES, callback.episodes)
+        else:
+            (output / EPISODES).unlink(missing_ok=True)
+        begin = clock.perf_counter()
+        remaining = config.steps - model.num_timesteps
+        with contextlib.suppress(_Stopped):
+            if remaining > 0:
+                model.learn(remaining, callback, reset_num_timesteps=False)
+        outcome = callback.outcome(clock.perf_counter() - begin)
+        if not callback.was_stopped:
+            export_policy(model.actor, config.task.agent, output / POLICY)
+        (output / "summary.json").write_text(json.dumps(dc.asdict(outcome), indent=2) + "\n")
+        return outcome
+    finally:
+        environments.close()
+
+
+def _make_model(config: TrainingConfig, environments: OverlapVecEnv) -> PrioritizedSAC:
+    agent = config.task.agent
+    model = PrioritizedSAC(
+        "MlpPolicy",
+        environments,
+        learning_rate=config.learning_rate,
+        buffer_size=config.steps,
+        learning_starts=config.warm_up,
+        batch_size=config.batch,
+        tau=config.tau,
+        gamma=config.gamma,
+        train_freq=1,
+        # Updates are made while the environment simulates.
+        gradient_steps=0,
+        replay_buffer_kwargs={"alpha": config.priority},
+        policy_kwargs={
+            "net_arch": list(config.layers),
+            "features_extractor_class": HistoryExtractor,
+            "features_extractor_kwargs": {
+                "history": agent.history,
+                "blind": not config.history,
+            },
+        },
+        seed=config.seed,
+        device="cpu",
+    )
+    model.replay_buffer.seed(config.seed)
+    return model
+
+
+def _load(file: Path, described: str) -> dict[str, Any] | None:
+    if not file.exists():
+        return None
+    saved = torch.load(file, weights_only=False)
+    if saved["config"] != described:
+        raise ConfigurationError(
+            "is of a training with other settings",
+            field="output",
+            source=str(file),
+            fix="Give another folder, or delete it.",
+        )
+    return saved
+
+
+def _cut_log(file: Path, episodes: int) -> None:
+    """Drops what was logged after the checkpoint."""
+    if file.exists():
+        lines = file.read_text().splitlines(keepends=True)[:episodes]
+        file.write_text("".join(lines))
+
+
+class _Watch(BaseCallback):
+    """Logs episodes, counts guards, keeps checkpoints."""
+
+    def __init__(
+        self,
+        config: TrainingConfig,
+        output: Path,
+        described: str,
+        progress: Callable[[int, str], None] | None,
+        stop_after: int | None,
+    ) -> None:
+        super().__init__()
+        self._config, self._output, self._described = config, output, described
+        self._progress, self._stop_after = progress, stop_after
+        self.episodes, self.was_stopped = 0, False
+        self._saved_at, self._is_due = 0, False
+        self._ends: Counter[str] = Counter()
+        self._guards: Counter[str] = Counter()
+        self._sums: dict[str, float] = {}
+        self._returns: deque[float] = deque(maxlen=20)
+        self._schedule = config.task.reward.schedule != "constant"
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self.episodes, self._saved_at = state["episodes"], state["steps"]
+        self._ends, self._guards = Counter(state["ends"]), Counter(state["guards"])
+        self._returns.extend(state["returns"])
+
+    def outcome(self, wall_time: float) -> Outcome:
+        guarded = sum(self._guards.values())
+        failed = None
+        if guarded > GUARD_SHARE * max(self.episodes, 1):
+            failed = (
+                f"guards of the simulation ended {guarded} of {self.episodes} episodes "
+                f"({dict(self._guards)}), more than {100 * GUARD_SHARE:g} %"
+            )
+        return Outcome(
+            self.num_timesteps,
+            self.episodes,
+            wall_time,
+            dict(self._guards),
+            dict(self._ends),
+            failed,
+        )
+
+    def _on_step(self) -> bool:
+        info, reward = self.locals["infos"][0], float(self.locals["rewards"][0])
+        for name, value in (
+            ("return", reward),
+            ("length", 1.0),
+            ("force", info["force"]),
+            *((f"reward_{name}", value) for name, value in info["reward_terms"].items()),
+        ):
+            self._sums[name] = self._sums.get(name, 0.0) + value
+        self._sums["peak"] = max(self._sums.get("peak", 0.0), info["force"])
+        if self._schedule:
+            share = self.num_timesteps / self._config.steps
+            self.training_env.env_method("set_progress", share)
+        if not self.locals["dones"][0]:
+            return True
+        self._finish_episode(info)
+        due = self.num_timesteps - self._saved_at >= self._config.checkpoint_interval
+        self.was_stopped = self._stop_after is not None and self.num_timesteps >= self._stop_after
+        self._is_due = due or self.was_stopped
+        return True
+
+    def _on_rollout_start(self) -> None:
+        # Only here the episode's last transition is in the buffer.
+        if not self._is_due:
+            return
+        self._is_due = False
+        self._save()
+        if self.was_stopped:
+            raise _Stopped
+
+    def _save(self) -> None:
+        self._saved_at = self.num_timesteps
+        assert isinstance(self.model, PrioritizedSAC)
+        state = {
+            "config": self._described,
+            "model": self.model.training_state(),
+            "environment": self.training_env.env_method("random_state")[0],
+            "watch": {
+                "episodes": self.episodes,
+                "steps": self.num_timesteps,
+                "ends": dict(self._ends),
+                "guards": dict(self._guards),
+                "returns": list(self._returns),
+            },
+        }
+        # Whole or not at all.
+        part = self._output / f"{CHECKPOINT}.part"
+        torch.save(state, part)
+        os.replace(part, self._output / CHECKPOINT)
+
+    def _finish_episode(self, info: dict[str, Any]) -> None:
+        self.episodes += 1
+        self._ends[info["end"]] += 1
+        if "guard_error" in info:
+            self._guards[info["guard_error"]] += 1
+        sums, self._sums = self._sums, {}
+        length = sums["length"]
+        row = {
+            "steps": self.num_timesteps,
+            "end": info["end"],
+            "length": int(length),
+            "return": sums["return"],
+            "force": sums["force"] / length,
+            "peak": sums["peak"],
+            "cut_progress": info["cut_progress"],
+            **{k: v / length for k, v in sums.items() if k.startswith("reward_")},
+        }
+        if "guard_message" in info:
+            row["guard"] = info["guard_message"]
+        with (self._output / EPISODES).open("a") as file:
+            file.write(json.dumps(row) + "\n")
+        self._returns.append(sums["return"])
+        for name, value in row.items():
+            if isinstance(value, int | float):
+                self.logger.record(f"episode/{name}", value)
+        self.logger.record("guards/episodes", sum(self._guards.values()))
+        self.logger.dump(self.num_timesteps)
+        if self._progress is not None:
+            mean = float(np.mean(self._returns))
+            self._progress(self.num_timesteps, f"return {mean:.1f}, {info['end']}")
+
+
+class _Stopped(Exception):
+    """Ends `learn` at a checkpoint."""

@@ -1,0 +1,370 @@
+"""The SliceIt! agent as a Drake system: what it observes, and what its six numbers do.
+
+The same system serves training, where the action is an input port, and deployment, where a network
+decides inside it. Facts of the original: Beltran-Hernandez et al., SliceIt! (2024), and its code.
+What differs, and why:
+
+- The authors double stiffness and gains before they send them; the ranges here are the doubled.
+- They map [0, 1], not [-1, 1], to a range, so that half of each action does nothing. Here the whole
+  range is used (`mapping: whole`); `upper` is theirs.
+- Their increments of the rotation about y are off in the cutting configuration (greatest rate 0).
+  That action moves the target's depth here: with a fixed target at the board the vertical spring
+  (2,000 N/m) pulls with less than a food resists over the last millimetres, in the spring-only
+  simulator as in the other, and no policy could end a slice in either.
+- The error is to the final pose, the edge on the board; how far the target has been moved from it
+  is observed as well. Without it the agent could not know what it has accumulated.
+- A slice of which 2 mm hold is not cut: the goal asks for 0.2 mm, and no lower bound, for a
+  board gives.
+"""
+
+import dataclasses as dc
+import math
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+
+import numpy as np
+from pydrake.common.value import AbstractValue, Value
+from pydrake.math import RigidTransform
+from pydrake.multibody.math import SpatialForce
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from sliceit_drake.configuration import ConfigurationError, choice, quantity
+from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan, Segment
+
+__all__ = ["ACTIONS", "AgentConfig", "AgentSystem", "Decide", "observation_names"]
+
+ACTIONS = ("stiffness_x", "stiffness_ry", "p_z", "p_ry", "draw", "press")
+"""What the numbers of an action decide."""
+
+Decide = Callable[[np.ndarray], np.ndarray]
+"""From an observation to an action [6], each within [-1, 1]."""
+
+# Scales of the observation: SliceIt!'s.
+ERROR = np.array([0.1, 0.06, 0.785])
+VELOCITY = np.array([0.5, 0.5, 0.785])
+JERK = 500.0
+WRENCH = np.array([50.0, 50.0, 10.0])
+
+# Parts of the decisions' state.
+_ERRORS, _ACTION, _OFFSET, _TARGET = slice(0, 9), slice(9, 15), slice(15, 17), slice(17, 19)
+_STIFFNESS, _GAINS, _SCALE = slice(19, 25), slice(25, 31), 31
+_COUNT, _LIFT, _SIZE = 32, 33, 34
+
+
+@dc.dataclass
+class AgentConfig:
+    """The SliceIt! agent in a scenario: its network, and what it may do."""
+
+    network: str = ""
+    """Exported network (`sliceit train`), relative to the resources or to the working directory."""
+    descent: float = quantity(
+        0.037, "m", low=1e-3, high=0.5, doc="Height of the edge over the board at the start."
+    )
+    duration: float = quantity(8.0, "s", low=0.05, high=600.0, doc="Of the run.")
+    period: float = quantity(0.05, "s", low=0.002, high=1.0, doc="Between two decisions.")
+    history: int = quantity(12, "", low=1, high=100, doc="Force/torque readings that it sees.")
+    reading_period: float = quantity(
+        0.01, "s", low=0.002, high=1.0, doc="Between two of these readings."
+    )
+    mapping: str = choice(
+        "whole",
+        ("whole", "upper"),
+        doc="What of [-1, 1] spans the ranges of stiffness and gains; upper: [0, 1], as the code "
+        "of SliceIt! has it.",
+    )
+    stiffness_x: list[float] = quantity(
+        [1000.0, 10000.0], "N/m", low=0.0, high=1e5, size=2, doc="Range, along the edge."
+    )
+    stiffness_ry: list[float] = quantity(
+        [40.0, 200.0], "Nm/rad", low=0.0, high=1e4, size=2, doc="Range, about Ky."
+    )
+    p_z: list[float] = quantity([0.02, 0.1], "", low=0.0, size=2, doc="Range of the gain, down.")
+    p_ry: list[float] = quantity([0.2, 3.0], "", low=0.0, size=2, doc="Range of the gain about Ky.")
+    error_scale: list[float] = quantity(
+        [0.15, 0.25],
+        "",
+        low=0.0,
+        size=2,
+        doc="Far from the final pose, and at it; with the factor of docs/control.md.",
+    )
+    draw_increment: float = quantity(
+        2e-3, "m", low=0.0, high=0.05, doc="Greatest move of the target along Kx in a decision."
+    )
+    press_increment: float = quantity(
+        2e-3, "m", low=0.0, high=0.05, doc="Greatest move of the target down in a decision."
+    )
+    draw: float = quantity(
+        0.035, "m", low=0.0, high=0.2, doc="Farthest that the target goes along Kx, either way."
+    )
+    overtravel: float = quantity(
+        0.03, "m", low=0.0, high=0.1, doc="Farthest that the target goes below the board."
+    )
+    lead: float = quantity(
+        0.8, "", low=0.01, high=1.0, doc="Share of the way to the target that a decision aims at."
+    )
+    goal: list[float] = quantity(
+        [0.04, 2e-4, 0.04],
+        "m, m, rad",
+        low=0.0,
+        size=3,
+        doc="Error along Kx, height over the board and error about Ky within which the slice ends.",
+    )
+    goal_decisions: int = quantity(10, "", low=0, high=1000, doc="That it stays there before.")
+    lift_speed: float = quantity(
+        0.05, "m/s", low=1e-3, high=0.5, doc="Of the target, up, once the slice has ended."
+    )
+
+    def check(self, where: str) -> None:
+        ratio = self.period / self.reading_period
+        if abs(ratio - round(ratio)) > 1e-6 or round(ratio) < 1:
+            raise ConfigurationError(
+                f"{self.reading_period:g} s does not divide the period of {self.period:g} s",
+                field=f"{where}.reading_period",
+                fix=f"Give {self.period:g} over a whole number.",
+            )
+        for name in ("stiffness_x", "stiffness_ry", "p_z", "p_ry"):
+            low, high = getattr(self, name)
+            if not low <= high:
+                raise ConfigurationError(
+                    f"{low:g} to {high:g} is no range", field=f"{where}.{name}", fix="Swap them."
+                )
+
+    def observation_size(self) -> int:
+        """How many numbers an observation has."""
+        return len(observation_names(self.history))
+
+    def describe(self) -> str:
+        """Who decides and what it may do at most, for an operator to read."""
+        return (
+            f"the network {self.network} decides every {self.period:g} s how compliant the knife "
+            f"is, at most {1e3 * self.descent:.1f} mm down, {1e3 * self.draw:.1f} mm along the "
+            f"edge; its target lies up to {1e3 * self.overtravel:g} mm below the board"
+        )
+
+    def envelope(self) -> MotionPlan:
+        """A motion through the corners of where the knife may go, at 50 mm/s.
+
+        The target may lie below the board; the knife stays on it.
+        """
+        way: list[Segment] = []
+        x = z = 0.0
+        draw, down = self.draw, self.descent
+        for a, b in ((0.0, down), (draw, down), (-draw, down), (-draw, 0.0), (draw, 0.0)):
+            if (distance := math.hypot(a - x, b - z)) > 0.0:
+                direction = [(a - x) / distance, 0.0, (b - z) / distance]
+                way.append(ConstantSpeed(0.05, direction, distance, label="agent"))
+                x, z = a, b
+        taken = sum(
+            s.distance / s.speed for s in way if isinstance(s, ConstantSpeed) and s.distance
+        )
+        return MotionPlan([*way, Hold(max(self.duration - taken, 1e-3), label="agent")])
+
+
+def observation_names(history: int) -> list[str]:
+    """Names of an observation's numbers, in order; all are scaled as SliceIt! scales them."""
+    axes = ("x", "z", "ry")
+    names = [f"{part}_{axis}" for part in ("error", "velocity", "jerk") for axis in axes]
+    names += [f"last_{name}" for name in ACTIONS] + ["target_x", "target_z"]
+    return names + [
+        f"{axis}_{k}" for k in range(1 - history, 1) for axis in ("force_x", "force_z", "moment_y")
+    ]
+
+
+class AgentSystem(LeafSystem):
+    """Decides at multiples of its period how compliant the knife is and where its target lies.
+
+    Errors, offsets and readings are along and about the axes of K as it was at the start: x along
+    the edge, z down. Once the goal is reached the target goes up to the start.
+
+    Inputs:
+        sensor_wrench: SpatialForce at So, in S.
+        knife_pose: RigidTransform X_WK.
+        action: [6], each within [-1, 1]; where no network decides.
+
+    Outputs:
+        target_pose: RigidTransform X_WK.
+        target_offset: Of the target from the start, along Kx and Kz there [2], m.
+        stiffness, p_gains, error_scale: For the compliance controller [6], [6], [1].
+        observation: What a decision at this instant would be taken by, see `observation_names`.
+        error: To the final pose, along Kx and Kz and about Ky [3], m and rad.
+        wrench: Mean of the readings seen: force along Kx and Kz, moment about Ky at Ko [3].
+        at_goal: Decisions in a row within the goal [1].
+
+    Args:
+        config: What the agent may do.
+        X_WK: Pose of the knife at the start.
+        X_KS: Pose of the sensor in the knife's frame.
+        stiffness, p_gains: What it leaves alone of the controller's [6].
+        decide: From observation to action; None to read the port `action`.
+
+    Attributes:
+        watch: Entered around each decision.
+    """
+
+    def __init__(
+        self,
+        config: AgentConfig,
+        X_WK: RigidTransform,
+        X_KS: RigidTransform,
+        stiffness: object,
+        p_gains: object,
+        decide: Decide | None = None,
+    ) -> None:
+        super().__init__()
+        self._config, self._X_WK, self._X_KW = config, X_WK, X_WK.inverse()
+        self._X_KS, self._decide_action = X_KS, decide
+        self.watch: Callable[[], AbstractContextManager] = nullcontext
+        self._wrench_in = self.DeclareAbstractInputPort("sensor_wrench", Value(SpatialForce.Zero()))
+        self._pose_in = self.DeclareAbstractInputPort("knife_pose", Value(RigidTransform()))
+        self._action_in = None
+        if decide is None:
+            self._action_in = self.DeclareVectorInputPort("action", len(ACTIONS))
+        state = np.zeros(_SIZE)
+        state[_ERRORS] = np.tile([0.0, config.descent, 0.0], 3)
+        state[_STIFFNESS], state[_GAINS] = np.array(stiffness, float), np.array(p_gains, float)
+        state[_SCALE], state[_LIFT] = config.error_scale[0], -1.0
+        self._state = self.DeclareDiscreteState(state)
+        # The oldest of the readings is dropped when the newest is taken, so one fewer is kept.
+        self._readings = self.DeclareDiscreteState(np.zeros(3 * (config.history - 1)))
+        self.DeclarePeriodicDiscreteUpdateEvent(config.period, 0.0, self._decide)
+        self.DeclarePeriodicDiscreteUpdateEvent(config.reading_period, 0.0, self._read)
+        held = {self.discrete_state_ticket(self._state)}
+        moving = held | {self.time_ticket()}
+        self.DeclareAbstractOutputPort(
+            "target_pose", lambda: Value(RigidTransform()), self._calc_target_pose, moving
+        )
+        self.DeclareVectorOutputPort("target_offset", 2, self._calc_offset, moving)
+        for name, part in (
+            ("stiffness", _STIFFNESS),
+            ("p_gains", _GAINS),
+            ("error_scale", slice(_SCALE, _SCALE + 1)),
+            ("at_goal", slice(_COUNT, _COUNT + 1)),
+        ):
+            size = part.stop - part.start
+            self.DeclareVectorOutputPort(name, size, self._copier(part), held)
+        seen = held | {
+            self.discrete_state_ticket(self._readings),
+            self._wrench_in.ticket(),
+            self._pose_in.ticket(),
+        }
+        for name, size, calc in (
+            ("observation", config.observation_size(), self.observe),
+            ("error", 3, self._error),
+            ("wrench", 3, lambda context: self._history(context).mean(axis=0)),
+        ):
+            self.DeclareVectorOutputPort(name, size, self._setter(calc), seen)
+
+    def observe(self, context: Context) -> np.ndarray:
+        """The observation in this context, float64."""
+        x, T, config = (
+            context.get_discrete_state(self._state).value(),
+            self._config.period,
+            (self._config),
+        )
+        e = np.vstack([self._error(context), x[_ERRORS].reshape(3, 3)])
+        velocity = (e[1] - e[0]) / T
+        jerk = -(e[0] - 3.0 * e[1] + 3.0 * e[2] - e[3]) / T**3
+        reach = np.maximum([config.draw, config.overtravel], 1e-9)
+        return np.concatenate(
+            [
+                e[0] / ERROR,
+                velocity / VELOCITY,
+                jerk / JERK,
+                x[_ACTION],
+                x[_OFFSET] / reach,
+                (self._history(context) / WRENCH).ravel(),
+            ]
+        )
+
+    def is_done(self, context: Context) -> bool:
+        """Whether the goal has been reached and the knife is lifted."""
+        return bool(context.get_discrete_state(self._state).value()[_LIFT] >= 0.0)
+
+    def _error(self, context: Context) -> np.ndarray:
+        X = (self._X_KW @ self._pose_in.Eval(context)).GetAsMatrix34()
+        angle = math.atan2(X[0, 2], X[2, 2])
+        return np.array([-X[0, 3], self._config.descent - X[2, 3], -angle])
+
+    def _reading(self, context: Context) -> np.ndarray:
+        wrench, X_KS = self._wrench_in.Eval(context), self._X_KS
+        force = X_KS.rotation() @ wrench.translational()
+        # So is at p_KoSo: moved to Ko the moment grows by its arm.
+        moment = X_KS.rotation() @ wrench.rotational() + np.cross(X_KS.translation(), force)
+        return np.array([force[0], force[2], moment[1]])
+
+    def _history(self, context: Context) -> np.ndarray:
+        before = context.get_discrete_state(self._readings).value().reshape(-1, 3)
+        return np.vstack([before, self._reading(context)])
+
+    def _read(self, context: Context, discrete_state: DiscreteValues) -> None:
+        discrete_state.set_value(self._readings, self._history(context)[1:].ravel())
+
+    def _decide(self, context: Context, discrete_state: DiscreteValues) -> None:
+        x, config = context.get_discrete_state(self._state).value().copy(), self._config
+        error, time = self._error(context), context.get_time()
+        if x[_LIFT] < 0.0:
+            self._act(context, x, error)
+            near = error[1] <= config.goal[1] and bool(
+                (np.abs(error[[0, 2]]) <= np.array(config.goal)[[0, 2]]).all()
+            )
+            x[_COUNT] = x[_COUNT] + 1 if near else 0
+            if x[_COUNT] > config.goal_decisions:
+                x[_LIFT] = time
+                x[_TARGET] = [-error[0], config.descent - error[1]]
+        x[_ERRORS] = np.concatenate([error, x[_ERRORS][:6]])
+        discrete_state.set_value(self._state, x)
+
+    def _act(self, context: Context, x: np.ndarray, error: np.ndarray) -> None:
+        config = self._config
+        if self._decide_action is not None:
+            with self.watch():
+                action = np.asarray(self._decide_action(self.observe(context)), float)
+        else:
+            assert self._action_in is not None
+            action = self._action_in.Eval(context)
+        if action.shape != (len(ACTIONS),) or not np.isfinite(action).all():
+            raise RuntimeError(
+                f"{self.GetSystemPathname()}: at t = {context.get_time():.6g} s the policy decided "
+                f"for {action}; {len(ACTIONS)} finite numbers are needed ({', '.join(ACTIONS)})."
+            )
+        action = np.clip(action, -1.0, 1.0)
+        share = 0.5 * (action[:4] + 1.0) if config.mapping == "whole" else np.maximum(action[:4], 0)
+        ranges = np.array([config.stiffness_x, config.stiffness_ry, config.p_z, config.p_ry])
+        chosen = ranges[:, 0] + share * (ranges[:, 1] - ranges[:, 0])
+        x[_STIFFNESS][[0, 4]], x[_GAINS][[2, 4]] = chosen[:2], chosen[2:]
+        far, near = config.error_scale
+        distance = math.hypot(error[0], error[1])
+        x[_SCALE] = far + (near - far) * (1.0 - math.tanh(100.0 * distance))
+        moved = x[_OFFSET] + action[4:] * [config.draw_increment, config.press_increment]
+        x[_OFFSET] = np.clip(moved, [-config.draw, 0.0], [config.draw, config.overtravel])
+        x[_ACTION] = action
+        place = np.array([-error[0], config.descent - error[1]])
+        final = x[_OFFSET] + [0.0, config.descent]
+        x[_TARGET] = place + config.lead * (final - place)
+
+    def _target(self, context: Context) -> np.ndarray:
+        """Of the target from the start along Kx and Kz [2], m."""
+        x = context.get_discrete_state(self._state).value()
+        if x[_LIFT] < 0.0:
+            return x[_TARGET]
+        risen = self._config.lift_speed * (context.get_time() - x[_LIFT])
+        return np.array([x[_TARGET][0], max(x[_TARGET][1] - risen, 0.0)])
+
+    def _calc_target_pose(self, context: Context, output: AbstractValue) -> None:
+        x, z = self._target(context)
+        output.set_value(self._X_WK @ RigidTransform([x, 0.0, z]))
+
+    def _calc_offset(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._target(context))
+
+    def _copier(self, part: slice) -> Callable[[Context, BasicVector], None]:
+        def calc(context: Context, output: BasicVector) -> None:
+            output.SetFromVector(context.get_discrete_state(self._state).value()[part])
+
+        return calc
+
+    @staticmethod
+    def _setter(
+        calc: Callable[[Context], np.ndarray],
+    ) -> Callable[[Context, BasicVector], None]:
+        return lambda context, output: output.SetFromVector(calc(context))

@@ -1,0 +1,90 @@
+"""An exported network that decides: ONNX, run by ONNX Runtime, without what trained it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.resources import resource_path
+from sliceit_drake.systems.agent import ACTIONS, AgentConfig, Decide, observation_names
+
+__all__ = ["LAYOUT", "layout_of", "load_network"]
+
+LAYOUT = "sliceit_layout"
+"""Key of the file's metadata under which the layout of observation and action stands."""
+
+
+def layout_of(config: AgentConfig) -> str:
+    """What an agent's network takes and gives, as the text that stands in its file."""
+    layout = {
+        "observation": observation_names(config.history),
+        "action": list(ACTIONS),
+        "period": config.period,
+        "reading_period": config.reading_period,
+    }
+    return json.dumps(layout)
+
+
+def load_network(config: AgentConfig) -> Decide:
+    """The network of an agent's configuration.
+
+    Returns:
+        A function from an observation to the action [6], float64.
+
+    Raises:
+        ConfigurationError: There is no such file, it is no network, or it was trained on another
+            observation.
+    """
+    import onnxruntime
+
+    field = "scenario.policy.network"
+    file = Path(config.network)
+    if not config.network or not file.is_file():
+        try:
+            file = resource_path(config.network)
+        except (FileNotFoundError, ValueError):
+            raise ConfigurationError(
+                f"there is no file {config.network!r}, neither here nor in the package",
+                field=field,
+                fix="Give the policy.onnx of a training.",
+            ) from None
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    try:
+        session = onnxruntime.InferenceSession(
+            str(file), options, providers=["CPUExecutionProvider"]
+        )
+    except Exception as error:  # ONNX Runtime's errors have no common class.
+        raise ConfigurationError(
+            f"{file} is no network that can be run ({error})",
+            field=field,
+            fix="Give the policy.onnx of a training.",
+        ) from error
+    found = session.get_modelmeta().custom_metadata_map.get(LAYOUT)
+    if found != layout_of(config):
+        raise ConfigurationError(
+            f"{file} {_difference(found, layout_of(config))}",
+            field=field,
+            fix="Give the agent the values of the training's task.yaml.",
+        )
+    name = session.get_inputs()[0].name
+
+    def decide(observation: np.ndarray) -> np.ndarray:
+        given = {name: np.asarray(observation, np.float32)[None]}
+        return np.asarray(session.run(None, given)[0], float).reshape(len(ACTIONS))
+
+    return decide
+
+
+def _difference(found: str | None, wanted: str) -> str:
+    if found is None:
+        return "does not say what it observes"
+    ours, theirs = json.loads(wanted), json.loads(found)
+    for key in ours:
+        if ours[key] != theirs.get(key):
+            if key == "observation":
+                sizes = len(theirs.get(key, [])), len(ours[key])
+                return f"observes {sizes[0]} numbers, the scenario's agent {sizes[1]}"
+            return f"has {key} {theirs.get(key)}, the scenario's agent {ours[key]}"
+    return "has another layout than the scenario's agent"
