@@ -113,7 +113,7 @@ class SlicingEnv(gymnasium.Env):
         observation = self._observation()
         error = station.GetOutputPort("error").Eval(context)
         wrench = station.GetOutputPort("wrench").Eval(context)
-        terms = reward_terms(float(error[1]), wrench[:2], observation[JERK])
+        terms = reward_terms(float(error[1]), wrench[:2], observation[JERK], config.force_scale)
         reward = float(reward_weights(config, self.progress) @ terms)
         end = end or self._end(error)
         if end == "goal":

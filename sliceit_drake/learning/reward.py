@@ -35,6 +35,14 @@ class RewardConfig:
         ("constant", "gaussian"),
         doc="gaussian: the weight moves from distance to force to jerk during the training.",
     )
+    force_scale: float = quantity(
+        2.0,
+        "N",
+        low=0.01,
+        high=1e3,
+        doc="Of the force term, which is half at three times as much and does not tell forces "
+        "apart from six times as much on; 2 in SliceIt!.",
+    )
     goal: float = quantity(100.0, "", low=0.0, doc="For a slice that is done.")
     collision: float = quantity(
         -100.0, "", high=0.0, doc="For a force over the limit, leaving the workspace, or a failure."
@@ -47,18 +55,21 @@ class RewardConfig:
             )
 
 
-def reward_terms(height: float, force: np.ndarray, jerk: np.ndarray) -> np.ndarray:
+def reward_terms(
+    height: float, force: np.ndarray, jerk: np.ndarray, force_scale: float = 2.0
+) -> np.ndarray:
     """Distance, force, jerk and step, each from -1 to 0 [4].
 
     Args:
         height: Of the edge over its final pose, metres.
         force: Mean of the readings seen, along Kx and Kz [2], N.
         jerk: Scaled as it is observed [3].
+        force_scale: N.
     """
     return np.array(
         [
             -np.tanh(5.0 * abs(height) / HEIGHT),
-            -1.0 / (1.0 + np.exp(3.0 - 0.5 * np.linalg.norm(force))),
+            -1.0 / (1.0 + np.exp(3.0 - np.linalg.norm(force) / force_scale)),
             -min(float(np.linalg.norm(jerk)), 1.0),
             -1.0,
         ]

@@ -1,0 +1,133 @@
+"""Lets a policy cut a slice, and measures it."""
+
+import dataclasses as dc
+from collections.abc import Callable
+
+import numpy as np
+from pydrake.multibody.tree import RigidBody
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
+
+from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.diagrams.agent_station import add_agent
+from sliceit_drake.diagrams.scenario import Scenario
+from sliceit_drake.diagrams.station import MakeSlicingStation
+from sliceit_drake.learning.metrics import SliceMetrics, slice_metrics
+from sliceit_drake.systems.agent import AgentConfig, Decide
+from sliceit_drake.systems.knife_force import KnifeForceSystem
+
+__all__ = ["Limits", "SliceTrace", "cut_slice"]
+
+
+@dc.dataclass(frozen=True)
+class Limits:
+    """What ends a slice besides its goal.
+
+    Attributes:
+        duration: s.
+        force: Of each component at the sensor, N.
+        torque: Likewise, Nm.
+        workspace: Errors to the final pose [3], m, m, rad.
+    """
+
+    duration: float = 25.0
+    force: float = 150.0
+    torque: float = 30.0
+    workspace: tuple[float, float, float] = (0.05, 0.1, 0.1745)
+
+
+@dc.dataclass
+class SliceTrace:
+    """A slice as it went.
+
+    Attributes:
+        time: [n], s.
+        food, board: Forces on the knife in W [n, 3], N.
+        cut: Share of the section [n].
+        height: Of the edge over the board at the decisions [m], metres.
+        actions: Decided [m, 6].
+        metrics: Of the slice.
+    """
+
+    time: np.ndarray
+    food: np.ndarray
+    board: np.ndarray
+    cut: np.ndarray
+    height: np.ndarray
+    actions: np.ndarray
+    metrics: SliceMetrics
+
+
+def cut_slice(
+    scenario: Scenario,
+    agent: AgentConfig,
+    decide: Decide,
+    make_cutting: Callable[[RigidBody], KnifeForceSystem] | None = None,
+    limits: Limits | None = None,
+) -> SliceTrace:
+    """Cuts one slice.
+
+    Args:
+        scenario: World, with the controller in parallel mode.
+        agent: What the policy may do; `descent` is taken from the scenario.
+        decide: The policy.
+        make_cutting: A cutting system in place of the scenario's food.
+        limits: What ends the slice.
+
+    Raises:
+        ConfigurationError: The scenario cannot be built, or is not for an agent.
+    """
+    limits = limits or Limits()
+    station = MakeSlicingStation(scenario, make_cutting=make_cutting)
+    descent = float(station.start_pose.translation()[2]) - scenario.board.height
+    agent, builder = dc.replace(agent, descent=descent), DiagramBuilder()
+    actions: list[np.ndarray] = []
+
+    def noted(observation: np.ndarray) -> np.ndarray:
+        actions.append(np.asarray(decide(observation), float))
+        return actions[-1]
+
+    builder.AddNamedSystem("station", station)
+    system = add_agent(builder, station, agent, noted)
+    logs = [
+        LogVectorOutput(station.GetOutputPort(name), builder, scenario.exchange_period)
+        for name in ("food_wrench_vector", "board_wrench_vector", "cut_progress")
+    ]
+    simulator = Simulator(builder.Build())
+    context = simulator.get_mutable_context()
+    station.SetStart(context)
+    simulator.Initialize()
+    own = system.GetMyContextFromRoot(context)
+    station_context = station.GetMyContextFromRoot(context)
+    heights, end = [], ""
+    while not end:
+        heights.append(float(system.GetOutputPort("error").Eval(own)[1]))
+        until = len(heights) * agent.period
+        try:
+            simulator.AdvanceTo(until)
+        except CuttingError:
+            end = "guard"
+            break
+        error = system.GetOutputPort("error").Eval(own)
+        wrench = station.GetOutputPort("sensor_wrench").Eval(station_context).get_coeffs()
+        torque, force = np.abs(wrench).reshape(2, 3).max(axis=1)
+        if system.GetOutputPort("at_goal").Eval(own)[0] > agent.goal_decisions:
+            end = "goal"
+        elif context.get_time() < until - 1e-6 or force > limits.force or torque > limits.torque:
+            end = "force"
+        elif (np.abs(error) > limits.workspace).any():
+            end = "workspace"
+        elif context.get_time() >= limits.duration:
+            end = "time"
+    time, food, board, cut = _logged(logs, simulator)
+    metrics = slice_metrics(time, food, board, cut, end)
+    return SliceTrace(time, food, board, cut, np.array(heights), np.array(actions), metrics)
+
+
+def _logged(
+    logs: list[VectorLogSink], simulator: Simulator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    found = [log.FindLog(simulator.get_context()) for log in logs]
+    food, board, cut = (np.array(log.data()) for log in found)
+    return np.array(found[0].sample_times()), food[3:].T, board[3:].T, cut[0]
