@@ -12,11 +12,13 @@ from sliceit_drake.cli import (
     diagram,
     emulate,
     hardware,
+    optimize_motion,
     record,
     records,
     score,
     simulate,
     study,
+    train,
 )
 
 __all__ = ["main"]
@@ -31,6 +33,8 @@ COMMANDS = (
     records,
     calibrate,
     diagnose,
+    optimize_motion,
+    train,
     study,
     score,
 )

@@ -17,14 +17,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from sliceit_drake.configuration import ConfigurationError, dump_yaml, quantity
+from sliceit_drake.configuration import ConfigurationError, dump_yaml, load_yaml, quantity
 from sliceit_drake.learning.environment import SlicingEnv
 from sliceit_drake.learning.export import export_policy
 from sliceit_drake.learning.network import HistoryExtractor
 from sliceit_drake.learning.sac import OverlapVecEnv, PrioritizedSAC
 from sliceit_drake.learning.task import TaskConfig
 
-__all__ = ["CHECKPOINT", "Outcome", "TrainingConfig", "train"]
+__all__ = ["CHECKPOINT", "Outcome", "TrainingConfig", "load_training", "train"]
 
 CHECKPOINT, CONFIGURATION, POLICY, EPISODES = (
     "checkpoint.pt",
@@ -58,6 +58,17 @@ class TrainingConfig:
     checkpoint_interval: int = quantity(
         5000, "", low=1, high=10**9, doc="Decisions between checkpoints, at episodes' ends."
     )
+
+
+def load_training(file: str | Path | None, overrides: str | None = None) -> TrainingConfig:
+    """Reads and validates a training; None for the defaults.
+
+    Raises:
+        ConfigurationError: Naming file, field and fix.
+    """
+    config = load_yaml(TrainingConfig, file, overrides_text=overrides)
+    assert isinstance(config, TrainingConfig)
+    return config
 
 
 @dc.dataclass

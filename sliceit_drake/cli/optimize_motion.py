@@ -1,0 +1,107 @@
+"""`sliceit optimize-motion`: the press and draw with the least force, by gradient."""
+
+import argparse
+from pathlib import Path
+
+from sliceit_drake.cli.scenario_argument import add_scenario_arguments, scenario_of
+
+__all__ = ["add_parser"]
+
+DESCRIPTION = """\
+Find the press and draw that cut a scenario's food with the least force, without learning.
+
+The knife presses at constant speed and draws to and fro by a sinusoid. Speed, amplitude and
+frequency are moved along the gradient of the mean force over the depth, which the cutting
+simulator's adjoint gives, by Scipy's SLSQP, under the limits below; the food stays on the edge.
+No robot is simulated: run what comes out by `sliceit simulate`.
+
+Writes to --output:
+  scenario.yaml   the scenario with the motion that was found
+  summary.json    motion, mean forces, limits that it touches
+"""
+
+
+def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        "optimize-motion",
+        help="find the press and draw with the least force",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_scenario_arguments(parser)
+    parser.add_argument("--output", metavar="FOLDER", type=Path, required=True)
+    for name, unit, default, text in (
+        ("duration", "S", 3.0, "longest time of the cut, s"),
+        ("draw-speed", "V", 0.15, "greatest speed along the edge, m/s"),
+        ("draw-acceleration", "A", 2.0, "greatest acceleration along the edge, m/s2"),
+        ("margin", "M", 0.01, "of the edge that stays beyond the food at each end, m"),
+    ):
+        parser.add_argument(
+            f"--{name}", metavar=unit, type=float, default=default, help=f"{text}; {default:g}"
+        )
+    parser.add_argument(
+        "--iterations", metavar="N", type=int, default=30, help="most of the optimiser; 30"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the command."""
+    import dataclasses as dc
+    import json
+
+    from tqdm import tqdm
+
+    from sliceit_drake.configuration import ConfigurationError, dump_yaml, validate
+    from sliceit_drake.cutting.food import Food, make_food_model
+    from sliceit_drake.cutting.motion import Hold, MotionPlan, PressAndDraw, Retract
+    from sliceit_drake.cutting.motion_optimization import MotionLimits, optimize_motion
+
+    scenario = scenario_of(options)
+    if not isinstance(scenario.food, Food) or scenario.sequence is not None:
+        raise ConfigurationError(
+            "has no single cut of finite elements",
+            field="scenario.food",
+            fix="Give a scenario such as scenarios/cucumber.yaml.",
+        )
+    limits = MotionLimits(
+        duration=options.duration,
+        draw_speed=options.draw_speed,
+        draw_acceleration=options.draw_acceleration,
+        margin=options.margin,
+    )
+    validate(limits, "limits")
+    model = make_food_model(scenario.food, scenario.knife, scenario.numerics)
+    with tqdm(desc="slices", unit="slice") as bar:
+
+        def show(count: int, force: float, motion: PressAndDraw) -> None:
+            bar.set_postfix_str(f"{force:.2f} N", refresh=False)
+            bar.update(count - bar.n)
+
+        found = optimize_motion(
+            model,
+            limits,
+            period=scenario.exchange_period,
+            iterations=options.iterations,
+            progress=show,
+        )
+    motion = found.motion
+    # A robot starts and stops; and the edge starts above the food.
+    down = scenario.start.clearance + model.top - model.bottom
+    slicing = dc.replace(motion, distance=down + 2e-4, acceleration=limits.draw_acceleration)
+    retract = Retract(down + 0.01, 0.05, 0.5, label="retract")
+    scenario.policy = None
+    scenario.motion = MotionPlan([slicing, Hold(0.1, label="hold"), retract])
+    options.output.mkdir(parents=True, exist_ok=True)
+    dump_yaml(scenario, options.output / "scenario.yaml")
+    summary = dc.asdict(found)
+    (options.output / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    print(
+        f"press {1e3 * motion.press_speed:.1f} mm/s, draw {1e3 * motion.amplitude:.1f} mm at "
+        f"{motion.frequency:.2f} Hz: {found.force:.2f} N in the mean over the depth; pressed as "
+        f"fast without a draw {found.press_force:.2f} N, at the start {found.start_force:.2f} N"
+    )
+    print(f"limits that it touches: {', '.join(found.active) or 'none'}")
+    print(f"sliceit simulate {options.output / 'scenario.yaml'} --output FOLDER")
+    return 0

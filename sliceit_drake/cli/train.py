@@ -1,0 +1,92 @@
+"""`sliceit train`: learns a slicing policy in a simulator."""
+
+import argparse
+from pathlib import Path
+
+__all__ = ["add_parser"]
+
+DESCRIPTION = """\
+Train a slicing policy: SAC with prioritised replay, a temporal convolution over the wrench.
+
+The agent of SliceIt! decides at 20 Hz how compliant the knife is and where its target lies, on
+calibrated foods that differ from slice to slice (docs/learning.md). --simulator spring trains the
+baseline of the paper, for which food is a spring, on the same task.
+
+Writes to --output:
+  policy.onnx       the policy; a scenario runs it as "policy: !AgentConfig {network: policy.onnx}"
+  training.yaml     all settings
+  episodes.jsonl    what each episode came to
+  events.*          for TensorBoard
+  summary.json      ends of episodes, guards of the simulation that ended any
+  checkpoint.pt     all that is needed to go on; the same command goes on from it
+
+Ends with status 1 if guards of the simulation ended more than 0.1 % of the episodes.
+"""
+
+
+def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        "train",
+        help="train a slicing policy",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "config",
+        nargs="?",
+        metavar="TRAINING",
+        help="YAML of a training; default: the settings of the package's study",
+    )
+    parser.add_argument(
+        "--output", metavar="FOLDER", type=Path, required=True, help="where all is written"
+    )
+    parser.add_argument(
+        "--simulator", choices=("cutting", "spring"), help="in the place of task.simulator"
+    )
+    parser.add_argument("--steps", metavar="N", type=int, help="decisions, in the place of steps")
+    parser.add_argument("--seed", metavar="N", type=int, help="in the place of seed")
+    parser.add_argument(
+        "--set", metavar="YAML", help="fields that replace others, as '{task: {foods: [potato]}}'"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the command."""
+    import warp
+    from tqdm import tqdm
+
+    from sliceit_drake.cli.extras import needs_extra
+
+    warp.config.log_level = warp.LOG_ERROR
+    with needs_extra("learn"):
+        from sliceit_drake.learning.training import load_training, train
+
+    config = load_training(options.config, options.set)
+    if options.simulator is not None:
+        config.task.simulator = options.simulator
+    for name in ("steps", "seed"):
+        if getattr(options, name) is not None:
+            setattr(config, name, getattr(options, name))
+    with tqdm(total=config.steps, desc="decisions") as bar:
+
+        def show(steps: int, remark: str) -> None:
+            bar.set_postfix_str(remark, refresh=False)
+            bar.update(steps - bar.n)
+
+        try:
+            outcome = train(config, options.output, show)
+        except KeyboardInterrupt:
+            print(f"Stopped. The same command goes on from the last checkpoint in {options.output}")
+            return 130
+        bar.update(outcome.steps - bar.n)
+    print(
+        f"{outcome.steps} decisions in {outcome.episodes} slices; how they ended: "
+        + ", ".join(f"{kind} {count}" for kind, count in sorted(outcome.ends.items()))
+    )
+    if outcome.failed is not None:
+        print(f"Failed: {outcome.failed}")
+        return 1
+    print(f"Policy: {options.output / 'policy.onnx'}")
+    return 0
