@@ -1,9 +1,11 @@
 """A training: its configuration, its run with checkpoints, and what it leaves."""
 
 import contextlib
+import copy
 import dataclasses as dc
 import functools
 import json
+import math
 import os
 import time as clock
 from collections import Counter, deque
@@ -24,7 +26,15 @@ from sliceit_drake.learning.network import HistoryExtractor
 from sliceit_drake.learning.sac import OverlapVecEnv, PrioritizedSAC
 from sliceit_drake.learning.task import TaskConfig
 
-__all__ = ["CHECKPOINT", "Outcome", "TrainingConfig", "load_training", "train"]
+__all__ = [
+    "CHECKPOINT",
+    "POLICY",
+    "Outcome",
+    "TrainingConfig",
+    "load_policy_folder",
+    "load_training",
+    "train",
+]
 
 CHECKPOINT, CONFIGURATION, POLICY, EPISODES = (
     "checkpoint.pt",
@@ -32,6 +42,8 @@ CHECKPOINT, CONFIGURATION, POLICY, EPISODES = (
     "policy.onnx",
     "episodes.jsonl",
 )
+SELECTION = 20
+"""Slices in a row by whose mean return the policy is chosen that is exported."""
 GUARD_SHARE = 1e-3
 """Of episodes that guards of the simulation may end."""
 
@@ -43,7 +55,7 @@ class TrainingConfig:
     task: TaskConfig = dc.field(default_factory=TaskConfig)
     steps: int = quantity(80_000, "", low=1, high=10**9, doc="Decisions.")
     seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Of everything random.")
-    learning_rate: float = quantity(1e-3, "", low=1e-7, high=1.0, doc="Of all networks.")
+    learning_rate: float = quantity(3e-4, "", low=1e-7, high=1.0, doc="Of all networks.")
     batch: int = quantity(256, "", low=1, high=10**6, doc="Transitions in an update.")
     warm_up: int = quantity(1000, "", low=1, high=10**9, doc="Random decisions at the start.")
     gamma: float = quantity(0.99, "", low=0.0, high=1.0, doc="Discount of a decision.")
@@ -71,6 +83,22 @@ def load_training(file: str | Path | None, overrides: str | None = None) -> Trai
     return config
 
 
+def load_policy_folder(folder: Path) -> TrainingConfig:
+    """The training of a folder that has a policy.
+
+    Raises:
+        ConfigurationError: There is no training, or it has not come to a policy.
+    """
+    if not (folder / POLICY).is_file():
+        raise ConfigurationError(
+            f"there is no {POLICY}",
+            field="POLICY",
+            source=str(folder),
+            fix="Give the --output of a `sliceit train` that came to its end.",
+        )
+    return load_training(folder / CONFIGURATION)
+
+
 @dc.dataclass
 class Outcome:
     """What a training came to.
@@ -81,6 +109,9 @@ class Outcome:
         wall_time: Of this run, s.
         guard_errors: Episodes that guards ended, by kind.
         ends: Episodes by how they ended.
+        best_return: Greatest mean return of `SELECTION` slices in a row, after which the policy is
+            the one that is exported; None where there were not so many, and it is the last.
+        best_steps: When that was.
         failed: Why the result cannot be used, or None.
     """
 
@@ -89,6 +120,8 @@ class Outcome:
     wall_time: float
     guard_errors: dict[str, int]
     ends: dict[str, int]
+    best_return: float | None
+    best_steps: int
     failed: str | None = None
 
 
@@ -128,7 +161,10 @@ def train(
             environments.reset()
             environments.env_method("set_random_state", saved["environment"])
             model.set_training_state(saved["model"])
-            model._current_progress_remaining = 1.0 - model.num_timesteps / config.steps
+            done = model.num_timesteps / config.steps
+            model._current_progress_remaining = 1.0 - done
+            if config.task.reward.schedule != "constant":
+                environments.env_method("set_progress", done)
             callback.restore(saved["watch"])
             _cut_log(output / EPISODES, callback.episodes)
         else:
@@ -140,6 +176,8 @@ def train(
                 model.learn(remaining, callback, reset_num_timesteps=False)
         outcome = callback.outcome(clock.perf_counter() - begin)
         if not callback.was_stopped:
+            if callback.best_actor is not None:
+                model.actor.load_state_dict(callback.best_actor)
             export_policy(model.actor, config.task.agent, output / POLICY)
         (output / "summary.json").write_text(json.dumps(dc.asdict(outcome), indent=2) + "\n")
         return outcome
@@ -213,17 +251,20 @@ class _Watch(BaseCallback):
         self._config, self._output, self._described = config, output, described
         self._progress, self._stop_after = progress, stop_after
         self.episodes, self.was_stopped = 0, False
-        self._saved_at, self._is_due = 0, False
+        self._saved_at, self._is_due, self._is_enough = 0, False, False
         self._ends: Counter[str] = Counter()
         self._guards: Counter[str] = Counter()
         self._sums: dict[str, float] = {}
-        self._returns: deque[float] = deque(maxlen=20)
+        self._returns: deque[float] = deque(maxlen=SELECTION)
+        self.best_return, self.best_steps = -math.inf, 0
+        self.best_actor: dict[str, torch.Tensor] | None = None
         self._schedule = config.task.reward.schedule != "constant"
 
     def restore(self, state: dict[str, Any]) -> None:
         self.episodes, self._saved_at = state["episodes"], state["steps"]
         self._ends, self._guards = Counter(state["ends"]), Counter(state["guards"])
         self._returns.extend(state["returns"])
+        self.best_return, self.best_steps, self.best_actor = state["best"]
 
     def outcome(self, wall_time: float) -> Outcome:
         guarded = sum(self._guards.values())
@@ -259,8 +300,8 @@ class _Watch(BaseCallback):
             return True
         self._finish_episode(info)
         due = self.num_timesteps - self._saved_at >= self._config.checkpoint_interval
-        self.was_stopped = self._stop_after is not None and self.num_timesteps >= self._stop_after
-        self._is_due = due or self.was_stopped
+        self._is_enough = self._stop_after is not None and self.num_timesteps >= self._stop_after
+        self._is_due = due or self._is_enough
         return True
 
     def _on_rollout_start(self) -> None:
@@ -269,7 +310,8 @@ class _Watch(BaseCallback):
             return
         self._is_due = False
         self._save()
-        if self.was_stopped:
+        if self._is_enough:
+            self.was_stopped = True
             raise _Stopped
 
     def _save(self) -> None:
@@ -285,6 +327,7 @@ class _Watch(BaseCallback):
                 "ends": dict(self._ends),
                 "guards": dict(self._guards),
                 "returns": list(self._returns),
+                "best": (self.best_return, self.best_steps, self.best_actor),
             },
         }
         # Whole or not at all.
@@ -314,13 +357,17 @@ class _Watch(BaseCallback):
         with (self._output / EPISODES).open("a") as file:
             file.write(json.dumps(row) + "\n")
         self._returns.append(sums["return"])
+        mean = float(np.mean(self._returns))
+        if len(self._returns) == SELECTION and mean > self.best_return:
+            self.best_return, self.best_steps = mean, self.num_timesteps
+            assert isinstance(self.model, PrioritizedSAC)
+            self.best_actor = copy.deepcopy(self.model.actor.state_dict())
         for name, value in row.items():
             if isinstance(value, int | float):
                 self.logger.record(f"episode/{name}", value)
         self.logger.record("guards/episodes", sum(self._guards.values()))
         self.logger.dump(self.num_timesteps)
         if self._progress is not None:
-            mean = float(np.mean(self._returns))
             self._progress(self.num_timesteps, f"return {mean:.1f}, {info['end']}")
 
 

@@ -1,0 +1,194 @@
+"""Policies of the cutting simulator against those of the spring: ratios, table, figures."""
+
+import collections
+import dataclasses as dc
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sliceit_drake.learning.evaluation import SliceTrace
+from sliceit_drake.learning.metrics import Ratio, bootstrap_ratio
+
+__all__ = ["Comparison", "compare", "comparison_page", "plot_boxes", "plot_two_slices"]
+
+METRICS = ("median_force", "peak_force", "board_peak", "duration")
+TITLES = ("median |F|", "peak |F|", "board's peak", "duration")
+PAPER = {"cucumber": 0.61, "tomato": 0.68, "potato": 0.67, "carrot": 0.77}
+"""Ratios of the contact force in the SliceIt! paper's figure: dual simulation over spring only."""
+OURS, BASELINE = "cutting", "spring"
+COLOURS = {OURS: "#1b7a5a", BASELINE: "#b5532a"}
+NAMES = {OURS: "cutting simulator", BASELINE: "spring only"}
+
+
+@dc.dataclass
+class Comparison:
+    """Both kinds of policies on one food, in one world, on one board.
+
+    Attributes:
+        world, food: Where.
+        board_stiffness: N/m.
+        values: By simulator and metric: a number for each policy and slice [policies, slices].
+        completed: Likewise by simulator: whether the slice was completed.
+        ratios: By metric, cutting over spring.
+    """
+
+    world: str
+    food: str
+    board_stiffness: float
+    values: dict[str, dict[str, np.ndarray]]
+    completed: dict[str, np.ndarray]
+    ratios: dict[str, Ratio]
+
+
+def compare(rows: Sequence[Mapping]) -> list[Comparison]:
+    """Compares what `sliceit evaluate` wrote, where both kinds of policies cut the same slices.
+
+    Args:
+        rows: Its lines.
+
+    Raises:
+        ValueError: A policy did not cut all slices that others did.
+    """
+    groups: dict[tuple, dict] = {}
+    for row in rows:
+        key = (row["world"], row["food"], row["board_stiffness"])
+        group = groups.setdefault(key, collections.defaultdict(dict))
+        group[row["simulator"], row["policy"]][row["slice"]] = row
+    found = []
+    for (world, food, board), policies in groups.items():
+        if {kind for kind, _ in policies} != {OURS, BASELINE}:
+            continue
+        slices = sorted({k for cut in policies.values() for k in cut})
+        for (_, policy), cut in policies.items():
+            if missing := [k for k in slices if k not in cut]:
+                raise ValueError(f"{policy} did not cut slices {missing} of {food} in {world}.")
+        values = {
+            kind: {
+                metric: np.array(
+                    [
+                        [cut[k][metric] for k in slices]
+                        for (simulator, _), cut in sorted(policies.items())
+                        if simulator == kind
+                    ],
+                    float,
+                )
+                for metric in (*METRICS, "completed")
+            }
+            for kind in (OURS, BASELINE)
+        }
+        # A seed for each comparison, so that none depends on the order of the others.
+        rng = np.random.default_rng([*map(ord, world + food), round(board)])
+        ratios = {
+            metric: bootstrap_ratio(values[OURS][metric], values[BASELINE][metric], rng)
+            for metric in METRICS
+        }
+        completed = {kind: values[kind].pop("completed") > 0.5 for kind in values}
+        found.append(Comparison(world, food, board, values, completed, ratios))
+    return found
+
+
+def comparison_page(found: Sequence[Comparison]) -> str:
+    """A table of all comparisons, and whether the paper's claim holds in each world."""
+    lines = [
+        "| world | board [N/m] | food | policies, slices | completed: ours, baseline | "
+        + " | ".join(f"{title}: ours, baseline | ratio" for title in TITLES)
+        + " | paper's ratio |",
+        "|" + "---|" * (6 + 2 * len(TITLES)),
+    ]
+    for each in found:
+        ours, baseline = each.values[OURS], each.values[BASELINE]
+        shape = ours[METRICS[0]].shape
+        cells = [
+            each.world,
+            f"{each.board_stiffness:.0e}".replace("e+0", "e"),
+            each.food,
+            f"{shape[0]} and {len(baseline[METRICS[0]])}, {shape[1]}",
+            f"{_share(each.completed[OURS])}, {_share(each.completed[BASELINE])}",
+        ]
+        for metric in METRICS:
+            unit = "s" if metric == "duration" else "N"
+            ratio = each.ratios[metric]
+            cells += [
+                f"{ours[metric].mean():.1f} {unit}, {baseline[metric].mean():.1f} {unit}",
+                f"**{ratio.value:.2f}** ({ratio.low:.2f} to {ratio.high:.2f})",
+            ]
+        lines.append("| " + " | ".join([*cells, f"{PAPER[each.food]:.2f}"]) + " |")
+    return "\n".join(lines)
+
+
+def _share(completed: np.ndarray) -> str:
+    return f"{int(completed.sum())} of {completed.size}"
+
+
+def plot_boxes(found: Sequence[Comparison], file: Path) -> None:
+    """Box plots of the median contact force of slices by food and world, as the paper's figure.
+
+    Args:
+        found: Of one board stiffness.
+        file: .png.
+    """
+    from matplotlib.figure import Figure
+
+    worlds = list(dict.fromkeys(each.world for each in found))
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    axes = figure.subplots(1, len(worlds), sharey=True, squeeze=False)[0]
+    for axis, world in zip(axes, worlds, strict=True):
+        here = [each for each in found if each.world == world]
+        for shift, kind in ((-0.18, OURS), (0.18, BASELINE)):
+            boxes = axis.boxplot(
+                [each.values[kind]["median_force"].ravel() for each in here],
+                positions=np.arange(len(here)) + shift,
+                widths=0.3,
+                patch_artist=True,
+                medianprops={"color": "black"},
+                flierprops={"markersize": 3},
+            )
+            for patch in boxes["boxes"]:
+                patch.set_facecolor(COLOURS[kind])
+                patch.set_alpha(0.75)
+            boxes["boxes"][0].set_label(f"trained with {NAMES[kind]}")
+        axis.set_xticks(range(len(here)), [each.food for each in here])
+        axis.set_title(world.replace("_", "-"))
+        axis.grid(axis="y", alpha=0.3)
+    axes[0].set_ylabel("median contact force of a slice [N]")
+    axes[0].set_ylim(bottom=0.0)
+    axes[0].legend(loc="upper left", fontsize=8)
+    figure.savefig(file, dpi=110)
+
+
+def plot_two_slices(traces: Mapping[str, Sequence[SliceTrace]], file: Path) -> None:
+    """Vertical force over slices of cucumber, the board's contact shaded, as the paper's figure.
+
+    Args:
+        traces: By simulator: slices.
+        file: .png.
+    """
+    from matplotlib.figure import Figure
+
+    count = max(len(slices) for slices in traces.values())
+    figure = Figure(figsize=(9.0, 3.4), layout="constrained")
+    axes = figure.subplots(1, count, sharey=True, squeeze=False)[0]
+    for kind, slices in traces.items():
+        for axis, trace in zip(axes, slices, strict=False):
+            normal = trace.food[:, 2] + trace.board[:, 2]
+            axis.plot(trace.time, normal, color=COLOURS[kind], label=NAMES[kind])
+            touching = np.linalg.norm(trace.board, axis=1) > 0.1
+            low, high = (0.0, 0.5) if kind == OURS else (0.5, 1.0)
+            axis.fill_between(
+                trace.time,
+                low,
+                high,
+                where=touching,
+                transform=axis.get_xaxis_transform(),
+                color=COLOURS[kind],
+                alpha=0.12,
+                linewidth=0.0,
+            )
+    for k, axis in enumerate(axes):
+        axis.set_title(f"cucumber, slice {k + 1}")
+        axis.set_xlabel("time [s]")
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("normal force on the knife [N]")
+    axes[0].legend(fontsize=8, title="trained with (shaded: on the board)", title_fontsize=8)
+    figure.savefig(file, dpi=110)
