@@ -280,6 +280,8 @@ class _Watch(BaseCallback):
             wall_time,
             dict(self._guards),
             dict(self._ends),
+            self.best_return if self.best_actor is not None else None,
+            self.best_steps,
             failed,
         )
 

@@ -1,0 +1,179 @@
+"""`sliceit evaluate`: lets policies cut slices in worlds that no training has seen."""
+
+import argparse
+import dataclasses as dc
+import json
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import lru_cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sliceit_drake.systems.agent import AgentConfig, Decide
+
+__all__ = ["add_parser"]
+
+DESCRIPTION = """\
+Let trained policies cut slices, and measure contact force, duration and completion.
+
+Each POLICY is a folder that `sliceit train` wrote. Worlds, none of which a training sees:
+  stand_in   finite elements on a finer mesh, effects that no training has, a noisy, late sensor
+  curves     measured force-depth curves with laws of speed and draw; no code of either simulator
+Slices are the paper's unless --slices is given: cucumber 15, tomato 5, potato 10, carrot 5. All
+policies cut the same slices. Everything here is simulated.
+
+Writes a line for each slice to --output, a .jsonl file, and goes on where it is.
+`sliceit study slicing` compares the policies of both simulators.
+"""
+WORLDS = ("stand_in", "curves")
+FOODS = ("cucumber", "tomato", "potato", "carrot")
+
+
+@dc.dataclass(frozen=True)
+class Case:
+    """One slice to cut: all that the process which cuts it needs."""
+
+    policy: str
+    world: str
+    food: str
+    slice: int
+    board_stiffness: float
+    seed: int
+
+
+def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Adds the command."""
+    parser = commands.add_parser(
+        "evaluate",
+        help="let trained policies cut slices in unseen worlds",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("policies", nargs="+", metavar="POLICY", type=Path)
+    parser.add_argument("--world", nargs="+", choices=WORLDS, default=list(WORLDS))
+    parser.add_argument("--foods", nargs="+", choices=FOODS, default=list(FOODS))
+    parser.add_argument("--slices", metavar="N", type=int, help="of each food")
+    parser.add_argument(
+        "--board-stiffness",
+        nargs="+",
+        metavar="K",
+        type=float,
+        default=[3e4],
+        help="N/m; several to vary it; default: 30000",
+    )
+    parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the slices; 0")
+    parser.add_argument("--workers", metavar="N", type=int, default=2, help="processes; 2")
+    parser.add_argument("--output", metavar="FILE", type=Path, required=True, help=".jsonl")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the command."""
+    from tqdm import tqdm
+
+    from sliceit_drake.cli.extras import needs_extra
+
+    with needs_extra("learn"):
+        from sliceit_drake.learning.metrics import COMPLETE  # noqa: F401
+
+    for policy in options.policies:
+        _policy(str(policy))
+    cases = list(_cases(options))
+    done = _done(options.output)
+    left = [case for case in cases if case not in done]
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    pool = ProcessPoolExecutor(options.workers, mp_context=get_context("forkserver"))
+    with pool, tqdm(total=len(cases), initial=len(cases) - len(left), desc="slices") as bar:
+        try:
+            for future in as_completed([pool.submit(cut, case) for case in left]):
+                with options.output.open("a") as file:
+                    file.write(json.dumps(future.result()) + "\n")
+                bar.update(1)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    print(_table(options.output, cases))
+    return 0
+
+
+def cut(case: Case) -> dict:
+    """Cuts one slice; returns its row."""
+    import warp
+
+    warp.config.log_level = warp.LOG_ERROR
+
+    from sliceit_drake.learning.evaluation import cut_slice
+    from sliceit_drake.stand_in.slicing_worlds import CurvesWorld, SlicingWorld, StandInWorld
+
+    agent, decide, simulator, seed = _policy(case.policy)
+    world: SlicingWorld = {"stand_in": StandInWorld, "curves": CurvesWorld}[case.world](case.seed)
+    scenario, make_cutting = world.scenario(case.food, case.slice, case.board_stiffness)
+    trace = cut_slice(scenario, agent, decide, make_cutting)
+    return (
+        dc.asdict(case) | {"simulator": simulator, "policy_seed": seed} | dc.asdict(trace.metrics)
+    )
+
+
+@lru_cache
+def _policy(folder: str) -> "tuple[AgentConfig, Decide, str, int]":
+    """Agent, network, simulator and seed of a training's folder."""
+    from sliceit_drake.learning.training import POLICY, load_policy_folder
+    from sliceit_drake.systems.network import load_network
+
+    config = load_policy_folder(Path(folder))
+    agent = dc.replace(config.task.agent, network=str(Path(folder) / POLICY))
+    return agent, load_network(agent), config.task.simulator, config.seed
+
+
+def _cases(options: argparse.Namespace) -> Iterator[Case]:
+    from sliceit_drake.stand_in.slicing_worlds import paper_slices
+
+    for policy in options.policies:
+        for world in options.world:
+            for board in options.board_stiffness:
+                for food in options.foods:
+                    for k in range(options.slices or paper_slices(food)):
+                        yield Case(str(policy), world, food, k, board, options.seed)
+
+
+def _done(file: Path) -> set[Case]:
+    if not file.exists():
+        return set()
+    names = [field.name for field in dc.fields(Case)]
+    rows = [json.loads(line) for line in file.read_text().splitlines()]
+    return {Case(**{name: row[name] for name in names}) for row in rows}
+
+
+def _table(file: Path, cases: list[Case]) -> str:
+    """Means over slices, a row for each policy, world, board and food."""
+    asked = set(cases)
+    names = [field.name for field in dc.fields(Case)]
+    groups: dict[tuple, list[dict]] = {}
+    for line in file.read_text().splitlines():
+        row = json.loads(line)
+        case = Case(**{name: row[name] for name in names})
+        if case in asked:
+            key = (case.policy, case.world, case.board_stiffness, case.food)
+            groups.setdefault(key, []).append(row)
+    rows = []
+    for (policy, world, board, food), found in groups.items():
+        mean = {
+            name: sum(row[name] for row in found) / len(found)
+            for name in ("median_force", "peak_force", "board_peak", "duration")
+        }
+        rows.append(
+            [
+                policy,
+                world,
+                f"{board:g}",
+                food,
+                f"{sum(row['completed'] for row in found)} of {len(found)}",
+                *(f"{value:.2f}" for value in mean.values()),
+            ]
+        )
+    head = ["policy", "world", "board [N/m]", "food", "completed", "median |F| [N]", "peak [N]"]
+    head += ["board [N]", "duration [s]"]
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
