@@ -11,6 +11,7 @@ from sliceit_drake.cli import (
     diagnose,
     diagram,
     emulate,
+    evaluate,
     hardware,
     optimize_motion,
     record,
@@ -35,6 +36,7 @@ COMMANDS = (
     diagnose,
     optimize_motion,
     train,
+    evaluate,
     study,
     score,
 )
