@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from sliceit_drake.learning.evaluation import SliceTrace
     from sliceit_drake.systems.agent import AgentConfig, Decide
 
-__all__ = ["add_parser"]
+__all__ = ["Case", "add_parser", "cut", "trace"]
 
 DESCRIPTION = """\
 Let trained policies cut slices, and measure contact force, duration and completion.
@@ -100,6 +101,13 @@ def run(options: argparse.Namespace) -> int:
 
 def cut(case: Case) -> dict:
     """Cuts one slice; returns its row."""
+    _, _, simulator, seed = _policy(case.policy)
+    metrics = dc.asdict(trace(case).metrics)
+    return dc.asdict(case) | {"simulator": simulator, "policy_seed": seed} | metrics
+
+
+def trace(case: Case) -> "SliceTrace":
+    """Cuts one slice."""
     import warp
 
     warp.config.log_level = warp.LOG_ERROR
@@ -107,13 +115,10 @@ def cut(case: Case) -> dict:
     from sliceit_drake.learning.evaluation import cut_slice
     from sliceit_drake.stand_in.slicing_worlds import CurvesWorld, SlicingWorld, StandInWorld
 
-    agent, decide, simulator, seed = _policy(case.policy)
+    agent, decide, _, _ = _policy(case.policy)
     world: SlicingWorld = {"stand_in": StandInWorld, "curves": CurvesWorld}[case.world](case.seed)
     scenario, make_cutting = world.scenario(case.food, case.slice, case.board_stiffness)
-    trace = cut_slice(scenario, agent, decide, make_cutting)
-    return (
-        dc.asdict(case) | {"simulator": simulator, "policy_seed": seed} | dc.asdict(trace.metrics)
-    )
+    return cut_slice(scenario, agent, decide, make_cutting)
 
 
 @lru_cache

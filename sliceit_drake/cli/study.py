@@ -11,6 +11,7 @@ from sliceit_drake.cli.hidden_study import add_hidden_study
 from sliceit_drake.cli.identifiability import add_identifiability
 from sliceit_drake.cli.real_study import add_real_study
 from sliceit_drake.cli.scenario_argument import add_scenario_arguments, scenario_of
+from sliceit_drake.cli.slicing_study import add_slicing
 from sliceit_drake.cli.verification import add_verification
 
 __all__ = ["add_parser"]
@@ -126,6 +127,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     stepping.set_defaults(run=run_stepping)
     add_verification(studies)
     add_coverage(studies)
+    add_slicing(studies)
     add_calibration_study(studies)
     add_identifiability(studies)
     add_real_study(studies)

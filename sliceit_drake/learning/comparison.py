@@ -10,7 +10,14 @@ import numpy as np
 from sliceit_drake.learning.evaluation import SliceTrace
 from sliceit_drake.learning.metrics import Ratio, bootstrap_ratio
 
-__all__ = ["Comparison", "compare", "comparison_page", "plot_boxes", "plot_two_slices"]
+__all__ = [
+    "Comparison",
+    "claim",
+    "compare",
+    "comparison_page",
+    "plot_boxes",
+    "plot_two_slices",
+]
 
 METRICS = ("median_force", "peak_force", "board_peak", "duration")
 TITLES = ("median |F|", "peak |F|", "board's peak", "duration")
@@ -88,8 +95,32 @@ def compare(rows: Sequence[Mapping]) -> list[Comparison]:
     return found
 
 
+def claim(found: Sequence[Comparison]) -> list[str]:
+    """Where the paper's claim holds: the ratio's interval ends below 1; a line for each board."""
+    lines = []
+    for world, board in dict.fromkeys((each.world, each.board_stiffness) for each in found):
+        here = [e for e in found if (e.world, e.board_stiffness) == (world, board)]
+        holds = [e.food for e in here if e.ratios["median_force"].high < 1.0]
+        fails = [e.food for e in here if e.food not in holds]
+        kinds = ((OURS, "ours"), (BASELINE, "the baseline"))
+        done = ", ".join(
+            f"{name} completed {100 * np.mean([e.completed[kind].mean() for e in here]):.0f} %"
+            for kind, name in kinds
+        )
+        lines.append(
+            f"- {world.replace('_', '-')}, board of {board:g} N/m: less contact force "
+            f"{_listed(holds, 'on ', 'on no food')}{_listed(fails, '; not shown on ', '')}; {done} "
+            "of the slices."
+        )
+    return lines
+
+
+def _listed(foods: Sequence[str], lead: str, none: str) -> str:
+    return lead + ", ".join(foods) if foods else none
+
+
 def comparison_page(found: Sequence[Comparison]) -> str:
-    """A table of all comparisons, and whether the paper's claim holds in each world."""
+    """A table of all comparisons."""
     lines = [
         "| world | board [N/m] | food | policies, slices | completed: ours, baseline | "
         + " | ".join(f"{title}: ours, baseline | ratio" for title in TITLES)
