@@ -72,6 +72,9 @@ class SlicingEnv(gymnasium.Env):
         Args:
             seed: Of all random numbers from here on.
             options: "food": one of the task's foods, instead of a random one.
+
+        Raises:
+            ValueError: The task has no such food.
         """
         super().reset(seed=seed)
         rng = self.np_random
@@ -83,6 +86,8 @@ class SlicingEnv(gymnasium.Env):
         along = float(rng.uniform(-1.0, 1.0)) * randomization.offset
         turn = float(rng.uniform(-1.0, 1.0)) * randomization.tilt
         food = (options or {}).get("food", food)
+        if food not in foods:
+            raise ValueError(f"the task has no food {food!r}; it has {', '.join(foods)}.")
         self._current = station, simulator = self._station(food)
         shift = RigidTransform(RotationMatrix.MakeYRotation(turn), [along, 0.0, -up])
         station.begin(simulator, rng, shift)

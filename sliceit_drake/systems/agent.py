@@ -45,6 +45,9 @@ VELOCITY = np.array([0.5, 0.5, 0.785])
 JERK = 500.0
 WRENCH = np.array([50.0, 50.0, 10.0])
 
+ENVELOPE_SPEED = 0.05
+"""Of the way through all places where the knife may go, m/s."""
+
 # Parts of the decisions' state.
 _ERRORS, _ACTION, _OFFSET, _TARGET = slice(0, 9), slice(9, 15), slice(15, 17), slice(17, 19)
 _STIFFNESS, _GAINS, _SCALE = slice(19, 25), slice(25, 31), 31
@@ -128,6 +131,14 @@ class AgentConfig:
                 raise ConfigurationError(
                     f"{low:g} to {high:g} is no range", field=f"{where}.{name}", fix="Swap them."
                 )
+        _, least = self._way()
+        if self.duration < least:
+            raise ConfigurationError(
+                f"{self.duration:.4g} s is less than the {least:.4g} s of the way through all "
+                f"places where the knife may go, at {1e3 * ENVELOPE_SPEED:g} mm/s",
+                field=f"{where}.duration",
+                fix="Lengthen it, or give draw less room.",
+            )
 
     def observation_size(self) -> int:
         """How many numbers an observation has."""
@@ -142,22 +153,26 @@ class AgentConfig:
         )
 
     def envelope(self) -> MotionPlan:
-        """A motion through the corners of where the knife may go, at 50 mm/s.
+        """A motion of the run's duration through the corners of where the knife may go.
 
         The target may lie below the board; the knife stays on it.
         """
+        way, taken = self._way()
+        left = self.duration - taken
+        return MotionPlan([*way, Hold(left, label="agent")] if left > 1e-9 else way)
+
+    def _way(self) -> tuple[list[Segment], float]:
+        """Straight ways between the corners, and the time that they take, s."""
         way: list[Segment] = []
-        x = z = 0.0
+        x = z = taken = 0.0
         draw, down = self.draw, self.descent
         for a, b in ((0.0, down), (draw, down), (-draw, down), (-draw, 0.0), (draw, 0.0)):
             if (distance := math.hypot(a - x, b - z)) > 0.0:
                 direction = [(a - x) / distance, 0.0, (b - z) / distance]
-                way.append(ConstantSpeed(0.05, direction, distance, label="agent"))
+                way.append(ConstantSpeed(ENVELOPE_SPEED, direction, distance, label="agent"))
+                taken += distance / ENVELOPE_SPEED
                 x, z = a, b
-        taken = sum(
-            s.distance / s.speed for s in way if isinstance(s, ConstantSpeed) and s.distance
-        )
-        return MotionPlan([*way, Hold(max(self.duration - taken, 1e-3), label="agent")])
+        return way, taken
 
 
 def observation_names(history: int) -> list[str]:
@@ -173,8 +188,9 @@ def observation_names(history: int) -> list[str]:
 class AgentSystem(LeafSystem):
     """Decides at multiples of its period how compliant the knife is and where its target lies.
 
-    Errors, offsets and readings are along and about the axes of K as it was at the start: x along
-    the edge, z down. Once the goal is reached the target goes up to the start.
+    Errors and offsets are along and about the axes of K as it was at the start: x along the edge,
+    z down; readings along and about those of K itself. Once the goal is reached the target goes up
+    to the start.
 
     Inputs:
         sensor_wrench: SpatialForce at So, in S.
@@ -226,6 +242,7 @@ class AgentSystem(LeafSystem):
         self._state = self.DeclareDiscreteState(state)
         # The oldest of the readings is dropped when the newest is taken, so one fewer is kept.
         self._readings = self.DeclareDiscreteState(np.zeros(3 * (config.history - 1)))
+        self.DeclareInitializationDiscreteUpdateEvent(self._begin)
         self.DeclarePeriodicDiscreteUpdateEvent(config.period, 0.0, self._decide)
         self.DeclarePeriodicDiscreteUpdateEvent(config.reading_period, 0.0, self._read)
         held = {self.discrete_state_ticket(self._state)}
@@ -256,11 +273,8 @@ class AgentSystem(LeafSystem):
 
     def observe(self, context: Context) -> np.ndarray:
         """The observation in this context, float64."""
-        x, T, config = (
-            context.get_discrete_state(self._state).value(),
-            self._config.period,
-            (self._config),
-        )
+        config, T = self._config, self._config.period
+        x = context.get_discrete_state(self._state).value()
         e = np.vstack([self._error(context), x[_ERRORS].reshape(3, 3)])
         velocity = (e[1] - e[0]) / T
         jerk = -(e[0] - 3.0 * e[1] + 3.0 * e[2] - e[3]) / T**3
@@ -295,6 +309,12 @@ class AgentSystem(LeafSystem):
     def _history(self, context: Context) -> np.ndarray:
         before = context.get_discrete_state(self._readings).value().reshape(-1, 3)
         return np.vstack([before, self._reading(context)])
+
+    def _begin(self, context: Context, discrete_state: DiscreteValues) -> None:
+        # Wherever the knife is, it rests there: no velocity or jerk comes of the way from X_WK.
+        x = context.get_discrete_state(self._state).value().copy()
+        x[_ERRORS] = np.tile(self._error(context), 3)
+        discrete_state.set_value(self._state, x)
 
     def _read(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._readings, self._history(context)[1:].ravel())

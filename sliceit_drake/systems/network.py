@@ -74,13 +74,25 @@ def load_network(config: AgentConfig) -> Decide:
         given = {name: np.asarray(observation, np.float32)[None]}
         return np.asarray(session.run(None, given)[0], float).reshape(len(ACTIONS))
 
+    try:
+        decide(np.zeros(config.observation_size()))
+    except Exception as error:
+        raise ConfigurationError(
+            f"{file} is a network, but none that decides ({error})",
+            field=field,
+            fix="Give the policy.onnx of a training.",
+        ) from error
     return decide
 
 
 def _difference(found: str | None, wanted: str) -> str:
     if found is None:
         return "does not say what it observes"
-    ours, theirs = json.loads(wanted), json.loads(found)
+    ours = json.loads(wanted)
+    try:
+        theirs = dict(json.loads(found))
+    except (TypeError, ValueError):
+        return "says what it observes in a way that cannot be read"
     for key in ours:
         if ours[key] != theirs.get(key):
             if key == "observation":
