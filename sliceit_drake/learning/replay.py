@@ -92,7 +92,10 @@ class PrioritizedReplayBuffer(ReplayBuffer):
     def update(self, places: np.ndarray, errors: np.ndarray) -> None:
         """Takes the errors [batch] of transitions for their priorities."""
         self._sampler.update_priority(
-            torch.as_tensor(places), torch.as_tensor(np.abs(errors)), storage=self._filled
+            torch.as_tensor(places),
+            # The tree is of single precision and takes no other.
+            torch.as_tensor(np.abs(errors), dtype=torch.float32),
+            storage=self._filled,
         )
 
     def state(self) -> dict[str, Any]:

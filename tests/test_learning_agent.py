@@ -1,0 +1,400 @@
+"""How the agent learns: its network, its replay, its update, its training and what that leaves."""
+
+import dataclasses as dc
+import io
+import json
+
+import numpy as np
+import pytest
+
+NEEDS = "of the extra [learn], which CI does not install"
+torch = pytest.importorskip("torch", reason=f"torch is {NEEDS}")
+pytest.importorskip("stable_baselines3", reason=f"Stable-Baselines3 is {NEEDS}")
+pytest.importorskip("torchrl", reason=f"torchrl is {NEEDS}")
+
+import gymnasium  # noqa: E402
+from stable_baselines3 import SAC  # noqa: E402
+from stable_baselines3.common.vec_env import DummyVecEnv  # noqa: E402
+
+from sliceit_drake.configuration import ConfigurationError  # noqa: E402
+from sliceit_drake.cutting.solver import CuttingError  # noqa: E402
+from sliceit_drake.diagrams.scenario import Start  # noqa: E402
+from sliceit_drake.learning import training  # noqa: E402
+from sliceit_drake.learning.export import export_policy  # noqa: E402
+from sliceit_drake.learning.network import HistoryExtractor, TemporalConvolution  # noqa: E402
+from sliceit_drake.learning.replay import PrioritizedReplayBuffer  # noqa: E402
+from sliceit_drake.learning.reward import RewardConfig  # noqa: E402
+from sliceit_drake.learning.sac import OverlapVecEnv, PrioritizedSAC  # noqa: E402
+from sliceit_drake.learning.task import RandomizationConfig, TaskConfig  # noqa: E402
+from sliceit_drake.learning.training import TrainingConfig, train  # noqa: E402
+from sliceit_drake.systems.agent import AgentConfig  # noqa: E402
+from sliceit_drake.systems.network import load_network  # noqa: E402
+
+AGENT = AgentConfig(history=3)
+SIZE = AGENT.observation_size()
+OBSERVATIONS = gymnasium.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
+ACTIONS = gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float32)
+POLICY = {
+    "net_arch": [16],
+    "features_extractor_class": HistoryExtractor,
+    "features_extractor_kwargs": {"history": 3, "features": 8},
+}
+
+
+# --- The temporal convolution.
+
+
+@pytest.mark.parametrize("length", [1, 2, 3, 10, 12, 13, 24])
+def test_the_convolution_is_a_stack_of_dilated_causal_ones_at_its_last_output(length):
+    torch.manual_seed(length)
+    network = TemporalConvolution(length, 3, width=5, features=7).double()
+    stack, channels, dilation = [], 3, 1
+    for level in network.levels:
+        kernel = level.in_features // channels
+        convolution = torch.nn.Conv1d(channels, 5, kernel, dilation=dilation).double()
+        with torch.no_grad():
+            convolution.weight.copy_(level.weight.view(5, kernel, channels).transpose(1, 2))
+            convolution.bias.copy_(level.bias)
+        stack += [convolution, torch.nn.ReLU()]
+        channels, dilation = 5, dilation * kernel
+    assert dilation >= length
+    history = torch.randn(4, length, 3, dtype=torch.float64)
+    before = torch.zeros(4, dilation - length, 3, dtype=torch.float64)
+    everywhere = torch.nn.Sequential(*stack)(torch.cat([before, history], 1).transpose(1, 2))
+    expected = torch.relu(network.head(everywhere[:, :, -1]))
+    assert torch.allclose(network(history), expected, rtol=0.0, atol=1e-12)
+    assert float(expected.detach().abs().max()) > 0.0
+
+
+def test_the_convolution_sees_each_reading():
+    torch.manual_seed(0)
+    network = TemporalConvolution(12, 3).double()
+    history = torch.randn(1, 12, 3, dtype=torch.float64, requires_grad=True)
+    network(history).sum().backward()
+    assert (history.grad.abs().sum(dim=2) > 0.0).all()
+
+
+def test_a_blind_extractor_does_not_see_the_history():
+    torch.manual_seed(0)
+    seeing, blind = (HistoryExtractor(OBSERVATIONS, 3, blind=b) for b in (False, True))
+    one = torch.randn(1, SIZE)
+    other = one.clone()
+    other[:, -9:] += 1.0
+    assert torch.equal(blind(one), blind(other)) and blind(one).shape == (1, 64)
+    assert not torch.equal(seeing(one), seeing(other)) and seeing(one).shape == (1, 128)
+
+
+# --- Replay.
+
+
+def buffer_of(size, filled, **options):
+    buffer = PrioritizedReplayBuffer(size, OBSERVATIONS, ACTIONS, device="cpu", **options)
+    for k in range(filled):
+        add(buffer, k)
+    return buffer
+
+
+def add(buffer, k, done=False, info=None):
+    """A transition whose reward is k."""
+    rng = np.random.default_rng(k)
+    old, new = rng.normal(size=(2, 1, SIZE)).astype(np.float32)
+    action = rng.uniform(-1.0, 1.0, (1, 6)).astype(np.float32)
+    buffer.add(old, new, action, np.array([float(k)]), np.array([done]), [info or {}])
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.6, 1.0])
+def test_transitions_are_drawn_in_proportion_to_a_power_of_their_errors(alpha):
+    buffer = buffer_of(16, 10, alpha=alpha, beta=0.5, floor=0.01)
+    errors = np.array([0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 10.0])
+    buffer.update(np.arange(10), -errors)
+    buffer.seed(7)
+    share = (errors + 0.01) ** alpha
+    share /= share.sum()
+    count, draws, batch = np.zeros(16), 0, 64
+    for _ in range(400):
+        drawn = buffer.sample_prioritized(batch)
+        count += np.bincount(drawn.places, minlength=16)
+        draws += batch
+        weights = share[drawn.places] ** -0.5
+        assert drawn.weights.numpy()[:, 0] == pytest.approx(weights / weights.max(), rel=1e-4)
+        rewards = drawn.transitions.rewards.numpy()[:, 0]
+        assert np.array_equal(rewards, drawn.places)
+    assert not count[10:].any(), "an empty place was drawn"
+    sigma = np.sqrt(draws * share * (1.0 - share))
+    assert np.all(np.abs(count[:10] - draws * share) < 4.5 * sigma)
+
+
+def test_without_priorities_all_weights_are_one():
+    buffer = buffer_of(8, 5, alpha=0.0, beta=1.0)
+    buffer.update(np.arange(5), np.array([0.0, 1.0, 10.0, 100.0, 1000.0]))
+    assert np.array_equal(buffer.sample_prioritized(32).weights, np.ones((32, 1)))
+
+
+def test_a_new_transition_has_the_greatest_priority_so_far():
+    buffer = buffer_of(8, 3, alpha=1.0, floor=0.0)
+    buffer.update(np.arange(3), np.array([4.0, 2.0, 2.0]))
+    add(buffer, 3)
+    drawn = np.concatenate([buffer.sample_prioritized(64).places for _ in range(100)])
+    share = np.bincount(drawn, minlength=8) / len(drawn)
+    assert share[:4] == pytest.approx([4 / 12, 2 / 12, 2 / 12, 4 / 12], abs=0.03)
+
+
+def test_a_full_buffer_overwrites_its_oldest():
+    buffer = buffer_of(4, 6, alpha=1.0)
+    drawn = np.concatenate(
+        [buffer.sample_prioritized(32).transitions.rewards.numpy()[:, 0] for _ in range(10)]
+    )
+    assert set(drawn) == {2.0, 3.0, 4.0, 5.0}
+    assert len(buffer._filled) == 4
+
+
+def test_a_transition_that_the_time_limit_ended_is_not_an_end():
+    buffer = buffer_of(4, 0)
+    add(buffer, 0, done=True)
+    add(buffer, 1, done=True, info={"TimeLimit.truncated": True})
+    batch = buffer.sample_prioritized(32)
+    assert np.array_equal(batch.transitions.dones.numpy()[:, 0], batch.places == 0)
+
+
+def test_a_buffer_goes_on_from_its_state_as_if_nothing_had_happened():
+    buffer = buffer_of(8, 11)
+    buffer.update(np.arange(8), np.arange(8.0))
+    buffer.set_beta(0.7)
+    file = io.BytesIO()
+    torch.save(buffer.state(), file)
+    file.seek(0)
+    other = buffer_of(8, 2)
+    other.set_state(torch.load(file, weights_only=False))
+    for each in (buffer, other):
+        add(each, 20)
+    for _ in range(3):
+        one, two = buffer.sample_prioritized(16), other.sample_prioritized(16)
+        assert np.array_equal(one.places, two.places)
+        assert torch.equal(one.weights, two.weights)
+        for left, right in zip(one.transitions[:5], two.transitions[:5], strict=True):
+            assert torch.equal(left, right)
+
+
+# --- The update.
+
+
+class Still(gymnasium.Env):
+    """Observations of the agent's size, and nothing happens."""
+
+    observation_space, action_space = OBSERVATIONS, ACTIONS
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(SIZE, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(SIZE, np.float32), 0.0, False, False, {}
+
+
+def algorithm(kind, **options):
+    return kind(
+        "MlpPolicy",
+        DummyVecEnv([Still]),
+        learning_rate=0.01,
+        buffer_size=64,
+        batch_size=32,
+        policy_kwargs=POLICY,
+        seed=0,
+        device="cpu",
+        **options,
+    )
+
+
+def numbers(model):
+    parts = {name: value.detach().clone() for name, value in model.policy.state_dict().items()}
+    return parts | {"log_ent_coef": model.log_ent_coef.detach().clone()}
+
+
+def test_with_equal_weights_the_update_is_that_of_stable_baselines3():
+    ours = algorithm(PrioritizedSAC, replay_buffer_kwargs={"alpha": 0.0})
+    theirs = algorithm(SAC)
+    theirs.policy.load_state_dict(ours.policy.state_dict())
+    for k in range(48):
+        add(ours.replay_buffer, k % 7, done=k % 5 == 0)
+    batch = ours.replay_buffer.sample_prioritized(32)
+    ours.replay_buffer.sample_prioritized = lambda _: batch
+    theirs.replay_buffer.sample = lambda *_, **__: batch.transitions
+    before = numbers(ours)
+    for model in (ours, theirs):
+        # A step of gradient descent shows the gradient itself; Adam's first, its sign alone.
+        for holder in (model.actor, model.critic):
+            holder.optimizer = torch.optim.SGD(holder.parameters(), lr=0.01)
+        model.ent_coef_optimizer = torch.optim.SGD([model.log_ent_coef], lr=0.01)
+        model.set_logger(training.configure(None, []))
+        torch.manual_seed(5)
+        model.train(1, 32)
+    one, two, moved = numbers(ours), numbers(theirs), 0
+    for name, value in one.items():
+        change = (value - before[name]).double(), (two[name] - before[name]).double()
+        scale = float(change[1].abs().max())
+        moved += scale > 0.0
+        # Single precision, and the 1e-6 within Stable-Baselines3's logarithm.
+        assert float((change[0] - change[1]).abs().max()) <= 1e-3 * scale + 1e-7, name
+    assert moved == len(one)
+
+
+def test_importance_weights_scale_the_critics_gradient():
+    def gradient(weights):
+        model = algorithm(PrioritizedSAC)
+        for k in range(40):
+            add(model.replay_buffer, k)
+        batch = model.replay_buffer.sample_prioritized(32)
+        model.replay_buffer.sample_prioritized = lambda _: batch._replace(weights=weights)
+        before = [p.detach().clone() for p in model.critic.parameters()]
+        model.critic.optimizer = torch.optim.SGD(model.critic.parameters(), lr=1e-4)
+        torch.manual_seed(1)
+        model._train_batch(32)
+        after = list(model.critic.parameters())
+        return torch.cat([(a - b).detach().ravel() for a, b in zip(after, before, strict=True)])
+
+    first = torch.zeros(32, 1)
+    first[:16] = 1.0
+    whole, one, two = gradient(torch.ones(32, 1)), gradient(first), gradient(1.0 - first)
+    assert torch.allclose(one + two, whole, rtol=0.0, atol=2e-3 * float(whole.abs().max()))
+    assert not torch.allclose(one, two, rtol=0.0, atol=0.01 * float(whole.abs().max()))
+
+
+def test_the_errors_of_a_batch_become_its_priorities():
+    model = algorithm(PrioritizedSAC, replay_buffer_kwargs={"alpha": 1.0, "floor": 0.01})
+    for k in range(40):
+        add(model.replay_buffer, k, done=True)
+    batch = model.replay_buffer.sample_prioritized(32)
+    model.replay_buffer.sample_prioritized = lambda _: batch
+    with torch.no_grad():
+        values = torch.cat(
+            model.critic(batch.transitions.observations, batch.transitions.actions), 1
+        )
+        errors = (values - batch.transitions.rewards).abs().mean(dim=1)
+    model._train_batch(32)
+    found = model.replay_buffer._sampler._sum_tree[torch.as_tensor(batch.places)]
+    assert np.asarray(found) == pytest.approx(errors.numpy() + 0.01, rel=1e-4)
+
+
+# --- Training.
+
+
+def training_of(**values):
+    task = TaskConfig(
+        simulator="spring",
+        foods=["cucumber"],
+        agent=AGENT,
+        randomization=RandomizationConfig(variants=1),
+        start=Start(clearance=0.003),
+        reward=RewardConfig(schedule="gaussian"),
+        decisions=15,
+    )
+    settings = {"steps": 120, "warm_up": 20, "batch": 16, "layers": [16], "seed": 3}
+    return TrainingConfig(task=task, **(settings | values))
+
+
+@pytest.fixture
+def one_process(monkeypatch):
+    """Environments in this process: the start of another takes seconds."""
+    monkeypatch.setattr(training, "SubprocVecEnv", lambda makers, _: DummyVecEnv(makers))
+
+
+def lines(folder):
+    return [json.loads(line) for line in (folder / training.EPISODES).read_text().splitlines()]
+
+
+def test_a_training_that_was_stopped_goes_on_as_if_it_had_not(tmp_path, one_process):
+    config = training_of(checkpoint_interval=25)
+    straight = train(config, tmp_path / "straight")
+    half = train(config, tmp_path / "halves", stop_after=50)
+    assert 50 <= half.steps < 120
+    assert not (tmp_path / "halves" / training.POLICY).exists()
+    # What was logged after the checkpoint is dropped.
+    with (tmp_path / "halves" / training.EPISODES).open("a") as file:
+        file.write('{"steps": 99}\n')
+    whole = train(config, tmp_path / "halves")
+    policies = [(tmp_path / name / training.POLICY).read_bytes() for name in ("straight", "halves")]
+    assert policies[0] == policies[1]
+    assert lines(tmp_path / "straight") == lines(tmp_path / "halves")
+    assert dc.replace(straight, wall_time=0.0) == dc.replace(whole, wall_time=0.0)
+    assert straight.steps == 120 and straight.episodes == 8 and straight.failed is None
+
+
+def test_another_seed_gives_another_policy(tmp_path, one_process):
+    for seed in (3, 4):
+        train(training_of(seed=seed, steps=40), tmp_path / str(seed))
+    one, other = ((tmp_path / str(seed) / training.POLICY).read_bytes() for seed in (3, 4))
+    assert one != other
+
+
+def test_a_stop_at_the_last_step_is_the_end(tmp_path, one_process):
+    outcome = train(training_of(steps=30, warm_up=20), tmp_path, stop_after=30)
+    assert outcome.steps == 30
+    assert (tmp_path / training.POLICY).exists()
+
+
+def test_a_checkpoint_of_another_training_is_refused(tmp_path, one_process):
+    train(training_of(steps=60), tmp_path, stop_after=15)
+    before = (tmp_path / training.CONFIGURATION).read_text()
+    with pytest.raises(ConfigurationError, match="other settings") as caught:
+        train(training_of(steps=60, learning_rate=2e-3), tmp_path)
+    assert "another folder" in str(caught.value)
+    assert (tmp_path / training.CONFIGURATION).read_text() == before
+
+
+def test_a_training_whose_guards_end_episodes_has_failed(tmp_path, one_process, monkeypatch):
+    def fail(*_):
+        raise CuttingError("an element is inverted")
+
+    monkeypatch.setattr("sliceit_drake.systems.spring_food.SpringCutter.advance", fail)
+    outcome = train(training_of(steps=5), tmp_path)
+    assert outcome.guard_errors == {"CuttingError": 5} and outcome.ends == {"guard": 5}
+    assert "5 of 5 episodes" in outcome.failed and "0.1 %" in outcome.failed
+    assert json.loads((tmp_path / "summary.json").read_text())["failed"] == outcome.failed
+    assert all("an element is inverted" in line["guard"] for line in lines(tmp_path))
+
+
+@pytest.mark.parametrize(("episodes", "failed"), [(1000, False), (999, True)])
+def test_one_guard_in_a_thousand_episodes_may_be(tmp_path, episodes, failed):
+    watch = training._Watch(training_of(), tmp_path, "", None, None)
+    watch.episodes = episodes
+    watch._guards.update({"CuttingError": 1})
+    assert (watch.outcome(1.0).failed is not None) == failed
+
+
+def test_updates_are_made_while_the_environment_steps():
+    order = []
+
+    class Noted(Still):
+        def step(self, action):
+            order.append("step")
+            return super().step(action)
+
+    environments = OverlapVecEnv(DummyVecEnv([Noted]))
+    environments.reset()
+    environments.meanwhile = lambda: order.append("update")
+    environments.step_async(np.zeros((1, 6)))
+    environments.step_wait()
+    assert order == ["update", "step"]
+
+
+# --- What is left.
+
+
+@pytest.mark.parametrize("history", [3, 12])
+def test_an_exported_policy_decides_as_the_actor(tmp_path, history):
+    agent = AgentConfig(history=history, network=str(tmp_path / "policy.onnx"))
+    size = agent.observation_size()
+
+    class Sized(Still):
+        observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+
+    policy = POLICY | {"features_extractor_kwargs": {"history": history}}
+    model = SAC("MlpPolicy", DummyVecEnv([Sized]), buffer_size=1, policy_kwargs=policy, seed=1)
+    export_policy(model.actor, agent, tmp_path / "policy.onnx")
+    decide = load_network(agent)
+    rng = np.random.default_rng(0)
+    for scale in (0.1, 1.0, 5.0):
+        observation = (scale * rng.normal(size=size)).astype(np.float32)
+        expected, _ = model.predict(observation, deterministic=True)
+        assert decide(observation) == pytest.approx(expected, abs=1e-6)
+        assert np.ptp(expected) > 1e-3

@@ -1,0 +1,293 @@
+"""The station as a Gymnasium environment: what repeats, how an episode ends, what is rewarded."""
+
+import dataclasses as dc
+
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium")
+
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+
+import sliceit_drake.learning  # noqa: E402, F401  (registers the environment)
+from sliceit_drake.configuration import ConfigurationError, validate  # noqa: E402
+from sliceit_drake.cutting.solver import CuttingError, CuttingSolver  # noqa: E402
+from sliceit_drake.diagrams.scenario import Start  # noqa: E402
+from sliceit_drake.learning.environment import SlicingEnv  # noqa: E402
+from sliceit_drake.learning.reward import (  # noqa: E402
+    TERMS,
+    RewardConfig,
+    reward_terms,
+    reward_weights,
+)
+from sliceit_drake.learning.task import RandomizationConfig, TaskConfig  # noqa: E402
+from sliceit_drake.systems.agent import AgentConfig  # noqa: E402
+
+PRESS = np.array([0.2, 0.1, 1.0, 0.3, 0.4, 1.0])
+
+
+def task_of(simulator="spring", agent=None, randomization=None, **values):
+    """A cheap task whose knife is at the food after a few decisions."""
+    values = {"foods": ["cucumber"], "refinement": 0.5, "start": Start(clearance=0.003)} | values
+    return TaskConfig(
+        simulator=simulator,
+        agent=AgentConfig(history=3, **(agent or {})),
+        randomization=RandomizationConfig(
+            **({"variants": 2, "height": [0.0, 0.001]} | (randomization or {}))
+        ),
+        **values,
+    )
+
+
+def rollout(env, steps, seed=None):
+    """Observations and rewards of an episode with actions of their own seed."""
+    observation, _ = env.reset(seed=seed)
+    rng, seen = np.random.default_rng(5), [observation]
+    for _ in range(steps):
+        action = np.clip(PRESS + rng.uniform(-0.5, 0.5, 6), -1.0, 1.0)
+        observation, reward, terminated, truncated, _ = env.step(action)
+        seen.append(np.append(observation, reward))
+        if terminated or truncated:
+            break
+    return np.concatenate(seen)
+
+
+@pytest.fixture(scope="module")
+def spring():
+    return SlicingEnv(task_of())
+
+
+def test_it_is_an_environment_as_gymnasium_has_them():
+    check_env(SlicingEnv(task_of()), skip_render_check=True)
+
+
+def test_it_is_registered():
+    env = gymnasium.make("sliceit_drake/Slicing-v0", task=task_of())
+    assert isinstance(env.unwrapped, SlicingEnv)
+    observation, info = env.reset(seed=0)
+    assert observation.shape == (26,) and info == {"food": "cucumber"}
+
+
+@pytest.mark.parametrize("simulator", ["spring", "cutting"])
+def test_a_seed_fixes_an_episode_whatever_came_before(simulator):
+    task, steps = task_of(simulator), 12
+    used, fresh = SlicingEnv(task), SlicingEnv(task)
+    first = rollout(used, steps, seed=11)
+    others = [rollout(used, steps, seed=seed) for seed in (12, 13, None)]
+    again = rollout(used, steps, seed=11)
+    assert np.array_equal(first, again)
+    assert np.array_equal(first, rollout(fresh, steps, seed=11))
+    assert all(not np.array_equal(first, other) for other in others)
+    # The knife has met the food.
+    assert np.ptp(first.reshape(-1)[-27:-1]) > 0.0 and used._force() > 0.5
+
+
+def test_the_foods_before_do_not_matter_either():
+    task = task_of(foods=["cucumber", "potato"])
+    used, fresh = SlicingEnv(task), SlicingEnv(task)
+    for seed in range(3):
+        rollout(used, 2, seed=seed)
+    assert np.array_equal(rollout(used, 4, seed=9), rollout(fresh, 4, seed=9))
+
+
+def test_an_episode_is_repeated_from_its_random_state(spring):
+    rollout(spring, 1, seed=3)
+    rollout(spring, 1)
+    state, expected = None, None
+    expected = rollout(spring, 3)
+    state = spring.random_state()
+    rollout(spring, 2)
+    other = SlicingEnv(spring.task)
+    for env in (spring, other):
+        if env is other:
+            env.reset(seed=77)
+        env.set_random_state(state)
+        assert np.array_equal(rollout(env, 3), expected)
+        # And so is the one after it.
+    assert np.array_equal(rollout(spring, 2), rollout(other, 2))
+
+
+def test_the_time_limit_truncates():
+    env = SlicingEnv(task_of(decisions=3))
+    env.reset(seed=0)
+    for k in range(3):
+        _, reward, terminated, truncated, info = env.step(np.zeros(6))
+        assert (terminated, truncated) == (False, k == 2)
+        assert ("end" in info) == (k == 2)
+    assert (info["end"], info["is_success"]) == ("time", False)
+    assert -1.0 <= reward <= 0.0
+
+
+def weighted(info, config=None):
+    weights = reward_weights(config or RewardConfig())
+    return float(weights @ [info["reward_terms"][name] for name in TERMS])
+
+
+@pytest.mark.parametrize(
+    ("values", "end", "bonus"),
+    [
+        ({"agent": {"goal": [1.0, 1.0, 1.0], "goal_decisions": 0}}, "goal", 100.0),
+        ({"workspace": [1.0, 0.001, 1.0]}, "workspace", -100.0),
+        ({"force_limit": 0.1}, "collision", -100.0),
+        ({"torque_limit": 0.1}, "collision", -100.0),
+    ],
+)
+def test_an_end_terminates_with_its_reward(values, end, bonus):
+    env = SlicingEnv(task_of(**values))
+    env.reset(seed=0)
+    for _ in range(40):
+        _, reward, terminated, truncated, info = env.step(PRESS)
+        if terminated or truncated:
+            break
+        assert reward == pytest.approx(weighted(info), abs=1e-6)
+    assert (terminated, truncated, info["end"]) == (True, False, end)
+    assert info["is_success"] == (end == "goal")
+    assert reward == pytest.approx(weighted(info) + bonus, abs=1e-6)
+
+
+def test_a_guard_of_the_simulation_terminates_with_the_reward_of_a_collision(monkeypatch):
+    env = SlicingEnv(task_of("cutting"))
+    env.reset(seed=0)
+    env.step(PRESS)
+
+    def fail(*_):
+        raise CuttingError("an element is inverted")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(CuttingSolver, "exchange", fail)
+        observation, reward, terminated, truncated, info = env.step(PRESS)
+    assert (terminated, truncated, info["end"]) == (True, False, "guard")
+    assert info["guard_error"] == "CuttingError"
+    assert "an element is inverted" in info["guard_message"]
+    assert reward == pytest.approx(weighted(info) - 100.0, abs=1e-6)
+    assert np.isfinite(observation).all()
+    # The next episode is as if nothing had happened.
+    expected = rollout(SlicingEnv(env.task), 3, seed=4)
+    assert np.array_equal(rollout(env, 3, seed=4), expected)
+
+
+def test_any_other_error_ends_the_training(monkeypatch, spring):
+    spring.reset(seed=0)
+
+    def fail(*_):
+        raise ZeroDivisionError("a bug")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sliceit_drake.systems.spring_food.SpringCutter.advance", fail)
+        with pytest.raises(ZeroDivisionError, match="a bug"):
+            spring.step(PRESS)
+
+
+@pytest.mark.parametrize("action", [[np.nan] * 6, [0, 0, 0, 0, 0, np.inf], [0.0] * 5])
+def test_an_action_that_is_none_is_refused(spring, action):
+    spring.reset(seed=0)
+    with pytest.raises(ValueError, match="six finite numbers"):
+        spring.step(np.array(action))
+
+
+def test_a_step_before_a_reset_is_refused():
+    with pytest.raises(RuntimeError, match="call reset"):
+        SlicingEnv(task_of()).step(np.zeros(6))
+
+
+def test_starts_are_within_their_ranges_and_fill_them():
+    ranges = {"height": [0.001, 0.006], "offset": 0.01, "tilt": 0.02}
+    env = SlicingEnv(task_of(randomization=ranges))
+    env.reset(seed=0)
+    station, simulator = env._current
+    descent, errors = station.agent._config.descent, []
+    for _ in range(40):
+        observation, _ = env.reset()
+        errors.append(observation[:3] * [0.1, 0.06, 0.785] - [0.0, descent, 0.0])
+        assert observation[3:9] == pytest.approx(np.zeros(6), abs=1e-6)
+    low, high = np.min(errors, axis=0), np.max(errors, axis=0)
+    wanted_low, wanted_high = np.array([-0.01, 0.001, -0.02]), np.array([0.01, 0.006, 0.02])
+    assert np.all(low >= wanted_low - 1e-5) and np.all(high <= wanted_high + 1e-5)
+    assert np.all(high - low > 0.8 * (wanted_high - wanted_low))
+
+
+def test_foods_are_drawn_or_asked_for():
+    env = SlicingEnv(task_of(foods=["cucumber", "tomato"]))
+    drawn = {env.reset(seed=seed)[1]["food"] for seed in range(8)}
+    assert drawn == {"cucumber", "tomato"}
+    assert env.reset(seed=0, options={"food": "tomato"})[1] == {"food": "tomato"}
+    with pytest.raises(ValueError, match="no food 'carrot'; it has cucumber, tomato"):
+        env.reset(options={"food": "carrot"})
+
+
+def test_the_terms_of_the_reward_are_those_of_sliceit():
+    height, force, jerk = 0.012, np.array([6.0, 8.0]), np.array([0.3, 0.0, 0.4])
+    # -tanh(1), -1 / (1 + e^-2), the norm, and the step.
+    expected = [-0.761594156, -0.880797078, -0.5, -1.0]
+    assert reward_terms(height, force, jerk) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(("force", "term"), [(0.0, -0.0474259), (6.0, -0.5), (30.0, -0.9999939)])
+def test_the_term_of_the_force_is_s_shaped(force, term):
+    assert reward_terms(0.0, np.array([0.0, -force]), np.zeros(3))[1] == pytest.approx(term, 1e-5)
+
+
+def test_the_term_of_the_jerk_ends_at_one():
+    assert reward_terms(0.0, np.zeros(2), np.array([3.0, -4.0, 0.0]))[2] == -1.0
+
+
+def test_weights_are_ratios():
+    assert reward_weights(RewardConfig(weights=[2.0, 4.0, 1.0, 1.0])) == pytest.approx(
+        [0.25, 0.5, 0.125, 0.125]
+    )
+
+
+@pytest.mark.parametrize(
+    ("progress", "raw"),
+    [
+        (0.0, [1.0, 0.135335283, 0.1, 1.0]),
+        (0.25, [1.0, 0.606530660, 0.1, 1.0]),
+        (0.5, [1.0, 1.0, 0.135335283, 1.0]),
+        (1.0, [1.0, 1.0, 1.0, 1.0]),
+    ],
+)
+def test_a_schedule_lets_the_weights_of_force_and_jerk_rise(progress, raw):
+    weights = reward_weights(RewardConfig(schedule="gaussian"), progress)
+    assert weights == pytest.approx(np.array(raw) / np.sum(raw), abs=1e-8)
+
+
+def test_the_environment_takes_the_progress_for_its_schedule():
+    reward = RewardConfig(schedule="gaussian")
+    env = SlicingEnv(task_of(reward=reward))
+    rewards = []
+    for progress in (0.0, 1.0):
+        env.set_progress(progress)
+        env.reset(seed=0)
+        _, value, _, _, info = env.step(PRESS)
+        terms = [info["reward_terms"][name] for name in TERMS]
+        assert value == pytest.approx(reward_weights(reward, progress) @ terms, abs=1e-6)
+        rewards.append(value)
+    assert rewards[0] != rewards[1]
+
+
+@pytest.mark.parametrize(
+    ("values", "field"),
+    [
+        ({"foods": []}, "task.foods"),
+        ({"reward": RewardConfig(weights=[0.0] * 4)}, "task.reward.weights"),
+        ({"randomization": {"height": [0.01, 0.0]}}, "task.randomization.height"),
+        ({"workspace": [0.1, 0.1]}, "task.workspace"),
+    ],
+)
+def test_a_task_that_cannot_be_is_named(values, field):
+    validate(task_of(), "task")
+    with pytest.raises(ConfigurationError) as caught:
+        validate(task_of(**values), "task")
+    assert caught.value.field == field
+
+
+def test_all_variants_of_a_food_are_the_same_in_every_environment_of_a_task():
+    task = dc.replace(task_of("cutting"), randomization=RandomizationConfig(variants=3))
+    pairs = []
+    for env in (SlicingEnv(task), SlicingEnv(task)):
+        env.reset(seed=0)
+        station, _ = env._current
+        states = [s.model.material for s in station.station.cutting.solvers]
+        pairs.append(states)
+    assert pairs[0] == pairs[1]
+    assert len({repr(material) for material in pairs[0]}) == 3
