@@ -1,9 +1,7 @@
 """A second world, of measured curves: it shares no code with the finite elements.
 
-The force over depth is a recorded one (calibration/measured), stretched over the height of the
-food. Around it stand laws of a few lines: a power of the speed (`RATE`), Atkins' draw
-(F_V / (1 + xi^2), F_H = xi F_V), a logarithmic fading in a hold, flanks that rub on what is buried,
-and a board of Hunt and Crossley's law with Hertz's exponent.
+The food's forces are those of `curve_laws`: a measured curve over depth, speed, draw, hold and
+flanks. With them goes a board of Hunt and Crossley's law with Hertz's exponent.
 
 Of `cutting` it has the knife's motion and the configuration that a protocol is written in (size of
 the food, board), and no solver, model, mesh or kernel: `tests/test_stand_in.py` looks at what it
@@ -15,44 +13,21 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.motion import Pose
-from sliceit_drake.records.force_profile import load_force_profile
-from sliceit_drake.resources import resource_path
+from sliceit_drake.stand_in.curve_laws import (
+    CutState,
+    EllipticSection,
+    food_forces,
+    measured_curve,
+)
 from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceFacts, Tissue
 from sliceit_drake.stand_in.protocol import Protocol, Specimen, section_size
 from sliceit_drake.stand_in.world import GRAVITY, Path, resampled
 
 __all__ = ["CurveWorld"]
 
-CURVES = {name: f"calibration/measured/sliceit_real_{name}_force.csv" for name in
-          ("cucumber", "potato", "tomato")}  # fmt: skip
-CURVE_SPEED = 0.02
-"""At which the curves were recorded (calibration/measured/README.md), m/s."""
-
-CONTACT = 0.3
-"""Force at which a curve begins, N."""
-
-RATE = 0.07
-"""Exponent of the speed."""
-
-LEAST_SPEED = 2e-3
-"""Below which the force falls no further, m/s."""
-
-FLANK_SHARE, WEDGE_SHARE = 0.15, 0.03
-"""Friction and pressure of the flanks, fully buried, over the curve's largest force."""
-
-HOLD_FADE, HOLD_ONSET = 0.06, 0.03
-"""In a hold a force loses this share with each tenfold of the time over the onset, s."""
-
-RELOAD = 4e-4
-"""Travel after which a force that faded, or was let go, is there again, metres."""
-
 BOARD_DEPTH = 3e-4
 """Depth at which the board is as stiff as the protocol's, metres."""
-
-TURN = 1e-4
-"""Travel over which friction turns round, metres."""
 
 TRAVEL, LONGEST = 4e-5, 50
 
@@ -68,19 +43,8 @@ class CurveWorld:
     """
 
     def __init__(self, protocol: Protocol) -> None:
-        name = protocol.food.name
-        if name not in CURVES:
-            raise ConfigurationError(
-                f"there is no measured curve of {name!r}",
-                field="food.name",
-                fix=f"Take one of {', '.join(CURVES)}, or the world finite_elements.",
-            )
-        profile = load_force_profile(resource_path(CURVES[name]))
-        begin = int(np.argmax(profile.force > CONTACT))
-        share = profile.time[begin:] - profile.time[begin]
         self.protocol = protocol
-        self._share = share / share[-1]
-        self._force = profile.force[begin:]
+        self._curve = measured_curve(protocol.food.name)
 
     def cut(
         self, specimen: Specimen, effects: Sequence[Effect], rng: np.random.Generator
@@ -93,7 +57,7 @@ class CurveWorld:
             peeled=condition.peeled,
             height=height,
             width=width,
-            toughness=float(np.mean(self._force)) / (0.25 * np.pi * width),
+            toughness=float(np.mean(self._curve.force)) / (0.25 * np.pi * width),
         )
         for effect in effects:
             effect.begin(facts, rng)
@@ -103,7 +67,7 @@ class CurveWorld:
             np.array([x + condition.offset, y, height + condition.clearance]),
         )
         path = Path.of(condition.motion, start, protocol.exchange_period)
-        section = _Section(facts, effects)
+        section = EllipticSection(width, height)
         series = self._along(path, specimen, facts, section, effects)
         for effect in effects:
             effect.respond(series)
@@ -114,14 +78,15 @@ class CurveWorld:
         path: Path,
         specimen: Specimen,
         facts: SliceFacts,
-        section: "_Section",
+        section: EllipticSection,
         effects: Sequence[Effect],
     ) -> Series:
         timeless = not any(effect.every_exchange for effect in effects)
         stretches = np.array(list(path.stretches(TRAVEL, LONGEST if timeless else 1, 0.0)))
         size = facts.width / section_size(self.protocol.food, 1.0)[0]
-        curve = self._force * specimen.toughness * size
-        state = _State(path.p[0])
+        curve = self._curve.scaled(specimen.toughness).scaled(size)
+        more = _EdgeEffects(section, facts, effects)
+        state, force = CutState(path.p[0]), np.zeros(3)
         forces = np.zeros((len(stretches), 3, 3))
         shifts = np.zeros((len(stretches), 2, 3))
         depths = np.zeros(len(stretches))
@@ -138,47 +103,23 @@ class CurveWorld:
                 depth=state.depth,
                 travel=state.travel,
                 swept=state.swept,
-                force=state.force,
+                force=force,
             )
             for effect in effects:
                 effect.drive(now)
             now.food_shift[2] += specimen.height
             shifts[row] = now.knife_shift, now.food_shift
             place = path.p[b] + now.knife_shift - now.food_shift
-            state.advance(now, path.R[b][:, 0], place, facts.height)
+            state.advance(period, path.R[b][:, 0], place, facts.height)
             depths[row] = state.depth
             if not specimen.condition.without_food:
-                forces[row] = self._forces(state, now, facts, section, curve)
+                forces[row] = food_forces(
+                    state, curve, section, now.toughness, now.friction, more.at(state.depth)
+                )
                 forces[row, 2] *= specimen.friction
             board = self._board(path.p[b][2] + now.knife_shift[2], press)
-            state.force = forces[row].sum(0) + [0.0, 0.0, board]
+            force = forces[row].sum(0) + [0.0, 0.0, board]
         return self._series(path, specimen, facts, section, stretches, forces, shifts, depths)
-
-    def _forces(
-        self,
-        state: "_State",
-        now: Now,
-        facts: SliceFacts,
-        section: "_Section",
-        curve: np.ndarray,
-    ) -> np.ndarray:
-        """Force of edge, flanks' pressure and friction on the knife, in F [3, 3], N."""
-        out = np.zeros((3, 3))
-        if state.depth <= 0.0:
-            return out
-        buried = section.above(state.depth)
-        flanks = float(curve.max()) * buried
-        share = state.depth / facts.height
-        whole = float(np.interp(share, self._share, curve))
-        edge = max(whole - (FLANK_SHARE + WEDGE_SHARE) * flanks, 0.0)
-        edge = max(edge + section.more(state.depth), 0.0) if share < 1.0 else 0.0
-        speed = max(state.speed, LEAST_SPEED)
-        edge *= now.toughness * (speed / CURVE_SPEED) ** RATE * state.loaded
-        xi = state.ratio
-        out[0] = [-xi * edge / (1.0 + xi**2), 0.0, edge / (1.0 + xi**2)]
-        out[1, 2] = WEDGE_SHARE * flanks * state.faded
-        out[2] = -FLANK_SHARE * flanks * now.friction * state.faded * state.heading
-        return out
 
     def _board(self, height: float, press: float) -> float:
         board = self.protocol.board
@@ -191,7 +132,7 @@ class CurveWorld:
         path: Path,
         specimen: Specimen,
         facts: SliceFacts,
-        section: "_Section",
+        section: EllipticSection,
         stretches: np.ndarray,
         forces: np.ndarray,
         shifts: np.ndarray,
@@ -239,17 +180,14 @@ class CurveWorld:
         )
 
 
-class _Section:
-    """An elliptic section: how much of it lies above a depth, and what effects do to it there."""
+class _EdgeEffects:
+    """What effects do to the edge's force in a section."""
 
-    def __init__(self, facts: SliceFacts, effects: Sequence[Effect]) -> None:
-        a, b = 0.5 * facts.width, 0.5 * facts.height
-        self.area = np.pi * a * b
-        self._depth = np.linspace(0.0, facts.height, 121)
-        up = 1.0 - self._depth / b
-        half = a * np.sqrt(np.maximum(1.0 - up**2, 0.0))
-        angle = np.arccos(np.clip(up, -1.0, 1.0))
-        self._above = (angle - np.sin(angle) * np.cos(angle)) / np.pi
+    def __init__(
+        self, section: EllipticSection, facts: SliceFacts, effects: Sequence[Effect]
+    ) -> None:
+        a, b, up, half = section.a, section.b, section.up, section.half
+        self._depth = section.depth
         across = np.linspace(-1.0, 1.0, 17)
         across = 0.5 * (across[1:] + across[:-1])
         x = np.outer(half, across).ravel()
@@ -273,60 +211,6 @@ class _Section:
         stretch = np.divide(wide, half, out=np.ones_like(half), where=half > 1e-6)
         self._more = facts.toughness * 2.0 * half * (factor.mean(1) * stretch - 1.0)
 
-    def above(self, depth: float) -> float:
-        """Share of the section above a depth."""
-        return float(np.interp(depth, self._depth, self._above))
-
-    def more(self, depth: float) -> float:
-        """What effects add to the force of the edge at a depth, N."""
+    def at(self, depth: float) -> float:
+        """What they add to the force of the edge at a depth, N."""
         return float(np.interp(depth, self._depth, self._more))
-
-
-class _State:
-    """What the slice remembers along the path."""
-
-    def __init__(self, place: np.ndarray) -> None:
-        self.place = place
-        self.depth = -1.0
-        self.deepest = 0.0
-        self.travel = self.swept = 0.0
-        self.speed = self.ratio = 0.0
-        self.heading = np.array([0.0, 0.0, -1.0])
-        self.force = np.zeros(3)
-        self.rest = 0.0
-        self.faded = 1.0
-
-    def advance(self, now: Now, along: np.ndarray, place: np.ndarray, height: float) -> None:
-        """To the end of a stretch.
-
-        Args:
-            now: The stretch.
-            along: Direction of the edge in F [3].
-            place: Of Ko in F relative to the food [3], metres.
-            height: Of the food, metres.
-        """
-        step, self.place = place - self.place, place
-        moved = float(np.linalg.norm(step))
-        self.depth = height - float(place[2])
-        self.deepest = max(self.deepest, self.depth)
-        if moved > 1e-9:
-            self.speed = moved / now.period
-            sunk = -float(step[2])
-            self.ratio = float(step @ along) / sunk if sunk > 1e-9 else 0.0
-            self.rest = 0.0
-            self.faded = min(1.0, self.faded + moved / RELOAD)
-        else:
-            self.rest += now.period
-            loss = HOLD_FADE * np.log10(1.0 + self.rest / HOLD_ONSET)
-            self.faded = min(self.faded, 1.0 - loss)
-        if self.depth > 0.0 and moved > 1e-9:
-            keep = np.exp(-moved / TURN)
-            self.heading = keep * self.heading + (1.0 - keep) * step / moved
-            self.travel += moved
-            self.swept += 2.0 * moved * min(self.depth, 0.03)
-
-    @property
-    def loaded(self) -> float:
-        """Share of the edge's force that is there: none in a cut that is open."""
-        behind = (self.deepest - self.depth) / RELOAD
-        return max(0.0, 1.0 - behind) * self.faded
