@@ -495,7 +495,9 @@ FINITE_ELEMENTS = (
 )
 
 
-@pytest.mark.parametrize("module", ["curve_world", "world", "effect", "sensor"])
+@pytest.mark.parametrize(
+    "module", ["curve_world", "curve_laws", "curve_cutter", "world", "effect", "sensor"]
+)
 def test_the_world_of_curves_has_no_import_of_the_finite_elements(module):
     found = {name.rpartition(".")[2] for name in imports(module) if ".cutting." in name}
     assert not found & set(FINITE_ELEMENTS)
