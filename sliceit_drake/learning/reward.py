@@ -24,11 +24,11 @@ class RewardConfig:
     """Weights of the terms, and what an episode's end gives."""
 
     weights: list[float] = quantity(
-        [1.0, 1.0, 1.0, 1.0],
+        [1.0, 8.0, 1.0, 1.0],
         "",
         low=0.0,
         size=4,
-        doc="Of distance, force, jerk and step; only their ratios count.",
+        doc="Of distance, force, jerk and step; only their ratios count. SliceIt! has all equal.",
     )
     schedule: str = choice(
         "constant",
@@ -36,7 +36,7 @@ class RewardConfig:
         doc="gaussian: the weight moves from distance to force to jerk during the training.",
     )
     force_scale: float = quantity(
-        2.0,
+        5.0,
         "N",
         low=0.01,
         high=1e3,

@@ -26,6 +26,7 @@ from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig
 __all__ = [
     "RandomizationConfig",
     "TaskConfig",
+    "check_task",
     "load_task",
     "make_agent_station",
     "station_scenario",
@@ -87,12 +88,12 @@ class TaskConfig:
         0.75, "", low=0.3, high=4.0, doc="Elements along an edge, relative to the food's mesh."
     )
     time_step: float = quantity(
-        1.25e-4,
+        2e-3 / 12,
         "s",
         low=1e-6,
         high=2e-3,
-        doc="Sub-step of the food: half the station's default, whose scaled masses have more than "
-        "5 % of the energy for an instant where the fastest agents touch a food.",
+        doc="Sub-step of the food: two thirds of the station's default, whose scaled masses have "
+        "more than 5 % of the energy for an instant where the fastest agents touch a food.",
     )
     board: Board = dc.field(default_factory=Board)
     sensor: WrenchSensorConfig = dc.field(default_factory=_sensor)
@@ -178,6 +179,18 @@ def make_agent_station(task: TaskConfig, food: str, rng: np.random.Generator) ->
     station = MakeSlicingStation(scenario, make_cutting=make_cutting)
     descent = float(station.start_pose.translation()[2]) - scenario.board.height
     return AgentStation(station, dc.replace(task.agent, descent=descent))
+
+
+def check_task(task: TaskConfig) -> None:
+    """Builds each food's station with one variant, so that what is wrong is said at once.
+
+    Raises:
+        ConfigurationError, MeshError, TimeStepError: A food cannot be loaded or cut, or its start
+            not be reached.
+    """
+    few = dc.replace(task, randomization=dc.replace(task.randomization, variants=1))
+    for food in task.foods:
+        make_agent_station(few, food, np.random.default_rng(0))
 
 
 def _meshed(food: Food, refinement: float) -> Food:

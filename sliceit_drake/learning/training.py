@@ -24,7 +24,7 @@ from sliceit_drake.learning.environment import SlicingEnv
 from sliceit_drake.learning.export import export_policy
 from sliceit_drake.learning.network import HistoryExtractor
 from sliceit_drake.learning.sac import OverlapVecEnv, PrioritizedSAC
-from sliceit_drake.learning.task import TaskConfig
+from sliceit_drake.learning.task import TaskConfig, check_task
 
 __all__ = [
     "CHECKPOINT",
@@ -53,7 +53,7 @@ class TrainingConfig:
     """How an agent is trained, and on what."""
 
     task: TaskConfig = dc.field(default_factory=TaskConfig)
-    steps: int = quantity(80_000, "", low=1, high=10**9, doc="Decisions.")
+    steps: int = quantity(30_000, "", low=1, high=10**9, doc="Decisions.")
     seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Of everything random.")
     learning_rate: float = quantity(3e-4, "", low=1e-7, high=1.0, doc="Of all networks.")
     batch: int = quantity(256, "", low=1, high=10**6, doc="Transitions in an update.")
@@ -148,6 +148,8 @@ def train(
     described = json.dumps(dc.asdict(config), sort_keys=True)
     saved = _load(output / CHECKPOINT, described)
     dump_yaml(config, output / CONFIGURATION)
+    # An error in the environment's process would come out as a broken pipe.
+    check_task(config.task)
     torch.set_num_threads(1)
     processes = SubprocVecEnv([functools.partial(SlicingEnv, config.task)], "forkserver")
     environments = OverlapVecEnv(processes)
