@@ -94,13 +94,20 @@ def test_a_network_of_another_observation_is_refused(tmp_path):
     with pytest.raises(ConfigurationError, match="observes 53 numbers.* 26") as caught:
         MakeScenarioDiagram(scenario_of(tmp_path, network))
     assert caught.value.field == "scenario.policy.network"
-    assert "task.yaml" in caught.value.fix
+    assert "training.yaml" in caught.value.fix
 
 
 def test_a_network_of_another_pace_is_refused(tmp_path):
     slow = AgentConfig(history=3, period=0.1)
     network = network_of(tmp_path / "policy.onnx", config=slow)
     with pytest.raises(ConfigurationError, match="has period 0.1, the scenario's agent 0.05"):
+        MakeScenarioDiagram(scenario_of(tmp_path, network))
+
+
+def test_a_network_whose_actions_meant_something_else_is_refused(tmp_path):
+    theirs = AgentConfig(history=3, mapping="upper")
+    network = network_of(tmp_path / "policy.onnx", config=theirs)
+    with pytest.raises(ConfigurationError, match="has mapping upper, the scenario's agent whole"):
         MakeScenarioDiagram(scenario_of(tmp_path, network))
 
 

@@ -1,5 +1,6 @@
 """An exported network that decides: ONNX, run by ONNX Runtime, without what trained it."""
 
+import dataclasses as dc
 import json
 from pathlib import Path
 
@@ -15,15 +16,15 @@ LAYOUT = "sliceit_layout"
 """Key of the file's metadata under which the layout of observation and action stands."""
 
 
+# What does not change the meaning of an observation or an action.
+FREE = ("network", "descent", "duration", "history", "lift_speed", "goal", "goal_decisions")
+
+
 def layout_of(config: AgentConfig) -> str:
-    """What an agent's network takes and gives, as the text that stands in its file."""
-    layout = {
-        "observation": observation_names(config.history),
-        "action": list(ACTIONS),
-        "period": config.period,
-        "reading_period": config.reading_period,
-    }
-    return json.dumps(layout)
+    """What an agent's network takes and gives, and what its actions do, as text for its file."""
+    meaning = {k: v for k, v in dc.asdict(config).items() if k not in FREE}
+    layout = {"observation": observation_names(config.history), "action": list(ACTIONS)}
+    return json.dumps(layout | meaning)
 
 
 def load_network(config: AgentConfig) -> Decide:
@@ -66,7 +67,7 @@ def load_network(config: AgentConfig) -> Decide:
         raise ConfigurationError(
             f"{file} {_difference(found, layout_of(config))}",
             field=field,
-            fix="Give the agent the values of the training's task.yaml.",
+            fix="Give the agent the values of the training's training.yaml.",
         )
     name = session.get_inputs()[0].name
 

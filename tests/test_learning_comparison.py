@@ -1,0 +1,147 @@
+"""What counts in the comparison of policies, and how sure it is."""
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("gymnasium")
+
+from sliceit_drake.cli.main import main
+from sliceit_drake.diagrams.agent_gains import AgentGains
+from sliceit_drake.diagrams.scenario import Scenario
+from sliceit_drake.learning.comparison import claim, compare, comparison_page, plot_boxes
+from sliceit_drake.learning.evaluation import Limits, cut_slice
+from sliceit_drake.learning.metrics import bootstrap_ratio, slice_metrics
+from sliceit_drake.systems.agent import AgentConfig
+from sliceit_drake.systems.analytic_cutter import AnalyticFood
+
+
+def forces(*norms):
+    out = np.zeros((len(norms), 3))
+    out[:, 2] = norms
+    return out
+
+
+def test_the_median_is_over_contact_and_the_resultant_of_food_and_board():
+    food, board = forces(0.0, 0.2, 4.0, 6.0, 0.0), forces(0.0, 0.0, 0.0, -2.0, 30.0)
+    time, cut = np.arange(5) * 0.002, np.array([0.0, 0.0, 0.5, 1.0, 1.0])
+    found = slice_metrics(time, food, board, cut, "goal")
+    # 0.2 N is no contact; 4, |6 - 2| and 30 are.
+    assert (found.median_force, found.peak_force, found.board_peak) == (4.0, 30.0, 30.0)
+    assert found.duration == pytest.approx(0.008) and found.completed
+
+
+@pytest.mark.parametrize(("cut", "end"), [(0.99, "goal"), (1.0, "time"), (1.0, "force")])
+def test_a_slice_is_completed_only_if_it_is_cut_and_brought_to_its_end(cut, end):
+    one = forces(1.0)
+    assert not slice_metrics(np.zeros(1), one, one, np.array([cut]), end).completed
+
+
+def test_a_slice_without_contact_has_no_force():
+    none = np.zeros((3, 3))
+    found = slice_metrics(np.arange(3.0), none, none, np.zeros(3), "time")
+    assert (found.median_force, found.peak_force, found.board_peak) == (0.0, 0.0, 0.0)
+
+
+def test_the_interval_of_a_ratio_holds_the_truth_as_often_as_it_says():
+    # Policies differ by 10 %, slices by 20 %, together: as in a study of five seeds.
+    rng, hits, runs = np.random.default_rng(0), 0, 150
+    for _ in range(runs):
+        shared = rng.normal(0.0, 0.2, 15)
+
+        def drawn(mean, shared=shared):
+            policies = rng.normal(0.0, 0.1, (5, 1))
+            return mean * np.exp(policies + shared + rng.normal(0.0, 0.05, (5, 15)))
+
+        found = bootstrap_ratio(drawn(7.0), drawn(10.0), rng, draws=400)
+        hits += found.low <= 0.7 <= found.high
+    # A bootstrap of five is too narrow by a factor of sqrt(4/5), so 92 % at best.
+    assert hits / runs > 0.85
+
+
+def test_slices_under_one_policy_are_no_replicates_of_the_training():
+    rng = np.random.default_rng(1)
+    ours = np.repeat([[5.0], [9.0]], 100, axis=1) + rng.normal(0.0, 0.1, (2, 100))
+    baseline = 10.0 + rng.normal(0.0, 0.1, (2, 100))
+    found = bootstrap_ratio(ours, baseline, rng)
+    assert found.value == pytest.approx(0.7, abs=0.01)
+    assert found.low < 0.55 and found.high > 0.85
+
+
+def rows(ours=6.0, baseline=10.0, world="stand_in", foods=("cucumber", "potato")):
+    found = []
+    for simulator, level in (("cutting", ours), ("spring", baseline)):
+        for seed in range(3):
+            for food in foods:
+                for k in range(4):
+                    found.append(
+                        {
+                            "policy": f"{simulator}_{seed}",
+                            "simulator": simulator,
+                            "world": world,
+                            "food": food,
+                            "slice": k,
+                            "board_stiffness": 3e4,
+                            "median_force": level + 0.1 * k + 0.05 * seed,
+                            "peak_force": 2.0 * level,
+                            "board_peak": level,
+                            "duration": 3.0,
+                            "completed": True,
+                        }
+                    )
+    return found
+
+
+def test_the_claim_holds_where_the_interval_ends_below_one(tmp_path):
+    lower = compare(rows())
+    assert [each.food for each in lower] == ["cucumber", "potato"]
+    assert lower[0].ratios["median_force"].high < 1.0
+    assert "less contact force on cucumber, potato; ours completed 100 %" in claim(lower)[0]
+    same = compare(rows(ours=10.0))
+    assert "on no food; not shown on cucumber, potato" in claim(same)[0]
+    page = comparison_page(lower)
+    assert page.count("\n") == 3 and "12 of 12, 12 of 12" in page
+    plot_boxes(lower, tmp_path / "boxes.png")
+    assert (tmp_path / "boxes.png").stat().st_size > 5000
+
+
+def test_policies_that_did_not_cut_the_same_slices_are_not_compared():
+    with pytest.raises(ValueError, match=r"spring_2 did not cut slices \[3\] of potato"):
+        compare(rows()[:-1])
+
+
+def test_the_study_writes_its_page_and_says_what_it_lacks(tmp_path, capsys):
+    file = tmp_path / "evaluation.jsonl"
+    file.write_text("\n".join(map(json.dumps, rows())))
+    assert main(["study", "slicing", str(file), "--output", str(tmp_path)]) == 0
+    assert "**0.6" in (tmp_path / "slicing_results.md").read_text()
+    file.write_text("\n".join(map(json.dumps, rows()[: len(rows()) // 2])))
+    assert main(["study", "slicing", str(file), "--output", str(tmp_path)]) == 2
+    assert "policies of both simulators" in capsys.readouterr().err
+
+
+def scenario():
+    return Scenario(
+        controller=AgentGains().controller(), food=AnalyticFood(diameter=0.027, toughness=200.0)
+    )
+
+
+def press(observation):
+    return np.array([0.0, 0.0, 1.0, 0.0, 0.0, 1.0])
+
+
+def test_a_pressing_policy_completes_a_slice_and_its_forces_are_those_of_food_and_board():
+    trace = cut_slice(scenario(), AgentConfig(), press)
+    assert trace.metrics.end == "goal" and trace.metrics.completed
+    # R w of the widest chord, by the analytic cutter's law.
+    assert np.linalg.norm(trace.food, axis=1).max() == pytest.approx(200.0 * 0.027, rel=0.05)
+    assert trace.metrics.board_peak > 5.0
+    assert len(trace.height) == len(trace.actions) and trace.height[-1] < 1e-3
+
+
+def test_a_slice_ends_by_time_and_by_force_where_a_policy_goes_on():
+    short = cut_slice(scenario(), AgentConfig(), press, limits=Limits(duration=0.3))
+    assert short.metrics.end == "time" and not short.metrics.completed
+    weak = cut_slice(scenario(), AgentConfig(), press, limits=Limits(force=3.0))
+    assert weak.metrics.end == "force"
