@@ -33,6 +33,7 @@ __all__ = [
     "TrainingConfig",
     "load_policy_folder",
     "load_training",
+    "make_model",
     "train",
 ]
 
@@ -154,7 +155,7 @@ def train(
     processes = SubprocVecEnv([functools.partial(SlicingEnv, config.task)], "forkserver")
     environments = OverlapVecEnv(processes)
     try:
-        model = _make_model(config, environments)
+        model = make_model(config, environments)
         model.set_logger(configure(str(output), ["tensorboard"]))
         environments.meanwhile = model.update_once
         callback = _Watch(config, output, described, progress, stop_after)
@@ -187,7 +188,8 @@ def train(
         environments.close()
 
 
-def _make_model(config: TrainingConfig, environments: OverlapVecEnv) -> PrioritizedSAC:
+def make_model(config: TrainingConfig, environments: OverlapVecEnv) -> PrioritizedSAC:
+    """The algorithm of a training, before its first step."""
     agent = config.task.agent
     model = PrioritizedSAC(
         "MlpPolicy",
