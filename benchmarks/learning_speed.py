@@ -1,4 +1,4 @@
-"""Cost of training and of a decision: python benchmarks/learning_speed.py --output docs/learning.md.
+"""Cost of a training and of a decision: python benchmarks/learning_speed.py [--output FILE].
 
 All in one process or one after the other on one machine: compare rows, not machines. The steps of
 the environment and the updates are timed alone first; then both overlap as in `sliceit train`, for
@@ -115,7 +115,7 @@ def main() -> None:
         ).stdout
     median, late = map(float, printed.split()[-2:])
     lines = [
-        "| simulator | a decision's simulation alone | an update alone | training | 80,000 decisions |",
+        "| simulator | simulating a decision | an update | training | 80,000 decisions |",
         "|---|---|---|---|---|",
     ]
     for simulator, (step, rate) in rows.items():
