@@ -359,7 +359,7 @@ def test_what_the_emulator_cannot_do_is_said(capsys):
         child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
         assert child.stdout is not None and b"Emulated UR5e" in child.stdout.readline()
         child.send_signal(number)
-        _, said = child.communicate(timeout=10.0)
+        _, said = child.communicate(timeout=60.0)
         assert child.returncode == code and b"Traceback" not in said
     assert main(["emulate", "--arm-alone", "--pace", "0"]) == 2
     assert "pace" in capsys.readouterr().err

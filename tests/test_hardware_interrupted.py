@@ -82,9 +82,10 @@ def test_a_program_that_ends_on_the_way_to_the_start_stops_the_arm(number, emula
             emulator, lambda status: status["runtime_state"] == "STOPPED" and is_still(status)
         )
         process.wait(30.0)
-    # 60 mm take 3 s at that speed.
-    assert status["time"] - moving["time"] < 1.0
-    stopped = [text for _, text in status["log"] if text.startswith(("program stopped", "RTDE"))]
+    entries = [e for e in status["log"] if e[1].startswith(("program stopped", "RTDE"))]
+    # 60 mm take 3 s at that speed. By the controller's log: a busy machine asks late.
+    assert entries[0][0] - moving["time"] < 1.0, status["log"]
+    stopped = [text for _, text in entries]
     assert ("RTDE watchdog" in " ".join(stopped)) == (number == signal.SIGKILL), stopped
 
 

@@ -247,7 +247,8 @@ def test_weights_are_ratios():
     ],
 )
 def test_a_schedule_lets_the_weights_of_force_and_jerk_rise(progress, raw):
-    weights = reward_weights(RewardConfig(schedule="gaussian"), progress)
+    config = RewardConfig(weights=[1.0] * 4, schedule="gaussian")
+    weights = reward_weights(config, progress)
     assert weights == pytest.approx(np.array(raw) / np.sum(raw), abs=1e-8)
 
 
