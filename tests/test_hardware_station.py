@@ -210,7 +210,7 @@ def test_a_pipe_moves_an_emulated_robot_but_no_other(robot, monkeypatch, capsys,
     assert "must be typed at a terminal" in capsys.readouterr().out
     assert robot.sent == []
     # What this protects is the question, not the pace: a busy machine shall not stop the run.
-    slow = dc.replace(PATIENT, state_age=0.2, command_age=0.2, joint_step=0.2)
+    slow = dc.replace(PATIENT, state_age=0.1, command_age=0.1, joint_step=0.1)
     run = command.checked_run(OPTIONS, hardware_run(robot, limits=slow), tmp_path)
     assert run.stopped is None
     assert len(robot.sent) > 20
