@@ -121,9 +121,10 @@ def test_an_observation_has_the_order_of_sliceit():
     ]
     assert names[9:15] == [f"last_{name}" for name in ACTIONS]
     assert names[15:17] == ["target_x", "target_z"]
-    assert names[17:20] == ["force_x_-2", "force_z_-2", "moment_y_-2"]
+    assert names[17:19] == ["near", "at_goal"]
+    assert names[19:22] == ["force_x_-2", "force_z_-2", "moment_y_-2"]
     assert names[-3:] == ["force_x_0", "force_z_0", "moment_y_0"]
-    assert AgentConfig(history=3).observation_size() == len(names) == 26
+    assert AgentConfig(history=3).observation_size() == len(names) == 28
 
 
 def test_the_error_is_that_to_the_final_pose_in_sliceits_scale():
@@ -184,7 +185,7 @@ def test_readings_are_a_reading_period_apart_the_newest_last(history):
         at_rest(), config, wrench=lambda t: [0.0, t, 0.0, 100.0 + t, 0.0, 1.0 + t]
     )
     simulator.AdvanceTo(0.2)
-    seen = out(simulator, agent, "observation")[17:].reshape(history, 3)
+    seen = out(simulator, agent, "observation")[19:].reshape(history, 3)
     times = 0.2 - 0.01 * np.arange(history)[::-1]
     expected = np.stack([100.0 + times, 1.0 + times, times], axis=1)
     assert seen == pytest.approx(expected / [50.0, 50.0, 10.0], abs=1e-10)
@@ -193,7 +194,7 @@ def test_readings_are_a_reading_period_apart_the_newest_last(history):
 
 def test_before_the_start_all_readings_are_zero():
     simulator, agent = agent_of(at_rest(), wrench=lambda _: np.ones(6))
-    seen = out(simulator, agent, "observation")[17:].reshape(12, 3)
+    seen = out(simulator, agent, "observation")[19:].reshape(12, 3)
     assert np.all(seen[:-1] == 0.0) and np.all(seen[-1] > 0.0)
 
 
@@ -296,6 +297,14 @@ def test_decisions_at_the_goal_count_only_in_a_row():
     for k, count in enumerate((1, 2, 0, 1, 2)):
         simulator.AdvanceTo(k * T + 0.01)
         assert out(simulator, agent, "at_goal") == [count]
+        assert observed(simulator, agent)["at_goal"] == 0.5 * count
+
+
+@pytest.mark.parametrize(("height", "near"), [(0.03, 1.0), (1e-3, 0.5), (-1e-4, -0.05)])
+def test_the_last_millimetres_are_seen_on_a_scale_of_their_own(height, near):
+    simulator, agent = agent_of(at_rest(0.0, 0.037 - height))
+    simulator.AdvanceTo(0.01)
+    assert observed(simulator, agent)["near"] == pytest.approx(near, abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -366,7 +375,7 @@ def test_decisions_through_the_port_and_within_give_the_same_bit_for_bit():
         within.AdvanceTo(k * T)
         port.AdvanceTo(k * T)
         assert np.array_equal(row(within, agent), row(port, other))
-    assert np.ptp(row(within, agent)[:17]) > 0.1
+    assert np.ptp(row(within, agent)[:19]) > 0.1
 
 
 def test_watch_is_entered_around_each_decision():

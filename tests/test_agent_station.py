@@ -65,7 +65,7 @@ def network_of(file, bias=(0.0,) * 6, weights=None, layout=None, config=None):
 
 def test_a_scenario_with_a_network_runs_as_its_network_decides(tmp_path):
     rng = np.random.default_rng(2)
-    weights = 0.3 * rng.normal(size=(6, 26))
+    weights = 0.3 * rng.normal(size=(6, 28))
     weights[5] = 0.0  # It always presses.
     bias = np.array([0.2, -0.4, 0.1, 0.3, 0.0, 9.0])
     network = network_of(tmp_path / "policy.onnx", bias, weights)
@@ -91,7 +91,7 @@ def test_a_scenario_with_a_network_runs_as_its_network_decides(tmp_path):
 
 def test_a_network_of_another_observation_is_refused(tmp_path):
     network = network_of(tmp_path / "policy.onnx", config=AgentConfig(history=12))
-    with pytest.raises(ConfigurationError, match="observes 53 numbers.* 26") as caught:
+    with pytest.raises(ConfigurationError, match="observes 55 numbers.* 28") as caught:
         MakeScenarioDiagram(scenario_of(tmp_path, network))
     assert caught.value.field == "scenario.policy.network"
     assert "training.yaml" in caught.value.fix
@@ -115,13 +115,13 @@ def test_a_network_whose_actions_meant_something_else_is_refused(tmp_path):
     ("layout", "problem"), [(None, "does not say what"), ("[1", "cannot be read")]
 )
 def test_a_network_without_a_layout_is_refused(tmp_path, layout, problem):
-    file = write_network(tmp_path / "policy.onnx", np.zeros((6, 26)), np.zeros(6), layout)
+    file = write_network(tmp_path / "policy.onnx", np.zeros((6, 28)), np.zeros(6), layout)
     with pytest.raises(ConfigurationError, match=problem) as caught:
         MakeScenarioDiagram(scenario_of(tmp_path, file))
     assert caught.value.field == "scenario.policy.network"
 
 
-@pytest.mark.parametrize("shape", [(6, 25), (5, 26)])
+@pytest.mark.parametrize("shape", [(6, 27), (5, 28)])
 def test_a_network_that_says_another_layout_than_it_has_is_refused(tmp_path, shape):
     network = network_of(tmp_path / "policy.onnx", np.zeros(shape[0]), np.zeros(shape))
     with pytest.raises(ConfigurationError, match="none that decides"):

@@ -65,7 +65,7 @@ def test_it_is_registered():
     env = gymnasium.make("sliceit_drake/Slicing-v0", task=task_of())
     assert isinstance(env.unwrapped, SlicingEnv)
     observation, info = env.reset(seed=0)
-    assert observation.shape == (26,) and info == {"food": "cucumber"}
+    assert observation.shape == (28,) and info == {"food": "cucumber"}
 
 
 @pytest.mark.parametrize("simulator", ["spring", "cutting"])
