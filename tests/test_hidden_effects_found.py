@@ -55,7 +55,7 @@ def drawn(rng: np.random.Generator) -> list[Case]:
 
     return [
         case("poor", "poor", "skin"),
-        *(case("single", "rich", str(e)) for e in rng.choice(SINGLE, 2, replace=False)),
+        case("single", "rich", str(rng.choice(SINGLE))),
         case("nothing", ("rich", "poor")[rng.integers(2)]),
         case("pairs", "rich", *PAIRS[rng.integers(len(PAIRS))]),
         case("unknown", "rich", UNKNOWN[rng.integers(len(UNKNOWN))]),
