@@ -32,14 +32,20 @@ class FakeRobot:
         self.move = None  # Where a planned motion goes, and how fast.
         self.stopped = threading.Event()
         self._running = True
+        self._lived, self._later = 0.0, []
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def _run(self):
         due = clock.perf_counter()
         while self._running:
-            due += 0.002 / self.pace
+            # What a busy machine made late is not made up for: a burst of cycles would be a fault.
+            due = max(due + 0.002 / self.pace, clock.perf_counter())
             clock.sleep(max(0.0, due - clock.perf_counter()))
+            self._lived += 0.002
+            for entry in [entry for entry in self._later if entry[0] <= self._lived]:
+                entry[1]()
+                self._later.remove(entry)
             if self.move is not None:
                 end, speed = self.move
                 way = [b - a for a, b in zip(self.target, end, strict=True)]
@@ -49,6 +55,16 @@ class FakeRobot:
                 self._state = self._law.step(self._state, self.target)
                 self.q, self.qd = self._state[0].tolist(), self._state[1].tolist()
                 self.time += 0.002
+
+    def later(self, seconds, call):
+        """Calls after so many of the controller's seconds, counted also while it is frozen."""
+        self._later.append((self._lived + seconds, call))
+
+    def wait(self, seconds):
+        """Waits for so much of it."""
+        over = threading.Event()
+        self.later(seconds, over.set)
+        assert over.wait(60.0), "the fake robot does not run"
 
     def timestamp(self):
         return self.time

@@ -6,7 +6,6 @@ import io
 import json
 import os
 import threading
-import time as clock
 
 import numpy as np
 import pytest
@@ -34,7 +33,7 @@ from sliceit_drake.resources import resource_path
 
 PACE = 0.15
 # A machine that other tests keep busy may be late: these runs are about what is done, not when.
-PATIENT = SafetyLimits(state_age=0.04, command_age=0.04, joint_step=0.04)
+PATIENT = SafetyLimits(state_age=0.1, command_age=0.1, joint_step=0.1)
 CONFIG = dict(payload=1.2, payload_cog=[0.0, 0.0, 0.06], board_height=0.05, limits=PATIENT)
 
 
@@ -120,8 +119,7 @@ def test_a_fault_ends_the_run_with_its_reason_and_keeps_the_record(robot, tmp_pa
     def fail():
         robot.bits = 1 << 2 | 1 << 10
 
-    timer = threading.Timer(0.1 / PACE, fail)
-    timer.start()
+    robot.later(0.1, fail)
     run = hardware.execute(3.0)
     assert run.stopped.startswith("safety_status") and "protective stop" in run.stopped
     assert robot.stopped.is_set()
@@ -209,9 +207,7 @@ def test_a_pipe_moves_an_emulated_robot_but_no_other(robot, monkeypatch, capsys,
     assert command.checked_run(real, hardware_run(robot), tmp_path) is None
     assert "must be typed at a terminal" in capsys.readouterr().out
     assert robot.sent == []
-    # What this protects is the question, not the pace: a busy machine shall not stop the run.
-    slow = dc.replace(PATIENT, state_age=0.1, command_age=0.1, joint_step=0.1)
-    run = command.checked_run(OPTIONS, hardware_run(robot, limits=slow), tmp_path)
+    run = command.checked_run(OPTIONS, hardware_run(robot), tmp_path)
     assert run.stopped is None
     assert len(robot.sent) > 20
 
@@ -247,7 +243,7 @@ def test_what_changes_while_the_plan_is_read_is_found_before_it_moves(
             if value == "moved":
                 robot.frozen = True
                 value = [*robot.q[:5], robot.q[5] + 0.05]
-                clock.sleep(0.1)
+                robot.wait(0.01)
             setattr(robot, name, value)
         if robot.frozen:
             robot.target = robot.q
@@ -287,8 +283,12 @@ def test_the_plan_names_each_setting_that_is_not_the_default(robot):
 def test_a_second_ctrl_c_does_not_keep_the_robot_from_stopping(robot, monkeypatch):
     hardware = hardware_run(robot)
 
-    def impatient(_):
-        raise KeyboardInterrupt
+    sleep = clock.sleep
+
+    def impatient(seconds):
+        if threading.current_thread() is threading.main_thread():
+            raise KeyboardInterrupt
+        sleep(seconds)
 
     def interrupt(now, wall):
         monkeypatch.setattr("sliceit_drake.hardware.rtde_link.clock.sleep", impatient)
@@ -307,8 +307,7 @@ def test_a_robot_that_does_not_confirm_its_stop_is_named(robot, monkeypatch, cap
     robot.stop = stop
     monkeypatch.setattr("sys.stdin", io.StringIO("slice\n"))
     robot.wrench = [0.0, 0.0, 2.9, 0.0, 0.0, 0.0]
-    timer = threading.Timer(1.0, lambda: setattr(robot, "bits", 1 << 2))
-    timer.start()
+    robot.later(0.3, lambda: setattr(robot, "bits", 1 << 2))
     options = argparse.Namespace(**vars(OPTIONS) | {"duration": 2.0})
     assert command.checked_run(options, hardware_run(robot), tmp_path).stopped
     assert "DID NOT CONFIRM THAT ITS PROGRAM IS STOPPED (no answer)" in capsys.readouterr().out

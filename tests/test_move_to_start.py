@@ -1,7 +1,9 @@
 """The straight motion to the start: slow enough, watched, and stopped by all that stops a run."""
 
+import contextlib
 import dataclasses as dc
-import threading
+import os
+import signal
 import time as clock
 
 import numpy as np
@@ -15,6 +17,7 @@ from sliceit_drake.diagrams.move_to_start import MoveToStart
 from sliceit_drake.diagrams.station import MakeSlicingStation
 from sliceit_drake.hardware.client import RobotUnavailableError
 from sliceit_drake.hardware.configuration import HardwareConfig
+from sliceit_drake.hardware.interruption import catch_signals
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +41,7 @@ def move_of(robot, **changes):
 def place(robot, q):
     """Puts the arm somewhere, and holds it there."""
     robot.frozen = True
-    clock.sleep(0.1)
+    robot.wait(0.01)
     robot.q = q.tolist()
 
 
@@ -109,12 +112,11 @@ def test_a_fault_on_the_way_stops_it(fault, said, robot, start):
         for name, value in fault.items():
             setattr(robot, name, value)
 
-    timer = threading.Timer(0.2 / PACE, fail)
-    timer.start()
+    robot.later(0.2, fail)
     assert said in move.execute()
     assert robot.stopped.is_set()
     robot.frozen = False
-    clock.sleep(0.2 / PACE)
+    robot.wait(0.2)
     assert np.abs(robot.q - start).max() > 0.05, "it went on"
 
 
@@ -150,3 +152,29 @@ def test_a_robot_that_does_not_say_it_has_stopped_is_named(robot):
     robot.stop = stop
     with pytest.raises(RobotUnavailableError, match="it still plays.*emergency stop"):
         move_of(robot).execute()
+
+
+def test_an_interrupt_that_is_dropped_where_it_is_raised_still_stops_the_motion(robot, start):
+    move, read = move_of(robot), robot.read
+
+    def read_interrupted():
+        if "move" in robot.log:
+            # As Python does in a destructor or a callback.
+            with contextlib.suppress(KeyboardInterrupt):
+                os.kill(os.getpid(), signal.SIGINT)
+                clock.sleep(0.01)
+            robot.read = read
+        return read()
+
+    robot.read = read_interrupted
+    with catch_signals(), pytest.raises(KeyboardInterrupt):
+        move.execute()
+    assert robot.log[-1] == "stop"
+    assert np.abs(robot.q - start).max() > 0.05
+
+
+def test_signals_are_handled_as_before_once_nothing_moves():
+    before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+    with contextlib.suppress(KeyboardInterrupt), catch_signals():
+        os.kill(os.getpid(), signal.SIGTERM)
+    assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)] == before

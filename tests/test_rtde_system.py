@@ -15,6 +15,9 @@ from sliceit_drake.hardware.rtde_system import RtdeSystem
 from sliceit_drake.hardware.safety import SafetyLayer
 
 PACE = 0.2
+# Half a second on the wall: a busy machine shall not break a limit that a test is not about.
+AGE = 0.1
+LIMITS = SafetyLimits(state_age=AGE, command_age=AGE, joint_step=0.1)
 
 
 @pytest.fixture
@@ -26,7 +29,7 @@ def robot():
 
 def make_link(robot):
     kinematics = KnifeKinematics(X_WB, X_TK, LENGTH)
-    safety = SafetyLayer(SafetyLimits(), kinematics, BOARD, START)
+    safety = SafetyLayer(LIMITS, kinematics, BOARD, START)
     return RobotLink(robot, safety, pace=PACE)
 
 
@@ -35,7 +38,7 @@ def stream(link, seconds, speed=0.1):
     status = link.latest()
     q, v, begin = list(status.state.q), 0.0, status.state.time
     while status.stop is None and status.state.time < begin + seconds:
-        newer = link.wait(status, 1.0)
+        newer = link.wait(status, 2.0 * AGE / PACE)
         if newer is None:
             break
         v = min(speed, v + 5.0 * newer.period)
@@ -45,7 +48,7 @@ def stream(link, seconds, speed=0.1):
     return link.latest()
 
 
-def wait_for_stop(link, seconds=1.0):
+def wait_for_stop(link, seconds=10.0):
     status, deadline = link.latest(), clock.perf_counter() + seconds
     while status.stop is None and clock.perf_counter() < deadline:
         status = link.wait(status, 0.05) or status
@@ -55,7 +58,7 @@ def wait_for_stop(link, seconds=1.0):
 def test_the_watchdog_is_set_before_the_first_target_and_the_arm_follows(robot):
     link = make_link(robot)
     link.start()
-    clock.sleep(0.05)
+    robot.wait(0.01)
     assert robot.sent == [] and robot.log == []
     assert link.arm() is None
     status = stream(link, 0.3)
@@ -64,7 +67,7 @@ def test_the_watchdog_is_set_before_the_first_target_and_the_arm_follows(robot):
     assert robot.sent[-1][1][0] - START[0] == pytest.approx(0.1 * 0.3, abs=0.004)
     stop = link.finish("done")
     assert (stop.limit, stop.detail) == ("end", "done")
-    assert robot.stopped.wait(1.0)
+    assert robot.stopped.wait(10.0)
     # At the end it brakes: the last targets slow down, 10 rad/s2 at most.
     times = np.array([t for t, _ in robot.sent])
     moves = np.array([q[0] for _, q in robot.sent])
@@ -84,7 +87,7 @@ def test_the_watchdog_is_set_before_the_first_target_and_the_arm_follows(robot):
         ({"time": 105.0}, "state_age", False),
         ({"connected": False}, "link", False),
         ({"accepts": False}, "link", False),
-        ({"call_time": 0.3}, "link", False),
+        ({"call_time": 1.0}, "link", False),
         ({"wrench": [0.0, 0.0, 60.0, 0.0, 0.0, 0.0]}, "force", True),
         ({"wrench": [np.nan] * 6}, "measurement", True),
         ({"payload": (2.0, 0.0, 0.0, 0.06)}, "payload", True),
@@ -104,14 +107,14 @@ def test_each_fault_stops_the_robot_for_good(robot, fault, limit, goes_on):
     stop = wait_for_stop(link)
     assert stop is not None and stop.limit == limit
     if not goes_on:
-        assert robot.stopped.wait(1.0), "the program on the robot was not stopped"
+        assert robot.stopped.wait(10.0), "the program on the robot was not stopped"
     sent = len(robot.sent)
     # Everything is well again: it must not resume.
     for name, value in healthy.items():
         setattr(robot, name, value if name != "time" else robot.time)
     for _ in range(20):
         link.put(robot.q, robot.time)
-        clock.sleep(0.02)
+        robot.wait(0.004)
     assert link.latest().stop == stop or not link.latest().stop.sends
     if not goes_on:
         assert len(robot.sent) <= sent + 1
@@ -126,9 +129,8 @@ def test_a_diagram_that_comes_late_stops_the_robot(robot):
     link.start()
     link.arm()
     stream(link, 0.05)
-    clock.sleep(0.02 / PACE)
     stop = wait_for_stop(link)
-    assert stop.limit == "command_age" and stop.value > 0.01
+    assert stop.limit == "command_age" and stop.value > AGE
     link.finish("test over")
 
 
@@ -136,7 +138,7 @@ def test_nothing_is_late_before_the_first_command(robot):
     link = make_link(robot)
     link.start()
     link.arm()
-    clock.sleep(0.1 / PACE)
+    robot.wait(2.0 * AGE)
     assert link.latest().stop is None and robot.sent == []
     assert robot.log.count("kick") > 10, "the watchdog would have stopped the program"
     link.finish("test over")
@@ -153,7 +155,7 @@ def test_an_error_in_the_client_is_a_stop_with_its_text(robot):
     robot.servo = broken
     stream(link, 0.02)
     assert "End of file" in wait_for_stop(link).detail
-    assert robot.stopped.wait(1.0)
+    assert robot.stopped.wait(10.0)
     link.finish("test over")
 
 
@@ -184,7 +186,7 @@ def test_the_system_shows_the_wrench_at_the_flange_in_its_axes(robot):
     context = system.CreateDefaultContext()
     robot.wrench = [1.0, -2.0, 12.0, 0.1, 0.2, 0.3]
     status = link.start()
-    clock.sleep(0.02)
+    robot.wait(0.004)
     assert system.receive(context) is None
     shown = system.GetOutputPort("sensor_wrench").Eval(context)
     R_BK = chain_pose(START).rotation()  # The knife has the flange's axes.

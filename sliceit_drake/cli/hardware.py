@@ -2,10 +2,8 @@
 
 import argparse
 import logging
-import signal
 import sys
 import termios
-import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -367,22 +365,14 @@ def connected(options: argparse.Namespace, config: "HardwareConfig") -> "Iterato
 
     A terminal that is closed, and a polite kill, end it as Ctrl-C does.
     """
-    caught = [signal.SIGTERM, signal.SIGHUP]
-    is_main = threading.current_thread() is threading.main_thread()
-    before = {s: signal.signal(s, _interrupt) for s in caught} if is_main else {}
-    try:
+    from sliceit_drake.hardware.interruption import catch_signals
+
+    with catch_signals():
         client = connect(options, config)
         try:
             yield client
         finally:
             client.close()
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _interrupt(*_: object) -> None:
-    raise KeyboardInterrupt
 
 
 def connect(options: argparse.Namespace, config: "HardwareConfig") -> "RobotClient":

@@ -34,6 +34,7 @@ from sliceit_drake.hardware.checks import (
 )
 from sliceit_drake.hardware.client import RobotClient
 from sliceit_drake.hardware.configuration import HardwareConfig
+from sliceit_drake.hardware.interruption import raise_if_interrupted
 from sliceit_drake.hardware.robot_state import RobotState
 from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.systems.motion_sources import placed_motion
@@ -185,6 +186,7 @@ class HardwareRun:
         zero, begin = status.state.time, clock.perf_counter()
         shown = 0.0
         while True:
+            raise_if_interrupted()
             newer = link.wait(status, NO_DATA / self.pace)
             if newer is None:
                 run.stopped = "no data from the robot"

@@ -9,6 +9,7 @@ from sliceit_drake.diagrams.hardware_run import HardwareRun
 from sliceit_drake.diagrams.hardware_station import make_knife_kinematics
 from sliceit_drake.hardware.checks import Check
 from sliceit_drake.hardware.client import RobotUnavailableError
+from sliceit_drake.hardware.interruption import raise_if_interrupted
 from sliceit_drake.hardware.robot_state import RobotState
 from sliceit_drake.hardware.safety import robot_fault
 
@@ -143,6 +144,7 @@ class MoveToStart:
         deadline = clock.perf_counter() + (1.5 * duration + SETTLING) / pace
         state, arrival = client.read(), clock.perf_counter()
         while True:
+            raise_if_interrupted()
             client.kick()
             newer, now = client.read(), clock.perf_counter()
             if newer.time != state.time:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sliceit_drake.hardware.configuration import TouchConfig
+from sliceit_drake.hardware.interruption import raise_if_interrupted
 from sliceit_drake.hardware.knife_kinematics import KnifeKinematics
 from sliceit_drake.hardware.robot_state import RobotState
 from sliceit_drake.hardware.rtde_link import LinkStatus, RobotLink
@@ -138,6 +139,7 @@ class GuardedTouch:
     def _next(self, status: LinkStatus) -> LinkStatus:
         """The next state of the robot."""
         while True:
+            raise_if_interrupted()
             newer = self._link.wait(status, NO_DATA / self._pace)
             if newer is None:
                 raise TouchError("no data from the robot")

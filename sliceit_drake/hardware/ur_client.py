@@ -10,6 +10,7 @@ import contextlib
 import re
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 from sliceit_drake.hardware.client import RobotFacts, RobotUnavailableError
@@ -149,18 +150,47 @@ class UrClient:
         if self._control is None:
             return
         self._is_stopped = True
-        try:
-            if self._is_moving:
-                self._control.stopJ(DECELERATION)
-            else:
-                self._control.servoStop()
-        finally:
+        before, errors = self._receive.getTimestamp(), []
+
+        def end_program() -> None:
+            try:
+                if self._is_moving:
+                    self._control.stopJ(DECELERATION)
+                else:
+                    self._control.servoStop()
+            except RuntimeError as error:
+                errors.append(error)
             self._control.stopScript()
+
+        if self._ends(end_program, before) and not errors:
+            return
+        # The dashboard has a connection of its own, and needs no program that listens.
+        if not self._ends(self._dashboard.stop, before):
+            reason = f" ({errors[0]})" if errors else ""
+            raise RuntimeError(f"the robot's program still plays, or no data come{reason}")
+
+    def _ends(self, ask: Callable[[], object], before: float) -> bool:
+        """Whether the program ends within the time for that, by data newer than `before`.
+
+        Args:
+            ask: What asks it to; may block for ever.
+            before: Controller time, s.
+        """
+
+        def quietly() -> None:
+            with contextlib.suppress(RuntimeError):
+                ask()
+
+        asking = threading.Thread(target=quietly, daemon=True)
+        asking.start()
         deadline = time.monotonic() + self._stop_time
-        while self._receive.getRuntimeState() == PLAYING:
+        receive = self._receive
+        while receive.getRuntimeState() == PLAYING or receive.getTimestamp() == before:
             if time.monotonic() > deadline:
-                raise RuntimeError("the robot's program still plays, or no data come")
+                return False
             time.sleep(0.01)
+        asking.join(max(0.0, deadline - time.monotonic()))
+        return True
 
     def facts(self) -> RobotFacts:
         dashboard, receive = self._dashboard, self._receive
@@ -199,16 +229,11 @@ class UrClient:
 
     def close(self) -> None:
         if not self._is_stopped:
-            # Left alone it would go on with what it does. A dead link may block for minutes.
-            stopping = threading.Thread(target=self._stop_quietly, daemon=True)
-            stopping.start()
-            stopping.join(1.5 * self._stop_time)
+            # Left alone it would go on with what it does.
+            with contextlib.suppress(RuntimeError):
+                self.stop()
         for part in (self._control, self._receive, self._dashboard):
             if part is not None:
                 # A link that is gone already cannot be closed better.
                 with contextlib.suppress(RuntimeError):
                     part.disconnect()
-
-    def _stop_quietly(self) -> None:
-        with contextlib.suppress(RuntimeError):
-            self.stop()

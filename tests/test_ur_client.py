@@ -1,0 +1,56 @@
+"""The client's last means to stop a robot whose control link does not answer."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+from emulator_bench import free_address
+from test_emulator_clients import no_test_hangs
+
+from sliceit_drake.emulator.process import EmulatorProcess
+from sliceit_drake.hardware.ur_client import UrClient
+
+__all__ = ["no_test_hangs"]
+
+
+class DeafControl:
+    """Takes a motion, but never comes back from what shall end it."""
+
+    def __init__(self, control, fails):
+        self._control, self._fails = control, fails
+        self.released = threading.Event()
+
+    def stopJ(self, _):  # noqa: N802
+        if self._fails:
+            raise RuntimeError("the control link is gone")
+        self.released.wait(60.0)
+
+    def stopScript(self):  # noqa: N802
+        pass
+
+    def disconnect(self):
+        self.released.set()
+        self._control.disconnect()
+
+    def __getattr__(self, name):
+        return getattr(self._control, name)
+
+
+@pytest.mark.parametrize("fails", [False, True], ids=["waits for ever", "fails"])
+def test_the_dashboard_stops_a_robot_whose_control_link_does_not(fails):
+    with EmulatorProcess(address=free_address(), pace=1.0) as emulator:
+        client = UrClient(emulator.address, 0.03, 2000.0)
+        try:
+            client._control = DeafControl(client._control, fails)
+            begin = client.read().q
+            client.start_move((np.array(begin) + [0.5, 0, 0, 0, 0, 0]).tolist(), 0.1, 0.5)
+            end = time.monotonic() + 20.0
+            while abs(client.read().q[0] - begin[0]) < 0.01:
+                assert time.monotonic() < end, "it does not move"
+            client.stop()
+            status = emulator.pendant.status()
+            assert status["runtime_state"] == "STOPPED"
+            assert any("stopped by the dashboard" in text for _, text in status["log"])
+        finally:
+            client.close()
