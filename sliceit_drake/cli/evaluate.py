@@ -146,19 +146,21 @@ def _cases(options: argparse.Namespace) -> Iterator[Case]:
 def _done(file: Path) -> set[Case]:
     if not file.exists():
         return set()
+    return {case for case, _ in _rows(file)}
+
+
+def _rows(file: Path) -> Iterator[tuple[Case, dict]]:
     names = [field.name for field in dc.fields(Case)]
-    rows = [json.loads(line) for line in file.read_text().splitlines()]
-    return {Case(**{name: row[name] for name in names}) for row in rows}
+    for line in file.read_text().splitlines():
+        row = json.loads(line)
+        yield Case(**{name: row[name] for name in names}), row
 
 
 def _table(file: Path, cases: list[Case]) -> str:
     """Means over slices, a row for each policy, world, board and food."""
     asked = set(cases)
-    names = [field.name for field in dc.fields(Case)]
     groups: dict[tuple, list[dict]] = {}
-    for line in file.read_text().splitlines():
-        row = json.loads(line)
-        case = Case(**{name: row[name] for name in names})
+    for case, row in _rows(file):
         if case in asked:
             key = (case.policy, case.world, case.board_stiffness, case.food)
             groups.setdefault(key, []).append(row)

@@ -31,14 +31,14 @@ def add_agent(
     Raises:
         ConfigurationError: The controller does not fit the agent, or the start is not at `descent`.
     """
-    scenario, controller = station.scenario, station.scenario.controller
+    controller = station.scenario.controller
     if controller.mode != "parallel":
         raise ConfigurationError(
             f"is {controller.mode!r}; the agent decides stiffness and gains of parallel control",
             field="scenario.controller.mode",
             fix="Write parallel, with the gains of docs/control.md.",
         )
-    descent = float(station.start_pose.translation()[2]) - scenario.board.height
+    descent = station.descent()
     if abs(descent - config.descent) > DESCENT_TOLERANCE:
         raise ConfigurationError(
             f"is {config.descent:.4f} m; the start is {descent:.4f} m over the board",

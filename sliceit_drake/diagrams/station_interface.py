@@ -52,6 +52,10 @@ class Station(Diagram):
         """Names for the port `sensor_state`: `reading` [6] for the moment and force."""
         raise NotImplementedError
 
+    def descent(self) -> float:
+        """Height of the edge over the board at the start, metres."""
+        return float(self.start_pose.translation()[2]) - self.scenario.board.height
+
     def X_KS(self) -> RigidTransform:
         """Pose of the wrench sensor's frame in the knife's; rigid, so the same in any context."""
         context = self.plant.CreateDefaultContext()

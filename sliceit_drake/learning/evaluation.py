@@ -80,8 +80,7 @@ def cut_slice(
     """
     limits = limits or Limits()
     station = MakeSlicingStation(scenario, make_cutting=make_cutting)
-    descent = float(station.start_pose.translation()[2]) - scenario.board.height
-    agent, builder = dc.replace(agent, descent=descent), DiagramBuilder()
+    agent, builder = dc.replace(agent, descent=station.descent()), DiagramBuilder()
     actions: list[np.ndarray] = []
 
     def noted(observation: np.ndarray) -> np.ndarray:

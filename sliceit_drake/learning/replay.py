@@ -59,7 +59,6 @@ class PrioritizedReplayBuffer(ReplayBuffer):
         **options: Any,
     ) -> None:
         super().__init__(*arguments, **options)
-        self.alpha, self.beta = alpha, beta
         self._filled = _Filled()
         self._sampler = PrioritizedSampler(self.buffer_size, alpha=alpha, beta=beta, eps=floor)
         self._generator = torch.Generator().manual_seed(0)
@@ -69,9 +68,13 @@ class PrioritizedReplayBuffer(ReplayBuffer):
         """Seeds the draws."""
         self._generator.manual_seed(seed)
 
+    @property
+    def beta(self) -> float:
+        """Power of the importance weights."""
+        return self._sampler.beta
+
     def set_beta(self, beta: float) -> None:
         """Sets the power of the importance weights."""
-        self.beta = beta
         self._sampler.beta = beta
 
     def add(self, *arguments: Any, **options: Any) -> None:

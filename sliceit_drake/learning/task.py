@@ -3,11 +3,10 @@
 import copy
 import dataclasses as dc
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
-from sliceit_drake.configuration import ConfigurationError, choice, load_yaml, quantity
+from sliceit_drake.configuration import ConfigurationError, choice, quantity
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.food import Cylinder, Food, make_food_model
 from sliceit_drake.cutting.model import Numerics
@@ -27,7 +26,6 @@ __all__ = [
     "RandomizationConfig",
     "TaskConfig",
     "check_task",
-    "load_task",
     "make_agent_station",
     "station_scenario",
 ]
@@ -68,10 +66,6 @@ class RandomizationConfig:
             )
 
 
-def _sensor() -> WrenchSensorConfig:
-    return WrenchSensorConfig()
-
-
 @dc.dataclass
 class TaskConfig:
     """A training's task; the same but for `simulator` for an agent and its baseline."""
@@ -96,7 +90,7 @@ class TaskConfig:
         "more than 5 % of the energy for an instant where the fastest agents touch a food.",
     )
     board: Board = dc.field(default_factory=Board)
-    sensor: WrenchSensorConfig = dc.field(default_factory=_sensor)
+    sensor: WrenchSensorConfig = dc.field(default_factory=WrenchSensorConfig)
     start: Start = dc.field(default_factory=Start)
     agent: AgentConfig = dc.field(default_factory=AgentConfig)
     """`descent` follows from the food and `start`, and `network` and `duration` are not used."""
@@ -113,17 +107,6 @@ class TaskConfig:
             raise ConfigurationError(
                 "names no food", field=f"{where}.foods", fix='Write "[cucumber]".'
             )
-
-
-def load_task(file: str | Path, overrides: str | None = None) -> TaskConfig:
-    """Reads and validates a task.
-
-    Raises:
-        ConfigurationError: Naming file, field and fix.
-    """
-    task = load_yaml(TaskConfig, file, defaults=TaskConfig(), overrides_text=overrides)
-    assert isinstance(task, TaskConfig)
-    return task
 
 
 def station_scenario(task: TaskConfig, calibrated: CalibratedFood, food: str) -> Scenario:
@@ -168,17 +151,16 @@ def make_agent_station(task: TaskConfig, food: str, rng: np.random.Generator) ->
     scenario = station_scenario(task, calibrated, food)
     make_cutting = None
     if isinstance(scenario.food, Food):
-        solvers = _variants(task, calibrated, scenario, rng)
+        models = _variants(task, calibrated, scenario, rng)
         X_WF, period = scenario.X_WF(), scenario.exchange_period
 
         def make_cutting(knife):  # type: ignore[no-untyped-def]
             return CuttingSystem(
-                [CuttingSolver(model, period) for model in solvers], X_WF, knife.index()
+                [CuttingSolver(model, period) for model in models], X_WF, knife.index()
             )
 
     station = MakeSlicingStation(scenario, make_cutting=make_cutting)
-    descent = float(station.start_pose.translation()[2]) - scenario.board.height
-    return AgentStation(station, dc.replace(task.agent, descent=descent))
+    return AgentStation(station, dc.replace(task.agent, descent=station.descent()))
 
 
 def check_task(task: TaskConfig) -> None:

@@ -31,7 +31,8 @@ from pydrake.multibody.math import SpatialForce
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from sliceit_drake.configuration import ConfigurationError, choice, quantity
-from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan, Segment
+from sliceit_drake.cutting.motion import MotionPlan
+from sliceit_drake.systems.envelope import envelope, envelope_time
 
 __all__ = ["ACTIONS", "AgentConfig", "AgentSystem", "Decide", "observation_names"]
 
@@ -135,7 +136,7 @@ class AgentConfig:
                 raise ConfigurationError(
                     f"{low:g} to {high:g} is no range", field=f"{where}.{name}", fix="Swap them."
                 )
-        _, least = self._way()
+        least = envelope_time(self._corners(), ENVELOPE_SPEED)
         if self.duration < least:
             raise ConfigurationError(
                 f"{self.duration:.4g} s is less than the {least:.4g} s of the way through all "
@@ -161,22 +162,11 @@ class AgentConfig:
 
         The target may lie below the board; the knife stays on it.
         """
-        way, taken = self._way()
-        left = self.duration - taken
-        return MotionPlan([*way, Hold(left, label="agent")] if left > 1e-9 else way)
+        return envelope(self._corners(), ENVELOPE_SPEED, self.duration, "agent")
 
-    def _way(self) -> tuple[list[Segment], float]:
-        """Straight ways between the corners, and the time that they take, s."""
-        way: list[Segment] = []
-        x = z = taken = 0.0
+    def _corners(self) -> list[tuple[float, float]]:
         draw, down = self.draw, self.descent
-        for a, b in ((0.0, down), (draw, down), (-draw, down), (-draw, 0.0), (draw, 0.0)):
-            if (distance := math.hypot(a - x, b - z)) > 0.0:
-                direction = [(a - x) / distance, 0.0, (b - z) / distance]
-                way.append(ConstantSpeed(ENVELOPE_SPEED, direction, distance, label="agent"))
-                taken += distance / ENVELOPE_SPEED
-                x, z = a, b
-        return way, taken
+        return [(0.0, down), (draw, down), (-draw, down), (-draw, 0.0), (draw, 0.0)]
 
 
 def observation_names(history: int) -> list[str]:

@@ -19,7 +19,8 @@ from pydrake.multibody.math import SpatialForce
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from sliceit_drake.configuration import ConfigurationError, quantity
-from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan, Segment
+from sliceit_drake.cutting.motion import MotionPlan
+from sliceit_drake.systems.envelope import envelope, envelope_time
 
 __all__ = [
     "Policy",
@@ -117,7 +118,7 @@ class PolicyConfig:
     )
 
     def check(self, where: str) -> None:
-        least = sum(_duration(segment) for segment in self._way())
+        least = envelope_time(self._corners(), self.speed)
         if self.duration < least:
             raise ConfigurationError(
                 f"{self.duration:.4g} s is less than the way through all that the policy may do "
@@ -128,9 +129,7 @@ class PolicyConfig:
 
     def envelope(self) -> MotionPlan:
         """A motion of the run's duration through all corners of where the target may go."""
-        way = self._way()
-        left = self.duration - sum(_duration(segment) for segment in way)
-        return MotionPlan([*way, Hold(left, label="policy")] if left > 1e-9 else way)
+        return envelope(self._corners(), self.speed, self.duration, "policy")
 
     def describe(self) -> str:
         """Who decides and what it may do at most, for an operator to read."""
@@ -140,24 +139,9 @@ class PolicyConfig:
             f"{1e3 * self.speed:g} mm/s"
         )
 
-    def _way(self) -> list[Segment]:
+    def _corners(self) -> list[tuple[float, float]]:
         corners = [(0.0, self.press), (self.draw, self.press), (-self.draw, self.press)]
-        if self.draw > 0.0:
-            corners += [(-self.draw, 0.0), (self.draw, 0.0)]
-        way: list[Segment] = []
-        x = z = 0.0
-        for a, b in corners:
-            dx, dz = a - x, b - z
-            if (distance := math.hypot(dx, dz)) > 0.0:
-                x, z = a, b
-                direction = [dx / distance, 0.0, dz / distance]
-                way.append(ConstantSpeed(self.speed, direction, distance, label="policy"))
-        return way
-
-
-def _duration(segment: Segment) -> float:
-    assert isinstance(segment, ConstantSpeed) and segment.distance is not None
-    return segment.distance / segment.speed
+        return corners + [(-self.draw, 0.0), (self.draw, 0.0)] if self.draw > 0.0 else corners
 
 
 class PolicySystem(LeafSystem):
