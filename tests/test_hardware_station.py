@@ -6,6 +6,7 @@ import io
 import json
 import os
 import threading
+import time as clock
 
 import numpy as np
 import pytest

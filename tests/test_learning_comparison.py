@@ -1,5 +1,6 @@
 """What counts in the comparison of policies, and how sure it is."""
 
+import dataclasses as dc
 import json
 
 import numpy as np
@@ -11,7 +12,7 @@ from sliceit_drake.cli.main import main
 from sliceit_drake.diagrams.agent_gains import AgentGains
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.learning.comparison import claim, compare, comparison_page, plot_boxes
-from sliceit_drake.learning.evaluation import Limits, cut_slice
+from sliceit_drake.learning.evaluation import LIMITS, cut_slice
 from sliceit_drake.learning.metrics import bootstrap_ratio, slice_metrics
 from sliceit_drake.systems.agent import AgentConfig
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
@@ -32,7 +33,7 @@ def test_the_median_is_over_contact_and_the_resultant_of_food_and_board():
     assert found.duration == pytest.approx(0.008) and found.completed
 
 
-@pytest.mark.parametrize(("cut", "end"), [(0.99, "goal"), (1.0, "time"), (1.0, "force")])
+@pytest.mark.parametrize(("cut", "end"), [(0.99, "goal"), (1.0, "time"), (1.0, "collision")])
 def test_a_slice_is_completed_only_if_it_is_cut_and_brought_to_its_end(cut, end):
     one = forces(1.0)
     assert not slice_metrics(np.zeros(1), one, one, np.array([cut]), end).completed
@@ -141,7 +142,7 @@ def test_a_pressing_policy_completes_a_slice_and_its_forces_are_those_of_food_an
 
 
 def test_a_slice_ends_by_time_and_by_force_where_a_policy_goes_on():
-    short = cut_slice(scenario(), AgentConfig(), press, limits=Limits(duration=0.3))
+    short = cut_slice(scenario(), AgentConfig(), press, longest=0.3)
     assert short.metrics.end == "time" and not short.metrics.completed
-    weak = cut_slice(scenario(), AgentConfig(), press, limits=Limits(force=3.0))
-    assert weak.metrics.end == "force"
+    weak = cut_slice(scenario(), AgentConfig(), press, limits=dc.replace(LIMITS, force=3.0))
+    assert weak.metrics.end == "collision"

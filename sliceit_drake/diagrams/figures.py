@@ -86,7 +86,7 @@ def plot_force(
         over_depth.plot(1e3 * comparison.depth, comparison.measured, **style)
     end = max(float(depth.max()), 1.0)
     over_depth.set_xlim(-0.12 * end, 1.05 * end)
-    over_time.set_xlim(time[0], time[-1])
+    over_time.set_xlim(time[0], max(time[-1], time[0] + 1e-3))
     over_time.set_xlabel("time [s]")
     over_depth.set_xlabel("depth of the edge below the food's top [mm]")
     over_time.set_ylabel("force on the knife [N]")

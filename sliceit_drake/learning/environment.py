@@ -169,10 +169,7 @@ class SlicingEnv(gymnasium.Env):
         if station.GetOutputPort("at_goal").Eval(context)[0] > task.agent.goal_decisions:
             return "goal"
         # A run that the station's monitor ended shakes.
-        wrench = station.GetOutputPort("sensor_wrench").Eval(context).get_coeffs()
-        largest = np.abs(wrench).reshape(2, 3).max(axis=1)
-        if largest[0] > task.torque_limit or largest[1] > task.force_limit:
-            return "collision"
         if context.get_time() < self._decisions * task.agent.period - 1e-6:
             return "collision"
-        return "workspace" if (np.abs(error) > task.workspace).any() else ""
+        wrench = station.GetOutputPort("sensor_wrench").Eval(context).get_coeffs()
+        return task.limits().broken(wrench, error)

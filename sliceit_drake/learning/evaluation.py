@@ -13,28 +13,18 @@ from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.agent_station import add_agent
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.station import MakeSlicingStation
+from sliceit_drake.learning.ending import Limits
 from sliceit_drake.learning.metrics import SliceMetrics, slice_metrics
 from sliceit_drake.systems.agent import AgentConfig, Decide
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 
-__all__ = ["Limits", "SliceTrace", "cut_slice"]
+__all__ = ["LIMITS", "SliceTrace", "cut_slice"]
 
 
-@dc.dataclass(frozen=True)
-class Limits:
-    """What ends a slice besides its goal.
-
-    Attributes:
-        duration: s.
-        force: Of each component at the sensor, N.
-        torque: Likewise, Nm.
-        workspace: Errors to the final pose [3], m, m, rad.
-    """
-
-    duration: float = 25.0
-    force: float = 150.0
-    torque: float = 30.0
-    workspace: tuple[float, float, float] = (0.05, 0.1, 0.1745)
+LONGEST = 25.0
+"""Of a slice, s: as many decisions as in training."""
+LIMITS = Limits(force=150.0, torque=30.0, workspace=(0.05, 0.1, 0.1745))
+"""Greater than in training: what a policy does over its sensor's limit is measured too."""
 
 
 @dc.dataclass
@@ -64,7 +54,8 @@ def cut_slice(
     agent: AgentConfig,
     decide: Decide,
     make_cutting: Callable[[RigidBody], KnifeForceSystem] | None = None,
-    limits: Limits | None = None,
+    limits: Limits = LIMITS,
+    longest: float = LONGEST,
 ) -> SliceTrace:
     """Cuts one slice.
 
@@ -73,12 +64,12 @@ def cut_slice(
         agent: What the policy may do; `descent` is taken from the scenario.
         decide: The policy.
         make_cutting: A cutting system in place of the scenario's food.
-        limits: What ends the slice.
+        limits: What ends the slice before its goal.
+        longest: After which it ends, s.
 
     Raises:
         ConfigurationError: The scenario cannot be built, or is not for an agent.
     """
-    limits = limits or Limits()
     station = MakeSlicingStation(scenario, make_cutting=make_cutting)
     agent, builder = dc.replace(agent, descent=station.descent()), DiagramBuilder()
     actions: list[np.ndarray] = []
@@ -110,15 +101,14 @@ def cut_slice(
             break
         error = system.GetOutputPort("error").Eval(own)
         wrench = station.GetOutputPort("sensor_wrench").Eval(station_context).get_coeffs()
-        torque, force = np.abs(wrench).reshape(2, 3).max(axis=1)
         if system.GetOutputPort("at_goal").Eval(own)[0] > agent.goal_decisions:
             end = "goal"
-        elif context.get_time() < until - 1e-6 or force > limits.force or torque > limits.torque:
-            end = "force"
-        elif (np.abs(error) > limits.workspace).any():
-            end = "workspace"
-        elif context.get_time() >= limits.duration:
-            end = "time"
+        elif context.get_time() < until - 1e-6:  # The station's monitor ended it: it shakes.
+            end = "collision"
+        else:
+            end = limits.broken(wrench, error)
+            if not end and context.get_time() >= longest:
+                end = "time"
     time, food, board, cut = _logged(logs, simulator)
     metrics = slice_metrics(time, food, board, cut, end)
     return SliceTrace(time, food, board, cut, np.array(heights), np.array(actions), metrics)

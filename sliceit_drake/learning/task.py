@@ -17,6 +17,7 @@ from sliceit_drake.diagrams.agent_station import AgentStation
 from sliceit_drake.diagrams.calibrated_food import CalibratedFood, load_calibrated_food
 from sliceit_drake.diagrams.scenario import Scenario, Start
 from sliceit_drake.diagrams.station import MakeSlicingStation
+from sliceit_drake.learning.ending import Limits
 from sliceit_drake.learning.reward import RewardConfig
 from sliceit_drake.systems.agent import AgentConfig
 from sliceit_drake.systems.cutting_system import CuttingSystem
@@ -101,6 +102,11 @@ class TaskConfig:
     )
     force_limit: float = quantity(50.0, "N", low=0.1, doc="Of each component; ends an episode.")
     torque_limit: float = quantity(10.0, "Nm", low=0.1, doc="Likewise.")
+
+    def limits(self) -> Limits:
+        """What ends an episode before its goal."""
+        x, z, angle = self.workspace
+        return Limits(self.force_limit, self.torque_limit, (x, z, angle))
 
     def check(self, where: str) -> None:
         if not self.foods:
