@@ -1,5 +1,6 @@
 """The link's thread and the Drake system of the robot, on a fake robot."""
 
+import threading
 import time as clock
 
 import numpy as np
@@ -170,13 +171,28 @@ def test_neither_side_of_the_exchange_waits(robot):
     link = make_link(robot)
     link.start()
     link.arm()
-    robot.call_time = 0.04  # The thread is inside a call most of the time.
-    stream(link, 0.004)
-    begin = clock.perf_counter()
-    for _ in range(100):
-        link.latest()
-        link.put(START, 0.0)
-    assert clock.perf_counter() - begin < 0.02
+    inside, go_on, servo = threading.Event(), threading.Event(), robot.servo
+
+    def stuck(q):
+        inside.set()
+        go_on.wait(60.0)
+        return servo(q)
+
+    robot.servo = stuck
+    link.put(START, robot.time)
+    assert inside.wait(10.0)
+
+    def exchange():
+        for _ in range(100):
+            link.latest()
+            link.put(START, 0.0)
+
+    other = threading.Thread(target=exchange, daemon=True)
+    other.start()
+    other.join(20.0)
+    waited = other.is_alive()
+    go_on.set()
+    assert not waited, "an exchange waited for the thread"
     link.finish("test over")
 
 
