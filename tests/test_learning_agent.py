@@ -275,6 +275,28 @@ def test_the_errors_of_a_batch_become_its_priorities():
     assert np.asarray(found) == pytest.approx(errors.numpy() + 0.01, rel=1e-4)
 
 
+def test_no_value_outgrows_what_an_episode_can_give():
+    def value(**options):
+        model = algorithm(PrioritizedSAC, gamma=0.99, tau=0.05, ent_coef=1e-6, **options)
+        for _ in range(40):
+            still, action = np.zeros((1, SIZE), np.float32), np.zeros((1, 6), np.float32)
+            model.replay_buffer.add(still, still, action, np.array([0.5]), np.array([False]), [{}])
+        for _ in range(300):
+            model._train_batch(32)
+        return float(torch.cat(model.critic(torch.zeros(1, SIZE), torch.zeros(1, 6))).mean())
+
+    # It lingers for ever: 0.5 / (1 - 0.99) = 50.
+    assert value(value_limit=3.0) == pytest.approx(3.0, abs=0.5)
+    assert value() > 4.0
+
+
+def test_a_training_starts_with_little_entropy_and_the_goal_as_limit():
+    config = training_of(entropy=0.25)
+    model = training.make_model(config, OverlapVecEnv(DummyVecEnv([Still])))
+    assert float(model.log_ent_coef.detach().exp()) == pytest.approx(0.25, rel=1e-6)
+    assert model.value_limit == config.task.reward.goal
+
+
 # --- Training.
 
 

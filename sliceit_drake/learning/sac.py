@@ -53,12 +53,16 @@ class PrioritizedSAC(SAC):
 
     Args:
         beta_end: Power of the importance weights at the end of the training; it grows linearly.
+        value_limit: No return is greater; the critics' targets are limited to it. Where an episode
+            can linger, an overestimated value feeds on itself, and fades only with the discount.
     """
 
     replay_buffer: PrioritizedReplayBuffer
 
-    def __init__(self, *arguments: Any, beta_end: float = 1.0, **options: Any) -> None:
-        self.beta_end = beta_end
+    def __init__(
+        self, *arguments: Any, beta_end: float = 1.0, value_limit: float = math.inf, **options: Any
+    ) -> None:
+        self.beta_end, self.value_limit = beta_end, value_limit
         self.running: dict[str, float] = {}
         super().__init__(*arguments, replay_buffer_class=PrioritizedReplayBuffer, **options)
 
@@ -94,6 +98,7 @@ class PrioritizedSAC(SAC):
             value = torch.cat(self.critic_target(batch.next_observations, following), dim=1)
             value = value.min(dim=1, keepdim=True).values - alpha * following_density
             target = batch.rewards + (1.0 - batch.dones) * self.gamma * value
+            target = target.clamp(max=self.value_limit)
         values = self.critic(batch.observations, batch.actions)
         errors = [value - target for value in values]
         critic_loss = 0.5 * sum((weights * error**2).mean() for error in errors)
