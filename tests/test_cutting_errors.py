@@ -131,7 +131,7 @@ def test_a_mesh_file_in_millimetres_names_food_and_factor(tmp_path):
     food.shape.scale = 1e-3
     assert make_food_model(food, Knife(), Numerics()).section_area == pytest.approx(4e-4)
     food.shape.path = str(tmp_path / "none.vtk")
-    with pytest.raises(MeshError, match=r"none\.vtk: cannot be read as a mesh"):
+    with pytest.raises(MeshError, match=r"none\.vtk cannot be read as a mesh: there is no"):
         make_food_model(food, Knife(), Numerics())
 
 

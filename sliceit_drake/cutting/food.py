@@ -1,6 +1,7 @@
 """A food as a user describes it, and the cut through it."""
 
 import dataclasses as dc
+from pathlib import Path
 
 import numpy as np
 
@@ -14,10 +15,12 @@ from sliceit_drake.cutting.mesh import (
     box_mesh,
     cylinder_mesh,
     ellipsoid_mesh,
+    tapered_mesh,
 )
 from sliceit_drake.cutting.model import CuttingModel, Numerics, make_cutting_model
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.split import CutPlane
+from sliceit_drake.resources import resource_path
 
 __all__ = [
     "Box",
@@ -26,13 +29,14 @@ __all__ = [
     "Food",
     "MeshFile",
     "Remainder",
+    "Tapered",
     "make_food_model",
     "start_pose",
 ]
 
 LEAST_END_RADIUS = 0.3
-"""Least radius of a sliced ellipsoid's flat end over its greatest: towards the pole the elements of
-a layer shrink to nothing."""
+"""Least radius of a flat end over the greatest, of sliced ellipsoids and tapered foods: towards a
+tip the elements of a layer shrink to nothing."""
 
 LEAST_LAYER = 0.2
 """Least thickness of a slice's element layer over the edge length in the section: stiffness across
@@ -150,10 +154,67 @@ class Ellipsoid:
 
 
 @dc.dataclass
+class Tapered:
+    """A straight tapered root along Fy, as a carrot: a cone's frustum, in rings and graded layers.
+
+    It lies on the board along one line of its side. Each section y is a circle above that line, so
+    that its axis rises with the radius. Those of a right cone on its side are ellipses, higher than
+    wide by 1 / sqrt(1 - t^2), where t is the slope of its side to its axis: 0.2 % for the default.
+    """
+
+    diameters: list[float] = quantity(
+        [0.015, 0.030], "m", low=5e-3, high=0.3, size=2, doc="At least and at greatest y."
+    )
+    length: float = quantity(0.12, "m", low=1e-2, high=1.0, doc="Length.")
+    rings: int = quantity(4, "", low=2, high=40, doc="Rings of elements across the radius.")
+    layers: list[float] = quantity(
+        [0.0, 2.8e-3, 6.4e-3, 12e-3],
+        "m",
+        low=0.0,
+        high=0.5,
+        doc="Distances of the element layers from y = 0, on both sides; the rest is one layer.",
+    )
+
+    def check(self, where: str) -> None:
+        thin = int(np.argmin(self.diameters))
+        least = LEAST_END_RADIUS * max(self.diameters)
+        if self.diameters[thin] < least:
+            raise ConfigurationError(
+                f"{self.diameters[thin]:g} m is too thin an end beside {max(self.diameters):g} m",
+                field=f"{where}.diameters[{thin}]",
+                fix=f"Give at least {least:.4g} m; the elements of a thinner tip are too small.",
+            )
+
+    def mesh(self, refinement: float = 1.0) -> TetrahedralMesh:
+        """The mesh in F, with `refinement` times as many elements along each edge, rounded."""
+        return self.between(_both_sides(self.layers, self.reach, refinement), refinement)
+
+    def between(self, y: np.ndarray, refinement: float) -> TetrahedralMesh:
+        """The part between the first and the last of the mesh layers `y` [L], metres."""
+        first, last = (0.5 * self.diameter_at(float(y[k])) for k in (0, -1))
+        return tapered_mesh((first, last), y, max(2, round(self.rings * refinement)))
+
+    def diameter_at(self, y: float) -> float:
+        """Diameter of the section at `y`, metres."""
+        return float(np.interp(y, [-self.reach, self.reach], self.diameters))
+
+    @property
+    def reach(self) -> float:
+        """Greatest y of a section that can be meshed, metres."""
+        return 0.5 * self.length
+
+    @property
+    def section_edge(self) -> float:
+        """Edge length of the elements in the greatest section, metres."""
+        return 0.5 * max(self.diameters) / self.rings
+
+
+@dc.dataclass
 class MeshFile:
     """A tetrahedral mesh in a file that meshio reads, with axes and origin of F, in metres."""
 
     path: str = ""
+    """Relative to the scenario that names it, to the working directory, or to the resources."""
     scale: float = quantity(1.0, "", low=1e-6, high=1e6, doc="Factor to metres.")
 
     def check(self, where: str) -> None:
@@ -162,8 +223,30 @@ class MeshFile:
                 "names no file", field=f"{where}.path", fix="Give a .msh, .vtk or .vtu file."
             )
 
+    def look_beside(self, folder: Path) -> None:
+        """Turns a relative path into that of a file below `folder`, if there is one."""
+        if self.path and (folder / self.path).is_file():
+            self.path = str((folder / self.path).resolve())
+
+    def file(self) -> Path:
+        """The file.
+
+        Raises:
+            MeshError: There is none.
+        """
+        if Path(self.path).is_file():
+            return Path(self.path)
+        try:
+            return resource_path(self.path)
+        except (FileNotFoundError, ValueError):
+            raise MeshError(
+                f"food.shape.path: {self.path} cannot be read as a mesh: there is no such file, "
+                f"neither beside the scenario, nor in {Path.cwd()}, nor among the resources. "
+                "Correct the path."
+            ) from None
+
     def mesh(self, refinement: float = 1.0) -> TetrahedralMesh:
-        """The mesh in F. A file cannot be refined.
+        """The mesh in F, without vertices that no tetrahedron uses. A file cannot be refined.
 
         Raises:
             MeshError: The file is absent, unreadable or holds no tetrahedra.
@@ -172,14 +255,29 @@ class MeshFile:
 
         if refinement != 1.0:
             raise MeshError(f"{self.path}: a mesh from a file cannot be refined.")
+        file = self.file()
+        # meshio's readers end on a broken file with whatever went wrong first, some with an exit.
         try:
-            content = meshio.read(self.path)
-        except (OSError, meshio.ReadError, SystemExit) as error:
-            raise MeshError(f"{self.path}: cannot be read as a mesh ({error}).") from error
-        cells = content.get_cells_type("tetra")
+            content = meshio.read(file)
+        except (Exception, SystemExit) as error:
+            reason = str(error) or type(error).__name__
+            raise MeshError(
+                f"food.shape.path: {self.path} cannot be read as a mesh ({reason}). Export it as "
+                ".msh, .vtk or .vtu."
+            ) from error
+        cells = np.asarray(content.get_cells_type("tetra"), np.int64)
         if len(cells) == 0:
-            raise MeshError(f"{self.path}: holds no linear tetrahedra; export a volume mesh.")
-        return TetrahedralMesh(self.scale * np.asarray(content.points, float)[:, :3], cells)
+            held = ", ".join(f"{len(c.data)} {c.type}" for c in content.cells) or "no cells"
+            raise MeshError(
+                f"food.shape.path: {self.path} holds no linear tetrahedra but {held}; export a "
+                "volume mesh of first order."
+            )
+        points = self.scale * np.asarray(content.points, float)[:, :3]
+        # gmsh writes the points that a geometry is drawn with, such as the centres of its arcs.
+        used = np.unique(cells)
+        if used[0] >= 0 and used[-1] < len(points):
+            points, cells = points[used], np.searchsorted(used, cells)
+        return TetrahedralMesh(points, cells)
 
 
 @dc.dataclass
@@ -190,7 +288,7 @@ class Remainder:
     the cut is the plane y = 0 and the next slice lies on the side y < 0.
     """
 
-    body: Cylinder | Box | Ellipsoid = dc.field(default_factory=Cylinder)
+    body: Cylinder | Box | Ellipsoid | Tapered = dc.field(default_factory=Cylinder)
     position: float = quantity(
         0.0, "m", low=-0.5, high=0.5, doc="Of the next cut, y in the frame of the whole body."
     )
@@ -262,7 +360,9 @@ class Food:
     """
 
     name: str = "cucumber"
-    shape: Cylinder | Box | Ellipsoid | MeshFile | Remainder = dc.field(default_factory=Cylinder)
+    shape: Cylinder | Box | Ellipsoid | Tapered | MeshFile | Remainder = dc.field(
+        default_factory=Cylinder
+    )
     material: Material = dc.field(default_factory=Material)
     effects: Effects = dc.field(default_factory=Effects)
     cut_point: list[float] = quantity(
@@ -313,7 +413,12 @@ def make_food_model(
         MeshError, TimeStepError, ConfigurationError: As `make_cutting_model`.
     """
     mesh = food.shape.mesh(refinement)
-    mesh.check(f"food.shape of {food.name}")
+    where = f"food.shape of {food.name}"
+    if isinstance(food.shape, MeshFile):
+        where += f" ({food.shape.path})"
+    mesh.check(where)
+    if isinstance(food.shape, MeshFile):
+        mesh.check_solid(where)
     return make_cutting_model(
         mesh,
         food.plane(),

@@ -184,7 +184,7 @@ def make_cut_geometry(
     if not active.any():
         raise ConfigurationError(
             "every element at the cut is held",
-            field="food.hold",
+            field="food.hold_distance",
             fix="Hold the food farther from the cut plane.",
         )
     tetrahedra = split.tetrahedra[active]
@@ -208,7 +208,7 @@ def make_cut_geometry(
         raise ConfigurationError(
             f"{np.count_nonzero(~free)} of {len(free)} points of the cut lie in elements that are "
             "held",
-            field="food.hold",
+            field="food.hold_distance",
             fix="Hold the food farther from the cut plane.",
         )
     board = np.concatenate([up_C, [0.0]])

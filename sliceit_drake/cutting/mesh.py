@@ -3,8 +3,24 @@
 import dataclasses as dc
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-__all__ = ["MeshError", "TetrahedralMesh", "box_mesh", "cylinder_mesh", "ellipsoid_mesh"]
+from sliceit_drake.cutting.mesh_surface import (
+    bodies,
+    folded_faces,
+    pinched_edges,
+    pinched_vertices,
+    surface_crossings,
+)
+
+__all__ = [
+    "MeshError",
+    "TetrahedralMesh",
+    "box_mesh",
+    "cylinder_mesh",
+    "ellipsoid_mesh",
+    "tapered_mesh",
+]
 
 
 class MeshError(ValueError):
@@ -95,6 +111,64 @@ class TetrahedralMesh:
                 f"{where}: {len(unused)} vertices belong to no tetrahedron, first {unused[0]}. "
                 "Remove them."
             )
+
+    def check_solid(self, where: str = "mesh") -> None:
+        """Refuses what is not one solid body; of a mesh that `check` accepts.
+
+        Our generators need no such check; a mesh from elsewhere does.
+
+        Raises:
+            MeshError: Fragments that share no vertex, elements on the same side of a face, parts
+                that meet in an edge or a vertex alone, a surface that goes through itself.
+        """
+        v, t = self.vertices, self.tetrahedra
+        body = bodies(t)
+        if body.any():
+            count = np.sort(np.bincount(body))[::-1]
+            listed = ", ".join(str(n) for n in count[:5]) + (", ..." if len(count) > 5 else "")
+            fix = "Keep one of them."
+            gap = _least_gap(v, t, body)
+            if gap <= 1e-6 * self.mean_edge_length():
+                fix = "They touch: merge the vertices that lie on each other when meshing."
+            raise MeshError(
+                f"{where}: {len(count)} fragments that share no vertex, of {listed} tetrahedra; a "
+                f"food is one body. {fix}"
+            )
+        folded = folded_faces(_faces(t))
+        if len(folded):
+            raise MeshError(
+                f"{where}: {len(folded)} faces have both of their tetrahedra on one side, first "
+                f"that of vertices {folded[0]}; elements overlap. Remesh."
+            )
+        boundary, owner = boundary_faces(t)
+        pinched = pinched_edges(boundary)
+        if len(pinched):
+            raise MeshError(
+                f"{where}: not manifold: at {len(pinched)} edges parts meet in the edge alone, "
+                f"first that of vertices {pinched[0]} at {v[pinched[0]].mean(0)} m. Join the parts "
+                "by faces, or part them."
+            )
+        pinched = pinched_vertices(boundary)
+        if len(pinched):
+            raise MeshError(
+                f"{where}: not manifold: at {len(pinched)} vertices parts meet in the vertex "
+                f"alone, first {pinched[0]} at {v[pinched[0]]} m. Join the parts by faces, or part "
+                "them."
+            )
+        crossings = surface_crossings(v, boundary)
+        if len(crossings):
+            one, other = owner[crossings[0]]
+            raise MeshError(
+                f"{where}: its surface goes through itself at {len(crossings)} places, first where "
+                f"tetrahedra {one} and {other} overlap, at {v[t[one]].mean(0)} m. Repair the "
+                "surface and mesh it again."
+            )
+
+
+def _least_gap(vertices: np.ndarray, tetrahedra: np.ndarray, body: np.ndarray) -> float:
+    """Least distance of a vertex of the first body to one of the others, metres."""
+    first, others = np.unique(tetrahedra[body == 0]), np.unique(tetrahedra[body != 0])
+    return float(cKDTree(vertices[first]).query(vertices[others])[0].min())
 
 
 def _edges(vertices: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
@@ -191,6 +265,23 @@ def cylinder_mesh(diameter: float, layers: np.ndarray, rings: int) -> Tetrahedra
     radius = 0.5 * diameter * np.sqrt(np.pi / (0.5 * corners * np.sin(2.0 * np.pi / corners)))
     section = radius * (section + [0.0, 1.0])
     return _extruded(section, triangles, np.asarray(layers, float))
+
+
+def tapered_mesh(radii: tuple[float, float], layers: np.ndarray, rings: int) -> TetrahedralMesh:
+    """A cone's frustum along y that lies on z = 0 along a line; each section y is a circle.
+
+    Args:
+        radii: At the first and at the last layer, metres; linear between.
+        layers: Increasing y coordinates of the mesh layers [L], metres.
+        rings: Concentric rings of the section.
+    """
+    y = np.asarray(layers, float)
+    unit = cylinder_mesh(2.0, y, rings)
+    p = unit.vertices
+    radius = np.interp(p[:, 1], y[[0, -1]], radii)
+    return TetrahedralMesh(
+        np.stack([radius * p[:, 0], p[:, 1], radius * p[:, 2]], axis=1), unit.tetrahedra
+    )
 
 
 def box_mesh(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> TetrahedralMesh:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sliceit_drake.cutting.food import MeshFile, Remainder
+from sliceit_drake.cutting.food import MeshFile, Remainder, Tapered
 from sliceit_drake.diagnosis.experiment_proposal import MARGIN, NEEDED, NextExperiment, Step
 from sliceit_drake.diagnosis.experiment_scenario import (
     experiment_of_record,
@@ -137,7 +137,7 @@ def _exploring(diagnosis: "Diagnosis", records: Sequence[SliceRecord]) -> list[S
 
 def _menu(diagnosis: "Diagnosis", records: Sequence[SliceRecord]) -> list[Experiment]:
     shape = diagnosis.setup.food.shape
-    fixed = isinstance(shape, MeshFile | Remainder)
+    fixed = isinstance(shape, MeshFile | Remainder | Tapered)
     return [e for e in menu(scale_of(diagnosis.setup, records)) if e.size == 1.0 or not fixed]
 
 

@@ -133,7 +133,7 @@ class SliceSequence:
             raise ConfigurationError(
                 "has no body that a sequence can slice",
                 field=f"{where}.food",
-                fix="Give a finite-element food with a Cylinder, Box or Ellipsoid.",
+                fix="Give a finite-element food with a Cylinder, Box, Ellipsoid or Tapered.",
             )
         if food.held_sides != "plus":
             raise ConfigurationError(
@@ -143,9 +143,10 @@ class SliceSequence:
             )
         if any(food.cut_point) or food.cut_normal != [0.0, 1.0, 0.0]:
             raise ConfigurationError(
-                "places a cut of its own; a sequence cuts across y, at trim and thickness",
+                "places a cut of its own; a sequence cuts across y, at trim and thickness; planes "
+                "that are oblique or not parallel are not supported in it",
                 field=f"{where}.food.cut_point and {where}.food.cut_normal",
-                fix="Leave both out.",
+                fix="Leave both out, or cut one slice without a sequence.",
             )
         length, end = self._length(food), -self._length(food) / 2.0 + self.trim
         if end < -food.shape.reach - 1e-9:

@@ -1,0 +1,152 @@
+"""Shapes of foods: tapered roots against the closed form, and what slices leave of each shape."""
+
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+
+from sliceit_drake.configuration import ConfigurationError, validate
+from sliceit_drake.cutting.food import (
+    Box,
+    Cylinder,
+    Ellipsoid,
+    Food,
+    Remainder,
+    Tapered,
+    make_food_model,
+    start_pose,
+)
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.material import Material
+from sliceit_drake.cutting.mesh import TetrahedralMesh
+from sliceit_drake.cutting.model import Numerics
+from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
+from sliceit_drake.cutting.simulate import simulate_slice
+from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.cutting.split import CutPlane, split_mesh
+from sliceit_drake.diagrams.sequence import SliceSequence
+
+CARROT = Tapered(diameters=[0.014, 0.030], length=0.12)
+UP = np.array([0.0, 0.0, 1.0])
+
+SHAPES = {
+    "cylinder": Cylinder(diameter=0.03, length=0.08),
+    "box": Box(size=[0.03, 0.08, 0.02], divisions=[6, 4]),
+    "ellipsoid": Ellipsoid(diameters=[0.04, 0.08, 0.03], refinements=2),
+    "tapered": Tapered(diameters=[0.015, 0.03], length=0.08),
+}
+
+
+def section_area(shape, y: float) -> float:
+    """In closed form, m^2."""
+    if isinstance(shape, Cylinder):
+        return 0.25 * np.pi * shape.diameter**2
+    if isinstance(shape, Box):
+        return shape.size[0] * shape.size[2]
+    if isinstance(shape, Ellipsoid):
+        a, b, c = 0.5 * np.array(shape.diameters)
+        return np.pi * a * c * (1.0 - (y / b) ** 2)
+    small, large = shape.diameters
+    return 0.25 * np.pi * (small + (large - small) * (y / shape.length + 0.5)) ** 2
+
+
+def frustum(shape: Tapered) -> float:
+    """Volume of a cone's frustum, m^3."""
+    d, D = shape.diameters
+    return np.pi * shape.length * (d * d + d * D + D * D) / 12.0
+
+
+@pytest.mark.parametrize("refinement", [0.5, 1.0, 2.0])
+def test_a_tapered_food_has_the_volume_and_the_sections_of_its_cone(refinement):
+    mesh = CARROT.mesh(refinement)
+    mesh.check()
+    mesh.check_solid()
+    assert mesh.volumes().min() > 0.0
+    # Polygons of the circles' areas, on straight sides: at every refinement.
+    assert mesh.volumes().sum() == pytest.approx(frustum(CARROT), rel=1e-12)
+    for y in (-0.05, 1e-3, 0.03):
+        split = split_mesh(mesh, CutPlane(np.array([0.0, y, 0.0]), np.array([0, 1.0, 0]), UP))
+        assert split.section_area() == pytest.approx(section_area(CARROT, y), rel=1e-9)
+
+
+def test_a_tapered_food_lies_on_the_board_along_its_whole_length():
+    mesh = CARROT.mesh()
+    for y in np.unique(mesh.vertices[:, 1]):
+        section = mesh.vertices[mesh.vertices[:, 1] == y]
+        assert section[:, 2].min() == pytest.approx(0.0, abs=3e-4 * CARROT.diameter_at(y))
+        assert np.abs(section[:, 0].mean()) < 1e-12
+        assert section[:, 2].max() == pytest.approx(CARROT.diameter_at(y), rel=0.01)
+
+
+def test_the_outline_of_a_tapered_food_converges_with_the_square_of_its_rings():
+    D = CARROT.diameter_at(0.0)
+    errors = []
+    for refinement in (1.0, 2.0, 4.0):
+        v = CARROT.mesh(refinement).vertices
+        hull = ConvexHull(v[v[:, 1] == 0.0][:, [0, 2]])
+        # In two dimensions the hull's "area" is the length of its outline.
+        errors.append(hull.area / (np.pi * D) - 1.0)
+    assert errors[0] < 5e-3
+    ratios = np.array(errors[:-1]) / errors[1:]
+    np.testing.assert_allclose(ratios, 4.0, rtol=0.05)
+
+
+def test_a_pointed_tapered_food_is_refused_with_the_thinnest_end_that_it_can_have():
+    with pytest.raises(ConfigurationError, match=r"shape\.diameters\[1\].*too thin.*least 0\.009"):
+        validate(Tapered(diameters=[0.03, 0.006]), "shape")
+
+
+def sliced(name: str) -> tuple[SliceSequence, Food]:
+    shape = SHAPES[name]
+    trim = 0.01 if isinstance(shape, Ellipsoid) else 0.0
+    food = Food(name=name, shape=shape, held_sides="plus")
+    sequence = SliceSequence(count=4, thickness=6e-3, trim=trim)
+    sequence.check_food(food, "scenario")
+    return sequence, food
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_each_slice_takes_its_volume_from_what_is_left_and_has_its_section(name):
+    sequence, food = sliced(name)
+    bodies = [each.shape for each in sequence.foods(food)]
+    left = []
+    for body in bodies:
+        mesh = body.mesh()
+        mesh.check()
+        split = split_mesh(mesh, CutPlane(np.zeros(3), np.array([0.0, 1.0, 0.0]), UP))
+        exact = section_area(food.shape, body.position)
+        assert split.section_area() == pytest.approx(exact, rel=1e-9)
+        volume = split.volumes()
+        side = split.node_side[split.tetrahedra[:, 0]]
+        left.append((volume[side == 0].sum(), volume[side == 1].sum()))
+        ends = (section_area(food.shape, body.position - sequence.thickness), exact)
+        # Simpson's rule is exact for sections that are quadratic in y.
+        middle = section_area(food.shape, body.position - 0.5 * sequence.thickness)
+        slab = sequence.thickness * (ends[0] + 4.0 * middle + ends[1]) / 6.0
+        assert left[-1][0] == pytest.approx(slab, rel=5e-3)
+    for (_, before), (cut_off, after) in zip(left, left[1:], strict=False):
+        assert cut_off + after == pytest.approx(before, rel=5e-3)
+
+
+def test_slices_of_a_tapered_food_take_toughness_times_their_growing_areas():
+    small = Tapered(diameters=[0.010, 0.018], length=0.05, rings=3)
+    food = Food(shape=small, held_sides="plus", material=Material(toughness=400.0, friction=0.0))
+    sequence = SliceSequence(count=2, thickness=6e-3, slice_layers=1, layers=[4e-3, 12e-3])
+    work, area = [], []
+    for each in sequence.foods(food):
+        model = make_food_model(each, Knife(), Numerics())
+        plan = MotionPlan([ConstantSpeed(distance=model.top + 1e-3, speed=0.04)])
+        result = simulate_slice(CuttingSolver(model, 2e-3), Motion(plan, start_pose(model, 5e-4)))
+        assert result.cut[-1] > 0.999
+        work.append(result.ledger.edge + result.ledger.opening)
+        area.append(section_area(small, each.shape.position))
+    np.testing.assert_allclose(work, 400.0 * np.array(area), rtol=0.03)
+    assert area[1] > 1.1 * area[0]
+
+
+def test_what_slices_left_can_be_cut_once_more_obliquely():
+    remainder = Remainder(SHAPES["tapered"], position=-0.02, thickness=0.008)
+    normal = np.array([0.3, 1.0, 0.0])
+    mesh: TetrahedralMesh = remainder.mesh()
+    split = split_mesh(mesh, CutPlane(np.zeros(3), normal, UP))
+    assert split.volumes().sum() == pytest.approx(mesh.volumes().sum(), rel=1e-12)
+    assert split.component_count() == 2
