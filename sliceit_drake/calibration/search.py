@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import optuna
-from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
 from sliceit_drake.calibration.prediction import Prediction, Predictor
+from sliceit_drake.calibration.storage import keeps_answering, open_storage
 from sliceit_drake.configuration import ConfigurationError
 
 __all__ = ["SearchResult", "error_of", "open_study", "search"]
@@ -53,27 +53,16 @@ def open_study(storage: str | Path, name: str) -> optuna.Study:
 
     Args:
         storage: A journal file (.log), or a URL that Optuna knows, as
-            postgresql://user:password@host/database, which many machines share.
+            postgresql://user@host/database, which many machines share; see `open_storage`.
         name: Of the study in the storage.
 
     Raises:
         ConfigurationError: The storage cannot be opened.
     """
-    try:
-        if "://" in str(storage):
-            backend: optuna.storages.BaseStorage = optuna.storages.get_storage(str(storage))
-        else:
-            backend = optuna.storages.JournalStorage(JournalFileBackend(str(storage)))
-        return optuna.create_study(study_name=name, storage=backend, load_if_exists=True)
-    except Exception as error:
-        raise ConfigurationError(
-            f"cannot be opened ({error})",
-            field="--storage",
-            fix="Give a journal file such as trials.log, or a URL such as "
-            "postgresql://user:password@host/database.",
-        ) from error
+    return optuna.create_study(study_name=name, storage=open_storage(storage), load_if_exists=True)
 
 
+@keeps_answering()
 def search(
     predictor: Predictor,
     study: optuna.Study,
@@ -95,7 +84,7 @@ def search(
         progress: Called with the finished trials and the best error so far, N.
 
     Raises:
-        ConfigurationError: The study in the storage is of other parameters.
+        ConfigurationError: The study in the storage is of other parameters, or the storage failed.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     names = [p.name for p in predictor.parameters]
@@ -115,7 +104,8 @@ def search(
     proposals = _Proposals(space, predictor.start, seed)
     done = _finished(study)
     while len(done) < trials:
-        known_units = {tuple(t.params.values()) for t in done[-GENERATION:]}
+        # A database does not keep the order of a trial's parameters.
+        known_units = {tuple(t.params[name] for name in names) for t in done[-GENERATION:]}
         # A generation that was cut short is proposed once more, and what it lacks is computed.
         units = [u for u in proposals.generation(done) if tuple(u.tolist()) not in known_units]
         for unit, row in zip(units, predictor.predict(units), strict=True):
@@ -126,7 +116,7 @@ def search(
                     params=params,
                     distributions=space,
                     value=error,
-                    user_attrs={"broken": broken},
+                    user_attrs={"broken": broken, "seed": seed},
                 )
             )
         done = _finished(study)
@@ -164,7 +154,9 @@ class _Proposals:
         for trial in done[len(self._history) : base]:
             self._memory.add_trial(
                 optuna.trial.create_trial(
-                    params=trial.params, distributions=self._space, value=trial.value
+                    params={name: trial.params[name] for name in self._space},
+                    distributions=self._space,
+                    value=trial.value,
                 )
             )
         self._history = done[:base]

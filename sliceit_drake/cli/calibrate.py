@@ -26,8 +26,9 @@ Gauss-Newton, and says how sure it is. Writes to DIR:
   adam-*.npz        checkpoints of Adam
 
 Several machines: give all the same --storage and different --seed, as
-  sliceit calibrate records/*.csv --food cucumber --output a \\
-    --storage postgresql://user:password@host/sliceit --seed 1
+  PGPASSWORD=... sliceit calibrate records/*.csv --food cucumber --output a \\
+    --storage postgresql://user@host/sliceit --seed 1
+PostgreSQL needs pip install 'sliceit_drake[database]'; what it gains: docs/scaling.md.
 A journal file (--storage trials.log) serves several processes that share a file system.
 
   sliceit calibrate calibration/records/cucumber.csv --food cucumber --output output/cucumber
@@ -165,6 +166,7 @@ def _calibrate(options: argparse.Namespace) -> int:
     from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate
     from sliceit_drake.calibration.report import parameter_table, write_results
     from sliceit_drake.calibration.setup import load_setup
+    from sliceit_drake.calibration.storage import without_password
     from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.records.validation import check_record, load_record, record_files
 
@@ -200,8 +202,8 @@ def _calibrate(options: argparse.Namespace) -> int:
             [r for r in records if r.name in options.hold_out],
             bars.show_error,
         )
-    arguments = [a for a in sys.argv[1:]]
-    command = shlex.join(["sliceit", *arguments])
+    # The command is kept with the food, for others to read.
+    command = shlex.join(["sliceit", *(without_password(a) for a in sys.argv[1:])])
     write_results(result, options.output, command)
     values = result.predictor.values(result.unit)
     posterior = result.posterior
