@@ -1,11 +1,15 @@
-"""Cuts through elements against cuts along their faces, in the same body, held alike."""
+"""Oblique cuts: against cuts along faces of the same body, held alike, and against the ellipse."""
+
+import dataclasses as dc
 
 import numpy as np
 import pytest
 
-from sliceit_drake.cutting.food import Cylinder, Food, start_pose
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.food import Cylinder, Food, make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.mesh import TetrahedralMesh
+from sliceit_drake.cutting.material import Material
+from sliceit_drake.cutting.mesh import MeshError, TetrahedralMesh
 from sliceit_drake.cutting.model import CuttingModel, Numerics, make_cutting_model
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
@@ -104,3 +108,72 @@ def test_true_masses_are_stable_at_the_limit_however_the_plane_cuts():
     assert model.mass_ratio < 1.01
     assert true.energy_ratio < 1e-3
     assert relative_rms(norms(scaled), norms(true)) < 0.02
+
+
+ELLIPSES = {
+    "across": [0.0, 1.0, 0.0],
+    "turned": [0.5, 1.0, 0.0],
+    "tilted": [0.0, 1.0, 0.3],
+    "both": [0.4, 1.0, -0.2],
+}
+
+
+def oblique(name: str, held_sides: str = "both") -> tuple[Food, CuttingModel]:
+    food = Food(
+        shape=Cylinder(diameter=0.02, length=0.07, rings=3, layers=[0.0, 0.004, 0.012]),
+        material=Material(toughness=400.0, friction=0.0),
+        cut_normal=ELLIPSES[name],
+        held_sides=held_sides,
+    )
+    return food, make_food_model(food, Knife(), Numerics())
+
+
+def ellipse(name: str) -> float:
+    """Area in which a plane meets the cylinder of 20 mm, m^2."""
+    normal = np.array(ELLIPSES[name])
+    return np.pi * 0.01**2 * float(np.linalg.norm(normal)) / normal[1]
+
+
+@pytest.mark.parametrize("name", ELLIPSES)
+def test_an_oblique_section_of_a_cylinder_is_its_ellipse_and_no_mass_is_lost(name):
+    food, model = oblique(name, held_sides="none")
+    assert model.section_area == pytest.approx(ellipse(name), rel=1e-9)
+    volume = np.pi * 0.01**2 * 0.07
+    assert model.true_mass.sum() == pytest.approx(food.material.density * volume, rel=1e-9)
+    angle = np.linspace(0.0, np.pi, 181)
+    widths = np.ptp(
+        model.split.points[:, [0, 2]] @ np.stack([np.cos(angle), np.sin(angle)]), axis=0
+    )
+    # Long along the slope of the plane, as wide as the cylinder across it; a polygon of 18 sides.
+    assert widths.max() / widths.min() == pytest.approx(ellipse(name) / ellipse("across"), rel=0.02)
+
+
+@pytest.mark.parametrize("name", ELLIPSES)
+def test_pressing_through_an_oblique_plane_takes_toughness_times_its_ellipse(name):
+    food, model = oblique(name)
+    plan = MotionPlan([ConstantSpeed(distance=model.top - model.bottom + 1e-3, speed=0.04)])
+    motion = Motion(plan, start_pose(model, clearance=5e-4))
+    result = simulate_slice(CuttingSolver(model, 2e-3), motion)
+    assert result.cut[-1] > 0.999
+    # The knife's work from forces and path alone, less what is stored or goes elsewhere.
+    moved = np.diff(np.vstack([motion.pose(0.0).p, result.position]), axis=0)
+    work = -float((result.food_wrench[:, 3:] * moved).sum())
+    ledger, energies = result.ledger, result.energies
+    stored = energies.elastic + energies.interface + energies.kinetic
+    elsewhere = ledger.opening + ledger.friction + ledger.board_friction + ledger.blade
+    net = work + ledger.gravity - stored - elsewhere - ledger.damping(energies)
+    assert net == pytest.approx(food.material.toughness * ellipse(name), rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        ({"cut_point": [0.0, 0.06, 0.0]}, MeshError, r"misses the food.*Move the plane's point"),
+        ({"hold_distance": 0.0}, ConfigurationError, r"food\.hold.*farther from the cut plane"),
+        ({"cut_normal": [0.0, 0.0, 1.0]}, MeshError, r"parallel to the normal.*cannot cut along"),
+    ],
+)
+def test_an_oblique_plane_that_cannot_be_cut_is_refused(change, error, words):
+    food, _ = oblique("turned")
+    with pytest.raises(error, match=words):
+        make_food_model(dc.replace(food, **change), Knife(), Numerics())
