@@ -4,11 +4,18 @@ import dataclasses as dc
 
 import numpy as np
 
-from sliceit_drake.configuration import ConfigurationError, quantity
+from sliceit_drake.configuration import ConfigurationError, choice, quantity
 
 STEEL_DENSITY = 7800.0
 
-__all__ = ["Knife", "section_distance", "signed_distance"]
+UNSUPPORTED = {
+    "serrated": "teeth cut by their points and saw; toughness times width does not describe that",
+    "curved": "a curved edge meets the food point by point; contact and board take a straight one",
+    "single bevel": "it pushes the blade aside; both sides of the section are alike here",
+}
+"""Kinds of knives that are known and cannot be computed, and why."""
+
+__all__ = ["UNSUPPORTED", "Knife", "section_distance", "signed_distance"]
 
 
 @dc.dataclass
@@ -21,6 +28,11 @@ class Knife:
     docs/physics.md.
     """
 
+    profile: str = choice(
+        "straight",
+        ("straight", *UNSUPPORTED),
+        doc="Kind of edge; only a straight one with two equal bevels can be computed.",
+    )
     spine_thickness: float = quantity(
         3.5e-3, "m", low=2e-4, high=2e-2, doc="Thickness at the spine."
     )
@@ -54,6 +66,12 @@ class Knife:
     )
 
     def check(self, where: str) -> None:
+        if self.profile in UNSUPPORTED:
+            raise ConfigurationError(
+                f"{self.profile} is not supported: {UNSUPPORTED[self.profile]}",
+                field=f"{where}.profile",
+                fix="Use a knife with a straight edge and two bevels, as calibration/knives lists.",
+            )
         if self.edge_thickness >= self.spine_thickness:
             raise ConfigurationError(
                 f"= {self.edge_thickness} m is not below spine_thickness, {self.spine_thickness} m",

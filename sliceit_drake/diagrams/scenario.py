@@ -14,6 +14,7 @@ from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.diagrams.calibrated_food import load_calibrated_food
+from sliceit_drake.diagrams.named_knife import load_knife
 from sliceit_drake.diagrams.robot import RobotConfig
 from sliceit_drake.diagrams.sequence import SliceSequence
 from sliceit_drake.systems.agent import AgentConfig
@@ -105,6 +106,8 @@ class Scenario:
     controller: ComplianceControllerConfig = dc.field(default_factory=ComplianceControllerConfig)
     monitor: ContactMonitorConfig = dc.field(default_factory=ContactMonitorConfig)
     knife: Knife = dc.field(default_factory=Knife)
+    knife_name: str | None = None
+    """A knife by name (calibration/knives) or file; it takes the place of `knife`."""
     board: Board = dc.field(default_factory=Board)
     food: Food | AnalyticFood | SpringFood = dc.field(default_factory=Food)
     calibration: str | None = None
@@ -182,6 +185,8 @@ def load_scenario(file: str | Path, overrides: str | None = None) -> Scenario:
     assert isinstance(scenario, Scenario)
     if isinstance(scenario.food, Food) and isinstance(scenario.food.shape, MeshFile):
         scenario.food.shape.look_beside(Path(file).parent)
+    if scenario.knife_name is not None:
+        scenario.knife = _named_knife(scenario.knife_name, scenario.knife, str(file))
     if scenario.calibration is not None:
         if not isinstance(scenario.food, Food):
             raise ConfigurationError(
@@ -198,3 +203,16 @@ def load_scenario(file: str | Path, overrides: str | None = None) -> Scenario:
             scenario.food.effects.skin.toughness = 0.0
     validate(scenario, "scenario")
     return scenario
+
+
+def _named_knife(name: str, given: Knife, source: str) -> Knife:
+    """The knife of a name; one that is given beside must be that or the default."""
+    knife = load_knife(name, "scenario.knife_name").knife
+    if given not in (Knife(), knife):
+        raise ConfigurationError(
+            f"cannot stand beside knife_name, which is {name!r}",
+            field="scenario.knife",
+            source=source,
+            fix="Leave out one of knife and knife_name, or give the knife a file of its own.",
+        )
+    return knife
