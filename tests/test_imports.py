@@ -10,7 +10,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "sliceit_drake"
 
 # Modules at the top of the package, on which everything may stand.
-BASE = {"configuration", "resources", "tables"}
+BASE = {"cluster", "configuration", "resources", "tables"}
 
 # Which of our packages each may import, besides itself and BASE.
 LAYERS: dict[str, set[str]] = {
@@ -38,7 +38,7 @@ LAYERS["cli"] = set(LAYERS)
 
 # All that some packages may import from others' libraries.
 LIBRARIES = {
-    "": {"numpy", "yaml", "pydrake"},
+    "": {"distributed", "numpy", "yaml", "pydrake"},
     "cutting": {"numpy", "scipy", "warp", "meshio"},
     "records": {"numpy", "scipy"},
 }

@@ -6,6 +6,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sliceit_drake.cli.cluster_arguments import add_cluster_arguments, check_cluster_arguments
 from sliceit_drake.cli.progress import StageBars
 
 if TYPE_CHECKING:
@@ -81,16 +82,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument(
         "--workers", type=int, default=os.cpu_count() or 1, help="processors (default: all)"
     )
-    parser.add_argument(
-        "--backend",
-        choices=("threads", "dask"),
-        default="threads",
-        help="where slices are simulated: threads of this machine (the default), or the workers of"
-        " a Dask cluster",
-    )
-    parser.add_argument(
-        "--scheduler", metavar="ADDRESS", help="of the cluster, as tcp://192.168.0.5:8786"
-    )
+    add_cluster_arguments(parser, "threads", "slices are simulated")
     parser.set_defaults(run=run)
 
 
@@ -138,12 +130,7 @@ def _check_options(options: argparse.Namespace) -> None:
             raise ConfigurationError(
                 f"is {value:g}", field=f"--{name}", fix=f"Give {least:g} to {most:g}."
             )
-    if (options.backend == "dask") != (options.scheduler is not None):
-        raise ConfigurationError(
-            "is given without --backend dask" if options.scheduler else "is not given",
-            field="--scheduler",
-            fix="Give both: --backend dask --scheduler tcp://HOST:8786.",
-        )
+    check_cluster_arguments(options)
 
 
 def _diagnose(

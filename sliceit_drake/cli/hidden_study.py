@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from sliceit_drake.cli.cluster_arguments import add_cluster_arguments, cluster_of
 from sliceit_drake.cli.progress import StageBars
 
 __all__ = ["add_hidden_study"]
@@ -23,6 +24,8 @@ Kinds of runs
 
   sliceit study hidden --output output/hidden --minutes 120
   sliceit study hidden --output output/hidden --runs-from FILE.jsonl --seed 1 --replicates 100
+  sliceit study hidden --output output/hidden --backend dask --scheduler tcp://192.168.0.5:8786
+On a cluster the list of runs and the sizes are made here, the runs there; no disk is shared.
 """
 
 SIZES = """\
@@ -50,6 +53,7 @@ def add_hidden_study(studies: "argparse._SubParsersAction[argparse.ArgumentParse
     hidden.add_argument("--runs", type=int, metavar="N", help="only the first N of the list")
     hidden.add_argument("--minutes", type=float, metavar="M", help="begin no run after these")
     hidden.add_argument("--workers", type=int, default=2, help="processes (default 2)")
+    add_cluster_arguments(hidden, "processes", "records are made and diagnosed")
     hidden.add_argument("--seed", type=int, default=0, help="of the list of runs (default 0)")
     hidden.add_argument(
         "--replicates", type=int, default=200, help="of each diagnosis's bootstrap (default 200)"
@@ -93,7 +97,7 @@ def run_hidden(options: argparse.Namespace) -> int:
     if options.runs_from is not None:
         unpack(options.runs_from, options.output)
     settings = StudyOptions(kinds, options.seed, options.replicates, protocols, effects)
-    with StageBars() as bars:
+    with cluster_of(options) as client, StageBars() as bars:
         cases = prepare(options.output, settings, bars.show)[: options.runs]
         done = run_study(
             cases,
@@ -102,6 +106,7 @@ def run_hidden(options: argparse.Namespace) -> int:
             options.workers,
             options.minutes,
             bars.show,
+            client,
         )
     print(f"{done} of {len(cases)} runs are done. Judge them: sliceit score {options.output}")
     return 0

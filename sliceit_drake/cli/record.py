@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sliceit_drake.cli.cluster_arguments import add_cluster_arguments, cluster_of
 from sliceit_drake.cli.scenario_argument import add_protocol_argument, protocol_file
 
 if TYPE_CHECKING:
@@ -37,6 +38,8 @@ Examples
   sliceit record --output records/null --seed 1
   sliceit record calibration/protocols/full.yaml --effect arm_compliance:5e-5 --output records/a
   sliceit record scenarios/cucumber.yaml --replicates 6 --world curves --output records/b
+  sliceit record --output records/c --seed 1 --backend dask --scheduler tcp://192.168.0.5:8786
+The workers of a cluster need no shared disk, but a FILE.py of yours at its place on each of them.
 """
 
 
@@ -65,6 +68,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         "--seed", type=int, help="makes a run repeatable; by default one that nobody knows"
     )
     parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
+    add_cluster_arguments(parser, "processes", "slices are cut")
     parser.add_argument(
         "--replicates", type=int, default=6, help="slices of a scenario's one cut (default 6)"
     )
@@ -95,7 +99,7 @@ def run(options: argparse.Namespace) -> int:
     settings.refinement = options.refinement or settings.refinement
     settings.time_step = options.time_step or settings.time_step
     validate(settings, "settings")
-    with tqdm(desc=protocol.name, unit="slice") as bar:
+    with cluster_of(options) as client, tqdm(desc=protocol.name, unit="slice") as bar:
 
         def show(done: int, count: int) -> None:
             bar.total = count
@@ -110,6 +114,7 @@ def run(options: argparse.Namespace) -> int:
             options.workers,
             settings,
             show,
+            client,
         )
     print(f"{len(files)} records in {directory}/")
     return 0

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sliceit_drake.cluster import CONNECT, connected
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.geometry import CutGeometry
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
 
 __all__ = ["active", "on_cluster", "run_jobs"]
 
-CONNECT = 10.0
-"""Time to reach a scheduler and one worker, s."""
 GEOMETRIC = ("blocks", "shape", "_gradient_products", "section_area")
 """What a cut keeps that only depends on its geometry; see `CuttingModel.derive`."""
 
@@ -50,35 +49,17 @@ def on_cluster(scheduler: str, patience: float = CONNECT) -> Iterator[None]:
         patience: For it and for its first worker, s.
 
     Raises:
-        ConfigurationError: The package is not installed, or nobody answers there.
+        ConfigurationError: The package is not installed, or see `cluster.connected`.
     """
     try:
         import joblib  # noqa: F401
-        from distributed import Client
     except ImportError as error:
         raise ConfigurationError(
             f"needs the packages of the extra `cluster` ({error.name} is missing)",
             field="--backend",
             fix="pip install 'sliceit_drake[cluster]'",
         ) from error
-    try:
-        client = Client(scheduler, timeout=patience, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise ConfigurationError(
-            f"no Dask scheduler answers at {scheduler}",
-            field="--scheduler",
-            fix="Start one (dask scheduler), give the address that it prints, and check that no"
-            " firewall is between.",
-        ) from error
-    with client:
-        try:
-            client.wait_for_workers(1, timeout=patience)
-        except TimeoutError as error:
-            raise ConfigurationError(
-                f"the scheduler at {scheduler} has no workers",
-                field="--scheduler",
-                fix=f"Start some on the machines of the cluster: dask worker {scheduler}",
-            ) from error
+    with connected(scheduler, patience) as client:
         token = _CLIENT.set(client)
         try:
             yield

@@ -1,16 +1,16 @@
 """One run of the study: records are made, and a process that sees nothing else diagnoses them."""
 
-import functools
-import hashlib
 import json
 import os
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
-import sliceit_drake
+from sliceit_drake.cluster import code_version
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.hidden_study.bench import DIAGNOSIS_REFINEMENT, WORLD, protocol_named
@@ -20,17 +20,22 @@ from sliceit_drake.stand_in.protocol import Protocol, protocol_of_scenario
 from sliceit_drake.stand_in.registry import make_effect
 from sliceit_drake.stand_in.session import Session
 
-__all__ = ["food_file", "is_done", "run_case"]
+__all__ = ["Made", "food_file", "is_done", "keep_case", "run_case", "run_case_there"]
+
+TIMING = "timing.json"
 
 KEPT = (
     "diagnosis.json",
     "table.txt",
     "diagnosis_next.json",
     "table_next.txt",
-    "timing.json",
+    TIMING,
     "failure.txt",
 )
 NEXT = "next.yaml"
+
+Made = tuple[str, dict[str, bytes]]
+"""A run's name, and its files by name."""
 
 
 def food_file(output: Path, protocol: str) -> Path:
@@ -40,16 +45,7 @@ def food_file(output: Path, protocol: str) -> Path:
 
 def is_done(output: Path, name: str) -> bool:
     """Whether a run has come to an end."""
-    return (output / "runs" / name / "timing.json").exists()
-
-
-@functools.cache
-def code_version() -> str:
-    """Hash of the package's source, by which runs of one version are known."""
-    h = hashlib.sha256()
-    for file in sorted(Path(sliceit_drake.__file__).parent.rglob("*.py")):
-        h.update(file.read_bytes())
-    return h.hexdigest()[:12]
+    return (output / "runs" / name / TIMING).exists()
 
 
 def run_case(case: Case, output: Path, replicates: int) -> str:
@@ -79,11 +75,56 @@ def run_case(case: Case, output: Path, replicates: int) -> str:
             shutil.rmtree(entry)
         elif entry.name not in KEPT:
             entry.unlink()
+    timing = json.dumps({**bench.seconds, "code": code_version()}) + "\n"
+    _finish(folder, timing.encode())
+    return case.name
+
+
+def _finish(folder: Path, timing: bytes) -> None:
     # Last: what is here is whole.
     part = folder / "timing.part"
-    part.write_text(json.dumps({**bench.seconds, "code": code_version()}) + "\n", encoding="utf-8")
-    os.replace(part, folder / "timing.json")
-    return case.name
+    part.write_bytes(timing)
+    os.replace(part, folder / TIMING)
+
+
+def run_case_there(case: Case, food: str, replicates: int) -> Made:
+    """A run on a worker of a cluster, in a folder that is gone afterwards.
+
+    Simulations of the diagnosis stay with the worker, from one run to the next.
+
+    Args:
+        case: The run.
+        food: Text of the food that is given to the diagnosis.
+        replicates: Of the diagnosis's bootstrap.
+
+    Returns:
+        The run's name, and its files by name.
+    """
+    from distributed import get_worker
+
+    cache = Path(get_worker().local_directory).resolve() / "sliceit_cache"
+    cache.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="sliceit_run_") as folder:
+        output = Path(folder)
+        file = food_file(output, case.protocol)
+        file.parent.mkdir(parents=True)
+        file.write_text(food, encoding="utf-8")
+        (output / "cache").symlink_to(cache)
+        run_case(case, output, replicates)
+        made = (output / "runs" / case.name).iterdir()
+        return case.name, {file.name: file.read_bytes() for file in made}
+
+
+def keep_case(name: str, files: Mapping[str, bytes], output: Path) -> str:
+    """Writes the files of a run that was made elsewhere, and returns its name."""
+    folder = output / "runs" / name
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    for file, content in files.items():
+        if file != TIMING:
+            (folder / file).write_bytes(content)
+    _finish(folder, files[TIMING])
+    return name
 
 
 class _Failure(RuntimeError):

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import warp
 
@@ -15,9 +15,19 @@ from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.hidden_study.bench import model_food, protocol_named
 from sliceit_drake.hidden_study.cases import KINDS, Case, make_cases
 from sliceit_drake.hidden_study.classes import ProtocolClasses, protocol_classes
-from sliceit_drake.hidden_study.runner import food_file, is_done, run_case
+from sliceit_drake.hidden_study.runner import (
+    Made,
+    food_file,
+    is_done,
+    keep_case,
+    run_case,
+    run_case_there,
+)
 from sliceit_drake.hidden_study.sizes import angles_for, size_for
 from sliceit_drake.hidden_study.truth import CAUSE_OF
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 __all__ = ["CASES", "StudyOptions", "load_cases", "prepare", "read_facts", "run_study"]
 
@@ -170,6 +180,7 @@ def run_study(
     workers: int = 2,
     minutes: float | None = None,
     progress: Progress | None = None,
+    client: "Client | None" = None,
 ) -> int:
     """Works off the runs that are not done.
 
@@ -180,6 +191,8 @@ def run_study(
         workers: Processes.
         minutes: After which no run is begun; None for no end.
         progress: See `Progress`.
+        client: Of a Dask cluster that does the runs, in place of processes: as many at once as it
+            has threads. What it makes is kept here.
 
     Returns:
         Number of runs that are done.
@@ -189,25 +202,70 @@ def run_study(
     left = [case for case in cases if not is_done(output, case.name)]
     done = len(cases) - len(left)
     show("runs", done, len(cases))
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_start_worker)
-    running: set[Future[str]] = set()
+    place = (
+        _Here(output, replicates, workers) if client is None else _There(output, replicates, client)
+    )
+    running: set[Future[Any]] = set()
     queue = iter(left)
     try:
         while True:
-            while len(running) < workers and (end is None or time.monotonic() < end):
+            while len(running) < place.width() and (end is None or time.monotonic() < end):
                 case = next(queue, None)
                 if case is None:
                     break
-                running.add(pool.submit(run_case, case, output, replicates))
+                running.add(place.submit(case))
             if not running:
                 return done
             ended, running = wait(running, return_when=FIRST_COMPLETED)
             for future in ended:
-                future.result()
+                place.keep(future.result())
                 done += 1
                 show("runs", done, len(cases))
     finally:
-        pool.shutdown(cancel_futures=True)
+        place.close()
+
+
+class _Here:
+    """Processes of this machine, which write their runs themselves."""
+
+    def __init__(self, output: Path, replicates: int, workers: int) -> None:
+        self._output, self._replicates, self._workers = output, replicates, workers
+        self._pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_start_worker)
+
+    def width(self) -> int:
+        return self._workers
+
+    def submit(self, case: Case) -> "Future[Any]":
+        return self._pool.submit(run_case, case, self._output, self._replicates)
+
+    def keep(self, made: Any) -> None:
+        pass
+
+    def close(self) -> None:
+        self._pool.shutdown(cancel_futures=True)
+
+
+class _There:
+    """The workers of a cluster, which need nothing of this machine's disk."""
+
+    def __init__(self, output: Path, replicates: int, client: "Client") -> None:
+        self._output, self._replicates, self._client = output, replicates, client
+        self._pool = client.get_executor(pure=False)
+
+    def width(self) -> int:
+        # Workers come and go.
+        return max(1, sum(self._client.nthreads().values()))
+
+    def submit(self, case: Case) -> "Future[Any]":
+        food = food_file(self._output, case.protocol).read_text(encoding="utf-8")
+        future: Future[Any] = self._pool.submit(run_case_there, case, food, self._replicates)
+        return future
+
+    def keep(self, made: Made) -> None:
+        keep_case(*made, self._output)
+
+    def close(self) -> None:
+        self._pool.shutdown(wait=False)
 
 
 def _start_worker() -> None:

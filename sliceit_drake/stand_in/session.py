@@ -2,12 +2,15 @@
 
 import copy
 import os
+import pickle
 import secrets
 import tempfile
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path as FilePath
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp
@@ -33,6 +36,9 @@ from sliceit_drake.stand_in.protocol import Protocol, Specimen, scaled_food, sch
 from sliceit_drake.stand_in.registry import make_effect
 from sliceit_drake.stand_in.sensor import measured
 from sliceit_drake.stand_in.world import World
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 __all__ = ["WORLDS", "Session", "is_recorded", "record_session"]
 
@@ -214,6 +220,7 @@ def record_session(
     workers: int = 1,
     settings: FiniteElementSettings | None = None,
     progress: Callable[[int, int], None] | None = None,
+    client: "Client | None" = None,
 ) -> list[FilePath]:
     """Writes the records of a protocol, one by one as they are done; goes on with what is there.
 
@@ -228,6 +235,8 @@ def record_session(
         workers: Processes.
         settings: How finely the finite elements are computed.
         progress: Called with the number of records that are there, and that of all.
+        client: Of a Dask cluster that cuts the slices, in place of processes; the files are
+            written here, and are the same.
 
     Returns:
         The CSV files, by slice.
@@ -251,7 +260,12 @@ def record_session(
     done = len(session) - len(left)
     if progress is not None:
         progress(done, len(session))
-    for _ in _written(session, effects, world, settings, output, left, workers):
+    written = (
+        _written(session, effects, world, settings, output, left, workers)
+        if client is None
+        else _written_by_cluster(client, session, effects, world, settings, output, left)
+    )
+    for _ in written:
         done += 1
         if progress is not None:
             progress(done, len(session))
@@ -277,10 +291,10 @@ def is_recorded(specimen: Specimen, folder: FilePath) -> bool:
     return True
 
 
-def _write(session: Session, output: FilePath, index: int) -> int:
+def _write(record: SliceRecord, output: FilePath, index: int) -> int:
     # Two files make a record; a run that is killed must not leave half of one.
     with tempfile.TemporaryDirectory(dir=output, prefix=".writing_") as folder:
-        made = write_record(session.record(index), FilePath(folder) / slice_name(index))
+        made = write_record(record, FilePath(folder) / slice_name(index))
         for file in (made, made.with_suffix(".yaml")):
             os.replace(file, output / file.name)
     return index
@@ -304,7 +318,7 @@ def _start_worker(
 
 def _work(index: int) -> int:
     session, output = _worker[0]
-    return _write(session, output, index)
+    return _write(session.record(index), output, index)
 
 
 def _written(
@@ -319,7 +333,7 @@ def _written(
     """Writes the slices that are left, and yields each when its files are there."""
     if min(workers, len(left)) < 2:
         for index in left:
-            yield _write(session, output, index)
+            yield _write(session.record(index), output, index)
         return
     # Effects travel by name: a class from a user's file is in no module that a process can import.
     arguments = (session.protocol, tuple(effects), world, session.seed, settings, output)
@@ -331,3 +345,37 @@ def _written(
             yield future.result()
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+_SESSIONS = threading.local()
+
+
+def _record_there(content: bytes, index: int) -> tuple[int, SliceRecord]:
+    """A slice on a worker of a cluster, whose threads keep the session from one to the next."""
+    known: tuple[bytes, Session] | None = getattr(_SESSIONS, "known", None)
+    if known is None or known[0] != content:
+        warp.config.log_level = warp.LOG_ERROR
+        protocol, effects, world, seed, settings = pickle.loads(content)
+        hidden = [make_effect(text) for text in effects]
+        known = _SESSIONS.known = (content, Session(protocol, hidden, world, seed, settings))
+    return index, known[1].record(index)
+
+
+def _written_by_cluster(
+    client: "Client",
+    session: Session,
+    effects: Sequence[str],
+    world: str,
+    settings: FiniteElementSettings | None,
+    output: FilePath,
+    left: Sequence[int],
+) -> Iterator[int]:
+    """Has the slices that are left cut by a cluster, and writes each as it comes."""
+    content = pickle.dumps((session.protocol, tuple(effects), world, session.seed, settings))
+    pool = client.get_executor(pure=False)
+    try:
+        for future in as_completed([pool.submit(_record_there, content, k) for k in left]):
+            index, record = future.result()
+            yield _write(record, output, index)
+    finally:
+        pool.shutdown(wait=False)
