@@ -343,7 +343,15 @@ def _merge_text(
     import yaml
     from pydrake.common.yaml import yaml_load_typed
 
-    loader = yaml.SafeLoader(text)
+    try:
+        loader = yaml.SafeLoader(text)
+    except yaml.reader.ReaderError as error:
+        line = text.count("\n", 0, error.position) + 1
+        raise ConfigurationError(
+            f"not valid YAML: the character #x{error.character:04x}",
+            source=f"{source}, line {line}",
+            fix="Save it as plain UTF-8 text.",
+        ) from None
     try:
         node = loader.get_single_node()
     except yaml.MarkedYAMLError as error:

@@ -9,6 +9,7 @@ from sliceit_drake.cli.calibration_study import add_calibration_study
 from sliceit_drake.cli.coverage import add_coverage
 from sliceit_drake.cli.hidden_study import add_hidden_study
 from sliceit_drake.cli.identifiability import add_identifiability
+from sliceit_drake.cli.random_study import add_random_study
 from sliceit_drake.cli.real_study import add_real_study
 from sliceit_drake.cli.scenario_argument import add_scenario_arguments, scenario_of
 from sliceit_drake.cli.slicing_study import add_slicing
@@ -128,6 +129,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     add_verification(studies)
     add_coverage(studies)
     add_slicing(studies)
+    add_random_study(studies)
     add_calibration_study(studies)
     add_identifiability(studies)
     add_real_study(studies)
