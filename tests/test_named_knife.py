@@ -78,7 +78,7 @@ def test_a_knife_of_ones_own_is_named_by_its_file(tmp_path):
     [
         ("knife_name: katana", r"scenario\.knife_name: there is no knife 'katana'; there are chef"),
         ("{knife_name: chef, knife: {length: 0.3}}", r"scenario\.knife: cannot stand beside.*chef"),
-        ("knife: {profile: serrated}", r"knife\.profile: serrated is not supported: the teeth"),
+        ("knife: {profile: serrated}", r"knife\.profile: serrated is not supported: teeth"),
         ("knife: {profile: wavy}", r"knife\.profile: 'wavy' is not one of straight, serrated"),
     ],
 )
