@@ -40,7 +40,7 @@ LAYERS["cli"] = set(LAYERS)
 LIBRARIES = {
     "": {"distributed", "numpy", "yaml", "pydrake"},
     "cutting": {"numpy", "scipy", "warp", "meshio"},
-    "records": {"numpy", "scipy"},
+    "records": {"numpy", "rosbags", "scipy"},
 }
 
 # Libraries that only some modules may import (a module's name, or the package that holds it).
@@ -52,6 +52,7 @@ ONLY_IN = {
     "onnx": ("learning",),
     "onnxruntime": ("systems.network",),
     "optuna": ("calibration",),
+    "rosbags": ("records.rosbag",),
     "rtde_control": ("hardware",),
     "rtde_receive": ("hardware",),
     "rtde_io": ("hardware",),

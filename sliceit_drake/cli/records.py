@@ -4,6 +4,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sliceit_drake.cli.extras import needs_extra
+
 if TYPE_CHECKING:
     from sliceit_drake.records.metadata import SliceMetadata
     from sliceit_drake.records.slice_record import SliceRecord
@@ -38,6 +40,11 @@ Make a slice record from another format.
               sliceit records import force scale.csv --metadata facts.yaml --contact 0.4 \\
                 --output records
   profile   a force profile digitised from a figure, as those in calibration/measured
+  rosbag    a ROS 1 .bag, a ROS 2 folder, .db3 or .mcap: --topics names one of WrenchStamped, and
+            one of PoseStamped, TransformStamped or (a UR5e's) JointState; no ROS is needed:
+              sliceit records import rosbag run_07.mcap --topics /wrench /tcp_pose \\
+                --tcp-to-knife 0 0 0.12 3.1416 0 0 --between 4.0 9.5 --metadata session.yaml \\
+                --output records
 
 --metadata is a YAML file with what FILE does not say: food, board, knife, nominal motion, sensor,
 provenance, and what is unknown (docs/records.md). Writes DIR/NAME.csv and DIR/NAME.yaml, and prints
@@ -70,7 +77,9 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         description=IMPORT,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    make.add_argument("format", choices=("ur_rtde", "force", "profile"), help="what FILE is")
+    make.add_argument(
+        "format", choices=("ur_rtde", "force", "profile", "rosbag"), help="what FILE is"
+    )
     make.add_argument("file", metavar="FILE", type=Path)
     make.add_argument("--output", metavar="DIR", type=Path, required=True, help="folder of records")
     make.add_argument("--metadata", metavar="YAML", type=Path, help="what FILE does not say")
@@ -81,15 +90,17 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         metavar=pose,
         nargs=6,
         type=float,
-        help="ur_rtde: knife in the tool frame set in the controller, m and rad; the knife "
-        "frame has its origin at the middle of the edge, x along it, z from spine to edge",
+        help="ur_rtde, rosbag: knife in the tool frame set in the controller, or in the frame that "
+        "the topic is of (of joints: tool0), m and rad; the knife frame has its origin at the "
+        "middle of the edge, x along it, z from spine to edge",
     )
     make.add_argument(
         "--world-to-base",
         metavar=pose,
         nargs=6,
         type=float,
-        help="ur_rtde: robot's base in the world; default: they are the same",
+        help="ur_rtde, rosbag: robot's base (of joints: UR's base, not base_link), or the frame "
+        "that poses are in, in the world; default: they are the same",
     )
     make.add_argument(
         "--component",
@@ -102,6 +113,25 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         metavar="S",
         type=float,
         help="force, profile: time at which the force rises, which ends the air phase",
+    )
+    make.add_argument(
+        "--topics", metavar=("WRENCH", "MOTION"), nargs=2, help="rosbag: of force and of motion"
+    )
+    make.add_argument(
+        "--tool-frame", metavar="NAME", help="rosbag: frame that MOTION is of, if it does not say"
+    )
+    make.add_argument(
+        "--between",
+        metavar=("S", "S"),
+        nargs=2,
+        type=float,
+        help="rosbag: begin and end of the slice, s after the first wrench; default: all",
+    )
+    make.add_argument(
+        "--clock",
+        choices=("header", "received"),
+        default="header",
+        help="rosbag: stamps of the messages (the default), or when they were recorded",
     )
     make.set_defaults(run=run_import)
 
@@ -156,6 +186,12 @@ def _import(options: argparse.Namespace, metadata: "SliceMetadata") -> "SliceRec
         return importers.import_force(
             options.file, metadata, component=options.component, contact=options.contact
         )
+    if options.format == "rosbag" and options.topics is None:
+        raise ConfigurationError(
+            "is not given",
+            field="--topics",
+            fix="Give two: of WrenchStamped, and of PoseStamped, TransformStamped or JointState.",
+        )
     if options.tcp_to_knife is None:
         raise ConfigurationError(
             "is not given",
@@ -166,4 +202,22 @@ def _import(options: argparse.Namespace, metadata: "SliceMetadata") -> "SliceRec
     tcp, base = options.tcp_to_knife, options.world_to_base or [0.0] * 6
     X_TK = importers.pose_matrix(tcp[:3], tcp[3:])
     X_WB = importers.pose_matrix(base[:3], base[3:])
-    return importers.import_ur_rtde(options.file, metadata, X_TK, X_WB)
+    if options.format == "ur_rtde":
+        return importers.import_ur_rtde(options.file, metadata, X_TK, X_WB)
+    from sliceit_drake.hardware.knife_kinematics import flange_pose
+    from sliceit_drake.records.rosbag import import_rosbag
+
+    wrench, motion = options.topics
+    with needs_extra("ros"):
+        return import_rosbag(
+            options.file,
+            metadata,
+            wrench,
+            motion,
+            X_TK,
+            X_WB,
+            forward=flange_pose,
+            tool_frame=options.tool_frame,
+            between=options.between,
+            clock=options.clock,
+        )

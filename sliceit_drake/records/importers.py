@@ -27,7 +27,14 @@ from sliceit_drake.records.slice_record import (
 )
 from sliceit_drake.tables import read_columns, require_increasing
 
-__all__ = ["import_force", "import_frame", "import_profile", "import_ur_rtde", "pose_matrix"]
+__all__ = [
+    "import_force",
+    "import_frame",
+    "import_profile",
+    "import_ur_rtde",
+    "imported_facts",
+    "pose_matrix",
+]
 
 CLEARANCE = 1e-3
 """Height of the edge above the food at the start of a nominal motion, m."""
@@ -94,7 +101,7 @@ def import_ur_rtde(
     torque = series["TCP_force"][:, 3:] @ R_WB.T - np.cross(p_TK_W, force)
     if metadata.wrench.sign == "by_knife":
         force, torque = -force, -torque
-    facts = _imported(metadata, file)
+    facts = imported_facts(metadata, file)
     note = "from actual_TCP_force in the base about the tool centre point, to W about Ko"
     numbers = {"start": float(stamp[0]), "repeated_rows": float((~fresh).sum())}
     facts.processing = [ProcessingStep("import_ur_rtde", numbers, note)]
@@ -234,7 +241,8 @@ def import_frame(
     return record_from_table(SliceTable(facts, values, facts.name or "table", lines))
 
 
-def _imported(metadata: SliceMetadata, file: str | Path) -> SliceMetadata:
+def imported_facts(metadata: SliceMetadata, file: str | Path) -> SliceMetadata:
+    """A copy of the facts, named after the file if they have no name."""
     facts = copy.deepcopy(metadata)
     facts.name = facts.name or Path(file).stem
     return facts
@@ -283,7 +291,7 @@ def _nominal_record(
     contact: float | None,
 ) -> SliceRecord:
     """A record whose motion is what the knife was told to do."""
-    facts = _imported(metadata, file)
+    facts = imported_facts(metadata, file)
     motion, food = facts.motion, facts.food
     if motion.speed is None or food.size is None:
         raise ConfigurationError(
