@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp
 from example_slices import HEIGHT, short_press
 
 from sliceit_drake import cluster
@@ -136,6 +137,8 @@ def fake_diagnosis(command: list[str], cwd: Path, **_: object) -> object:
 
 
 def test_a_sweep_on_a_cluster_is_that_of_one_process(tmp_path, monkeypatch):
+    # Asks the system for the processor's name, by a program.
+    warp.init()
     monkeypatch.setattr(runner.subprocess, "run", fake_diagnosis)
     monkeypatch.setattr(runner, "protocol_named", lambda name: small_protocol())
     cases = [

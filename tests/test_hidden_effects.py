@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp
 from scipy.stats import binomtest
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
@@ -138,6 +139,8 @@ def test_nothing_that_the_diagnosis_sees_tells_what_is_hidden(tmp_path, monkeypa
         seen["command"] = " ".join(command)
         return subprocess.CompletedProcess(command, 1, "", "looked")
 
+    # Asks the system for the processor's name, by a program.
+    warp.init()
     monkeypatch.setattr(runner.subprocess, "run", look)
     monkeypatch.setattr(runner, "WORLD", COARSE)
     run_case(case, output, 100)
