@@ -104,7 +104,7 @@ def search(
     proposals = _Proposals(space, predictor.start, seed)
     done = _finished(study)
     while len(done) < trials:
-        # A database does not keep the order of a trial's parameters.
+        # A database need not keep the order of a trial's parameters.
         known_units = {tuple(t.params[name] for name in names) for t in done[-GENERATION:]}
         # A generation that was cut short is proposed once more, and what it lacks is computed.
         units = [u for u in proposals.generation(done) if tuple(u.tolist()) not in known_units]

@@ -265,7 +265,7 @@ def _series(
             f"the time of {topic} goes back by {-step[k]:.3g} s, {time[k] - time[0]:.3f} s after "
             "its first message",
             source=str(file),
-            fix="The clock was set, or two nodes publish it. Record again, or try --clock received.",
+            fix="The clock was set, or two nodes publish it: record again, or try --clock received",
         )
     fresh = np.concatenate([[True], step > 0.0])
     values = _values([m for _, m in rows], kind, file, topic)
