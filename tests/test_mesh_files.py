@@ -2,11 +2,13 @@
 
 import dataclasses as dc
 import re
+from pathlib import Path
 
 import meshio
 import numpy as np
 import pytest
 
+from sliceit_drake.calibration.setup import CalibrationSetup, load_setup
 from sliceit_drake.configuration import dump_yaml
 from sliceit_drake.cutting.food import Box, Cylinder, Ellipsoid, Food, MeshFile, make_food_model
 from sliceit_drake.cutting.knife import Knife
@@ -86,6 +88,19 @@ def test_points_that_no_tetrahedron_uses_are_left_out(tmp_path):
     read.check()
     np.testing.assert_array_equal(read.tetrahedra, mesh.tetrahedra)
     np.testing.assert_allclose(read.vertices, mesh.vertices, atol=1e-12)
+
+
+def test_a_mesh_from_a_file_is_refined_by_halving_its_edges_and_not_made_coarser(tmp_path):
+    mesh = Cylinder(rings=2).mesh()
+    shape = MeshFile(write(tmp_path / "food.vtu", mesh, "vtu"))
+    fine = shape.mesh(2.0)
+    fine.check()
+    fine.check_solid()
+    assert len(fine.tetrahedra) == 8 * len(mesh.tetrahedra)
+    assert fine.volumes().sum() == pytest.approx(mesh.volumes().sum(), rel=1e-12)
+    assert len(shape.mesh(1.25).tetrahedra) == len(mesh.tetrahedra)
+    with pytest.raises(MeshError, match=r"food\.vtu cannot be made coarser by 0\.5"):
+        shape.mesh(0.5)
 
 
 def refusal(mesh: TetrahedralMesh, tmp_path) -> str:
@@ -220,6 +235,9 @@ def test_a_mesh_lies_beside_its_scenario_and_an_absent_one_is_looked_for_by_name
     # What is written from it is found from anywhere.
     dump_yaml(loaded, tmp_path / "again.yaml")
     assert load_scenario(tmp_path / "again.yaml").food.shape.mesh().vertices.shape[1] == 3
+    setup = CalibrationSetup(food=Food(shape=MeshFile("pear.vtk")))
+    dump_yaml(setup, folder / "setup.yaml")
+    assert Path(load_setup(folder / "setup.yaml").food.shape.path) == folder / "pear.vtk"
     absent = load_scenario(folder / "pear.yaml", "{food: {shape: !MeshFile {path: pare.vtk}}}")
     with pytest.raises(MeshError, match=r"food\.shape\.path: pare\.vtk.*no such file.*Correct"):
         absent.food.shape.mesh()

@@ -142,6 +142,7 @@ def load_setup(name: str | Path) -> CalibrationSetup:
         )
     setup = load_yaml(CalibrationSetup, file)
     assert isinstance(setup, CalibrationSetup)
+    setup.food.look_beside(file)
     try:
         model = make_food_model(setup.food, setup.knife, setup.numerics, setup.refinement)
     except MeshError as error:

@@ -15,6 +15,7 @@ from sliceit_drake.cutting.mesh import (
     box_mesh,
     cylinder_mesh,
     ellipsoid_mesh,
+    halved_mesh,
     tapered_mesh,
 )
 from sliceit_drake.cutting.model import CuttingModel, Numerics, make_cutting_model
@@ -246,15 +247,22 @@ class MeshFile:
             ) from None
 
     def mesh(self, refinement: float = 1.0) -> TetrahedralMesh:
-        """The mesh in F, without vertices that no tetrahedron uses. A file cannot be refined.
+        """The mesh in F, without vertices that no tetrahedron uses.
+
+        Args:
+            refinement: Rounded to a power of two, by which each edge is divided; the body stays.
 
         Raises:
-            MeshError: The file is absent, unreadable or holds no tetrahedra.
+            MeshError: The file is absent, unreadable or holds no tetrahedra, or was to be coarser.
         """
         import meshio
 
-        if refinement != 1.0:
-            raise MeshError(f"{self.path}: a mesh from a file cannot be refined.")
+        steps = round(np.log2(refinement))
+        if steps < 0:
+            raise MeshError(
+                f"food.shape.path: {self.path} cannot be made coarser by {refinement:g}; a mesh "
+                "from a file can only be refined. Export a coarser one."
+            )
         file = self.file()
         # meshio's readers end on a broken file with whatever went wrong first, some with an exit.
         try:
@@ -277,7 +285,12 @@ class MeshFile:
         used = np.unique(cells)
         if used[0] >= 0 and used[-1] < len(points):
             points, cells = points[used], np.searchsorted(used, cells)
-        return TetrahedralMesh(points, cells)
+        mesh = TetrahedralMesh(points, cells)
+        if steps:
+            mesh.check(f"food.shape.path: {self.path}")
+        for _ in range(steps):
+            mesh = halved_mesh(mesh)
+        return mesh
 
 
 @dc.dataclass
@@ -379,6 +392,11 @@ class Food:
     hold_distance: float = quantity(
         0.0119, "m", low=0.0, high=1.0, doc="Held material is farther than this from the cut."
     )
+
+    def look_beside(self, file: str | Path) -> None:
+        """Lets a mesh be found beside the file that this food was read from."""
+        if isinstance(self.shape, MeshFile):
+            self.shape.look_beside(Path(file).parent)
 
     def plane(self) -> CutPlane:
         """The cut plane; the knife comes from above."""

@@ -19,6 +19,7 @@ __all__ = [
     "box_mesh",
     "cylinder_mesh",
     "ellipsoid_mesh",
+    "halved_mesh",
     "tapered_mesh",
 ]
 
@@ -328,6 +329,11 @@ def ellipsoid_mesh(diameters: tuple[float, float, float], refinements: int) -> T
     ball = vertices * np.divide(gauge, length, out=np.ones_like(length), where=length > 0.0)
     half = 0.5 * np.asarray(diameters, float)
     return _oriented(ball * half + [0.0, 0.0, half[2]], tetrahedra)
+
+
+def halved_mesh(mesh: TetrahedralMesh) -> TetrahedralMesh:
+    """The same body with each edge halved: eight tetrahedra for one."""
+    return _oriented(*_halved(mesh.vertices, mesh.tetrahedra))
 
 
 def _halved(vertices: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -79,4 +79,5 @@ def load_calibrated_food(name: str | Path) -> CalibratedFood:
         )
     food = load_yaml(CalibratedFood, file)
     assert isinstance(food, CalibratedFood)
+    food.food.look_beside(file)
     return food

@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from sliceit_drake.configuration import ConfigurationError, choice, load_yaml, quantity, validate
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.effects import Effects
-from sliceit_drake.cutting.food import Food, MeshFile
+from sliceit_drake.cutting.food import Food
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import MotionPlan
@@ -183,8 +183,8 @@ def load_scenario(file: str | Path, overrides: str | None = None) -> Scenario:
     """
     scenario = load_yaml(Scenario, file, defaults=Scenario(), overrides_text=overrides)
     assert isinstance(scenario, Scenario)
-    if isinstance(scenario.food, Food) and isinstance(scenario.food.shape, MeshFile):
-        scenario.food.shape.look_beside(Path(file).parent)
+    if isinstance(scenario.food, Food):
+        scenario.food.look_beside(file)
     if scenario.knife_name is not None:
         scenario.knife = _named_knife(scenario.knife_name, scenario.knife, str(file))
     if scenario.calibration is not None:
