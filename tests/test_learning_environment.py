@@ -126,10 +126,10 @@ def weighted(info, config=None):
 @pytest.mark.parametrize(
     ("values", "end", "bonus"),
     [
-        ({"agent": {"goal": [1.0, 1.0, 1.0], "goal_decisions": 0}}, "goal", 100.0),
-        ({"workspace": [1.0, 0.001, 1.0]}, "workspace", -100.0),
-        ({"force_limit": 0.1}, "collision", -100.0),
-        ({"torque_limit": 0.1}, "collision", -100.0),
+        ({"agent": {"goal": [1.0, 1.0, 1.0], "goal_decisions": 0}}, "goal", 30.0),
+        ({"workspace": [1.0, 0.001, 1.0]}, "workspace", -30.0),
+        ({"force_limit": 0.1}, "collision", -30.0),
+        ({"torque_limit": 0.1}, "collision", -30.0),
     ],
 )
 def test_an_end_terminates_with_its_reward(values, end, bonus):
@@ -159,7 +159,7 @@ def test_a_guard_of_the_simulation_terminates_with_the_reward_of_a_collision(mon
     assert (terminated, truncated, info["end"]) == (True, False, "guard")
     assert info["guard_error"] == "CuttingError"
     assert "an element is inverted" in info["guard_message"]
-    assert reward == pytest.approx(weighted(info) - 100.0, abs=1e-6)
+    assert reward == pytest.approx(weighted(info) - 30.0, abs=1e-6)
     assert np.isfinite(observation).all()
     # The next episode is as if nothing had happened.
     expected = rollout(SlicingEnv(env.task), 3, seed=4)
@@ -215,20 +215,33 @@ def test_foods_are_drawn_or_asked_for():
         env.reset(options={"food": "carrot"})
 
 
+THEIRS = RewardConfig(force_shape="sigmoid", force_scale=2.0)
+
+
 def test_the_terms_of_the_reward_are_those_of_sliceit():
     height, force, jerk = 0.012, np.array([6.0, 8.0]), np.array([0.3, 0.0, 0.4])
     # -tanh(1), -1 / (1 + e^-2), the norm, and the step.
     expected = [-0.761594156, -0.880797078, -0.5, -1.0]
-    assert reward_terms(height, force, jerk) == pytest.approx(expected, abs=1e-9)
+    assert reward_terms(THEIRS, height, force, jerk) == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.parametrize(("force", "term"), [(0.0, -0.0474259), (6.0, -0.5), (30.0, -0.9999939)])
-def test_the_term_of_the_force_is_s_shaped(force, term):
-    assert reward_terms(0.0, np.array([0.0, -force]), np.zeros(3))[1] == pytest.approx(term, 1e-5)
+def test_their_term_of_the_force_is_s_shaped(force, term):
+    found = reward_terms(THEIRS, 0.0, np.array([0.0, -force]), np.zeros(3))[1]
+    assert found == pytest.approx(term, 1e-5)
+
+
+@pytest.mark.parametrize(
+    ("force", "term"), [(0.0, 0.0), (10.0, -0.0625), (20.0, -0.25), (90.0, -1)]
+)
+def test_half_of_the_force_for_twice_the_time_costs_half(force, term):
+    config = RewardConfig(force_scale=40.0)
+    found = reward_terms(config, 0.0, np.array([0.6 * force, -0.8 * force]), np.zeros(3))[1]
+    assert found == pytest.approx(term, abs=1e-12)
 
 
 def test_the_term_of_the_jerk_ends_at_one():
-    assert reward_terms(0.0, np.zeros(2), np.array([3.0, -4.0, 0.0]))[2] == -1.0
+    assert reward_terms(RewardConfig(), 0.0, np.zeros(2), np.array([3.0, -4.0, 0.0]))[2] == -1.0
 
 
 def test_weights_are_ratios():

@@ -118,7 +118,7 @@ class SlicingEnv(gymnasium.Env):
         observation = self._observation()
         error = station.GetOutputPort("error").Eval(context)
         wrench = station.GetOutputPort("wrench").Eval(context)
-        terms = reward_terms(float(error[1]), wrench[:2], observation[JERK], config.force_scale)
+        terms = reward_terms(config, float(error[1]), wrench[:2], observation[JERK])
         reward = float(reward_weights(config, self.progress) @ terms)
         end = end or self._end(error)
         if end == "goal":

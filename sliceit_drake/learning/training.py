@@ -64,11 +64,11 @@ class TrainingConfig:
         "",
         low=0.0,
         high=1.0,
-        doc="Discount of a decision. At 0.99 the goal's 100 lose one with each decision more, "
-        "twice what a decision's force costs: agents hurry.",
+        doc="Discount of a decision. At 0.99 the goal is worth 1 % less with each decision more, "
+        "which is more than a decision's force costs: agents hurry.",
     )
     entropy: float = quantity(
-        0.1,
+        0.03,
         "",
         low=1e-6,
         high=10.0,
