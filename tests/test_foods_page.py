@@ -1,0 +1,42 @@
+"""docs/foods.md: its tables are those of the files, and what it says to write can be used."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from sliceit_drake.calibration.setup import load_setup
+from sliceit_drake.cutting.food import make_food_model
+from sliceit_drake.diagrams.named_knife import load_knife
+from sliceit_drake.diagrams.scenario import load_scenario
+from sliceit_drake.resources import load_module
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE = (ROOT / "docs/foods.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["foods", "knives"])
+def test_tables_are_made_from_the_files_of_foods_and_knives(name):
+    page = load_module("foods_page", ROOT / "benchmarks/foods_page.py")
+    table = {"foods": page.foods_table, "knives": page.knives_table}[name]()
+    command = "python benchmarks/foods_page.py --output docs/foods.md"
+    assert page.between(PAGE, name, table) == PAGE, command
+
+
+def test_what_the_page_says_to_write_is_a_food_a_knife_and_a_setup(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for kind, text in re.findall(r"```(python|yaml)\n(.*?)```", PAGE, re.DOTALL):
+        if kind == "python":
+            exec(text, {})
+        else:
+            (tmp_path / text.split()[1]).write_text(text, encoding="utf-8")
+    names = {file.name for file in tmp_path.iterdir()}
+    assert names == {"knife.yaml", "radish.vtk", "radish.yaml", "radish_setup.yaml"}
+    monkeypatch.chdir(ROOT)  # The mesh lies beside the files that name it.
+    scenario = load_scenario(tmp_path / "radish.yaml")
+    model = make_food_model(scenario.food, scenario.knife, scenario.numerics)
+    press = scenario.motion.segments[0].distance
+    assert press > model.top + scenario.start.clearance
+    assert scenario.knife == load_knife("nakiri").knife
+    assert load_setup(tmp_path / "radish_setup.yaml").food.material == scenario.food.material
+    assert load_knife(tmp_path / "knife.yaml").knife.length == 0.18
