@@ -162,7 +162,7 @@ def test_pressing_through_an_oblique_plane_takes_toughness_times_its_ellipse(nam
     stored = energies.elastic + energies.interface + energies.kinetic
     elsewhere = ledger.opening + ledger.friction + ledger.board_friction + ledger.blade
     net = work + ledger.gravity - stored - elsewhere - ledger.damping(energies)
-    assert net == pytest.approx(food.material.toughness * ellipse(name), rel=0.03)
+    assert net == pytest.approx(food.material.toughness * ellipse(name), rel=0.01)
 
 
 @pytest.mark.parametrize(
