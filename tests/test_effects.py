@@ -16,6 +16,7 @@ from sliceit_drake.cutting.effects import (
     Centre,
     Compliance,
     Core,
+    Edge,
     Effects,
     Relaxation,
     Skin,
@@ -79,6 +80,7 @@ def steady(result: SliceResult | BatchSlice) -> np.ndarray:
 
 
 NULLS = {
+    "edge": Effects(edge=Edge(1.0)),
     "toughness_rate": Effects(toughness_rate=ToughnessRate(0.0, 0.3)),
     "relaxation": Effects(relaxation=Relaxation([0.0, 0.0], [0.01, 3.0])),
     "skin": Effects(skin=Skin(0.0, 2e-3)),

@@ -16,6 +16,7 @@ __all__ = [
     "Centre",
     "Compliance",
     "Core",
+    "Edge",
     "Effects",
     "Relaxation",
     "Skin",
@@ -205,9 +206,22 @@ class Slip:
 
 
 @dc.dataclass
+class Edge:
+    """How much of the surface the edge parts where it passes; the rest is left to opening.
+
+    At 0 the edge cuts nothing: bonds last behind it until the flanks have torn them, as in DiSECt.
+    """
+
+    share: float = quantity(
+        1.0, "", low=0.0, high=1.0, doc="Of toughness and bonds; 0 for opening alone."
+    )
+
+
+@dc.dataclass
 class Effects:
     """All groups; the defaults are the base model."""
 
+    edge: Edge = dc.field(default_factory=Edge)
     toughness_rate: ToughnessRate = dc.field(default_factory=ToughnessRate)
     relaxation: Relaxation = dc.field(default_factory=Relaxation)
     skin: Skin = dc.field(default_factory=Skin)

@@ -42,6 +42,7 @@ PARAMETERS = (
     "flank_speed",
     "initiation",
     "initiation_depth",
+    "edge_share",
 )
 """Scalars of a cut that the kernels read, in the order of their array."""
 

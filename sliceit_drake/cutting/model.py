@@ -49,7 +49,11 @@ class Numerics:
         doc="Share of the unbalanced force that opposes the motion of nodes with scaled masses.",
     )
     bond_stiffness: float = quantity(
-        4.0, "E/h", low=0.1, high=1e3, doc="Stiffness of the uncut faces and of their self contact."
+        4.0,
+        "E/h",
+        low=0.01,
+        high=1e3,
+        doc="Stiffness of the uncut faces and of their self contact.",
     )
     flank_stiffness: float = quantity(
         4.0, "E/h", low=0.01, high=1e3, doc="Contact stiffness of the flanks, also in friction."
@@ -258,6 +262,7 @@ def _derived(
         "flank_speed": effects.adhesion.reference_speed,
         "initiation": effects.bluntness.grown,
         "initiation_depth": effects.bluntness.depth,
+        "edge_share": effects.edge.share,
     }
 
     flank = parameters["flank_stiffness"] * point_scales.flank_stiffness

@@ -25,6 +25,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
     ADHESION, FLANK_VISCOSITY = t.ADHESION, t.FLANK_VISCOSITY
     FLANK_EXPONENT, FLANK_SPEED = t.FLANK_EXPONENT, t.FLANK_SPEED
     INITIATION, INITIATION_DEPTH = t.INITIATION, t.INITIATION_DEPTH
+    EDGE_SHARE = t.EDGE_SHARE
     # Without gradients, an effect that is off costs nothing; with them its derivative is wanted.
     ALL = wp.constant(gradients)
     LINEAR = wp.constant(real(LINEAR_BELOW**2))
@@ -238,10 +239,11 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         )
         parted_next[cut, i] = new_parted
         intact = intact_share(new_parted, onset, failure)
-        stiffness = bond * A * (real(1.0) - D) * intact
+        by_edge = P[cut, EDGE_SHARE]
+        stiffness = bond * A * (real(1.0) - by_edge * D) * intact
         closing = bond * A * wp.min(gap[1], real(0.0))
         pull = stiffness * opening + vec3(real(0.0), closing, real(0.0))
-        opening_loss = toughness_i * A * (real(1.0) - D0) * (new_parted - old_parted)
+        opening_loss = toughness_i * A * (real(1.0) - by_edge * D0) * (new_parted - old_parted)
 
         # Edge: a force against the edge's direction d, elastic up to R T (d . n), where R is the
         # toughness that opening left less what the bonds that the edge cuts give up. d follows the
@@ -262,8 +264,8 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         if size > real(1.0e-6):
             d = in_plane / size
         heading_next[cut, i] = d
-        bonded = real(0.5) * bond * intact * length * length
-        left = wp.max(toughness_i * (real(1.0) - new_parted) - bonded, real(0.0))
+        bonded = real(0.5) * by_edge * bond * intact * length * length
+        left = wp.max(by_edge * toughness_i * (real(1.0) - new_parted) - bonded, real(0.0))
         # The edge cuts what its direction has across it; pressing straight, all.
         across = wp.max(wp.dot(d, knife_z), real(0.0))
         effect = across
@@ -508,7 +510,12 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         opening = vec3(gap[0], wp.max(gap[1], real(0.0)), gap[2])
         closing = wp.min(gap[1], real(0.0))
         doubled = (
-            bond * A * ((real(1.0) - D) * intact * wp.dot(opening, opening) + closing * closing)
+            bond
+            * A
+            * (
+                (real(1.0) - P[cut, EDGE_SHARE] * D) * intact * wp.dot(opening, opening)
+                + closing * closing
+            )
         )
         knife_x = vec3(R[0, 0], R[1, 0], R[2, 0])
         knife_z = vec3(R[0, 2], R[1, 2], R[2, 2])
