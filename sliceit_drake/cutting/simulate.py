@@ -90,6 +90,8 @@ class SliceResult:
         ledger: Work and dissipation.
         energies: At the end.
         energy_ratio: Largest kinetic over internal energy.
+        contact_sum: Sum of the norms of all contact forces of the food on the knife at time[k] [n],
+            N, by cut point and face; None if not asked for.
     """
 
     time: np.ndarray
@@ -105,6 +107,7 @@ class SliceResult:
     ledger: EnergyLedger
     energies: Energies
     energy_ratio: float
+    contact_sum: np.ndarray | None = None
 
 
 def check_clear(model: CuttingModel, X_CK: Pose) -> None:
@@ -263,7 +266,11 @@ class KnifePath:
 
 
 def simulate_slice(
-    solver: CuttingSolver, motion: Motion, board: Board | None = None, check_period: float = 0.05
+    solver: CuttingSolver,
+    motion: Motion,
+    board: Board | None = None,
+    check_period: float = 0.05,
+    contact_sum: bool = False,
 ) -> SliceResult:
     """Drives the knife along `motion` through the food.
 
@@ -273,6 +280,7 @@ def simulate_slice(
         board: Board under the knife, its height in F; None for none.
         check_period: Interval of the energy and inversion checks, s; shorter where the knife moves
             more than `CHECK_TRAVEL` in it.
+        contact_sum: Whether to record `SliceResult.contact_sum`, which takes longer.
 
     Raises:
         CuttingError: The knife starts in the food, or the cut became unphysical.
@@ -285,10 +293,11 @@ def simulate_slice(
     check_clear(model, path.pose(0))
     ledger = EnergyLedger()
     rows = np.zeros((count, 26))
+    norms = np.zeros(count)
     ratio = travel = 0.0
     k = last_check = 0
     while k < count:
-        block = path.block(k)
+        block = 1 if contact_sum else path.block(k)
         at, ends = slice(k, k + block), slice(k, k + block + 1)
         for m in range(k + 1, k + block + 1):
             check_in_plane(model, path.pose(m), m * T)
@@ -305,6 +314,9 @@ def simulate_slice(
         rows[at, 4:10] = parts.sum(1).reshape(block, 6)
         rows[at, 16:25] = parts[:, :, 1].reshape(block, 9)
         rows[at, 25] = step.cut
+        if contact_sum:
+            forces = solver.contact_forces(state, path.pose(k), path.pose(k + 1))
+            norms[k] = np.linalg.norm(forces, axis=-1).sum()
         travel += float(np.linalg.norm(np.diff(path.p_FK[ends], axis=0), axis=1).sum())
         k += block
         if k - last_check >= every or travel > CHECK_TRAVEL or k == count:
@@ -330,6 +342,7 @@ def simulate_slice(
         ledger=ledger,
         energies=energies,
         energy_ratio=ratio,
+        contact_sum=norms if contact_sum else None,
     )
 
 

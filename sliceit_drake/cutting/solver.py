@@ -316,12 +316,40 @@ class CuttingSolver:
 
     def _place(self, state: np.ndarray, pose: Pose) -> None:
         """Puts food and knife, at rest at `pose`, into the workspace for launches with k = 0."""
-        ws = self._workspace
-        ws.write(ws.states[0], state[None])
-        motion = np.zeros((1, 18 * self.substeps))
+        self._workspace.write(self._workspace.states[0], state[None])
+        self._place_knife(pose, np.zeros(3), np.zeros(3))
+
+    def _place_knife(self, pose: Pose, v: np.ndarray, w: np.ndarray) -> None:
+        n = self.substeps
+        motion = np.zeros((1, 18 * n))
         motion[0, :9] = pose.R.ravel()
-        motion[0, 9 * self.substeps : 9 * self.substeps + 3] = pose.p
-        ws.write(ws.motion, motion)
+        for k, vector in ((9, pose.p), (12, v), (15, w)):
+            motion[0, k * n : k * n + 3] = vector
+        self._workspace.write(self._workspace.motion, motion)
+
+    def contact_forces(self, state: np.ndarray, start: Pose, end: Pose) -> np.ndarray:
+        """Forces on the knife at the end of an exchange, by cut point and face [P, 2, 3], N, in C.
+
+        Half of the edge's force, the flank's pressure and its friction. The sum of their norms is
+        what DiSECt records as the knife's force; their sum is the resultant.
+
+        Args:
+            state: The food's state after the exchange [state_size].
+            start, end: Knife poses in C between which it moved.
+        """
+        T, ws = self.exchange_period, self._workspace
+        motion = interpolate_motion(
+            np.array([[start.R, end.R]]), np.array([[start.p, end.p]]), 1, T
+        )[0]
+        away = end._replace(p=end.p + 10.0 * end.R[:, 0])
+        with self._lock:
+            self._place(state, end)
+            self._place_knife(end, motion[12:15], motion[15:18])
+            both = ws.point_forces()
+            # What is left with the knife beyond the food are the bonds, in the same state.
+            self._place_knife(away, np.zeros(3), np.zeros(3))
+            bonds = ws.point_forces()
+        return bonds - both
 
     def energies(self, state: np.ndarray, pose: Pose) -> Energies:
         """Energies of `state` with the knife at `pose`."""

@@ -483,16 +483,21 @@ class Workspace:
     def present_forces(self) -> tuple[np.ndarray, np.ndarray]:
         """Of the first cut: forces of elements [B, 12, LANES] and of cut points [P, 2, 3], N."""
         look_ahead = self.kernels.look_ahead
-        # A step of no duration changes no history that another call reads.
-        points = self.point_arguments(0, self.real(0.0))
         with DIRECT:
             self.launch(look_ahead, len(self.model.nodes), self.look_ahead_arguments())
             self.launch_elements(0)
-            self.launch_many(self.kernels.points, len(self.model.point_nodes), points)
+            point_forces = self.point_forces()
         B = len(self.model.blocks)
         forces = self.force.numpy()[0, : B * 12 * LANES].astype(np.float64)
-        point_forces = self.w["point_force"].numpy()[0].astype(np.float64)
         return forces.reshape(B, 12, LANES), point_forces
+
+    def point_forces(self) -> np.ndarray:
+        """Of the first cut: forces on both faces at the cut points [P, 2, 3], N."""
+        # A step of no duration changes no history that another call reads.
+        points = self.point_arguments(0, self.real(0.0))
+        with DIRECT:
+            self.launch_many(self.kernels.points, len(self.model.point_nodes), points)
+        return np.array(self.w["point_force"].numpy()[0], np.float64)
 
 
 def parameter_row(model: CuttingModel) -> np.ndarray:
