@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sliceit_drake.cli.calibration_study import add_calibration_study
 from sliceit_drake.cli.coverage import add_coverage
+from sliceit_drake.cli.disect_study import add_disect_study
 from sliceit_drake.cli.hidden_study import add_hidden_study
 from sliceit_drake.cli.identifiability import add_identifiability
 from sliceit_drake.cli.random_study import add_random_study
@@ -134,6 +135,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     add_identifiability(studies)
     add_real_study(studies)
     add_hidden_study(studies)
+    add_disect_study(studies)
 
 
 def run_coupling(options: argparse.Namespace) -> int:
