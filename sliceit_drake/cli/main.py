@@ -12,6 +12,7 @@ from sliceit_drake.cli import (
     diagram,
     emulate,
     evaluate,
+    export,
     hardware,
     optimize_motion,
     record,
@@ -26,6 +27,7 @@ __all__ = ["main"]
 
 COMMANDS = (
     simulate,
+    export,
     emulate,
     hardware,
     collect,

@@ -19,6 +19,7 @@ Writes to DIR:
   record.csv     joints, poses, wrenches, energies at every exchange (500 Hz), SI units
   summary.json   peak and mean force, work by mechanism, real-time factor, discretisation error, ...
   scenario.yaml  what was simulated, complete
+  paraview/      with --paraview: food, knife and forces as a series for ParaView
 
 In the replay and in the live view (--meshcat) you see:
   blue arrow     force of the food on the knife, at the middle of the edge, 200 N a metre
@@ -56,6 +57,12 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         action="store_true",
         help="show coordinate frames at first, live and in the replay",
     )
+    parser.add_argument(
+        "--paraview",
+        choices=("vtu", "xdmf"),
+        help="also write DIR/paraview, the run as a series of that format (docs/paraview.md)",
+    )
+    parser.add_argument("--fps", type=float, default=30.0, help="its frames a second (default 30)")
     parser.add_argument("--no-replay", action="store_true", help="do not write replay.html")
     parser.set_defaults(run=run)
 
@@ -74,6 +81,7 @@ def run(options: argparse.Namespace) -> int:
         viewing_instructions,
         wait_for_browser,
     )
+    from sliceit_drake.diagrams.paraview import FoodFrames, write_series
     from sliceit_drake.diagrams.run import make_meshcat, prepare_run, simulate, write_outputs
 
     if options.duration is not None and not options.duration > 0.0:
@@ -96,6 +104,7 @@ def run(options: argparse.Namespace) -> int:
             flush=True,
         )
         wait_for_browser(meshcat, WAIT_FOR_BROWSER)
+    frames = FoodFrames(prepared, options.fps) if options.paraview else None
     duration = options.duration or prepared.motion.duration
     with tqdm(
         total=duration,
@@ -111,6 +120,8 @@ def run(options: argparse.Namespace) -> int:
         simulate(prepared, duration, show)
     directory = options.output or Path("output") / scenario.name
     summary = write_outputs(prepared, directory, None if options.no_replay else meshcat)
+    if frames is not None:
+        write_series(frames, directory / "paraview", options.paraview)
     _report(summary, directory)
     if meshcat is not None:
         meshcat.Flush()  # A browser that watched keeps the replay.

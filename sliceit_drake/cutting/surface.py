@@ -7,25 +7,24 @@ import numpy as np
 
 from sliceit_drake.cutting.mesh import boundary_faces
 from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.cutting.split import SplitMesh
 
-__all__ = ["FoodSurface", "food_surface"]
+__all__ = ["FoodCorners", "FoodSurface", "food_surface", "heights_over_cut"]
 
 
 @dc.dataclass
-class FoodSurface:
-    """Triangles whose corners are weighted pairs of nodes.
+class FoodCorners:
+    """Points of the food that follow the computed nodes: weighted pairs of nodes.
 
     Attributes:
         ends: Nodes of the split mesh at each corner [V, 2].
         weights: Their weights [V, 2].
-        triangles: Corners [M, 3], outward oriented.
-        side: Of the cut: 0 minus, 1 plus [V]; no triangle joins both.
-        cut_point: Cut point that each corner is, -1 on the skin [V].
+        side: Of the cut: 0 minus, 1 plus [V].
+        cut_point: Cut point that each corner is, -1 elsewhere [V].
     """
 
     ends: np.ndarray
     weights: np.ndarray
-    triangles: np.ndarray
     side: np.ndarray
     cut_point: np.ndarray
 
@@ -33,18 +32,6 @@ class FoodSurface:
     def is_cut_face(self) -> np.ndarray:
         """Whether each corner belongs to the cut rather than the skin [V]."""
         return self.cut_point >= 0
-
-    @functools.cached_property
-    def halves(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-        """Of each side, its corners [V_s] and its triangles [M_s, 3], which index into those."""
-        halves = []
-        for side in (0, 1):
-            corners = np.flatnonzero(self.side == side)
-            number = np.full(len(self.side), -1)
-            number[corners] = np.arange(len(corners))
-            mine = self.side[self.triangles[:, 0]] == side
-            halves.append((corners, number[self.triangles[mine]]))
-        return tuple(halves)
 
     def positions(self, model: CuttingModel, computed: np.ndarray) -> np.ndarray:
         """Corners in the food frame [V, 3], metres.
@@ -78,6 +65,37 @@ class FoodSurface:
         return np.where(self.is_cut_face, spent[self.cut_point], 0.0)
 
 
+@dc.dataclass
+class FoodSurface(FoodCorners):
+    """Triangles between corners.
+
+    Attributes:
+        triangles: Corners [M, 3], outward oriented; none joins both sides.
+    """
+
+    triangles: np.ndarray
+
+    @functools.cached_property
+    def halves(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+        """Of each side, its corners [V_s] and its triangles [M_s, 3], which index into those."""
+        halves = []
+        for side in (0, 1):
+            corners = np.flatnonzero(self.side == side)
+            number = np.full(len(self.side), -1)
+            number[corners] = np.arange(len(corners))
+            mine = self.side[self.triangles[:, 0]] == side
+            halves.append((corners, number[self.triangles[mine]]))
+        return tuple(halves)
+
+
+def heights_over_cut(split: SplitMesh) -> np.ndarray:
+    """Height of each original vertex over the cut plane [V], metres; 0 if it counts as on it."""
+    y = split.vertex_position[:, 1].copy()
+    single = split.point_weights[:, 1] == 0.0
+    y[split.node_source[split.point_nodes[single, 0, 0]]] = 0.0
+    return np.asarray(y)
+
+
 def food_surface(model: CuttingModel) -> FoodSurface:
     """The drawable surface of both halves.
 
@@ -88,12 +106,9 @@ def food_surface(model: CuttingModel) -> FoodSurface:
         (int(v), int(s)): i
         for i, (v, s) in enumerate(zip(split.node_source, split.node_side, strict=True))
     }
-    y = split.vertex_position[:, 1].copy()
-    on_plane = np.zeros(len(y), bool)
+    y = heights_over_cut(split)
     ends = split.point_nodes
     single = split.point_weights[:, 1] == 0.0
-    on_plane[split.node_source[ends[single, 0, 0]]] = True
-    y[on_plane] = 0.0
 
     corner_ends: list[tuple[int, int]] = []
     corner_weights: list[tuple[float, float]] = []
@@ -141,9 +156,9 @@ def food_surface(model: CuttingModel) -> FoodSurface:
             # Section triangles face +y, which is outward on the minus side.
             triangles.append((p, q, r) if side == 0 else (p, r, q))
     return FoodSurface(
-        np.array(corner_ends),
-        np.array(corner_weights),
-        np.array(triangles),
-        np.array(sides),
-        np.array(cut_point),
+        ends=np.array(corner_ends),
+        weights=np.array(corner_weights),
+        side=np.array(sides),
+        cut_point=np.array(cut_point),
+        triangles=np.array(triangles),
     )
