@@ -173,7 +173,7 @@ def make_cutting_model(
     """Splits the mesh and prepares one cut.
 
     Args:
-        mesh: The food in F.
+        mesh: The food in F; one that no generator of ours made should pass its `check_solid`.
         plane: The cut plane in F.
         held: Vertices of the mesh that cannot move, mask [V].
         material: Food.
