@@ -28,6 +28,8 @@ policies cut the same slices. Everything here is simulated.
 Writes a line for each slice to --output, a .jsonl file, and goes on where it is.
 `sliceit study slicing` compares the policies of both simulators.
 """
+SLICES = 25
+"""That a process cuts: pydrake does not free the stations that it has built (docs/endurance.md)."""
 WORLDS = ("stand_in", "curves")
 FOODS = ("cucumber", "tomato", "potato", "carrot")
 
@@ -85,7 +87,9 @@ def run(options: argparse.Namespace) -> int:
     done = _done(options.output)
     left = [case for case in cases if case not in done]
     options.output.parent.mkdir(parents=True, exist_ok=True)
-    pool = ProcessPoolExecutor(options.workers, mp_context=get_context("forkserver"))
+    pool = ProcessPoolExecutor(
+        options.workers, mp_context=get_context("forkserver"), max_tasks_per_child=SLICES
+    )
     with pool, tqdm(total=len(cases), initial=len(cases) - len(left), desc="slices") as bar:
         try:
             for future in as_completed([pool.submit(cut, case) for case in left]):
