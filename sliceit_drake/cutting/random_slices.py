@@ -13,7 +13,15 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError, validate
 from sliceit_drake.cutting.board import Board
-from sliceit_drake.cutting.food import Box, Cylinder, Ellipsoid, Food, make_food_model, start_pose
+from sliceit_drake.cutting.food import (
+    Box,
+    Cylinder,
+    Ellipsoid,
+    Food,
+    Tapered,
+    make_food_model,
+    start_pose,
+)
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.material import Material
 from sliceit_drake.cutting.mesh import MeshError
@@ -90,9 +98,13 @@ def draw_slice(rng: np.random.Generator) -> RandomSlice:
         return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
     layers = [0.0, 3e-3, 7e-3, 13e-3]
-    kind = int(rng.integers(3))
-    shape: Cylinder | Box | Ellipsoid
-    if kind == 0:
+    kind = int(rng.integers(4))
+    shape: Cylinder | Tapered | Box | Ellipsoid
+    if kind == 3:
+        wide = between(0.02, 0.05)
+        ends = [wide, between(0.4, 1.0) * wide]
+        shape = Tapered(ends, between(0.06, 0.15), int(rng.integers(2, 4)), layers)
+    elif kind == 0:
         shape = Cylinder(between(0.02, 0.06), between(0.06, 0.15), int(rng.integers(2, 4)), layers)
     elif kind == 1:
         size = [between(0.015, 0.05), between(0.06, 0.15), between(0.015, 0.05)]
