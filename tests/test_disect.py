@@ -104,9 +104,19 @@ def test_bonds_that_the_edge_left_are_torn_apart_by_a_thick_blade():
     model = bar(Knife(length=0.4, spine_thickness=0.015), 0.0, friction=0.0).derive(
         material=Material(youngs_modulus=2e6, toughness=20.0, friction=0.0)
     )
-    ledger = cut(model, depth=0.03).ledger
+    result = cut(model, depth=0.03)
+    ledger, whole = result.ledger, 20.0 * model.section_area
     assert ledger.edge == 0.0
-    assert ledger.opening == pytest.approx(20.0 * model.section_area, rel=0.05)
+    assert ledger.opening == pytest.approx(whole, rel=0.05)
+    # Bonds that held nothing behind the edge would dissipate what nobody put in.
+    assert abs(ledger.imbalance(result.energies)) < 0.1 * whole
+
+
+def test_bonds_that_hold_behind_the_edge_store_what_the_books_say():
+    model = bar(Knife(length=0.4, spine_thickness=0.006), 0.0, friction=0.0)
+    result = cut(model, depth=0.01)
+    assert result.cut[-1] > 0.5 and result.ledger.opening == 0.0
+    assert abs(result.ledger.imbalance(result.energies)) < 0.003 * result.ledger.work
 
 
 def test_the_case_holds_disects_parameters_per_area():
