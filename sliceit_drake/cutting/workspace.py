@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.kernel_types import ACCUMULATED, GATHER, LANES, PARAMETERS
 from sliceit_drake.cutting.kernels import kernels
 from sliceit_drake.cutting.model import CuttingModel, TimeStepError
@@ -60,7 +61,7 @@ class Workspace:
         self.dtype: Any = np.float32 if single else np.float64
         with DIRECT:
             self.kernels = kernels(self.real, gradients)
-        self.device = wp.get_device(model.numerics.device)
+        self.device = _device(model.numerics.device)
         self.model = model
         self._gradients = gradients
         self._graph: Any = None
@@ -597,3 +598,20 @@ def _point_gather(
     order = np.argsort(node, kind="stable")
     start = np.concatenate([[0], np.cumsum(np.bincount(node, minlength=node_count))])
     return start.astype(np.int32), entry[order].astype(np.int32), weight[order]
+
+
+def _device(name: str) -> Any:
+    """The device of Warp's.
+
+    Raises:
+        ConfigurationError: There is none of that name on this machine.
+    """
+    try:
+        return wp.get_device(name)
+    except (ValueError, RuntimeError) as error:
+        there = ", ".join(str(device) for device in wp.get_devices())
+        raise ConfigurationError(
+            f"there is no device {name!r} on this machine",
+            field="numerics.device",
+            fix=f"Give one of: {there}. A GPU needs NVIDIA's driver.",
+        ) from error

@@ -1,0 +1,73 @@
+"""Kernels on a GPU give what they give on the CPU; without one that is said, and nothing fails."""
+
+import dataclasses as dc
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import warp as wp
+
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.batch import simulate_batch
+from sliceit_drake.cutting.food import Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.model import CuttingModel, Numerics
+from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
+from sliceit_drake.cutting.parameters import with_parameters
+from sliceit_drake.cutting.workspace import Workspace
+
+ROOT = Path(__file__).resolve().parent.parent
+PERIOD = 2e-3
+
+
+def cuts(device: str) -> list[CuttingModel]:
+    food = Food(shape=Cylinder(rings=2, layers=[0.0, 4e-3, 12e-3]))
+    base = make_food_model(food, Knife(), dc.replace(Numerics(precision="float64"), device=device))
+    return [with_parameters(base, {"material.toughness": r}) for r in (250.0, 350.0, 450.0)]
+
+
+def test_a_batch_on_a_gpu_is_that_on_the_cpu():
+    if not wp.is_cuda_available():
+        pytest.skip("no CUDA device on this machine: CPU and GPU are not compared")
+    results = {}
+    for device in ("cpu", "cuda:0"):
+        models = cuts(device)
+        plan = MotionPlan([ConstantSpeed(distance=0.02, speed=0.1)])
+        motion = Motion(plan, start_pose(models[0], 1e-3))
+        results[device] = simulate_batch(models, [motion], PERIOD)
+    for here, there in zip(results["cpu"], results["cuda:0"], strict=True):
+        assert here.failure is None and there.failure is None
+        size = np.abs(here.food_wrench).max(0)
+        # The order of sums differs, in double precision.
+        np.testing.assert_array_less(
+            np.abs(here.food_wrench - there.food_wrench).max(0), 1e-6 * size.max()
+        )
+        np.testing.assert_allclose(there.cut, here.cut, atol=1e-9)
+
+
+def test_a_device_that_is_not_there_is_named_with_those_that_are():
+    model = cuts("cuda:99")[0]
+    with pytest.raises(ConfigurationError, match="no device 'cuda:99'") as error:
+        Workspace([model], PERIOD)
+    assert error.value.field == "numerics.device" and "cpu" in error.value.fix
+
+
+def test_the_benchmark_goes_on_without_a_gpu_and_says_why(monkeypatch, capsys, tmp_path):
+    spec = importlib.util.spec_from_file_location("batch_speed", ROOT / "benchmarks/batch_speed.py")
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    monkeypatch.setattr(module.wp, "is_cuda_available", lambda: False)
+    page = tmp_path / "page.md"
+    page.write_text(f"before\n{module.BEGIN}\n{module.END}\nafter\n", encoding="utf-8")
+    options = ["--batches", "1", "2", "--refinement", "0.5", "--repeats", "1"]
+    assert module.main([*options, "--output", str(page)]) == 0
+    assert "The GPU is skipped: there is no CUDA device" in capsys.readouterr().out
+    text = page.read_text(encoding="utf-8")
+    rows = [line.split("|")[1:5] for line in text.splitlines() if line.startswith("| cpu")]
+    assert [row[1].strip() for row in rows] == ["1", "2"]
+    # The first cut of a batch is the same in all of them.
+    assert [row[3].strip() for row in rows] == ["0.0000 %", "0.0000 %"]
+    assert text.startswith("before\n") and text.endswith("after\n")
+    assert module.put_between((ROOT / "docs/speed.md").read_text(encoding="utf-8"), "", "speed.md")
