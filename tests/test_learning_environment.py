@@ -17,6 +17,7 @@ from sliceit_drake.learning.environment import SlicingEnv  # noqa: E402
 from sliceit_drake.learning.reward import (  # noqa: E402
     TERMS,
     RewardConfig,
+    reward_progress,
     reward_terms,
     reward_weights,
 )
@@ -115,18 +116,18 @@ def test_the_time_limit_truncates():
         assert (terminated, truncated) == (False, k == 2)
         assert ("end" in info) == (k == 2)
     assert (info["end"], info["is_success"]) == ("time", False)
-    assert -1.0 <= reward <= 0.0
+    assert reward == pytest.approx(weighted(info), abs=1e-6)
 
 
 def weighted(info, config=None):
     weights = reward_weights(config or RewardConfig())
-    return float(weights @ [info["reward_terms"][name] for name in TERMS])
+    return float(weights @ [info["reward_terms"][name] for name in TERMS]) + info["progress"]
 
 
 @pytest.mark.parametrize(
     ("values", "end", "bonus"),
     [
-        ({"agent": {"goal": [1.0, 1.0, 1.0], "goal_decisions": 0}}, "goal", 30.0),
+        ({"agent": {"goal": [1.0, 1.0, 1.0], "goal_decisions": 0}}, "goal", 10.0),
         ({"workspace": [1.0, 0.001, 1.0]}, "workspace", -30.0),
         ({"force_limit": 0.1}, "collision", -30.0),
         ({"torque_limit": 0.1}, "collision", -30.0),
@@ -244,6 +245,23 @@ def test_the_term_of_the_jerk_ends_at_one():
     assert reward_terms(RewardConfig(), 0.0, np.zeros(2), np.array([3.0, -4.0, 0.0]))[2] == -1.0
 
 
+def test_progress_is_paid_as_it_is_made_and_taken_back():
+    config = RewardConfig(way=15.0, hold=10.0)
+    high, low, done = ((0.04, 0.0), (0.01, 0.0), (-1e-4, 1.1))
+    assert reward_progress(config, *low) - reward_progress(config, *high) == pytest.approx(7.5)
+    assert reward_progress(config, *done) - reward_progress(config, *low) == pytest.approx(12.5)
+    env = SlicingEnv(task_of("spring"))
+    env.reset(seed=3)
+    start = env.step(np.array([0.0, 0.0, 1.0, 0.0, 0.0, 1.0]))[4]
+    made, last = start["progress"], start
+    for action in [PRESS] * 8 + [-PRESS] * 8:
+        last = env.step(action)[4]
+        made += last["progress"]
+        assert abs(made) < env.task.reward.most()
+    before = env.task.reward.way / 0.06 * (start["height"] - last["height"])
+    assert made - start["progress"] == pytest.approx(before, abs=1e-6)
+
+
 def test_weights_are_ratios():
     assert reward_weights(RewardConfig(weights=[2.0, 4.0, 1.0, 1.0])) == pytest.approx(
         [0.25, 0.5, 0.125, 0.125]
@@ -274,7 +292,8 @@ def test_the_environment_takes_the_progress_for_its_schedule():
         env.reset(seed=0)
         _, value, _, _, info = env.step(PRESS)
         terms = [info["reward_terms"][name] for name in TERMS]
-        assert value == pytest.approx(reward_weights(reward, progress) @ terms, abs=1e-6)
+        expected = reward_weights(reward, progress) @ terms + info["progress"]
+        assert value == pytest.approx(expected, abs=1e-6)
         rewards.append(value)
     assert rewards[0] != rewards[1]
 

@@ -216,7 +216,7 @@ def make_model(config: TrainingConfig, environments: OverlapVecEnv) -> Prioritiz
         tau=config.tau,
         gamma=config.gamma,
         ent_coef=f"auto_{config.entropy:.9g}",
-        value_limit=config.task.reward.goal,
+        value_limit=config.task.reward.most(),
         train_freq=1,
         # Updates are made while the environment simulates.
         gradient_steps=0,
