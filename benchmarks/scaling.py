@@ -36,11 +36,10 @@ from sliceit_drake.calibration.local_database import NoServerError, local_databa
 from sliceit_drake.calibration.prediction import Predictor
 from sliceit_drake.calibration.search import open_study, search
 from sliceit_drake.calibration.setup import load_setup
-from sliceit_drake.records.slice_record import write_record
 from sliceit_drake.records.validation import load_record
 from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.protocol import Protocol, load_protocol
-from sliceit_drake.stand_in.session import Session, record_session
+from sliceit_drake.stand_in.session import keep_record, record_session
 
 warp.config.log_level = warp.LOG_ERROR
 optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -95,8 +94,8 @@ class DaskRun:
         walls: Wall time by workers, s.
         slices: Each time.
         tasks: Empty tasks a second.
-        write: Time to write one record here, s.
-        size: Of a record that travels, bytes.
+        write: Time to write one record's files here, s.
+        size: Of these, which travel, bytes.
     """
 
     walls: dict[int, float]
@@ -304,12 +303,13 @@ def measure_dask(slices: int, tasks: int, folder: Path) -> DaskRun:
             for future in [pool.submit(_nothing, content, k) for k in range(tasks)]:
                 future.result()
             rate = tasks / (time.perf_counter() - begin)
-    record = Session(small_protocol(1), seed=1).record(0)
+    made = folder / "records_1"
+    files = {file.name: file.read_bytes() for file in made.glob("slice_000.*")}
     begin = time.perf_counter()
-    for k in range(20):
-        write_record(record, folder / f"written_{k}")
-    write = (time.perf_counter() - begin) / 20
-    return DaskRun(walls, slices, rate, write, len(pickle.dumps(record)))
+    for k in range(100):
+        keep_record(files, folder / "warm_1", k)
+    write = (time.perf_counter() - begin) / 100
+    return DaskRun(walls, slices, rate, write, sum(map(len, files.values())))
 
 
 def search_tables(runs: dict[str, list[SearchRun]], limits: dict[str, StorageLimits]) -> list[str]:

@@ -290,11 +290,11 @@ def test_no_value_outgrows_what_an_episode_can_give():
     assert value() > 4.0
 
 
-def test_a_training_starts_with_little_entropy_and_the_goal_as_limit():
+def test_a_training_starts_with_little_entropy_and_the_greatest_return_as_limit():
     config = training_of(entropy=0.25)
     model = training.make_model(config, OverlapVecEnv(DummyVecEnv([Still])))
     assert float(model.log_ent_coef.detach().exp()) == pytest.approx(0.25, rel=1e-6)
-    assert model.value_limit == config.task.reward.goal
+    assert model.value_limit == config.task.reward.most()
 
 
 # --- Training.

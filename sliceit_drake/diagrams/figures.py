@@ -1,13 +1,15 @@
 """Figures of a run."""
 
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sliceit_drake.diagrams.comparison import Comparison
 from sliceit_drake.diagrams.record import Record
 from sliceit_drake.diagrams.snapshot import Snapshot, draw_snapshot
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["plot_force"]
 
@@ -22,18 +24,16 @@ CONTACT_THRESHOLD = 0.05
 
 def plot_force(
     record: Record,
-    file: Path,
     title: str,
     top_height: float,
     comparison: Comparison | None,
     caption: str,
     snapshot: Snapshot | None = None,
-) -> None:
+) -> "Figure":
     """Draws the knife in the food, and its force over time and over depth.
 
     Args:
         record: The run.
-        file: PNG to write.
         title: What is shown.
         top_height: World height of the food's top at the cut, metres.
         comparison: Measured profile with its fitted offset, or None.
@@ -98,4 +98,4 @@ def plot_force(
     over_time.set_title(title, loc="left", fontsize=11)
     over_depth.set_title("the same over depth", loc="left", fontsize=11)
     figure.supxlabel(caption, fontsize=7.5, color="0.35", wrap=True)
-    figure.savefig(file, dpi=150)
+    return figure

@@ -8,6 +8,7 @@ import platform
 import time as clock
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams
@@ -18,6 +19,7 @@ from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.discretization import estimate_discretization_error
 from sliceit_drake.cutting.food import Food, start_pose
 from sliceit_drake.cutting.mesh import MeshError
+from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Motion
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.comparison import Comparison, can_compare, compare_with_measurement
@@ -34,6 +36,9 @@ from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.cutting_system import ENERGY_NAMES, LEDGER_NAMES, CuttingSystem
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["Run", "make_meshcat", "measured_profile", "prepare_run", "simulate", "write_outputs"]
 
@@ -80,6 +85,11 @@ class Run:
     def motion(self) -> Motion:
         """The prescribed targets of the knife."""
         return self.diagram.motion
+
+    def plot(self) -> "Figure":
+        """Knife and food, and the force over time and depth; of a sequence slice by slice."""
+        record = self.record()
+        return _figure(self, record, _comparison(self, record))
 
 
 def prepare_run(scenario: Scenario, meshcat: Meshcat | None = None) -> Run:
@@ -162,13 +172,7 @@ def write_outputs(
     comparison = _comparison(run, record)
     summary = _summary(run, record, comparison) | (extra or {})
     (directory / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
-    title, caption = _title(run), _caption(run, comparison, summary)
-    figure, cutting = directory / "force.png", run.station.cutting
-    if run.scenario.sequence is not None and isinstance(cutting, CuttingSystem):
-        board = run.scenario.board.height
-        plot_sequence(record, cutting, figure, title, board, caption, run.snapshot)
-    else:
-        plot_force(record, figure, title, _top_height(run), comparison, caption, run.snapshot)
+    _figure(run, record, comparison).savefig(directory / "force.png", dpi=150)
     if meshcat is not None:
         if run.station.food_visualizer is not None:
             run.station.food_visualizer.PublishRecording()
@@ -176,6 +180,14 @@ def write_outputs(
         meshcat.PublishRecording()
         (directory / "replay.html").write_text(meshcat.StaticHtml())
     return summary
+
+
+def _figure(run: Run, record: Record, comparison: Comparison | None) -> "Figure":
+    title, caption, cutting = _title(run), _caption(run, comparison), run.station.cutting
+    if run.scenario.sequence is not None and isinstance(cutting, CuttingSystem):
+        board = run.scenario.board.height
+        return plot_sequence(record, cutting, title, board, caption, run.snapshot)
+    return plot_force(record, title, _top_height(run), comparison, caption, run.snapshot)
 
 
 def make_meshcat() -> Meshcat:
@@ -250,14 +262,14 @@ def _title(run: Run) -> str:
     return f"A UR5e slices {scenario.name.replace('_', ' ')}{at}"
 
 
-def _caption(run: Run, comparison: Comparison | None, summary: dict) -> str:
+def _caption(run: Run, comparison: Comparison | None) -> str:
     lines = []
-    food = run.scenario.food
-    if isinstance(food, Food) and "elements" in summary:  # A robot's food has none.
+    food, cutting = run.scenario.food, run.station.cutting
+    if isinstance(food, Food) and isinstance(cutting, CuttingSystem):  # A robot's has none.
         m, dt = food.material, run.scenario.numerics.time_step
         lines.append(
             f"Parameters set by hand: E = {m.youngs_modulus:.3g} Pa, toughness {m.toughness:.3g} "
-            f"J/m², flank friction {m.friction:.2g}; {summary['elements']} tetrahedra, sub-step "
+            f"J/m², flank friction {m.friction:.2g}; {_middle_model(cutting).element_count} tetrahedra, sub-step "
             f"{1e3 * dt:.3g} ms."
         )
     if comparison is not None:
@@ -351,16 +363,19 @@ def _motion_times(motion: Motion) -> dict[str, list]:
     return {label: spans[0] if len(spans) == 1 else spans for label, spans in times.items()}
 
 
+def _middle_model(cutting: CuttingSystem) -> CuttingModel:
+    """The cut; of a sequence, its middle slice, which stands for all."""
+    return cutting.solvers[len(cutting.solvers) // 2].model
+
+
 def _cutting_summary(run: Run, record: Record) -> dict:
     """Numbers of the finite-element food."""
     scenario, station = run.scenario, run.station
     assert isinstance(station.cutting, CuttingSystem) and isinstance(scenario.food, Food)
     models = [solver.model for solver in station.cutting.solvers]
-    # Of a sequence, its middle slice stands for all.
-    middle, food, plan = len(models) // 2, scenario.food, scenario.motion
-    model = models[middle]
+    food, plan, model = scenario.food, scenario.motion, _middle_model(station.cutting)
     if scenario.sequence is not None:
-        food = scenario.sequence.foods(food)[middle]
+        food = scenario.sequence.foods(food)[len(models) // 2]
         plan = scenario.sequence.motion([model.top], scenario.start.clearance)
     work = float(record["energy_work"][-1])
     area = sum(m.section_area for m in models[: int(record["food_index"][-1]) + 1])

@@ -1,7 +1,7 @@
 """What came of each slice of a sequence: a table and a figure."""
 
 import dataclasses as dc
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -9,6 +9,9 @@ from sliceit_drake.diagrams.figures import BOARD_PHASE, CONTACT_THRESHOLD, SIMUL
 from sliceit_drake.diagrams.record import Record
 from sliceit_drake.diagrams.snapshot import Snapshot, draw_snapshot
 from sliceit_drake.systems.cutting_system import CuttingSystem
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["SliceReport", "plot_sequence", "slice_reports"]
 
@@ -96,18 +99,16 @@ def slice_reports(record: Record, cutting: CuttingSystem) -> list[SliceReport]:
 def plot_sequence(
     record: Record,
     cutting: CuttingSystem,
-    file: Path,
     title: str,
     board_height: float,
     caption: str,
     snapshot: Snapshot | None = None,
-) -> None:
+) -> "Figure":
     """Draws the force over time, over the edge's height slice by slice, and its spread by slice.
 
     Args:
         record: The run.
         cutting: The system that was cut.
-        file: PNG to write.
         title: What is shown.
         board_height: World height of the board's top, metres.
         caption: Conditions and provenance, below the plots.
@@ -175,4 +176,4 @@ def plot_sequence(
         axes.grid(alpha=0.25)
         axes.spines[["top", "right"]].set_visible(False)
     figure.supxlabel(caption, fontsize=7.5, color="0.35", wrap=True)
-    figure.savefig(file, dpi=150)
+    return figure

@@ -6,7 +6,7 @@ import pickle
 import secrets
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path as FilePath
@@ -40,7 +40,7 @@ from sliceit_drake.stand_in.world import World
 if TYPE_CHECKING:
     from distributed import Client
 
-__all__ = ["WORLDS", "Session", "is_recorded", "record_session"]
+__all__ = ["WORLDS", "Session", "is_recorded", "keep_record", "record_session"]
 
 WORLDS = ("finite_elements", "curves")
 
@@ -300,6 +300,16 @@ def _write(record: SliceRecord, output: FilePath, index: int) -> int:
     return index
 
 
+def keep_record(files: Mapping[str, bytes], output: FilePath, index: int) -> int:
+    """Writes the two files of a record that was made elsewhere; returns its index."""
+    with tempfile.TemporaryDirectory(dir=output, prefix=".writing_") as folder:
+        for name in sorted(files):
+            (FilePath(folder) / name).write_bytes(files[name])
+        for name in sorted(files):
+            os.replace(FilePath(folder) / name, output / name)
+    return index
+
+
 _worker: list[tuple[Session, FilePath]] = []
 
 
@@ -350,15 +360,20 @@ def _written(
 _SESSIONS = threading.local()
 
 
-def _record_there(content: bytes, index: int) -> tuple[int, SliceRecord]:
-    """A slice on a worker of a cluster, whose threads keep the session from one to the next."""
+def _record_there(content: bytes, index: int) -> tuple[int, dict[str, bytes]]:
+    """The files of a slice, from a worker of a cluster whose threads keep the session.
+
+    A record takes longer to turn into text than to send: whoever collects them only writes.
+    """
     known: tuple[bytes, Session] | None = getattr(_SESSIONS, "known", None)
     if known is None or known[0] != content:
         warp.config.log_level = warp.LOG_ERROR
         protocol, effects, world, seed, settings = pickle.loads(content)
         hidden = [make_effect(text) for text in effects]
         known = _SESSIONS.known = (content, Session(protocol, hidden, world, seed, settings))
-    return index, known[1].record(index)
+    with tempfile.TemporaryDirectory() as folder:
+        made = write_record(known[1].record(index), FilePath(folder) / slice_name(index))
+        return index, {f.name: f.read_bytes() for f in (made, made.with_suffix(".yaml"))}
 
 
 def _written_by_cluster(
@@ -375,7 +390,7 @@ def _written_by_cluster(
     pool = client.get_executor(pure=False)
     try:
         for future in as_completed([pool.submit(_record_there, content, k) for k in left]):
-            index, record = future.result()
-            yield _write(record, output, index)
+            index, files = future.result()
+            yield keep_record(files, output, index)
     finally:
         pool.shutdown(wait=False)
