@@ -16,7 +16,7 @@ from sliceit_drake.records.validation import check_table, load_record
 from sliceit_drake.resources import resource_path
 
 SETTINGS = settings(
-    max_examples=150,
+    max_examples=60,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
