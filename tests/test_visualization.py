@@ -1,6 +1,7 @@
 """What the viewer shows, and that showing it changes nothing."""
 
 import base64
+import dataclasses as dc
 import re
 
 import numpy as np
@@ -347,3 +348,23 @@ def test_instructions_say_how_to_see_the_viewer(environment, platform, words, ab
     text = viewing_instructions(7001, environment, platform)
     assert all(word in text for word in words)
     assert not any(word in text for word in absent)
+
+
+def test_a_run_plots_itself_and_says_whose_parameters_it_had(watched):
+    run, _ = watched
+    figure = run.plot()
+    over_time, over_depth, _ = figure.axes
+    assert over_time.get_xlabel() == "time [s]" and "depth" in over_depth.get_xlabel()
+    force = run.record().vector("food_wrench_f") + run.record().vector("board_wrench_f")
+    np.testing.assert_array_equal(over_time.lines[1].get_ydata(), force[:, 2])
+    assert figure._supxlabel.get_text().startswith("Parameters set by hand: E = 2.6e+06 Pa")
+    calibrated = dc.replace(run.scenario, calibration="potato")
+    text = dc.replace(run, scenario=calibrated).plot()._supxlabel.get_text()
+    assert text.startswith("Calibrated food potato: ")
+
+
+def test_a_station_built_by_hand_looks_at_the_knife_too():
+    meshcat = make_meshcat()
+    assert not meshcat.HasPath("/Background/<object>")
+    MakeSlicingStation(fast_slice(), meshcat)
+    assert meshcat.HasPath("/Background/<object>")

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams
-from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
@@ -31,7 +30,7 @@ from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram, ScenarioDiagram
 from sliceit_drake.diagrams.sequence_report import plot_sequence, slice_reports
 from sliceit_drake.diagrams.snapshot import Snapshot, take_snapshot
-from sliceit_drake.diagrams.station import CAMERA_OFFSET, SlicingStation
+from sliceit_drake.diagrams.station import SlicingStation
 from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.resources import resource_path
@@ -106,7 +105,6 @@ def prepare_run(scenario: Scenario, meshcat: Meshcat | None = None) -> Run:
     simulator = Simulator(diagram)
     diagram.SetStart(simulator.get_mutable_context())
     if meshcat is not None:
-        _set_scene(meshcat, station.start_pose)
         meshcat.StartRecording(set_visualizations_while_recording=True)
         if station.food_visualizer is not None:
             station.food_visualizer.StartRecording()
@@ -195,15 +193,6 @@ def make_meshcat() -> Meshcat:
     return Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
 
 
-def _set_scene(meshcat: Meshcat, X_WK: RigidTransform) -> None:
-    target = X_WK.translation() + [0.0, 0.0, 0.05]
-    meshcat.SetCameraPose(target + CAMERA_OFFSET, target)
-    meshcat.SetProperty("/Grid", "visible", False)
-    meshcat.SetProperty("/Axes", "visible", False)
-    meshcat.SetProperty("/Background/<object>", "top_color", [0.92, 0.94, 0.96])
-    meshcat.SetProperty("/Background/<object>", "bottom_color", [0.80, 0.83, 0.86])
-
-
 def _cut_progress(run: Run) -> float:
     context = run.station.GetMyContextFromRoot(run.simulator.get_context())
     return float(run.station.GetOutputPort("cut_progress").Eval(context)[0])
@@ -267,10 +256,12 @@ def _caption(run: Run, comparison: Comparison | None) -> str:
     food, cutting = run.scenario.food, run.station.cutting
     if isinstance(food, Food) and isinstance(cutting, CuttingSystem):  # A robot's has none.
         m, dt = food.material, run.scenario.numerics.time_step
+        named = run.scenario.calibration
+        source = "Parameters set by hand" if named is None else f"Calibrated food {named}"
+        elements = _middle_model(cutting).element_count
         lines.append(
-            f"Parameters set by hand: E = {m.youngs_modulus:.3g} Pa, toughness {m.toughness:.3g} "
-            f"J/m², flank friction {m.friction:.2g}; {_middle_model(cutting).element_count} tetrahedra, sub-step "
-            f"{1e3 * dt:.3g} ms."
+            f"{source}: E = {m.youngs_modulus:.3g} Pa, toughness {m.toughness:.3g} J/m², flank "
+            f"friction {m.friction:.2g}; {elements} tetrahedra, sub-step {1e3 * dt:.3g} ms."
         )
     if comparison is not None:
         lines.append(

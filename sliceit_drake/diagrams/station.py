@@ -233,6 +233,7 @@ class SlicingStation(Station):
                 self.cutting.GetOutputPort("compression"), plates.GetInputPort("compression")
             )
         self._add_arrows_and_frames(builder, meshcat)
+        _set_scene(meshcat, self.start_pose)
 
     def _frame_period(self) -> float:
         size = SCENE_FRAME_SIZE
@@ -306,6 +307,16 @@ def MakeSlicingStation(
 def _compliance_controller(scenario: Scenario) -> ComplianceController:
     robot = scenario.robot
     return ComplianceController(scenario.controller, ur5e_chain(robot.X_TK()), X_WB=robot.X_WB())
+
+
+def _set_scene(meshcat: Meshcat, X_WK: RigidTransform) -> None:
+    """Looks at the knife, before a plain background."""
+    target = X_WK.translation() + [0.0, 0.0, 0.05]
+    meshcat.SetCameraPose(target + CAMERA_OFFSET, target)
+    meshcat.SetProperty("/Grid", "visible", False)
+    meshcat.SetProperty("/Axes", "visible", False)
+    meshcat.SetProperty("/Background/<object>", "top_color", [0.92, 0.94, 0.96])
+    meshcat.SetProperty("/Background/<object>", "bottom_color", [0.80, 0.83, 0.86])
 
 
 def _food_solvers(scenario: Scenario) -> list[CuttingSolver]:
