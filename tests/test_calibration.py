@@ -249,6 +249,15 @@ def test_a_calibration_recovers_what_made_the_records_within_its_intervals(recor
     assert result.rms <= result.refined_rms + 1e-6
     assert result.held_out_records["slice_001"] == pytest.approx(0.1, rel=0.3)
     assert result.held_out_rms == pytest.approx(0.1, rel=0.5)
+    assert f"polished {result.rms:.3f} N" in result.table()
+    assert f"Held-out record slice_001: {result.held_out_records['slice_001']:.3f} N" in (
+        result.table()
+    )
+    above, below = result.plot().axes
+    measured = result.predictor.targets[0].measured
+    np.testing.assert_array_equal(above.lines[0].get_ydata(), measured[:, 0])
+    rest = measured - result.predictions[0].predicted
+    np.testing.assert_array_equal(below.lines[0].get_ydata(), rest[:, 0])
     again = calibrate(setup, records[:1], tmp_path, options)
     np.testing.assert_array_equal(again.unit, result.unit)
     food = result.calibrated_food("2026-01-01", "sliceit calibrate")

@@ -8,7 +8,7 @@ import multiprocessing
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, wait
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.calibrated_food import CalibratedFood
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.systems.spring_food import calibrate_spring
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["Calibration", "CalibrationOptions", "Progress", "calibrate", "write_json"]
 
@@ -60,7 +63,7 @@ class CalibrationOptions:
 
 @dc.dataclass
 class Calibration:
-    """What a calibration found.
+    """What a calibration found; prints as a table, plots itself.
 
     Attributes:
         setup: What was searched.
@@ -90,7 +93,19 @@ class Calibration:
     held_out_records: dict[str, float]
     failures: int
 
-    def calibrated_food(self, date: str, command: str, note: str = "") -> CalibratedFood:
+    def table(self) -> str:
+        """Parameters with 90 % intervals, which of them are not determined, and errors."""
+        from sliceit_drake.calibration.report import calibration_table
+
+        return calibration_table(self)
+
+    def plot(self) -> "Figure":
+        """Measured and predicted force of the first three records, and what is left."""
+        from sliceit_drake.calibration.report import figure
+
+        return figure(self)
+
+    def calibrated_food(self, date: str = "", command: str = "", note: str = "") -> CalibratedFood:
         """The food as scenarios load it."""
         values = self.predictor.values(self.unit)
         target = self.predictor.targets[0]

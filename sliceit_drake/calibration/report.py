@@ -11,7 +11,7 @@ from sliceit_drake.calibration.calibrate import Calibration, write_json
 from sliceit_drake.configuration import dump_yaml
 from sliceit_drake.cutting.distribution import ParameterDistribution
 
-__all__ = ["figure", "food_table", "parameter_table", "write_results"]
+__all__ = ["calibration_table", "figure", "food_table", "parameter_table", "write_results"]
 
 MEASURED, PREDICTED = "#111827", "#c2410c"
 CHANNELS = ("force x", "force y", "force z")
@@ -35,7 +35,22 @@ def food_table(distribution: ParameterDistribution) -> str:
     return parameter_table(distribution, distribution.values())
 
 
-def figure(calibration: Calibration, file: Path) -> None:
+def calibration_table(calibration: Calibration) -> str:
+    """`parameter_table` of what was found, remarks on it, and the errors."""
+    c = calibration
+    lines = [parameter_table(c.posterior, c.predictor.values(c.unit)), *c.posterior.remarks()]
+    lines.append(
+        f"RMS error: search {c.search_rms:.3f}, Adam {c.refined_rms:.3f}, polished {c.rms:.3f} N"
+    )
+    if c.held_out_rms is not None:
+        blocks = ", ".join(f"{b:.2f}" for b in c.blocks)
+        lines.append(f"Held-out blocks of depth: {c.held_out_rms:.3f} N ({blocks})")
+    for name, error in c.held_out_records.items():
+        lines.append(f"Held-out record {name}: {error:.3f} N")
+    return "\n".join(lines)
+
+
+def figure(calibration: Calibration) -> Figure:
     """Measured and predicted force of each record, and what is left."""
     targets = calibration.predictor.targets
     sheet = Figure(figsize=(5.2 * min(len(targets), 3), 4.2), layout="constrained")
@@ -64,7 +79,7 @@ def figure(calibration: Calibration, file: Path) -> None:
             lower.legend(frameon=False, fontsize=7, ncols=3)
         for axis in (upper, lower):
             axis.grid(alpha=0.25)
-    sheet.savefig(file, dpi=150)
+    return sheet
 
 
 def write_results(calibration: Calibration, directory: Path, command: str) -> None:
@@ -78,4 +93,4 @@ def write_results(calibration: Calibration, directory: Path, command: str) -> No
     food = calibration.calibrated_food(datetime.date.today().isoformat(), command)
     dump_yaml(food, directory / "food.yaml")
     write_json(calibration, directory / "calibration.json")
-    figure(calibration, directory / "fit.png")
+    calibration.plot().savefig(directory / "fit.png", dpi=150)

@@ -59,6 +59,8 @@ def open_study(storage: str | Path, name: str) -> optuna.Study:
     Raises:
         ConfigurationError: The storage cannot be opened.
     """
+    # Before the first study: Optuna reports each that it creates.
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna.create_study(study_name=name, storage=open_storage(storage), load_if_exists=True)
 
 
@@ -86,7 +88,6 @@ def search(
     Raises:
         ConfigurationError: The study in the storage is of other parameters, or the storage failed.
     """
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
     names = [p.name for p in predictor.parameters]
     described = [f"{p.name} {p.low!r} {p.high!r} {p.log}" for p in predictor.parameters]
     known = study.user_attrs.get("parameters")

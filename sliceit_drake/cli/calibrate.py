@@ -164,7 +164,7 @@ def _calibrate(options: argparse.Namespace) -> int:
     import sys
 
     from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate
-    from sliceit_drake.calibration.report import parameter_table, write_results
+    from sliceit_drake.calibration.report import write_results
     from sliceit_drake.calibration.setup import load_setup
     from sliceit_drake.calibration.storage import without_password
     from sliceit_drake.configuration import ConfigurationError
@@ -205,20 +205,7 @@ def _calibrate(options: argparse.Namespace) -> int:
     # The command is kept with the food, for others to read.
     command = shlex.join(["sliceit", *(without_password(a) for a in sys.argv[1:])])
     write_results(result, options.output, command)
-    values = result.predictor.values(result.unit)
-    posterior = result.posterior
-    print(parameter_table(posterior, values))
-    for line in posterior.remarks():
-        print(line)
-    print(
-        f"RMS error: search {result.search_rms:.3f}, Adam {result.refined_rms:.3f}, polished "
-        f"{result.rms:.3f} N"
-    )
-    if result.held_out_rms is not None:
-        blocks = ", ".join(f"{b:.2f}" for b in result.blocks)
-        print(f"Held-out blocks of depth: {result.held_out_rms:.3f} N ({blocks})")
-    for name, error in result.held_out_records.items():
-        print(f"Held-out record {name}: {error:.3f} N")
+    print(result.table())
     if options.per_point:
         _fit_points(options, result)
     print(f"Results in {options.output}/")

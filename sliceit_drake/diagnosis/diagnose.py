@@ -6,7 +6,7 @@ import datetime
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,6 +29,9 @@ from sliceit_drake.diagnosis.slices import Meshing
 from sliceit_drake.diagnosis.verdict import ALARM, Finding, Verdict, foretold, reach_verdict
 from sliceit_drake.diagrams.calibrated_food import CalibratedFood
 from sliceit_drake.records.slice_record import SliceRecord
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["BASE", "Diagnosis", "diagnose", "setup_of_food"]
 
@@ -155,6 +158,18 @@ class Diagnosis:
             if abs(np.log(factor)) > 2.0 * error:
                 lines.append(f"Shift of {name}: times {factor:.3f} (+-{error:.3f})")
         return "\n".join(lines + self.remarks)
+
+    def plot(self) -> "Figure":
+        """Measured and simulated force of each condition, and what is left."""
+        from sliceit_drake.diagnosis.report import records_figure
+
+        return records_figure(self)
+
+    def plot_evidence(self) -> "Figure":
+        """Gain of each cause against chance, and the angles between causes."""
+        from sliceit_drake.diagnosis.report import evidence_figure
+
+        return evidence_figure(self)
 
     def _lines(self, finding: Finding, named: bool) -> list[str]:
         e, cause = finding.evidence, self.causes[finding.evidence.name]

@@ -111,9 +111,9 @@ def report_html(diagnosis: "Diagnosis") -> str:
         "<h1>What the simulation gets wrong</h1>",
         f"<pre>{html.escape(diagnosis.table())}</pre>",
         "<h2>Measured and simulated</h2>",
-        _image(records_figure(diagnosis)),
+        _image(diagnosis.plot()),
         "<h2>Evidence</h2>",
-        _image(evidence_figure(diagnosis)),
+        _image(diagnosis.plot_evidence()),
     ]
     if rows:
         parts += [
