@@ -23,11 +23,11 @@ from sliceit_drake.learning import training  # noqa: E402
 from sliceit_drake.learning.export import export_policy  # noqa: E402
 from sliceit_drake.learning.network import HistoryExtractor, TemporalConvolution  # noqa: E402
 from sliceit_drake.learning.replay import PrioritizedReplayBuffer  # noqa: E402
-from sliceit_drake.learning.reward import RewardConfig  # noqa: E402
+from sliceit_drake.learning.reward import RewardConfig, reward_potential  # noqa: E402
 from sliceit_drake.learning.sac import OverlapVecEnv, PrioritizedSAC  # noqa: E402
 from sliceit_drake.learning.task import RandomizationConfig, TaskConfig  # noqa: E402
 from sliceit_drake.learning.training import TrainingConfig, train  # noqa: E402
-from sliceit_drake.systems.agent import AgentConfig  # noqa: E402
+from sliceit_drake.systems.agent import AgentConfig, observation_names  # noqa: E402
 from sliceit_drake.systems.network import load_network  # noqa: E402
 
 AGENT = AgentConfig(history=3)
@@ -286,15 +286,30 @@ def test_no_value_outgrows_what_an_episode_can_give():
         return float(torch.cat(model.critic(torch.zeros(1, SIZE), torch.zeros(1, 6))).mean())
 
     # It lingers for ever: 0.5 / (1 - 0.99) = 50.
-    assert value(value_limit=3.0) == pytest.approx(3.0, abs=0.5)
+    assert value(value_limit=lambda o: torch.full((len(o), 1), 3.0)) == pytest.approx(3.4, abs=0.5)
     assert value() > 4.0
 
 
-def test_a_training_starts_with_little_entropy_and_the_greatest_return_as_limit():
+def test_a_training_starts_with_little_entropy_and_its_discount():
     config = training_of(entropy=0.25)
     model = training.make_model(config, OverlapVecEnv(DummyVecEnv([Still])))
     assert float(model.log_ent_coef.detach().exp()) == pytest.approx(0.25, rel=1e-6)
-    assert model.value_limit == config.task.reward.most()
+    assert model.gamma == config.task.reward.discount
+
+
+def test_no_slice_gets_more_than_what_is_left_to_get():
+    reward = RewardConfig(goal=15.0, way=15.0, hold=5.0)
+    names = observation_names(3)
+    observations = torch.zeros(3, SIZE)
+    observations[0, names.index("error_z")] = 0.5  # 30 mm
+    observations[1, names.index("at_goal")] = 0.8
+    observations[2, names.index("error_z")] = -0.01
+    observations[2, names.index("at_goal")] = 1.1
+    found = training.value_limit(reward)(observations).ravel()
+    assert found.tolist() == pytest.approx([15.0 + 5.0 + 7.5, 15.0 + 1.0, 15.0])
+    for row, limit in zip(observations.tolist(), found.tolist(), strict=True):
+        height, count = 0.06 * row[names.index("error_z")], row[names.index("at_goal")]
+        assert limit == pytest.approx(reward.goal - reward_potential(reward, height, count))
 
 
 # --- Training.

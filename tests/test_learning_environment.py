@@ -17,7 +17,7 @@ from sliceit_drake.learning.environment import SlicingEnv  # noqa: E402
 from sliceit_drake.learning.reward import (  # noqa: E402
     TERMS,
     RewardConfig,
-    reward_progress,
+    reward_potential,
     reward_terms,
     reward_weights,
 )
@@ -121,16 +121,16 @@ def test_the_time_limit_truncates():
 
 def weighted(info, config=None):
     weights = reward_weights(config or RewardConfig())
-    return float(weights @ [info["reward_terms"][name] for name in TERMS]) + info["progress"]
+    return float(weights @ [info["reward_terms"][name] for name in TERMS]) + info["shaping"]
 
 
 @pytest.mark.parametrize(
     ("values", "end", "bonus"),
     [
-        ({"agent": {"goal": [1.0, 1.0, 1.0], "goal_decisions": 0}}, "goal", 10.0),
-        ({"workspace": [1.0, 0.001, 1.0]}, "workspace", -30.0),
-        ({"force_limit": 0.1}, "collision", -30.0),
-        ({"torque_limit": 0.1}, "collision", -30.0),
+        ({"agent": {"goal": [1.0, 1.0, 1.0], "goal_decisions": 0}}, "goal", 15.0),
+        ({"workspace": [1.0, 0.001, 1.0]}, "workspace", -15.0),
+        ({"force_limit": 0.1}, "collision", -15.0),
+        ({"torque_limit": 0.1}, "collision", -15.0),
     ],
 )
 def test_an_end_terminates_with_its_reward(values, end, bonus):
@@ -160,7 +160,7 @@ def test_a_guard_of_the_simulation_terminates_with_the_reward_of_a_collision(mon
     assert (terminated, truncated, info["end"]) == (True, False, "guard")
     assert info["guard_error"] == "CuttingError"
     assert "an element is inverted" in info["guard_message"]
-    assert reward == pytest.approx(weighted(info) - 30.0, abs=1e-6)
+    assert reward == pytest.approx(weighted(info) - 15.0, abs=1e-6)
     assert np.isfinite(observation).all()
     # The next episode is as if nothing had happened.
     expected = rollout(SlicingEnv(env.task), 3, seed=4)
@@ -245,21 +245,22 @@ def test_the_term_of_the_jerk_ends_at_one():
     assert reward_terms(RewardConfig(), 0.0, np.zeros(2), np.array([3.0, -4.0, 0.0]))[2] == -1.0
 
 
-def test_progress_is_paid_as_it_is_made_and_taken_back():
-    config = RewardConfig(way=15.0, hold=10.0)
-    high, low, done = ((0.04, 0.0), (0.01, 0.0), (-1e-4, 1.1))
-    assert reward_progress(config, *low) - reward_progress(config, *high) == pytest.approx(7.5)
-    assert reward_progress(config, *done) - reward_progress(config, *low) == pytest.approx(12.5)
+def test_the_potential_tells_what_is_left_and_pays_no_policy():
+    config = RewardConfig(way=15.0, hold=5.0)
+    assert reward_potential(config, 0.03, 0.0) == pytest.approx(-12.5)
+    assert reward_potential(config, 1e-4, 0.5) == pytest.approx(-2.525)
+    assert reward_potential(config, -1e-4, 1.1) == 0.0
+    # What is paid on the way depends on where it begins and ends alone.
     env = SlicingEnv(task_of("spring"))
-    env.reset(seed=3)
-    start = env.step(np.array([0.0, 0.0, 1.0, 0.0, 0.0, 1.0]))[4]
-    made, last = start["progress"], start
-    for action in [PRESS] * 8 + [-PRESS] * 8:
-        last = env.step(action)[4]
-        made += last["progress"]
-        assert abs(made) < env.task.reward.most()
-    before = env.task.reward.way / 0.06 * (start["height"] - last["height"])
-    assert made - start["progress"] == pytest.approx(before, abs=1e-6)
+    config = env.task.reward
+    for actions in ([PRESS] * 12, [PRESS] * 6 + [-PRESS] * 6):
+        potential = reward_potential(config, 0.06 * env.reset(seed=3)[0][1], 0.0)
+        paid = 0.0
+        for k, action in enumerate(actions):
+            *_, info = env.step(action)
+            paid += config.discount**k * info["shaping"]
+        after = config.discount ** len(actions) * reward_potential(config, info["height"], 0.0)
+        assert paid == pytest.approx(after - potential, abs=1e-5)
 
 
 def test_weights_are_ratios():
@@ -292,7 +293,7 @@ def test_the_environment_takes_the_progress_for_its_schedule():
         env.reset(seed=0)
         _, value, _, _, info = env.step(PRESS)
         terms = [info["reward_terms"][name] for name in TERMS]
-        expected = reward_weights(reward, progress) @ terms + info["progress"]
+        expected = reward_weights(reward, progress) @ terms + info["shaping"]
         assert value == pytest.approx(expected, abs=1e-6)
         rewards.append(value)
     assert rewards[0] != rewards[1]

@@ -15,7 +15,7 @@ from pydrake.systems.analysis import Simulator
 
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.agent_station import AgentStation
-from sliceit_drake.learning.reward import TERMS, reward_progress, reward_terms, reward_weights
+from sliceit_drake.learning.reward import TERMS, reward_potential, reward_terms, reward_weights
 from sliceit_drake.learning.task import TaskConfig, make_agent_station
 
 __all__ = ["SlicingEnv"]
@@ -27,11 +27,11 @@ VARIANT_SEED = 1
 class SlicingEnv(gymnasium.Env):
     """One slice an episode; observation and action as `systems.agent.AgentSystem`.
 
-    `step` returns in `info`: `reward_terms` (before their weights), `progress` (the reward for it),
-    `cut_progress`, `height` of the edge over the board, m, `force`: the norm of food's and board's
-    force on the knife at the decision, N, and at an episode's end `end`: goal, collision,
-    workspace, guard or time. A guard of the simulation that ends an episode (an inverted element,
-    say) is `guard_error`, its kind.
+    `step` returns in `info`: `reward_terms` (before their weights), `shaping` (the reward that the
+    potential gives), `cut_progress`, `height` of the edge over the board, m, `force`: the norm of
+    food's and board's force on the knife at the decision, N, and at an episode's end `end`: goal,
+    collision, workspace, guard or time. A guard of the simulation that ends an episode (an inverted
+    element, say) is `guard_error`, its kind.
 
     A seed given to `reset` fixes all that follows. The variants of the foods come from a seed of
     their own, the same in every environment of a task.
@@ -51,7 +51,7 @@ class SlicingEnv(gymnasium.Env):
         self._built: dict[str, tuple[AgentStation, Simulator]] = {}
         self._current: tuple[AgentStation, Simulator] | None = None
         self._decisions = 0
-        self._made = 0.0
+        self._potential = 0.0
         self._before_reset: dict | None = None
 
     def set_progress(self, progress: float) -> None:
@@ -95,7 +95,7 @@ class SlicingEnv(gymnasium.Env):
         station.begin(simulator, rng, shift)
         self._decisions = 0
         error = station.GetOutputPort("error").Eval(simulator.get_context())
-        self._made = self._progress(float(error[1]))
+        self._potential = self._calc_potential(float(error[1]))
         return self._observation(), {"food": food}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -124,8 +124,9 @@ class SlicingEnv(gymnasium.Env):
         wrench = station.GetOutputPort("wrench").Eval(context)
         terms = reward_terms(config, float(error[1]), wrench[:2], observation[JERK])
         reward = float(reward_weights(config, self.progress) @ terms)
-        before, self._made = self._made, self._progress(float(error[1]))
-        reward += self._made - before
+        before, self._potential = self._potential, self._calc_potential(float(error[1]))
+        shaping = config.discount * self._potential - before
+        reward += shaping
         end = end or self._end(error)
         if end == "goal":
             reward += config.goal
@@ -133,7 +134,7 @@ class SlicingEnv(gymnasium.Env):
             reward += config.collision
         info: dict[str, Any] = {
             "reward_terms": dict(zip(TERMS, terms.tolist(), strict=True)),
-            "progress": self._made - before,
+            "shaping": shaping,
             "cut_progress": float(station.GetOutputPort("cut_progress").Eval(context)[0]),
             "height": float(error[1]),
             "force": self._force(),
@@ -160,12 +161,12 @@ class SlicingEnv(gymnasium.Env):
         values = station.GetOutputPort("observation").Eval(simulator.get_context())
         return values.astype(np.float32)
 
-    def _progress(self, height: float) -> float:
+    def _calc_potential(self, height: float) -> float:
         assert self._current is not None
         station, simulator = self._current
         count = float(station.GetOutputPort("at_goal").Eval(simulator.get_context())[0])
         share = count / max(self.task.agent.goal_decisions, 1)
-        return reward_progress(self.task.reward, height, share)
+        return reward_potential(self.task.reward, height, share)
 
     def _force(self) -> float:
         assert self._current is not None

@@ -12,7 +12,7 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError, choice, quantity
 
-__all__ = ["TERMS", "RewardConfig", "reward_progress", "reward_terms", "reward_weights"]
+__all__ = ["HEIGHT", "TERMS", "RewardConfig", "reward_potential", "reward_terms", "reward_weights"]
 
 TERMS = ("distance", "force", "jerk", "step")
 HEIGHT = 0.06
@@ -49,30 +49,22 @@ class RewardConfig:
         high=1e3,
         doc="Of the force term. A sigmoid's is half at three times as much; 2 in SliceIt!.",
     )
-    goal: float = quantity(10.0, "", low=0.0, doc="For a slice that is done; 100 in SliceIt!.")
+    goal: float = quantity(15.0, "", low=0.0, doc="For a slice that is done; 100 in SliceIt!.")
     way: float = quantity(
-        15.0,
-        "",
-        low=0.0,
-        doc="For 60 mm of way down to the board, as it is made, and taken back where the knife "
-        "rises; not in SliceIt!.",
+        15.0, "", low=0.0, doc="Of `reward_potential`, for 60 mm of way down; not in SliceIt!."
     )
     hold: float = quantity(
-        10.0,
-        "",
-        low=0.0,
-        doc="For the decisions at the goal that end a slice, likewise; not in SliceIt!.",
+        5.0, "", low=0.0, doc="Likewise, for the decisions at the goal that end a slice."
+    )
+    discount: float = quantity(
+        0.99, "", low=0.0, high=1.0, doc="Of a decision; of the potential too, so that it is free."
     )
     collision: float = quantity(
-        -30.0,
+        -15.0,
         "",
         high=0.0,
         doc="For a force over the limit, leaving the workspace, or a failure; -100 in SliceIt!.",
     )
-
-    def most(self) -> float:
-        """No slice from less than 90 mm over the board gives more."""
-        return self.goal + self.hold + 1.5 * self.way
 
     def check(self, where: str) -> None:
         if sum(self.weights) <= 0.0:
@@ -104,19 +96,20 @@ def reward_terms(
     )
 
 
-def reward_progress(config: RewardConfig, height: float, at_goal: float) -> float:
-    """How far a slice has come; what it grows by in a decision is part of the reward.
+def reward_potential(config: RewardConfig, height: float, at_goal: float) -> float:
+    """What a slice has still to make good, below zero; zero when it is done.
 
-    A slice that is done gets the same in all, however it came there (Ng, Harada and Russell,
-    "Policy invariance under reward transformations", 1999), but sees at once what each decision
-    brings: where only the end pays, and time costs little, agents learn to put the end off.
+    A decision's reward has ``discount * potential after - potential before`` added to it. No policy
+    becomes better by that than another (Ng, Harada and Russell, "Policy invariance under reward
+    transformations", 1999), but each decision sees at once what it brings: where only the end
+    pays, and time costs little, agents learned to put the end off.
 
     Args:
         config: Its `way` and `hold`.
         height: Of the edge over the board, metres.
         at_goal: Share of the decisions at the goal that end a slice.
     """
-    return config.hold * min(at_goal, 1.0) - config.way * max(height, 0.0) / HEIGHT
+    return -config.way * max(height, 0.0) / HEIGHT - config.hold * (1.0 - min(at_goal, 1.0))
 
 
 def reward_weights(config: RewardConfig, progress: float = 0.0) -> np.ndarray:

@@ -53,14 +53,19 @@ class PrioritizedSAC(SAC):
 
     Args:
         beta_end: Power of the importance weights at the end of the training; it grows linearly.
-        value_limit: No return is greater; the critics' targets are limited to it. Where an episode
-            can linger, an overestimated value feeds on itself, and fades only with the discount.
+        value_limit: From observations [batch, n] to the most that can still be got from there
+            [batch, 1]; None for no limit. Where an episode can linger, an overestimated value feeds
+            on itself, and fades only with the discount.
     """
 
     replay_buffer: PrioritizedReplayBuffer
 
     def __init__(
-        self, *arguments: Any, beta_end: float = 1.0, value_limit: float = math.inf, **options: Any
+        self,
+        *arguments: Any,
+        beta_end: float = 1.0,
+        value_limit: Callable[[torch.Tensor], torch.Tensor] | None = None,
+        **options: Any,
     ) -> None:
         self.beta_end, self.value_limit = beta_end, value_limit
         self.running: dict[str, float] = {}
@@ -97,8 +102,9 @@ class PrioritizedSAC(SAC):
             following, following_density = self._act(batch.next_observations)
             value = torch.cat(self.critic_target(batch.next_observations, following), dim=1)
             value = value.min(dim=1, keepdim=True).values - alpha * following_density
+            if self.value_limit is not None:
+                value = torch.minimum(value, self.value_limit(batch.next_observations))
             target = batch.rewards + (1.0 - batch.dones) * self.gamma * value
-            target = target.clamp(max=self.value_limit)
         values = self.critic(batch.observations, batch.actions)
         errors = [value - target for value in values]
         critic_loss = 0.5 * sum((weights * error**2).mean() for error in errors)

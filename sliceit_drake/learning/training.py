@@ -23,8 +23,10 @@ from sliceit_drake.configuration import ConfigurationError, dump_yaml, load_yaml
 from sliceit_drake.learning.environment import SlicingEnv
 from sliceit_drake.learning.export import export_policy
 from sliceit_drake.learning.network import HistoryExtractor
+from sliceit_drake.learning.reward import HEIGHT, RewardConfig
 from sliceit_drake.learning.sac import OverlapVecEnv, PrioritizedSAC
 from sliceit_drake.learning.task import TaskConfig, check_task
+from sliceit_drake.systems.agent import ERROR, observation_names
 
 __all__ = [
     "CHECKPOINT",
@@ -35,6 +37,7 @@ __all__ = [
     "load_training",
     "make_model",
     "train",
+    "value_limit",
 ]
 
 CHECKPOINT, CONFIGURATION, POLICY, EPISODES = (
@@ -59,14 +62,6 @@ class TrainingConfig:
     learning_rate: float = quantity(3e-4, "", low=1e-7, high=1.0, doc="Of all networks.")
     batch: int = quantity(256, "", low=1, high=10**6, doc="Transitions in an update.")
     warm_up: int = quantity(1000, "", low=1, high=10**9, doc="Random decisions at the start.")
-    gamma: float = quantity(
-        0.998,
-        "",
-        low=0.0,
-        high=1.0,
-        doc="Discount of a decision. At 0.99 the goal is worth 1 % less with each decision more, "
-        "which is more than a decision's force costs: agents hurry.",
-    )
     entropy: float = quantity(
         0.03,
         "",
@@ -75,7 +70,7 @@ class TrainingConfig:
         doc="Weight of the entropy at the start, from which it adapts. At Stable-Baselines3's 1 "
         "lingering is worth more than the goal at first, and is long after believed to be.",
     )
-    tau: float = quantity(0.005, "", low=0.0, high=1.0, doc="Of the targets' moving average.")
+    tau: float = quantity(0.01, "", low=0.0, high=1.0, doc="Of the targets' moving average.")
     layers: list[int] = dc.field(default_factory=lambda: [128, 128])
     """Widths of the fully connected layers behind the joined features."""
     priority: float = quantity(
@@ -214,9 +209,9 @@ def make_model(config: TrainingConfig, environments: OverlapVecEnv) -> Prioritiz
         learning_starts=config.warm_up,
         batch_size=config.batch,
         tau=config.tau,
-        gamma=config.gamma,
+        gamma=config.task.reward.discount,
         ent_coef=f"auto_{config.entropy:.9g}",
-        value_limit=config.task.reward.most(),
+        value_limit=value_limit(config.task.reward),
         train_freq=1,
         # Updates are made while the environment simulates.
         gradient_steps=0,
@@ -234,6 +229,22 @@ def make_model(config: TrainingConfig, environments: OverlapVecEnv) -> Prioritiz
     )
     model.replay_buffer.seed(config.seed)
     return model
+
+
+def value_limit(reward: RewardConfig) -> Callable[[torch.Tensor], torch.Tensor]:
+    """From observations [batch, n] to the most that can still be got from there [batch, 1].
+
+    It is the goal and what is left to make good of the potential: all terms cost.
+    """
+    names = observation_names(1)
+    height, at_goal = names.index("error_z"), names.index("at_goal")
+
+    def limit(observations: torch.Tensor) -> torch.Tensor:
+        left = 1.0 - observations[:, at_goal].clamp(max=1.0)
+        way = observations[:, height].clamp(min=0.0) * (ERROR[1] / HEIGHT)
+        return (reward.goal + reward.hold * left + reward.way * way)[:, None]
+
+    return limit
 
 
 def _load(file: Path, described: str) -> dict[str, Any] | None:

@@ -34,7 +34,7 @@ from sliceit_drake.configuration import ConfigurationError, choice, quantity
 from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.systems.envelope import envelope, envelope_time
 
-__all__ = ["ACTIONS", "AgentConfig", "AgentSystem", "Decide", "observation_names"]
+__all__ = ["ACTIONS", "ERROR", "AgentConfig", "AgentSystem", "Decide", "observation_names"]
 
 ACTIONS = ("stiffness_x", "stiffness_ry", "p_z", "p_ry", "draw", "press")
 """What the numbers of an action decide."""
@@ -42,8 +42,8 @@ ACTIONS = ("stiffness_x", "stiffness_ry", "p_z", "p_ry", "draw", "press")
 Decide = Callable[[np.ndarray], np.ndarray]
 """From an observation to an action [6], each within [-1, 1]."""
 
-# Scales of the observation: SliceIt!'s.
 ERROR = np.array([0.1, 0.06, 0.785])
+"""Scales of the observed error, m, m, rad, as those below SliceIt!'s."""
 VELOCITY = np.array([0.5, 0.5, 0.785])
 JERK = 500.0
 WRENCH = np.array([50.0, 50.0, 10.0])
