@@ -1,5 +1,6 @@
 """The program `sliceit`, as a user calls it."""
 
+import argparse
 import base64
 import json
 import re
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sliceit_drake.cli.main import main
+from sliceit_drake.cli.main import main, make_parser
 
 SMALL_FOOD = "{food: {shape: !Cylinder {rings: 3, layers: [0.0, 0.004, 0.012]}}}"
 
@@ -144,6 +145,31 @@ def test_help_is_quick_and_lists_the_commands():
     assert "simulate" in shown.stdout and "diagram" in shown.stdout
     for heavy in ("pydrake", "warp", "scipy", "matplotlib"):
         assert f"| {heavy}" not in shown.stderr
+
+
+def subcommands(parser, name="sliceit"):
+    """All commands and studies, by their full names."""
+    found = {name: parser}
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for key, nested in action.choices.items():
+                found |= subcommands(nested, f"{name} {key}")
+    return found
+
+
+def test_each_command_is_listed_in_its_group_and_teaches():
+    commands = subcommands(make_parser())
+    shown = commands.pop("sliceit").format_help()
+    listed = re.findall(r"^  ([a-z-]+) {2,}\S", shown, re.M)
+    assert sorted(listed) == sorted(n.split()[1] for n in commands if n.count(" ") == 1)
+    assert len(commands) > 20
+    for name, parser in commands.items():
+        text = parser.format_help()
+        assert text.startswith(f"usage: {name} "), text[:80]
+        assert parser.description and len(parser.description) > 30, name
+        for action in parser._actions:
+            nested = isinstance(action, argparse._SubParsersAction)
+            assert action.help or nested, (name, action.option_strings or action.dest)
 
 
 def test_diagram_writes_graphviz_and_ports(tmp_path, capsys):

@@ -28,8 +28,12 @@ def add_calibration_study(studies: "argparse._SubParsersAction[argparse.Argument
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--output", metavar="FOLDER", type=Path, required=True)
-    parser.add_argument("--foods", nargs="+", choices=FOODS, default=list(FOODS))
+    parser.add_argument(
+        "--output", metavar="FOLDER", type=Path, required=True, help="where the results go"
+    )
+    parser.add_argument(
+        "--foods", nargs="+", choices=FOODS, default=list(FOODS), help="default: all"
+    )
     parser.add_argument("--trials", type=int, default=500, help="of the search (default 500)")
     parser.add_argument("--steps", type=int, default=100, help="of Adam (default 100)")
     parser.add_argument(
@@ -38,7 +42,9 @@ def add_calibration_study(studies: "argparse._SubParsersAction[argparse.Argument
         default=100,
         help="of Adam on a toughness for each cut point (default 100; 0: none)",
     )
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument(
+        "--workers", type=int, default=os.cpu_count() or 1, help="default: all processors"
+    )
     parser.set_defaults(run=run)
 
 

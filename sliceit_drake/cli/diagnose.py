@@ -50,11 +50,19 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("records", metavar="RECORDS_DIR", type=Path, nargs="+")
+    parser.add_argument(
+        "records",
+        metavar="RECORDS_DIR",
+        type=Path,
+        nargs="+",
+        help="folder of records; sessions in order",
+    )
     parser.add_argument(
         "--model", metavar="FOOD", required=True, help="a calibrated food by name, or its YAML file"
     )
-    parser.add_argument("--output", metavar="DIR", type=Path, required=True)
+    parser.add_argument(
+        "--output", metavar="DIR", type=Path, required=True, help="where results go"
+    )
     parser.add_argument(
         "--cause", metavar="FILE", type=Path, action="append", default=[], help="a cause of yours"
     )

@@ -23,7 +23,9 @@ def add_disect_study(studies: "argparse._SubParsersAction[argparse.ArgumentParse
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--output", metavar="FOLDER", type=Path, required=True)
+    parser.add_argument(
+        "--output", metavar="FOLDER", type=Path, required=True, help="where page and figure go"
+    )
     parser.set_defaults(run=run)
 
 

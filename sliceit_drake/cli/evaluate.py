@@ -54,9 +54,15 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("policies", nargs="+", metavar="POLICY", type=Path)
-    parser.add_argument("--world", nargs="+", choices=WORLDS, default=list(WORLDS))
-    parser.add_argument("--foods", nargs="+", choices=FOODS, default=list(FOODS))
+    parser.add_argument(
+        "policies", nargs="+", metavar="POLICY", type=Path, help="folder of a training"
+    )
+    parser.add_argument(
+        "--world", nargs="+", choices=WORLDS, default=list(WORLDS), help="default: both"
+    )
+    parser.add_argument(
+        "--foods", nargs="+", choices=FOODS, default=list(FOODS), help="default: all"
+    )
     parser.add_argument("--slices", metavar="N", type=int, help="of each food")
     parser.add_argument(
         "--board-stiffness",
@@ -68,7 +74,9 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     )
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the slices; 0")
     parser.add_argument("--workers", metavar="N", type=int, default=2, help="processes; 2")
-    parser.add_argument("--output", metavar="FILE", type=Path, required=True, help=".jsonl")
+    parser.add_argument(
+        "--output", metavar="FILE", type=Path, required=True, help=".jsonl file of slices"
+    )
     parser.set_defaults(run=run)
 
 

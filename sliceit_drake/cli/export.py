@@ -35,7 +35,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("folder", metavar="FOLDER", type=Path, help="of `sliceit simulate`")
-    parser.add_argument("--format", choices=("vtu", "xdmf"), default="vtu")
+    parser.add_argument("--format", choices=("vtu", "xdmf"), default="vtu", help="default: vtu")
     parser.add_argument("--fps", type=float, default=30.0, help="frames a second (default 30)")
     parser.add_argument(
         "--output", metavar="DIR", type=Path, help="default: paraview, in the folder"

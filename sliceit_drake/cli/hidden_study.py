@@ -41,7 +41,7 @@ def add_hidden_study(studies: "argparse._SubParsersAction[argparse.ArgumentParse
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    hidden.add_argument("--output", metavar="DIR", type=Path, required=True)
+    hidden.add_argument("--output", metavar="DIR", type=Path, required=True, help="where runs go")
     hidden.add_argument(
         "--runs-from", metavar="FILE", type=Path, help="go on with the runs that are in this file"
     )
@@ -65,7 +65,13 @@ def add_hidden_study(studies: "argparse._SubParsersAction[argparse.ArgumentParse
         description=SIZES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    sizes.add_argument("--protocols", nargs="+", metavar="NAME", default=["poor", "rich", "full"])
+    sizes.add_argument(
+        "--protocols",
+        nargs="+",
+        metavar="NAME",
+        default=["poor", "rich", "full"],
+        help="default: all",
+    )
     sizes.add_argument("--effects", nargs="+", metavar="NAME", help="default: all")
     sizes.add_argument("--cache", metavar="DIR", type=Path, help="keep what was computed there")
     sizes.add_argument("--output", metavar="FILE", type=Path, help="also write the table there")

@@ -3,6 +3,7 @@
 import argparse
 import os
 import sys
+import textwrap
 from collections.abc import Sequence
 
 from sliceit_drake.cli import (
@@ -23,39 +24,47 @@ from sliceit_drake.cli import (
     train,
 )
 
-__all__ = ["main"]
+__all__ = ["main", "make_parser"]
 
-COMMANDS = (
-    simulate,
-    export,
-    emulate,
-    hardware,
-    collect,
-    diagram,
-    record,
-    records,
-    calibrate,
-    diagnose,
-    optimize_motion,
-    train,
-    evaluate,
-    study,
-    score,
-)
+GROUPS = {
+    "run a slice": (simulate, hardware, emulate, collect),
+    "records and foods": (record, records, calibrate, diagnose),
+    "motions and policies": (train, evaluate, optimize_motion),
+    "look at it": (diagram, export),
+    "study the simulation": (study, score),
+}
 BAD_INPUT = 2
 INTERRUPTED = 130
+WIDTH = 88
 
 
 def make_parser() -> argparse.ArgumentParser:
     """The parser of the whole program."""
     parser = argparse.ArgumentParser(
         prog="sliceit",
+        usage="sliceit [-h] COMMAND ...",
         description="Simulate a robot that slices food, in Drake.",
-        epilog="`sliceit COMMAND --help` explains a command. SI units everywhere.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in COMMANDS:
-        command.add_parser(commands)
+    commands = parser.add_subparsers(
+        prog="sliceit", metavar="COMMAND", required=True, help=argparse.SUPPRESS
+    )
+    lines = []
+    for title, group in GROUPS.items():
+        lines += [f"{title}:"]
+        for command in group:
+            command.add_parser(commands)
+            # argparse has no public way to read a command's help back, nor to group commands.
+            added = commands._choices_actions[-1]
+            lines += textwrap.wrap(
+                added.help or "",
+                WIDTH,
+                initial_indent=f"  {added.dest:17}",
+                subsequent_indent=19 * " ",
+            )
+        lines.append("")
+    lines.append("`sliceit COMMAND --help` explains a command. SI units everywhere.")
+    parser.epilog = "\n".join(lines)
     return parser
 
 

@@ -30,7 +30,9 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_scenario_arguments(parser)
-    parser.add_argument("--output", metavar="FOLDER", type=Path, required=True)
+    parser.add_argument(
+        "--output", metavar="FOLDER", type=Path, required=True, help="where motion and figure go"
+    )
     for name, unit, default, text in (
         ("duration", "S", 3.0, "longest time of the cut, s"),
         ("draw-speed", "V", 0.15, "greatest speed along the edge, m/s"),

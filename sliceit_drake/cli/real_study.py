@@ -28,8 +28,12 @@ def add_real_study(studies: "argparse._SubParsersAction[argparse.ArgumentParser]
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--output", metavar="FOLDER", type=Path, required=True)
-    parser.add_argument("--foods", nargs="+", choices=FOODS, default=list(FOODS))
+    parser.add_argument(
+        "--output", metavar="FOLDER", type=Path, required=True, help="where page and figures go"
+    )
+    parser.add_argument(
+        "--foods", nargs="+", choices=FOODS, default=list(FOODS), help="default: all"
+    )
     parser.add_argument(
         "--refinement",
         type=float,
@@ -37,7 +41,9 @@ def add_real_study(studies: "argparse._SubParsersAction[argparse.ArgumentParser]
         help="elements along an edge, relative to the food's mesh (default 1)",
     )
     parser.add_argument("--cache", metavar="DIR", type=Path, help="keep simulations there")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument(
+        "--workers", type=int, default=os.cpu_count() or 1, help="default: all processors"
+    )
     parser.set_defaults(run=run)
 
 

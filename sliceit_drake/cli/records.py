@@ -80,7 +80,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     make.add_argument(
         "format", choices=("ur_rtde", "force", "profile", "rosbag"), help="what FILE is"
     )
-    make.add_argument("file", metavar="FILE", type=Path)
+    make.add_argument("file", metavar="FILE", type=Path, help="what to read")
     make.add_argument("--output", metavar="DIR", type=Path, required=True, help="folder of records")
     make.add_argument("--metadata", metavar="YAML", type=Path, help="what FILE does not say")
     make.add_argument("--name", help="name of the record; default: that in YAML, or FILE's")

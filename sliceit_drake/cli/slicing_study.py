@@ -32,7 +32,9 @@ def add_slicing(studies: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("evaluation", metavar="EVALUATION", type=Path, help=".jsonl")
-    parser.add_argument("--output", metavar="FOLDER", type=Path, required=True)
+    parser.add_argument(
+        "--output", metavar="FOLDER", type=Path, required=True, help="where page and figures go"
+    )
     parser.add_argument(
         "--policies",
         nargs=2,

@@ -75,7 +75,11 @@ STATION_STEPS = (5e-5, 1e-4, 2.5e-4, 5e-4, 1e-3)
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Adds the command."""
-    parser = commands.add_parser("study", help="run a study of the simulation itself")
+    parser = commands.add_parser(
+        "study",
+        help="run a study of the simulation itself",
+        description="Studies whose tables and figures stand in docs; each says how long it takes.",
+    )
     studies = parser.add_subparsers(title="studies", metavar="STUDY", required=True)
     coupling = studies.add_parser(
         "coupling",
