@@ -12,9 +12,7 @@ v_B = v_C @ R_BC.T.
 """
 
 import dataclasses as dc
-import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
@@ -23,7 +21,6 @@ from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     FixedOffsetFrame,
-    JacobianWrtVariable,
     RevoluteJoint,
     SpatialInertia,
     UnitInertia,
@@ -36,14 +33,18 @@ from pydrake.systems.framework import (
     LeafSystem,
     ValueProducer,
 )
-from scipy.linalg.lapack import dposv
 
 from sliceit_drake.configuration import ConfigurationError, choice, quantity, validate
+from sliceit_drake.systems.compliance_kernel import MODES
+from sliceit_drake.systems.compliance_update import (
+    ComplianceLaw,
+    ComplianceUpdate,
+    load_kernels,
+)
 from sliceit_drake.systems.ur5e_kinematics import KinematicChain
 
 __all__ = ["ComplianceController", "ComplianceControllerConfig", "make_virtual_model"]
 
-_MODES = ("compliance", "motion", "force", "parallel")
 _END_EFFECTOR = "end_effector"
 
 # Virtual mass [kg] and moment of inertia [kg m2] of the end effector, moment of inertia of a link.
@@ -51,18 +52,11 @@ _END_EFFECTOR_MASS = 1.0
 _END_EFFECTOR_INERTIA = 1.0
 _LINK_INERTIA = 1e-6
 
-# A pose error is limited to this length [m] and to this angle [rad].
-_MAX_DISTANCE = 1.0
-_MAX_ANGLE = 1.0
-
 # Threshold of KDL (orocos_kinematics_dynamics, frames.cpp): shorter vectors count as zero, and
 # rotation matrices whose opposite elements differ by less count as symmetric.
 _KDL_THRESHOLD = 1e-6
 # Without the dead zones the same tests only keep divisions by zero away.
 _ROUNDING_THRESHOLD = 1e-12
-
-_ORIGIN = np.zeros(3)
-_ZERO = np.zeros((2, 3))
 
 
 @dc.dataclass
@@ -75,7 +69,7 @@ class ComplianceControllerConfig:
 
     mode: str = choice(
         "compliance",
-        _MODES,
+        MODES,
         doc="compliance: spring plus wrenches. motion: pose error alone, without stiffness. "
         "force: wrenches alone. parallel: spring and wrenches weighted by the selection.",
     )
@@ -149,19 +143,12 @@ def make_virtual_model(chain: KinematicChain, link_mass: float) -> MultibodyPlan
     Raises:
         ConfigurationError: If the chain has no joints, or a joint's limits are the wrong way round.
     """
-    if not chain.joints:
-        raise ConfigurationError("the chain has no joints", field="chain.joints", fix="Give one.")
+    _check(chain)
     plant = MultibodyPlant(0.0)
     plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, 0.0])
     parent = plant.world_body()
     end_effector_inertia = _inertia(_END_EFFECTOR_MASS, _END_EFFECTOR_INERTIA)
     for index, joint in enumerate(chain.joints):
-        if not joint.lower <= joint.upper:
-            raise ConfigurationError(
-                f"the limits of {joint.name} are [{joint.lower:.6g}, {joint.upper:.6g}] rad",
-                field=f"chain.joints[{index}]",
-                fix="Give lower <= upper.",
-            )
         is_end_effector = chain.X_LE is None and index == len(chain.joints) - 1
         link = plant.AddRigidBody(
             _END_EFFECTOR if is_end_effector else joint.name,
@@ -186,22 +173,27 @@ def _inertia(mass: float, moment: float) -> SpatialInertia:
     return SpatialInertia(mass, np.zeros(3), UnitInertia.TriaxiallySymmetric(moment / mass))
 
 
-class _Settings(NamedTuple):
-    """What the input ports that change seldom ask for.
+def _check(chain: KinematicChain) -> None:
+    if not chain.joints:
+        raise ConfigurationError("the chain has no joints", field="chain.joints", fix="Give one.")
+    for index, joint in enumerate(chain.joints):
+        if not joint.lower <= joint.upper:
+            raise ConfigurationError(
+                f"the limits of {joint.name} are [{joint.lower:.6g}, {joint.upper:.6g}] rad",
+                field=f"chain.joints[{index}]",
+                fix="Give lower <= upper.",
+            )
 
-    Attributes:
-        stiffness: [2, 3], in C.
-        selection: [2, 3], in B.
-        proportional: P gains times the error scale, [2, 3], in B.
-        derivative: D gains times the error scale over the virtual time step, [2, 3], in B.
-        target_wrench: [2, 3], in B, or in E with `hand_frame_control`.
-    """
 
-    stiffness: np.ndarray
-    selection: np.ndarray
-    proportional: np.ndarray
-    derivative: np.ndarray
-    target_wrench: np.ndarray
+def _bodies(chain: KinematicChain, link_mass: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns masses [kg] and moments of inertia [kg m2] of the links and the end effector."""
+    n = len(chain.joints)
+    mass = np.array([link_mass] * n + [_END_EFFECTOR_MASS])
+    moment = np.array([_LINK_INERTIA] * n + [_END_EFFECTOR_INERTIA])
+    if chain.X_LE is None:
+        # The end effector stands for the last link.
+        mass[-2] = moment[-2] = 0.0
+    return mass, moment
 
 
 class ComplianceController(LeafSystem):
@@ -277,23 +269,26 @@ class ComplianceController(LeafSystem):
         """
         super().__init__()
         validate(config, "compliance_controller")
-        self._mode = config.mode
-        self._iterations = 1 if config.mode == "force" else config.iterations
-        self._time_step = config.virtual_time_step
-        self._damping_factor = config.damping_factor
-        self._threshold = _KDL_THRESHOLD if config.dead_zones else _ROUNDING_THRESHOLD
-        self._hand_frame_control = config.hand_frame_control
+        _check(chain)
+        mass, moment = _bodies(chain, config.link_mass)
+        self._law = ComplianceLaw(
+            chain=chain,
+            mass=mass,
+            moment=moment,
+            R_EC=(X_EC or RigidTransform()).rotation().matrix(),
+            mode=config.mode,
+            iterations=1 if config.mode == "force" else config.iterations,
+            time_step=config.virtual_time_step,
+            damping_factor=config.damping_factor,
+            threshold=_KDL_THRESHOLD if config.dead_zones else _ROUNDING_THRESHOLD,
+            hand_frame_control=config.hand_frame_control,
+        )
 
-        self._plant = make_virtual_model(chain, config.link_mass)
-        self._end_effector = self._plant.GetBodyByName(_END_EFFECTOR)
-        self._frame_E = self._end_effector.body_frame()
-        self._frame_B = self._plant.world_frame()
-        self._lower = np.array([joint.lower for joint in chain.joints])
-        self._upper = np.array([joint.upper for joint in chain.joints])
+        # Here, so that no robot waits for it.
+        load_kernels()
 
         self._X_WB = X_WB or RigidTransform()
         self._X_BW = self._X_WB.inverse().GetAsMatrix34()
-        self._R_EC = (X_EC or RigidTransform()).rotation().matrix()
         if X_ES is None:
             X_ES = RigidTransform() if chain.X_LE is None else chain.X_LE.inverse()
         self._wrench_C_from_S = _wrench_transform((X_EC or RigidTransform()).InvertAndCompose(X_ES))
@@ -310,12 +305,11 @@ class ComplianceController(LeafSystem):
         self._selection = self._parameter_input("selection", config.selection)
         self._error_scale = self._parameter_input("error_scale", [config.error_scale])
 
-        # A context of the virtual model is scratch paper: every use overwrites its positions before
-        # it reads anything. It lies in the cache of this system's own context, so that contexts do
-        # not disturb each other, in other threads either.
-        self._scratch = self._cache_entry(
-            "virtual model",
-            lambda context: self._plant.CreateDefaultContext(),
+        # Every use fills this room before it reads anything. It lies in the cache of this system's
+        # own context, so that contexts do not disturb each other, in other threads either.
+        self._room = self._cache_entry(
+            "room for an update",
+            lambda context: ComplianceUpdate(self._law),
             {self.nothing_ticket()},
         )
         # A policy changes these far less often than the controller runs, so they are read only when
@@ -374,55 +368,48 @@ class ComplianceController(LeafSystem):
         discrete_state.set_value(self._velocities_state, np.zeros_like(positions))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        scratch = self._scratch.Eval(context)
-        settings = self._settings.Eval(context)
-        target = None if self._mode == "force" else self._eval_target(context)
-        sensor_wrench = _ZERO if self._mode == "motion" else self._eval_sensor_wrench(context)
-        q = self._joint_positions.Eval(context)
+        room: ComplianceUpdate = self._room.Eval(context)
+        room.settings[:] = self._settings.Eval(context)
+        if self._law.mode != "force":
+            target = self._target_pose.Eval(context).GetAsMatrix4()
+            self._X_BW.dot(target, out=room.target)
+        if self._law.mode != "motion":
+            room.sensor_wrench[:] = self._eval_sensor_wrench(context)
+        room.measured[:] = self._joint_positions.Eval(context)
         state = context.get_discrete_state()
-        v = state.value(self._velocities_state)
-        previous_error = state.value(self._error_state).reshape(2, 3)
-        dt = self._time_step
-
-        # The first error is that of the pose which the model reached in the last update, although
-        # everything else is taken at the measured joints, as in the reference implementation.
-        X_BE_of_error = self._calc_pose(scratch, state.value(self._positions_state))
-        X_BE = self._calc_pose(scratch, q)
-        for step in range(self._iterations):
-            if step > 0:
-                X_BE_of_error = X_BE = self._calc_pose(scratch, q)
-            pose_error = (
-                _ZERO if target is None else _pose_error(target, X_BE_of_error, self._threshold)
+        room.q[:] = state.value(self._positions_state)
+        room.v[:] = state.value(self._velocities_state)
+        room.error.reshape(6)[:] = state.value(self._error_state)
+        if not room.run():
+            raise RuntimeError(
+                f"{self.GetSystemPathname()}: the virtual model has no finite acceleration at "
+                f"t = {context.get_time():.6g} s (joint positions {room.q} rad, scaled net force "
+                f"{room.u.reshape(6)}). An input is not finite, or the loop has diverged: lower "
+                "error_scale or the stiffness."
             )
-            error = self._calc_error(settings, pose_error, sensor_wrench, X_BE[:, :3])
-            u = settings.proportional * error + settings.derivative * (error - previous_error)
-            acceleration = self._calc_acceleration(scratch, u, context)
-            q = np.minimum(np.maximum(q + dt * v, self._lower), self._upper)
-            v = self._damping_factor * (v + dt * acceleration)
-            previous_error = error
-        discrete_state.set_value(self._positions_state, q)
-        discrete_state.set_value(self._velocities_state, v)
-        discrete_state.set_value(self._error_state, error.reshape(6))
+        discrete_state.set_value(self._positions_state, room.q)
+        discrete_state.set_value(self._velocities_state, room.v)
+        discrete_state.set_value(self._error_state, room.error.reshape(6))
 
-    def _calc_settings(self, context: Context) -> _Settings:
+    def _calc_settings(self, context: Context) -> np.ndarray:
+        """Returns what `ComplianceUpdate.settings` takes [5, 2, 3]."""
+
         def axes(port: tuple[int, np.ndarray]) -> np.ndarray:
             return self._parameter(context, port).reshape(2, 3)
 
         error_scale = self._parameter(context, self._error_scale)
-        target_wrench = _ZERO
+        settings = np.zeros((5, 2, 3))
+        settings[0] = axes(self._stiffness)
+        settings[1] = axes(self._selection)
+        settings[2] = error_scale * axes(self._p_gains)
+        settings[3] = error_scale * axes(self._d_gains) / self._law.time_step
         value = self.EvalAbstractInput(context, self._target_wrench)
         if value is not None:
             # Drake's spatial forces have the moment first.
-            target_wrench = value.get_value().get_coeffs().copy().reshape(2, 3)[::-1]
-            if not self._hand_frame_control:
-                target_wrench = target_wrench.dot(self._X_BW[:, :3].T)
-        return _Settings(
-            stiffness=axes(self._stiffness),
-            selection=axes(self._selection),
-            proportional=error_scale * axes(self._p_gains),
-            derivative=error_scale * axes(self._d_gains) / self._time_step,
-            target_wrench=target_wrench,
-        )
+            settings[4] = value.get_value().get_coeffs().reshape(2, 3)[::-1]
+            if not self._law.hand_frame_control:
+                settings[4] = settings[4].dot(self._X_BW[:, :3].T)
+        return settings
 
     def _parameter(self, context: Context, port: tuple[int, np.ndarray]) -> np.ndarray:
         index, default = port
@@ -430,67 +417,17 @@ class ComplianceController(LeafSystem):
         # The copy outlives the input's value, as a view of it would not.
         return default if vector is None else vector.CopyToVector()
 
-    def _eval_target(self, context: Context) -> np.ndarray:
-        """Returns the target X_BE as [3, 4]."""
-        return self._X_BW.dot(self._target_pose.Eval(context).GetAsMatrix4())
-
     def _eval_sensor_wrench(self, context: Context) -> np.ndarray:
         """Returns the sensor wrench [2, 3] about Co in C."""
         value = self.EvalAbstractInput(context, self._sensor_wrench)
         if value is None:
-            return _ZERO
+            return np.zeros((2, 3))
         return self._wrench_C_from_S.dot(value.get_value().get_coeffs()).reshape(2, 3)
 
-    def _calc_error(
-        self,
-        settings: _Settings,
-        pose_error: np.ndarray,
-        sensor_wrench: np.ndarray,
-        R_BE: np.ndarray,
-    ) -> np.ndarray:
-        """Returns the net force, or the pose error in motion mode, [2, 3] in B."""
-        if self._mode == "motion":
-            return pose_error
-        R_BC = R_BE.dot(self._R_EC)
-        R_CB = R_BC.T
-        target_wrench = settings.target_wrench
-        if self._hand_frame_control:
-            target_wrench = target_wrench.dot(R_BE.T)
-        if self._mode == "force":
-            return sensor_wrench.dot(R_CB) + target_wrench
-        spring = settings.stiffness * pose_error.dot(R_BC)
-        if self._mode == "compliance":
-            return (spring + sensor_wrench).dot(R_CB) + target_wrench
-        force = sensor_wrench.dot(R_CB) + target_wrench
-        return settings.selection * spring.dot(R_CB) + (1.0 - settings.selection) * force
-
-    def _calc_pose(self, scratch: Context, q: np.ndarray) -> np.ndarray:
-        """Puts the virtual model at `q`, and returns X_BE there as [3, 4]."""
-        self._plant.SetPositions(scratch, q)
-        return self._end_effector.EvalPoseInWorld(scratch).GetAsMatrix34()
-
-    def _calc_acceleration(self, scratch: Context, u: np.ndarray, context: Context) -> np.ndarray:
-        """Returns H^-1 J^T u [n] at the positions in `scratch`, `u` [2, 3] acting at Eo, in B."""
-        J = self._plant.CalcJacobianSpatialVelocity(
-            scratch, JacobianWrtVariable.kV, self._frame_E, _ORIGIN, self._frame_B, self._frame_B
-        )
-        # Drake's Jacobian has the rotational rows first.
-        joint_torques = u[::-1].reshape(6).dot(J)
-        _, acceleration, info = dposv(self._plant.CalcMassMatrix(scratch), joint_torques)
-        if info != 0 or not math.isfinite(acceleration.dot(acceleration)):
-            raise RuntimeError(
-                f"{self.GetSystemPathname()}: the virtual model has no finite acceleration at "
-                f"t = {context.get_time():.6g} s (joint positions "
-                f"{self._plant.GetPositions(scratch)} rad, scaled net force {u.reshape(6)}). An "
-                "input is not finite, or the loop has diverged: lower error_scale or the stiffness."
-            )
-        return acceleration
-
     def _calc_commanded_pose(self, context: Context, output: AbstractValue) -> None:
-        q = context.get_discrete_state(self._positions_state).value()
-        scratch = self._scratch.Eval(context)
-        self._plant.SetPositions(scratch, q)
-        output.set_value(self._X_WB @ self._end_effector.EvalPoseInWorld(scratch))
+        room: ComplianceUpdate = self._room.Eval(context)
+        room.q[:] = context.get_discrete_state(self._positions_state).value()
+        output.set_value(self._X_WB @ RigidTransform(room.place()))
 
 
 def _wrench_transform(X_CS: RigidTransform) -> np.ndarray:
@@ -502,44 +439,3 @@ def _wrench_transform(X_CS: RigidTransform) -> np.ndarray:
     x, y, z = X_CS.translation()
     p_cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.block([[np.zeros((3, 3)), R], [R, p_cross @ R]])
-
-
-def _pose_error(target: np.ndarray, pose: np.ndarray, threshold: float) -> np.ndarray:
-    """Returns the displacement and the rotation vector from `pose` to `target`.
-
-    Args:
-        target: Target pose [3, 4].
-        pose: Pose [3, 4].
-        threshold: A displacement shorter than this [m] counts as zero, and so does a rotation whose
-            matrix differs from its transpose by less.
-
-    Returns:
-        Float array [2, 3]: the displacement [m], limited to 1 m, and axis times angle [rad], the
-        angle limited to 1 rad; both in the axes in which the poses are given.
-    """
-    dx, dy, dz = (target[:, 3] - pose[:, 3]).tolist()
-    distance = math.hypot(dx, dy, dz)
-    scale = 0.0 if distance < threshold else min(1.0, _MAX_DISTANCE / distance)
-    rotation = _rotation_vector(target[:, :3].dot(pose[:, :3].T).tolist(), threshold)
-    return np.array([[scale * dx, scale * dy, scale * dz], rotation])
-
-
-def _rotation_vector(R: list[list[float]], threshold: float) -> list[float]:
-    """Returns axis times angle of a rotation matrix, the angle limited to 1 rad."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R
-    # These are 2 sin(angle) axis and 2 cos(angle).
-    x, y, z = zy - yz, xz - zx, yx - xy
-    cosine = xx + yy + zz - 1.0
-    if abs(x) < threshold and abs(y) < threshold and abs(z) < threshold:
-        if cosine > 0.0:
-            return [0.0, 0.0, 0.0]
-        # A half turn, R = 2 a a^T - 1, leaves the sign of the axis a open. As in KDL, the component
-        # with the largest diagonal element is positive.
-        i = 0 if xx > yy and xx > zz else 1 if yy > zz else 2
-        largest = math.sqrt(0.5 * (R[i][i] + 1.0))
-        axis = [0.25 * (R[i][j] + R[j][i]) / largest for j in range(3)]
-        axis[i] = largest
-        return [_MAX_ANGLE * component for component in axis]
-    norm = math.hypot(x, y, z)
-    scale = min(math.atan2(norm, cosine), _MAX_ANGLE) / norm
-    return [scale * x, scale * y, scale * z]
