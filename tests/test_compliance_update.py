@@ -1,17 +1,14 @@
 """The kernel of compliance control: the dynamics of Drake's plant, rooms that share nothing."""
 
 import copy
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-import warp as wp
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.tree import JacobianWrtVariable
 
-from sliceit_drake.cutting.workspace import DIRECT
 from sliceit_drake.systems.compliance_controller import (
     ComplianceController,
     ComplianceControllerConfig,
@@ -143,18 +140,3 @@ def test_an_acceleration_that_is_not_finite_is_told_and_stops_the_update():
     assert not np.isfinite(room.u).all() and np.isfinite(room.v).all()
     fill(room)
     assert room.run()
-
-
-def test_an_update_during_a_capture_in_another_thread_runs_and_is_no_part_of_it():
-    room, expected = motion_room(), motion_room()
-    fill(room)
-    fill(expected)
-    expected.run()
-    values = wp.ones(1, dtype=wp.float64, device="cpu")
-    with DIRECT, wp.ScopedCapture(device="cpu") as capture:
-        values.zero_()
-        with ThreadPoolExecutor(1) as pool:
-            assert pool.submit(room.run).result()
-    np.testing.assert_array_equal(state(room), state(expected))
-    wp.capture_launch(capture.graph)
-    np.testing.assert_array_equal(state(room), state(expected))
