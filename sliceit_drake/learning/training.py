@@ -57,7 +57,7 @@ class TrainingConfig:
     """How an agent is trained, and on what."""
 
     task: TaskConfig = dc.field(default_factory=TaskConfig)
-    steps: int = quantity(30_000, "", low=1, high=10**9, doc="Decisions.")
+    steps: int = quantity(15_000, "", low=1, high=10**9, doc="Decisions.")
     seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Of everything random.")
     learning_rate: float = quantity(3e-4, "", low=1e-7, high=1.0, doc="Of all networks.")
     batch: int = quantity(256, "", low=1, high=10**6, doc="Transitions in an update.")
