@@ -34,6 +34,9 @@ __all__ = [
     "Waypoints",
 ]
 
+_NO_TURN = np.eye(3)
+_NO_TURN.setflags(write=False)
+
 _POSITION_COLUMNS = ("p_WK_x", "p_WK_y", "p_WK_z")
 _QUATERNION_COLUMNS = ("quat_WK_w", "quat_WK_x", "quat_WK_y", "quat_WK_z")
 
@@ -497,7 +500,7 @@ class _Translation:
 
     def pose(self, t: float) -> Pose:
         tau, _ = self.scale.at(t)
-        return Pose(np.eye(3), self.position(tau))
+        return Pose(_NO_TURN, self.position(tau))
 
     def velocity(self, t: float) -> Velocity:
         tau, rate = self.scale.at(t)

@@ -18,6 +18,9 @@ DIRECT = threading.RLock()
 """Held while kernels are made, in a capture, which takes in the launches of all threads, and in
 launches outside of one."""
 
+SKEW = np.array([[7, 2, 3], [5, 6, 1]])
+"""Where R - R^T holds x, y and z of twice the axis times sine: these elements of R, less those."""
+
 PER_POINT = ("toughness", "flank_scale", "friction_scale", "unloading")
 """Parameters that each cut point has for itself, in the order of the kernels' arguments."""
 
@@ -549,13 +552,15 @@ def interpolate_motion(R: np.ndarray, p: np.ndarray, substeps: int, period: floa
     )
     share = (np.arange(1, n + 1) / n)[:, None]
     R0, R1 = R[:, :-1], R[:, 1:]
-    rotation[:] = R0.reshape(C, E, 1, 9) + share * (R1 - R0).reshape(C, E, 1, 9)
+    np.multiply(share, (R1 - R0).reshape(C, E, 1, 9), out=rotation)
+    rotation += R0.reshape(C, E, 1, 9)
     dp = (p[:, 1:] - p[:, :-1])[:, :, None]
-    position[:] = p[:, :-1, None] + share * dp
+    np.multiply(share, dp, out=position)
+    position += p[:, :-1, None]
     velocity[:] = dp * (1.0 / period)
-    turn = R1 @ R0.transpose(0, 1, 3, 2)
-    turn = turn - turn.transpose(0, 1, 3, 2)
-    rate[:] = (turn[..., (2, 0, 1), (1, 2, 0)] * (0.5 / period))[:, :, None]
+    turn = (R1 @ R0.transpose(0, 1, 3, 2)).reshape(C, E, 9)
+    twice = turn.take(SKEW[0], -1) - turn.take(SKEW[1], -1)
+    rate[:] = (twice * (0.5 / period))[:, :, None]
     return out
 
 
