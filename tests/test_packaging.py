@@ -20,7 +20,7 @@ def test_the_readme_begins_with_one_command_to_simulate_and_one_to_test():
     assert simulate.startswith("python3 -m venv .venv && .venv/bin/pip install -c constraints.txt")
     assert simulate.endswith(" && .venv/bin/sliceit simulate")
     assert "-e '.[test]'" in test
-    assert test.endswith(" && .venv/bin/pytest")
+    assert test.endswith(" && .venv/bin/pytest -n 2")
 
 
 def test_ci_runs_the_second_command_of_the_readme_and_not_one_of_its_own():
