@@ -64,7 +64,8 @@ def figure(calibration: Calibration) -> Figure:
         upper, lower = axes[0, column], axes[1, column]
         channels = ("force",) if target.by_norm else CHANNELS
         for c, name in enumerate(channels):
-            style = ("-", "--", ":")[c]
+            # The press, which is nearly all of the force, stands out.
+            style = (":", "--", "-")[c] if len(channels) > 1 else "-"
             upper.plot(target.time, target.measured[:, c], style, color=MEASURED, lw=1.2)
             upper.plot(target.time, prediction.predicted[:, c], style, color=PREDICTED, lw=1.2)
             rest = target.measured[:, c] - prediction.predicted[:, c]
