@@ -223,7 +223,12 @@ class AgentSystem(LeafSystem):
     ) -> None:
         super().__init__()
         self._config, self._X_WK, self._X_KW = config, X_WK, X_WK.inverse()
-        self._X_KS, self._decide_action = X_KS, decide
+        self._decide_action = decide
+        # From moment and force at So, in S, to the force along Kx and Kz and the moment about Ky at
+        # Ko, which grows by the force's arm.
+        R = X_KS.rotation().matrix()
+        about_Ko = np.hstack([R, np.cross(X_KS.translation(), R.T).T])
+        self._of_wrench = np.array([[0, 0, 0, *R[0]], [0, 0, 0, *R[2]], about_Ko[1]])
         self.watch: Callable[[], AbstractContextManager] = nullcontext
         self._wrench_in = self.DeclareAbstractInputPort("sensor_wrench", Value(SpatialForce.Zero()))
         self._pose_in = self.DeclareAbstractInputPort("knife_pose", Value(RigidTransform()))
@@ -296,11 +301,7 @@ class AgentSystem(LeafSystem):
         return np.array([-X[0, 3], self._config.descent - X[2, 3], -angle])
 
     def _reading(self, context: Context) -> np.ndarray:
-        wrench, X_KS = self._wrench_in.Eval(context), self._X_KS
-        force = X_KS.rotation() @ wrench.translational()
-        # So is at p_KoSo: moved to Ko the moment grows by its arm.
-        moment = X_KS.rotation() @ wrench.rotational() + np.cross(X_KS.translation(), force)
-        return np.array([force[0], force[2], moment[1]])
+        return self._of_wrench @ self._wrench_in.Eval(context).get_coeffs()
 
     def _history(self, context: Context) -> np.ndarray:
         before = context.get_discrete_state(self._readings).value().reshape(-1, 3)
