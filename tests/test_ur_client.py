@@ -9,7 +9,8 @@ from emulator_bench import free_address
 from test_emulator_clients import no_test_hangs
 
 from sliceit_drake.emulator.process import EmulatorProcess
-from sliceit_drake.hardware.ur_client import UrClient
+from sliceit_drake.hardware.rtde_link import HALT_TIME
+from sliceit_drake.hardware.ur_client import ATTEMPT, UrClient
 
 __all__ = ["no_test_hangs"]
 
@@ -54,3 +55,7 @@ def test_the_dashboard_stops_a_robot_whose_control_link_does_not(fails):
             assert any("stopped by the dashboard" in text for _, text in status["log"])
         finally:
             client.close()
+
+
+def test_both_ways_to_stop_are_tried_before_the_operator_is_told_that_none_did():
+    assert 2.0 * ATTEMPT < HALT_TIME

@@ -23,6 +23,9 @@ DECELERATION = 2.0
 """Of the fastest joint when a planned motion is stopped, rad/s2."""
 STOP_TIME = 2.0
 """In which a program ends that is asked to, s; longer means that the link is dead."""
+ATTEMPT = 1.4
+"""Of each of two ways to stop a robot, s: together less than `RobotLink` waits before it tells the
+operator that the robot does not answer, and lets go of the connections."""
 SLOWEST = 0.2
 """Pace below which no more wall time is given for that."""
 
@@ -61,7 +64,7 @@ class UrClient:
         self._host, self._lookahead, self._gain = host, lookahead_time, gain
         self._control: Any = None
         self._is_moving = False
-        self._stop_time = STOP_TIME / max(pace, SLOWEST)
+        self._stop_time, self._attempt = (t / max(pace, SLOWEST) for t in (STOP_TIME, ATTEMPT))
         self._is_stopped = not controls
         step = "the dashboard server (port 29999)"
         try:
@@ -183,7 +186,7 @@ class UrClient:
 
         asking = threading.Thread(target=quietly, daemon=True)
         asking.start()
-        deadline = time.monotonic() + self._stop_time
+        deadline = time.monotonic() + self._attempt
         receive = self._receive
         while receive.getRuntimeState() == PLAYING or receive.getTimestamp() == before:
             if time.monotonic() > deadline:
