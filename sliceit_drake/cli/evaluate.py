@@ -29,7 +29,7 @@ Writes a line for each slice to --output, a .jsonl file, and goes on where it is
 `sliceit study slicing` compares the policies of both simulators.
 """
 SLICES = 25
-"""That a process cuts: pydrake does not free the stations that it has built (docs/endurance.md)."""
+"""That a process cuts: pydrake frees no station that it has built (benchmarks/endurance.py)."""
 WORLDS = ("stand_in", "curves")
 FOODS = ("cucumber", "tomato", "potato", "carrot")
 

@@ -6,6 +6,10 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sliceit_drake.cutting.random_slices import Outcome
 
 __all__ = ["add_random_study"]
 
@@ -56,7 +60,7 @@ def run_random(options: argparse.Namespace) -> int:
     return 1 if any(outcome.kind == "unexplained" for outcome in outcomes) else 0
 
 
-def _cut(seed: int, index: int):  # type: ignore[no-untyped-def]
+def _cut(seed: int, index: int) -> "Outcome":
     import warp
 
     warp.config.log_level = warp.LOG_ERROR

@@ -175,7 +175,7 @@ def cut_random_slice(case: RandomSlice) -> Outcome:
         return Outcome("refused", str(error), shape)
     except CuttingError as error:
         return Outcome("stopped", str(error), shape)
-    except Exception as error:  # noqa: BLE001 - what is not foreseen is what is looked for.
+    except Exception as error:  # What nobody foresaw is what is looked for.
         return Outcome("unexplained", f"{type(error).__name__}: {error}", shape)
     wrong = _wrong(result, model)
     peak = float(np.linalg.norm(result.food_wrench[:, 3:], axis=1).max())

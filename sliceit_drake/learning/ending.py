@@ -22,7 +22,7 @@ class Limits:
     workspace: tuple[float, float, float]
 
     def broken(self, wrench: np.ndarray, error: np.ndarray) -> str:
-        """ "collision", "workspace", or nothing.
+        """What is broken: collision, workspace, or nothing.
 
         Args:
             wrench: Moment and force at the sensor [6].

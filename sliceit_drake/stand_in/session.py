@@ -1,5 +1,6 @@
 """A session at the bench: what a world cuts, as a sensor and the arm's encoders record it."""
 
+import contextlib
 import copy
 import os
 import pickle
@@ -292,22 +293,30 @@ def is_recorded(specimen: Specimen, folder: FilePath) -> bool:
 
 
 def _write(record: SliceRecord, output: FilePath, index: int) -> int:
-    # Two files make a record; a run that is killed must not leave half of one.
-    with tempfile.TemporaryDirectory(dir=output, prefix=".writing_") as folder:
-        made = write_record(record, FilePath(folder) / slice_name(index))
-        for file in (made, made.with_suffix(".yaml")):
-            os.replace(file, output / file.name)
+    with _moved_into(output) as folder:
+        write_record(record, folder / slice_name(index))
     return index
 
 
 def keep_record(files: Mapping[str, bytes], output: FilePath, index: int) -> int:
     """Writes the two files of a record that was made elsewhere; returns its index."""
-    with tempfile.TemporaryDirectory(dir=output, prefix=".writing_") as folder:
-        for name in sorted(files):
-            (FilePath(folder) / name).write_bytes(files[name])
-        for name in sorted(files):
-            os.replace(FilePath(folder) / name, output / name)
+    with _moved_into(output) as folder:
+        for name, content in files.items():
+            (folder / name).write_bytes(content)
     return index
+
+
+@contextlib.contextmanager
+def _moved_into(output: FilePath) -> Iterator[FilePath]:
+    """A folder whose files go to `output` at the end, the table before what describes it.
+
+    Two files make a record; a run that is killed must not leave half of one.
+    """
+    with tempfile.TemporaryDirectory(dir=output, prefix=".writing_") as name:
+        folder = FilePath(name)
+        yield folder
+        for file in sorted(folder.iterdir()):
+            os.replace(file, output / file.name)
 
 
 _worker: list[tuple[Session, FilePath]] = []
