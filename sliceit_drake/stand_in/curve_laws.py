@@ -173,7 +173,7 @@ class CutState:
             still: Move below which the knife is held, metres.
             turn: Travel over which the edge's ratio turns to that of the motion, metres; 0: at
                 once. A motion that a controller makes shakes; what it rises then does not count,
-                for that unloads the edge.
+                for that unloads the edge. Friction turns over it too, if it is more than `TURN`.
         """
         step, self.place = place - self.place, place
         moved = float(np.linalg.norm(step))
@@ -189,7 +189,7 @@ class CutState:
             loss = HOLD_FADE * np.log10(1.0 + self.rest / HOLD_ONSET)
             self.faded = min(self.faded, 1.0 - loss)
         if self.depth > 0.0 and moved > still:
-            keep = np.exp(-moved / TURN)
+            keep = np.exp(-moved / max(turn, TURN))
             self.heading = keep * self.heading + (1.0 - keep) * step / moved
             self.travel += moved
             self.swept += 2.0 * moved * min(self.depth, 0.03)
