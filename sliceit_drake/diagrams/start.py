@@ -4,7 +4,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.inverse_kinematics import InverseKinematics
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import RigidBody
+from pydrake.multibody.tree import JacobianWrtVariable, RigidBody
 from pydrake.solvers import Solve
 
 from sliceit_drake.configuration import ConfigurationError
@@ -13,6 +13,11 @@ __all__ = ["solve_start_joints"]
 
 POSITION_TOLERANCE = 1e-6
 ANGLE_TOLERANCE = 1e-6
+ACCEPTED = 1e-4
+"""How far from the pose a solution of the solver may be, metres."""
+NEWTON_STEPS = 8
+LONGEST_STEP = 0.1
+"""rad."""
 
 
 def solve_start_joints(
@@ -44,16 +49,58 @@ def solve_start_joints(
     program.AddQuadraticErrorCost(np.eye(6), guess, ik.q())
     result = Solve(program, guess)
     q = result.GetSolution(ik.q())
+    _, missed = _misses(plant, knife, X_WK, q)
+    if result.is_success() and missed <= ACCEPTED:
+        return q
+    # The solver gives up now and then beside a pose, or far from one, that the arm does reach.
+    low, high = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
+    for begin in (q, guess):
+        q = _newton(plant, knife, X_WK, begin)
+        turned, missed = _misses(plant, knife, X_WK, q)
+        if (
+            missed <= POSITION_TOLERANCE
+            and turned <= ANGLE_TOLERANCE
+            and np.all((q >= low) & (q <= high))
+        ):
+            return q
+    raise ConfigurationError(
+        f"the arm cannot put the knife at {np.round(p_WK, 4).tolist()} m; it comes "
+        f"within {1e3 * missed:.3g} mm and {np.rad2deg(turned):.3g} degrees",
+        field="scenario.placement and scenario.start",
+        fix="Place the food nearer to the robot's base (reach of the knife: about 0.85 m), or "
+        "give robot.joint_positions near a posture that reaches it.",
+    )
+
+
+def _pose_error(
+    plant: MultibodyPlant, knife: RigidBody, X_WK: RigidTransform, q: np.ndarray
+) -> np.ndarray:
+    """Rotation vector and translation from the knife at q to X_WK, in W [6], rad and metres."""
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, q)
-    X_WK_found = plant.EvalBodyPoseInWorld(context, knife)
-    missed = float(np.linalg.norm(X_WK_found.translation() - p_WK))
-    if not result.is_success() or missed > 1e-4:
-        raise ConfigurationError(
-            f"the arm cannot put the knife at {np.round(p_WK, 4).tolist()} m; it comes "
-            f"within {1e3 * missed:.3g} mm",
-            field="scenario.placement and scenario.start",
-            fix="Place the food nearer to the robot's base (reach of the knife: about 0.85 m), or "
-            "give robot.joint_positions near a posture that reaches it.",
+    found = plant.EvalBodyPoseInWorld(context, knife)
+    turn = (X_WK.rotation() @ found.rotation().inverse()).ToAngleAxis()
+    return np.concatenate([turn.angle() * turn.axis(), X_WK.translation() - found.translation()])
+
+
+def _misses(
+    plant: MultibodyPlant, knife: RigidBody, X_WK: RigidTransform, q: np.ndarray
+) -> tuple[float, float]:
+    """Angle and distance of the knife at q from X_WK, rad and metres."""
+    error = _pose_error(plant, knife, X_WK, q)
+    return float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
+
+
+def _newton(
+    plant: MultibodyPlant, knife: RigidBody, X_WK: RigidTransform, q: np.ndarray
+) -> np.ndarray:
+    """Joint positions that put the knife at X_WK, from ones near to it; else where it ends."""
+    context, world, K = plant.CreateDefaultContext(), plant.world_frame(), knife.body_frame()
+    for _ in range(NEWTON_STEPS):
+        plant.SetPositions(context, q)
+        J = plant.CalcJacobianSpatialVelocity(
+            context, JacobianWrtVariable.kQDot, K, np.zeros(3), world, world
         )
+        step = np.linalg.lstsq(J, _pose_error(plant, knife, X_WK, q), rcond=1e-6)[0]
+        q = q + step * min(1.0, LONGEST_STEP / max(float(np.abs(step).max()), 1e-12))
     return q
