@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sliceit_drake.cutting.food import Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.food import Box, Cylinder, Food, make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.material import Material
 from sliceit_drake.cutting.model import Numerics
@@ -12,6 +12,7 @@ from sliceit_drake.cutting.motion import (
     Hold,
     Motion,
     MotionPlan,
+    Pose,
     PressAndDraw,
     Retract,
 )
@@ -113,3 +114,42 @@ def test_a_second_pass_through_the_open_cut_does_no_work_of_cutting():
     again = (result.time > 1.75) & (result.position[:, 2] > 0.003)
     assert np.count_nonzero(again) > 100
     assert np.abs(result.edge[again, 2]).max() < 0.02 * result.edge[:, 2].max()
+
+
+@pytest.fixture(scope="module")
+def parted():
+    """A bar cut through, the knife back up in the cut: only the flanks act, on each half alone."""
+    food = Food(shape=Box([0.02, 0.04, 0.015], [4, 4], [0.0, 0.004]), held_sides="minus")
+    model = make_food_model(food, Knife(), Numerics(precision="float64"))
+    solver = CuttingSolver(model, Numerics().time_step)
+    start = start_pose(model, clearance=-0.010)
+    pose = Pose(model.X_FC_rotation.T @ start.R, model.to_cut_frame(start.p))
+    state = solver.initial_state()
+    solver.field(state, "passed")[:] = model.tables.reach
+    solver.field(state, "parted")[:] = 1.0
+
+    def at(shift):
+        """Forces on the knife [P, 2, 3] and energy with the half that is cut off moved [3]."""
+        moved = state.copy()
+        x = solver.field(moved, "x").reshape(-1, 3)
+        x[np.unique(model.point_nodes[:, 2:])] += shift
+        return solver.contact_forces(moved, pose, pose), solver.energies(moved, pose).interface
+
+    return at
+
+
+@pytest.mark.parametrize("end", [(0.0, 0.0, 0.004), (0.0, 3e-4, 0.008)])
+def test_what_a_half_takes_from_the_flanks_is_their_energy_wherever_it_goes(parted, end):
+    path = np.linspace(np.zeros(3), end, 41)
+    forces, energies = zip(*map(parted, path), strict=True)
+    on_half = -np.array(forces)[:, :, 1].sum(1)
+    work = float((0.5 * (on_half[1:] + on_half[:-1]) * np.diff(path, axis=0)).sum())
+    assert np.ptp(energies) > 5e-4
+    assert energies[0] - energies[-1] == pytest.approx(work, rel=1e-3)
+
+
+def test_a_half_that_goes_away_leaves_the_flank_on_the_other_as_it_was(parted):
+    (both, _), (one, _) = parted(np.zeros(3)), parted(np.array([0.0, 0.05, 0.03]))
+    assert np.linalg.norm(both[:, 1], axis=1).max() > 0.1
+    assert np.linalg.norm(one[:, 1], axis=1).max() == 0.0
+    np.testing.assert_allclose(one[:, 0], both[:, 0], rtol=1e-9, atol=1e-9)

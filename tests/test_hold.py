@@ -39,7 +39,10 @@ def test_a_hold_after_a_press_neither_creeps_nor_relaxes(friction, time_step):
     food.material.friction = friction
     hold = 0.3
     press = ConstantSpeed(distance=0.012, speed=0.02)
-    solver, exchanges, positions, poses = follow([press, Hold(duration=hold)], food, time_step)
+    # In double precision: single rounds to a vibration of 1e-9 of the elastic energy.
+    solver, exchanges, positions, poses = follow(
+        [press, Hold(duration=hold)], food, time_step, precision="float64"
+    )
 
     vertical = np.array([step.wrench[5] for step in exchanges])
     resting = round(hold / PERIOD)
@@ -50,9 +53,9 @@ def test_a_hold_after_a_press_neither_creeps_nor_relaxes(friction, time_step):
     creep = np.abs(positions[-1] - positions[-resting // 2]).max() / (0.5 * hold)
     assert creep < 1e-6
 
-    # Nothing feeds a vibration: what rings at the sudden stop dies away, down to rounding.
+    # Nothing feeds a vibration: what rings at the sudden stop dies away.
     after, rest = (solver.energies(exchanges[k].state, poses[-1]) for k in (-resting, -1))
-    assert rest.kinetic < max(0.1 * after.kinetic, 1e-9 * rest.elastic)
+    assert rest.kinetic < 1e-6 * after.kinetic
 
 
 def test_halves_that_are_not_held_come_to_rest_on_the_board_with_their_weight():

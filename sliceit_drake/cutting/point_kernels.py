@@ -68,10 +68,13 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         rotation_rate: vec3,
         bend: real,
         bend_rate: real,
-        area: real,
-        old_area: real,
-        growth: real,
-        rise: real,
+        i: wp.int32,
+        whole: real,
+        width: wp.array2d(dtype=real),
+        fraction: wp.array2d(dtype=real),
+        centroid: wp.array2d(dtype=real),
+        reach: real,
+        per_spacing: real,
         stiffness: real,
         friction_scale: real,
         slip: vec3,
@@ -82,36 +85,47 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
     ):
         """Flank pressure and friction on one face of the cut.
 
-        The edge has passed a part of the point's area: `area` now, `old_area` before the sub-step.
-        The mean of the flank's thickness over that part is that at its centroid, `rise` above the
-        point, for the flank is straight.
+        Of the face's `whole` area a part is above the edge: `area` now, `old_area` before the
+        sub-step. It goes by the depth of the edge below this face, not below the middle of both: a
+        piece that is cut off leaves the other where it is. The mean of the flank's thickness over
+        that part is that at its centroid, `rise` above the point, for the flank is straight.
 
         The normal force is minus the gradient of 1/2 stiffness area depth^2, `growth` of the area
         with the depth of the edge included: a knife at rest then puts no energy into a vibration.
 
-        Returns: normal force and friction force on the food, new slip, energy lost by friction.
+        Returns: normal force and friction force on the food, new slip, energy lost by friction,
+        area between the ends of the blade.
         """
         arm = p - origin
+        knife_y = vec3(R[0, 1], R[1, 1], R[2, 1])
+        knife_z = vec3(R[0, 2], R[1, 2], R[2, 2])
+        relative = v - velocity - wp.cross(rotation_rate, arm) - bend_rate * knife_y
+        grid = fraction.shape[1]
+        depth = -wp.dot(arm, knife_z)
+        k_now, w_now = place(depth, reach, per_spacing, grid)
+        k_old, w_old = place(depth + wp.dot(relative, knife_z) * dt, reach, per_spacing, grid)
+        area = whole * table(fraction, i, k_now, w_now)
+        old_area = whole * table(fraction, i, k_old, w_old)
+        growth = table(width, i, k_now, w_now)
+        rise = table(centroid, i, k_now, w_now)
         r = wp.transpose(R) * (arm + vec3(real(0.0), real(0.0), rise))
+        between = wp.abs(r[0]) < knife[cut, 7]
         normal_force = vec3()
         friction_force = vec3()
         new_slip = vec3()
         # What the anchor stored, less what it stores when the part in contact has changed.
         lost = real(0.5) * stiffness * old_area * wp.dot(slip, slip)
-        if area > real(0.0) and wp.abs(r[0]) < knife[cut, 7]:
+        if area > real(0.0) and between:
             # Ky points to the minus side when the knife hangs upside down in C.
             facing = wp.where(R[1, 1] < real(0.0), -side, side)
             height = -r[2]
             phi, n2 = wedge(facing * (r[1] - bend), height, cut, knife)
             if phi < real(0.0):
                 n = R * vec3(real(0.0), facing * n2[0], -n2[1])
-                knife_y = vec3(R[0, 1], R[1, 1], R[2, 1])
-                knife_z = vec3(R[0, 2], R[1, 2], R[2, 2])
                 N = -stiffness * area * phi
                 # The part grows at the edge, where the flank is thinner than at the centroid.
                 at_edge = stiffness * growth * phi * (real(0.5) * phi - n[2] * height)
                 normal_force = N * n + at_edge * knife_z
-                relative = v - velocity - wp.cross(rotation_rate, arm) - bend_rate * knife_y
                 sliding = relative - wp.dot(relative, n) * n
                 extra = wp.max(P[cut, STATIC_FRICTION] - P[cut, FRICTION], real(0.0))
                 mu = P[cut, FRICTION]
@@ -134,7 +148,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
                     - real(0.5) * stiffness * area * wp.dot(old, old)
                     + viscosity * wp.dot(sliding, sliding) * dt
                 )
-        return normal_force, friction_force, new_slip, lost
+        return normal_force, friction_force, new_slip, lost, wp.where(between, area, real(0.0))
 
     @wp.func
     def advance_point(
@@ -203,21 +217,9 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         # s: depth of the edge below the point. Nothing happens beyond the ends of the blade.
         old_passed = passed[cut, i]
         s = old_passed
-        share = real(0.0)
-        old_share = real(0.0)
-        growth = real(0.0)
-        rise = real(0.0)
         beyond = wp.abs(wp.dot(arm, knife_x)) >= knife[cut, 7]
         if not beyond:
-            depth = -wp.dot(arm, knife_z)
-            s0 = depth - wp.dot(motion, knife_z)
-            k_now, w_now = place(depth, reach, per_spacing, grid)
-            k_old, w_old = place(s0, reach, per_spacing, grid)
-            s = depth
-            share = table(fraction, i, k_now, w_now)
-            growth = table(width, i, k_now, w_now)
-            old_share = table(fraction, i, k_old, w_old)
-            rise = table(centroid, i, k_now, w_now)
+            s = -wp.dot(arm, knife_z)
         new_passed = wp.max(old_passed, s)
         passed_next[cut, i] = new_passed
         k0, w0 = place(old_passed, reach, per_spacing, grid)
@@ -296,7 +298,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
 
         # Flanks on the part that is cut.
         flank = P[cut, FLANK_STIFFNESS] * flank_scale[cut, i]
-        normal_m, friction_m, slip_m, loss_m = flank_contact(
+        normal_m, friction_m, slip_m, loss_m, area_m = flank_contact(
             xm,
             vm,
             real(-1.0),
@@ -306,10 +308,13 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
             rotation_rate,
             blade[cut, 0],
             blade[cut, 1],
-            A * share,
-            A * old_share,
-            growth,
-            rise,
+            i,
+            A,
+            width,
+            fraction,
+            centroid,
+            reach,
+            per_spacing,
             flank,
             friction_scale[cut, i],
             slip[cut, i, 0],
@@ -318,7 +323,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
             P,
             knife,
         )
-        normal_p, friction_p, slip_p, loss_p = flank_contact(
+        normal_p, friction_p, slip_p, loss_p, area_p = flank_contact(
             xp,
             vp,
             real(1.0),
@@ -328,10 +333,13 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
             rotation_rate,
             blade[cut, 0],
             blade[cut, 1],
-            A * share,
-            A * old_share,
-            growth,
-            rise,
+            i,
+            A,
+            width,
+            fraction,
+            centroid,
+            reach,
+            per_spacing,
             flank,
             friction_scale[cut, i],
             slip[cut, i, 1],
@@ -364,8 +372,9 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         total[cut, exchange, i, 19] += opening_loss
         total[cut, exchange, i, 20] += loss_m + loss_p
         total[cut, exchange, i, 21] = A * D
-        a = A * share
-        buried[cut, exchange, i] = vec4(a * arm[0], a * arm[1], a * arm[2], a)
+        a = real(0.5) * (area_m + area_p)
+        b = real(0.5) * (area_m * (xm - origin) + area_p * (xp - origin))
+        buried[cut, exchange, i] = vec4(b[0], b[1], b[2], a)
 
     @wp.kernel(enable_backward=gradients, module=module)
     def points(
@@ -517,16 +526,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
                 + closing * closing
             )
         )
-        knife_x = vec3(R[0, 0], R[1, 0], R[2, 0])
         knife_z = vec3(R[0, 2], R[1, 2], R[2, 2])
-        arm = real(0.5) * (xm + xp) - p_CK[cut, k]
-        share = real(0.0)
-        rise = real(0.0)
-        if wp.abs(wp.dot(arm, knife_x)) < knife[cut, 7]:
-            s = -wp.dot(arm, knife_z)
-            k1, w1 = place(s, reach, per_spacing, grid)
-            share = table(fraction, i, k1, w1)
-            rise = table(centroid, i, k1, w1)
         doubled += edge_force[cut, i] * edge_force[cut, i] / wp.max(unloading[cut, i], TINY)
         facing = real(1.0)
         if R[1, 1] < real(0.0):
@@ -538,7 +538,11 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
             if side == 1:
                 p = xp
                 sign = facing
-            r = wp.transpose(R) * (p - p_CK[cut, k] + vec3(real(0.0), real(0.0), rise))
+            arm = p - p_CK[cut, k]
+            k1, w1 = place(-wp.dot(arm, knife_z), reach, per_spacing, grid)
+            share = table(fraction, i, k1, w1)
+            rise = table(centroid, i, k1, w1)
+            r = wp.transpose(R) * (arm + vec3(real(0.0), real(0.0), rise))
             if share > real(0.0) and wp.abs(r[0]) < knife[cut, 7]:
                 phi, _n = wedge(sign * (r[1] - blade[cut, 0]), -r[2], cut, knife)
                 if phi < real(0.0):
