@@ -3,6 +3,7 @@
 import dataclasses as dc
 import io
 import json
+import multiprocessing
 
 import numpy as np
 import pytest
@@ -376,6 +377,24 @@ def test_a_checkpoint_of_another_training_is_refused(tmp_path, one_process):
         train(training_of(steps=60, learning_rate=2e-3), tmp_path)
     assert "another folder" in str(caught.value)
     assert (tmp_path / training.CONFIGURATION).read_text() == before
+
+
+def test_a_training_whose_environment_dies_says_so_and_goes_on(tmp_path):
+    config = training_of(steps=40, checkpoint_interval=15)
+
+    def kill(steps: int, _: str) -> None:
+        if steps >= 20:
+            for process in multiprocessing.active_children():
+                process.kill()
+
+    with pytest.raises(RuntimeError, match="process ended.*last checkpoint"):
+        train(config, tmp_path, kill)
+    before = torch.load(tmp_path / training.CHECKPOINT, weights_only=False)
+    assert before["watch"]["episodes"] >= 1
+    assert train(config, tmp_path).steps == 40
+    straight = tmp_path / "straight"
+    train(config, straight)
+    assert (straight / training.POLICY).read_bytes() == (tmp_path / training.POLICY).read_bytes()
 
 
 def test_a_training_whose_guards_end_episodes_has_failed(tmp_path, one_process, monkeypatch):

@@ -154,6 +154,7 @@ def train(
 
     Raises:
         ConfigurationError: `output` has a checkpoint of another configuration.
+        RuntimeError: The environment's process ended.
     """
     output.mkdir(parents=True, exist_ok=True)
     described = json.dumps(dc.asdict(config), sort_keys=True)
@@ -194,8 +195,15 @@ def train(
             export_policy(model.actor, config.task.agent, output / POLICY)
         (output / "summary.json").write_text(json.dumps(dc.asdict(outcome), indent=2) + "\n")
         return outcome
+    except (EOFError, ConnectionError) as error:
+        raise RuntimeError(
+            "The environment's process ended; if by an error, that is printed above. The same "
+            f"command goes on from the last checkpoint in {output}."
+        ) from error
     finally:
-        environments.close()
+        # A process that has ended cannot be told to end.
+        with contextlib.suppress(EOFError, ConnectionError):
+            environments.close()
 
 
 def make_model(config: TrainingConfig, environments: OverlapVecEnv) -> PrioritizedSAC:
