@@ -331,7 +331,12 @@ def test_start_sensor_and_board_are_not_those_of_a_training(world):
         assert scenario.sensor.force_noise > 0.0 and scenario.sensor.delay > 0.0
         assert np.any(scenario.sensor.force_bias)
         assert scenario.controller.mode == "parallel"
-    assert world.scenario("potato", 0, 5e4)[0].board.stiffness == 5e4
+    default = scenarios[0].robot.plant_time_step
+    for stiffness, steps in ((3e3, 1.0), (3e4, 1.0), (3e5, 3.5)):
+        scenario, make_cutting = world.scenario("potato", 0, stiffness)
+        assert scenario.board.stiffness == stiffness
+        assert default / scenario.robot.plant_time_step == pytest.approx(steps)
+    MakeSlicingStation(scenario, make_cutting=make_cutting)
 
 
 def test_the_stand_in_hides_effects_and_shifts_what_was_calibrated(monkeypatch):

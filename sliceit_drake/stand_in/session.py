@@ -8,13 +8,11 @@ import secrets
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from concurrent.futures import as_completed
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING
 
 import numpy as np
-import warp
 
 from sliceit_drake.configuration import ConfigurationError, load_yaml
 from sliceit_drake.diagrams.record_facts import food_support, knife_facts, shape_facts
@@ -37,6 +35,8 @@ from sliceit_drake.stand_in.protocol import Protocol, Specimen, scaled_food, sch
 from sliceit_drake.stand_in.registry import make_effect
 from sliceit_drake.stand_in.sensor import measured
 from sliceit_drake.stand_in.world import World
+from sliceit_drake.warp_start import start_warp
+from sliceit_drake.workers import worker_processes
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -330,7 +330,6 @@ def _start_worker(
     settings: FiniteElementSettings | None,
     output: FilePath,
 ) -> None:
-    warp.config.log_level = warp.LOG_ERROR
     hidden = [make_effect(text) for text in effects]
     _worker.append((Session(protocol, hidden, world, seed, settings), output))
 
@@ -356,14 +355,9 @@ def _written(
         return
     # Effects travel by name: a class from a user's file is in no module that a process can import.
     arguments = (session.protocol, tuple(effects), world, session.seed, settings, output)
-    pool = ProcessPoolExecutor(
-        workers, get_context("spawn"), initializer=_start_worker, initargs=arguments
-    )
-    try:
+    with worker_processes(workers, "spawn", _start_worker, arguments) as pool:
         for future in as_completed([pool.submit(_work, index) for index in left]):
             yield future.result()
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 _SESSIONS = threading.local()
@@ -376,7 +370,7 @@ def _record_there(content: bytes, index: int) -> tuple[int, dict[str, bytes]]:
     """
     known: tuple[bytes, Session] | None = getattr(_SESSIONS, "known", None)
     if known is None or known[0] != content:
-        warp.config.log_level = warp.LOG_ERROR
+        start_warp()
         protocol, effects, world, seed, settings = pickle.loads(content)
         hidden = [make_effect(text) for text in effects]
         known = _SESSIONS.known = (content, Session(protocol, hidden, world, seed, settings))

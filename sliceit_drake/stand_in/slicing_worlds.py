@@ -16,6 +16,7 @@ seed, the food and the slice's index alone. Both are simulated: a table made fro
 
 import copy
 import dataclasses as dc
+import math
 import typing
 import zlib
 from collections.abc import Callable
@@ -24,7 +25,6 @@ import numpy as np
 from pydrake.multibody.tree import RigidBody
 
 from sliceit_drake.configuration import ConfigurationError, quantity
-from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.food import Cylinder, Food
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.diagrams.agent_gains import AgentGains
@@ -161,19 +161,16 @@ def _scenario(
     name: str, calibrated: CalibratedFood, board_stiffness: float | None, rng: np.random.Generator
 ) -> Scenario:
     """All of a slice's scenario but its food."""
-    board, start = Board(), Start()
-    if board_stiffness is not None:
-        board.stiffness = board_stiffness
+    start = Start()
     along, up = (PLACE_SPREAD * _deviations(rng, 2)).tolist()
     placement = Placement()
     shifted = np.array(placement.position) + PLACE_SPREAD * _deviations(rng, 2)
     placement.position = shifted.tolist()
     bias = _deviations(rng, 6) * np.repeat([FORCE_BIAS, MOMENT_BIAS], 3)
-    return Scenario(
+    scenario = Scenario(
         name=name,
         controller=AgentGains().controller(),
         knife=copy.deepcopy(calibrated.knife),
-        board=board,
         placement=placement,
         start=Start(clearance=start.clearance + up, offset=start.offset + along),
         sensor=WrenchSensorConfig(
@@ -185,6 +182,19 @@ def _scenario(
             seed=int(rng.integers(2**31)),
         ),
     )
+    if board_stiffness is not None:
+        _set_board(scenario, board_stiffness)
+    return scenario
+
+
+def _set_board(scenario: Scenario, stiffness: float) -> None:
+    """Gives a scenario a board, and the plant as many steps in an impact as the default has."""
+    board, robot = scenario.board, scenario.robot
+    # The duration of an impact goes with the root of the stiffness.
+    steps = scenario.exchange_period / robot.plant_time_step
+    steps *= max(1.0, math.sqrt(stiffness / board.stiffness))
+    robot.plant_time_step = scenario.exchange_period / math.ceil(steps)
+    board.stiffness = stiffness
 
 
 def _diameter(calibrated: CalibratedFood, rng: np.random.Generator) -> float:
