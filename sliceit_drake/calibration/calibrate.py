@@ -6,7 +6,7 @@ import hashlib
 import json
 import multiprocessing
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, wait
+from concurrent.futures import wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +21,7 @@ from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.calibration.uncertainty import Posterior, estimate_posterior
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.cutting.workers import worker_processes
 from sliceit_drake.diagrams.calibrated_food import CalibratedFood
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.systems.spring_food import calibrate_spring
@@ -273,8 +274,8 @@ def _refine(
 
             out.append(job.refine(note))
         return out
-    context = multiprocessing.get_context("spawn")
-    with context.Manager() as manager, ProcessPoolExecutor(workers, context) as pool:
+    spawned = multiprocessing.get_context("spawn")
+    with spawned.Manager() as manager, worker_processes(workers) as pool:
         steps = manager.dict()
         futures = [pool.submit(_refine_beside, job, steps, k) for k, job in enumerate(jobs)]
         while not all(f.done() for f in futures):

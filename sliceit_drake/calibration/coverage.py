@@ -2,10 +2,9 @@
 
 import dataclasses as dc
 import json
-import multiprocessing
 import textwrap
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from sliceit_drake.calibration.setup import CalibrationSetup, load_setup
 from sliceit_drake.calibration.uncertainty import estimate
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.food import Cylinder
+from sliceit_drake.cutting.workers import worker_processes
 from sliceit_drake.records.metadata import FoodFacts, NominalMotion, SliceMetadata
 from sliceit_drake.records.slice_record import SliceRecord, velocities
 
@@ -241,8 +241,7 @@ def coverage_study(
     if progress is not None:
         progress(replicates - len(missing))
     # Processes that share a simulator's threads would hinder each other.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, max(len(missing), 1)), context) as pool:
+    with worker_processes(min(workers, max(len(missing), 1))) as pool:
         futures = [pool.submit(run_replicate, problem, n) for n in missing]
         for future in as_completed(futures):
             replicate = future.result()

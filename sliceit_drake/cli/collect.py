@@ -15,6 +15,7 @@ from sliceit_drake.cli.hardware import (
     touch_confirmed,
 )
 from sliceit_drake.cli.scenario_argument import add_protocol_argument, find_file, protocol_file
+from sliceit_drake.output_folder import check_folder
 
 if TYPE_CHECKING:
     from sliceit_drake.diagrams.run import Run
@@ -87,15 +88,13 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         metavar="PORT",
         help="of the emulator at --host, to put fresh food there before each slice",
     )
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, resumes=True)
 
 
 def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     import numpy as np
-    import warp
 
-    warp.config.log_level = warp.LOG_ERROR
     logging.getLogger("drake").setLevel(logging.WARNING)
 
     from sliceit_drake.diagrams.scenario import load_scenario
@@ -106,8 +105,8 @@ def run(options: argparse.Namespace) -> int:
     config = _checked_config(options)
     protocol = load_protocol(str(protocol_file(options)))
     station = load_scenario(find_file(options.station, "scenario", STATION))
-    directory = options.output or Path("output") / protocol.name
-    directory.mkdir(parents=True, exist_ok=True)
+    options.output = directory = options.output or Path("output") / protocol.name
+    check_folder(directory, "--output")
     specimens = schedule(protocol, np.random.default_rng([options.seed, 0]))[: options.first]
     left = [specimen for specimen in specimens if not is_recorded(specimen, directory)]
     if config is not None and options.touch and left and not options.dry_run:

@@ -32,7 +32,7 @@ def add_coverage(studies: "argparse._SubParsersAction[argparse.ArgumentParser]")
     parser.add_argument(
         "--output", metavar="FOLDER", type=Path, help="write coverage.md and coverage.jsonl there"
     )
-    parser.set_defaults(run=run_coverage)
+    parser.set_defaults(run=run_coverage, resumes=True)
 
 
 def run_coverage(options: argparse.Namespace) -> int:

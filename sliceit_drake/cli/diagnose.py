@@ -91,16 +91,16 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         "--workers", type=int, default=os.cpu_count() or 1, help="processors (default: all)"
     )
     add_cluster_arguments(parser, "threads", "slices are simulated")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, resumes=True)
 
 
 def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.diagnosis.cluster import on_cluster
-    from sliceit_drake.diagnosis.input_checks import check_folder
     from sliceit_drake.diagnosis.registry import load_cause
     from sliceit_drake.diagrams.calibrated_food import load_calibrated_food
+    from sliceit_drake.output_folder import check_folder
     from sliceit_drake.records.validation import load_sessions
 
     for folder in options.records:

@@ -4,9 +4,8 @@ import argparse
 import dataclasses as dc
 import json
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from functools import lru_cache
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -77,7 +76,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument(
         "--output", metavar="FILE", type=Path, required=True, help=".jsonl file of slices"
     )
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, resumes=True, warp=False)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -88,6 +87,7 @@ def run(options: argparse.Namespace) -> int:
 
     with needs_extra("learn"):
         from sliceit_drake.learning.metrics import COMPLETE  # noqa: F401
+    from sliceit_drake.cutting.workers import worker_processes
 
     for policy in options.policies:
         _policy(str(policy))
@@ -95,18 +95,14 @@ def run(options: argparse.Namespace) -> int:
     done = _done(options.output)
     left = [case for case in cases if case not in done]
     options.output.parent.mkdir(parents=True, exist_ok=True)
-    pool = ProcessPoolExecutor(
-        options.workers, mp_context=get_context("forkserver"), max_tasks_per_child=SLICES
-    )
-    with pool, tqdm(total=len(cases), initial=len(cases) - len(left), desc="slices") as bar:
-        try:
-            for future in as_completed([pool.submit(cut, case) for case in left]):
-                with options.output.open("a") as file:
-                    file.write(json.dumps(future.result()) + "\n")
-                bar.update(1)
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    with (
+        worker_processes(options.workers, "forkserver", tasks=SLICES) as pool,
+        tqdm(total=len(cases), initial=len(cases) - len(left), desc="slices") as bar,
+    ):
+        for future in as_completed([pool.submit(cut, case) for case in left]):
+            with options.output.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(future.result()) + "\n")
+            bar.update(1)
     print(_table(options.output, cases))
     return 0
 
@@ -120,10 +116,6 @@ def cut(case: Case) -> dict:
 
 def trace(case: Case) -> "SliceTrace":
     """Cuts one slice."""
-    import warp
-
-    warp.config.log_level = warp.LOG_ERROR
-
     from sliceit_drake.learning.evaluation import cut_slice
     from sliceit_drake.stand_in.slicing_worlds import CurvesWorld, SlicingWorld, StandInWorld
 

@@ -58,7 +58,7 @@ def add_hidden_study(studies: "argparse._SubParsersAction[argparse.ArgumentParse
     hidden.add_argument(
         "--replicates", type=int, default=200, help="of each diagnosis's bootstrap (default 200)"
     )
-    hidden.set_defaults(run=run_hidden)
+    hidden.set_defaults(run=run_hidden, resumes=True)
     sizes = studies.add_parser(
         "sizes",
         help="sizes of effects by their strength against the noise",
@@ -80,7 +80,6 @@ def add_hidden_study(studies: "argparse._SubParsersAction[argparse.ArgumentParse
 
 def run_hidden(options: argparse.Namespace) -> int:
     """Runs the study."""
-    _quiet()
     from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.hidden_study.archive import unpack
     from sliceit_drake.hidden_study.cases import KINDS
@@ -120,7 +119,6 @@ def run_hidden(options: argparse.Namespace) -> int:
 
 def run_sizes(options: argparse.Namespace) -> int:
     """Prints the table."""
-    _quiet()
     from tqdm import tqdm
 
     from sliceit_drake.hidden_study.sizes import ProtocolSizes, sizes_as_markdown
@@ -135,9 +133,3 @@ def run_sizes(options: argparse.Namespace) -> int:
         options.output.parent.mkdir(parents=True, exist_ok=True)
         options.output.write_text(text, encoding="utf-8")
     return 0
-
-
-def _quiet() -> None:
-    import warp
-
-    warp.config.log_level = warp.LOG_ERROR

@@ -1,10 +1,15 @@
 """Entry point of `sliceit`: parses the command line and turns bad input into a message."""
 
 import argparse
+import errno
 import os
+import signal
 import sys
 import textwrap
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 
 from sliceit_drake.cli import (
     calibrate,
@@ -23,6 +28,8 @@ from sliceit_drake.cli import (
     study,
     train,
 )
+from sliceit_drake.cutting.warp_start import start_warp
+from sliceit_drake.output_folder import check_output
 
 __all__ = ["main", "make_parser"]
 
@@ -36,6 +43,18 @@ GROUPS = {
 BAD_INPUT = 2
 INTERRUPTED = 130
 WIDTH = 88
+
+REFUSED = {
+    errno.EACCES,
+    errno.EDQUOT,
+    errno.EISDIR,
+    errno.ENAMETOOLONG,
+    errno.ENOSPC,
+    errno.ENOTDIR,
+    errno.EPERM,
+    errno.EROFS,
+}
+"""Errors by which a disk refuses, rather than a program fails."""
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -75,21 +94,50 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Command line without the program's name; None for that of the process.
 
     Returns:
-        0 on success, 1 if a run stopped early, 2 for bad input, 130 for Ctrl-C outside a run.
+        0 on success, 1 if a run stopped early, 2 for bad input, 130 for Ctrl-C outside a run (and
+        for a polite kill, or a terminal that is closed).
     """
     # The arrays are small; threads of the linear algebra library would only wait beside the run.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     options = make_parser().parse_args(arguments)
     try:
-        return options.run(options)
+        with _ended_by_signals():
+            if isinstance(getattr(options, "output", None), Path):
+                check_output(options.output)
+            if getattr(options, "warp", True):
+                start_warp()
+            return options.run(options)
     except KeyboardInterrupt:
-        print("sliceit: interrupted", file=sys.stderr)
+        goes_on = getattr(options, "resumes", False) and options.output is not None
+        hint = (
+            f". What is done is in {options.output}; the same command goes on." if goes_on else ""
+        )
+        print(f"sliceit: interrupted{hint}", file=sys.stderr)
         return INTERRUPTED
     except Exception as error:
-        if not _is_bad_input(error):
+        if isinstance(error, OSError) and error.errno in REFUSED:
+            print(f"sliceit: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
+        elif _is_bad_input(error):
+            print(f"sliceit: {error}", file=sys.stderr)
+        else:
             raise
-        print(f"sliceit: {error}", file=sys.stderr)
         return BAD_INPUT
+
+
+@contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """Lets what ends a program politely interrupt it as Ctrl-C does."""
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            # `nohup` has one ignored, for a reason.
+            if signal.getsignal(number) is signal.SIG_DFL:
+                before[number] = signal.signal(number, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _is_bad_input(error: Exception) -> bool:

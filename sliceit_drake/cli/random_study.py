@@ -3,8 +3,6 @@
 import argparse
 import shlex
 import sys
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -44,27 +42,33 @@ def run_random(options: argparse.Namespace) -> int:
 
     from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.cutting.random_slices import random_slices_page
+    from sliceit_drake.cutting.workers import worker_processes
 
     if options.count < 1 or options.workers < 1:
         raise ConfigurationError("is below 1", field="--count or --workers", fix="Give 1 or more.")
-    context = get_context("forkserver")
-    with ProcessPoolExecutor(options.workers, mp_context=context) as pool:
-        seeds = [options.seed] * options.count
-        results = pool.map(_cut, seeds, range(options.count))
-        outcomes = list(tqdm(results, total=options.count, desc="slices"))
+    outcomes: list[Outcome] = []
+    interrupted = False
+    try:
+        with worker_processes(options.workers, "forkserver") as pool:
+            seeds = [options.seed] * options.count
+            results = pool.map(_cut, seeds, range(options.count))
+            outcomes.extend(tqdm(results, total=options.count, desc="slices"))
+    except KeyboardInterrupt:
+        if not outcomes:
+            raise
+        interrupted = True  # What was asked for has no page then.
     page = random_slices_page(outcomes, options.seed, shlex.join(["sliceit", *sys.argv[1:]]))
     print(page)
-    if options.output is not None:
+    if options.output is not None and not interrupted:
         options.output.mkdir(parents=True, exist_ok=True)
         (options.output / "random_slices.md").write_text(page, encoding="utf-8")
+    if interrupted:
+        print(f"Interrupted: this is of the first {len(outcomes)} of {options.count} slices.")
+        return 130
     return 1 if any(outcome.kind == "unexplained" for outcome in outcomes) else 0
 
 
 def _cut(seed: int, index: int) -> "Outcome":
-    import warp
-
-    warp.config.log_level = warp.LOG_ERROR
-
     from sliceit_drake.cutting.random_slices import cut_drawn
 
     return cut_drawn(seed, index)

@@ -49,10 +49,11 @@ def add_real_study(studies: "argparse._SubParsersAction[argparse.ArgumentParser]
 
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
-    from sliceit_drake.diagnosis.input_checks import check_folder, check_records
+    from sliceit_drake.diagnosis.input_checks import check_records
     from sliceit_drake.diagnosis.one_slice import diagnose_slice, setup_of_slice
     from sliceit_drake.diagnosis.real_slices import SIMULATIONS, MeasuredSlice, draw, page
     from sliceit_drake.diagrams.calibrated_food import load_calibrated_food
+    from sliceit_drake.output_folder import check_folder
     from sliceit_drake.records.validation import load_record
     from sliceit_drake.resources import resource_path
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from sliceit_drake.cli.cluster_arguments import add_cluster_arguments, cluster_of
 from sliceit_drake.cli.scenario_argument import add_protocol_argument, protocol_file
+from sliceit_drake.output_folder import check_output
 
 if TYPE_CHECKING:
     from sliceit_drake.stand_in.protocol import Protocol
@@ -87,7 +88,9 @@ def run(options: argparse.Namespace) -> int:
         print(effects_as_markdown())
         return 0
     protocol = _protocol(options)
-    directory = options.output or Path("output") / protocol.name
+    options.output = directory = options.output or Path("output") / protocol.name
+    check_output(directory)
+    options.resumes = options.seed is not None
 
     from tqdm import tqdm
 
@@ -121,10 +124,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _protocol(options: argparse.Namespace) -> "Protocol":
-    import warp
     import yaml
-
-    warp.config.log_level = warp.LOG_ERROR
 
     from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.cutting.effects import Effects

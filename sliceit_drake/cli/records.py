@@ -70,7 +70,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     check.add_argument(
         "paths", metavar="PATH", nargs="+", type=Path, help="a record (NAME.csv), or a folder"
     )
-    check.set_defaults(run=run_check)
+    check.set_defaults(run=run_check, warp=False)
     make = actions.add_parser(
         "import",
         help="make a record from another format",
@@ -133,7 +133,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         default="header",
         help="rosbag: stamps of the messages (the default), or when they were recorded",
     )
-    make.set_defaults(run=run_import)
+    make.set_defaults(run=run_import, warp=False)
 
 
 def run_check(options: argparse.Namespace) -> int:

@@ -46,11 +46,6 @@ def scenario_of(options: argparse.Namespace) -> "Scenario":
     Raises:
         ConfigurationError: It is missing or invalid.
     """
-    import warp
-
-    # Its greeting and its regret that there is no GPU would stand between the user and the result.
-    warp.config.log_level = warp.LOG_ERROR
-
     from sliceit_drake.diagrams.scenario import load_scenario
 
     return load_scenario(find_file(options.scenario, "scenario", DEFAULT), options.set)

@@ -5,6 +5,7 @@ import logging
 from pathlib import Path
 
 from sliceit_drake.cli.scenario_argument import add_scenario_arguments, scenario_of
+from sliceit_drake.output_folder import check_output
 
 __all__ = ["add_parser"]
 
@@ -70,6 +71,8 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     scenario = scenario_of(options)
+    directory = options.output or Path("output") / scenario.name
+    check_output(directory)
 
     from tqdm import tqdm
 
@@ -118,7 +121,6 @@ def run(options: argparse.Namespace) -> int:
             bar.update(time - bar.n)
 
         simulate(prepared, duration, show)
-    directory = options.output or Path("output") / scenario.name
     summary = write_outputs(prepared, directory, None if options.no_replay else meshcat)
     if frames is not None:
         write_series(frames, directory / "paraview", options.paraview)

@@ -46,12 +46,9 @@ def add_slicing(studies: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 def run(options: argparse.Namespace) -> int:
     """Runs the command."""
-    import warp
-
     from sliceit_drake.cli.extras import needs_extra
     from sliceit_drake.configuration import ConfigurationError
 
-    warp.config.log_level = warp.LOG_ERROR
     with needs_extra("learn"):
         from sliceit_drake.learning.comparison import compare, plot_boxes, plot_two_slices
 

@@ -54,12 +54,10 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 def run(options: argparse.Namespace) -> int:
     """Runs the command."""
-    import warp
     from tqdm import tqdm
 
     from sliceit_drake.cli.extras import needs_extra
 
-    warp.config.log_level = warp.LOG_ERROR
     with needs_extra("learn"):
         from sliceit_drake.learning.training import load_training, train
 

@@ -6,8 +6,6 @@ cannot be used is an error with file, field and fix; what a reader must know is 
 """
 
 import dataclasses as dc
-import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,7 +17,7 @@ from sliceit_drake.diagnosis.slices import is_bare
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.records.validation import check_record
 
-__all__ = ["check_folder", "check_records", "without_lone_torques"]
+__all__ = ["check_records", "without_lone_torques"]
 
 BEGUN = 0.1
 """Share of the greatest force that the first rows may have before contact."""
@@ -33,30 +31,6 @@ SAME_SPEED, SAME_DRAW = 0.1, 0.1
 UNNAMED = ("", "unknown")
 OBVIOUS = ("missing fact", "phases", "unknown name")
 """Warnings on facts that a diagnosis does not ask for; `sliceit records check` has them."""
-
-
-def check_folder(folder: Path, field: str) -> None:
-    """Refuses a folder that cannot be written to, before anything is computed for it.
-
-    Args:
-        folder: It is made if it is not there.
-        field: Option that names it.
-
-    Raises:
-        ConfigurationError: Naming folder and reason.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=folder)
-        os.close(handle)
-        os.unlink(name)
-    except OSError as error:
-        raise ConfigurationError(
-            f"cannot be written to ({error.strerror or error})",
-            source=str(folder),
-            field=field,
-            fix="Give a folder of yours on a disk with room.",
-        ) from error
 
 
 def check_records(

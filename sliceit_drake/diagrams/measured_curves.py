@@ -5,10 +5,8 @@ can follow, in sample, with parameters that one press cut hardly tells apart.
 """
 
 import dataclasses as dc
-import multiprocessing
 import os
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +19,7 @@ from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
+from sliceit_drake.cutting.workers import worker_processes
 from sliceit_drake.diagrams.comparison import Comparison, compare_with_measurement
 from sliceit_drake.diagrams.scenario import Measurement
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
@@ -185,7 +184,7 @@ def fit_measured_food(
     """
     found = []
     # Processes, for what a cut spends in Python.
-    with ProcessPoolExecutor(os.cpu_count(), multiprocessing.get_context("spawn")) as pool:
+    with worker_processes(os.cpu_count() or 1) as pool:
         for result in pool.map(_fit_from, [case] * len(STARTS), STARTS):
             found.append(result)
             if progress is not None:

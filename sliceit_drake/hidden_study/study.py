@@ -4,14 +4,13 @@ import dataclasses as dc
 import json
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from multiprocessing import get_context
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import warp
-
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
+from sliceit_drake.cutting.workers import worker_processes
 from sliceit_drake.hidden_study.bench import model_food, protocol_named
 from sliceit_drake.hidden_study.cases import KINDS, Case, make_cases
 from sliceit_drake.hidden_study.classes import ProtocolClasses, protocol_classes
@@ -202,12 +201,16 @@ def run_study(
     left = [case for case in cases if not is_done(output, case.name)]
     done = len(cases) - len(left)
     show("runs", done, len(cases))
-    place = (
-        _Here(output, replicates, workers) if client is None else _There(output, replicates, client)
-    )
     running: set[Future[Any]] = set()
     queue = iter(left)
-    try:
+    with ExitStack() as stack:
+        place: _Here | _There
+        if client is None:
+            pool = stack.enter_context(worker_processes(workers))
+            place = _Here(output, replicates, workers, pool)
+        else:
+            place = _There(output, replicates, client)
+            stack.callback(place.close)
         while True:
             while len(running) < place.width() and (end is None or time.monotonic() < end):
                 case = next(queue, None)
@@ -221,16 +224,14 @@ def run_study(
                 place.keep(future.result())
                 done += 1
                 show("runs", done, len(cases))
-    finally:
-        place.close()
 
 
 class _Here:
     """Processes of this machine, which write their runs themselves."""
 
-    def __init__(self, output: Path, replicates: int, workers: int) -> None:
+    def __init__(self, output: Path, replicates: int, workers: int, pool: Executor) -> None:
         self._output, self._replicates, self._workers = output, replicates, workers
-        self._pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_start_worker)
+        self._pool = pool
 
     def width(self) -> int:
         return self._workers
@@ -240,9 +241,6 @@ class _Here:
 
     def keep(self, made: Any) -> None:
         pass
-
-    def close(self) -> None:
-        self._pool.shutdown(cancel_futures=True)
 
 
 class _There:
@@ -266,7 +264,3 @@ class _There:
 
     def close(self) -> None:
         self._pool.shutdown(wait=False)
-
-
-def _start_worker() -> None:
-    warp.config.log_level = warp.LOG_ERROR

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError, load_yaml
+from sliceit_drake.cutting.warp_start import start_warp
+from sliceit_drake.cutting.workers import worker_processes
 from sliceit_drake.diagrams.record_facts import food_support, knife_facts, shape_facts
 from sliceit_drake.records.metadata import (
     PHASE_LABELS,
@@ -35,8 +37,6 @@ from sliceit_drake.stand_in.protocol import Protocol, Specimen, scaled_food, sch
 from sliceit_drake.stand_in.registry import make_effect
 from sliceit_drake.stand_in.sensor import measured
 from sliceit_drake.stand_in.world import World
-from sliceit_drake.warp_start import start_warp
-from sliceit_drake.workers import worker_processes
 
 if TYPE_CHECKING:
     from distributed import Client

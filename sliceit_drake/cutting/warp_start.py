@@ -1,0 +1,75 @@
+"""Starts Warp as a program wants it: without its messages, with a place for compiled kernels."""
+
+import atexit
+import contextlib
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+__all__ = ["start_warp"]
+
+CACHE = "WARP_CACHE_PATH"
+NO_GPU = b"NVIDIA CUDA driver"
+"""In the line that Warp's library prints on a machine without one, whatever its log level is."""
+
+
+def start_warp() -> None:
+    """Starts Warp; without its greeting, and without its regret that there is no GPU.
+
+    Where Warp cannot keep compiled kernels it would end with an error; they are then compiled for
+    this process and those that it starts, which is said.
+    """
+    _find_cache()
+    import warp
+
+    warp.config.log_level = warp.LOG_ERROR
+    with _without_line(NO_GPU):
+        warp.init()
+
+
+def _find_cache() -> None:
+    """Sets Warp's variable, for child processes too, if its own folder cannot be written."""
+    if CACHE in os.environ:
+        return
+    usual = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "warp"
+    try:
+        usual.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=usual).close()
+    except OSError as error:
+        folder = tempfile.mkdtemp(prefix="sliceit_kernels_")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        os.environ[CACHE] = folder
+        print(
+            f"Compiled kernels cannot be kept in {usual} ({error.strerror}): this run compiles its "
+            f"own. To keep them, set {CACHE} to a folder of yours.",
+            file=sys.stderr,
+        )
+
+
+@contextlib.contextmanager
+def _without_line(words: bytes) -> Iterator[None]:
+    """Drops lines with `words` from what libraries print to the standard error meanwhile."""
+    sys.stderr.flush()
+    try:
+        saved = os.dup(2)
+    except OSError:  # There is none.
+        yield
+        return
+    reading, writing = os.pipe()
+    # What is more than a pipe holds is lost rather than waited for.
+    os.set_blocking(writing, False)
+    os.dup2(writing, 2)
+    os.close(writing)
+    try:
+        yield
+    finally:
+        sys.stderr.flush()
+        os.dup2(saved, 2)
+        os.close(saved)
+        with open(reading, "rb") as caught:
+            for line in caught:
+                if words not in line:
+                    os.write(2, line)

@@ -1,0 +1,62 @@
+"""Processes that work for a command, and end with it."""
+
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context
+from typing import Any
+
+from sliceit_drake.cutting.warp_start import start_warp
+
+__all__ = ["start_worker", "worker_processes"]
+
+
+@contextmanager
+def worker_processes(
+    count: int,
+    method: str = "spawn",
+    initializer: Callable[..., None] | None = None,
+    arguments: tuple[Any, ...] = (),
+    tasks: int | None = None,
+) -> Iterator[ProcessPoolExecutor]:
+    """Processes in which Warp is started.
+
+    What leaves the context by an error, Ctrl-C included, ends the tasks that run by a SystemExit
+    and drops those that wait.
+
+    Args:
+        count: How many.
+        method: By which they start, "spawn" or "forkserver".
+        initializer: Called in each at its start.
+        arguments: Of `initializer`.
+        tasks: After which a process makes room for a new one; None for no end.
+    """
+    pool = ProcessPoolExecutor(
+        count,
+        get_context(method),
+        initializer=start_worker,
+        initargs=(initializer, arguments),
+        max_tasks_per_child=tasks,
+    )
+    try:
+        yield pool
+    except BaseException:
+        for process in list((pool._processes or {}).values()):
+            process.terminate()
+        pool.shutdown(cancel_futures=True)
+        raise
+    pool.shutdown()
+
+
+def start_worker(
+    initializer: Callable[..., None] | None = None, arguments: tuple[Any, ...] = ()
+) -> None:
+    """Readies a process: Ctrl-C, which a terminal sends to all, is for the one that started it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # An exit cleans up, where the signal alone would leave what is half written.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+    start_warp()
+    if initializer is not None:
+        initializer(*arguments)
