@@ -203,6 +203,11 @@ def _top_height(run: Run) -> float:
 
 
 def measured_profile(scenario: Scenario) -> ForceProfile | None:
+    """The measured force that a scenario names, or None.
+
+    Raises:
+        ConfigurationError: There is no such file, or it cannot be read.
+    """
     if scenario.measurement is None:
         return None
     file = Path(scenario.measurement.file)

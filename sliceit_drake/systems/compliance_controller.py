@@ -223,10 +223,10 @@ class ComplianceController(LeafSystem):
       about C then acts as if it were about E.
 
     The initialization event puts the model at the measured joints, at rest. Run it
-    (`Simulator.Initialize`) before the first update.
+    (`Simulator.Initialize`) before the first update. Outputs are functions of the state alone.
 
-    Inputs (n joints):
-        joint_positions: Measured joint positions [n] [rad].
+    Inputs:
+        joint_positions: Measured positions [n] of the n joints [rad].
         sensor_wrench: SpatialForce of the environment on the robot, about So, in S. Zero if not
             connected.
         target_pose: RigidTransform X_WE. Not used in force mode.
@@ -238,7 +238,7 @@ class ComplianceController(LeafSystem):
         selection: [6] in B; used in parallel mode.
         error_scale: [1].
 
-    Outputs, functions of the state alone:
+    Outputs:
         joint_positions_command: [n] [rad].
         joint_velocities_command: [n], rad per *virtual* second. A real second has
             ``iterations * virtual_time_step / period`` virtual ones.

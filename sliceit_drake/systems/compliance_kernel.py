@@ -21,6 +21,7 @@ ZERO = wp.constant(wp.float64(0.0))
 ONE = wp.constant(wp.float64(1.0))
 
 mat34d = wp.types.matrix((3, 4), wp.float64)
+"""Three rows of a rigid transform, in doubles."""
 
 # A pose error is limited to this length [m] and to this angle [rad].
 MAX_DISTANCE = wp.constant(wp.float64(1.0))

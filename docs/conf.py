@@ -1,0 +1,263 @@
+"""Builds the documentation as a site: sphinx-build -W -c docs . output/docs
+
+The source is the whole checkout, so that links between README, docs and notebooks are the same here
+and there. Pages of `docs/api` are written before each build, from the packages; the order of the
+pages is that of the links in `docs/index.md`.
+"""
+
+import argparse
+import ast
+import dataclasses as dc
+import importlib
+import importlib.metadata
+import itertools
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import nbformat
+from myst_parser.parsers.sphinx_ import MystParser
+from sphinx.application import Sphinx
+from sphinx.ext.autodoc.mock import mock
+from sphinx.util import logging
+
+from sliceit_drake.cli.main import make_parser
+
+ROOT = Path(__file__).resolve().parent.parent
+API = ROOT / "docs" / "api"
+
+project = "sliceit_drake"
+author = "the authors of sliceit_drake"
+release = importlib.metadata.version(project)
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+root_doc = "docs/index"
+include_patterns = ["*.md", "docs/*.md", "docs/api/*", "notebooks/*", "calibration/*/README.md"]
+exclude_patterns = [".*", "**/.*", "output"]
+myst_heading_anchors = 3
+# A single backtick in a docstring is code, as in Markdown.
+default_role = "code"
+highlight_language = "text"
+# The contents of a page name its modules, not each of their names.
+toc_object_entries = False
+
+autodoc_default_options = {"members": True, "member-order": "bysource"}
+autodoc_typehints_format = "short"
+# Of the extra "learn": large, and what they would document is ours.
+autodoc_mock_imports = ["gymnasium", "onnx", "stable_baselines3", "torch", "torchrl"]
+# A type's name that several modules have.
+suppress_warnings = ["ref.python"]
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+napoleon_use_rtype = False
+napoleon_custom_sections = [
+    (title, "params_style")
+    for title in ("Input port", "Input ports", "Output ports", "Further output port")
+    + ("Further output ports", "Inputs", "Outputs")
+]
+
+html_theme = "furo"
+html_title = project
+html_show_sourcelink = False
+html_copy_source = False
+
+
+class NotebookParser(MystParser):
+    """Shows a notebook as it is stored, without outputs; the tests run them."""
+
+    supported = ("notebook",)
+
+    def parse(self, inputstring: str, document) -> None:
+        parts = []
+        for cell in nbformat.reads(inputstring, as_version=4).cells:
+            language = "text" if cell.source.startswith("%%") else "python"
+            code = f"```{language}\n{cell.source}\n```"
+            parts.append(cell.source if cell.cell_type == "markdown" else code)
+        super().parse("\n\n".join(parts), document)
+
+
+# --- Pages that are written.
+
+
+def packages() -> list[str]:
+    """Every folder of modules but that of the program, which has a page of its own."""
+    folders = sorted({file.parent for file in (ROOT / project).rglob("*.py")})
+    names = [".".join(folder.relative_to(ROOT).parts) for folder in folders]
+    return [name for name in names if name != f"{project}.cli"]
+
+
+def modules(package: str) -> list[str]:
+    files = sorted((ROOT / package.replace(".", "/")).glob("*.py"))
+    return [f"{package}.{file.stem}" for file in files if file.stem != "__init__"]
+
+
+def package_page(package: str) -> str:
+    """The docstring of a package, then each of its modules with the names of its `__all__`."""
+    lines = [package, "=" * len(package), "", f".. automodule:: {package}", "   :no-members:", ""]
+    for module in modules(package):
+        title = module.removeprefix(f"{package}.")
+        lines += [title, "-" * len(title), "", f".. automodule:: {module}", ""]
+        for name, words in constants(module):
+            lines += [f".. py:data:: {name}", f"   :module: {module}", "", f"   {words}", ""]
+    return "\n".join(lines)
+
+
+def constants(module: str) -> Iterator[tuple[str, str]]:
+    """Public constants and kernels that automodule passes over, and what is said of them.
+
+    Those are the ones with a comment before them, or nothing, in place of a docstring after them.
+    """
+    text = (ROOT / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8")
+    body, lines = ast.parse(text).body, text.splitlines()
+    public: list[str] = []
+    for node, following in itertools.pairwise([*body, ast.Pass()]):
+        if isinstance(node, ast.FunctionDef):
+            kernel = any(ast.unparse(d).startswith("wp.kernel") for d in node.decorator_list)
+            names = [node.name] if kernel else []
+            words = (ast.get_docstring(node) or "").partition("\n\n")[0].replace("\n", " ")
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            target = node.target if isinstance(node, ast.AnnAssign) else node.targets[0]
+            names = [n.id for n in ast.walk(target) if isinstance(n, ast.Name)]
+            before = itertools.takewhile(
+                lambda line: line.startswith("# "), reversed(lines[: node.lineno - 1])
+            )
+            words = " ".join(line[2:] for line in reversed(list(before)))
+            if names == ["__all__"]:
+                public = ast.literal_eval(node.value)
+        else:
+            continue
+        if not (isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant)):
+            yield from ((name, escape(words)) for name in names if name in public)
+
+
+def command_page() -> str:
+    """The help of each command."""
+    lines = ["# The program sliceit", ""]
+
+    def add(parser: argparse.ArgumentParser, level: int) -> None:
+        lines.extend([f"{'#' * level} {parser.prog}", ""])
+        lines.extend(["```text", parser.format_help().rstrip(), "```", ""])
+        for action in parser._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                for nested in action.choices.values():
+                    add(nested, min(level + 1, 3))
+
+    add(make_parser(), 2)
+    return "\n".join(lines)
+
+
+def write_api(app: Sphinx) -> None:
+    """Writes `docs/api`; what is the same stays, so that it is not built again."""
+    pages = {f"{package}.rst": package_page(package) for package in packages()}
+    pages["commands.md"] = command_page()
+    API.mkdir(exist_ok=True)
+    for file in API.iterdir():
+        if file.name not in pages:
+            file.unlink()
+    for name, text in pages.items():
+        file = API / name
+        if not file.exists() or file.read_text(encoding="utf-8") != text:
+            file.write_text(text, encoding="utf-8")
+
+
+def order_pages(app: Sphinx, docname: str, content: list[str]) -> None:
+    """Gives each section of the index a table of contents, of what it links to."""
+    if docname != root_doc:
+        return
+    api = "".join(f"- [{file.stem}](api/{file.name})\n" for file in sorted(API.iterdir()))
+    text = f"{content[0]}\n## Commands and API\n\n{api}"
+    first, *sections = re.split(r"^(?=## )", text, flags=re.M)
+    for k, section in enumerate(sections):
+        title = section.partition("\n")[0].removeprefix("## ")
+        links = re.findall(r"\]\(([^)#:]+)\.(?:md|rst|ipynb)\)", section)
+        table = "\n".join([":hidden:", f":caption: {title}", "", *dict.fromkeys(links)])
+        sections[k] = f"{section}\n```{{toctree}}\n{table}\n```\n\n"
+    content[0] = "".join([first, *sections])
+
+
+def open_at_the_index(app: Sphinx, exception: Exception | None) -> None:
+    """Lets the folder be opened as a site: its first page leads to the index."""
+    if exception is None and app.builder.format == "html":
+        to = f'<meta http-equiv="refresh" content="0; url={root_doc}.html">'
+        (Path(app.outdir) / "index.html").write_text(f"<!doctype html>{to}\n", encoding="utf-8")
+
+
+def check_names(app: Sphinx, env) -> None:
+    """Warns of a public name that no page has."""
+    shown = env.get_domain("py").objects
+    for package in packages():
+        for module in modules(package):
+            with mock(autodoc_mock_imports):
+                names = importlib.import_module(module).__all__
+            for name in names:
+                if f"{module}.{name}" not in shown:
+                    logging.getLogger(__name__).warning("%s.%s is on no page", module, name)
+
+
+# --- Docstrings.
+
+
+def add_fields(app, what: str, name: str, obj, options, lines: list[str]) -> None:
+    """Adds to the docstring of a configuration what its fields say of themselves."""
+    if what != "class" or not dc.is_dataclass(obj):
+        return
+    found = []
+    for field in dc.fields(obj):
+        rule = field.metadata.get(project)
+        if rule is not None:
+            found.append(f"    {field.name}: {rule.doc} {limits(rule)}".rstrip())
+    if found:
+        while lines and not lines[-1].strip():
+            lines.pop()
+        heading = [] if "Attributes:" in lines else ["", "Attributes:"]
+        lines += [*heading, *found, ""]
+
+
+def limits(rule) -> str:
+    """Unit and range of a quantity, values of a choice."""
+    options = getattr(rule, "options", None)
+    if options is not None:
+        return f"One of {', '.join(options)}."
+    ends = [
+        f"at {end} {x:g}" for end, x in (("least", rule.low), ("most", rule.high)) if x is not None
+    ]
+    text = ", ".join(([rule.unit] if rule.unit else []) + ends)
+    return f"({text})" if text else ""
+
+
+def as_markdown(app, what: str, name: str, obj, options, lines: list[str]) -> None:
+    """Reads a docstring as it is meant: indented blocks are literal, `|` and `*` themselves."""
+    out: list[str] = []
+    last, literal = 0, None
+    for line in lines:
+        indent = len(line) - len(line.lstrip())
+        if line.strip():
+            if literal is not None and indent <= literal:
+                literal = None
+            if literal is None and out and not out[-1].strip() and indent >= last + 4:
+                out += [f"{' ' * last}::", ""]
+                literal = last
+            if literal is None:
+                last = indent
+        out.append(line if literal is not None else escape(line))
+    # Napoleon takes what is before a colon in the first line of these for a type.
+    lines[:] = ["", *out] if what in ("attribute", "data", "property") else out
+
+
+def escape(line: str) -> str:
+    """What neither is code nor stresses a word."""
+    parts = re.split(r"(``.*?``|`[^`]*`|\*\w+\*)", line)
+    return "".join(p if k % 2 else re.sub(r"[|*]", r"\\\g<0>", p) for k, p in enumerate(parts))
+
+
+def setup(app: Sphinx) -> dict:
+    app.add_source_suffix(".ipynb", "notebook")
+    app.add_source_parser(NotebookParser)
+    app.connect("builder-inited", write_api)
+    app.connect("source-read", order_pages)
+    app.connect("env-check-consistency", check_names)
+    app.connect("build-finished", open_at_the_index)
+    # Before napoleon, which takes sections apart.
+    app.connect("autodoc-process-docstring", add_fields, priority=300)
+    app.connect("autodoc-process-docstring", as_markdown, priority=310)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
