@@ -101,7 +101,7 @@ class History:
         s: Depth of the edge below the points at the last step, and the largest so far [2, P].
         parted: Share of the surface energy that opening spent [P].
         edge: Force of the edge [P], N.
-        share: Share of the point's area that the edge has passed and that lies above it [P].
+        share: Share of the point's area above the edge, of both faces [P, 2].
         slip: From the friction anchors of both faces [P, 2, 3], metres.
         board_slip: [M, 3], metres.
     """
@@ -204,7 +204,7 @@ class Contacts:
         one = np.zeros(P)
         low = np.full(P, -1.0)
         zero = np.zeros((P, 2, 3))
-        return History(low, low, one, one, one, zero, np.zeros((M, 3)))
+        return History(low, low, one, one, zero[..., 0], zero, np.zeros((M, 3)))
 
     def table(self, values: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Values of a table at s and their slopes [P]."""
@@ -244,9 +244,6 @@ class Contacts:
         bend = moved[self.faces]
 
         s = 0.5 * (x[:, 0, 2] + x[:, 1, 2]) - edge_z
-        share, _ = self.table(m.tables.fraction, s)
-        growth, _ = self.table(m.tables.width, s)
-        rise, _ = self.table(m.tables.rise, s)
         passed = np.maximum(h.passed, s)
         D, _ = self.table(m.tables.fraction, passed)
         T, slope = self.table(m.tables.width, passed)
@@ -286,8 +283,14 @@ class Contacts:
 
         normal, friction, slip = np.zeros((3, *u.shape))
         stiffness = P["flank_stiffness"] * m.point_scales.flank_stiffness
+        shares = np.zeros((len(u), 2))
         for f, side in enumerate((-1.0, 1.0)):
-            height = x[:, f, 2] + rise - edge_z
+            below = x[:, f, 2] - edge_z
+            share, _ = self.table(m.tables.fraction, below)
+            growth, _ = self.table(m.tables.width, below)
+            rise, _ = self.table(m.tables.rise, below)
+            shares[:, f] = share
+            height = below + rise
             phi, n = self._wedge(side * (x[:, f, 1] - bend), height, side)
             area = A * share
             active = (phi < 0.0) & (area > 0.0)
@@ -297,7 +300,7 @@ class Contacts:
             at_edge = stiffness * growth * phi * (0.5 * phi - n[:, 2] * height)
             normal[:, f, 2] -= np.where(active, at_edge, 0.0)
             sliding = du[:, f] + [0.0, before[self.faces] - bend, travel]
-            kept = np.minimum(h.share / np.maximum(share, 1e-12), 1.0)[:, None]
+            kept = np.minimum(h.share[:, f] / np.maximum(share, 1e-12), 1.0)[:, None]
             anchor = h.slip[:, f] * kept + sliding
             anchor -= (anchor * n).sum(1, keepdims=True) * n
             size = np.linalg.norm(anchor, axis=1)
@@ -335,7 +338,7 @@ class Contacts:
             np.concatenate([force.ravel(), knife[1:2], on_board.ravel()]),
             np.concatenate([blocks.ravel(), on_nodes.ravel()]),
             knife,
-            History(s, passed, parted, q, share, slip, board_slip),
+            History(s, passed, parted, q, shares, slip, board_slip),
         )
 
     def _wedge(self, y: np.ndarray, height: np.ndarray, side: float) -> tuple:
