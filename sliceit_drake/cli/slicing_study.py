@@ -71,10 +71,10 @@ def run(options: argparse.Namespace) -> int:
     figures.mkdir(parents=True, exist_ok=True)
     page = _page(found)
     (options.output / "slicing_results.md").write_text(page, encoding="utf-8")
-    stiffness = found[0].board_stiffness
+    boards = [each.board_stiffness for each in found]
+    usual = max(boards, key=boards.count)
     plot_boxes(
-        [each for each in found if each.board_stiffness == stiffness],
-        figures / "slicing_forces.png",
+        [each for each in found if each.board_stiffness == usual], figures / "slicing_forces.png"
     )
     if options.policies:
         plot_two_slices(_two_slices(options.policies), figures / "slicing_two_slices.png")

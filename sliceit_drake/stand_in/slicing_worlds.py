@@ -211,7 +211,7 @@ class StandInWorld:
     refinement: float = quantity(
         1.25, "", low=0.3, high=4.0, doc="Elements along an edge, relative to the food's mesh."
     )
-    time_step: float = quantity(5e-5, "s", low=1e-6, high=2e-3, doc="Sub-step of the food.")
+    time_step: float = quantity(1e-4, "s", low=1e-6, high=2e-3, doc="Sub-step of the food.")
 
     def scenario(
         self, food: str, slice: int, board_stiffness: float | None = None
