@@ -343,6 +343,8 @@ def lines(folder):
 def test_a_training_that_was_stopped_goes_on_as_if_it_had_not(tmp_path, one_process):
     config = training_of(checkpoint_interval=25)
     straight = train(config, tmp_path / "straight")
+    first = train(config, tmp_path / "halves", is_stopped=lambda: True)
+    assert first.episodes == 1 and first.steps < 50
     half = train(config, tmp_path / "halves", stop_after=50)
     assert 50 <= half.steps < 120
     assert not (tmp_path / "halves" / training.POLICY).exists()

@@ -1,6 +1,11 @@
 """`sliceit train`: learns a slicing policy in a simulator."""
 
 import argparse
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 __all__ = ["add_parser"]
@@ -20,6 +25,7 @@ Writes to --output:
   summary.json      ends of episodes, guards of the simulation that ended any
   checkpoint.pt     all that is needed to go on; the same command goes on from it
 
+Ctrl-C ends the training with a checkpoint after the slice that is being cut.
 Ends with status 1 if guards of the simulation ended more than 0.1 % of the episodes.
 """
 
@@ -52,6 +58,26 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.set_defaults(run=run)
 
 
+@contextmanager
+def _stop_by(asked: threading.Event) -> Iterator[None]:
+    """Lets the first Ctrl-C or kill set `asked`, and the second interrupt."""
+
+    def ask(*_: object) -> None:
+        if asked.is_set():
+            raise KeyboardInterrupt
+        asked.set()
+        print("\nStopping at the end of this slice; Ctrl-C again stops at once", file=sys.stderr)
+
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        before = {n: signal.signal(n, ask) for n in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     from tqdm import tqdm
@@ -73,12 +99,20 @@ def run(options: argparse.Namespace) -> int:
             bar.set_postfix_str(remark, refresh=False)
             bar.update(steps - bar.n)
 
+        asked = threading.Event()
         try:
-            outcome = train(config, options.output, show)
-        except KeyboardInterrupt:
+            with _stop_by(asked):
+                outcome = train(config, options.output, show, is_stopped=asked.is_set)
+        except (KeyboardInterrupt, RuntimeError) as error:
+            # A kill that reaches all processes ends the environment's as well.
+            if isinstance(error, RuntimeError) and not asked.is_set():
+                raise
             print(f"Stopped. The same command goes on from the last checkpoint in {options.output}")
             return 130
         bar.update(outcome.steps - bar.n)
+    if asked.is_set() and outcome.steps < config.steps:
+        print(f"Stopped after {outcome.steps} decisions; the same command goes on from there.")
+        return 130
     print(
         f"{outcome.steps} decisions in {outcome.episodes} slices; how they ended: "
         + ", ".join(f"{kind} {count}" for kind, count in sorted(outcome.ends.items()))

@@ -5,12 +5,12 @@ import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import get_context
+from multiprocessing import get_context, resource_tracker
 from typing import Any
 
 from sliceit_drake.cutting.warp_start import start_warp
 
-__all__ = ["start_worker", "worker_processes"]
+__all__ = ["deaf_children", "start_worker", "worker_processes"]
 
 
 @contextmanager
@@ -48,6 +48,18 @@ def worker_processes(
         pool.shutdown(cancel_futures=True)
         raise
     pool.shutdown()
+
+
+@contextmanager
+def deaf_children() -> Iterator[None]:
+    """Processes that are started in this context do not hear Ctrl-C, from their first moment on."""
+    # Its start would end the blocking.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def start_worker(

@@ -6,6 +6,7 @@ import dataclasses as dc
 import functools
 import json
 import math
+import multiprocessing
 import os
 import time as clock
 from collections import Counter, deque
@@ -20,6 +21,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml, load_yaml, quantity
+from sliceit_drake.cutting.workers import deaf_children, start_worker
 from sliceit_drake.learning.environment import SlicingEnv
 from sliceit_drake.learning.export import export_policy
 from sliceit_drake.learning.network import HistoryExtractor
@@ -141,6 +143,7 @@ def train(
     output: Path,
     progress: Callable[[int, str], None] | None = None,
     stop_after: int | None = None,
+    is_stopped: Callable[[], bool] | None = None,
 ) -> Outcome:
     """Trains, or goes on where the checkpoint in `output` is.
 
@@ -151,6 +154,7 @@ def train(
         output: Folder for checkpoint, training.yaml, episodes.jsonl, TensorBoard and policy.onnx.
         progress: Called with the steps so far and a line about the last episodes.
         stop_after: Ends at the first checkpoint after so many steps; None to go on to the end.
+        is_stopped: Asked at each episode's end whether to end with a checkpoint there.
 
     Raises:
         ConfigurationError: `output` has a checkpoint of another configuration.
@@ -163,13 +167,14 @@ def train(
     # An error in the environment's process would come out as a broken pipe.
     check_task(config.task)
     torch.set_num_threads(1)
-    processes = SubprocVecEnv([functools.partial(SlicingEnv, config.task)], "forkserver")
+    with deaf_children():
+        processes = SubprocVecEnv([functools.partial(_environment, config.task)], "forkserver")
     environments = OverlapVecEnv(processes)
     try:
         model = make_model(config, environments)
         model.set_logger(configure(str(output), ["tensorboard"]))
         environments.meanwhile = model.update_once
-        callback = _Watch(config, output, described, progress, stop_after)
+        callback = _Watch(config, output, described, progress, stop_after, is_stopped)
         if saved is not None:
             # The first reset takes the seed; the next repeats the one of the checkpoint.
             environments.reset()
@@ -193,7 +198,8 @@ def train(
             if callback.best_actor is not None:
                 model.actor.load_state_dict(callback.best_actor)
             export_policy(model.actor, config.task.agent, output / POLICY)
-        (output / "summary.json").write_text(json.dumps(dc.asdict(outcome), indent=2) + "\n")
+        summary = json.dumps(dc.asdict(outcome), indent=2) + "\n"
+        (output / "summary.json").write_text(summary, encoding="utf-8")
         return outcome
     except (EOFError, ConnectionError) as error:
         raise RuntimeError(
@@ -255,6 +261,12 @@ def value_limit(reward: RewardConfig) -> Callable[[torch.Tensor], torch.Tensor]:
     return limit
 
 
+def _environment(task: TaskConfig) -> SlicingEnv:
+    if multiprocessing.parent_process() is not None:
+        start_worker()
+    return SlicingEnv(task)
+
+
 def _load(file: Path, described: str) -> dict[str, Any] | None:
     if not file.exists():
         return None
@@ -272,8 +284,8 @@ def _load(file: Path, described: str) -> dict[str, Any] | None:
 def _cut_log(file: Path, episodes: int) -> None:
     """Drops what was logged after the checkpoint."""
     if file.exists():
-        lines = file.read_text().splitlines(keepends=True)[:episodes]
-        file.write_text("".join(lines))
+        lines = file.read_text(encoding="utf-8").splitlines(keepends=True)[:episodes]
+        file.write_text("".join(lines), encoding="utf-8")
 
 
 class _Watch(BaseCallback):
@@ -286,10 +298,11 @@ class _Watch(BaseCallback):
         described: str,
         progress: Callable[[int, str], None] | None,
         stop_after: int | None,
+        is_stopped: Callable[[], bool] | None,
     ) -> None:
         super().__init__()
         self._config, self._output, self._described = config, output, described
-        self._progress, self._stop_after = progress, stop_after
+        self._progress, self._stop_after, self._is_stopped = progress, stop_after, is_stopped
         self.episodes, self.was_stopped = 0, False
         self._saved_at, self._is_due, self._is_enough = 0, False, False
         self._ends: Counter[str] = Counter()
@@ -342,7 +355,9 @@ class _Watch(BaseCallback):
             return True
         self._finish_episode(info)
         due = self.num_timesteps - self._saved_at >= self._config.checkpoint_interval
-        self._is_enough = self._stop_after is not None and self.num_timesteps >= self._stop_after
+        self._is_enough = (
+            self._stop_after is not None and self.num_timesteps >= self._stop_after
+        ) or (self._is_stopped is not None and self._is_stopped())
         self._is_due = due or self._is_enough
         return True
 
@@ -396,7 +411,7 @@ class _Watch(BaseCallback):
         }
         if "guard_message" in info:
             row["guard"] = info["guard_message"]
-        with (self._output / EPISODES).open("a") as file:
+        with (self._output / EPISODES).open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
         self._returns.append(sums["return"])
         mean = float(np.mean(self._returns))
