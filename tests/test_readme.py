@@ -1,12 +1,19 @@
 """What README and docs say is what the project does."""
 
 import ast
+import json
 import re
 from pathlib import Path
 
+import pytest
+
+from sliceit_drake.calibration import coverage
+from sliceit_drake.cli.main import main
 from sliceit_drake.diagrams.ports import ports_as_markdown
+from sliceit_drake.resources import load_module
 
 ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "sliceit_drake"
 
 
 def run_example(number: int) -> None:
@@ -31,6 +38,55 @@ def test_batch_and_gradient_of_the_readme_run(capsys):
     assert gradient["material.friction"] > 0.0
 
 
+def table_of_the_readme() -> dict[str, list[float]]:
+    """Numbers of the first table by row: those of its value, then those in the row's name."""
+    text = (ROOT / "README.md").read_text()
+    table = text.partition("|---|---|\n")[2].partition("\n\n")[0]
+    rows = re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", table, re.M)
+    number = re.compile(r"\d[\d,]*\.?\d*")
+    return {
+        name.split(",")[0].split(" (")[0]: [
+            float(x.replace(",", "")) for x in number.findall(f"{value} {name}")
+        ]
+        for name, value in rows
+    }
+
+
+def test_the_table_is_what_the_first_command_measures(tmp_path):
+    assert main(["simulate", "--no-replay", "--output", str(tmp_path)]) == 0
+    found = json.loads((tmp_path / "summary.json").read_text())
+    measured, work, table = found["measurement"], found["work_of_cutting_J"], table_of_the_readme()
+    stored = json.loads((ROOT / "docs/verification.json").read_text())["foods"]
+    (paper,) = (food["curves"] for food in stored if food["name"] == "cucumber")
+    error = found["discretization_error"]["relative_rms"]
+    expected = {
+        "RMS difference from the measured curve": (
+            0.01,
+            [measured["rms_N"], paper["DiSECt"]["rms"], paper["spring"]["rms"]],
+        ),
+        "peak force in the food": (
+            0.1,
+            [measured["simulated_peak_N"], measured["measured_peak_N"]],
+        ),
+        "estimated discretisation error of the force": (
+            0.1,
+            [1e2 * error, found["elements"], 1e3 * found["sub_step_s"]],
+        ),
+        "energy that the books do not explain": (
+            0.01,
+            [1e2 * abs(found["energy_imbalance_J"]) / work],
+        ),
+        "work error of the coupling between food and robot": (
+            0.01,
+            [1e2 * abs(found["coupling_work_error_J"]) / work],
+        ),
+    }
+    for name, (digit, values) in expected.items():
+        # Of the last digit that is written; another machine rounds elsewhere.
+        assert table[name] == pytest.approx(values, abs=digit), name
+    assert set(table) - set(expected) == {"real-time factor of the whole station"}
+
+
 def test_files_that_the_docs_link_to_exist():
     for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
         for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
@@ -40,3 +96,65 @@ def test_files_that_the_docs_link_to_exist():
 
 def test_written_port_contract_is_that_of_the_code():
     assert ports_as_markdown() in (ROOT / "docs/ports.md").read_text()
+
+
+# --- Pages whose numbers are stored beside them.
+
+COMPARED = {
+    "coverage.jsonl": "test_readme.py::test_the_page_on_coverage_is_that_of_its_replicates",
+    "hidden_effects.json": "test_hidden_effects_page.py::test_the_page_is_made_from_the_runs_and",
+    "hidden_effects.jsonl": "test_hidden_effects_page.py::test_the_page_is_made_from_the_runs_and",
+    "verification.json": "test_verification.py::test_page_is_that_of_the_stored_numbers",
+}
+
+
+def test_each_file_of_numbers_has_a_test_that_its_page_says_them():
+    assert {file.name for file in (ROOT / "docs").glob("*.json*")} == set(COMPARED)
+    for test in COMPARED.values():
+        file, _, name = test.partition("::")
+        assert f"def {name}" in (ROOT / "tests" / file).read_text()
+
+
+def test_the_page_on_coverage_is_that_of_its_replicates(tmp_path, monkeypatch):
+    page = (ROOT / "docs/coverage.md").read_text()
+    (command,) = re.findall(r"^    (sliceit study coverage .*)$", page, re.M)
+    file = tmp_path / "coverage.jsonl"
+    file.write_bytes((ROOT / "docs/coverage.jsonl").read_bytes())
+    count = int(re.search(r"--replicates (\d+)", command)[1])
+    # All replicates are there, so that none is computed.
+    monkeypatch.setattr(coverage, "run_replicate", None)
+    problem = coverage.Problem()
+    results = coverage.coverage_study(problem, count, file)
+    assert coverage.coverage_page(problem, results, command) == page
+
+
+def test_marks_between_which_commands_write_come_in_pairs():
+    for file in (ROOT / "docs").glob("*.md"):
+        marks = re.findall(r"<!-- (.*?) -->", file.read_text())
+        begun, ended = marks[::2], marks[1::2]
+        assert ended == [f"end of {name}" for name in begun], file.name
+
+
+# --- The site.
+
+
+def test_every_page_is_linked_from_the_index_and_the_index_from_the_readme():
+    index = (ROOT / "docs/index.md").read_text()
+    pages = {file.name for file in (ROOT / "docs").glob("*.md")} - {"index.md"}
+    pages |= {f"../notebooks/{file.name}" for file in (ROOT / "notebooks").glob("*.ipynb")}
+    assert pages <= set(re.findall(r"\]\(([^)#]+)\)", index))
+    assert "](docs/index.md)" in (ROOT / "README.md").read_text()
+
+
+def test_names_that_code_of_the_docs_imports_exist():
+    for file in (ROOT / "docs").glob("*.md"):
+        for block in re.findall(r"^```(?:python)?\n(.*?)^```", file.read_text(), re.M | re.S):
+            for line in re.findall(r"^from sliceit_drake.*$", block, re.M):
+                exec(line, {})
+
+
+def test_pages_of_the_api_have_every_folder_of_modules():
+    conf = load_module("docs_conf", ROOT / "docs/conf.py")
+    files = [f.relative_to(ROOT) for f in PACKAGE.rglob("*.py") if f.stem != "__init__"]
+    found = {".".join(f.with_suffix("").parts) for f in files if f.parts[1] != "cli"}
+    assert {module for package in conf.packages() for module in conf.modules(package)} == found

@@ -1,0 +1,419 @@
+"""What README and docs tell a reader to type can be typed.
+
+Each command is read by the parser that would read it, and the files that it names are there. The
+table says of each who runs it: this test, another one, CI, or nobody because it takes too long.
+"""
+
+import argparse
+import functools
+import glob
+import os
+import re
+import shlex
+import tomllib
+from pathlib import Path
+
+import pytest
+from docs_commands import Command, commands_of
+
+from sliceit_drake.cli.main import main, make_parser
+from sliceit_drake.cutting.mesh import MeshError
+from sliceit_drake.resources import load_module
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+COMMANDS = [command for page in PAGES for command in commands_of(page, ROOT)]
+
+# Run below, in an empty folder; simulations for two exchanges.
+HERE = """
+sliceit simulate --set "{calibration: cucumber}"
+sliceit simulate --set "{calibration: potato, knife_name: nakiri}"
+sliceit simulate scenarios/carrot_sequence.yaml --set "{food: {shape: !Tapered {diameters: [0.018, 0.034], length: 0.10}}}"
+sliceit simulate --set "{food: {cut_normal: [0.2, 1.0, 0.1]}}"
+sliceit calibrate --show cucumber
+sliceit calibrate --show NAME
+sliceit diagram --ports
+python -c "from sliceit_drake.hardware.knife_kinematics import flange_pose; print(flange_pose([q1, q2, q3, q4, q5, q6])[11] - 0.21)"
+"""  # noqa: E501
+
+# Run by another test, perhaps on a smaller food.
+TESTED = {
+    "tests/test_readme.py::test_the_table_is_what_the_first_command_measures": [
+        "sliceit simulate",
+    ],
+    "tests/test_named_food.py::test_the_apple_is_cut_by_a_knife_that_is_higher_and_the_arm_"
+    "reaches_its_start": ["sliceit simulate scenarios/apple.yaml"],
+    "tests/test_foods_page.py::test_what_the_page_says_to_write_is_a_food_a_knife_and_a_setup": [
+        'sliceit simulate --set "{knife_name: knife.yaml}"',
+        "sliceit simulate radish.yaml",
+    ],
+    "tests/test_foods_page.py::test_tables_are_made_from_the_files_of_foods_and_knives": [
+        "python benchmarks/foods_page.py --output docs/foods.md",
+    ],
+    "tests/test_paraview.py::test_the_series_of_a_run_has_its_body_its_knife_and_its_forces": [
+        "sliceit simulate --paraview vtu",
+    ],
+    "tests/test_paraview.py::test_a_run_is_exported_again_as_it_was": [
+        "sliceit export FOLDER",
+        "sliceit export output/cucumber",
+    ],
+    "tests/test_record_importers.py::test_the_program_imports_a_recording_and_says_what_is_wrong": [
+        "sliceit records check FOLDER",
+    ],
+    "tests/test_stand_in.py::test_the_command_hides_an_effect_from_a_users_file_in_two_processes": [
+        "sliceit record calibration/protocols/rich.yaml --effect skin:0.8 --seed 3"
+        " --output records/a",
+        "sliceit record --effect brine.py:2.0 --output records/b",
+        "sliceit record --seed 1 --effect bulk_relaxation:0.0399",
+    ],
+    "tests/test_cluster.py::test_records_of_a_cluster_are_those_of_one_process": [
+        "sliceit record --output records/b --seed 1 --backend dask --scheduler tcp://10.0.0.5:8786",
+    ],
+    "tests/test_cluster.py::test_a_sweep_on_a_cluster_is_that_of_one_process": [
+        "sliceit study hidden --output output/hidden --backend dask"
+        " --scheduler tcp://10.0.0.5:8786",
+    ],
+    "tests/test_cluster.py::test_a_backend_without_its_scheduler_is_refused": [
+        "sliceit diagnose ... --backend dask --scheduler tcp://HOST:8786",
+        "sliceit diagnose records/monday --model cucumber --output output/a --backend dask"
+        " --scheduler tcp://10.0.0.5:8786",
+    ],
+    "tests/test_database.py::test_two_workers_share_a_database_and_one_that_is_killed_goes_on": [
+        "sliceit calibrate records/*.csv --food cucumber --output a"
+        " --storage postgresql://sliceit@10.0.0.5/sliceit --seed 1",
+    ],
+    "tests/test_causes.py::test_a_cause_in_a_file_is_loaded_and_used": [
+        "sliceit diagnose records/monday --model cucumber --output output/a --cause my_cause.py",
+    ],
+    "tests/test_hidden_effects_found.py::test_runs_of_every_kind_are_diagnosed_rightly": [
+        "sliceit diagnose RECORDS_DIR --model cucumber --output DIR",
+        "sliceit diagnose RECORDS --model FOOD --output DIR",
+        "sliceit diagnose records/monday --model cucumber --output output/diagnosis",
+    ],
+    "tests/test_next_experiment.py::test_the_proposed_slices_find_what_was_hidden": [
+        "sliceit diagnose records/monday --model cucumber --output output/a"
+        " --next-experiment next.yaml",
+        "sliceit diagnose old --model food.yaml --refinement 0.5 --output a"
+        " --next-experiment next.yaml",
+        "sliceit diagnose records/monday records/tuesday --model cucumber --output output/b",
+        "sliceit diagnose --next-experiment FILE",
+    ],
+    "tests/test_next_experiment.py::test_station_and_stand_in_run_what_was_written": [
+        "sliceit simulate next.yaml",
+        "sliceit record next.yaml --replicates 3 --output records/tuesday",
+    ],
+    "tests/test_hidden_effects_page.py::test_the_page_is_made_from_the_runs_and_says_how_they_"
+    "were": [
+        "sliceit score docs/hidden_effects.jsonl --output docs",
+        "sliceit score output/hidden --output docs",
+    ],
+    "tests/test_learning_agent.py::test_a_training_that_was_stopped_goes_on_as_if_it_had_not": [
+        "sliceit train --output DIR",
+        "sliceit train --output output/ours --seed 0",
+        "sliceit train --output output/baseline --seed 0 --simulator spring",
+    ],
+    "tests/test_learning_comparison.py::test_a_pressing_policy_completes_a_slice_and_its_forces_"
+    "are_those_of_food_and_board": [
+        "sliceit evaluate output/ours output/baseline --output output/evaluation.jsonl",
+    ],
+    "tests/test_learning_comparison.py::test_the_study_writes_its_page_and_says_what_it_lacks": [
+        "sliceit study slicing output/evaluation.jsonl --output docs",
+    ],
+    "tests/test_motion_optimization.py::test_the_command_leaves_a_scenario_that_simulate_takes": [
+        "sliceit optimize-motion SCENARIO --output DIR",
+        "sliceit optimize-motion scenarios/cucumber.yaml --output FOLDER",
+    ],
+    "tests/test_hardware_end_to_end.py::test_a_robot_slices_over_the_network_as_the_simulation_"
+    "does": [
+        "sliceit hardware SCENARIO --host ADDRESS",
+        "sliceit emulate SCENARIO",
+        "sliceit emulate scenarios/cucumber.yaml --pace 0.25",
+        "sliceit hardware scenarios/cucumber.yaml --host 127.0.0.1 --pace 0.25"
+        " --robot hardware/emulated.yaml",
+        "sliceit emulate scenarios/cucumber.yaml --pace 0.2",
+        "sliceit hardware --host 127.0.0.1 --pace 0.2 --robot hardware/emulated.yaml",
+    ],
+    "tests/test_hardware_end_to_end.py::test_the_touch_finds_a_lifted_board_and_refuses_the_"
+    "height_that_was_given": ["sliceit hardware SCENARIO --host ADDRESS --robot my.yaml --touch"],
+    "tests/test_collect.py::test_a_protocol_on_one_emulated_robot_is_recorded_as_on_the_"
+    "simulated_station": [
+        "sliceit emulate scenarios/cucumber.yaml --pace 0.1",
+        "sliceit collect --emulator-pendant 30099",
+        "sliceit collect calibration/protocols/rich.yaml --host 127.0.0.1 --pace 0.1"
+        " --robot hardware/emulated.yaml --move-to-start --emulator-pendant 30099",
+        "sliceit collect PROTOCOL --host ADDRESS --robot my.yaml --move-to-start --touch",
+    ],
+    "tests/test_hardware_interrupted.py::test_a_program_that_runs_on_the_robot_is_not_replaced": [
+        "sliceit hardware SCENARIO --host ADDRESS --robot my.yaml --dry-run",
+    ],
+    "tests/test_hardware_pace.py::test_it_runs_emulator_and_client_and_prints_and_writes_the_"
+    "table": ["python benchmarks/hardware_pace.py --output docs/hardware.md"],
+    "tests/test_rosbag.py::test_the_command_cuts_a_slice_out_of_a_bag": [
+        "sliceit records import rosbag",
+    ],
+}
+
+# Run by .ci/run, which installs what the tests need.
+CI = """
+python3 -m venv .venv
+pip install -c constraints.txt -e '.[test]'
+pytest -n 2
+sphinx-build -W -c docs . output/docs
+"""
+
+# Read by their parser and no further.
+READ_ONLY = {
+    "installs": """
+        pip install -c constraints.txt -e .
+        pip install -c constraints.txt -e '.[docs]'
+        pip install -c constraints.txt -e '.[notebooks]'
+        pip install -e '.[learn]'
+        pip install 'sliceit_drake[cluster]'
+        pip install 'sliceit_drake[database]'
+        pip install 'sliceit_drake[hardware]'
+        pip install 'sliceit_drake[ros]'
+        """,
+    "of another project; the tests start its scheduler and workers from Python": """
+        dask scheduler
+        dask worker tcp://HOST:8786
+        dask worker tcp://10.0.0.5:8786 --nthreads 1 --nworkers -1
+        """,
+    "minutes, of which parts are tested": """
+        sliceit simulate scenarios/cucumber_sequence.yaml
+        sliceit record radish.yaml --replicates 2 --seed 1 --output records/radish
+        sliceit calibrate records/radish --food radish_setup.yaml --output output/radish_food
+        sliceit simulate radish.yaml --set "{calibration: output/radish_food/food.yaml}"
+        sliceit calibrate RECORD... --food cucumber --output DIR
+        sliceit calibrate RECORD... --food NAME --output DIR
+        sliceit calibrate calibration/records/NAME.csv --food NAME --start NAME --output FOLDER --blocks 0 --per-point 60
+        sliceit calibrate --food carrot --literature --output DIR
+        sliceit record calibration/protocols/poor.yaml --effect skin --refinement 0.7 --seed 32 --output old
+        sliceit record next.yaml --replicates 3 --effect skin --refinement 0.7 --seed 132 --output new
+        """,  # noqa: E501
+    "a study of minutes to hours, whose results stand in docs": """
+        sliceit study calibration --output FOLDER
+        sliceit study control --output FOLDER
+        sliceit study coverage --replicates 24 --output docs
+        sliceit study disect --output docs
+        sliceit study hidden --output output/hidden --seed 1 --replicates 100
+        sliceit study identifiability --output docs/identifiability.md --figure docs/figures/identifiability.png
+        sliceit study random --count 200 --seed 1 --output docs
+        sliceit study real --output docs
+        sliceit study stepping --output FOLDER
+        sliceit study verification --fit
+        sliceit study verification --output docs/verification.md
+        """,  # noqa: E501
+    "measures times or draws figures, whose results stand in docs": """
+        python benchmarks/condensed_scheme.py
+        python benchmarks/cutting_speed.py --repeats 3 --output docs/figures/cutting_speed.png
+        python benchmarks/effects_figure.py
+        python benchmarks/foods_page.py --cut --output docs/foods.md
+        python benchmarks/safety_layer.py
+        python benchmarks/scaling.py --output docs/scaling.md
+        python benchmarks/scaling.py --trials 24 --slices 4 --tasks 500 --seconds 2 --output docs/scaling.md
+        python benchmarks/split_step_limit.py
+        python benchmarks/stand_in_figure.py
+        python benchmarks/station_speed.py
+        """,  # noqa: E501
+}
+
+# Files that a reader has, by the pages that say so.
+READERS = {
+    "records/monday": "the reader's records",
+    "records/*.csv": "the reader's records",
+    "records/radish": "docs/foods.md, where the radish is recorded",
+    "my.yaml": "docs/hardware.md: the reader's robot",
+    "my_cause.py": "docs/causes.md, where it is shown",
+    "brine.py": "docs/stand_in.md, where it is shown",
+    "radish.yaml": "docs/foods.md, where it is shown",
+    "radish_setup.yaml": "docs/foods.md, where it is shown",
+    "food.yaml": "docs/next_experiment.md, where it is said how to write it",
+    "output/cucumber": "`sliceit simulate` without --output",
+}
+WRITES = ("--output", "--figure", "--next-experiment")
+PLACEHOLDER = re.compile(r"[A-Z_]{3,}|.*/NAME\.\w+|\w+://.*")
+
+
+class Refused(Exception):
+    """What a parser says of a command."""
+
+
+class ReadUpToHere(Exception):
+    """A program has read its command."""
+
+
+@pytest.fixture
+def parsers_raise(monkeypatch):
+    def error(parser, message):
+        raise Refused(message)
+
+    monkeypatch.setattr(argparse.ArgumentParser, "error", error)
+
+
+def lines(text: str) -> list[str]:
+    return [line.strip() for line in text.splitlines() if line.strip()]
+
+
+def table() -> list[str]:
+    listed = [command for commands in TESTED.values() for command in commands]
+    for text in (HERE, CI, *READ_ONLY.values()):
+        listed += lines(text)
+    return listed
+
+
+def key(command: Command) -> str:
+    return command.text.replace(".venv/bin/", "")
+
+
+@functools.cache
+def whole_parser() -> argparse.ArgumentParser:
+    return make_parser()
+
+
+def nested_parser(words: list[str]) -> tuple[argparse.ArgumentParser, list[str]]:
+    """Parser of a command of `sliceit`, and the arguments that are left for it."""
+    parser = whole_parser()
+    while True:
+        nested = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+        if not nested or not words or words[0] not in nested[0].choices:
+            return parser, words
+        parser, words = nested[0].choices[words[0]], words[1:]
+
+
+def is_name(command: Command) -> bool:
+    """Whether it only names a command or its options, asks for its help, or runs tests by name."""
+    words = command.words
+    if "pytest" in [Path(w).name for w in words[:2]] and any(
+        word.endswith(".py") for word in words
+    ):
+        return True
+    if words[0] != "sliceit":
+        return False
+    rest = nested_parser(words[1:])[1]
+    return rest == ["--help"] or not (command.typed or any(w[:2] != "--" for w in rest))
+
+
+def test_the_table_has_each_command_of_the_docs_once_and_no_other():
+    listed, found = table(), {key(c): c for c in COMMANDS if not is_name(c)}
+    assert len(listed) == len(set(listed))
+    missing = [f"{c.page}:{c.line}: {text}" for text, c in found.items() if text not in listed]
+    assert not missing, f"say in {Path(__file__).name} who runs\n" + "\n".join(missing)
+    named = {key(c) for c in COMMANDS}
+    assert not [text for text in listed if text not in named], "in the table, but on no page"
+
+
+@pytest.mark.parametrize("test", sorted(TESTED))
+def test_tests_of_the_table_exist(test):
+    file, _, name = test.partition("::")
+    assert f"def {name}(" in (ROOT / file).read_text() if name else (ROOT / file).exists()
+
+
+@pytest.mark.parametrize("page", sorted({c.page for c in COMMANDS}))
+def test_commands_of_a_page_are_read_and_the_files_they_name_are_there(page, parsers_raise):
+    made: set[str] = set()
+    for command in (c for c in COMMANDS if c.page == page):
+        where = f"{page}:{command.line}: {command.text}"
+        words = [w for w in command.words if not re.fullmatch(r"[A-Z_]+=\S+", w)]
+        program = Path(words[0]).name
+        try:
+            if program == "sliceit":
+                read_sliceit(words[1:], command.typed)
+            elif program == "pip":
+                read_pip(words[1:])
+            elif program == "pytest":
+                read_pytest(words[1:])
+            elif words[1].endswith(".py") and program == "python":
+                read_script(words[1:])
+            else:
+                assert program in ("python", "python3", "dask", "sphinx-build"), where
+        except Refused as error:
+            pytest.fail(f"{where}: {error}")
+        if program == "sphinx-build":
+            continue  # CI runs it as it stands.
+        outputs = {after for word, after in zip(words, words[1:], strict=False) if word in WRITES}
+        for word in words[1:]:
+            if is_file(word) and word not in outputs:
+                name = word.partition(":")[0]
+                there = name in READERS or name in made or name in ("docs", ".")
+                assert there or glob.glob(str(ROOT / name)), f"{where}: there is no {name}"
+        made |= outputs
+
+
+def is_file(word: str) -> bool:
+    known = re.fullmatch(r"[\w./*-]+\.(yaml|py|jsonl|csv|md|txt)(:[\d.]+)?", word)
+    return not PLACEHOLDER.fullmatch(word) and bool(
+        known or re.fullmatch(r"[\w*.]+/[\w/*.]+", word)
+    )
+
+
+def read_sliceit(words: list[str], typed: bool) -> None:
+    parser, rest = nested_parser(words)
+    options = parser._option_string_actions
+    unknown = [w for w in rest if w.startswith("--") and w not in options]
+    if unknown:
+        raise Refused(f"{parser.prog} has no {unknown[0]}")
+    try:
+        whole_parser().parse_args(words)
+    except SystemExit as end:
+        assert end.code == 0  # --help.
+    except Refused as error:
+        # A sentence may leave out what is not its subject.
+        if typed or not re.search("arguments are required|expected one argument", str(error)):
+            raise
+
+
+def read_pip(words: list[str]) -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    for extra in re.findall(r"(?:\.|sliceit_drake)\[(\w+)\]", " ".join(words)):
+        if extra not in extras:
+            raise Refused(f"pyproject.toml has no extra {extra}")
+
+
+def read_pytest(words: list[str]) -> None:
+    """Each word after -k is in the name of a test of each file."""
+    wanted = words[words.index("-k") + 1].split(" or ") if "-k" in words else []
+    texts = [(ROOT / word).read_text() for word in words if word.endswith(".py")]
+    names = [name for text in texts for name in re.findall(r"^def (test_\w+)", text, re.M)]
+    for part in wanted:
+        if not any(part in name for name in names):
+            raise Refused(f"no test has {part} in its name")
+
+
+def read_script(words: list[str]) -> None:
+    """Runs a script up to where it has read its arguments."""
+    file, parse = ROOT / words[0], argparse.ArgumentParser.parse_args
+    if "argparse" not in file.read_text():
+        assert words[1:] == [], f"{words[0]} takes no arguments"
+        return
+
+    def parse_and_stop(parser, arguments=None, namespace=None):
+        parse(parser, words[1:])
+        raise ReadUpToHere
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(file.parent))
+        patch.setattr(argparse.ArgumentParser, "parse_args", parse_and_stop)
+        with pytest.raises(ReadUpToHere):
+            load_module(f"script_{file.stem}", file).main()
+
+
+@pytest.mark.parametrize("text", lines(HERE))
+def test_it_runs(text, tmp_path, monkeypatch, capsys):
+    def not_here(*_):
+        raise MeshError("another cut, on a coarser mesh")
+
+    monkeypatch.setattr("sliceit_drake.diagrams.run.estimate_discretization_error", not_here)
+    monkeypatch.chdir(tmp_path)
+    program, *words = shlex.split(text.replace("NAME", "potato"))
+    if program == "python":
+        home = re.sub(r"q\d", "0.1", words[1])
+        exec(home, {})
+        assert -2.0 < float(capsys.readouterr().out) < 2.0
+        return
+    if words[0] == "simulate":
+        words += ["--duration", "0.004", "--no-replay"]
+    assert main(words) == 0
+    assert capsys.readouterr().out
+    assert (words[0] == "simulate") == bool(os.listdir(tmp_path))
