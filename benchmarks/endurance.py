@@ -39,7 +39,7 @@ BUILT = 10
 def memory() -> float:
     """What this process holds, MB."""
     gc.collect()
-    for line in Path("/proc/self/status").read_text().splitlines():
+    for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
         if line.startswith("VmRSS"):
             return float(line.split()[1]) / 1024.0
     raise RuntimeError("/proc/self/status has no VmRSS: this needs Linux.")

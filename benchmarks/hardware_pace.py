@@ -135,7 +135,7 @@ def paced_run(
         late = emulator.pendant.status()["late_cycles"] - before
     if not (directory / "robot.csv").exists():
         return PacedRun(stop_of(done.stdout + done.stderr), emulator_late=late)
-    summary = json.loads((directory / "summary.json").read_text())
+    summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
     cycles, missed, lateness = timing(read(directory / "robot.csv"))
     run = PacedRun("", cycles, missed, lateness, late)
     if summary["stopped"]:
@@ -247,13 +247,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if options.output is not None:
             # Before the runs, which take minutes.
-            put_between(options.output.read_text(), "", str(options.output))
+            put_between(options.output.read_text(encoding="utf-8"), "", str(options.output))
         rows = measure(options)
         machine = f"{os.cpu_count()} cores, load {load:.2f} in the minute before"
         table = "\n".join([HEADER, *rows, "", f"`{command}`, {machine}."])
         if options.output is not None:
-            text = put_between(options.output.read_text(), table, str(options.output))
-            options.output.write_text(text)
+            text = put_between(
+                options.output.read_text(encoding="utf-8"), table, str(options.output)
+            )
+            options.output.write_text(text, encoding="utf-8")
     except (ConfigurationError, EmulatorError, OSError) as error:
         print(error, file=sys.stderr)
         return 2

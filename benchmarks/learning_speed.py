@@ -134,11 +134,11 @@ def main() -> None:
     text = "\n".join(lines)
     print(text)
     if options.output is not None:
-        page = options.output.read_text()
+        page = options.output.read_text(encoding="utf-8")
         head, rest = page.split("<!-- learning_speed -->\n")
         _, tail = rest.split("<!-- end of learning_speed -->")
         begin, end = "<!-- learning_speed -->", "<!-- end of learning_speed -->"
-        options.output.write_text(f"{head}{begin}\n{text}\n{end}{tail}")
+        options.output.write_text(f"{head}{begin}\n{text}\n{end}{tail}", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -132,4 +132,6 @@ def _wait(server: "subprocess.Popen[bytes]", port: int, log: Path) -> None:
         if b"ready to accept connections" in log.read_bytes():
             return
         time.sleep(0.02)
-    raise NoServerError(f"the server does not start on port {port}: {log.read_text()[-1000:]}")
+    raise NoServerError(
+        f"the server does not start on port {port}: {log.read_text(encoding='utf-8')[-1000:]}"
+    )

@@ -155,7 +155,7 @@ def _done(file: Path) -> set[Case]:
 
 def _rows(file: Path) -> Iterator[tuple[Case, dict]]:
     names = [field.name for field in dc.fields(Case)]
-    for line in file.read_text().splitlines():
+    for line in file.read_text(encoding="utf-8").splitlines():
         row = json.loads(line)
         yield Case(**{name: row[name] for name in names}), row
 

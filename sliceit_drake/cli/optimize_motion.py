@@ -98,7 +98,8 @@ def run(options: argparse.Namespace) -> int:
     options.output.mkdir(parents=True, exist_ok=True)
     dump_yaml(scenario, options.output / "scenario.yaml")
     summary = dc.asdict(found)
-    (options.output / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    text = json.dumps(summary, indent=2) + "\n"
+    (options.output / "summary.json").write_text(text, encoding="utf-8")
     print(
         f"press {1e3 * motion.press_speed:.1f} mm/s, draw {1e3 * motion.amplitude:.1f} mm at "
         f"{motion.frequency:.2f} Hz: {found.force:.2f} N in the mean over the depth; pressed as "

@@ -53,7 +53,8 @@ def run(options: argparse.Namespace) -> int:
         from sliceit_drake.learning.comparison import compare, plot_boxes, plot_two_slices
 
     try:
-        rows = [json.loads(line) for line in options.evaluation.read_text().splitlines()]
+        lines = options.evaluation.read_text(encoding="utf-8").splitlines()
+        rows = [json.loads(line) for line in lines]
         found = compare(rows)
     except (OSError, ValueError, KeyError) as error:
         raise ConfigurationError(

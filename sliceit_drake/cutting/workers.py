@@ -2,8 +2,9 @@
 
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import get_context, resource_tracker
 from typing import Any
@@ -33,7 +34,7 @@ def worker_processes(
         arguments: Of `initializer`.
         tasks: After which a process makes room for a new one; None for no end.
     """
-    pool = ProcessPoolExecutor(
+    pool = _Pool(
         count,
         get_context(method),
         initializer=start_worker,
@@ -67,8 +68,29 @@ def start_worker(
 ) -> None:
     """Readies a process: Ctrl-C, which a terminal sends to all, is for the one that started it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # An exit cleans up, where the signal alone would leave what is half written.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+    signal.signal(signal.SIGTERM, _end)
     start_warp()
     if initializer is not None:
         initializer(*arguments)
+
+
+class _Pool(ProcessPoolExecutor):
+    """Drops the task, too, that a process holds in advance."""
+
+    def submit(self, task: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
+        return super().submit(_unless_ended, task, *arguments, **named)
+
+
+_ended = threading.Event()
+
+
+def _end(*_: object) -> None:
+    """Leaves a task by an exit, which cleans up; by the signal alone files stay half written."""
+    _ended.set()
+    sys.exit(1)
+
+
+def _unless_ended(task: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    if _ended.is_set():
+        sys.exit(1)
+    return task(*arguments, **named)

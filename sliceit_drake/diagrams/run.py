@@ -169,14 +169,15 @@ def write_outputs(
     dump_yaml(run.scenario, directory / "scenario.yaml")
     comparison = _comparison(run, record)
     summary = _summary(run, record, comparison) | (extra or {})
-    (directory / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    text = json.dumps(summary, indent=2) + "\n"
+    (directory / "summary.json").write_text(text, encoding="utf-8")
     _figure(run, record, comparison).savefig(directory / "force.png", dpi=150)
     if meshcat is not None:
         if run.station.food_visualizer is not None:
             run.station.food_visualizer.PublishRecording()
         meshcat.StopRecording()
         meshcat.PublishRecording()
-        (directory / "replay.html").write_text(meshcat.StaticHtml())
+        (directory / "replay.html").write_text(meshcat.StaticHtml(), encoding="utf-8")
     return summary
 
 

@@ -234,7 +234,7 @@ class RobotLink:
         names = ["time", "lateness"]
         for part in ("q", "qd", "wrench", "sent"):
             names += [f"{part}_{k}" for k in range(1, 7)]
-        with file.open("w", newline="") as stream:
+        with file.open("w", encoding="utf-8", newline="") as stream:
             writer = csv.writer(stream)
             writer.writerow([*names, "runtime_state", "safety_bits"])
             for state, late, sent in self._log:
