@@ -63,6 +63,7 @@ TESTED = {
     "tests/test_stand_in.py::test_the_command_hides_an_effect_from_a_users_file_in_two_processes": [
         "sliceit record calibration/protocols/rich.yaml --effect skin:0.8 --seed 3"
         " --output records/a",
+        "sliceit record --output records/a --seed 1",
         "sliceit record --effect brine.py:2.0 --output records/b",
         "sliceit record --seed 1 --effect bulk_relaxation:0.0399",
     ],
@@ -88,6 +89,7 @@ TESTED = {
     "tests/test_hidden_effects_found.py::test_runs_of_every_kind_are_diagnosed_rightly": [
         "sliceit diagnose RECORDS_DIR --model cucumber --output DIR",
         "sliceit diagnose RECORDS --model FOOD --output DIR",
+        "sliceit diagnose records/a --model cucumber --output a",
         "sliceit diagnose records/monday --model cucumber --output output/diagnosis",
     ],
     "tests/test_next_experiment.py::test_the_proposed_slices_find_what_was_hidden": [
@@ -109,6 +111,7 @@ TESTED = {
     ],
     "tests/test_learning_agent.py::test_a_training_that_was_stopped_goes_on_as_if_it_had_not": [
         "sliceit train --output DIR",
+        "sliceit train --output policy",
         "sliceit train --output output/ours --seed 0",
         "sliceit train --output output/baseline --seed 0 --simulator spring",
     ],
@@ -168,9 +171,11 @@ READ_ONLY = {
         pip install -c constraints.txt -e '.[docs]'
         pip install -c constraints.txt -e '.[notebooks]'
         pip install -e '.[learn]'
+        pip install sliceit_drake
         pip install 'sliceit_drake[cluster]'
         pip install 'sliceit_drake[database]'
         pip install 'sliceit_drake[hardware]'
+        pip install 'sliceit_drake[learn]'
         pip install 'sliceit_drake[ros]'
         """,
     "of another project; the tests start its scheduler and workers from Python": """
