@@ -249,7 +249,7 @@ def _title(run: Run) -> str:
     scenario, segments = run.scenario, run.station.motion_plan.segments
     speeds = [getattr(s, "speed", None) for s in segments]
     speed = next((s for s in speeds if s), None)
-    at = f" at {1e3 * speed:.3g} mm/s" if speed else ""
+    at = f" at {1e3 * speed:.3g} mm/s" if speed and scenario.policy is None else ""
     if scenario.sequence is not None:
         name = scenario.food.name if isinstance(scenario.food, Food) else scenario.name
         count, thickness = scenario.sequence.count, 1e3 * scenario.sequence.thickness
