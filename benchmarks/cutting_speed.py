@@ -3,7 +3,8 @@
 Prints a table and writes a figure; each cost stands beside the error of the same mesh. Times are
 the least of several repeats, taken in turns, since a shared machine only ever adds to them:
 
-    python benchmarks/cutting_speed.py --output docs/figures/cutting_speed.png
+    python benchmarks/cutting_speed.py --output docs/figures/cutting_speed.png \
+        --json docs/benchmarks/cutting_speed.json
 """
 
 import argparse
@@ -16,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 from matplotlib.figure import Figure
+from results import write_results
 from tqdm import tqdm
 
 from sliceit_drake.cutting.batch import simulate_batch
@@ -87,6 +89,7 @@ def main() -> None:
     """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--output", type=Path, help="figure (.png)")
+    parser.add_argument("--json", type=Path, help="also write the values there")
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args()
     scenario: Scenario = load_scenario(resource_path("scenarios/cucumber.yaml"))
@@ -148,14 +151,15 @@ def main() -> None:
     for count, step, total, error in rows:
         shown = "-" if np.isnan(error) else f"{100 * error:.2f} %"
         print(f"| {count} | {step:.1f} | {total:.3f} | {shown} |")
-    error = difference(results[1.0], exact)
-    print(f"\nforce error of the sub-step against 5e-5 s: {100 * error:.2f} % RMS")
+    step_error = difference(results[1.0], exact)
+    print(f"\nforce error of the sub-step against 5e-5 s: {100 * step_error:.2f} % RMS")
     print("\n| tetrahedra | sub-step [s] | slice [s] | force error of the sub-step |")
     print("|---|---|---|---|")
+    reference_force, errors = reference, {}
     for (r, step), solver in steppers.items():
         small = dc.replace(base.numerics, time_step=5e-5)
         reference = simulate_slice(CuttingSolver(models[r].derive(numerics=small), PERIOD), motion)
-        error = difference(simulate_slice(solver, motion), reference)
+        error = errors[r, step] = difference(simulate_slice(solver, motion), reference)
         total = times[f"stepped {(r, step)}"]
         print(f"| {models[r].element_count} | {step:g} | {total:.3f} | {100 * error:.2f} % |")
     ratio = times["gradient"] / times["slice 1.0"]
@@ -165,6 +169,21 @@ def main() -> None:
     for n in BATCHES:
         shares = [times[f"batch {n} {w}"] / n for w in sorted({1, cores})]
         print(f"| {n} | " + " | ".join(f"{s:.3f} s a cut" for s in shares) + " |")
+    if options.json is not None:
+        whole, searched = difference(results[1.0], reference_force), (1.0, 1e-3)
+        write_results(
+            options.json,
+            {
+                "tetrahedra": base.element_count,
+                "slice_s": times["slice 1.0"],
+                "sub_step_us": rows[REFINEMENTS.index(1.0)][1],
+                "mesh_error": whole,
+                "step_error": step_error,
+                "search_slice_s": times[f"stepped {searched}"],
+                "search_step_error": errors[searched],
+                "gradient_slices": ratio,
+            },
+        )
     if options.output:
         plot(rows, times, sorted({1, cores}), options.output)
 

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import warp
+from results import write_results
 
 warp.config.log_level = warp.LOG_ERROR
 WARM_UP, STEPS = 300, 2000
@@ -100,6 +101,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--output", type=Path, help="Markdown file with the two lines")
+    parser.add_argument("--json", type=Path, help="also write the values there")
     options = parser.parse_args()
     import torch
 
@@ -124,6 +126,10 @@ def main() -> None:
             f"{80_000 / rate / 60:.0f} min |"
         )
     ratio = rows["spring"][1] / rows["cutting"][1]
+    if options.json is not None:
+        rates = {f"{name}_decisions_a_second": rate for name, (_, rate) in rows.items()}
+        minutes = {f"{name}_80000_min": 80_000 / rate / 60 for name, (_, rate) in rows.items()}
+        write_results(options.json, rates | minutes | {"cutting_over_spring": ratio})
     lines += [
         "",
         f"The cutting simulator takes {ratio:.2f} times as long as the spring. A decision of the "

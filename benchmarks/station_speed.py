@@ -5,11 +5,13 @@ All numbers come from one process on one core, so their ratios hold on any machi
 
 import argparse
 import time
+from pathlib import Path
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
+from results import write_results
 
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.robot import add_plant, add_robot, connect_arm_controller
@@ -76,6 +78,7 @@ def plant_time(scenario: Scenario) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeat", type=int, default=3, help="runs, of which the fastest counts")
+    parser.add_argument("--json", type=Path, help="also write the values there")
     options = parser.parse_args()
     scenario = load_scenario(resource_path("scenarios/cucumber.yaml"))
     baseline = load_scenario(resource_path("scenarios/cucumber_spring.yaml"))
@@ -102,6 +105,15 @@ def main() -> None:
     ):
         print(
             f"  {name:32s} {100 * part / total:5.1f} %  {1e6 * part / DURATION * 2e-3:7.0f} us/2 ms"
+        )
+    if options.json is not None:
+        write_results(
+            options.json,
+            {
+                "tetrahedra": elements,
+                "real_time_factor": DURATION / total,
+                "spring_real_time_factor": DURATION / spring,
+            },
         )
 
 

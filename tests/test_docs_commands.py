@@ -151,6 +151,9 @@ TESTED = {
     ],
     "tests/test_hardware_pace.py::test_it_runs_emulator_and_client_and_prints_and_writes_the_"
     "table": ["python benchmarks/hardware_pace.py --output docs/hardware.md"],
+    "tests/test_benchmarks_page.py::test_the_page_is_what_its_command_makes": [
+        "python benchmarks/report.py",
+    ],
     "tests/test_rosbag.py::test_the_command_cuts_a_slice_out_of_a_bag": [
         "sliceit records import rosbag",
     ],
@@ -210,15 +213,20 @@ READ_ONLY = {
         """,  # noqa: E501
     "measures times or draws figures, whose results stand in docs": """
         python benchmarks/condensed_scheme.py
+        python benchmarks/cutting_speed.py --json docs/benchmarks/cutting_speed.json
         python benchmarks/cutting_speed.py --repeats 3 --output docs/figures/cutting_speed.png
+        python benchmarks/diagnosis_speed.py --json docs/benchmarks/diagnosis_speed.json
         python benchmarks/effects_figure.py
+        python benchmarks/first_run.py --json docs/benchmarks/first_run.json
         python benchmarks/foods_page.py --cut --output docs/foods.md
+        python benchmarks/learning_speed.py --output docs/learning.md --json docs/benchmarks/learning_speed.json
         python benchmarks/safety_layer.py
         python benchmarks/scaling.py --output docs/scaling.md
         python benchmarks/scaling.py --trials 24 --slices 4 --tasks 500 --seconds 2 --output docs/scaling.md
         python benchmarks/split_step_limit.py
         python benchmarks/stand_in_figure.py
         python benchmarks/station_speed.py
+        python benchmarks/station_speed.py --json docs/benchmarks/station_speed.json
         """,  # noqa: E501
 }
 
@@ -235,7 +243,7 @@ READERS = {
     "food.yaml": "docs/next_experiment.md, where it is said how to write it",
     "output/cucumber": "`sliceit simulate` without --output",
 }
-WRITES = ("--output", "--figure", "--next-experiment")
+WRITES = ("--output", "--figure", "--json", "--next-experiment")
 PLACEHOLDER = re.compile(r"[A-Z_]{3,}|.*/NAME\.\w+|\w+://.*")
 
 

@@ -164,3 +164,13 @@ def test_processes_end_with_the_command_that_started_them_and_clean_up(tmp_path)
 def test_an_error_of_a_folder_names_the_option():
     with pytest.raises(ConfigurationError, match="--cache: cannot be written"):
         check_output(Path("/proc/none"), "--cache")
+
+
+def test_what_ships_can_be_named_as_the_help_does_from_any_folder(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["records", "check", "calibration/records/cucumber.csv"]) == 0
+    assert "cucumber" in capsys.readouterr().out
+    here = tmp_path / "calibration" / "records"
+    here.mkdir(parents=True)
+    # What a user has of that name comes first.
+    assert main(["records", "check", "calibration/records"]) == 2

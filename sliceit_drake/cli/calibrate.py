@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sliceit_drake.cli.progress import StageBars
+from sliceit_drake.cli.scenario_argument import here_or_shipped
 
 if TYPE_CHECKING:
     from sliceit_drake.calibration.calibrate import Calibration
@@ -171,7 +172,8 @@ def _calibrate(options: argparse.Namespace) -> int:
     from sliceit_drake.records.validation import check_record, load_record, record_files
 
     setup = load_setup(options.food)
-    files = [file for given in options.records for file in record_files(given)]
+    given = map(here_or_shipped, options.records)
+    files = [file for path in given for file in record_files(path)]
     records = [load_record(file) for file in files]
     for record in records:
         for finding in check_record(record):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from sliceit_drake.cli.cluster_arguments import add_cluster_arguments, check_cluster_arguments
 from sliceit_drake.cli.progress import StageBars
+from sliceit_drake.cli.scenario_argument import here_or_shipped
 
 if TYPE_CHECKING:
     from sliceit_drake.diagnosis.cause import Cause
@@ -103,6 +104,7 @@ def run(options: argparse.Namespace) -> int:
     from sliceit_drake.output_folder import check_folder
     from sliceit_drake.records.validation import load_sessions
 
+    options.records = list(map(here_or_shipped, options.records))
     for folder in options.records:
         if not folder.is_dir() and folder.suffix not in (".csv", ".yaml"):
             raise ConfigurationError(

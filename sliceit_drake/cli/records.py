@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sliceit_drake.cli.extras import needs_extra
+from sliceit_drake.cli.scenario_argument import here_or_shipped
 
 if TYPE_CHECKING:
     from sliceit_drake.records.metadata import SliceMetadata
@@ -142,7 +143,8 @@ def run_check(options: argparse.Namespace) -> int:
     from sliceit_drake.records.slice_record import read_table
     from sliceit_drake.records.validation import check_table, record_files
 
-    files = [file for path in options.paths for file in record_files(path)]
+    paths = map(here_or_shipped, options.paths)
+    files = [file for path in paths for file in record_files(path)]
     bad = 0
     for file in files:
         try:

@@ -11,6 +11,7 @@ __all__ = [
     "add_protocol_argument",
     "add_scenario_arguments",
     "find_file",
+    "here_or_shipped",
     "protocol_file",
     "scenario_of",
 ]
@@ -101,3 +102,19 @@ def find_file(name: str, kind: str, example: str) -> Path:
             source=name,
             fix=f"Give a YAML file; {example} is one to start from.",
         ) from None
+
+
+def here_or_shipped(path: Path) -> Path:
+    """A file or folder where the user is, or the one of that name that ships with the package.
+
+    Args:
+        path: What they wrote; it is returned as it is where neither is there.
+    """
+    from sliceit_drake.resources import resource_path
+
+    if path.exists():
+        return path
+    try:
+        return resource_path(path.as_posix())
+    except (FileNotFoundError, ValueError):
+        return path
