@@ -8,12 +8,14 @@ import pytest
 
 pytest.importorskip("gymnasium")
 
+from sliceit_drake.cli import evaluate
 from sliceit_drake.cli.main import main
 from sliceit_drake.diagrams.agent_gains import AgentGains
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.learning.comparison import claim, compare, comparison_page, plot_boxes
 from sliceit_drake.learning.evaluation import LIMITS, cut_slice
 from sliceit_drake.learning.metrics import bootstrap_ratio, slice_metrics
+from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.agent import AgentConfig
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 
@@ -120,6 +122,22 @@ def test_the_study_writes_its_page_and_says_what_it_lacks(tmp_path, capsys):
     file.write_text("\n".join(map(json.dumps, rows()[: len(rows()) // 2])))
     assert main(["study", "slicing", str(file), "--output", str(tmp_path)]) == 2
     assert "policies of both simulators" in capsys.readouterr().err
+
+
+def test_an_evaluation_goes_on_over_batches_of_processes_and_runs(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("torch", reason="the settings of a training name torch's")
+    monkeypatch.setattr(evaluate, "SLICES", 1)
+    file, policy = tmp_path / "evaluation.jsonl", resource_path("models/policies/cutting_0")
+    given = ["evaluate", str(policy), "--world", "curves", "--foods", "cucumber"]
+    given += ["--workers", "1", "--output", str(file)]
+    assert main([*given, "--slices", "1"]) == 0
+    first = file.read_text()
+    assert main([*given, "--slices", "3"]) == 0
+    assert file.read_text().startswith(first)
+    found = [json.loads(line) for line in file.read_text().splitlines()]
+    assert sorted(row["slice"] for row in found) == [0, 1, 2]
+    assert all(row["completed"] and row["simulator"] == "cutting" for row in found)
+    assert "3 of 3" in capsys.readouterr().out
 
 
 def scenario():

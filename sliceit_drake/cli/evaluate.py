@@ -95,14 +95,16 @@ def run(options: argparse.Namespace) -> int:
     done = _done(options.output)
     left = [case for case in cases if case not in done]
     options.output.parent.mkdir(parents=True, exist_ok=True)
-    with (
-        worker_processes(options.workers, "forkserver", tasks=SLICES) as pool,
-        tqdm(total=len(cases), initial=len(cases) - len(left), desc="slices") as bar,
-    ):
-        for future in as_completed([pool.submit(cut, case) for case in left]):
-            with options.output.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(future.result()) + "\n")
-            bar.update(1)
+    with tqdm(total=len(cases), initial=len(cases) - len(left), desc="slices") as bar:
+        # New processes for each batch: Python 3.11's own renewal of a pool's processes hangs.
+        batch = SLICES * options.workers
+        for first in range(0, len(left), batch):
+            with worker_processes(options.workers, "forkserver") as pool:
+                tasks = [pool.submit(cut, case) for case in left[first : first + batch]]
+                for task in as_completed(tasks):
+                    with options.output.open("a", encoding="utf-8") as file:
+                        file.write(json.dumps(task.result()) + "\n")
+                    bar.update(1)
     print(_table(options.output, cases))
     return 0
 

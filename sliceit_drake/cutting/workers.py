@@ -20,7 +20,6 @@ def worker_processes(
     method: str = "spawn",
     initializer: Callable[..., None] | None = None,
     arguments: tuple[Any, ...] = (),
-    tasks: int | None = None,
 ) -> Iterator[ProcessPoolExecutor]:
     """Processes in which Warp is started.
 
@@ -32,14 +31,12 @@ def worker_processes(
         method: By which they start, "spawn" or "forkserver".
         initializer: Called in each at its start.
         arguments: Of `initializer`.
-        tasks: After which a process makes room for a new one; None for no end.
     """
     pool = _Pool(
         count,
         get_context(method),
         initializer=start_worker,
         initargs=(initializer, arguments),
-        max_tasks_per_child=tasks,
     )
     try:
         yield pool
