@@ -18,12 +18,11 @@ from sliceit_drake.cutting.effects import (
     Slip,
     ToughnessRate,
 )
-from sliceit_drake.cutting.food import Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.food import Cylinder, Food, make_food_model
 from sliceit_drake.cutting.gradient import SliceAdjoint, SliceGradient, SliceRun
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.material import Material
 from sliceit_drake.cutting.model import CuttingModel, Numerics
-from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.parameters import (
     POINT_PARAMETERS,
     get_parameter,
@@ -32,8 +31,6 @@ from sliceit_drake.cutting.parameters import (
     pull_back,
     with_parameters,
 )
-from sliceit_drake.cutting.sensitivity import force_sensitivity
-from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 
 PERIOD = 2e-3
@@ -272,24 +269,6 @@ def test_a_food_that_slips_is_refused():
     model = cut(Effects(compliance=Compliance(0.0, 1e-5), slip=Slip(5.0)))
     with pytest.raises(ValueError, match="slip"):
         SliceAdjoint(model, PERIOD).run(*path(model))
-
-
-def test_the_time_resolved_sensitivity_projects_to_the_gradient():
-    model = cut()
-    motion = Motion(MotionPlan([ConstantSpeed(distance=0.02, speed=0.15)]), start_pose(model, 1e-3))
-    names = ["material.youngs_modulus", "material.toughness", "material.friction"]
-    wrench, slope = force_sensitivity(model, motion, names, PERIOD)
-    result = simulate_slice(CuttingSolver(model, PERIOD), motion)
-    np.testing.assert_array_equal(wrench, result.food_wrench)
-    poses = [motion.pose(k * PERIOD) for k in range(len(wrench) + 1)]
-    R = np.array([model.X_FC_rotation.T @ X.R for X in poses])
-    p = model.to_cut_frame(np.array([X.p for X in poses]))
-    weights = np.random.default_rng(1).normal(size=wrench.shape)
-    adjoint = SliceAdjoint(model, PERIOD)
-    to_cut = (weights.reshape(-1, 2, 3) @ model.X_FC_rotation).reshape(-1, 6)
-    by_name = pull_back(model, adjoint.gradient(adjoint.run(R, p), to_cut), names)
-    for k, name in enumerate(names):
-        assert (weights * slope[:, :, k]).sum() == pytest.approx(by_name[name], rel=1e-3)
 
 
 def test_torch_differentiates_a_slice_by_parameters_and_path(everything):

@@ -8,9 +8,16 @@ import numpy as np
 from sliceit_drake.configuration import quantity
 from sliceit_drake.cutting.knife import Knife
 
-__all__ = ["Board", "board_wrench", "edge_contact_positions", "impact_peak_loss"]
+__all__ = [
+    "EDGE_CONTACTS",
+    "Board",
+    "board_wrench",
+    "edge_contact_positions",
+    "impact_peak_loss",
+]
 
 EDGE_CONTACTS = 9
+"""Points of the edge that share the contact with the board."""
 
 
 @dc.dataclass

@@ -13,15 +13,10 @@ from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 
-__all__ = [
-    "CutBudget",
-    "Refinement",
-    "cut_budget",
-    "refine_mesh",
-    "refine_step",
-]
+__all__ = ["CutBudget", "Refinement", "cut_budget", "refine_mesh", "refine_step"]
 
 PERIOD = 2e-3
+"""Of an exchange, s."""
 
 
 @dc.dataclass
@@ -133,7 +128,7 @@ def _order(coarse: float, fine: float, reference: float, ratio: float) -> float 
 
 @dc.dataclass
 class CutBudget:
-    """Where the work of a cut goes, J, per area of the section that the edge passed where noted.
+    """Where the work of a cut goes, J.
 
     Attributes:
         work: Of the knife on the food.

@@ -115,7 +115,7 @@ def edge_tables(
     return EdgeTables(reach, width, fraction, above_edge - grid_s, outline, area)
 
 
-def outline(triangles: np.ndarray) -> np.ndarray:
+def _outline_edges(triangles: np.ndarray) -> np.ndarray:
     """Edges of the section's outline, as pairs of points, and the point inside of each [E, 3]."""
     corners = triangles[:, [[0, 1, 2], [1, 2, 0], [2, 0, 1]]].reshape(-1, 3)
     edges = np.sort(corners[:, :2], axis=1)
@@ -126,7 +126,7 @@ def outline(triangles: np.ndarray) -> np.ndarray:
 
 def depth_below(points: np.ndarray, triangles: np.ndarray, positions: np.ndarray) -> np.ndarray:
     """Depth of positions [M, 2] below the upper outline of the section [M], metres."""
-    a, b = (points[outline(triangles)[:, k]] for k in (0, 1))
+    a, b = (points[_outline_edges(triangles)[:, k]] for k in (0, 1))
     x = positions[:, 0, None]
     across = b[:, 0] - a[:, 0]
     w = (x - a[:, 0]) / np.where(across == 0.0, 1.0, across)
@@ -137,7 +137,7 @@ def depth_below(points: np.ndarray, triangles: np.ndarray, positions: np.ndarray
 
 def distance_inside(points: np.ndarray, triangles: np.ndarray, positions: np.ndarray) -> np.ndarray:
     """Distance of positions [M, 2] from the outline of the section [M], metres."""
-    a, b = (points[outline(triangles)[:, k]] for k in (0, 1))
+    a, b = (points[_outline_edges(triangles)[:, k]] for k in (0, 1))
     along = b - a
     from_a = positions[:, None] - a
     w = np.clip((from_a * along).sum(-1) / (along**2).sum(-1), 0.0, 1.0)
@@ -146,7 +146,7 @@ def distance_inside(points: np.ndarray, triangles: np.ndarray, positions: np.nda
 
 def _outline_tables(points: np.ndarray, triangles: np.ndarray, grid_s: np.ndarray) -> np.ndarray:
     """Length of outline that each point carries up to the grid points [2, P, G]: upper, lower."""
-    edges = outline(triangles)
+    edges = _outline_edges(triangles)
     along = points[edges[:, 1]] - points[edges[:, 0]]
     inwards = points[edges[:, 2]] - points[edges[:, 0]]
     # Height of the point inside over the edge's line, times the edge's run along x.

@@ -27,13 +27,11 @@ __all__ = [
     "ReferenceRun",
     "Springs",
     "as_run",
-    "at_speed",
     "break_opening",
     "intact_share",
     "load_case",
     "load_reference",
     "opening_law",
-    "opening_of_faces",
     "refined",
     "rotation_stress",
     "run_case",
@@ -42,7 +40,6 @@ __all__ = [
     "translation_pressure",
     "with_contact",
     "with_material",
-    "with_whole_copies",
 ]
 
 FOLDER = "calibration/disect"
@@ -274,7 +271,7 @@ def as_run(
     friction = springs.friction_at(run.speed)
     new = with_material(case, toughness=toughness, strength=strength, friction=friction)
     new = with_contact(new, run.spring_factor, "bond_stiffness")
-    return at_speed(with_contact(new, run.contact_factor), run.speed)
+    return _at_speed(with_contact(new, run.contact_factor), run.speed)
 
 
 def intact_share(parted: np.ndarray, onset: float, failure: np.ndarray) -> np.ndarray:
@@ -282,7 +279,9 @@ def intact_share(parted: np.ndarray, onset: float, failure: np.ndarray) -> np.nd
     return onset * (1.0 - parted) / (onset + parted * (failure - onset))
 
 
-def opening_of_faces(model: CuttingModel, solver: CuttingSolver, result: SliceResult) -> np.ndarray:
+def _opening_of_faces(
+    model: CuttingModel, solver: CuttingSolver, result: SliceResult
+) -> np.ndarray:
     """Height above the edge and opening of all cut points at the end [P, 2], metres."""
     x, w = solver.positions(result.state)[model.point_nodes], model.point_weights[:, :, None]
     minus, plus = (x[:, :2] * w).sum(1), (x[:, 2:] * w).sum(1)
@@ -294,14 +293,15 @@ def run_case(case: Case, whole_copies: bool = False) -> CaseResult:
 
     Args:
         case: The cut.
-        whole_copies: As `with_whole_copies`.
+        whole_copies: Both copies of each split element have all of its volume and stiffness, as
+            in DiSECt.
 
     Raises:
         CuttingError: The cut became unphysical.
     """
     model = case.model()
     if whole_copies:
-        model = with_whole_copies(model)
+        model = _with_whole_copies(model)
     solver = CuttingSolver(model, case.period)
     motion = Motion(case.motion, start_pose(model, case.clearance))
     result = simulate_slice(solver, motion, contact_sum=True)
@@ -312,7 +312,7 @@ def run_case(case: Case, whole_copies: bool = False) -> CaseResult:
     shares = intact_share(parted, p["strength"] / p["bond_stiffness"], failure)
     # What the edge has passed it has cut.
     passed = result.cut[-1] * model.effects.edge.share
-    above, opening = opening_of_faces(model, solver, result).T
+    above, opening = _opening_of_faces(model, solver, result).T
     slope, offset = np.polyfit(above, opening, 1)
     return CaseResult(
         height=result.position[:, 2],
@@ -329,7 +329,7 @@ def run_case(case: Case, whole_copies: bool = False) -> CaseResult:
     )
 
 
-def with_whole_copies(model: CuttingModel) -> CuttingModel:
+def _with_whole_copies(model: CuttingModel) -> CuttingModel:
     """Both copies of each split element with all of its volume and stiffness, as in DiSECt."""
     whole = 1.0 / (6.0 * np.linalg.det(model.inverse))
     node_volume = np.zeros(len(model.nodes))
@@ -418,7 +418,7 @@ def translation_pressure(viscosity: float, speed: float, height: float) -> float
     return viscosity * speed / height
 
 
-def at_speed(case: Case, speed: float) -> Case:
+def _at_speed(case: Case, speed: float) -> Case:
     """The same cut at another speed."""
     (segment,) = case.motion.segments
     assert isinstance(segment, ConstantSpeed)

@@ -115,9 +115,9 @@ class SliceAdjoint:
             CuttingError: A force is not finite.
             ValueError: The food may slip, which has no gradient.
         """
-        _give(model or self.model)
-        ws, n = self._forward, self._forward.substeps
         model = model or self.model
+        _give(model)
+        ws, n = self._forward, self._forward.substeps
         ws.set_models([model])
         mounting = Mounting.of(model.effects, tolerance=1e-12)
         state = ws.initial_state() if state is None else np.asarray(state, ws.dtype)
@@ -180,7 +180,7 @@ class SliceAdjoint:
 
     def _adjoint_of_exchange(
         self, run: SliceRun, e: int, weights: np.ndarray, adj_state: np.ndarray
-    ) -> "_Back":
+    ) -> _Back:
         """Back through exchange e, whose sub-steps the workspace holds.
 
         Args:

@@ -6,7 +6,10 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError, choice, quantity
 
+__all__ = ["STEEL_DENSITY", "UNSUPPORTED", "Knife", "section_distance", "signed_distance"]
+
 STEEL_DENSITY = 7800.0
+"""kg/m^3."""
 
 UNSUPPORTED = {
     "serrated": "teeth cut by their points and saw; toughness times width does not describe that",
@@ -14,8 +17,6 @@ UNSUPPORTED = {
     "single bevel": "it pushes the blade aside; both sides of the section are alike here",
 }
 """Kinds of knives that are known and cannot be computed, and why."""
-
-__all__ = ["UNSUPPORTED", "Knife", "section_distance", "signed_distance"]
 
 
 @dc.dataclass

@@ -16,6 +16,7 @@ from sliceit_drake.cutting.mesh_surface import (
 __all__ = [
     "MeshError",
     "TetrahedralMesh",
+    "boundary_faces",
     "box_mesh",
     "cylinder_mesh",
     "ellipsoid_mesh",
@@ -54,9 +55,9 @@ class TetrahedralMesh:
         """Refuses what the physics cannot use.
 
         Raises:
-            MeshError: Non-finite vertices, indices out of range, repeated vertices in an element,
-                inverted or degenerate elements, faces shared by more than two elements, size out of
-                the plausible range (1 mm to 1 m), vertices that no element uses.
+            MeshError: Non-finite vertices, indices out of range, inverted, degenerate or repeated
+                elements, faces shared by more than two elements, size out of the plausible range
+                (1 mm to 1 m), vertices that no element uses.
         """
         v, t = self.vertices, self.tetrahedra
         if v.ndim != 2 or v.shape[1] != 3 or t.ndim != 2 or t.shape[1] != 4 or len(t) == 0:

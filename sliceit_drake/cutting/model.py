@@ -15,9 +15,17 @@ from sliceit_drake.cutting.material import Material
 from sliceit_drake.cutting.mesh import TetrahedralMesh
 from sliceit_drake.cutting.split import CutPlane
 
-__all__ = ["CuttingModel", "Numerics", "TimeStepError", "make_cutting_model"]
+__all__ = [
+    "GRAVITY",
+    "CuttingModel",
+    "Numerics",
+    "PointScales",
+    "TimeStepError",
+    "make_cutting_model",
+]
 
 GRAVITY = 9.81
+"""As Drake's plants have it, m/s^2."""
 
 SLIVER = 0.1
 """Share of a vertex's mass below which a node of one side does not set the step."""

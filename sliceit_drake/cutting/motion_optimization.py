@@ -21,6 +21,8 @@ __all__ = ["MotionLimits", "Optimum", "mean_force", "optimize_motion"]
 
 SMOOTH = 0.05
 """Force below which |F| is rounded off, N."""
+CLEARANCE = 1e-3
+"""Of the edge above the food at the start, metres."""
 NAMES = ("amplitude", "frequency", "press_speed")
 
 
@@ -85,7 +87,7 @@ class Optimum:
 
 
 def mean_force(
-    adjoint: SliceAdjoint, motion: PressAndDraw, clearance: float = 1e-3
+    adjoint: SliceAdjoint, motion: PressAndDraw, clearance: float = CLEARANCE
 ) -> tuple[float, np.ndarray]:
     """Mean over the depth of the norm of the food's force, and its derivatives.
 
@@ -151,7 +153,7 @@ def optimize_motion(
         CuttingError: A slice breaks down.
     """
     adjoint, reach = SliceAdjoint(model, period), limits.amplitude(model)
-    height = model.top - model.bottom + 1e-3
+    height = model.top - model.bottom + CLEARANCE
     low = np.array([0.0, limits.frequency[0], max(limits.press_speed[0], height / limits.duration)])
     high = np.array([reach, limits.frequency[1], limits.press_speed[1]])
     if (low > high).any():

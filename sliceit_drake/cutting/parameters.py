@@ -134,7 +134,7 @@ def pull_back(
 
     Args:
         model: The cut at which `gradient` was taken.
-        gradient: Of `SliceAdjoint.backward`.
+        gradient: Of `SliceAdjoint.gradient`.
         names: Parameters.
     """
     out: dict[str, float | np.ndarray] = {}

@@ -13,6 +13,7 @@ from sliceit_drake.cutting.mounting import Mounting
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver, Energies, Exchanges
 
 __all__ = [
+    "ENERGY_RATIO_LIMIT",
     "EnergyLedger",
     "KnifePath",
     "PosedMotion",
@@ -21,15 +22,21 @@ __all__ = [
     "check_clear",
     "check_energies",
     "check_in_plane",
+    "energy_ratio",
     "simulate_slice",
 ]
 
 ENERGY_RATIO_LIMIT = 0.05
+"""Kinetic over internal energy above which scaled masses are not quasi-static."""
 LATERAL_LIMIT = 3e-3
+"""Of the blade off the cut plane, metres."""
 TILT_LIMIT = 0.15
+"""Of the blade out of the cut plane, rad."""
 LEAST_VOLUME_RATIO = 0.0
 CHECK_TRAVEL = 1e-3
+"""Of the knife between two looks at the energies, metres."""
 BLOCK = 10
+"""Exchanges that are advanced at once where nothing stands against it."""
 
 
 @dc.dataclass
@@ -168,6 +175,19 @@ def check_in_plane(model: CuttingModel, X_CK: Pose, time: float) -> None:
     _check_ends(model, X_CK, time)
 
 
+def energy_ratio(energies: Energies, dissipated: float, model: CuttingModel) -> float:
+    """Kinetic energy over internal energy, at least 1 % of that needed to cut through.
+
+    Args:
+        energies: Of the state.
+        dissipated: Since the start, J.
+        model: The cut.
+    """
+    through = float(model.toughness @ model.tables.area)
+    internal = max(energies.elastic + energies.interface + dissipated, 0.01 * through, 1e-9)
+    return energies.kinetic / internal
+
+
 def check_energies(
     energies: Energies, dissipated: float, model: CuttingModel, time: float
 ) -> float:
@@ -180,7 +200,7 @@ def check_energies(
         time: For the message, s.
 
     Returns:
-        Kinetic energy over internal energy, at least 1 % of that needed to cut through.
+        Their `energy_ratio`.
 
     Raises:
         CuttingError: With time, element and cause.
@@ -194,9 +214,7 @@ def check_energies(
             f"follow. Toughness / (E h) is {softness:.2g}; above about 0.5 elements at the edge "
             "invert. Use a stiffer or less tough food; a finer mesh alone rarely helps."
         )
-    through = float(model.toughness @ model.tables.area)
-    internal = max(energies.elastic + energies.interface + dissipated, 0.01 * through, 1e-9)
-    ratio = energies.kinetic / internal
+    ratio = energy_ratio(energies, dissipated, model)
     if ratio > ENERGY_RATIO_LIMIT:
         raise CuttingError(
             f"at {time:.4g} s the kinetic energy is {100 * ratio:.1f} % of the internal energy, "

@@ -10,7 +10,16 @@ from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.workspace import Workspace, interpolate_motion, parameter_row
 
-__all__ = ["CuttingError", "CuttingSolver", "Energies", "Exchange", "Exchanges", "knife_wrenches"]
+__all__ = [
+    "NOT_FINITE",
+    "CuttingError",
+    "CuttingSolver",
+    "Energies",
+    "Exchange",
+    "Exchanges",
+    "knife_wrenches",
+    "run_exchanges",
+]
 
 
 class CuttingError(RuntimeError):
@@ -97,6 +106,7 @@ NOT_FINITE = (
     "the knife's force is not finite: elements inverted or the step became unstable. "
     "Use a smaller numerics.time_step or a finer mesh near the cut."
 )
+"""What is said of a cut that broke down."""
 
 YZX, ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
 

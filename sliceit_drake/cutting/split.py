@@ -12,8 +12,6 @@ say what becomes of it, benchmarks/split_step_limit.py what that leaves of the s
 import dataclasses as dc
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from sliceit_drake.cutting.mesh import MeshError, TetrahedralMesh
 
@@ -103,13 +101,6 @@ class SplitMesh:
         """Area of the cut, m^2."""
         a, b, c = (self.points[self.triangles[:, k]] for k in range(3))
         return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-
-    def component_count(self) -> int:
-        """Number of bodies that share no node."""
-        t = self.tetrahedra
-        rows = np.repeat(t[:, 0], 3)
-        graph = coo_matrix((np.ones(len(rows)), (rows, t[:, 1:].ravel())), [len(self.nodes)] * 2)
-        return int(connected_components(graph, directed=False)[0])
 
 
 def _minority_part(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,8 +12,8 @@ from sliceit_drake.cutting.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel, Numerics, TimeStepError
 from sliceit_drake.cutting.motion import Hold, Motion, MotionPlan, PressAndDraw, Segment
-from sliceit_drake.cutting.simulate import ENERGY_RATIO_LIMIT, KnifePath
-from sliceit_drake.cutting.solver import CuttingError, CuttingSolver, Energies
+from sliceit_drake.cutting.simulate import ENERGY_RATIO_LIMIT, KnifePath, energy_ratio
+from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
 
 __all__ = [
     "STEPS",
@@ -21,7 +21,6 @@ __all__ = [
     "StepResult",
     "SteppingCase",
     "cost_table",
-    "energy_ratio",
     "error_table",
     "hold_table",
     "inertia_table",
@@ -182,19 +181,6 @@ def stepping_cases(
             if fastest:
                 cases.append(dc.replace(hold, acceleration=RAMP))
     return cases
-
-
-def energy_ratio(energies: Energies, dissipated: float, model: CuttingModel) -> float:
-    """Kinetic over internal energy as `check_energies` has it, whatever it is.
-
-    Args:
-        energies: Of the state.
-        dissipated: Since the start, J.
-        model: The cut.
-    """
-    through = float(model.toughness @ model.tables.area)
-    internal = max(energies.elastic + energies.interface + dissipated, 0.01 * through, 1e-9)
-    return energies.kinetic / internal
 
 
 def true_step(case: SteppingCase, most: float) -> float:

@@ -12,17 +12,12 @@ from scipy.spatial.transform import Rotation
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.material import Material, first_piola_stress, small_strain_stiffness
 from sliceit_drake.cutting.mesh import TetrahedralMesh, box_mesh
-from sliceit_drake.cutting.model import Numerics, make_cutting_model
+from sliceit_drake.cutting.model import GRAVITY, Numerics, make_cutting_model
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.cutting.split import CutPlane
 
-__all__ = [
-    "BeamCheck",
-    "PatchCheck",
-    "check_beam",
-    "check_patch",
-]
+__all__ = ["BeamCheck", "PatchCheck", "check_beam", "check_patch"]
 
 UP = np.array([0.0, 0.0, 1.0])
 FAR = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.5]))
@@ -180,7 +175,7 @@ def check_beam(divisions: Sequence[int] = (2, 4, 8)) -> BeamCheck:
     side, length = 0.01, 0.06
     material = dc.replace(SOFT, youngs_modulus=1e7, poisson_ratio=0.0)
     inertia, area = side**4 / 12.0, side**2
-    load = material.density * 9.81 * area
+    load = material.density * GRAVITY * area
     E = material.youngs_modulus
     # Shear coefficient 5/6 is exact for a rectangle without Poisson's effect.
     exact = load * length**4 / (8.0 * E * inertia) + load * length**2 / (

@@ -26,7 +26,9 @@ __all__ = [
 ]
 
 PERIOD = 2e-3
+"""Of an exchange, s."""
 SPEED = 0.02
+"""Of the press, m/s."""
 
 
 def _press(
@@ -183,7 +185,7 @@ def check_hold(duration: float = 0.5) -> HoldCheck:
     """A cucumber of the default material, 12 mm deep."""
     food = Food(shape=Cylinder(rings=3, layers=[0.0, 4e-3, 12e-3]))
     solver, result = _press(food, 0.0125, hold=0.5 * duration)
-    pressed = float(np.argmax(result.time > 0.0125 / SPEED))
+    pressed = int(np.argmax(result.time > 0.0125 / SPEED))
     vertical = result.food_wrench[:, 5]
     state, X = result.state, result.pose
     before = solver.positions(state).astype(float)
@@ -193,9 +195,9 @@ def check_hold(duration: float = 0.5) -> HoldCheck:
         state = step.state
         forces.append(step.wrench[5])
     moved = np.abs(solver.positions(state) - before).max()
-    early = float(vertical[int(pressed) + 50])
+    early = float(vertical[pressed + 50])
     return HoldCheck(
-        force=float(vertical[int(pressed)]),
+        force=float(vertical[pressed]),
         drift=float(forces[-1]) / early - 1.0,
         creep=float(moved / (0.5 * duration)),
         duration=duration,

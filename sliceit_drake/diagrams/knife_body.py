@@ -18,7 +18,7 @@ from pydrake.multibody.tree import CalcSpatialInertia, Frame, JacobianWrtVariabl
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.board import Board, edge_contact_positions, impact_peak_loss
-from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.knife import STEEL_DENSITY, Knife
 
 __all__ = [
     "add_knife",
@@ -31,7 +31,6 @@ __all__ = [
 # Above it a station is refused. The default board and step have 4.5 %, measured 2 to 4 %.
 PEAK_LOSS_LIMIT = 0.05
 
-STEEL_DENSITY = 7800.0
 # Polyoxymethylene, the usual plastic of kitchen knives' handles.
 HANDLE_DENSITY = 1410.0
 
