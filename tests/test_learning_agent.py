@@ -15,6 +15,7 @@ pytest.importorskip("torchrl", reason=f"torchrl is {NEEDS}")
 
 import gymnasium  # noqa: E402
 from stable_baselines3 import SAC  # noqa: E402
+from stable_baselines3.common.logger import Logger  # noqa: E402
 from stable_baselines3.common.vec_env import DummyVecEnv  # noqa: E402
 
 from sliceit_drake.configuration import ConfigurationError  # noqa: E402
@@ -340,9 +341,12 @@ def lines(folder):
     return [json.loads(line) for line in (folder / training.EPISODES).read_text().splitlines()]
 
 
-def test_a_training_that_was_stopped_goes_on_as_if_it_had_not(tmp_path, one_process):
+def test_a_training_that_was_stopped_goes_on_as_if_it_had_not(tmp_path, one_process, monkeypatch):
+    # So few that a policy is chosen before the stop and compared with those after it.
+    monkeypatch.setattr(training, "SELECTION", 3)
     config = training_of(checkpoint_interval=25)
     straight = train(config, tmp_path / "straight")
+    assert straight.best_return is not None
     first = train(config, tmp_path / "halves", is_stopped=lambda: True)
     assert first.episodes == 1 and first.steps < 50
     half = train(config, tmp_path / "halves", stop_after=50)
@@ -413,10 +417,78 @@ def test_a_training_whose_guards_end_episodes_has_failed(tmp_path, one_process, 
 
 @pytest.mark.parametrize(("episodes", "failed"), [(1000, False), (999, True)])
 def test_one_guard_in_a_thousand_episodes_may_be(tmp_path, episodes, failed):
-    watch = training._Watch(training_of(), tmp_path, "", None, None)
+    watch = training._Watch(training_of(), tmp_path, "", None, None, None)
     watch.episodes = episodes
     watch._guards.update({"CuttingError": 1})
     assert (watch.outcome(1.0).failed is not None) == failed
+
+
+class Episodes:
+    """Slices of one decision, told to a training's watch; the actor's weights are their number."""
+
+    def __init__(self, output):
+        config = training_of()
+        config.task.reward = RewardConfig()
+        self.model = training.make_model(config, OverlapVecEnv(DummyVecEnv([Still])))
+        self.model.set_logger(Logger(None, []))
+        self.watch = training._Watch(config, output, "", None, None, None)
+        self.watch.init_callback(self.model)
+
+    def cut(self, returns):
+        for number, value in enumerate(returns, 1):
+            with torch.no_grad():
+                self.model.actor.mu.bias.fill_(float(number))
+            self.watch.num_timesteps = 10 * number
+            info = {"end": "goal", "force": 1.0, "cut_progress": 1.0, "reward_terms": {}}
+            self.watch.locals = {"infos": [info], "rewards": [value], "dones": [True]}
+            self.watch._on_step()
+        return self.watch.outcome(1.0)
+
+
+def test_the_policy_is_that_after_the_best_slices_in_a_row(tmp_path):
+    count = training.SELECTION
+    returns = np.random.default_rng(5).normal(size=4 * count)
+    returns[2 * count : 3 * count] += 2.0
+    # A single slice that is better than all does not count for more than its share.
+    returns[-1] = returns[2 * count : 3 * count].max() + 1.0
+    episodes = Episodes(tmp_path)
+    outcome = episodes.cut(returns)
+    means = np.convolve(returns, np.ones(count) / count, mode="valid")
+    best = int(means.argmax()) + count
+    assert 2 * count < best < len(returns)
+    assert outcome.best_steps == 10 * best
+    assert outcome.best_return == pytest.approx(means.max())
+    # Not the one that learned on since.
+    assert episodes.watch.best_actor["mu.bias"].tolist() == [float(best)] * 6
+    assert episodes.model.actor.mu.bias.tolist() == [float(len(returns))] * 6
+
+
+def test_fewer_slices_than_are_compared_choose_no_policy(tmp_path):
+    episodes = Episodes(tmp_path)
+    outcome = episodes.cut(np.ones(training.SELECTION - 1))
+    assert outcome.best_return is None and episodes.watch.best_actor is None
+    assert episodes.cut([1.0]).best_return == 1.0
+
+
+@pytest.mark.parametrize("is_chosen", [True, False])
+def test_the_policy_that_was_chosen_is_exported_else_the_last(
+    is_chosen, tmp_path, one_process, monkeypatch
+):
+    def learn(model, steps, callback, **_):
+        if is_chosen:
+            chosen = model.actor.state_dict()
+            callback.best_actor = chosen | {"mu.bias": torch.full((6,), 7.0)}
+        with torch.no_grad():
+            model.actor.mu.bias.fill_(9.0)
+
+    exported = []
+    monkeypatch.setattr(training, "check_task", lambda _: None)
+    monkeypatch.setattr(PrioritizedSAC, "learn", learn)
+    monkeypatch.setattr(
+        training, "export_policy", lambda actor, *_: exported.append(actor.mu.bias.tolist())
+    )
+    train(training_of(), tmp_path)
+    assert exported == [[7.0 if is_chosen else 9.0] * 6]
 
 
 def test_updates_are_made_while_the_environment_steps():

@@ -2,6 +2,7 @@
 
 import dataclasses as dc
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,13 +12,16 @@ pytest.importorskip("gymnasium")
 from sliceit_drake.cli import evaluate
 from sliceit_drake.cli.main import main
 from sliceit_drake.diagrams.agent_gains import AgentGains
-from sliceit_drake.diagrams.scenario import Scenario
+from sliceit_drake.diagrams.run import prepare_run, simulate
+from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.learning.comparison import claim, compare, comparison_page, plot_boxes
 from sliceit_drake.learning.evaluation import LIMITS, cut_slice
 from sliceit_drake.learning.metrics import bootstrap_ratio, slice_metrics
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.agent import AgentConfig
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 def forces(*norms):
@@ -104,7 +108,9 @@ def test_the_claim_holds_where_the_interval_ends_below_one(tmp_path):
     same = compare(rows(ours=10.0))
     assert "on no food; not shown on cucumber, potato" in claim(same)[0]
     page = comparison_page(lower)
-    assert page.count("\n") == 3 and "12 of 12, 12 of 12" in page
+    assert page.count("\n") == 3 and "12 of 12, 12 of 12" in page and "| 0.61 |" in page
+    # A food that the paper did not cut has no ratio of the paper's.
+    assert comparison_page([dc.replace(lower[0], food="leek")]).endswith(" |  |")
     plot_boxes(lower, tmp_path / "boxes.png")
     assert (tmp_path / "boxes.png").stat().st_size > 5000
 
@@ -138,6 +144,22 @@ def test_an_evaluation_goes_on_over_batches_of_processes_and_runs(tmp_path, monk
     assert sorted(row["slice"] for row in found) == [0, 1, 2]
     assert all(row["completed"] and row["simulator"] == "cutting" for row in found)
     assert "3 of 3" in capsys.readouterr().out
+
+
+def test_the_page_is_that_of_the_slices(tmp_path, capsys):
+    file = ROOT / "docs/slicing_evaluation.jsonl"
+    assert main(["study", "slicing", str(file), "--output", str(tmp_path)]) == 0
+    page = (tmp_path / "slicing_results.md").read_text()
+    assert page == (ROOT / "docs/slicing_results.md").read_text()
+    capsys.readouterr()
+
+
+def test_a_trained_policy_runs_in_a_scenario():
+    run = prepare_run(load_scenario(resource_path("scenarios/cucumber_agent.yaml")))
+    simulate(run, 2.4)
+    record = run.record()
+    assert not run.stopped and record["cut_progress"][-1] > 0.999
+    assert 5.0 < np.abs(record["food_wrench_f_z"]).max() < 30.0
 
 
 def scenario():

@@ -120,7 +120,7 @@ def _listed(foods: Sequence[str], lead: str, none: str) -> str:
 
 
 def comparison_page(found: Sequence[Comparison]) -> str:
-    """A table of all comparisons."""
+    """A table of all comparisons; the paper's ratio stands beside the foods that it cut."""
     lines = [
         "| world | board [N/m] | food | policies, slices | completed: ours, baseline | "
         + " | ".join(f"{title}: ours, baseline | ratio" for title in TITLES)
@@ -144,7 +144,8 @@ def comparison_page(found: Sequence[Comparison]) -> str:
                 f"{ours[metric].mean():.1f} {unit}, {baseline[metric].mean():.1f} {unit}",
                 f"**{ratio.value:.2f}** ({ratio.low:.2f} to {ratio.high:.2f})",
             ]
-        lines.append("| " + " | ".join([*cells, f"{PAPER[each.food]:.2f}"]) + " |")
+        paper = f"{PAPER[each.food]:.2f}" if each.food in PAPER else ""
+        lines.append("| " + " | ".join([*cells, paper]) + " |")
     return "\n".join(lines)
 
 

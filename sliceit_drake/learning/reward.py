@@ -102,7 +102,9 @@ def reward_potential(config: RewardConfig, height: float, at_goal: float) -> flo
     A decision's reward has ``discount * potential after - potential before`` added to it. No policy
     becomes better by that than another (Ng, Harada and Russell, "Policy invariance under reward
     transformations", 1999), but each decision sees at once what it brings: where only the end
-    pays, and time costs little, agents learned to put the end off.
+    pays, and time costs little, agents learned to put the end off. That theorem wants a potential
+    of zero at every end; it is kept where a limit or a failure ends a slice, which therefore costs
+    what was left to make good besides `RewardConfig.collision`.
 
     Args:
         config: Its `way` and `hold`.

@@ -127,8 +127,8 @@ class PrioritizedSAC(SAC):
             targets = list(self.critic_target.parameters())
             torch._foreach_lerp_(targets, list(self.critic.parameters()), self.tau)
         self._trace(
-            actor_loss=float(actor_loss),
-            critic_loss=float(critic_loss),
+            actor_loss=actor_loss.item(),
+            critic_loss=critic_loss.item(),
             ent_coef=float(alpha),
             entropy=-float(log_density.mean()),
             value=float(worth.mean()),
