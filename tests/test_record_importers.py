@@ -209,14 +209,16 @@ def test_a_vertical_force_keeps_its_sign(tmp_path, sign):
         ("t,f\n1,1\n0,1\n", {}, "scale.csv: time: row 2 has 0 after 1. Sort the rows"),
         ("t,f\n0,1\n1,1\n", {"speed": None}, "motion.speed: is not given, but the motion of"),
         ("t,f\n0,1\n1,1\n", {"contact": 3.0}, "contact: 3 s is not within the record, 0 to 1 s"),
+        ("t,f\n0,1\n1,1\n", {"component": "sideways"}, "component: 'sideways' is no component"),
     ],
 )
 def test_a_force_that_makes_no_record_is_refused(tmp_path, text, change, message):
     (tmp_path / "scale.csv").write_text(text, encoding="utf-8")
     metadata = facts()
     metadata.motion.speed = change.get("speed", 0.02)
+    options = {name: change[name] for name in ("contact", "component") if name in change}
     with pytest.raises(ConfigurationError, match=message):
-        import_force(tmp_path / "scale.csv", metadata, contact=change.get("contact"))
+        import_force(tmp_path / "scale.csv", metadata, **options)
 
 
 class Column:

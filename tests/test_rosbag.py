@@ -261,3 +261,5 @@ def test_what_spoils_a_bag_is_named(tmp_path):
     (tmp_path / "no.bag").write_text("time,force\n")
     with pytest.raises(ConfigurationError, match="cannot be read as a bag"):
         import_rosbag(tmp_path / "no.bag", truth.metadata, "/wrench", "/motion", X_TK)
+    with pytest.raises(ConfigurationError, match="'wall' is no clock"):
+        import_rosbag(bag, truth.metadata, "/wrench", "/motion", X_TK, clock="wall")

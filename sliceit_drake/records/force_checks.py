@@ -5,6 +5,7 @@ from scipy.integrate import trapezoid
 
 from sliceit_drake.records import slice_record as fmt
 from sliceit_drake.records.findings import Findings, runs
+from sliceit_drake.records.preprocessing import LEAST_AIR_ROWS
 from sliceit_drake.records.slice_record import SliceRecord, SliceTable
 
 __all__ = ["check_force"]
@@ -88,7 +89,7 @@ def _known_offset(record: SliceRecord, air: np.ndarray) -> np.ndarray | None:
     """
     if record.force is None:
         return np.zeros(3)
-    if air.sum() >= 10:
+    if air.sum() >= LEAST_AIR_ROWS:
         return record.force[air].mean(axis=0)
     facts = record.metadata.wrench
     return np.zeros(3) if facts.tared == "yes" and "gravity" not in facts.includes else None
@@ -96,12 +97,13 @@ def _known_offset(record: SliceRecord, air: np.ndarray) -> np.ndarray | None:
 
 def _check_tare(record: SliceRecord, air: np.ndarray, findings: Findings) -> None:
     facts = record.metadata.wrench
-    if air.sum() < 10:
+    if air.sum() < LEAST_AIR_ROWS:
         findings.fact(
             "warning",
             "no air phase",
             "motion.phases",
-            "the first phase labelled air has not 10 rows: the sensor's zero and noise are unknown",
+            f"the first phase labelled air has not {LEAST_AIR_ROWS} rows: the sensor's zero and "
+            "noise are unknown",
             "Label the time before contact as air; record half a second of it.",
         )
         return
@@ -166,7 +168,7 @@ def _check_units(
 def _noise(record: SliceRecord, air: np.ndarray) -> float:
     """Standard deviation in the air of the noisiest component, N, after drift; 0 if not known."""
     force = record.force if record.force is not None else record.force_magnitude[:, None]
-    if air.sum() < 10:
+    if air.sum() < LEAST_AIR_ROWS:
         return 0.0
     return float(np.diff(force[air], axis=0).std(axis=0).max() / np.sqrt(2.0))
 

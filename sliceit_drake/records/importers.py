@@ -36,6 +36,8 @@ __all__ = [
     "pose_matrix",
 ]
 
+COMPONENTS = ("norm", "vertical")
+
 CLEARANCE = 1e-3
 """Height of the edge above the food at the start of a nominal motion, m."""
 
@@ -173,8 +175,15 @@ def import_force(
             phases of `metadata`.
 
     Raises:
-        ConfigurationError: If the file is not such a table, or a fact is missing.
+        ConfigurationError: If the file is not such a table, the component none, or a fact is
+            missing.
     """
+    if component not in COMPONENTS:
+        raise ConfigurationError(
+            f"{component!r} is no component of a force",
+            field="component",
+            fix=f"Give one of {', '.join(COMPONENTS)}.",
+        )
     time, force = _two_columns(file)
     step = ProcessingStep("import_force", {}, "the motion is nominal")
     if component == "norm":

@@ -18,6 +18,7 @@ from sliceit_drake.records.metadata import ProcessingStep, SliceMetadata
 from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = [
+    "LEAST_AIR_ROWS",
     "apply_filters",
     "as_measured",
     "compensate_tool",
@@ -29,6 +30,7 @@ __all__ = [
 
 GRAVITY = 9.81
 LEAST_AIR_ROWS = 10
+"""In the first air phase, for its mean to be a zero and its scatter the noise."""
 
 ANTI_ALIASING = 0.35
 """Cutoff of the filter before a resampling to fewer rows, of the new rate: at the new Nyquist

@@ -20,7 +20,7 @@ from sliceit_drake.records.metadata import ProcessingStep, SliceMetadata
 from sliceit_drake.records.phases import phases_from_motion
 from sliceit_drake.records.slice_record import SliceRecord, SliceTable, record_from_table
 
-__all__ = ["LARGEST_GAP", "import_rosbag"]
+__all__ = ["import_rosbag"]
 
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -40,6 +40,8 @@ JOINT_NAMES = (
 
 FLANGE = "tool0"
 """The frame whose pose follows from the joints."""
+
+CLOCKS = ("header", "received")
 
 LARGEST_GAP = 0.1
 """Time without a message over which a motion or a force is not interpolated, s."""
@@ -89,9 +91,13 @@ def import_rosbag(
         largest_gap: Time without a message that is bridged, s.
 
     Raises:
-        ConfigurationError: The file is no bag; a topic is missing, of another type or has a gap;
-            the frames do not fit together.
+        ConfigurationError: The file is no bag, the clock none; a topic is missing, of another type or
+            has a gap; the frames do not fit together.
     """
+    if clock not in CLOCKS:
+        raise ConfigurationError(
+            f"{clock!r} is no clock", field="--clock", fix=f"Give one of {', '.join(CLOCKS)}."
+        )
     series = _read(Path(file), wrench, motion, clock)
     force, moving = series[wrench], series[motion]
     if between is not None:
@@ -211,7 +217,7 @@ def _no_topic(
         f"{name} ({c.msgtype.split('/')[-1]}, {c.msgcount} messages)"
         for name, c in sorted(there.items())
     )
-    wanted = " or ".join(kind.split("/")[-1] for kind in kinds)
+    wanted = " or ".join(_short(kinds))
     problem = f"there is no topic {topic!r}"
     if topic in there:
         problem = f"{topic} is of {there[topic].msgtype.split('/')[-1]}, not {wanted}"

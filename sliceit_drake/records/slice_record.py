@@ -337,7 +337,7 @@ def _wrench_on_knife(
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Force and torque about Ko on the knife in W."""
     facts, sensor = table.metadata.wrench, table.metadata.sensor
-    where = f"{Path(table.file).with_suffix('.yaml')}"
+    where = str(Path(table.file).with_suffix(".yaml"))
     if facts.sign == "by_knife":
         force, torque = -force, None if torque is None else -torque
     if facts.frame == "K":

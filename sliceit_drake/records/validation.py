@@ -18,7 +18,6 @@ from sliceit_drake.records.motion_checks import check_motion
 from sliceit_drake.records.slice_record import SliceRecord, SliceTable
 
 __all__ = [
-    "Finding",
     "check_record",
     "check_table",
     "load_record",
