@@ -91,8 +91,8 @@ def import_rosbag(
         largest_gap: Time without a message that is bridged, s.
 
     Raises:
-        ConfigurationError: The file is no bag, the clock none; a topic is missing, of another type or
-            has a gap; the frames do not fit together.
+        ConfigurationError: The file is no bag, the clock none; a topic is missing, of another type
+            or has a gap; the frames do not fit together.
     """
     if clock not in CLOCKS:
         raise ConfigurationError(
