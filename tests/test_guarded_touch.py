@@ -62,6 +62,12 @@ def test_no_contact_and_a_contact_too_short_are_named():
         contact_of(rows, 0.0, TouchConfig())
 
 
+@pytest.mark.parametrize("noise", [2.5, 4.0])
+def test_a_force_that_scatters_as_much_as_the_contact_is_named(noise):
+    with pytest.raises(TouchError, match="scatters by"):
+        contact_of(touch_rows(), noise, TouchConfig())
+
+
 def test_a_height_that_is_not_the_expected_one_is_refused_with_both_and_the_field():
     found = Touch(0.0512, 2e-5, STIFFNESS, 9.0)
     check_height(found, 0.0510, 1e-3, "board_height")

@@ -145,6 +145,21 @@ def test_nothing_is_late_before_the_first_command(robot):
     link.finish("test over")
 
 
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [(RuntimeError("no answer"), "no answer"), (OSError("pipe"), "pipe"), (KeyError(), "KeyError")],
+)
+def test_a_robot_that_could_not_be_stopped_is_told_whatever_the_client_raises(robot, error, said):
+    def broken():
+        raise error
+
+    link = make_link(robot)
+    link.start()
+    robot.stop = broken
+    link.finish("test over")
+    assert link.stop_error == said
+
+
 def test_an_error_in_the_client_is_a_stop_with_its_text(robot):
     link = make_link(robot)
     link.start()

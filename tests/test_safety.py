@@ -9,8 +9,9 @@ import pytest
 from scipy.optimize import brentq
 
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.hardware.configuration import load_hardware_config
 from sliceit_drake.hardware.knife_kinematics import KnifeKinematics
-from sliceit_drake.hardware.limits import SafetyLimits, load_limits, loosened
+from sliceit_drake.hardware.limits import SafetyLimits, loosened
 from sliceit_drake.hardware.robot_state import PLAYING, RobotState
 from sliceit_drake.hardware.safety import LatchedError, SafetyLayer
 from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
@@ -321,23 +322,26 @@ def test_the_tip_must_stay_above_the_board_as_well_as_the_middle():
     assert make_layer().arm(state(1.0, tilted)).limit == "board_depth"
 
 
+def limits_of(text, folder):
+    """Limits as a robot's file gives them."""
+    file = folder / "robot.yaml"
+    file.write_text(f"limits: {{{text}}}\n")
+    return load_hardware_config(file).limits
+
+
 def test_limits_change_only_by_name(tmp_path):
-    file = tmp_path / "limits.yaml"
-    file.write_text("force: 80.0\n")
-    limits = load_limits(file)
+    limits = limits_of("force: 80.0", tmp_path)
     assert limits == dc.replace(SafetyLimits(), force=80.0)
     assert loosened(limits) == ["force: 80.0"]
     assert loosened(SafetyLimits()) == []
-    file.write_text("forse: 80.0\n")
     with pytest.raises(ConfigurationError, match="force"):
-        load_limits(file)
-    file.write_text("joint_step: 0.001\n")
+        limits_of("forse: 80.0", tmp_path)
     with pytest.raises(ConfigurationError, match="less than a stop needs"):
-        load_limits(file)
+        limits_of("joint_step: 0.001", tmp_path)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, -7.0, 1e6])
-def test_a_limit_that_nothing_breaks_is_refused(value):
+def test_a_limit_that_nothing_breaks_is_refused(value, tmp_path):
     for field in dc.fields(SafetyLimits):
         default = getattr(SafetyLimits(), field.name)
         wrong = value
@@ -347,7 +351,7 @@ def test_a_limit_that_nothing_breaks_is_refused(value):
             make_layer(**{field.name: wrong})
         text = f"{field.name}: {wrong}".replace("nan", ".nan").replace("inf", ".inf")
         with pytest.raises(ConfigurationError, match=field.name):
-            load_limits(None, f"{{{text}}}")
+            limits_of(text, tmp_path)
 
 
 @pytest.mark.parametrize(

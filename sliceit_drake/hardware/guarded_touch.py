@@ -28,7 +28,9 @@ CONFIRMED = 3
 CLEAR = 1e-3
 """Way after the board is left before the knife goes faster, m."""
 SETTLED = 0.1
+"""Time at the start again, before it ends, s."""
 NO_DATA = 1.0
+"""How long the robot may be silent, s."""
 LEAST_SAMPLES = 3
 PERIOD = 0.002
 """Of an e-Series controller, s."""
@@ -87,9 +89,9 @@ class GuardedTouch:
         Raises:
             TouchError: Nothing was touched, or the safety layer stopped the robot.
         """
-        status = self._watch(self._link.latest(), BASELINE)
-        zero = np.mean([state.wrench[:3] for state in self._states], axis=0)
-        noise = float(np.std([np.linalg.norm(s.wrench[:3] - zero) for s in self._states]))
+        forces = np.array([state.wrench[:3] for state in self._watch(BASELINE)])
+        zero = forces.mean(axis=0)
+        noise = float(np.std(np.linalg.norm(forces - zero, axis=1)))
         stop = self._link.arm()
         if stop is not None:
             raise TouchError(str(stop))
@@ -129,12 +131,14 @@ class GuardedTouch:
         if is_up and self._way < 1e-6:
             self._way, self._speed = 0.0, 0.0
 
-    def _watch(self, status: LinkStatus, count: int) -> LinkStatus:
-        self._states: list[RobotState] = []
-        while len(self._states) < count:
+    def _watch(self, count: int) -> list[RobotState]:
+        """The next states of the robot."""
+        status = self._link.latest()
+        states: list[RobotState] = []
+        while len(states) < count:
             status = self._next(status)
-            self._states.append(status.state)
-        return status
+            states.append(status.state)
+        return states
 
     def _next(self, status: LinkStatus) -> LinkStatus:
         """The next state of the robot."""
@@ -170,6 +174,11 @@ def contact_of(rows: np.ndarray, noise: float, config: TouchConfig) -> Touch:
         )
     at_peak = int(force.argmax())
     low, high = max(0.2 * config.force, 3.0 * noise), max(config.force, 0.7 * peak)
+    if low >= high:
+        raise TouchError(
+            f"the force scatters by {noise:.2g} N, too much to tell a contact of {peak:.2g} N: "
+            "find what shakes, or give touch.force a greater value"
+        )
     heights, compliances = [], []
     for way in (slice(at_peak, None, -1), slice(at_peak, None)):
         z, f = _one_contact(height[way], force[way], low, high)

@@ -4,11 +4,10 @@ A limit stands at its default unless the user's YAML names it, so that nobody lo
 """
 
 import dataclasses as dc
-from pathlib import Path
 
-from sliceit_drake.configuration import ConfigurationError, dump_yaml, load_yaml, quantity
+from sliceit_drake.configuration import ConfigurationError, dump_yaml, quantity
 
-__all__ = ["SafetyLimits", "load_limits", "loosened"]
+__all__ = ["SafetyLimits", "loosened"]
 
 JOINTS = 6
 
@@ -152,17 +151,6 @@ class SafetyLimits:
                 field=f"{where}.joint_step",
                 fix="Lower joint_speed or the ages, or raise it.",
             )
-
-
-def load_limits(file: str | Path | None, overrides: str | None = None) -> SafetyLimits:
-    """Reads limits; what the file does not name keeps its default.
-
-    Raises:
-        ConfigurationError: Naming file, field and fix.
-    """
-    limits = load_yaml(SafetyLimits, file, defaults=SafetyLimits(), overrides_text=overrides)
-    assert isinstance(limits, SafetyLimits)
-    return limits
 
 
 def loosened(limits: SafetyLimits) -> list[str]:

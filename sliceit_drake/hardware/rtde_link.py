@@ -22,6 +22,7 @@ POLL = 1e-4
 SLOW_CALL = 0.05
 """A call that sends a target and takes longer has reconnected or stands, controller s."""
 FIRST_DATA = 3.0
+"""How long a robot that is connected may be silent, s."""
 STOP_TIME = 2.0
 """How long a stop at the end may take, s."""
 HALT_TIME = 3.0
@@ -97,8 +98,8 @@ class RobotLink:
         self._judged = 0
         self._served: RobotState | None = None  # In whose cycle the last target went out.
         self._armed = self._ending = False
-        # What came and went out in each cycle: state, lateness, target, judged last in it.
         self._task: _Task | None = None
+        # What came and went out in each cycle: state, lateness, target.
         self._log: list[tuple[RobotState, float, list[float] | None]] = []
         self._status: LinkStatus | None = None
         self._changed = threading.Condition()
@@ -353,7 +354,7 @@ class RobotLink:
     def _ask_to_stop(self) -> None:
         try:
             self._client.stop()
-        except RuntimeError as error:
+        except Exception as error:  # Whatever it is, the operator must hear of it.
             # The link is gone; the robot's watchdog stops it. Latched already.
             with self._changed:
-                self.stop_error = str(error)
+                self.stop_error = str(error) or type(error).__name__
