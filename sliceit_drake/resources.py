@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pydrake.multibody.parsing import Parser
 
-__all__ = ["MODEL_PACKAGE", "add_package_map", "load_module", "named_yaml", "resource_path"]
+__all__ = ["add_package_map", "file_or_resource", "load_module", "named_yaml", "resource_path"]
 
-MODEL_PACKAGE = "sliceit_drake_models"
+_MODEL_PACKAGE = "sliceit_drake_models"
 FOLDERS = ("calibration", "hardware", "models", "scenarios")
 
 _PACKAGE = Path(__file__).resolve().parent
@@ -49,6 +49,24 @@ def resource_path(relative: str) -> Path:
     return path
 
 
+def file_or_resource(path: str) -> Path | None:
+    """The file at a path from the working directory, or else from the resources.
+
+    Args:
+        path: As a user writes it.
+
+    Returns:
+        The file, or None where there is none at either.
+    """
+    if Path(path).is_file():
+        return Path(path)
+    try:
+        file = resource_path(path)
+    except (FileNotFoundError, ValueError):
+        return None
+    return file if file.is_file() else None
+
+
 def named_yaml(name: str | Path, folder: str) -> Path | None:
     """The YAML file that a user means by a file name, or by the name of one that ships.
 
@@ -73,8 +91,8 @@ def add_package_map(parser: "Parser") -> None:
         parser: A Drake parser; its package map gains our package unless it has it already.
     """
     package_map = parser.package_map()
-    if not package_map.Contains(MODEL_PACKAGE):
-        package_map.Add(MODEL_PACKAGE, str(resource_path("models")))
+    if not package_map.Contains(_MODEL_PACKAGE):
+        package_map.Add(_MODEL_PACKAGE, str(resource_path("models")))
 
 
 def _resource_root() -> Path:

@@ -151,3 +151,11 @@ def test_what_slices_left_can_be_cut_once_more_obliquely():
     split = split_mesh(mesh, CutPlane(np.zeros(3), normal, UP))
     assert split.volumes().sum() == pytest.approx(mesh.volumes().sum(), rel=1e-12)
     assert np.unique(bodies(split.tetrahedra)).size == 2
+
+
+@pytest.mark.parametrize(
+    ("divisions", "field"), [([8], "shape.divisions"), ([8, 0], r"shape.divisions\[1\]")]
+)
+def test_divisions_of_a_box_that_make_no_mesh_are_refused(divisions, field):
+    with pytest.raises(ConfigurationError, match=f"{field}: .*Give"):
+        validate(Box(divisions=divisions), "shape")

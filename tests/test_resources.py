@@ -46,6 +46,20 @@ def test_paths_outside_the_shipped_folders_are_refused(path):
         resources.resource_path(path)
 
 
+def test_a_file_here_goes_before_one_of_the_same_path_that_ships(tmp_path, monkeypatch):
+    path = "scenarios/cucumber.yaml"
+    monkeypatch.chdir(tmp_path)
+    assert resources.file_or_resource(path) == ROOT / path
+    (tmp_path / "scenarios").mkdir()
+    (tmp_path / path).touch()
+    assert resources.file_or_resource(path) == Path(path)
+
+
+@pytest.mark.parametrize("path", ["", "scenarios", "scenarios/none.yaml", "elsewhere.yaml"])
+def test_where_there_is_no_file_there_is_none(path):
+    assert resources.file_or_resource(path) is None
+
+
 def test_package_uris_load_through_drake_and_the_map_may_be_added_twice():
     plant = MultibodyPlant(1e-3)
     parser = Parser(plant)

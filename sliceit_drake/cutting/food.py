@@ -21,7 +21,7 @@ from sliceit_drake.cutting.mesh import (
 from sliceit_drake.cutting.model import CuttingModel, Numerics, make_cutting_model
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.split import CutPlane
-from sliceit_drake.resources import resource_path
+from sliceit_drake.resources import file_or_resource
 
 __all__ = [
     "Box",
@@ -85,7 +85,9 @@ class Box:
     size: list[float] = quantity(
         [0.027, 0.12, 0.027], "m", low=2e-3, high=1.0, size=3, doc="Extent along x, y, z."
     )
-    divisions: list[int] = dc.field(default_factory=lambda: [8, 8])
+    divisions: list[int] = quantity(
+        [8, 8], "", low=1, high=1000, size=2, doc="Elements along x and along z."
+    )
     layers: list[float] = quantity(
         [0.0, 2.8e-3, 6.4e-3, 12e-3],
         "m",
@@ -235,16 +237,14 @@ class MeshFile:
         Raises:
             MeshError: There is none.
         """
-        if Path(self.path).is_file():
-            return Path(self.path)
-        try:
-            return resource_path(self.path)
-        except (FileNotFoundError, ValueError):
+        file = file_or_resource(self.path)
+        if file is None:
             raise MeshError(
                 f"food.shape.path: {self.path} cannot be read as a mesh: there is no such file, "
                 f"neither beside the scenario, nor in {Path.cwd()}, nor among the resources. "
                 "Correct the path."
-            ) from None
+            )
+        return file
 
     def mesh(self, refinement: float = 1.0) -> TetrahedralMesh:
         """The mesh in F, without vertices that no tetrahedron uses.

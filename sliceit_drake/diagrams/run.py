@@ -33,7 +33,7 @@ from sliceit_drake.diagrams.snapshot import Snapshot, take_snapshot
 from sliceit_drake.diagrams.station import SlicingStation
 from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
-from sliceit_drake.resources import resource_path
+from sliceit_drake.resources import file_or_resource
 from sliceit_drake.systems.cutting_system import ENERGY_NAMES, LEDGER_NAMES, CuttingSystem
 
 if TYPE_CHECKING:
@@ -211,16 +211,13 @@ def measured_profile(scenario: Scenario) -> ForceProfile | None:
     """
     if scenario.measurement is None:
         return None
-    file = Path(scenario.measurement.file)
-    if not file.exists():
-        try:
-            file = resource_path(scenario.measurement.file)
-        except (FileNotFoundError, ValueError):
-            raise ConfigurationError(
-                f'there is no file "{scenario.measurement.file}", neither here nor in the package',
-                field="scenario.measurement.file",
-                fix="Give a force profile such as those in calibration/measured.",
-            ) from None
+    file = file_or_resource(scenario.measurement.file)
+    if file is None:
+        raise ConfigurationError(
+            f'there is no file "{scenario.measurement.file}", neither here nor in the package',
+            field="scenario.measurement.file",
+            fix="Give a force profile such as those in calibration/measured.",
+        )
     return load_force_profile(file)
 
 

@@ -2,12 +2,11 @@
 
 import dataclasses as dc
 import json
-from pathlib import Path
 
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.resources import resource_path
+from sliceit_drake.resources import file_or_resource
 from sliceit_drake.systems.agent import ACTIONS, AgentConfig, Decide, observation_names
 
 __all__ = ["LAYOUT", "layout_of", "load_network"]
@@ -40,16 +39,13 @@ def load_network(config: AgentConfig) -> Decide:
     import onnxruntime
 
     field = "scenario.policy.network"
-    file = Path(config.network)
-    if not config.network or not file.is_file():
-        try:
-            file = resource_path(config.network)
-        except (FileNotFoundError, ValueError):
-            raise ConfigurationError(
-                f"there is no file {config.network!r}, neither here nor in the package",
-                field=field,
-                fix="Give the policy.onnx of a training.",
-            ) from None
+    file = file_or_resource(config.network)
+    if file is None:
+        raise ConfigurationError(
+            f"there is no file {config.network!r}, neither here nor in the package",
+            field=field,
+            fix="Give the policy.onnx of a training.",
+        )
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     try:
