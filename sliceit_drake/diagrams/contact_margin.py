@@ -27,7 +27,6 @@ __all__ = [
     "board_stiffness",
     "check_contact_margin",
     "contact_margin",
-    "food_response",
 ]
 
 LEAST_MARGIN = 2.0
@@ -114,7 +113,7 @@ def contact_margin(station: SlicingStation) -> ContactMargin:
 def _bearable_response(solver: CuttingSolver, offset: float) -> list[np.ndarray] | None:
     for speed in APPROACH_SPEEDS:
         with contextlib.suppress(CuttingError):
-            return food_response(solver, speed, offset)
+            return _food_response(solver, speed, offset)
     return None
 
 
@@ -126,7 +125,7 @@ def board_stiffness(board: Board, knife: Knife, R_WK: np.ndarray) -> np.ndarray:
     return board.stiffness / len(x) * rows.T @ rows
 
 
-def food_response(solver: CuttingSolver, speed: float, offset: float = 0.0) -> list[np.ndarray]:
+def _food_response(solver: CuttingSolver, speed: float, offset: float = 0.0) -> list[np.ndarray]:
     """How the food answers small motions of the blade in it, at several depths.
 
     The blade moves within one exchange and then rests. Of both senses of a direction, that which
@@ -150,7 +149,7 @@ def food_response(solver: CuttingSolver, speed: float, offset: float = 0.0) -> l
     R = model.X_FC_rotation.T @ X_FK.R
     p = model.X_FC_rotation.T @ (X_FK.p - model.X_FC_position)
     state = solver.initial_state()
-    height = p[2] - model.split.points[:, 2].min()
+    height = p[2] - model.bottom
     step = speed * solver.exchange_period
     responses, depth, pose = [], -step, Pose(R, p + [0.0, 0.0, step])
     for share in DEPTHS:

@@ -29,8 +29,6 @@ __all__ = [
     "BoxRun",
     "Check",
     "FactorRow",
-    "SpringContact",
-    "approach_time",
     "box_table",
     "check_on_station",
     "check_table",
@@ -107,7 +105,7 @@ def stability_limits(
     return np.array(limits)
 
 
-class SpringContact(KnifeForceSystem):
+class _SpringContact(KnifeForceSystem):
     """A linear spring along Wz, slack where the knife starts: the contact of the linear loop.
 
     Args:
@@ -151,7 +149,7 @@ def station_growth(scenario: Scenario, stiffness: float, duration: float = 2.0) 
         "station",
         MakeSlicingStation(
             scenario,
-            make_cutting=lambda knife: SpringContact(
+            make_cutting=lambda knife: _SpringContact(
                 stiffness, knife.index(), scenario.exchange_period, height
             ),
         ),
@@ -285,7 +283,7 @@ def run_in_contact(
     return BoxRun(gains, factor, contact, peak, stopped, context.get_time())
 
 
-def approach_time(loop: ContactLoop) -> float:
+def _approach_time(loop: ContactLoop) -> float:
     """Time in which a vertical error falls to 1/e in free air, s; infinite if it grows."""
     if not loop.least_stable_mode().stable:
         return math.inf
@@ -313,7 +311,8 @@ class FactorRow:
         unstable: How many of the 32 corners are unstable in free air, on food of 5 kN/m, and on
             a board of 100 kN/m.
         least_limit: Least stable vertical stiffness over the corners that are stable in air, N/m.
-        approach: `approach_time` at the lowest corner, the middle and the highest corner, s.
+        approach: Time in which a vertical error falls to 1/e in free air, infinite if it grows, at
+            the lowest corner, the middle and the highest corner, s.
     """
 
     factor: float
@@ -346,7 +345,7 @@ def factor_row(factor: float, lag: float, tracking: str = "arm") -> FactorRow:
         unstable += ~np.array(stable)
         if stable[0]:
             limit = min(limit, loop.stiffness_limit(VERTICAL))
-    low, middle, high = (approach_time(loop_of(g)) for g in (box[0], AgentGains(), box[-1]))
+    low, middle, high = (_approach_time(loop_of(g)) for g in (box[0], AgentGains(), box[-1]))
     counts = (int(unstable[0]), int(unstable[1]), int(unstable[2]))
     return FactorRow(factor, lag, tracking, counts, limit, (low, middle, high))
 

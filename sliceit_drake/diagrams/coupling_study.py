@@ -69,7 +69,9 @@ def coupling_study(
         simulate(run)
         if run.stopped:
             raise ConfigurationError(
-                f"the run with an exchange of {exchange:g} s broke off: {run.stopped}"
+                f"the run with an exchange of {exchange:g} s broke off: {run.stopped}",
+                field="scenario",
+                fix="Give a scenario that `sliceit simulate` runs to its end at this exchange.",
             )
         record = run.record()
         results.append((record, float(record["time"][-1] / run.wall_time)))

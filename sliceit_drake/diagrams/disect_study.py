@@ -18,14 +18,7 @@ from sliceit_drake.diagrams.comparison import compare_with_measurement
 from sliceit_drake.diagrams.measured_curves import MeasuredFood
 from sliceit_drake.records.force_profile import ForceProfile
 
-__all__ = [
-    "STEPS",
-    "Curve",
-    "Difference",
-    "DisectStudy",
-    "MeasuredCurves",
-    "disect_study",
-]
+__all__ = ["STEPS", "Curve", "Difference", "DisectStudy", "MeasuredCurves", "disect_study"]
 
 STEPS = 20
 """How often `disect_study` reports progress, besides once a food."""
@@ -143,7 +136,7 @@ def disect_study(
     differences = _differences(reference, opening_case, full_case, opening, full, laws, run)
     measured = []
     for food in foods:
-        measured.append(measured_curves(food, reference))
+        measured.append(_measured_curves(food, reference))
         progress()
     return DisectStudy(reference, fit, runs, delays, laws, opening, full, differences, measured)
 
@@ -337,7 +330,7 @@ def _differences(
     ]
 
 
-def measured_curves(case: MeasuredFood, reference: Reference) -> MeasuredCurves:
+def _measured_curves(case: MeasuredFood, reference: Reference) -> MeasuredCurves:
     """A measured cut with DiSECt's curve, the full model's, and the opening law's.
 
     The opening law's contact stiffness is the one that brings its sum of norms nearest to DiSECt's

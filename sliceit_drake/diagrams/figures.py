@@ -11,7 +11,7 @@ from sliceit_drake.diagrams.snapshot import Snapshot, draw_snapshot
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["plot_force"]
+__all__ = ["BOARD_PHASE", "CONTACT_THRESHOLD", "SIMULATED", "plot_force"]
 
 # Okabe and Ito's palette: distinct for colour-blind readers and in grey.
 SIMULATED = "#0072B2"
@@ -20,6 +20,7 @@ MEASURED = "#000000"
 FOOD_PHASE = "#009E73"
 BOARD_PHASE = "#E69F00"
 CONTACT_THRESHOLD = 0.05
+"""Force from which knife and food, or knife and board, count as touching, N."""
 
 
 def plot_force(

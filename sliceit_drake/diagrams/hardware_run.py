@@ -24,7 +24,7 @@ from sliceit_drake.diagrams.plan_check import JointPlan, check_plan, plan_joints
 from sliceit_drake.diagrams.run import Run, measured_profile, write_outputs
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
-from sliceit_drake.diagrams.station import MakeSlicingStation, SlicingStation
+from sliceit_drake.diagrams.station import FRAMES_PER_SECOND, MakeSlicingStation, SlicingStation
 from sliceit_drake.hardware.checks import (
     Check,
     check_facts,
@@ -43,8 +43,9 @@ __all__ = ["HardwareRun", "prepare_hardware_run", "steady_python", "write_hardwa
 
 SENSOR_SAMPLES = 50
 WARM_UP = 0.05
+"""Simulated in another context before the run, s."""
 NO_DATA = 1.0
-FRAMES_PER_SECOND = 32
+"""Controller time without data after which a run ends, s."""
 
 
 @dc.dataclass
@@ -253,7 +254,7 @@ def prepare_hardware_run(
 def write_hardware_outputs(hardware: HardwareRun, directory: Path) -> dict:
     """Writes the files of `run.write_outputs` from what the robot measured.
 
-    And robot.csv: what came and what went out in every cycle, braking included; robot.json in the
+    And robot.csv: what came and what went out in every cycle, braking included; `robot` in the
     summary has the timing. The replay shows the measured motion; the food in it is not cut.
 
     Returns:

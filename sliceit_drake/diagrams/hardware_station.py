@@ -33,7 +33,9 @@ from sliceit_drake.systems.servo import JOINTS
 from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
 
 __all__ = [
+    "PERIOD",
     "HardwareStation",
+    "KnifeEstimate",
     "MakeHardwareStation",
     "make_knife_kinematics",
     "make_safety_layer",

@@ -9,11 +9,12 @@ from collections.abc import Mapping
 from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator
 
-__all__ = ["LiveControls", "viewing_instructions", "wait_for_browser"]
+__all__ = ["FASTEST", "LiveControls", "viewing_instructions", "wait_for_browser"]
 
 SPEED = "speed"
 STOP = "stop"
 FASTEST = 2.0
+"""Right end of the slider, in times real time: no limit."""
 
 
 class LiveControls:

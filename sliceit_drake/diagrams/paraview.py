@@ -27,7 +27,7 @@ __all__ = ["FORMATS", "FoodFrames", "write_series"]
 
 FORMATS = ("vtu", "xdmf")
 
-WRENCHES = ("food_wrench", "board_wrench", "sensor_wrench")
+WRENCHES = ("food", "board", "sensor")
 
 
 @dc.dataclass
@@ -209,7 +209,7 @@ class _Parts:
                 first[:, 3][None],
                 {"vertex": np.zeros((1, 1), dtype=np.int64)},
                 {
-                    f"{name[:-7]}_{what}": self._record.vector(f"{name}_{letter}")[row][None]
+                    f"{name}_{what}": self._record.vector(f"{name}_wrench_{letter}")[row][None]
                     for name in WRENCHES
                     for what, letter in (("force", "f"), ("moment", "m"))
                 }

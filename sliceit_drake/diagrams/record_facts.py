@@ -21,7 +21,8 @@ def knife_facts(knife: Knife) -> KnifeFacts:
 
 
 def shape_facts(food: Food) -> tuple[str, list[float] | None]:
-    """`FoodFacts.shape` and `FoodFacts.size` of a food, metres; "unknown" and None for a mesh."""
+    """`FoodFacts.shape` and `FoodFacts.size` of a food, metres; "unknown" and None for
+    a shape that records do not know."""
     shape = food.shape
     if isinstance(shape, Cylinder):
         return "cylinder", [shape.diameter, shape.length, shape.diameter]

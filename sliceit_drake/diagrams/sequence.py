@@ -168,8 +168,9 @@ class SliceSequence:
                 fix=f"{fix}, or a longer food.shape.",
             )
         for each in self.foods(food):
+            assert isinstance(each.shape, Remainder)
             try:
-                each.shape.check("") if isinstance(each.shape, Remainder) else None
+                each.shape.check("")
             except ConfigurationError as error:
                 name = (error.field or "").removeprefix(".")
                 raise ConfigurationError(

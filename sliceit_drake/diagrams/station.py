@@ -45,9 +45,10 @@ from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
 from sliceit_drake.systems.wrench_sensor import WrenchSensor
 from sliceit_drake.systems.wrench_visualizer import WrenchVisualizer
 
-__all__ = ["MakeSlicingStation", "SlicingStation"]
+__all__ = ["FRAMES_PER_SECOND", "MakeSlicingStation", "SlicingStation"]
 
 FRAMES_PER_SECOND = 32
+"""Of what is drawn and of replays; fewer where a replay would be too large."""
 # A browser opens no more than 20 MB with ease: 3 MB are the arm, the rest is for frames. What is
 # drawn beside the food takes this much a frame.
 REPLAY_SIZE = 16e6

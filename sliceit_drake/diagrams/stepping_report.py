@@ -108,7 +108,11 @@ def station_steps(
         run = prepare_run(case)
         simulate(run)
         if run.stopped and not results:
-            raise ConfigurationError(f"the run with a step of {step:g} s broke off: {run.stopped}")
+            raise ConfigurationError(
+                f"the run with a step of {step:g} s, the reference, broke off: {run.stopped}",
+                field="scenario",
+                fix="Give a scenario that `sliceit simulate` runs to its end.",
+            )
         record = run.record()
         force, path = record.vector("food_wrench_f"), record.vector("knife_pose_p")
         if not results:

@@ -17,8 +17,6 @@ __all__ = [
     "EDGE_CASES",
     "FRICTION_CASES",
     "Limit",
-    "REFERENCES",
-    "check_physics",
     "cucumber",
     "food_numbers",
     "limits",
@@ -35,7 +33,8 @@ BEAM = (2, 4, 8)
 DEPTH = 0.0265
 COARSE = 0.5
 """Refinement of the first food's cut that a test repeats."""
-REFERENCES = {"DiSECt": "the authors' calibrated DiSECt", "spring": "the authors' spring"}
+REFERENCES = ("DiSECt", "spring")
+"""Curves beside the measured one that its record holds, both by the paper's authors."""
 
 CHECKS = 4 + len(EDGE_CASES) + len(FRICTION_CASES) + len(REFINEMENTS) + len(DIVISORS)
 """How often `run_verification` reports progress, besides once a food."""
@@ -62,7 +61,7 @@ def run_verification(
     Raises:
         CuttingError: A food cannot be cut.
     """
-    results = check_physics(progress)
+    results = _check_physics(progress)
     results["coarse"] = food_numbers(foods[0], cut_measured_food(foods[0], COARSE))
     results["foods"] = []
     cuts = []
@@ -74,7 +73,7 @@ def run_verification(
     return results, cuts
 
 
-def check_physics(progress: Callable[[], None] = lambda: None) -> dict[str, Any]:
+def _check_physics(progress: Callable[[], None]) -> dict[str, Any]:
     """The results that need no measured food; see `run_verification`."""
 
     def done(result: Any) -> Any:

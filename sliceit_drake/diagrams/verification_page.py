@@ -12,7 +12,7 @@ from sliceit_drake.diagrams.verification import limits
 __all__ = ["plot_convergence", "plot_measured_cuts", "verification_page"]
 
 COMMAND = "sliceit study verification --output docs/verification.md"
-CURVES = {"measured": "measured", "DiSECt": "DiSECt", "spring": "spring", "ours": "ours"}
+CURVES = ("measured", "DiSECt", "spring", "ours")
 
 PAGE = """\
 # Verification
@@ -226,11 +226,11 @@ def verification_page(results: Mapping[str, Any]) -> str:
             for h, (error, order) in zip(step["size"], _errors(step), strict=True)
         ),
         curves=_rows(
-            (food["name"] if name == "measured" else "", label)
+            (food["name"] if name == "measured" else "", name)
             + ("-" if name == "measured" else f"{curve['rms']:.2f}", f"{curve['peak']:.1f}")
             + (f"{curve['work']:.0f}",)
             for food in foods
-            for name, label in CURVES.items()
+            for name in CURVES
             for curve in [food["curves"][name]]
         ),
         parameters=_rows(

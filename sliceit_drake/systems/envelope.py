@@ -8,10 +8,10 @@ from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan, Segmen
 
 __all__ = ["envelope", "envelope_time"]
 
-Corners = Sequence[tuple[float, float]]
+_Corners = Sequence[tuple[float, float]]
 
 
-def envelope(corners: Corners, speed: float, duration: float, label: str) -> MotionPlan:
+def envelope(corners: _Corners, speed: float, duration: float, label: str) -> MotionPlan:
     """Straight from corner to corner, then at rest.
 
     Args:
@@ -28,12 +28,12 @@ def envelope(corners: Corners, speed: float, duration: float, label: str) -> Mot
     return MotionPlan([*way, Hold(left, label=label)] if left > 1e-9 else way)
 
 
-def envelope_time(corners: Corners, speed: float) -> float:
+def envelope_time(corners: _Corners, speed: float) -> float:
     """How long the way through the corners takes, s; arguments as of `envelope`."""
     return sum(distance for *_, distance in _legs(corners)) / speed
 
 
-def _legs(corners: Corners) -> list[tuple[float, float, float]]:
+def _legs(corners: _Corners) -> list[tuple[float, float, float]]:
     legs = []
     for (x, z), (a, b) in itertools.pairwise([(0.0, 0.0), *corners]):
         distance = math.hypot(a - x, b - z)

@@ -102,7 +102,7 @@ class PolicyConfig:
     """A policy in a scenario, how often it decides, and what it may do at most."""
 
     decide: PressByForce = dc.field(default_factory=PressByForce)
-    """The policy, by its parameters. One that a network decides joins here."""
+    """The policy, by its parameters; one that a network decides is an `AgentConfig`."""
     period: float = quantity(0.05, "s", low=0.002, high=1.0, doc="Between two decisions.")
     history: int = quantity(3, "", low=1, high=100, doc="Wrenches that it sees, one a decision.")
     duration: float = quantity(3.0, "s", low=0.05, high=600.0, doc="Of the run.")

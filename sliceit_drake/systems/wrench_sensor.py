@@ -167,6 +167,7 @@ class WrenchSensor(LeafSystem):
             raise ConfigurationError(
                 f"exchange period {exchange_period:.6g} s is not a whole number of plant steps of "
                 f"{step:.6g} s",
+                field="exchange_period and robot.plant_time_step",
                 fix="Change one of the two.",
             )
         if plant.has_sampled_output_ports():
