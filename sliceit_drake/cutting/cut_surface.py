@@ -17,6 +17,9 @@ import numpy as np
 
 __all__ = ["EdgeTables", "depth_below", "distance_inside", "edge_tables"]
 
+OVERSAMPLING = 8
+"""Exact line integrals that are averaged into each grid point of the tables."""
+
 
 @dc.dataclass
 class EdgeTables:
@@ -58,16 +61,13 @@ class EdgeTables:
         return np.asarray(self.outline[0] - upper + lower - self.outline[1]) / thickness
 
 
-def edge_tables(
-    points: np.ndarray, triangles: np.ndarray, grid: int = 97, oversampling: int = 8
-) -> EdgeTables:
+def edge_tables(points: np.ndarray, triangles: np.ndarray, grid: int = 97) -> EdgeTables:
     """Integrates the hat functions along horizontal lines.
 
     Args:
         points: Cut points [P, 2], (x along the edge, z up), metres.
         triangles: The section triangulated by cut points [M, 3].
         grid: Grid points of the tables.
-        oversampling: Exact line integrals averaged into each grid point.
     """
     corner = points[triangles]
     x, z = corner[..., 0], corner[..., 1]
@@ -79,7 +79,7 @@ def edge_tables(
 
     reach = 1.02 * float(np.ptp(z, axis=1).max())
     spacing = 2.0 * reach / (grid - 1)
-    fine = np.linspace(-reach - 0.5 * spacing, reach + 0.5 * spacing, grid * oversampling + 1)
+    fine = np.linspace(-reach - 0.5 * spacing, reach + 0.5 * spacing, grid * OVERSAMPLING + 1)
     fine = 0.5 * (fine[1:] + fine[:-1])
     width = np.zeros((len(points), grid))
     for k in range(3):
@@ -97,7 +97,7 @@ def edge_tables(
             high = np.where(crosses, np.maximum(high, crossing), high)
             hat += np.where(crosses, (1.0 - w) * (k == u) + w * (k == v), 0.0)
         chord = np.where(high > low, high - low, 0.0)
-        carried = (chord * 0.5 * hat).reshape(len(triangles), grid, oversampling).mean(-1)
+        carried = (chord * 0.5 * hat).reshape(len(triangles), grid, OVERSAMPLING).mean(-1)
         np.add.at(width, triangles[:, k], carried)
 
     # A point between two lines carries all of its area at its own height, so that it too is cut.

@@ -86,15 +86,12 @@ class Optimum:
     converged: bool
 
 
-def mean_force(
-    adjoint: SliceAdjoint, motion: PressAndDraw, clearance: float = CLEARANCE
-) -> tuple[float, np.ndarray]:
+def mean_force(adjoint: SliceAdjoint, motion: PressAndDraw) -> tuple[float, np.ndarray]:
     """Mean over the depth of the norm of the food's force, and its derivatives.
 
     Args:
         adjoint: Of the cut.
-        motion: From `clearance` above the food to its bottom; its ramps are left out.
-        clearance: m.
+        motion: From `CLEARANCE` above the food to its bottom; its ramps are left out.
 
     Returns:
         Mean, N, and its derivatives by amplitude, frequency and press speed [3].
@@ -104,13 +101,13 @@ def mean_force(
     """
     model, period = adjoint.model, adjoint.exchange_period
     A, omega, v = motion.amplitude, 2.0 * np.pi * motion.frequency, motion.press_speed
-    way = model.top - model.bottom + clearance
+    way = model.top - model.bottom + CLEARANCE
     exchanges = way / v / period
     time = period * np.arange(int(np.ceil(exchanges)) + 1)
     middle = 0.5 * float(model.nodes[:, 0].min() + model.nodes[:, 0].max())
     p = np.zeros((len(time), 3))
     p[:, 0] = middle + A * np.sin(omega * time)
-    p[:, 2] = model.top + clearance - v * time
+    p[:, 2] = model.top + CLEARANCE - v * time
     # In C the edge points down and x stays along it.
     R = np.tile(np.diag([1.0, -1.0, -1.0]), (len(time), 1, 1))
     run = adjoint.run(R, p)

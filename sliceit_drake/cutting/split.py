@@ -3,7 +3,7 @@
 Each tetrahedron with material on one side of the plane gets a copy for that side, which refers to
 that side's copies of its vertices and holds the share of the volume on its side (Molino, Bao and
 Fedkiw 2004; Sifakis, Der and Fedkiw 2007). Nothing is moved, so volume, mass and section are
-conserved for any plane. A vertex within `snap` of the plane counts as on it. No sliver is merged:
+conserved for any plane. A vertex within `SNAP` of the plane counts as on it. No sliver is merged:
 its bulk stiffness and its mass shrink alike, but the stiffness of bonds, flanks and edge at its
 surface does not, nor does the force of the edge on it; `model.SLIVER` and `geometry.LEAST_SHARE`
 say what becomes of it, benchmarks/split_step_limit.py what that leaves of the step limit.
@@ -16,6 +16,9 @@ import numpy as np
 from sliceit_drake.cutting.mesh import MeshError, TetrahedralMesh
 
 __all__ = ["CutPlane", "SplitMesh", "split_mesh"]
+
+SNAP = 1e-6
+"""Share of the mean edge length by which a vertex may be off the plane and counts as on it."""
 
 
 @dc.dataclass
@@ -161,13 +164,12 @@ def _side_parts(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(whole, 1.0, share), np.where(whole[:, None], 0.25, centroid)
 
 
-def split_mesh(mesh: TetrahedralMesh, plane: CutPlane, snap: float = 1e-6) -> SplitMesh:
+def split_mesh(mesh: TetrahedralMesh, plane: CutPlane) -> SplitMesh:
     """Splits a mesh by a plane.
 
     Args:
         mesh: The mesh, checked.
         plane: The cut plane, in the mesh's frame.
-        snap: A vertex nearer to the plane than this share of the mean edge length lies on it.
 
     Returns:
         The two halves in the frame of the cut.
@@ -179,7 +181,7 @@ def split_mesh(mesh: TetrahedralMesh, plane: CutPlane, snap: float = 1e-6) -> Sp
     vertices = (mesh.vertices - np.asarray(plane.point, float)) @ R_FC
     t0 = mesh.tetrahedra
     y = vertices[:, 1].copy()
-    y[np.abs(y) <= snap * mesh.mean_edge_length()] = 0.0
+    y[np.abs(y) <= SNAP * mesh.mean_edge_length()] = 0.0
     h = y[t0]
     if not (y > 0.0).any() or not (y < 0.0).any():
         raise MeshError(

@@ -43,13 +43,13 @@ class ServoCase:
 
 
 def servo_study(
-    configs: Sequence[ServoConfig], on_progress: Callable[[int, int], None] | None = None
+    configs: Sequence[ServoConfig], progress: Callable[[int, int], None] | None = None
 ) -> list[ServoCase]:
     """Moves the arm without food, by a ramp and by a step of all joints, from its start posture.
 
     Args:
         configs: The servos.
-        on_progress: Called with the runs done and their number after each; there are two a servo.
+        progress: Called with the runs done and their number after each; there are two a servo.
 
     Returns:
         What was measured, in the order of `configs`.
@@ -62,13 +62,13 @@ def servo_study(
     cases = []
     for k, config in enumerate(configs):
         times, q, q_servo = _respond(config, ramp)
-        if on_progress is not None:
-            on_progress(2 * k + 1, 2 * len(configs))
+        if progress is not None:
+            progress(2 * k + 1, 2 * len(configs))
         ramp_lag = np.abs(times[-1] - (q[-1] - start) / SPEED).max()
         arm_lag = np.abs((q_servo[-1] - q[-1]) / SPEED).max()
         times, q, _ = _respond(config, step)
-        if on_progress is not None:
-            on_progress(2 * k + 2, 2 * len(configs))
+        if progress is not None:
+            progress(2 * k + 2, 2 * len(configs))
         response = (q - start) / STEP
         late = times[(np.abs(response - 1.0) > 0.02).any(axis=1)][-1]
         cases.append(

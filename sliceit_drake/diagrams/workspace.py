@@ -41,15 +41,14 @@ def add_board(plant: MultibodyPlant, board: Board, X_WF: RigidTransform) -> None
         _draw(plant, _standing_at(X_WF, 0.5 * underside), feet, "board_feet", BOARD_FEET)
 
 
-def add_table(plant: MultibodyPlant, centre: tuple[float, float], height: float = 0.0) -> None:
-    """Draws a table top.
+def add_table(plant: MultibodyPlant, centre: tuple[float, float]) -> None:
+    """Draws a table top at the height of the world's origin.
 
     Args:
         plant: Plant, not finalized, registered with a scene graph.
         centre: Middle of the table in the world, x and y, metres.
-        height: Height of its upper side in the world, metres.
     """
-    X_WT = RigidTransform([*centre, height - 0.5 * TABLE_SIZE[2]])
+    X_WT = RigidTransform([*centre, -0.5 * TABLE_SIZE[2]])
     _draw(plant, X_WT, Box(*TABLE_SIZE), "table", TABLE)
 
 
