@@ -108,9 +108,8 @@ def sliced(name: str) -> tuple[SliceSequence, Food]:
 @pytest.mark.parametrize("name", SHAPES)
 def test_each_slice_takes_its_volume_from_what_is_left_and_has_its_section(name):
     sequence, food = sliced(name)
-    bodies = [each.shape for each in sequence.foods(food)]
     left = []
-    for body in bodies:
+    for body in (each.shape for each in sequence.foods(food)):
         mesh = body.mesh()
         mesh.check()
         split = split_mesh(mesh, CutPlane(np.zeros(3), np.array([0.0, 1.0, 0.0]), UP))
