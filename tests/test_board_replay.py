@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.board import impact_peak_loss
+from sliceit_drake.configuration import ConfigurationError, validate
+from sliceit_drake.cutting.board import Board, impact_peak_loss
 from sliceit_drake.cutting.food import Cylinder, Food, make_food_model
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan, Recorded, Retract
 from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
@@ -127,3 +127,8 @@ def test_a_board_too_stiff_for_the_plants_step_is_refused_with_a_step_that_does(
     assert 0.04 < MakeSlicingStation(analytic(1e6, PERIOD / 11)).board_peak_loss <= 0.05
     stiffness = float(refused.value.fix.split("at most ")[1].split(" N")[0])
     assert 0.04 < MakeSlicingStation(analytic(stiffness)).board_peak_loss <= 0.05
+
+
+def test_a_board_without_a_thickness_is_refused():
+    with pytest.raises(ConfigurationError, match=r"board\.size: has 2 values\. Give 3"):
+        validate(Board(size=[0.3, 0.2]), "board")

@@ -32,7 +32,7 @@ class Board:
 
     height: float = quantity(0.05, "m", low=-1.0, high=2.0, doc="Top surface in the world frame.")
     size: list[float] = quantity(
-        [0.30, 0.20, 0.02], "m", low=1e-3, high=2.0, doc="Extent along x, y and thickness."
+        [0.30, 0.20, 0.02], "m", low=1e-3, high=2.0, size=3, doc="Extent along x, y and thickness."
     )
     stiffness: float = quantity(
         3e4, "N/m", low=1e2, high=1e8, doc="Force over penetration of the whole edge."

@@ -43,6 +43,7 @@ class Numerics:
         2.5e-4, "s", low=1e-7, high=5e-3, doc="Sub-step; must divide the exchange period."
     )
     mass_scaling: bool = True
+    """Whether masses are raised where the step asks for it; else a step too long is refused."""
     stability_margin: float = quantity(
         0.8, "", low=0.1, high=0.95, doc="Step over the Gershgorin stability limit."
     )
@@ -81,6 +82,7 @@ class Numerics:
     )
     precision: str = choice("float32", ("float32", "float64"), doc="Arithmetic of the kernels.")
     device: str = "cpu"
+    """Of Warp's: "cpu", "cuda" or "cuda:1"."""
 
 
 @dc.dataclass

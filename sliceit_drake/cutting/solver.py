@@ -89,7 +89,7 @@ class Energies:
 
     Attributes:
         elastic: Of the bulk.
-        interface: Of bonds, contacts, friction anchors and the edge's unloading.
+        interface: Of bonds, contacts, friction anchors, the edge's unloading and the bent blade.
         kinetic: Of the stepped (scaled) mass.
         least_volume_ratio: Smallest J of all elements.
         least_element: Its element.
