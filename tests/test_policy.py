@@ -9,7 +9,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.motion import Motion, Pose
-from sliceit_drake.diagrams.run import prepare_run, simulate
+from sliceit_drake.diagrams.run import prepare_run, simulate, write_outputs
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.policy import (
@@ -144,3 +144,13 @@ def test_a_scenario_runs_by_a_policy_and_its_record_has_the_target_of_the_run():
     # Slower in the food than in the air, where the sensor feels the tool's inertia alone.
     speed = np.gradient(depth, record["time"])
     assert speed[40] == pytest.approx(0.03, rel=0.01) and speed[350] < 0.85 * 0.03
+
+
+def test_the_summary_of_a_policys_run_estimates_no_error_on_a_motion_that_was_not_run(tmp_path):
+    overrides = """{food: {shape: !Cylinder {rings: 2, layers: [0.0, 0.006, 0.0125]}},
+      policy: {press: 0.001, draw: 0.0, duration: 0.05}}"""
+    run = prepare_run(load_scenario(POLICY, overrides))
+    simulate(run)
+    assert run.stopped is None
+    summary = write_outputs(run, tmp_path, None)
+    assert summary["elements"] > 0 and summary["discretization_error"] is None

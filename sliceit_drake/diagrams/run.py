@@ -394,7 +394,8 @@ def _cutting_summary(run: Run, record: Record) -> dict:
     if scenario.sequence is not None:
         summary["slices"] = [dc.asdict(r) for r in slice_reports(record, station.cutting)]
     summary["discretization_error"] = None
-    if run.stopped is None:
+    # Of a policy the prescribed motion is not known, and it would decide otherwise on another mesh.
+    if run.stopped is None and scenario.policy is None:
         try:
             error = estimate_discretization_error(
                 food,
