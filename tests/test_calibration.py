@@ -8,6 +8,7 @@ import numpy as np
 import optuna
 import pytest
 
+from sliceit_drake.calibration import calibrate as calibrate_module
 from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate
 from sliceit_drake.calibration.oscillation import Oscillation, fit_oscillation
 from sliceit_drake.calibration.per_point import fit_points
@@ -234,6 +235,23 @@ def test_a_storage_with_other_parameters_is_refused(records, tmp_path):
     other.parameters[0].high = 900.0
     with pytest.raises(ConfigurationError, match="other parameters"):
         search(Predictor(other, records[:1]), study, 8, seed=1)
+
+
+def test_a_record_that_is_fitted_and_held_out_is_refused_before_anything_is_computed(
+    records, tmp_path
+):
+    with pytest.raises(ConfigurationError, match="slice_000 is fitted and held out") as error:
+        calibrate(coarse_setup(), records, tmp_path, held_out=records[:1])
+    assert error.value.field == "--hold-out" and not list(tmp_path.iterdir())
+
+
+def test_a_held_out_record_may_have_a_parameter_that_no_fitted_one_has(records):
+    fitted = Predictor(coarse_setup(), records[:1], workers=1)
+    other = copy.deepcopy(records[1])
+    other.metadata.unknown.append("motion.speed")
+    held_out = Predictor(coarse_setup(), [other], workers=1)
+    (error,) = calibrate_module._held_out(held_out, fitted, fitted.start).values()
+    assert np.isfinite(error)
 
 
 def test_a_calibration_recovers_what_made_the_records_within_its_intervals(records, tmp_path):

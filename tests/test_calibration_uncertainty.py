@@ -17,7 +17,7 @@ from sliceit_drake.calibration.coverage import (
     synthetic_predictor,
 )
 from sliceit_drake.calibration.gauss_newton import gauss_newton
-from sliceit_drake.calibration.held_out import blocked_error, record_error
+from sliceit_drake.calibration.held_out import blocked_error
 from sliceit_drake.calibration.noise import NoiseModel, group_series
 from sliceit_drake.calibration.posterior import Posterior
 from sliceit_drake.calibration.prediction import Parameter
@@ -314,23 +314,6 @@ def test_held_out_blocks_of_depth_show_an_overfit_and_fitted_error_does_not():
         errors.append((held.fitted, held.rms))
     assert errors[1][0] < 0.5 * errors[0][0]
     assert errors[1][1] > 2.0 * errors[1][0]
-
-
-def test_a_record_that_is_held_out_has_the_others_height():
-    n = 40
-    time = np.linspace(0.0, 1.0, n)
-    index = np.repeat([0, 1, 2], n)
-
-    def force(unit):
-        return 4.0 * unit[0] * np.tile(time, 3) + unit[1 + index]
-
-    names = ["stiffness", "height_offset:a", "height_offset:b", "height_offset:c"]
-    model = MapModel(force, names, [time] * 3, ["x"] * 3)
-    truth = np.array([0.5, 0.2, 0.4, 0.9])
-    model.measured = force(truth)
-    held = record_error(model, gauss_newton(model, np.full(4, 0.5)).unit)
-    assert held.names == ["a", "b", "c"] and held.fitted < 1e-5
-    assert held.blocks == pytest.approx([0.65 - 0.2, 0.55 - 0.4, 0.9 - 0.3], abs=1e-3)
 
 
 def test_parameters_of_simulated_cuts_are_found_within_their_intervals():

@@ -104,6 +104,8 @@ COMPARED = {
     "coverage.jsonl": "test_readme.py::test_the_page_on_coverage_is_that_of_its_replicates",
     "hidden_effects.json": "test_hidden_effects_page.py::test_the_page_is_made_from_the_runs_and",
     "hidden_effects.jsonl": "test_hidden_effects_page.py::test_the_page_is_made_from_the_runs_and",
+    "slicing_evaluation.jsonl": "test_learning_comparison.py::test_the_page_is_that_of_the_slices",
+    "slicing_results.json": "test_learning_comparison.py::test_the_page_is_that_of_the_slices",
     "verification.json": "test_verification.py::test_page_is_that_of_the_stored_numbers",
 }
 
@@ -122,7 +124,7 @@ def test_the_page_on_coverage_is_that_of_its_replicates(tmp_path, monkeypatch):
     file.write_bytes((ROOT / "docs/coverage.jsonl").read_bytes())
     count = int(re.search(r"--replicates (\d+)", command)[1])
     # All replicates are there, so that none is computed.
-    monkeypatch.setattr(coverage, "run_replicate", None)
+    monkeypatch.setattr(coverage, "_run_replicate", None)
     problem = coverage.Problem()
     results = coverage.coverage_study(problem, count, file)
     assert coverage.coverage_page(problem, results, command) == page

@@ -22,7 +22,7 @@ from sliceit_drake.diagnosis.identifiability import ANGLE, Evidence, NoiseLevel
 from sliceit_drake.diagnosis.identifiability_report import Study, report
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.diagnosis.registry import load_cause
-from sliceit_drake.diagnosis.sensitivity import Sensitivities, sensitivities
+from sliceit_drake.diagnosis.sensitivity import Column, Sensitivities, sensitivities
 from sliceit_drake.diagnosis.slices import Meshing
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.resources import resource_path
@@ -185,6 +185,14 @@ class Offset(Cause):
     def wrench(self, series, values, facts):
         return series.wrench + FACTOR * values["size"]
 '''
+
+
+def test_a_cause_may_be_named_as_what_differs_between_slices():
+    columns = [Column("record", "friction", per_record=True), Column("base", "material.friction")]
+    columns += [Column("cause", "friction", "share", scan) for scan in (1e-3, 1e-2)]
+    found = Sensitivities(columns, [])
+    assert found.scans("friction") == [1e-3, 1e-2]
+    assert [found.index("cause", "friction", x) for x in found.scans("friction")] == [[2], [3]]
 
 
 def test_results_are_found_again_until_a_cause_changes(tmp_path):

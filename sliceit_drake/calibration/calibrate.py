@@ -3,7 +3,6 @@
 import copy
 import dataclasses as dc
 import hashlib
-import json
 import multiprocessing
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import wait
@@ -14,11 +13,12 @@ import numpy as np
 
 from sliceit_drake.calibration.gauss_newton import gauss_newton
 from sliceit_drake.calibration.held_out import blocked_error
+from sliceit_drake.calibration.posterior import Posterior
 from sliceit_drake.calibration.prediction import Prediction, Predictor
 from sliceit_drake.calibration.refine import Refinement, refine
 from sliceit_drake.calibration.search import SearchResult, error_of, open_study, search
 from sliceit_drake.calibration.setup import CalibrationSetup
-from sliceit_drake.calibration.uncertainty import Posterior, estimate_posterior
+from sliceit_drake.calibration.uncertainty import estimate_posterior
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.cutting.workers import worker_processes
@@ -29,7 +29,7 @@ from sliceit_drake.systems.spring_food import calibrate_spring
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Calibration", "CalibrationOptions", "Progress", "calibrate", "write_json"]
+__all__ = ["Calibration", "CalibrationOptions", "Progress", "calibrate"]
 
 Progress = Callable[[str, int, int, float], None]
 """Called with what is done, steps done, steps in all, best error so far in N."""
@@ -158,12 +158,15 @@ def calibrate(
     options = options or CalibrationOptions()
     show = progress or (lambda *_: None)
     directory.mkdir(parents=True, exist_ok=True)
+    # Before anything is computed: what is wrong with a record shall not show after hours.
+    _check_names(records, held_out)
+    others = Predictor(setup, held_out, workers=options.workers) if held_out else None
     predictor = Predictor(setup, records, workers=options.workers)
     if options.start is not None:
         found = _given(predictor, options.start)
         refinements = [Refinement(found.units[0], float(found.errors[0]), [])]
     else:
-        problem = fingerprint(setup, records)
+        problem = _fingerprint(setup, records)
         found = _search(setup, records, directory, options, problem, show)
         if not np.isfinite(found.errors).any():
             raise CuttingError("no trial of the search could be cut; widen the setup's ranges")
@@ -199,7 +202,7 @@ def calibrate(
         posterior,
         blocks,
         held_out_rms,
-        _held_out(setup, records, held_out, predictor, unit, options),
+        {} if others is None else _held_out(others, predictor, unit),
         found.failures,
     )
 
@@ -218,7 +221,7 @@ def _given(predictor: Predictor, start: Mapping[str, float]) -> SearchResult:
     return SearchResult(unit[None], np.array([error]), 0)
 
 
-def fingerprint(setup: CalibrationSetup, records: Sequence[SliceRecord]) -> str:
+def _fingerprint(setup: CalibrationSetup, records: Sequence[SliceRecord]) -> str:
     """What tells a calibration's checkpoints from another's: setup and data."""
     digest = hashlib.sha256(repr(setup).encode())
     for record in records:
@@ -311,17 +314,7 @@ def _refine_beside(start: _Start, steps: Any, k: int) -> Refinement:
     return start.refine(note)
 
 
-def _held_out(
-    setup: CalibrationSetup,
-    records: Sequence[SliceRecord],
-    held_out: Sequence[SliceRecord],
-    fitted: Predictor,
-    unit: np.ndarray,
-    options: CalibrationOptions,
-) -> dict[str, float]:
-    """Errors on other records, at the mean of the fitted records' own parameters."""
-    if not held_out:
-        return {}
+def _check_names(records: Sequence[SliceRecord], held_out: Sequence[SliceRecord]) -> None:
     names = {r.name for r in records} & {r.name for r in held_out}
     if names:
         raise ConfigurationError(
@@ -329,7 +322,14 @@ def _held_out(
             field="--hold-out",
             fix="Name a record once.",
         )
-    predictor = Predictor(setup, held_out, workers=options.workers)
+
+
+def _mean(values: list[float] | None, otherwise: float) -> float:
+    return otherwise if values is None else float(np.mean(values))
+
+
+def _held_out(predictor: Predictor, fitted: Predictor, unit: np.ndarray) -> dict[str, float]:
+    """Errors on other records, at the mean of the fitted records' own parameters, N."""
     values = fitted.values(unit)
     own: dict[str, list[float]] = {}
     for name, value in values.items():
@@ -337,7 +337,8 @@ def _held_out(
             own.setdefault(name.split(":")[0], []).append(value)
     at = np.array(
         [
-            p.unit(values[p.name] if p.shared else float(np.mean(own[p.name.split(":")[0]])))
+            # Of the fitted records perhaps none has such a parameter, as where speeds are known.
+            p.unit(values[p.name] if p.shared else _mean(own.get(p.name.split(":")[0]), p.start))
             for p in predictor.parameters
         ]
     )
@@ -347,22 +348,3 @@ def _held_out(
         residual = prediction.predicted - target.measured
         errors[target.record.name] = float(np.sqrt(np.mean(residual**2)))
     return errors
-
-
-def write_json(calibration: Calibration, file: Path) -> None:
-    """Writes the numbers of a calibration."""
-    c = calibration
-    content = {
-        "food": c.setup.food.name,
-        "records": [t.record.name for t in c.predictor.targets],
-        "rms_N": c.rms,
-        "search_rms_N": c.search_rms,
-        "adam_rms_N": c.refined_rms,
-        "held_out_rms_N": c.held_out_rms,
-        "held_out_blocks_N": c.blocks,
-        "held_out_records_N": c.held_out_records,
-        "failed_trials": c.failures,
-        "parameters": c.predictor.values(c.unit),
-        "oscillation": [dc.asdict(p.oscillation) for p in c.predictions],
-    }
-    file.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

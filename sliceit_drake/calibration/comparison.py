@@ -14,6 +14,7 @@ from sliceit_drake.records.force_profile import ForceProfile
 __all__ = ["FoodComparison", "Row", "compare", "plot_comparisons", "table"]
 
 LARGEST_SHIFT = 0.4
+"""In time, that other simulators' curves get, s."""
 NAMES = {"DiSECt": "authors' calibrated DiSECt", "spring": "authors' spring"}
 COLOURS = {"DiSECt": "#2563eb", "spring": "#16a34a", "ours": "#c2410c"}
 
@@ -70,7 +71,7 @@ def compare(calibration: Calibration, profile: ForceProfile, minutes: float) -> 
     """
     (target,), (prediction,) = calibration.predictor.targets, calibration.predictions
     time, measured = target.time, target.measured[:, 0]
-    speed = float(calibration.predictor.targets[0].record.metadata.motion.speed or 0.0)
+    speed = float(target.record.metadata.motion.speed or 0.0)
     rows = []
     for name, reference in profile.references.items():
         shift = _best_shift(time, measured, profile.time, reference)

@@ -28,8 +28,6 @@ __all__ = [
     "coverage_page",
     "coverage_share",
     "coverage_study",
-    "press_record",
-    "run_replicate",
     "synthetic_predictor",
 ]
 
@@ -120,7 +118,7 @@ def coarse_setup(problem: Problem) -> CalibrationSetup:
     return setup
 
 
-def press_record(name: str, height: float, speed: float, rate: float) -> SliceRecord:
+def _press_record(name: str, height: float, speed: float, rate: float) -> SliceRecord:
     """A press through a food of this height at constant speed, without a force as yet."""
     time = np.arange(0.0, (height + CLEARANCE - REST) / speed, 1.0 / rate)
     position = np.zeros((len(time), 3))
@@ -152,7 +150,7 @@ def synthetic_predictor(
     setup = coarse_setup(problem)
     assert isinstance(setup.food.shape, Cylinder)
     records = [
-        press_record(f"{k}-{n}", setup.food.shape.diameter, speed, problem.rate)
+        _press_record(f"{k}-{n}", setup.food.shape.diameter, speed, problem.rate)
         for k, speed in enumerate(problem.speeds)
         for n in range(problem.records)
     ]
@@ -180,7 +178,7 @@ def synthetic_predictor(
     return predictor, truth
 
 
-def run_replicate(problem: Problem, number: int) -> Replicate:
+def _run_replicate(problem: Problem, number: int) -> Replicate:
     """Simulates records, calibrates from near the truth and compares.
 
     Raises:
@@ -242,7 +240,7 @@ def coverage_study(
         progress(replicates - len(missing))
     # Processes that share a simulator's threads would hinder each other.
     with worker_processes(min(workers, max(len(missing), 1))) as pool:
-        futures = [pool.submit(run_replicate, problem, n) for n in missing]
+        futures = [pool.submit(_run_replicate, problem, n) for n in missing]
         for future in as_completed(futures):
             replicate = future.result()
             done[replicate.number] = replicate

@@ -28,7 +28,9 @@ DAMPINGS = (0.0, 1e-2, 1.0, 1e2)
 """Tried side by side, times the present damping; in units of the diagonal."""
 FIRST_DAMPING, WORST_DAMPING = 1e-2, 1e6
 RETREAT = 1e3
+"""By which the damping grows where none of a step's was good enough."""
 EASE = 1e-2
+"""By which it falls at most after a step."""
 NUISANCE_FLOOR = 1e-9
 
 
@@ -142,13 +144,13 @@ def gauss_newton(
     """
     free = np.ones(len(start), bool) if free is None else free
     at = linearisation or linearise(model, np.clip(start, 0.0, 1.0))
-    unit, residuals, cost = at.unit, at.residuals, _cost(at.residuals, at.unit, noise)
+    cost = _cost(at.residuals, at.unit, noise)
     damping, taken = FIRST_DAMPING, 0
     while taken < steps:
         H, g = _normal_equations(at, noise)
         promised = _decrease(H, g, _step(H, g, at.unit, 0.0, free))
         if promised <= tolerance * cost:
-            return Fit(unit, cost, taken, True, at)
+            return Fit(at.unit, cost, taken, True, at)
         accepted = None
         while accepted is None and damping <= WORST_DAMPING:
             moves = [_step(H, g, at.unit, factor * damping, free) for factor in DAMPINGS]
@@ -167,12 +169,11 @@ def gauss_newton(
                 # So near to where slices break down there is no derivative.
                 damping *= RETREAT
         if accepted is None:
-            return Fit(unit, cost, taken, False, at)
+            return Fit(at.unit, cost, taken, False, at)
         at, taken = accepted, taken + 1
-        unit, residuals = at.unit, at.residuals
-        cost = _cost(residuals, unit, noise)
+        cost = _cost(at.residuals, at.unit, noise)
         damping = float(np.clip(damping * max(DAMPINGS[k], EASE), 1e-8, 1.0))
-    return Fit(unit, cost, taken, False, at)
+    return Fit(at.unit, cost, taken, False, at)
 
 
 def _cost(residuals: np.ndarray, unit: np.ndarray, noise: NoiseModel | None) -> float:

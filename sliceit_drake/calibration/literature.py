@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.stats import qmc
 
+from sliceit_drake.calibration.record_target import EXCHANGE_PERIOD
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.batch import simulate_batch
@@ -18,9 +19,10 @@ from sliceit_drake.systems.spring_food import calibrate_spring
 
 __all__ = ["food_from_literature"]
 
-PERIOD = 2e-3
 CLEARANCE = 5e-4
+"""Height of the edge over the food at the start, metres."""
 LEAST_KEPT = 20
+"""Cuts within the published range without which there is no distribution."""
 
 
 def food_from_literature(
@@ -66,7 +68,7 @@ def food_from_literature(
     slices = simulate_batch(
         [with_parameters(model, v) for v in values],
         [Motion(plan, start_pose(model, CLEARANCE))],
-        PERIOD,
+        EXCHANGE_PERIOD,
         progress=progress,
     )
     low, high = literature.peak_force

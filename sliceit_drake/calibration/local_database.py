@@ -13,6 +13,7 @@ import os
 import pwd
 import secrets
 import shutil
+import signal
 import socket
 import subprocess
 import tempfile
@@ -97,7 +98,7 @@ def local_database() -> Iterator[str]:
             yield f"postgresql://sliceit:{password}@127.0.0.1:{port}/postgres"
         finally:
             # SIGINT is PostgreSQL's fast shutdown: it drops who is still connected.
-            server.send_signal(2)
+            server.send_signal(signal.SIGINT)
             try:
                 server.wait(START)
             except subprocess.TimeoutExpired:

@@ -14,8 +14,11 @@ import numpy as np
 __all__ = ["Oscillation", "fit_oscillation"]
 
 LARGEST = 0.3
+"""Greatest amplitude, relative to the force."""
 GRID = 60
+"""Frequencies that are tried first, over the whole range."""
 REFINEMENTS = 3
+"""Rounds, each about the best frequency of the one before."""
 
 
 @dc.dataclass(frozen=True)

@@ -5,31 +5,29 @@ import dataclasses as dc
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from sliceit_drake.calibration.oscillation import Oscillation, fit_oscillation
+from sliceit_drake.calibration.record_target import (
+    EXCHANGE_PERIOD,
+    KnifeMotion,
+    RecordTarget,
+    food_of,
+    knife_of,
+)
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.batch import BatchSimulator, BatchSlice
 from sliceit_drake.cutting.distribution import from_unit, to_unit
-from sliceit_drake.cutting.food import Box, Cylinder, Ellipsoid, Food, make_food_model, start_pose
+from sliceit_drake.cutting.food import make_food_model
 from sliceit_drake.cutting.gradient import SliceAdjoint
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel, TimeStepError
-from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.parameters import get_parameter, pull_back, with_parameters
 from sliceit_drake.cutting.simulate import KnifePath, board_wrenches
 from sliceit_drake.cutting.solver import CuttingError
-from sliceit_drake.records.preprocessing import as_measured
 from sliceit_drake.records.slice_record import SliceRecord
 
-__all__ = ["EXCHANGE_PERIOD", "Parameter", "Prediction", "Predictor"]
-
-EXCHANGE_PERIOD = 2e-3
-CLEARANCE = 5e-4
-ONSET = 0.02
-"""Share of a record's greatest force at which contact is taken to begin, where its height is not
-known."""
+__all__ = ["Parameter", "Prediction", "Predictor"]
 
 NO_ADJOINT = ("effects.skin.thickness",)
 """Parameters whose derivative is taken by differences."""
@@ -88,111 +86,6 @@ class Prediction:
     oscillation: Oscillation
     smooth: np.ndarray
     failure: str | None
-
-
-@dc.dataclass
-class _KnifeMotion:
-    """A recorded motion in F at the exchanges, as `simulate_batch` takes it."""
-
-    R: np.ndarray
-    p: np.ndarray
-
-    @property
-    def duration(self) -> float:
-        return (len(self.p) - 1) * EXCHANGE_PERIOD
-
-    def pose(self, t: float) -> Pose:
-        k = round(t / EXCHANGE_PERIOD)
-        return Pose(self.R[k], self.p[k])
-
-
-class RecordTarget:
-    """One record: its motion relative to the food, and what of its force is compared.
-
-    The force is compared by component in F where the record has them, else by its norm, from first
-    to last contact and where the metadata name no phase that is not of the food ("air" stays in: a
-    prediction of zero there is a prediction). Prediction and measurement went through the same
-    filters: `records.preprocessing.as_measured`.
-
-    Attributes:
-        record: The record.
-        model: Its cut, with the parameters of the setup.
-        time: Of the compared samples [m], s.
-        measured: Force at them [m, channels], N; channels are x, y, z of F, or the norm.
-        depth: Of the edge below the top of the cut at them [m], metres, as the record says.
-        by_norm: Whether only the norm is known.
-    """
-
-    def __init__(self, record: SliceRecord, model: CuttingModel, setup: CalibrationSetup) -> None:
-        self.record, self.model = record, model
-        self.by_norm = record.force is None
-        R_FW, rotation, p = poses_in_food(record, model)
-        home = start_pose(model, 0.0)
-        self.unknown_speed = "motion.speed" in record.metadata.unknown
-        margin = CLEARANCE + max(abs(v) for v in setup.height_offset)
-        height = p[:, 2] - home.p[2]
-        low = np.flatnonzero(height < margin)
-        if low.size == 0:
-            raise ConfigurationError(
-                f"the knife stays {1e3 * height.min():.3g} mm or more above the food",
-                source=record.file or record.name,
-                field="p_WK_z",
-                fix="Correct food.position or the heights; both are in the world frame, in metres.",
-            )
-        self.first, self.last = max(low[0] - 1, 0), min(low[-1] + 1, len(p) - 1)
-        self.contact = home.p
-        self.start = float(record.time[self.first])
-        # One more than there is time for: no sample lies beyond the last mean.
-        count = int(np.ceil((record.time[self.last] - self.start) / EXCHANGE_PERIOD)) + 1
-        self.times = self.start + EXCHANGE_PERIOD * np.arange(count + 1)
-        at = np.minimum(self.times, record.time[-1])
-        self.position = np.column_stack([np.interp(at, record.time, column) for column in p.T])
-        self.rotation = Slerp(record.time, rotation)(at).as_matrix()
-        self.time = record.time[self.first : self.last + 1]
-        self.depth = -height[self.first : self.last + 1]
-        if self.by_norm:
-            self.measured = record.force_magnitude[self.first : self.last + 1, None]
-        else:
-            assert record.force is not None
-            self.measured = R_FW.apply(record.force)[self.first : self.last + 1]
-        self.operator = self._operator(count)
-
-    def _operator(self, count: int) -> np.ndarray:
-        """From means over exchanges to what would have been measured at the samples [m, count].
-
-        Filters are linear, so that their effect on each exchange's force is all there is to know.
-        """
-        record, T = self.record, EXCHANGE_PERIOD
-        before = int((self.start - record.time[0]) / T) + 2
-        after = int(max(record.time[-1] - self.times[-1], 0.0) / T) + 2
-        # A reading stands for the mean over the exchange that ends with it, as everywhere.
-        ends = self.start + T * np.arange(1 - before, count + after + 1)
-        series = np.zeros((len(ends), count))
-        series[before : before + count] = np.eye(count)
-        time, rows = as_measured(record.metadata, ends, series)
-        at = np.searchsorted(time, self.time, side="right")
-        low, high = np.clip(at - 1, 0, len(time) - 1), np.clip(at, 0, len(time) - 1)
-        span = np.where(high > low, time[high] - time[low], 1.0)
-        share = np.clip((self.time - time[low]) / span, 0.0, 1.0)[:, None]
-        return (1.0 - share) * rows[low] + share * rows[high]
-
-    def motion(self, height_offset: float, speed_factor: float) -> _KnifeMotion:
-        """The knife's motion in F where it stood lower by `height_offset` and moved faster."""
-        p = self.contact + speed_factor * (self.position - self.contact)
-        return _KnifeMotion(self.rotation, p - np.array([0.0, 0.0, height_offset]))
-
-    def compare(self, force: np.ndarray) -> np.ndarray:
-        """Channels at the samples [m, channels] from forces of the exchanges [E, 3], N, in F."""
-        seen = self.operator @ force
-        return np.linalg.norm(seen, axis=1)[:, None] if self.by_norm else seen
-
-    def adjoint(self, force: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Adjoint of `compare` at `force`: of the channels [m, channels] to forces [E, 3]."""
-        if self.by_norm:
-            seen = self.operator @ force
-            norm = np.maximum(np.linalg.norm(seen, axis=1), 1e-9)[:, None]
-            weights = weights * seen / norm
-        return np.asarray(self.operator.T @ weights)
 
 
 class Predictor:
@@ -318,7 +211,7 @@ class Predictor:
         other.point_factors = dict(factors)
         return other
 
-    def motion(self, target: RecordTarget, values: Mapping[str, float]) -> _KnifeMotion:
+    def motion(self, target: RecordTarget, values: Mapping[str, float]) -> KnifeMotion:
         """The knife's motion of a record with these values."""
         name = target.record.name
         return target.motion(values[f"{HEIGHT}:{name}"], values.get(f"{SPEED}:{name}", 1.0))
@@ -583,78 +476,3 @@ def _slope(parameter: Parameter, unit: float) -> float:
     if parameter.log:
         return float(parameter.value(unit) * np.log(parameter.high / parameter.low))
     return span
-
-
-def poses_in_food(
-    record: SliceRecord, model: CuttingModel
-) -> tuple[Rotation, Rotation, np.ndarray]:
-    """Poses of the knife relative to the food that it cuts.
-
-    Where food or heights are not known, contact is taken to begin over the middle of the cut, as
-    high as its top, when the force does.
-
-    Args:
-        record: With n rows.
-        model: The cut.
-
-    Returns:
-        R_FW, R_FK [n], p_FK [n, 3], metres.
-    """
-    facts = record.metadata.food
-    R_FW = Rotation.from_euler("z", -(facts.yaw or 0.0))
-    p = record.position.copy()
-    home = start_pose(model, 0.0)
-    unknown = set(record.metadata.unknown)
-    rotation = R_FW * Rotation.from_matrix(record.rotation)
-    if facts.position is None:
-        p = R_FW.apply(p - p[0]) + home.p
-        rotation = Rotation.from_matrix(home.R) * (rotation[0].inv() * rotation)
-    else:
-        p = R_FW.apply(p - np.array(facts.position))
-    if facts.position is None or "p_WK_z" in unknown or "food.position" in unknown:
-        # Height is measured from where the force begins.
-        force = record.force_magnitude
-        quiet = force[: max(3, len(force) // 50)].max()
-        onset = int(np.argmax(force > quiet + ONSET * force.max()))
-        p[:, 2] += home.p[2] - p[onset, 2]
-    return R_FW, rotation, p
-
-
-def food_of(food: Food, record: SliceRecord) -> Food:
-    """The food with what the record says of its size and support.
-
-    Raises:
-        ConfigurationError: The record is of another shape than the food.
-    """
-    facts = record.metadata.food
-    food = copy.deepcopy(food)
-    if facts.support != "unknown":
-        food.held_sides = "both" if facts.support == "clamped_slab" else "plus"
-    if facts.size is None or facts.shape == "unknown":
-        return food
-    shapes = {"cylinder": Cylinder, "box": Box, "ellipsoid": Ellipsoid}
-    if not isinstance(food.shape, shapes[facts.shape]):
-        raise ConfigurationError(
-            f"is a {facts.shape}, the food of the setup is a {type(food.shape).__name__.lower()}",
-            source=record.file or record.name,
-            field="food.shape",
-            fix="Calibrate it with a setup of that shape (--food FILE.yaml).",
-        )
-    if isinstance(food.shape, Cylinder):
-        food.shape.diameter, food.shape.length = facts.size[2], facts.size[1]
-    elif isinstance(food.shape, Box):
-        food.shape.size = list(facts.size)
-    elif isinstance(food.shape, Ellipsoid):
-        food.shape.diameters = list(facts.size)
-    return food
-
-
-def knife_of(knife: Knife, record: SliceRecord) -> Knife:
-    """The knife with what the record says of it."""
-    facts = record.metadata.knife
-    known = {
-        name: getattr(facts, name)
-        for name in (f.name for f in dc.fields(Knife))
-        if getattr(facts, name, None) is not None
-    }
-    return dc.replace(knife, **known)

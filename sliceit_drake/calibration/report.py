@@ -1,23 +1,25 @@
 """A calibration as a person reads it: table and figure."""
 
+import dataclasses as dc
 import datetime
+import json
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from sliceit_drake.calibration.calibrate import Calibration, write_json
+from sliceit_drake.calibration.calibrate import Calibration
 from sliceit_drake.configuration import dump_yaml
 from sliceit_drake.cutting.distribution import ParameterDistribution
 
-__all__ = ["calibration_table", "figure", "food_table", "parameter_table", "write_results"]
+__all__ = ["calibration_table", "figure", "food_table", "write_results"]
 
 MEASURED, PREDICTED = "#111827", "#c2410c"
 CHANNELS = ("force x", "force y", "force z")
 
 
-def parameter_table(distribution: ParameterDistribution, values: Mapping[str, float]) -> str:
+def _parameter_table(distribution: ParameterDistribution, values: Mapping[str, float]) -> str:
     """Lines of parameters with values and 90 % intervals, and what is not determined."""
     names, intervals = distribution.names, distribution.intervals(0.9)
     determined = distribution.determined()
@@ -31,14 +33,14 @@ def parameter_table(distribution: ParameterDistribution, values: Mapping[str, fl
 
 
 def food_table(distribution: ParameterDistribution) -> str:
-    """`parameter_table` of a calibrated food."""
-    return parameter_table(distribution, distribution.values())
+    """Parameters of a calibrated food with 90 % intervals, and what is not determined."""
+    return _parameter_table(distribution, distribution.values())
 
 
 def calibration_table(calibration: Calibration) -> str:
-    """`parameter_table` of what was found, remarks on it, and the errors."""
+    """Parameters with 90 % intervals, remarks on what is not determined, and the errors."""
     c = calibration
-    lines = [parameter_table(c.posterior, c.predictor.values(c.unit)), *c.posterior.remarks()]
+    lines = [_parameter_table(c.posterior, c.predictor.values(c.unit)), *c.posterior.remarks()]
     lines.append(
         f"RMS error: search {c.search_rms:.3f}, Adam {c.refined_rms:.3f}, polished {c.rms:.3f} N"
     )
@@ -51,10 +53,9 @@ def calibration_table(calibration: Calibration) -> str:
 
 
 def figure(calibration: Calibration) -> Figure:
-    """Measured and predicted force of each record, and what is left."""
-    targets = calibration.predictor.targets
-    sheet = Figure(figsize=(5.2 * min(len(targets), 3), 4.2), layout="constrained")
-    shown = targets[:3]
+    """Measured and predicted force of the first three records, and what is left."""
+    shown = calibration.predictor.targets[:3]
+    sheet = Figure(figsize=(5.2 * len(shown), 4.2), layout="constrained")
     axes = sheet.subplots(
         2, len(shown), squeeze=False, sharex="col", gridspec_kw={"height_ratios": (3, 1)}
     )
@@ -93,5 +94,24 @@ def write_results(calibration: Calibration, directory: Path, command: str) -> No
     """
     food = calibration.calibrated_food(datetime.date.today().isoformat(), command)
     dump_yaml(food, directory / "food.yaml")
-    write_json(calibration, directory / "calibration.json")
+    _write_json(calibration, directory / "calibration.json")
     calibration.plot().savefig(directory / "fit.png", dpi=150)
+
+
+def _write_json(calibration: Calibration, file: Path) -> None:
+    """Writes the numbers of a calibration."""
+    c = calibration
+    content = {
+        "food": c.setup.food.name,
+        "records": [t.record.name for t in c.predictor.targets],
+        "rms_N": c.rms,
+        "search_rms_N": c.search_rms,
+        "adam_rms_N": c.refined_rms,
+        "held_out_rms_N": c.held_out_rms,
+        "held_out_blocks_N": c.blocks,
+        "held_out_records_N": c.held_out_records,
+        "failed_trials": c.failures,
+        "parameters": c.predictor.values(c.unit),
+        "oscillation": [dc.asdict(p.oscillation) for p in c.predictions],
+    }
+    file.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

@@ -12,7 +12,7 @@ from optuna.storages.journal import JournalFileBackend
 
 from sliceit_drake.configuration import ConfigurationError
 
-__all__ = ["CONNECT", "keeps_answering", "open_storage", "without_password"]
+__all__ = ["keeps_answering", "open_storage", "without_password"]
 
 CONNECT = 10
 """Time to reach a database, s."""

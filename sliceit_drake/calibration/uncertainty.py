@@ -24,7 +24,6 @@ from sliceit_drake.cutting.solver import CuttingError
 
 __all__ = [
     "Estimate",
-    "Posterior",
     "Profile",
     "RecordModel",
     "estimate",

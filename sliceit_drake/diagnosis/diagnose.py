@@ -33,7 +33,7 @@ from sliceit_drake.records.slice_record import SliceRecord
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["BASE", "Diagnosis", "diagnose", "setup_of_food"]
+__all__ = ["BASE", "Diagnosis", "Progress", "diagnose", "setup_of_food"]
 
 Progress = Callable[[str, int, int], None]
 """Called with what is done, steps done and steps in all."""
@@ -61,6 +61,8 @@ class Diagnosis:
             factor (log scale) and its standard error.
         gain: Error on records that were left out; None if nothing is named.
         remarks: What a reader must know.
+        confirmation: What simulations with the named causes say; None before, or if none is named
+            whose numbers all records share.
         next_experiment: What to cut next, where that was asked for.
     """
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from scipy.stats import norm
 
+from sliceit_drake.configuration import dump_yaml
 from sliceit_drake.diagnosis.motion_menu import Experiment
 from sliceit_drake.diagnosis.verdict import ALARM, CLASS_ANGLE
 from sliceit_drake.diagrams.scenario import Scenario
@@ -141,8 +142,6 @@ class NextExperiment:
         return [step.file for step in self.steps if step.file is not None]
 
     def _text(self, step: Step) -> str:
-        from sliceit_drake.configuration import dump_yaml
-
         head = [
             f"Next experiment of a diagnosis: {self.reason}",
             f"What: {step.experiment.what}.",

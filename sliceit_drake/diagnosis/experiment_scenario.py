@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sliceit_drake.calibration.prediction import food_of, knife_of
+from sliceit_drake.calibration.record_target import food_of, knife_of
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.cutting.effects import Compliance, Slip
 from sliceit_drake.cutting.food import Box, Cylinder, Ellipsoid, Food, make_food_model, start_pose
@@ -26,7 +26,6 @@ from sliceit_drake.systems.analytic_cutter import AnalyticFood
 
 __all__ = [
     "experiment_of_record",
-    "motion_of_record",
     "next_knife_slice",
     "planned_record",
     "scale_of",
@@ -182,7 +181,7 @@ def experiment_of_record(record: SliceRecord, setup: CalibrationSetup) -> Experi
     return Experiment(
         name=record.metadata.condition or record.name,
         what=f"the motion of {record.name} once more",
-        motion=motion_of_record(record),
+        motion=_motion_of_record(record),
         clearance=clearance,
         offset=offset,
         by_hand="; ".join(by_hand),
@@ -192,7 +191,7 @@ def experiment_of_record(record: SliceRecord, setup: CalibrationSetup) -> Experi
     )
 
 
-def motion_of_record(record: SliceRecord) -> MotionPlan:
+def _motion_of_record(record: SliceRecord) -> MotionPlan:
     """The recorded motion by straight legs, phase by phase."""
     phases = record.metadata.motion.phases
     edges = [(phase.label, phase.start, phase.end) for phase in phases]

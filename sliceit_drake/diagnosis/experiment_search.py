@@ -2,9 +2,9 @@
 
 import dataclasses as dc
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,14 +18,19 @@ from sliceit_drake.diagnosis.experiment_scenario import (
 from sliceit_drake.diagnosis.linear import LinearProblem, integrate_out, scaled_inverse
 from sliceit_drake.diagnosis.motion_menu import Experiment
 from sliceit_drake.diagnosis.screen import CauseEvidence, Screening
-from sliceit_drake.diagnosis.sensitivity import RecordSensitivity, Sensitivities, sensitivities
+from sliceit_drake.diagnosis.sensitivity import (
+    Progress,
+    RecordSensitivity,
+    Sensitivities,
+    sensitivities,
+)
 from sliceit_drake.diagnosis.verdict import LEAST_REPLICATES
 from sliceit_drake.records.slice_record import SliceRecord
 
 if TYPE_CHECKING:
     from sliceit_drake.diagnosis.diagnose import Diagnosis
 
-__all__ = ["CauseClass", "ExperimentSearch", "Progress"]
+__all__ = ["CauseClass", "ExperimentSearch"]
 
 SLICE_COST, HAND_COST = 1.0, 5.0
 """What a slice, and handwork, must bring: degrees nearer to `WANTED`, over all pairs."""
@@ -35,9 +40,6 @@ MOST_STEPS = 3
 """More motions are not proposed."""
 USUAL = ("sensor_delay", "sensor_zero")
 """Causes that every record has a little of; they are fitted beside."""
-
-Progress = Callable[[int, int], None]
-"""Called with the number of simulated slices, and of those that must be."""
 
 
 @dc.dataclass(frozen=True)
@@ -79,7 +81,7 @@ class ExperimentSearch:
         records: The records at hand.
         cache: Folder for finished simulations; None for none.
         workers: Threads.
-        progress: See `Progress`.
+        progress: See `sensitivity.Progress`.
     """
 
     def __init__(
@@ -121,7 +123,9 @@ class ExperimentSearch:
         self.new = reduced[count:]
         self._before = self._angles(self.old)
 
-    def _projected(self, total: np.ndarray, assumed: Sequence[tuple[str, float | None]]) -> Any:
+    def _projected(
+        self, total: np.ndarray, assumed: Sequence[tuple[str, float | None]]
+    ) -> np.ndarray:
         """What is left of a summed Gram matrix beside what is fitted in any case."""
         problem = self.problem
         null = [*problem.base, *problem.numerical, *problem.spline, *problem.usual]
@@ -129,7 +133,7 @@ class ExperimentSearch:
             null += problem.found.index("cause", name, scan)
         null = list(dict.fromkeys(null))
         inverse = scaled_inverse(total[np.ix_(null, null)] + np.diag(problem.prior()[null]))
-        return total - total[:, null] @ inverse @ total[null]
+        return np.asarray(total - total[:, null] @ inverse @ total[null])
 
     def _angles(self, total: np.ndarray) -> list[tuple[str, str, float, float]]:
         """Of each ordered pair the angle, degrees, and the expected gain."""

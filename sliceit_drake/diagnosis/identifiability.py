@@ -159,7 +159,7 @@ class Evidence:
         return rest, places
 
 
-def share_explained(G: np.ndarray, a: slice, b: slice) -> float:
+def _share_explained(G: np.ndarray, a: slice, b: slice) -> float:
     """Share of the square of columns `a` that columns `b` explain, from their scalar products."""
     total = float(np.trace(G[a, a]))
     if total <= 0.0:
@@ -323,7 +323,7 @@ class _Pairs:
             one = at.stop - at.start == other.stop - other.start == 1
             if one and G[at.start, other.start] <= 0.0:
                 return 0.0
-        return share_explained(G, at, other)
+        return _share_explained(G, at, other)
 
     def angles(self, records: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """All of them [n, n], and what shows [n]."""

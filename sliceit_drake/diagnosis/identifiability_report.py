@@ -10,7 +10,7 @@ from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.identifiability import ANGLE, SHIFT, SHOWS, Identifiability
 from sliceit_drake.diagnosis.sensitivity import Sensitivities
 
-__all__ = ["Study", "plot_angles", "report"]
+__all__ = ["Study", "classes", "plot_angles", "report", "short"]
 
 
 @dc.dataclass
@@ -33,7 +33,7 @@ def short(name: str) -> str:
     return f"shift of {name.rsplit('.', 1)[-1].replace('youngs_', '')}" if "." in name else name
 
 
-def table(result: Identifiability) -> str:
+def _table(result: Identifiability) -> str:
     """One line a cause: what shows, with what it can be confused, what would part it."""
     lines = [
         "| cause | shows [sd] | delta | class | nearest other | parted by |",
@@ -65,7 +65,7 @@ def table(result: Identifiability) -> str:
     return "\n".join(lines)
 
 
-def nonlinearity(found: Sensitivities) -> dict[str, float]:
+def _nonlinearity(found: Sensitivities) -> dict[str, float]:
     """Angle by which the change at plus a cause's size is off the linear part, degrees."""
     out: dict[str, list[float]] = {}
     for k, column in enumerate(found.columns):
@@ -79,7 +79,7 @@ def nonlinearity(found: Sensitivities) -> dict[str, float]:
     return {name: float(np.median(values)) for name, values in out.items()}
 
 
-def scan_angles(found: Sensitivities) -> dict[str, float]:
+def _scan_angles(found: Sensitivities) -> dict[str, float]:
     """Angle between what neighbouring values of a cause's scan do, degrees."""
     out: dict[str, list[float]] = {}
     for name in found.causes:
@@ -186,9 +186,9 @@ def report(study: Study, figure: str = "docs/figures/identifiability.png") -> st
         if groups:
             listed = "; ".join("{" + ", ".join(map(short, g)) + "}" for g in groups)
             parts.append(f"Not told apart: {listed}.")
-        parts.append(table(result))
+        parts.append(_table(result))
     parts.append(f"![Angles between causes]({figure.removeprefix('docs/')})")
-    bent, scanned = nonlinearity(found), scan_angles(found)
+    bent, scanned = _nonlinearity(found), _scan_angles(found)
     rows = "\n".join(
         f"| `{name}` | {f'{scanned[name]:.0f}' if name in scanned else ''} "
         f"| {f'{bent[name]:.0f}' if name in bent else ''} |"

@@ -21,7 +21,7 @@ from sliceit_drake.diagnosis.noise_levels import ChannelNoise, differences, esti
 from sliceit_drake.diagnosis.replicates import replicates
 from sliceit_drake.diagnosis.sensitivity import RecordSensitivity, Sensitivities
 
-__all__ = ["LinearProblem", "Moments", "integrate_out", "scaled_inverse"]
+__all__ = ["USUAL", "LinearProblem", "Moments", "integrate_out", "scaled_inverse"]
 
 KNOT = 4e-3
 """Spacing of the splines of depth in which the discretisation's error is taken to vary, metres."""
@@ -81,6 +81,7 @@ class LinearProblem:
         usual: Numbers of columns of `USUAL` that all records share, and their standard deviations.
         usual_own: The same of those that are each record's own.
         spline: Numbers of the columns appended for the discretisation's error.
+        discretisation: Standard deviations of their coefficients [len(spline)], N and Nm.
         correction: Numbers of the columns of each condition's nonparametric correction.
         size: Number of all columns; y stands there.
         moments: Of the records.
@@ -188,7 +189,7 @@ class LinearProblem:
             gram[r, -1], gram[r, :, -1] = b, b
             b = np.einsum("mck,mc->k", inside, inside[:, :, -1])
             force_gram[r, -1], force_gram[r, :, -1] = b, b
-        out.found = Sensitivities(self.found.columns, records, self.found.warnings)
+        out.found = dc.replace(self.found, records=records)
         out.moments = Moments(gram, force_gram, self.moments.force_rows)
         return out
 

@@ -126,7 +126,7 @@ def _through(scale: Scale) -> float:
     return round(scale.clearance + scale.height + OVERTRAVEL, 6)
 
 
-def tour(scale: Scale, speeds: tuple[float, float] = (0.3, 3.0)) -> MotionPlan:
+def _tour(scale: Scale, speeds: tuple[float, float] = (0.3, 3.0)) -> MotionPlan:
     """Slow to the middle, held there, fast through; out slowly, once more in, out fast."""
     slow, fast = (scale.times(x) for x in speeds)
     way = _through(scale)
@@ -195,7 +195,7 @@ def _cuts(scale: Scale) -> list[Experiment]:
         Experiment(
             "tour",
             "slowly to the middle, held, fast through, out, once more through the open cut",
-            tour(scale),
+            _tour(scale),
             scale.clearance,
         ),
     ]
@@ -293,7 +293,7 @@ def _by_hand(scale: Scale) -> list[Experiment]:
         Experiment(
             "peeled",
             "peeled food: slowly to the middle, held, fast through, out, once more",
-            tour(scale),
+            _tour(scale),
             scale.clearance,
             by_hand="take the skin off the food",
             peeled=True,
@@ -301,7 +301,7 @@ def _by_hand(scale: Scale) -> list[Experiment]:
         Experiment(
             "narrow",
             f"food of {NARROW:g} times the size: slowly to the middle, held, fast through, out",
-            tour(narrow),
+            _tour(narrow),
             scale.clearance,
             by_hand=f"take a piece of {1e3 * narrow.height:.3g} mm height, or as near as there is, "
             "and write its size into the scenario and its motion",

@@ -29,9 +29,11 @@ from sliceit_drake.diagnosis.experiment_scenario import (
     scenario_of,
     template_of,
 )
-from sliceit_drake.diagnosis.experiment_search import CauseClass, ExperimentSearch, Progress
+from sliceit_drake.diagnosis.experiment_search import CauseClass, ExperimentSearch
 from sliceit_drake.diagnosis.motion_menu import Experiment, menu
 from sliceit_drake.diagnosis.screen import CauseEvidence
+from sliceit_drake.diagnosis.sensitivity import Progress
+from sliceit_drake.diagnosis.slices import is_bare
 from sliceit_drake.diagnosis.verdict import CLASS_ANGLE, LEAST_REPLICATES
 from sliceit_drake.records.slice_record import SliceRecord
 
@@ -61,7 +63,7 @@ def next_experiment(
         records: The records at hand.
         cache: Folder for finished simulations.
         workers: Threads.
-        progress: See `Progress`.
+        progress: See `sensitivity.Progress`.
     """
     verdict = diagnosis.verdict
     if verdict.kind == "too_few_replicates":
@@ -91,7 +93,7 @@ def _repeat(diagnosis: "Diagnosis", records: Sequence[SliceRecord]) -> NextExper
     for members in conditions.values():
         missing = LEAST_REPLICATES - len(members)
         if missing > 0:
-            own = members[0] if members[0].metadata.food.name != "none" else template
+            own = template if is_bare(members[0]) else members[0]
             experiment = experiment_of_record(members[0], diagnosis.setup)
             scenario = scenario_of(experiment, diagnosis.setup, own, knife)
             steps.append(Step(experiment, scenario, missing))

@@ -10,7 +10,7 @@ left out. Projected sensitivities say which causes such a motion cannot tell apa
 
 import copy
 import dataclasses as dc
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ import numpy as np
 from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.cutting.effects import Effects
 from sliceit_drake.diagnosis.cause import Cause
+from sliceit_drake.diagnosis.diagnose import BASE, Progress
 from sliceit_drake.diagnosis.identifiability import SHIFT, Evidence, identifiability
 from sliceit_drake.diagnosis.one_slice_evidence import (
     LEVEL,
@@ -35,20 +36,13 @@ from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = ["diagnose_slice", "setup_of_slice"]
 
-BASE = (
-    ParameterRange("material.toughness", 10.0, 5000.0),
-    ParameterRange("material.youngs_modulus", 2e4, 2e7),
-    ParameterRange("material.friction", 1e-3, 2.0),
-)
-"""Fitted in any case."""
 CONFIRMED = 3
 """Most causes that are fitted by simulation."""
 REFINED = 1.5
+"""Elements along an edge of the mesh of the prediction, relative to that of its changes."""
 END = 0.02
 """Last stretch of a record without a say in the evidence, s: the simulated knife comes to rest when
 the record is over, and causes that go with speed or acceleration would be told by that."""
-
-Progress = Callable[[str, int, int], None]
 
 
 def setup_of_slice(
@@ -106,7 +100,7 @@ def diagnose_slice(
         replicates: Of the bootstrap.
         seed: Of the bootstrap.
         workers: Threads.
-        progress: See `Progress`.
+        progress: See `diagnose.Progress`.
         remarks: What is known already that a reader must know.
 
     Raises:

@@ -1,17 +1,15 @@
 """Figures and report of what one slice shows."""
 
-import base64
 import html
-import io
 from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from sliceit_drake.diagnosis.html_page import html_page, image
 from sliceit_drake.diagnosis.one_slice_evidence import LEVEL
 from sliceit_drake.diagnosis.one_slice_result import OneSlice
-from sliceit_drake.diagnosis.report import STYLE
 
 __all__ = ["evidence_table", "report_html", "slice_figure"]
 
@@ -120,24 +118,15 @@ def evidence_table(result: OneSlice, most: int = 8) -> str:
     return "\n".join(lines)
 
 
-def _image(figure: Figure) -> str:
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=110)
-    code = base64.b64encode(stream.getvalue()).decode()
-    return f'<img alt="figure" src="data:image/png;base64,{code}">'
-
-
 def report_html(result: OneSlice) -> str:
     """The report as one self-contained page."""
     parts = [
-        "<!doctype html><html lang=en><meta charset=utf-8><title>One slice</title>",
-        f"<style>{STYLE}</style>",
         "<h1>What the simulation gets wrong in one slice</h1>",
         "<p>This describes one slice. It is no diagnosis: how slices vary is unknown, so that what"
         f" is found may be this slice's own. p is that of a gain as large, by any cause, where"
         f" nothing is wrong; below {LEVEL:g} it counts.</p>",
         f"<pre>{html.escape(result.table())}</pre>",
         "<h2>Measured and simulated</h2>",
-        _image(slice_figure([result], [result.record.name])),
+        image(slice_figure([result], [result.record.name])),
     ]
-    return "\n".join([*parts, "</html>", ""])
+    return html_page("One slice", parts)

@@ -14,15 +14,14 @@ from sliceit_drake.diagnosis.one_slice_evidence import LEVEL, CauseInSlice, Slic
 from sliceit_drake.diagnosis.registry import is_users
 from sliceit_drake.diagnosis.sensitivity import RecordSensitivity
 from sliceit_drake.diagnosis.slice_fit import SliceFit
+from sliceit_drake.diagnosis.verdict import LEAST_REPLICATES
 
-__all__ = ["KIND", "LEAST_GAIN", "REPLICATES", "OneSlice"]
+__all__ = ["KIND", "LEAST_GAIN", "OneSlice"]
 
 KIND = "one_slice"
 """The verdict on a single record, whatever it shows."""
 LEAST_GAIN = 0.1
 """Least share of the error on left-out depth that such a cause removes."""
-REPLICATES = 3
-"""Slices of each condition from which variation can be told from an effect."""
 
 
 @dc.dataclass
@@ -192,8 +191,8 @@ class OneSlice:
     def needed(self) -> list[str]:
         """What would make a diagnosis of it."""
         lines = [
-            f"Needed for a diagnosis: at least {REPLICATES} slices of each condition (one slice"
-            " says nothing of how slices vary)."
+            f"Needed for a diagnosis: at least {LEAST_REPLICATES} slices of each condition (one"
+            " slice says nothing of how slices vary)."
         ]
         for name in self.experiments()[:3]:
             lines.append(f"  Next: {EXPERIMENTS[name]} ({name})")
@@ -222,7 +221,7 @@ class OneSlice:
             "cannot_show": self.hidden,
             "not_above_what_is_left": self.drowned,
             "experiments": self.experiments(),
-            "slices_needed_of_each_condition": REPLICATES,
+            "slices_needed_of_each_condition": LEAST_REPLICATES,
             "remarks": self.remarks,
         }
 

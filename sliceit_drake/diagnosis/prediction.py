@@ -59,16 +59,11 @@ class ActiveCause:
 
     Attributes:
         cause: The cause.
-        values: By name; or, where it has values for each record, by the record's name.
+        values: By name.
     """
 
     cause: Cause
     values: Mapping[str, float]
-    by_record: Mapping[str, Mapping[str, float]] = dc.field(default_factory=dict)
-
-    def of(self, record: str) -> Mapping[str, float]:
-        """Values for a record."""
-        return {**self.values, **self.by_record.get(record, {})}
 
 
 @dc.dataclass(frozen=True)
@@ -181,9 +176,7 @@ class SlicePredictor:
         }
         model = with_parameters(model, factors) if factors else model
         for active in point.causes:
-            model = active.cause.model(
-                model, active.of(target.facts.name), target.seen_by(active.cause)
-            )
+            model = active.cause.model(model, active.values, target.seen_by(active.cause))
         if target.facts.peeled and model.effects.skin.toughness > 0.0:
             model = with_parameters(model, {"effects.skin.toughness": 0.0})
         return model
@@ -200,7 +193,7 @@ class SlicePredictor:
         if target.height_unknown:
             p = p - lower
         for k, active in enumerate(point.causes):
-            values, force = active.of(target.facts.name), None
+            values, force = active.values, None
             if active.cause.uses_force:
                 before = dc.replace(point, causes=point.causes[:k], only=(number,))
                 series = self.predict([before])[0][number]
@@ -233,11 +226,11 @@ class SlicePredictor:
             p = p + rise[:, None] * [0.0, 0.0, 1.0]
         key = planned.R.tobytes() + p.tobytes()
         if key not in self._boards:
-            self._boards[key] = target.board(self.setup, planned.R, p)
+            self._boards[key] = target.board(self.board, planned.R, p)
         series = target.series(run, self._boards[key])
         for active in point.causes:
-            values = active.of(target.facts.name)
-            series.wrench = active.cause.wrench(series, values, target.seen_by(active.cause))
+            facts = target.seen_by(active.cause)
+            series.wrench = active.cause.wrench(series, active.values, facts)
         return series
 
 

@@ -11,7 +11,8 @@ from sliceit_drake.diagnosis.identifiability import ANGLE
 from sliceit_drake.diagnosis.identifiability_report import short
 from sliceit_drake.diagnosis.one_slice_evidence import LEVEL
 from sliceit_drake.diagnosis.one_slice_report import evidence_table, slice_figure
-from sliceit_drake.diagnosis.one_slice_result import LEAST_GAIN, REPLICATES, OneSlice
+from sliceit_drake.diagnosis.one_slice_result import LEAST_GAIN, OneSlice
+from sliceit_drake.diagnosis.verdict import LEAST_REPLICATES
 
 __all__ = ["SIMULATIONS", "MeasuredSlice", "draw", "page"]
 
@@ -173,7 +174,7 @@ def _food(item: MeasuredSlice) -> str:
         parts.append(_by_depth(result))
         parts.append(evidence_table(result))
         parts.append(_fitted(result))
-    plain = result
+    plain = item.results["plain"]
     groups = "; ".join("{" + ", ".join(map(short, g)) + "}" for g in plain.classes)
     lines = [
         f"Not told apart by such a recording: {groups or 'nothing that shows'}.",
@@ -290,7 +291,7 @@ def _cell(result: OneSlice, expected: str, pairs: Sequence[tuple[str, str]]) -> 
 
 def _next(items: Sequence[MeasuredSlice]) -> str:
     lines = [
-        f"At least {REPLICATES} slices of each condition, in random order: without them no"
+        f"At least {LEAST_REPLICATES} slices of each condition, in random order: without them no"
         " difference can be told from a slice. Then what reveals the causes that these recordings"
         " cannot show or part, those first that serve most of them:",
         "",

@@ -15,7 +15,6 @@ from sliceit_drake.resources import load_module
 __all__ = [
     "ENTRY_POINTS",
     "all_causes",
-    "causes_as_markdown",
     "is_users",
     "load_cause",
     "open_causes",
@@ -130,26 +129,3 @@ def _broken(file: Path, error: Exception, what: str) -> ConfigurationError:
         field="--cause",
         fix="Correct the file (docs/causes.md has a complete example).",
     )
-
-
-def causes_as_markdown(causes: Sequence[Cause]) -> str:
-    """A table of causes."""
-    lines = [
-        "| row | cause | parameters (size, range) | scanned | signature | revealed by |",
-        "|---|---|---|---|---|---|",
-    ]
-    for cause in causes:
-        numbers = "; ".join(
-            f"{p.name} {p.size:g} {p.unit}".strip() + f" ({p.low:g} to {p.high:g})"
-            for p in cause.parameters
-        )
-        scanned = ""
-        if cause.scan is not None:
-            values = ", ".join(f"{v:g}" for v in cause.scan.values)
-            scanned = f"{cause.scan.name}: {values} {cause.scan.unit}".strip()
-        row = str(cause.row or "")
-        lines.append(
-            f"| {row} | `{cause.name}` | {numbers} | {scanned} | {cause.signature} "
-            f"| {cause.experiment} |"
-        )
-    return "\n".join(lines)

@@ -51,7 +51,7 @@ def _try_wrench(
     facts: SliceFacts,
     source: str,
 ) -> None:
-    series = made_up_slice()
+    series = _made_up_slice()
     before = series.wrench.copy()
     for values, name in ((nulls, "nulls"), (full, "size")):
         out = cause.wrench(series, values, facts)
@@ -81,7 +81,7 @@ def _try_motion(
     facts: SliceFacts,
     source: str,
 ) -> None:
-    series = made_up_slice()
+    series = _made_up_slice()
     t = np.concatenate([[series.time[0] - PERIOD], series.time])
     R, p = (np.concatenate([v[:1], v]) for v in (series.R, series.p))
     force = series.wrench[:, 3:]
@@ -107,7 +107,7 @@ def _refuse(cause: Cause, hook: str, problem: str, fix: str, source: str) -> Con
     )
 
 
-def made_up_slice() -> ForceSeries:
+def _made_up_slice() -> ForceSeries:
     """A press into food, a stop and a withdrawal, with a force that goes with the depth."""
     time = PERIOD * np.arange(1, ROWS + 1)
     turn = 0.6 * time[-1]

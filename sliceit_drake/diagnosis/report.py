@@ -1,14 +1,13 @@
 """The report of a diagnosis: one HTML file with its figures in it."""
 
-import base64
 import html
-import io
 from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from sliceit_drake.diagnosis.held_out import fitted_changes
+from sliceit_drake.diagnosis.html_page import html_page, image
 
 if TYPE_CHECKING:
     from sliceit_drake.diagnosis.diagnose import Diagnosis
@@ -19,14 +18,6 @@ MEASURED, PREDICTED, EXTENDED = "#111827", "#2563eb", "#c2410c"
 SHOWN = 8
 CALM = 0.3
 """Jump of the prediction, N, near which what is left does not set the scale of a plot."""
-
-STYLE = """
-body{font:15px/1.5 system-ui,sans-serif;color:#111827;
-max-width:62rem;margin:2rem auto;padding:0 1rem}
-h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}
-pre{background:#f3f4f6;padding:1rem;overflow-x:auto;font-size:13px}
-img{max-width:100%}
-"""
 
 
 def records_figure(diagnosis: "Diagnosis") -> Figure:
@@ -79,20 +70,13 @@ def evidence_figure(diagnosis: "Diagnosis") -> Figure:
     bars.set_xscale("log")
     bars.set_xlabel("twice the gain in log-likelihood")
     bars.legend(frameon=False, fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
-    image = matrix.imshow(screening.angles, vmin=0.0, vmax=90.0, cmap="viridis")
+    shown = matrix.imshow(screening.angles, vmin=0.0, vmax=90.0, cmap="viridis")
     ticks = np.arange(len(screening.names))
     matrix.set_xticks(ticks, screening.names, rotation=90, fontsize=6)
     matrix.set_yticks(ticks, screening.names, fontsize=6)
     matrix.set_title("angle between causes [degrees]", fontsize=9)
-    figure.colorbar(image, ax=matrix, shrink=0.8)
+    figure.colorbar(shown, ax=matrix, shrink=0.8)
     return figure
-
-
-def _image(figure: Figure) -> str:
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=110)
-    code = base64.b64encode(stream.getvalue()).decode()
-    return f'<img alt="figure" src="data:image/png;base64,{code}">'
 
 
 def report_html(diagnosis: "Diagnosis") -> str:
@@ -106,18 +90,16 @@ def report_html(diagnosis: "Diagnosis") -> str:
             rows.append(f"{record.name:20}{record.condition:20}{before:10.3f}{after:10.3f}")
     held_out = "\n".join([f"{'record':20}{'condition':20}{'before N':>10}{'after N':>10}", *rows])
     parts = [
-        "<!doctype html><html lang=en><meta charset=utf-8><title>Diagnosis</title>",
-        f"<style>{STYLE}</style>",
         "<h1>What the simulation gets wrong</h1>",
         f"<pre>{html.escape(diagnosis.table())}</pre>",
         "<h2>Measured and simulated</h2>",
-        _image(diagnosis.plot()),
+        image(diagnosis.plot()),
         "<h2>Evidence</h2>",
-        _image(diagnosis.plot_evidence()),
+        image(diagnosis.plot_evidence()),
     ]
     if rows:
         parts += [
             "<h2>Error on records that were left out</h2>",
             f"<pre>{html.escape(held_out)}</pre>",
         ]
-    return "\n".join([*parts, "</html>", ""])
+    return html_page("Diagnosis", parts)

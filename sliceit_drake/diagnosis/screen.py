@@ -431,7 +431,7 @@ def screen(
             columns = problem.found.index("cause", e.name, e.scan)
             e.gain = max(e.gain, statistics.gain_with_usual(measured, columns))
     p_misfit = (1.0 + (np.array(null_misfits) >= misfit[0]).sum()) / (replicates + 1.0)
-    angles, visible = _angles(statistics, statistics.projected)
+    angles, visible = _angles(statistics)
     return Screening(
         causes=sorted(evidence, key=lambda e: -e.score),
         p_value=float(p),
@@ -489,9 +489,9 @@ class _Bootstrap:
         return out
 
 
-def _angles(statistics: _Statistics, projected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _angles(statistics: _Statistics) -> tuple[np.ndarray, np.ndarray]:
     """Least angles between causes [n, n], degrees, and norms of their sensitivities [n]."""
-    names = statistics.names
+    names, projected = statistics.names, statistics.projected
     groups = {
         name: [c for n, _, cs in statistics.options if n == name for c in cs] for name in names
     }

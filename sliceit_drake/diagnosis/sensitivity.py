@@ -38,7 +38,7 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-from sliceit_drake.calibration.prediction import poses_in_food
+from sliceit_drake.calibration.record_target import poses_in_food
 from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.cutting.parameters import get_parameter
 from sliceit_drake.cutting.solver import CuttingError
@@ -52,10 +52,13 @@ from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = [
     "FINER",
+    "LINEAR_STEP",
+    "LOG_STEP",
+    "MESH",
     "Column",
+    "Progress",
     "RecordSensitivity",
     "Sensitivities",
-    "cause_columns",
     "sensitivities",
 ]
 
@@ -211,10 +214,10 @@ class Sensitivities:
 
     def scans(self, cause: str) -> list[float | None]:
         """Values of a cause's scan; [None] for one without."""
-        return list(dict.fromkeys(c.scan for c in self.columns if c.name == cause))
+        return list(dict.fromkeys(self.columns[k].scan for k in self.index("cause", cause)))
 
 
-def cause_columns(cause: Cause) -> list[tuple[Column, dict[str, float], dict[str, float] | None]]:
+def _cause_columns(cause: Cause) -> list[tuple[Column, dict[str, float], dict[str, float] | None]]:
     """Columns of a cause, with the values at plus its size, and at minus where that may be."""
     out = []
     for value in cause.scan.values if cause.scan else (None,):
@@ -337,7 +340,7 @@ class _Computation:
             for name, finer in zip(("step", "mesh"), predictor.meshings[1:], strict=False):
                 self._add(Column("numerical", name), dc.replace(point, meshing=finer), None, -1.0)
         for cause in causes:
-            for column, up_values, down_values in cause_columns(cause):
+            for column, up_values, down_values in _cause_columns(cause):
                 if not cause.simulates:
                     self.shown.append((len(self.columns), cause, up_values, down_values))
                     self._add(column, point, None)
@@ -505,7 +508,7 @@ class _Store:
             facts = dc.replace(facts, slice_index=0, knife_slices=0)
         h.update(repr((metadata, facts, target.channels)).encode())
         name = target.facts.name
-        own = [dict(a.of(name)) for a in self._point.causes]
+        own = [dict(a.values) for a in self._point.causes]
         h.update(repr((self._point.records.get(name), own)).encode())
         for values in (target.time, target.grid, target.R, target.p):
             h.update(np.ascontiguousarray(values).tobytes())

@@ -18,7 +18,7 @@ from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.diagnosis.sensitivity import LINEAR_STEP, LOG_STEP
 
-__all__ = ["BLOCKS", "SliceFit", "Unknown", "depth_blocks", "fit_slice", "slice_unknowns"]
+__all__ = ["BLOCKS", "OWN", "SliceFit", "Unknown", "depth_blocks", "fit_slice"]
 
 BLOCKS = 5
 STEPS = 8
@@ -67,7 +67,7 @@ OWN = {"height": (1e-4, 2e-3), "speed": (0.01, 0.15)}
 """Of what a record does not say of its motion: step, and plausible standard deviation; m, log."""
 
 
-def slice_unknowns(
+def _unknowns(
     predictor: SlicePredictor, parameters: Sequence[ParameterRange], cause: Cause | None = None
 ) -> list[Unknown]:
     """What is fitted: base parameters, where the knife was as far as it is unknown, a cause."""
@@ -172,7 +172,7 @@ def fit_slice(
     Raises:
         CuttingError: The slice breaks down where the fit begins.
     """
-    unknowns = slice_unknowns(predictor, parameters, cause)
+    unknowns = _unknowns(predictor, parameters, cause)
     given = start or {}
     theta = np.array([np.clip(given.get(u.name, 0.0), u.low, u.high) for u in unknowns])
     work = _Work(predictor, unknowns, cause, scan, noise)

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from sliceit_drake.calibration.prediction import food_of, knife_of, poses_in_food
+from sliceit_drake.calibration.record_target import food_of, knife_of, poses_in_food
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.food import make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel, Numerics
@@ -19,7 +20,7 @@ from sliceit_drake.diagnosis.simulator import Run
 from sliceit_drake.records.preprocessing import as_measured
 from sliceit_drake.records.slice_record import SliceRecord
 
-__all__ = ["CHANNELS", "Meshing", "SliceTarget", "make_targets"]
+__all__ = ["CHANNELS", "Meshing", "SliceTarget", "is_bare", "make_targets"]
 
 CHANNELS = ("force_x", "force_y", "force_z", "torque_y")
 """Compared components, in F: along the edge, normal to the blade, vertical, N; moment about Ko and
@@ -54,6 +55,8 @@ class SliceTarget:
         facts: What causes see of it.
         models: Its cut by meshing; empty without food.
         knife: The knife.
+        clock: Of the grid.
+        home: Ko where the edge first touches the food, in F [3], metres; 0 without food.
         channels: Names of the compared channels: `CHANNELS`, the first three without a torque, or
             "force_norm".
         time: Of the rows [m], s.
@@ -213,9 +216,13 @@ class SliceTarget:
         ends = self.stretches.ends.astype(float)
         return np.interp(np.arange(len(self.grid)), ends[1:], run.rise)
 
-    def board(self, setup: CalibrationSetup, R: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """Wrench of the board, whose top is z = 0 of F, with the knife at poses at the grid."""
-        board = dc.replace(setup.board, height=0.0)
+    def board(self, board: Board, R: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """Wrench of a board, its height in F, with the knife at poses at the grid [N, 6], Nm, N.
+
+        Args:
+            board: The board.
+            R, p: Poses X_FK [N + 1, 3, 3] and [N + 1, 3], metres.
+        """
         return board_wrenches(board, self.knife, R, p, self.clock.period)
 
     def _weight(self) -> np.ndarray:

@@ -10,7 +10,15 @@ from sliceit_drake.diagnosis.held_out import HeldOutGain
 from sliceit_drake.diagnosis.linear import LinearProblem
 from sliceit_drake.diagnosis.screen import CauseEvidence, Screening, screen
 
-__all__ = ["Finding", "Verdict", "foretold", "reach_verdict"]
+__all__ = [
+    "ALARM",
+    "CLASS_ANGLE",
+    "LEAST_REPLICATES",
+    "Finding",
+    "Verdict",
+    "foretold",
+    "reach_verdict",
+]
 
 ALARM = 0.02
 """Greatest p-value of the largest gain."""
@@ -54,6 +62,7 @@ ONE_CONDITION_GAIN = 0.05
 """The same where all cuts are of one condition: where more causes are near, what they gain has to
 tell them apart."""
 LEAST_REPLICATES = 3
+"""Slices of a condition from which variation can be told from an effect."""
 CANDIDATES = 8
 """Causes that are looked at more closely, those with most evidence."""
 

@@ -13,7 +13,7 @@ import numpy as np
 from sliceit_drake.hidden_study.truth import BASE_OF, CAUSE_OF, UNKNOWN
 from sliceit_drake.stand_in.registry import EFFECTS
 
-__all__ = ["CURVE_EFFECTS", "KINDS", "PAIRS", "Case", "Hidden", "SizeOf", "make_cases"]
+__all__ = ["KINDS", "PAIRS", "Case", "Hidden", "SizeOf", "make_cases"]
 
 KINDS: dict[str, int] = {
     "single": 210,

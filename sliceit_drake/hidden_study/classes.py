@@ -12,7 +12,6 @@ from sliceit_drake.diagnosis.registry import open_causes
 from sliceit_drake.diagnosis.sensitivity import sensitivities
 from sliceit_drake.hidden_study.bench import (
     DIAGNOSIS_REFINEMENT,
-    PROTOCOLS,
     QuietBench,
     model_food,
     protocol_named,
@@ -45,8 +44,10 @@ def protocol_classes(name: str, cache: Path | None = None) -> ProtocolClasses:
     Args:
         name: Of a protocol.
         cache: Folder for what was computed.
+
+    Raises:
+        ConfigurationError: There is no such protocol.
     """
-    assert name in PROTOCOLS
     protocol = protocol_named(name)
     causes = open_causes([p.name for p in BASE])
     file = None

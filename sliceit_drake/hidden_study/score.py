@@ -12,9 +12,10 @@ from sliceit_drake.hidden_study.runner import is_done
 from sliceit_drake.hidden_study.study import load_cases, read_facts
 from sliceit_drake.hidden_study.truth import CAUSE_OF
 
-__all__ = ["Judgement", "Rate", "judge", "judge_study", "load_near"]
+__all__ = ["NAMING", "Judgement", "Rate", "judge", "judge_study", "rate"]
 
 NAMING = ("cause", "causes", "too_few_replicates")
+"""Verdicts that give a name to what is wrong."""
 CLASS_ANGLE = 20.0
 """Causes that can do what was hidden to within this, degrees, are its class."""
 AS_WELL = 3.0
@@ -80,11 +81,6 @@ class Judgement:
     shifts: dict[str, list[float]]
     seconds: float
     code: str = ""
-
-    @property
-    def truth(self) -> list[str]:
-        """What should be named."""
-        return [CAUSE_OF[h.effect] for h in self.case.hidden if h.effect in CAUSE_OF]
 
     @property
     def effects(self) -> str:
@@ -162,15 +158,6 @@ def _is_resolved(facts: Mapping[str, Any], truth: list[str]) -> bool:
     return bool(facts["verdict"] == "cause" and facts["classes"] == [truth])
 
 
-def load_near(output: Path) -> Near:
-    """Which causes effects are how near to, as the study computed it.
-
-    Raises:
-        ConfigurationError: There is no study.
-    """
-    return _shared(output, "near.json")
-
-
 def _shared(output: Path, name: str) -> dict[str, Any]:
     found = read_facts(output / name)
     if found is None:
@@ -188,7 +175,7 @@ def judge_study(output: Path) -> list[Judgement]:
     Raises:
         ConfigurationError: There is no study.
     """
-    near = load_near(output)
+    near = _shared(output, "near.json")
     found = _shared(output, "classes.json")
     classes = {name: facts["classes"] for name, facts in found.items()}
     out = []

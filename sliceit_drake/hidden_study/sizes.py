@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.diagnose import BASE, setup_of_food
 from sliceit_drake.diagnosis.effect_size import effect_in_noise
 from sliceit_drake.diagnosis.linear import USUAL, LinearProblem
@@ -43,7 +44,7 @@ from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
 from sliceit_drake.stand_in.registry import EFFECTS, make_effect
 from sliceit_drake.stand_in.session import Session
 
-__all__ = ["DELTAS", "ProtocolSizes", "SizeCurve", "angles_for", "size_for", "sizes_as_markdown"]
+__all__ = ["ProtocolSizes", "SizeCurve", "angles_for", "size_for", "sizes_as_markdown"]
 
 DELTAS = (0.5, 1.0, 2.0, 2.5, 3.0, 4.0)
 """Strengths that a table shows."""
@@ -74,6 +75,7 @@ MIDDLE = 2.5
 """Strength at which an effect is compared with the causes."""
 
 ROUNDS = 3
+"""In which sizes are tried nearer and nearer to the strengths that are wanted."""
 CLOSE = 0.08
 """Relative distance of a size that was computed from one that is wanted, to be good enough."""
 
@@ -176,12 +178,7 @@ class ProtocolSizes:
     @functools.cached_property
     def _null(self) -> tuple[Sensitivities, LinearProblem]:
         """Sensitivities without causes, and the problem of a session with nothing hidden."""
-        real = Session(self.protocol, seed=SEED, settings=self.settings)
-        records = [real.record(k) for k in range(len(real))]
-        usual = [c for c in all_causes() if c.name in {name for name, *_ in USUAL}]
-        setup = setup_of_food(model_food(self.protocol), DIAGNOSIS_REFINEMENT)
-        found = sensitivities(setup, records, usual, cache=self.cache, workers=1)
-        return found, LinearProblem(found)
+        return self._problem([c for c in all_causes() if c.name in {name for name, *_ in USUAL}])
 
     @functools.cached_property
     def _plain(self) -> list[SliceRecord]:
@@ -220,11 +217,17 @@ class ProtocolSizes:
     @functools.cached_property
     def _full(self) -> tuple[Sensitivities, LinearProblem]:
         """The same session with the sensitivities of all causes."""
+        return self._problem(open_causes([p.name for p in BASE]))
+
+    @functools.cached_property
+    def _noisy(self) -> list[SliceRecord]:
+        """The slices of a session with nothing hidden."""
         real = Session(self.protocol, seed=SEED, settings=self.settings)
-        records = [real.record(k) for k in range(len(real))]
+        return [real.record(k) for k in range(len(real))]
+
+    def _problem(self, causes: Sequence[Cause]) -> tuple[Sensitivities, LinearProblem]:
         setup = setup_of_food(model_food(self.protocol), DIAGNOSIS_REFINEMENT)
-        causes = open_causes([p.name for p in BASE])
-        found = sensitivities(setup, records, causes, cache=self.cache, workers=1)
+        found = sensitivities(setup, self._noisy, causes, cache=self.cache, workers=1)
         return found, LinearProblem(found)
 
     def size_about(self, effect: str, delta: float) -> float:

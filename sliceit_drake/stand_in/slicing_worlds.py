@@ -76,7 +76,7 @@ DELAY = 4e-3
 
 
 @dc.dataclass(frozen=True)
-class Hidden:
+class _Hidden:
     """Effects of the stand-in that no training has, in the parameter groups of `cutting.effects`.
 
     Attributes:
@@ -94,7 +94,7 @@ class Hidden:
     bluntness: float = 0.3
 
 
-HIDDEN = Hidden()
+HIDDEN = _Hidden()
 
 
 def paper_slices(food: str) -> int:
