@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from sliceit_drake.emulator.kinematics import Posture, matrix_of_pose, pose_of_matrix
 from sliceit_drake.emulator.modes import (
     SAFETY_BITS,
+    MessageLevel,
     RobotMode,
     RuntimeState,
     SafetyMode,
@@ -28,7 +29,6 @@ from sliceit_drake.systems.servo import ServoConfig
 
 __all__ = ["Controller", "ControllerConfig", "Program"]
 
-_ERROR, _WARNING, _INFORMATION = 1, 2, 3
 _LOG_LENGTH = 1000
 # Joint speed below which the arm counts as standing still, rad/s.
 _STEADY = 1e-4
@@ -214,7 +214,7 @@ class Controller:
         """Plays a program in place of the one that runs; refused with a message if it cannot."""
         if not self.safety.may_move or self.mode != RobotMode.RUNNING:
             self.tell(
-                _ERROR,
+                MessageLevel.ERROR,
                 f"program refused: safety mode {self.safety.name}, robot mode {self.mode.name}",
             )
             return
@@ -261,7 +261,7 @@ class Controller:
         self._note(f"safety mode {mode.name}: {why}")
         if mode.may_move:
             return
-        self.messages.append((_ERROR, f"{mode.name}: {why}"))
+        self.messages.append((MessageLevel.ERROR, f"{mode.name}: {why}"))
         self._stopped_at = self.time
         if mode == SafetyMode.PROTECTIVE_STOP:
             if (program or self.config.protective_stop) == "stop":
@@ -302,7 +302,7 @@ class Controller:
         self._last_target = self._target
         self._move()
         while self.robot.warnings:
-            self.tell(_WARNING, self.robot.warnings.pop(0))
+            self.tell(MessageLevel.WARNING, self.robot.warnings.pop(0))
         self._show()
         self._supervise()
 
@@ -323,7 +323,7 @@ class Controller:
             if not self._program.step():
                 self.stop_program("it ended")
         except ScriptError as error:
-            self.messages.append((_ERROR, f"program error: {error}"))
+            self.messages.append((MessageLevel.ERROR, f"program error: {error}"))
             self.stop_program(f"error: {error}")
 
     def _check_watchdog(self) -> None:
@@ -332,7 +332,7 @@ class Controller:
         name, period = self._watchdog
         silent = self.time - self.registers.written_at[name]
         if silent > period:
-            self.tell(_ERROR, f"RTDE watchdog: no {name} for {silent:.3f} s")
+            self.tell(MessageLevel.ERROR, f"RTDE watchdog: no {name} for {silent:.3f} s")
             self.stop_program("RTDE watchdog")
 
     def _brake_if_uncommanded(self) -> None:

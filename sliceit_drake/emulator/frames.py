@@ -52,7 +52,7 @@ def encode_frame(kind: int, payload: bytes = b"") -> bytes:
 
 
 def encode_text(message: str, level: int, source: str = "emulator") -> bytes:
-    """A text message to a client; level 0 exception, 1 error, 2 warning, 3 information."""
+    """A text message to a client; its level is a `modes.MessageLevel`."""
     text, origin = (s.encode("ascii", "replace")[:255] for s in (message, source))
     payload = bytes([len(text)]) + text + bytes([len(origin)]) + origin + bytes([level])
     return encode_frame(PackageType.TEXT, payload)

@@ -7,6 +7,7 @@ import enum
 
 __all__ = [
     "SAFETY_BITS",
+    "MessageLevel",
     "RobotMode",
     "RuntimeState",
     "SafetyMode",
@@ -24,6 +25,15 @@ class RuntimeState(enum.IntEnum):
     PAUSING = 3
     PAUSED = 4
     RESUMING = 5
+
+
+class MessageLevel(enum.IntEnum):
+    """How grave a text message to the clients is."""
+
+    EXCEPTION = 0
+    ERROR = 1
+    WARNING = 2
+    INFORMATION = 3
 
 
 class RobotMode(enum.IntEnum):

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from sliceit_drake.emulator.kinematics import forward, inverse
 from sliceit_drake.emulator.robot_model import CYCLE
 
-__all__ = ["Scale", "ScriptError", "line_motion", "joint_motion", "slow_down"]
+__all__ = ["Scale", "ScriptError", "joint_motion", "line_motion", "slow_down"]
 
 Scale = Callable[[], float]
 """Share of the planned speed that the speed slider allows now."""

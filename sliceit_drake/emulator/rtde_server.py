@@ -16,6 +16,7 @@ from sliceit_drake.emulator.frames import (
     encode_text,
     split_names,
 )
+from sliceit_drake.emulator.modes import MessageLevel
 from sliceit_drake.emulator.registers import IN_USE
 from sliceit_drake.emulator.robot_model import CYCLE
 from sliceit_drake.emulator.variables import NOT_FOUND, output_type
@@ -28,8 +29,6 @@ RATE = 1.0 / CYCLE
 _PROTOCOL = 2
 # Above this backlog a client gets no further packages: only whole ones are ever dropped.
 _FULL = 65536
-_ERROR = 1
-
 
 _Values = dict[str, int | float | bool | tuple]
 
@@ -94,7 +93,7 @@ class RtdeServer:
                     return
         except (FrameError, struct.error) as error:
             # What follows cannot be told from garbage.
-            connection.send(encode_text(f"connection closed: {error}", _ERROR))
+            connection.send(encode_text(f"connection closed: {error}", MessageLevel.ERROR))
             connection.close()
 
     # Every cycle.
@@ -171,7 +170,7 @@ class RtdeServer:
         elif kind == PackageType.SETUP_INPUTS:
             connection.send(encode_frame(kind, self._set_inputs(connection, session, payload)))
         else:
-            connection.send(encode_text(f"unknown type of package {kind}", _ERROR))
+            connection.send(encode_text(f"unknown type of package {kind}", MessageLevel.ERROR))
 
     def _set_outputs(self, session: _Session, payload: bytes) -> bytes:
         (frequency,) = struct.unpack_from(">d", payload)
@@ -198,7 +197,7 @@ class RtdeServer:
                 raise FrameError(f"there is no input recipe {number}")
             values = session.inputs[number - 1].unpack(payload[1:])
         except FrameError as error:
-            connection.send(encode_text(f"input package ignored: {error}", _ERROR))
+            connection.send(encode_text(f"input package ignored: {error}", MessageLevel.ERROR))
             return
         self.packages_in += 1
         for name in ("input_int_register_0", "input_int_register_24"):

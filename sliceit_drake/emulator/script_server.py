@@ -5,10 +5,10 @@ import dataclasses as dc
 from sliceit_drake.emulator.connections import Connection
 from sliceit_drake.emulator.control_script import ControlScript, register_offset
 from sliceit_drake.emulator.controller import Controller
+from sliceit_drake.emulator.modes import MessageLevel
 
 __all__ = ["ScriptServer"]
 
-_ERROR = 1
 _LONGEST_PROGRAM = 1 << 20
 _END = b"\nend\n"
 
@@ -66,7 +66,7 @@ class ScriptServer:
         if offset is None:
             first = text.strip().splitlines()[0][:60]
             controller.tell(
-                _ERROR,
+                MessageLevel.ERROR,
                 f"program not emulated, only ur_rtde's control script is; it begins with {first!r}",
             )
             controller.stop_program("a program that is not emulated was sent")

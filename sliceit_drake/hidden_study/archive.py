@@ -6,12 +6,19 @@ from pathlib import Path
 from typing import Any
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.hidden_study.runner import is_done
-from sliceit_drake.hidden_study.study import CASES, load_cases, read_facts
+from sliceit_drake.hidden_study.runner import TIMING, is_done
+from sliceit_drake.hidden_study.study import (
+    CASES,
+    CLASSES,
+    NEAR,
+    OPTIONS,
+    load_cases,
+    read_facts,
+)
 
 __all__ = ["pack", "unpack"]
 
-SHARED = ("study.json", CASES, "near.json", "classes.json")
+SHARED = (OPTIONS, CASES, NEAR, CLASSES)
 """What all runs of a study have in common."""
 SAID = ("verdict", "classes", "gain", "shifts", "misfit_over_noise")
 """What is kept of a diagnosis beside the held-out shares of its causes."""
@@ -35,7 +42,7 @@ def pack(output: Path, file: Path) -> int:
         folder = output / "runs" / case.name
         run = {
             "truth": read_facts(output / "truth" / f"{case.name}.json"),
-            "timing": read_facts(folder / "timing.json"),
+            "timing": read_facts(folder / TIMING),
             "diagnosis": _said(read_facts(folder / "diagnosis.json")),
             "diagnosis_next": _said(read_facts(folder / "diagnosis_next.json")),
         }

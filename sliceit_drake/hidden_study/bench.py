@@ -19,8 +19,8 @@ from sliceit_drake.stand_in.world import World
 __all__ = [
     "DIAGNOSIS_REFINEMENT",
     "PROTOCOLS",
-    "QuietBench",
     "WORLD",
+    "QuietBench",
     "model_food",
     "protocol_named",
 ]

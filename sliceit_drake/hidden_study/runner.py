@@ -20,9 +20,10 @@ from sliceit_drake.stand_in.protocol import Protocol, protocol_of_scenario
 from sliceit_drake.stand_in.registry import make_effect
 from sliceit_drake.stand_in.session import Session
 
-__all__ = ["Made", "food_file", "is_done", "keep_case", "run_case", "run_case_there"]
+__all__ = ["TIMING", "Made", "food_file", "is_done", "keep_case", "run_case", "run_case_there"]
 
 TIMING = "timing.json"
+"""What a run took, by part; written last."""
 
 KEPT = (
     "diagnosis.json",

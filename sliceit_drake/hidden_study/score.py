@@ -8,8 +8,8 @@ from typing import Any
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.hidden_study.cases import Case
-from sliceit_drake.hidden_study.runner import is_done
-from sliceit_drake.hidden_study.study import load_cases, read_facts
+from sliceit_drake.hidden_study.runner import TIMING, is_done
+from sliceit_drake.hidden_study.study import CLASSES, NEAR, load_cases, read_facts
 from sliceit_drake.hidden_study.truth import CAUSE_OF
 
 __all__ = ["NAMING", "Judgement", "Rate", "judge", "judge_study", "rate"]
@@ -175,14 +175,14 @@ def judge_study(output: Path) -> list[Judgement]:
     Raises:
         ConfigurationError: There is no study.
     """
-    near = _shared(output, "near.json")
-    found = _shared(output, "classes.json")
+    near = _shared(output, NEAR)
+    found = _shared(output, CLASSES)
     classes = {name: facts["classes"] for name, facts in found.items()}
     out = []
     for case in load_cases(output):
         if is_done(output, case.name):
             folder = output / "runs" / case.name
-            timing = read_facts(folder / "timing.json") or {}
+            timing = read_facts(folder / TIMING) or {}
             judgement = judge(
                 case,
                 read_facts(folder / "diagnosis.json"),

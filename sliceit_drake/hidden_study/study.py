@@ -28,7 +28,17 @@ from sliceit_drake.hidden_study.truth import CAUSE_OF
 if TYPE_CHECKING:
     from distributed import Client
 
-__all__ = ["CASES", "StudyOptions", "load_cases", "prepare", "read_facts", "run_study"]
+__all__ = [
+    "CASES",
+    "CLASSES",
+    "NEAR",
+    "OPTIONS",
+    "StudyOptions",
+    "load_cases",
+    "prepare",
+    "read_facts",
+    "run_study",
+]
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage, what is done and what there is."""
@@ -36,6 +46,12 @@ Progress = Callable[[str, int, int], None]
 
 CASES = "cases.json"
 """The list of runs, done or not, and what it follows from."""
+CLASSES = "classes.json"
+"""By protocol all that its slices cannot tell apart (`classes.ProtocolClasses`)."""
+NEAR = "near.json"
+"""By protocol and effect the angles to all causes, degrees."""
+OPTIONS = "study.json"
+"""Seed and replicates."""
 
 
 @dc.dataclass(frozen=True)
@@ -65,7 +81,7 @@ def prepare(output: Path, options: StudyOptions, progress: Progress) -> list[Cas
     Raises:
         ConfigurationError: The folder holds another study.
     """
-    file = output / "study.json"
+    file = output / OPTIONS
     facts = {"seed": options.seed, "replicates": options.replicates}
     found = read_facts(file)
     if found is not None and found != facts:
@@ -102,7 +118,7 @@ def _listed_by(options: StudyOptions) -> dict[str, Any]:
 def _begun(output: Path, options: StudyOptions) -> list[Case] | None:
     """The runs of a study that goes on; None where there is none, or one of other runs."""
     known = read_facts(output / CASES)
-    if known is None or any(not (output / n).exists() for n in ("near.json", "classes.json")):
+    if known is None or any(not (output / n).exists() for n in (NEAR, CLASSES)):
         return None
     cases = [Case.of(facts) for facts in known.pop("cases")]
     return cases if known == _listed_by(options) else None
@@ -141,7 +157,7 @@ def _classes(
         found[name] = protocol_classes(name, output / "cache")
         progress("classes", k + 1, len(protocols))
     text = json.dumps({name: dc.asdict(c) for name, c in found.items()}) + "\n"
-    (output / "classes.json").write_text(text, encoding="utf-8")
+    (output / CLASSES).write_text(text, encoding="utf-8")
     return found
 
 
@@ -150,7 +166,7 @@ def _near(output: Path, cases: Sequence[Case], progress: Progress) -> None:
     wanted = sorted(
         {(c.protocol, h.effect) for c in cases for h in c.hidden if h.effect in CAUSE_OF}
     )
-    file = output / "near.json"
+    file = output / NEAR
     near: dict[str, dict[str, dict[str, float]]] = read_facts(file) or {}
     for k, (protocol, effect) in enumerate(wanted):
         near.setdefault(protocol, {})[effect] = angles_for(protocol, effect, output / "cache")

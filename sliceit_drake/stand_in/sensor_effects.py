@@ -4,6 +4,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from sliceit_drake.stand_in.effect import Effect, Series, SliceFacts
+from sliceit_drake.stand_in.world import GRAVITY
 
 __all__ = [
     "DriveVibration",
@@ -14,8 +15,6 @@ __all__ = [
     "StickSlip",
     "ToolWeight",
 ]
-
-GRAVITY = 9.81
 
 
 class SensorDrift(Effect):

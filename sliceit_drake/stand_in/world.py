@@ -13,6 +13,7 @@ from sliceit_drake.stand_in.protocol import Specimen
 __all__ = ["GRAVITY", "Path", "World", "resampled"]
 
 GRAVITY = 9.81
+"""m/s2."""
 
 
 class World(typing.Protocol):
