@@ -92,10 +92,10 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         default=5,
         help="blocks of depth held out in turn (default 5; 0: none)",
     )
-    parser.set_defaults(run=run, resumes=True)
+    parser.set_defaults(run=_run, resumes=True)
 
 
-def run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
     """Runs the command."""
     from sliceit_drake.configuration import ConfigurationError
 

@@ -45,10 +45,10 @@ def add_calibration_study(studies: "argparse._SubParsersAction[argparse.Argument
     parser.add_argument(
         "--workers", type=int, default=os.cpu_count() or 1, help="default: all processors"
     )
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=_run)
 
 
-def run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
     """Runs the study."""
     import time
 

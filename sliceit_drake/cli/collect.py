@@ -88,10 +88,10 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         metavar="PORT",
         help="of the emulator at --host, to put fresh food there before each slice",
     )
-    parser.set_defaults(run=run, resumes=True)
+    parser.set_defaults(run=_run, resumes=True)
 
 
-def run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
     """Runs the command."""
     import numpy as np
 

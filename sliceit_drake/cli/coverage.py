@@ -32,10 +32,10 @@ def add_coverage(studies: "argparse._SubParsersAction[argparse.ArgumentParser]")
     parser.add_argument(
         "--output", metavar="FOLDER", type=Path, help="write coverage.md and coverage.jsonl there"
     )
-    parser.set_defaults(run=run_coverage, resumes=True)
+    parser.set_defaults(run=_run_coverage, resumes=True)
 
 
-def run_coverage(options: argparse.Namespace) -> int:
+def _run_coverage(options: argparse.Namespace) -> int:
     """Runs the study."""
     from tqdm import tqdm
 

@@ -92,10 +92,10 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         "--workers", type=int, default=os.cpu_count() or 1, help="processors (default: all)"
     )
     add_cluster_arguments(parser, "threads", "slices are simulated")
-    parser.set_defaults(run=run, resumes=True)
+    parser.set_defaults(run=_run, resumes=True)
 
 
-def run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
     """Runs the command."""
     from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.diagnosis.cluster import on_cluster

@@ -26,10 +26,10 @@ def add_disect_study(studies: "argparse._SubParsersAction[argparse.ArgumentParse
     parser.add_argument(
         "--output", metavar="FOLDER", type=Path, required=True, help="where page and figure go"
     )
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=_run)
 
 
-def run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
     """Runs the study."""
     import time
 

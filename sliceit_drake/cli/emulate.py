@@ -74,10 +74,10 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     )
     parser.add_argument("--end-with-stdin", action="store_true", help=argparse.SUPPRESS)
     # The arm alone needs none.
-    parser.set_defaults(run=run, warp=False)
+    parser.set_defaults(run=_run, warp=False)
 
 
-def run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
     """Runs the command."""
     logging.getLogger("drake").setLevel(logging.WARNING)
 

@@ -23,10 +23,14 @@ if TYPE_CHECKING:
 __all__ = [
     "add_parser",
     "add_robot_arguments",
+    "ask",
+    "checked_run",
     "is_loopback",
     "move_confirmed",
+    "plan_text",
     "robot_config",
     "run_confirmed",
+    "touch_board",
     "touch_confirmed",
 ]
 
@@ -77,7 +81,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument(
         "--touch", action="store_true", help="first find the board's height with the knife"
     )
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=_run)
 
 
 def add_robot_arguments(parser: argparse.ArgumentParser) -> None:
@@ -114,7 +118,7 @@ def add_robot_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
     """Runs the command."""
     logging.getLogger("drake").setLevel(logging.WARNING)
     scenario = scenario_of(options)
@@ -151,7 +155,7 @@ def run_confirmed(
     if getattr(options, "touch", False) and not options.dry_run:
         if not touch_confirmed(options, scenario, config):
             return None
-    with connected(options, config) as client:
+    with _connected(options, config) as client:
         is_drawn = not (getattr(options, "no_replay", True) or options.dry_run)
         meshcat = make_meshcat() if is_drawn else None
         hardware = prepare_hardware_run(scenario, config, client, options.pace, meshcat)
@@ -162,7 +166,7 @@ def touch_confirmed(
     options: argparse.Namespace, scenario: "Scenario", config: "HardwareConfig"
 ) -> bool:
     """Connects and finds the board, see `touch_board`; the program on the robot is stopped then."""
-    with connected(options, config) as client:
+    with _connected(options, config) as client:
         return touch_board(options, scenario, config, client)
 
 
@@ -177,7 +181,7 @@ def move_confirmed(
     from sliceit_drake.diagrams.hardware_run import prepare_hardware_run
     from sliceit_drake.diagrams.move_to_start import MoveToStart
 
-    with connected(options, config) as client:
+    with _connected(options, config) as client:
         hardware = prepare_hardware_run(scenario, config, client, options.pace)
         if not _report("Robot", hardware.check_facts()):
             return False
@@ -236,7 +240,7 @@ def touch_board(
         found = touch.execute()
     except TouchError as error:
         print(f"STOPPED: {error}")
-        print(stopped_text(touch.link))
+        print(_stopped_text(touch.link))
         return False
     print(
         f"The board is at {found.height:.4f} m (+- {1e3 * found.uncertainty:.2f} mm), expected at "
@@ -255,7 +259,7 @@ def checked_run(
     """The same with a robot that is connected already."""
     if not _report("Robot and plan", hardware.check_before()):
         return None
-    duration = run_duration(options, hardware)
+    duration = _run_duration(options, hardware)
     if not _report("Start", hardware.check_at_start()):
         return None
     print(plan_text(hardware, duration))
@@ -268,7 +272,7 @@ def checked_run(
     return _slice(hardware, duration, directory) if ask(WORD, options) else None
 
 
-def run_duration(options: argparse.Namespace, hardware: "HardwareRun") -> float:
+def _run_duration(options: argparse.Namespace, hardware: "HardwareRun") -> float:
     """How long to run, s.
 
     Raises:
@@ -288,7 +292,7 @@ def run_duration(options: argparse.Namespace, hardware: "HardwareRun") -> float:
     return duration
 
 
-def stopped_text(link: "RobotLink | None") -> str:
+def _stopped_text(link: "RobotLink | None") -> str:
     """What an operator must know about the robot after a stop."""
     if link is None or link.stop_error is None:
         return "The robot's program is stopped. Find the cause before you start again."
@@ -317,7 +321,7 @@ def _slice(hardware: "HardwareRun", duration: float, directory: Path) -> "Run":
     summary = write_hardware_outputs(hardware, directory)
     if made.stopped:
         print(f"STOPPED: {made.stopped}")
-        print(stopped_text(hardware.link))
+        print(_stopped_text(hardware.link))
     robot = summary["robot"]
     print(
         f"Peak force {summary['peak_force_N']:.1f} N; {robot['cycles']:.0f} cycles, "
@@ -360,7 +364,7 @@ def is_loopback(host: str) -> bool:
 
 
 @contextmanager
-def connected(options: argparse.Namespace, config: "HardwareConfig") -> "Iterator[RobotClient]":
+def _connected(options: argparse.Namespace, config: "HardwareConfig") -> "Iterator[RobotClient]":
     """A client in control of the robot; at the end the robot's program is stopped, however it ends.
 
     A terminal that is closed, and a polite kill, end it as Ctrl-C does.
@@ -368,14 +372,14 @@ def connected(options: argparse.Namespace, config: "HardwareConfig") -> "Iterato
     from sliceit_drake.hardware.interruption import catch_signals
 
     with catch_signals():
-        client = connect(options, config)
+        client = _connect(options, config)
         try:
             yield client
         finally:
             client.close()
 
 
-def connect(options: argparse.Namespace, config: "HardwareConfig") -> "RobotClient":
+def _connect(options: argparse.Namespace, config: "HardwareConfig") -> "RobotClient":
     """Connects to the robot and takes control.
 
     Raises:

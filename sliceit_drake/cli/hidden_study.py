@@ -58,7 +58,7 @@ def add_hidden_study(studies: "argparse._SubParsersAction[argparse.ArgumentParse
     hidden.add_argument(
         "--replicates", type=int, default=200, help="of each diagnosis's bootstrap (default 200)"
     )
-    hidden.set_defaults(run=run_hidden, resumes=True)
+    hidden.set_defaults(run=_run_hidden, resumes=True)
     sizes = studies.add_parser(
         "sizes",
         help="sizes of effects by their strength against the noise",
@@ -75,10 +75,10 @@ def add_hidden_study(studies: "argparse._SubParsersAction[argparse.ArgumentParse
     sizes.add_argument("--effects", nargs="+", metavar="NAME", help="default: all")
     sizes.add_argument("--cache", metavar="DIR", type=Path, help="keep what was computed there")
     sizes.add_argument("--output", metavar="FILE", type=Path, help="also write the table there")
-    sizes.set_defaults(run=run_sizes)
+    sizes.set_defaults(run=_run_sizes)
 
 
-def run_hidden(options: argparse.Namespace) -> int:
+def _run_hidden(options: argparse.Namespace) -> int:
     """Runs the study."""
     from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.hidden_study.archive import unpack
@@ -117,7 +117,7 @@ def run_hidden(options: argparse.Namespace) -> int:
     return 0
 
 
-def run_sizes(options: argparse.Namespace) -> int:
+def _run_sizes(options: argparse.Namespace) -> int:
     """Prints the table."""
     from tqdm import tqdm
 

@@ -60,7 +60,7 @@ def add_identifiability(studies: "argparse._SubParsersAction[argparse.ArgumentPa
         "--cause", metavar="FILE", action="append", default=[], help="also a cause of your own"
     )
     parser.add_argument("--workers", metavar="N", type=int, help="threads (default: all)")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=_run)
 
 
 def protocol_setup(protocol: "Protocol", refinement: float = 1.0) -> "CalibrationSetup":
@@ -136,7 +136,7 @@ def study(
     return Study(results, causes, found)
 
 
-def run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
     """Runs the study."""
     from tqdm import tqdm
 

@@ -33,10 +33,10 @@ def add_random_study(studies: "argparse._SubParsersAction[argparse.ArgumentParse
     parser.add_argument(
         "--output", metavar="FOLDER", type=Path, help="write random_slices.md there"
     )
-    parser.set_defaults(run=run_random)
+    parser.set_defaults(run=_run_random)
 
 
-def run_random(options: argparse.Namespace) -> int:
+def _run_random(options: argparse.Namespace) -> int:
     """Runs the study."""
     from tqdm import tqdm
 

@@ -44,10 +44,10 @@ def add_real_study(studies: "argparse._SubParsersAction[argparse.ArgumentParser]
     parser.add_argument(
         "--workers", type=int, default=os.cpu_count() or 1, help="default: all processors"
     )
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=_run)
 
 
-def run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
     """Runs the study."""
     from sliceit_drake.diagnosis.input_checks import check_records
     from sliceit_drake.diagnosis.one_slice import diagnose_slice, setup_of_slice

@@ -77,10 +77,10 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         "--refinement", type=float, help="finite elements along an edge, against the food's mesh"
     )
     parser.add_argument("--time-step", type=float, metavar="S", help="their sub-step")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=_run)
 
 
-def run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
     """Runs the command."""
     if options.list_effects:
         from sliceit_drake.stand_in.registry import effects_as_markdown

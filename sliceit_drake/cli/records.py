@@ -71,7 +71,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     check.add_argument(
         "paths", metavar="PATH", nargs="+", type=Path, help="a record (NAME.csv), or a folder"
     )
-    check.set_defaults(run=run_check, warp=False)
+    check.set_defaults(run=_run_check, warp=False)
     make = actions.add_parser(
         "import",
         help="make a record from another format",
@@ -134,10 +134,10 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         default="header",
         help="rosbag: stamps of the messages (the default), or when they were recorded",
     )
-    make.set_defaults(run=run_import, warp=False)
+    make.set_defaults(run=_run_import, warp=False)
 
 
-def run_check(options: argparse.Namespace) -> int:
+def _run_check(options: argparse.Namespace) -> int:
     """Runs `sliceit records check`."""
     from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.records.slice_record import read_table
@@ -159,7 +159,7 @@ def run_check(options: argparse.Namespace) -> int:
     return 1 if bad else 0
 
 
-def run_import(options: argparse.Namespace) -> int:
+def _run_import(options: argparse.Namespace) -> int:
     """Runs `sliceit records import`."""
     from sliceit_drake.configuration import load_yaml
     from sliceit_drake.records.metadata import SliceMetadata

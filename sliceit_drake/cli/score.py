@@ -29,10 +29,10 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     )
     parser.add_argument("study", metavar="DIR", type=Path, help="folder of the study, or its runs")
     parser.add_argument("--output", metavar="FOLDER", type=Path, help="also write the report there")
-    parser.set_defaults(run=run, warp=False)
+    parser.set_defaults(run=_run, warp=False)
 
 
-def run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
     """Runs the command."""
     import json
     import tempfile

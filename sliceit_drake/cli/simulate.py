@@ -65,10 +65,10 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     )
     parser.add_argument("--fps", type=float, default=30.0, help="its frames a second (default 30)")
     parser.add_argument("--no-replay", action="store_true", help="do not write replay.html")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=_run)
 
 
-def run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
     """Runs the command."""
     scenario = scenario_of(options)
     directory = options.output or Path("output") / scenario.name

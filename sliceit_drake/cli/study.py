@@ -89,7 +89,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     )
     add_scenario_arguments(coupling)
     coupling.add_argument("--output", metavar="FILE", type=Path, help="also write the table there")
-    coupling.set_defaults(run=run_coupling)
+    coupling.set_defaults(run=_run_coupling)
     servo = studies.add_parser(
         "servo",
         help="lag and step response of the arm against servoj's parameters",
@@ -97,7 +97,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     servo.add_argument("--output", metavar="FILE", type=Path, help="also write the table there")
-    servo.set_defaults(run=run_servo)
+    servo.set_defaults(run=_run_servo)
     control = studies.add_parser(
         "control",
         help="stability of compliance control against contact stiffness",
@@ -107,7 +107,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     control.add_argument(
         "--output", metavar="FOLDER", type=Path, help="also write control.png and control.md there"
     )
-    control.set_defaults(run=run_control)
+    control.set_defaults(run=_run_control)
     stepping = studies.add_parser(
         "stepping",
         help="error of the force against sub-step and cost",
@@ -130,7 +130,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         action="store_true",
         help="steps from 5e-5 s against scaled masses at that step, a sixth of the time",
     )
-    stepping.set_defaults(run=run_stepping)
+    stepping.set_defaults(run=_run_stepping)
     add_verification(studies)
     add_coverage(studies)
     add_slicing(studies)
@@ -142,7 +142,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     add_disect_study(studies)
 
 
-def run_coupling(options: argparse.Namespace) -> int:
+def _run_coupling(options: argparse.Namespace) -> int:
     """Runs the study of the coupling."""
     scenario = scenario_of(options)
 
@@ -160,7 +160,7 @@ def run_coupling(options: argparse.Namespace) -> int:
     return 0
 
 
-def run_servo(options: argparse.Namespace) -> int:
+def _run_servo(options: argparse.Namespace) -> int:
     """Runs the study of the servo."""
     from tqdm import tqdm
 
@@ -180,7 +180,7 @@ def run_servo(options: argparse.Namespace) -> int:
     return 0
 
 
-def run_control(options: argparse.Namespace) -> int:
+def _run_control(options: argparse.Namespace) -> int:
     """Runs the study of compliance control in contact."""
     import numpy as np
     from tqdm import tqdm
@@ -214,7 +214,7 @@ def run_control(options: argparse.Namespace) -> int:
     return 0
 
 
-def run_stepping(options: argparse.Namespace) -> int:
+def _run_stepping(options: argparse.Namespace) -> int:
     """Runs the study of the sub-step."""
     from collections.abc import Callable
 

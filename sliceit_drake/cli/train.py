@@ -55,7 +55,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument(
         "--set", metavar="YAML", help="fields that replace others, as '{task: {foods: [potato]}}'"
     )
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=_run)
 
 
 @contextmanager
@@ -78,7 +78,7 @@ def _stop_by(asked: threading.Event) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
     """Runs the command."""
     from tqdm import tqdm
 

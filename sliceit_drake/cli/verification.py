@@ -38,10 +38,10 @@ def add_verification(studies: "argparse._SubParsersAction[argparse.ArgumentParse
         action="store_true",
         help="first fit the foods to the measured cuts, some minutes each, and write that file",
     )
-    parser.set_defaults(run=run_verification)
+    parser.set_defaults(run=_run_verification)
 
 
-def run_verification(options: argparse.Namespace) -> int:
+def _run_verification(options: argparse.Namespace) -> int:
     """Runs the verification."""
     from tqdm import tqdm
 
