@@ -41,10 +41,10 @@ def add_slicing(studies: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         metavar=("OURS", "BASELINE"),
         help="folders of two trainings, for the figure of the force over time",
     )
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=_run)
 
 
-def run(options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
     """Runs the command."""
     from sliceit_drake.cli.extras import needs_extra
     from sliceit_drake.configuration import ConfigurationError
