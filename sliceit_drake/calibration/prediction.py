@@ -288,11 +288,6 @@ class Predictor:
         residual = np.concatenate([p.predicted.ravel() for p in row]) - self.measured
         return float(np.sqrt(np.mean(residual[self.used] ** 2)))
 
-    def residuals(self, unit: np.ndarray) -> np.ndarray:
-        """Predicted minus measured, all records in a row [M], N; NaN where a slice broke down."""
-        (row,) = self.predict([unit])
-        return np.concatenate([p.predicted.ravel() for p in row]) - self.measured
-
     def mean_square_and_gradient(self, unit: np.ndarray) -> tuple[float, np.ndarray]:
         """Mean square of the used residuals [N^2], and its gradient by the unit values.
 

@@ -98,22 +98,22 @@ class RecordTarget:
                 field="p_WK_z",
                 fix="Correct food.position or the heights; both are in the world frame, in metres.",
             )
-        self.first, self.last = max(low[0] - 1, 0), min(low[-1] + 1, len(p) - 1)
-        self.contact = home.p
-        self.start = float(record.time[self.first])
+        self._first, self._last = max(low[0] - 1, 0), min(low[-1] + 1, len(p) - 1)
+        self._contact = home.p
+        self._start = float(record.time[self._first])
         # One more than there is time for: no sample lies beyond the last mean.
-        count = int(np.ceil((record.time[self.last] - self.start) / EXCHANGE_PERIOD)) + 1
-        self.times = self.start + EXCHANGE_PERIOD * np.arange(count + 1)
-        at = np.minimum(self.times, record.time[-1])
-        self.position = np.column_stack([np.interp(at, record.time, column) for column in p.T])
-        self.rotation = Slerp(record.time, rotation)(at).as_matrix()
-        self.time = record.time[self.first : self.last + 1]
-        self.depth = -height[self.first : self.last + 1]
+        count = int(np.ceil((record.time[self._last] - self._start) / EXCHANGE_PERIOD)) + 1
+        self._times = self._start + EXCHANGE_PERIOD * np.arange(count + 1)
+        at = np.minimum(self._times, record.time[-1])
+        self._position = np.column_stack([np.interp(at, record.time, column) for column in p.T])
+        self._rotation = Slerp(record.time, rotation)(at).as_matrix()
+        self.time = record.time[self._first : self._last + 1]
+        self.depth = -height[self._first : self._last + 1]
         if self.by_norm:
-            self.measured = record.force_magnitude[self.first : self.last + 1, None]
+            self.measured = record.force_magnitude[self._first : self._last + 1, None]
         else:
             assert record.force is not None
-            self.measured = R_FW.apply(record.force)[self.first : self.last + 1]
+            self.measured = R_FW.apply(record.force)[self._first : self._last + 1]
         self.operator = self._operator(count)
 
     def _operator(self, count: int) -> np.ndarray:
@@ -122,10 +122,10 @@ class RecordTarget:
         Filters are linear, so that their effect on each exchange's force is all there is to know.
         """
         record, T = self.record, EXCHANGE_PERIOD
-        before = int((self.start - record.time[0]) / T) + 2
-        after = int(max(record.time[-1] - self.times[-1], 0.0) / T) + 2
+        before = int((self._start - record.time[0]) / T) + 2
+        after = int(max(record.time[-1] - self._times[-1], 0.0) / T) + 2
         # A reading stands for the mean over the exchange that ends with it, as everywhere.
-        ends = self.start + T * np.arange(1 - before, count + after + 1)
+        ends = self._start + T * np.arange(1 - before, count + after + 1)
         series = np.zeros((len(ends), count))
         series[before : before + count] = np.eye(count)
         time, rows = as_measured(record.metadata, ends, series)
@@ -137,8 +137,8 @@ class RecordTarget:
 
     def motion(self, height_offset: float, speed_factor: float) -> KnifeMotion:
         """The knife's motion in F where it stood lower by `height_offset` and moved faster."""
-        p = self.contact + speed_factor * (self.position - self.contact)
-        return KnifeMotion(self.rotation, p - np.array([0.0, 0.0, height_offset]))
+        p = self._contact + speed_factor * (self._position - self._contact)
+        return KnifeMotion(self._rotation, p - np.array([0.0, 0.0, height_offset]))
 
     def compare(self, force: np.ndarray) -> np.ndarray:
         """Channels at the samples [m, channels] from forces of the exchanges [E, 3], N, in F."""

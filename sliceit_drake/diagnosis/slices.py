@@ -12,7 +12,7 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.food import make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.model import CuttingModel, Numerics
+from sliceit_drake.cutting.model import GRAVITY, CuttingModel, Numerics
 from sliceit_drake.cutting.simulate import board_wrenches
 from sliceit_drake.diagnosis.cause import Cause, ForceSeries, SharedFacts, SliceFacts
 from sliceit_drake.diagnosis.clock import Clock, Stretches
@@ -27,7 +27,6 @@ CHANNELS = ("force_x", "force_y", "force_z", "torque_y")
 Fy, which a draw and a turned sensor change, Nm."""
 WRENCH_ROWS = (3, 4, 5, 1)
 
-GRAVITY = 9.81
 MARGIN = 2e-3
 """Height of the edge over the food from which on the food is computed, metres."""
 CLEAR = 6e-4

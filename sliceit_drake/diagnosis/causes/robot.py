@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sliceit_drake.cutting.model import GRAVITY
 from sliceit_drake.diagnosis.cause import Cause, CauseParameter, ForceSeries, Scan, SliceFacts
 from sliceit_drake.diagnosis.periodicity import strongest_frequencies
 
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
 
 __all__ = ["StickSlip", "ToolWeight", "Vibration"]
 
-GRAVITY = 9.81
 AXES = ("x", "y", "z")
 REST = 2e-3
 """Speed below which drives do not shake, m/s."""
