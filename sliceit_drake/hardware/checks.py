@@ -62,7 +62,7 @@ def check_facts(facts: RobotFacts, config: HardwareConfig) -> list[Check]:
         Check(
             "safety mode",
             facts.safety_mode in ("NORMAL", "REDUCED"),
-            f"{facts.safety_mode}, wanted NORMAL",
+            f"{facts.safety_mode}, wanted NORMAL or REDUCED",
             "Clear the stop on the pendant, after finding its cause.",
         ),
         Check(
