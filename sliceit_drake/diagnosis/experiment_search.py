@@ -230,6 +230,7 @@ def _joined(problem: LinearProblem, new: Sensitivities, names: set[str]) -> Line
     ]
     records += [dc.replace(r, columns=picked(r.columns), even=picked(r.even)) for r in new.records]
     elements = max(old.elements, new.elements)
-    joint = LinearProblem(Sensitivities(columns, records, [], elements), noise=problem.noise)
-    joint.variation, joint.variation_samples = problem.variation, problem.variation_samples
+    found = Sensitivities(columns, records, [], elements)
+    joint = LinearProblem(found, problem.noise, problem.variation)
+    joint.variation_samples = problem.variation_samples
     return joint
