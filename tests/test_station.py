@@ -194,6 +194,13 @@ def test_unreachable_food_is_refused_with_its_place():
         MakeSlicingStation(scenario)
 
 
+def test_a_food_that_is_higher_than_the_blade_is_refused():
+    scenario = cucumber()
+    scenario.knife.height = 0.02
+    with pytest.raises(ConfigurationError, match=r"scenario\.knife\.height.*20 mm.*food 27 mm"):
+        MakeSlicingStation(scenario)
+
+
 @pytest.mark.parametrize("group", ["compliance: {arm: 1.0e-5}", "slip: {remaining: 0.2}"])
 def test_a_station_refuses_effects_that_are_for_a_prescribed_motion(group):
     with pytest.raises(ConfigurationError, match="prescribed motion") as error:

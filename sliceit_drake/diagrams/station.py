@@ -11,6 +11,7 @@ from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import Demultiplexer
 
+from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.cutting.solver import CuttingSolver
@@ -325,12 +326,19 @@ def _food_solvers(scenario: Scenario) -> list[CuttingSolver]:
     food, sequence = scenario.food, scenario.sequence
     if not isinstance(food, Food):
         return []
-    return [
-        CuttingSolver(
-            make_food_model(each, scenario.knife, scenario.numerics), scenario.exchange_period
+    foods = sequence.foods(food) if sequence else [food]
+    models = [make_food_model(each, scenario.knife, scenario.numerics) for each in foods]
+    blade = scenario.knife.tip_height + scenario.knife.height
+    highest = max(model.top - model.bottom for model in models)
+    if highest > blade:
+        raise ConfigurationError(
+            f"the blade is {1e3 * blade:.3g} mm high and the food {1e3 * highest:.3g} mm: spine "
+            "and gripper would go into the food",
+            field="scenario.knife.height",
+            fix="Take a higher knife (those of calibration/knives by `knife_name`), or a smaller "
+            "food.",
         )
-        for each in (sequence.foods(food) if sequence else [food])
-    ]
+    return [CuttingSolver(model, scenario.exchange_period) for model in models]
 
 
 def _motion_plan(scenario: Scenario, solvers: list[CuttingSolver]) -> MotionPlan:
