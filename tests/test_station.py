@@ -197,7 +197,7 @@ def test_unreachable_food_is_refused_with_its_place():
 def test_a_food_that_is_higher_than_the_blade_is_refused():
     scenario = cucumber()
     scenario.knife.height = 0.02
-    with pytest.raises(ConfigurationError, match=r"scenario\.knife\.height.*20 mm.*food 27 mm"):
+    with pytest.raises(ConfigurationError, match=r"scenario\.knife\.height.*20 mm.*food 27"):
         MakeSlicingStation(scenario)
 
 
