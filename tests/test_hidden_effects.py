@@ -219,6 +219,11 @@ def test_the_lower_bound_is_wilsons():
         assert Rate(hits, runs).lower == pytest.approx(bound, abs=1e-9)
 
 
+def test_the_upper_bound_is_the_lower_one_of_what_did_not_happen():
+    for hits, runs in ((0, 10), (1, 201), (16, 200), (7, 7)):
+        assert Rate(hits, runs).upper == pytest.approx(1.0 - Rate(runs - hits, runs).lower)
+
+
 def test_too_few_runs_never_meet_a_requirement():
     judgements = [said("single", ("skin",), "cause", ["skin"]) for _ in range(50)]
     rows = {row["what"]: row for row in numbers(judgements)["requirements"]}

@@ -8,7 +8,7 @@ __all__ = ["add_parser"]
 DESCRIPTION = """\
 Judge the diagnoses of `sliceit study hidden`: what was said against what was hidden.
 
-Prints rates with Wilson's lower bounds, what is asked for, rates by cause, detection curves and
+Prints rates with Wilson's bounds, what is asked for, rates by cause, detection curves and
 what was said where it was not right. With --output FOLDER it also writes hidden_effects.md,
 hidden_effects.json, hidden_effects.jsonl (the runs, from which the study can be judged again and
 gone on with) and figures/hidden_effects.png there. A study that is not done is judged by what there

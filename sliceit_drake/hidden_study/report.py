@@ -87,6 +87,7 @@ def _rate_facts(r: Rate) -> dict[str, float | int | None]:
         "runs": r.runs,
         "share": share,
         "lower_bound": r.lower if r.runs else None,
+        "upper_bound": r.upper if r.runs else None,
     }
 
 
@@ -207,15 +208,17 @@ def report(
     head = HEAD.format(command=_command(judgements, options or {}))
     lines = [head, f"{len(judgements)} runs.", ""]
     lines += [
-        "| what | asked for | reached | share | lower bound, 95 % | met |",
+        "| what | asked for | reached | share | one-sided bound, 95 % | met |",
         "|---|---|---|---|---|---|",
     ]
     for row in _requirements(judgements):
         shown = f"{row['hits']} of {row['runs']}" + (f" ({row['shown']})" if row["shown"] else "")
         met = ("yes" if row["met"] else "no") if row["runs"] else "not run"
+        few = row["asked"].startswith("<=")
+        bound = f"{'<=' if few else '>='} {_percent(row['upper_bound' if few else 'lower_bound'])}"
         lines.append(
             f"| {row['what']} | {row['asked']} | {shown} | {_percent(row['share'])} "
-            f"| {_percent(row['lower_bound'])} | {met} |"
+            f"| {bound if row['runs'] else _percent(None)} | {met} |"
         )
     lines.append("")
     sizes = [len(c) for j in _of(judgements, "single") for c in j.classes]

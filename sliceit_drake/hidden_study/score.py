@@ -43,12 +43,20 @@ class Rate:
     @property
     def lower(self) -> float:
         """Wilson's one-sided lower bound, 95 %."""
+        return self._bound(-1.0)
+
+    @property
+    def upper(self) -> float:
+        """Wilson's one-sided upper bound, 95 %."""
+        return self._bound(1.0)
+
+    def _bound(self, side: float) -> float:
         n, p = self.runs, self.share
         if not n:
             return math.nan
         middle = p + Z * Z / (2 * n)
         spread = Z * math.sqrt(p * (1 - p) / n + Z * Z / (4 * n * n))
-        return (middle - spread) / (1 + Z * Z / n)
+        return (middle + side * spread) / (1 + Z * Z / n)
 
 
 @dc.dataclass(frozen=True)
