@@ -117,7 +117,8 @@ class UrClient:
 
     def read(self) -> RobotState:
         receive = self._receive
-        # Each getter takes the newest package; a package may come in between.
+        # Each getter takes the newest package; a package may come in between. If one always does,
+        # parts of the state are newer than its time stamp, by which alone freshness is judged.
         for _ in range(5):
             before = receive.getTimestamp()
             state = RobotState(
