@@ -259,6 +259,48 @@ def learning_rows(docs: Docs) -> Iterator[Row]:
     )
 
 
+PAPER_RATIOS = {"cucumber": 0.61, "tomato": 0.68, "potato": 0.67, "carrot": 0.77}
+"""Of the contact force in the figure of the SliceIt! paper, dual simulation over spring only."""
+BOARD_RATIO = 0.4
+USUAL_BOARD = 3e4
+
+
+def slicing_rows(docs: Docs) -> Iterator[Row]:
+    """Aims for what a policy of the cutting simulator is worth, on the usual board."""
+    command = (
+        "sliceit study slicing docs/slicing_evaluation.jsonl --policies models/policies/cutting_0 "
+        "models/policies/spring_0 --output docs"
+    )
+    source = "slicing_results.md"
+    facts = docs.facts("slicing_results.json") or []
+    by_case = {(f["world"], f["food"]): f for f in facts if f["board_stiffness"] == USUAL_BOARD}
+    for world in ("curves", "stand_in"):
+        name = world.replace("_", "-")
+        for food, paper in PAPER_RATIOS.items():
+            case = by_case.get((world, food))
+            for metric, of, least in (
+                ("median_force", "contact force", paper),
+                ("board_peak", "board's peak", BOARD_RATIO),
+            ):
+                value = met = None
+                if case is not None:
+                    ratio, low, high = case["ratios"][metric]
+                    value = f"{ratio:.2f} ({low:.2f} to {high:.2f})"
+                    met = ratio <= least and high < 1.0
+                yield Row(
+                    f"{of}, ours over spring only: {food}, {name} world",
+                    f"<= {least:g}, interval below 1",
+                    value,
+                    met,
+                    command,
+                    source,
+                )
+        done = [f["completed"]["cutting"] for (w, _), f in by_case.items() if w == world]
+        share = f"{100 * sum(done) / len(done):.1f} % in the mean of foods" if done else None
+        met = min(done) == 1.0 if done else None
+        yield Row(f"slices completed by ours, {name} world", "all", share, met, command, source)
+
+
 def calibration_rows(docs: Docs) -> Iterator[Row]:
     """Aims for the calibration on the paper's curves."""
     command, source = "sliceit study calibration --output FOLDER", "calibration.md"
@@ -352,6 +394,7 @@ SECTIONS = {
     "Calibration": calibration_rows,
     "Diagnosis": diagnosis_rows,
     "Learning": learning_rows,
+    "Slicing with what was learnt": slicing_rows,
 }
 
 

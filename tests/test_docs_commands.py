@@ -119,8 +119,19 @@ TESTED = {
     "are_those_of_food_and_board": [
         "sliceit evaluate output/ours output/baseline --output output/evaluation.jsonl",
     ],
+    "tests/test_learning_comparison.py::test_an_evaluation_goes_on_over_batches_of_processes_and_"
+    "runs": [
+        "sliceit evaluate models/policies/*_[0-4] --output docs/slicing_evaluation.jsonl",
+        "sliceit evaluate models/policies/*_[0-4] --world curves --board-stiffness 3e3 3e5"
+        " --output docs/slicing_evaluation.jsonl",
+    ],
+    "tests/test_learning_comparison.py::test_a_trained_policy_runs_in_a_scenario": [
+        "sliceit simulate scenarios/cucumber_agent.yaml",
+    ],
     "tests/test_learning_comparison.py::test_the_study_writes_its_page_and_says_what_it_lacks": [
         "sliceit study slicing output/evaluation.jsonl --output docs",
+        "sliceit study slicing docs/slicing_evaluation.jsonl --policies models/policies/cutting_0"
+        " models/policies/spring_0 --output docs",
     ],
     "tests/test_motion_optimization.py::test_the_command_leaves_a_scenario_that_simulate_takes": [
         "sliceit optimize-motion SCENARIO --output DIR",

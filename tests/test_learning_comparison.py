@@ -149,8 +149,8 @@ def test_an_evaluation_goes_on_over_batches_of_processes_and_runs(tmp_path, monk
 def test_the_page_is_that_of_the_slices(tmp_path, capsys):
     file = ROOT / "docs/slicing_evaluation.jsonl"
     assert main(["study", "slicing", str(file), "--output", str(tmp_path)]) == 0
-    page = (tmp_path / "slicing_results.md").read_text()
-    assert page == (ROOT / "docs/slicing_results.md").read_text()
+    for name in ("slicing_results.md", "slicing_results.json"):
+        assert (tmp_path / name).read_text() == (ROOT / "docs" / name).read_text()
     capsys.readouterr()
 
 

@@ -17,9 +17,9 @@ Compare policies trained with the cutting simulator with those trained with a sp
 
 EVALUATION is what `sliceit evaluate` wrote for policies of both kinds; all must have cut the same
 slices. Ratios are cutting over spring, of means over policies and slices; the intervals (95 %) come
-from a bootstrap of policies and slices. Writes to --output slicing_results.md and
-figures/slicing_forces.png, and with --policies figures/slicing_two_slices.png, for which two
-slices of the stand-in's cucumber are cut anew.
+from a bootstrap of policies and slices. Writes to --output slicing_results.md, its ratios as
+slicing_results.json, figures/slicing_forces.png, and with --policies
+figures/slicing_two_slices.png, for which two slices of the stand-in's cucumber are cut anew.
 """
 
 
@@ -72,6 +72,8 @@ def _run(options: argparse.Namespace) -> int:
     figures.mkdir(parents=True, exist_ok=True)
     page = _page(found)
     (options.output / "slicing_results.md").write_text(page, encoding="utf-8")
+    facts = json.dumps([_facts(each) for each in found], indent=1) + "\n"
+    (options.output / "slicing_results.json").write_text(facts, encoding="utf-8")
     boards = [each.board_stiffness for each in found]
     usual = max(boards, key=boards.count)
     plot_boxes(
@@ -81,6 +83,22 @@ def _run(options: argparse.Namespace) -> int:
         plot_two_slices(_two_slices(options.policies), figures / "slicing_two_slices.png")
     print(page)
     return 0
+
+
+def _facts(comparison: "Comparison") -> dict:
+    """World, board and food; ratios with intervals; share of slices completed by each kind."""
+    return {
+        "world": comparison.world,
+        "food": comparison.food,
+        "board_stiffness": comparison.board_stiffness,
+        "ratios": {
+            metric: [round(value, 4) for value in (ratio.value, ratio.low, ratio.high)]
+            for metric, ratio in comparison.ratios.items()
+        },
+        "completed": {
+            kind: round(float(done.mean()), 4) for kind, done in comparison.completed.items()
+        },
+    }
 
 
 def _two_slices(policies: Sequence[str]) -> "dict[str, list[SliceTrace]]":
