@@ -154,6 +154,13 @@ def test_the_page_is_that_of_the_slices(tmp_path, capsys):
     capsys.readouterr()
 
 
+def test_the_readme_says_what_the_policies_are_worth():
+    facts = json.loads((ROOT / "docs/slicing_results.json").read_text())
+    ratios = [case["ratios"]["median_force"][0] for case in facts]
+    said = f"meet {min(ratios):.2f} to {max(ratios):.2f} times the contact force"
+    assert said in " ".join((ROOT / "README.md").read_text().split())
+
+
 def test_a_trained_policy_runs_in_a_scenario():
     run = prepare_run(load_scenario(resource_path("scenarios/cucumber_agent.yaml")))
     simulate(run, 2.4)
