@@ -32,7 +32,14 @@ release = importlib.metadata.version(project)
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 root_doc = "docs/index"
-include_patterns = ["*.md", "docs/*.md", "docs/api/*", "notebooks/*", "calibration/*/README.md"]
+include_patterns = [
+    "*.md",
+    "docs/*.md",
+    "docs/api/*",
+    "notebooks/*",
+    "calibration/*/README.md",
+    "models/*/README.md",
+]
 exclude_patterns = [".*", "**/.*", "output"]
 myst_heading_anchors = 3
 # A single backtick in a docstring is code, as in Markdown.

@@ -203,8 +203,8 @@ def test_metadata_that_are_wrong_are_refused_with_the_field(tmp_path, old, new, 
 
 def test_the_example_of_the_documentation_is_a_good_record(tmp_path):
     page = (Path(__file__).resolve().parent.parent / "docs" / "records.md").read_text()
-    for kind in ("csv", "yaml"):
-        (text,) = re.findall(rf"```{kind}\n(.*?)```", page, flags=re.DOTALL)
+    for kind, fence in (("csv", "text"), ("yaml", "yaml")):
+        (text,) = re.findall(rf"```{fence}\n(.*?)```", page, flags=re.DOTALL)
         (tmp_path / f"cucumber_03.{kind}").write_text(text, encoding="utf-8")
     assert check_record(load_record(tmp_path / "cucumber_03.csv")) == []
 
