@@ -24,6 +24,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import warp as wp
+from marked_page import Place
 
 from sliceit_drake.cutting.batch import BatchSimulator
 from sliceit_drake.cutting.food import make_food_model, start_pose
@@ -34,7 +35,7 @@ from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.resources import resource_path
 
 wp.config.log_level = wp.LOG_ERROR
-BEGIN, END = "<!-- batch_speed -->", "<!-- end of batch_speed -->"
+PLACE = Place("batch_speed")
 PERIOD = 2e-3
 CPU_BATCHES, GPU_BATCHES = (1, 2, 4, 8, 16), (1, 4, 16, 64, 256, 1024)
 
@@ -87,18 +88,6 @@ def measure(options: argparse.Namespace) -> list[str]:
     return [title, "|---|---|---|---|", *lines, "", caption]
 
 
-def put_between(text: str, table: str, file: str) -> str:
-    """A page with other text between the marks.
-
-    Raises:
-        ValueError: The page has not both marks.
-    """
-    if text.count(BEGIN) != 1 or text.count(END) != 1:
-        raise ValueError(f"{file} has not the lines {BEGIN} and {END} once each")
-    before, rest = text.split(BEGIN)
-    return f"{before}{BEGIN}\n{table}\n{END}{rest.split(END)[1]}"
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measures, prints and writes."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -107,8 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--refinement", type=float, default=1.0, help="of the mesh (default 1)")
     parser.add_argument("--repeats", type=int, default=3, help="of each time (default 3)")
     options = parser.parse_args(arguments)
-    if options.output is not None:
-        put_between(options.output.read_text(encoding="utf-8"), "", str(options.output))
+    PLACE.check(options.output)
     load = os.getloadavg()[0]
     lines = measure(options)
     given = sys.argv[1:] if arguments is None else arguments
@@ -118,9 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         lines.append("No CUDA device was at hand: the kernels have not been run on one.")
     table = "\n".join(lines)
     print(table)
-    if options.output is not None:
-        text = options.output.read_text(encoding="utf-8")
-        options.output.write_text(put_between(text, table, str(options.output)), encoding="utf-8")
+    PLACE.write(options.output, table)
     return 0
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import warp
+from marked_page import Place
 
 from sliceit_drake.cutting.food import Box, Cylinder, Ellipsoid, Food, make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
@@ -144,14 +145,6 @@ def _cuts(scenario: Scenario) -> list[str]:
     return lines
 
 
-def between(page: str, name: str, text: str) -> str:
-    """The page with the text between the marks of a name."""
-    begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
-    head, rest = page.split(begin)
-    _, tail = rest.split(end)
-    return f"{head}{begin}{text}\n{end}{tail}"
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -164,11 +157,10 @@ def main() -> None:
     if options.cut:
         tables["cuts"] = cuts_table()
     print("\n\n".join(tables.values()))
-    if options.output is not None:
-        page = options.output.read_text(encoding="utf-8")
-        for name, text in tables.items():
-            page = between(page, name, text)
-        options.output.write_text(page, encoding="utf-8")
+    for name in tables:
+        Place(name).check(options.output)
+    for name, text in tables.items():
+        Place(name).write(options.output, text)
 
 
 if __name__ == "__main__":

@@ -38,13 +38,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from marked_page import Place
 from tqdm import tqdm
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.emulator.process import EmulatorError, EmulatorProcess
 
 PERIOD = 0.002
-BEGIN, END = "<!-- hardware_pace -->", "<!-- end of hardware_pace -->"
+PLACE = Place("hardware_pace")
 SCENARIO = "scenarios/cucumber_spring.yaml"
 ROBOT = "hardware/emulated.yaml"
 QUIET = 0.5
@@ -176,24 +177,6 @@ def row(pace: float, runs: Sequence[PacedRun]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def put_between(text: str, table: str, source: str) -> str:
-    """`text` with `table` between the two marking lines.
-
-    Raises:
-        ConfigurationError: They are not there, once each and in this order.
-    """
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not (begin and end) or BEGIN in rest or END in before + after:
-        raise ConfigurationError(
-            "has no place for the table",
-            field="--output",
-            source=source,
-            fix=f"Write the lines {BEGIN} and {END} where it belongs, once.",
-        )
-    return f"{before}{BEGIN}\n{table}\n{END}{after}"
-
-
 def measure(options: argparse.Namespace) -> list[str]:
     """Rows of the table.
 
@@ -245,17 +228,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if load > QUIET:
         print(f"The machine is busy (load {load:.2f}): the numbers will be of that too.")
     try:
-        if options.output is not None:
-            # Before the runs, which take minutes.
-            put_between(options.output.read_text(encoding="utf-8"), "", str(options.output))
+        PLACE.check(options.output)
         rows = measure(options)
         machine = f"{os.cpu_count()} cores, load {load:.2f} in the minute before"
         table = "\n".join([HEADER, *rows, "", f"`{command}`, {machine}."])
-        if options.output is not None:
-            text = put_between(
-                options.output.read_text(encoding="utf-8"), table, str(options.output)
-            )
-            options.output.write_text(text, encoding="utf-8")
+        PLACE.write(options.output, table)
     except (ConfigurationError, EmulatorError, OSError) as error:
         print(error, file=sys.stderr)
         return 2

@@ -11,6 +11,8 @@ after the warm-up. A decision is timed with the exported network, torch not impo
 """
 
 import argparse
+import os
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -19,9 +21,11 @@ from pathlib import Path
 
 import numpy as np
 import warp
+from marked_page import Place
 from results import write_results
 
 warp.config.log_level = warp.LOG_ERROR
+PLACE = Place("learning_speed")
 WARM_UP, STEPS = 300, 2000
 DECISION = """
 import sys, time, numpy as np
@@ -103,6 +107,8 @@ def main() -> None:
     parser.add_argument("--output", type=Path, help="Markdown file with the two lines")
     parser.add_argument("--json", type=Path, help="also write the values there")
     options = parser.parse_args()
+    PLACE.check(options.output)
+    command = shlex.join(["python", "benchmarks/learning_speed.py", *sys.argv[1:]])
     import torch
 
     torch.set_num_threads(1)
@@ -135,16 +141,11 @@ def main() -> None:
         f"The cutting simulator takes {ratio:.2f} times as long as the spring. A decision of the "
         f"exported network takes {median:.3f} ms (99 %: {late:.3f} ms).",
         "",
-        "`python benchmarks/learning_speed.py --output docs/learning.md`, two cores.",
+        f"`{command}`, {os.cpu_count()} cores.",
     ]
     text = "\n".join(lines)
     print(text)
-    if options.output is not None:
-        page = options.output.read_text(encoding="utf-8")
-        head, rest = page.split("<!-- learning_speed -->\n")
-        _, tail = rest.split("<!-- end of learning_speed -->")
-        begin, end = "<!-- learning_speed -->", "<!-- end of learning_speed -->"
-        options.output.write_text(f"{head}{begin}\n{text}\n{end}{tail}", encoding="utf-8")
+    PLACE.write(options.output, text)
 
 
 if __name__ == "__main__":

@@ -15,11 +15,13 @@ ones. Metrics are those of `sliceit evaluate`.
 import argparse
 import copy
 import dataclasses as dc
+import shlex
 import sys
 from pathlib import Path
 
 import numpy as np
 import warp
+from marked_page import Place
 from tqdm import tqdm
 
 from sliceit_drake.cli.evaluate import FOODS
@@ -38,7 +40,7 @@ from sliceit_drake.systems.compliance_controller import ComplianceControllerConf
 from sliceit_drake.systems.network import load_network
 
 warp.config.log_level = warp.LOG_ERROR
-MARKS = "<!-- policy_and_motion -->\n", "<!-- end of policy_and_motion -->"
+PLACE = Place("policy_and_motion")
 STIFF = "scenarios/cucumber.yaml"
 """Whose controller tracks the motion."""
 BELOW = 2e-4
@@ -100,6 +102,7 @@ def main() -> None:
     parser.add_argument("--slices", type=int, default=3, help="of each food; 3")
     parser.add_argument("--output", type=Path, help="Markdown file with the two lines")
     options = parser.parse_args()
+    PLACE.check(options.output)
     config = load_policy_folder(options.policy)
     agent = dc.replace(config.task.agent, network=str(options.policy / POLICY))
     decide, stiff = load_network(agent), load_scenario(resource_path(STIFF)).controller
@@ -121,15 +124,11 @@ def main() -> None:
             f"{motion.frequency:.1f} Hz"
         )
         lines += [f"| {food} | {row('policy', agents)}", f"| | {row(what, planned)}"]
-    command = " ".join(["python", "benchmarks/policy_and_motion.py", *sys.argv[1:]])
+    command = shlex.join(["python", "benchmarks/policy_and_motion.py", *sys.argv[1:]])
     lines += ["", f"`{command}`: means of {options.slices} slices of the stand-in world."]
     text = "\n".join(lines)
     print(text)
-    if options.output is not None:
-        page = options.output.read_text(encoding="utf-8")
-        head, rest = page.split(MARKS[0])
-        _, tail = rest.split(MARKS[1])
-        options.output.write_text(f"{head}{MARKS[0]}{text}\n{MARKS[1]}{tail}", encoding="utf-8")
+    PLACE.write(options.output, text)
 
 
 if __name__ == "__main__":

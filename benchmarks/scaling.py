@@ -31,6 +31,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import optuna
 import warp
+from marked_page import Place
 
 from sliceit_drake.calibration.local_database import NoServerError, local_database
 from sliceit_drake.calibration.prediction import Predictor
@@ -43,7 +44,7 @@ from sliceit_drake.stand_in.session import keep_record, record_session
 
 warp.config.log_level = warp.LOG_ERROR
 optuna.logging.set_verbosity(optuna.logging.WARNING)
-BEGIN, END = "<!-- scaling -->", "<!-- end of scaling -->"
+PLACE = Place("scaling")
 FOOD = "cucumber"
 WORKERS = (1, 2)
 MODELLED = (1, 2, 10, 30, 100, 300, 1000)
@@ -393,18 +394,6 @@ def model_table(
     return lines
 
 
-def put_between(text: str, table: str, file: str) -> str:
-    """A page with other text between the marks.
-
-    Raises:
-        ValueError: The page has not both marks.
-    """
-    if text.count(BEGIN) != 1 or text.count(END) != 1:
-        raise ValueError(f"{file} has not the lines {BEGIN} and {END} once each")
-    before, rest = text.split(BEGIN)
-    return f"{before}{BEGIN}\n{table}\n{END}{rest.split(END)[1]}"
-
-
 @contextmanager
 def storages(folder: Path) -> Iterator[dict[str, Callable[[str], str]]]:
     """Storages by name: each a function from the name of a purpose to a storage of its own."""
@@ -460,9 +449,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     given = sys.argv[1:] if arguments is None else arguments
     command = shlex.join(["python", "benchmarks/scaling.py", *given])
-    if options.output is not None:
-        # Before minutes are spent.
-        put_between(options.output.read_text(encoding="utf-8"), "", str(options.output))
+    PLACE.check(options.output)
     load = os.getloadavg()[0]
     if load > QUIET:
         print(f"The machine is busy (load {load:.2f}): the numbers will be of that too.")
@@ -473,10 +460,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         busy += ", so that other work is in the numbers and two workers had less than two cores"
     table = "\n".join([*lines, "", f"`{command}`: {machine}, {busy}."])
     print(table)
-    if options.output is not None:
-        text = options.output.read_text(encoding="utf-8")
-        text = put_between(text, table, str(options.output))
-        options.output.write_text(text, encoding="utf-8")
+    PLACE.write(options.output, table)
     return 0
 
 

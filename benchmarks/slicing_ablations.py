@@ -15,10 +15,12 @@ count.
 import argparse
 import collections
 import json
+import shlex
 import sys
 from pathlib import Path
 
 import numpy as np
+from marked_page import Place
 
 from sliceit_drake.cli.main import main as sliceit
 
@@ -31,7 +33,7 @@ VARIANTS = {
     "action mapping of the authors' code": "{task: {agent: {mapping: upper}}}",
     "uniform noise, not the posterior": "{task: {randomization: {foods: uniform}}}",
 }
-MARKS = "<!-- slicing_ablations -->\n", "<!-- end of slicing_ablations -->"
+PLACE = Place("slicing_ablations")
 LAST = 20
 """Slices at the end of a training whose return is given."""
 
@@ -71,6 +73,7 @@ def main() -> int:
     parser.add_argument("--slices", type=int, default=5, help="of each food; 5")
     parser.add_argument("--output", type=Path, help="Markdown file with the two lines")
     options = parser.parse_args()
+    PLACE.check(options.output)
     evaluation = options.folder / "evaluation.jsonl"
     folders = {variant: options.folder / slug(variant) for variant in VARIANTS}
     for variant, settings in VARIANTS.items():
@@ -95,7 +98,7 @@ def main() -> int:
     ]
     for variant, folder in folders.items():
         lines.append(row(variant, folder, [c for c in cuts if c["policy"] == str(folder)]))
-    command = " ".join(["python", "benchmarks/slicing_ablations.py", *sys.argv[1:]])
+    command = shlex.join(["python", "benchmarks/slicing_ablations.py", *sys.argv[1:]])
     lines += [
         "",
         f"Means of the median force, {options.slices} slices of each food in the world of measured "
@@ -103,11 +106,7 @@ def main() -> int:
     ]
     text = "\n".join(lines)
     print(text)
-    if options.output is not None:
-        page = options.output.read_text(encoding="utf-8")
-        head, rest = page.split(MARKS[0])
-        _, tail = rest.split(MARKS[1])
-        options.output.write_text(f"{head}{MARKS[0]}{text}\n{MARKS[1]}{tail}", encoding="utf-8")
+    PLACE.write(options.output, text)
     return 0
 
 

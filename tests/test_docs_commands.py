@@ -230,7 +230,6 @@ READ_ONLY = {
         python benchmarks/effects_figure.py
         python benchmarks/first_run.py --json docs/benchmarks/first_run.json
         python benchmarks/foods_page.py --cut --output docs/foods.md
-        python benchmarks/learning_speed.py --output docs/learning.md
         python benchmarks/learning_speed.py --output docs/learning.md --json docs/benchmarks/learning_speed.json
         python benchmarks/safety_layer.py
         python benchmarks/scaling.py --output docs/scaling.md

@@ -20,7 +20,7 @@ def test_tables_are_made_from_the_files_of_foods_and_knives(name):
     page = load_module("foods_page", ROOT / "benchmarks/foods_page.py")
     table = {"foods": page.foods_table, "knives": page.knives_table}[name]()
     command = "python benchmarks/foods_page.py --output docs/foods.md"
-    assert page.between(PAGE, name, table) == PAGE, command
+    assert page.Place(name).put(PAGE, table, "docs/foods.md") == PAGE, command
 
 
 def test_what_the_page_says_to_write_is_a_food_a_knife_and_a_setup(tmp_path, monkeypatch):

@@ -60,7 +60,7 @@ def test_the_benchmark_goes_on_without_a_gpu_and_says_why(monkeypatch, capsys, t
     spec.loader.exec_module(module)
     monkeypatch.setattr(module.wp, "is_cuda_available", lambda: False)
     page = tmp_path / "page.md"
-    page.write_text(f"before\n{module.BEGIN}\n{module.END}\nafter\n", encoding="utf-8")
+    page.write_text(f"before\n{module.PLACE.begin}\n{module.PLACE.end}\nafter\n", encoding="utf-8")
     options = ["--batches", "1", "2", "--refinement", "0.5", "--repeats", "1"]
     assert module.main([*options, "--output", str(page)]) == 0
     assert "The GPU is skipped: there is no CUDA device" in capsys.readouterr().out
@@ -70,4 +70,4 @@ def test_the_benchmark_goes_on_without_a_gpu_and_says_why(monkeypatch, capsys, t
     # The first cut of a batch is the same in all of them.
     assert [row[3].strip() for row in rows] == ["0.0000 %", "0.0000 %"]
     assert text.startswith("before\n") and text.endswith("after\n")
-    assert module.put_between((ROOT / "docs/speed.md").read_text(encoding="utf-8"), "", "speed.md")
+    assert module.PLACE.put((ROOT / "docs/speed.md").read_text(encoding="utf-8"), "", "speed.md")

@@ -83,19 +83,19 @@ def test_the_force_is_compared_at_the_times_of_the_run(pace):
 
 
 def test_a_table_replaces_what_is_between_the_marks_and_nothing_else(pace):
-    text = f"a\n{pace.BEGIN}\nold\n{pace.END}\nb\n"
-    new = pace.put_between(text, "new", "x.md")
-    assert new == f"a\n{pace.BEGIN}\nnew\n{pace.END}\nb\n"
-    assert pace.put_between(new, "new", "x.md") == new
-    for wrong in ("a", f"{pace.END}{pace.BEGIN}", text + text):
+    text = f"a\n{pace.PLACE.begin}\nold\n{pace.PLACE.end}\nb\n"
+    new = pace.PLACE.put(text, "new", "x.md")
+    assert new == f"a\n{pace.PLACE.begin}\nnew\n{pace.PLACE.end}\nb\n"
+    assert pace.PLACE.put(new, "new", "x.md") == new
+    for wrong in ("a", f"{pace.PLACE.end}{pace.PLACE.begin}", text + text):
         with pytest.raises(ConfigurationError, match=r"x\.md.*no place for the table"):
-            pace.put_between(wrong, "new", "x.md")
-    pace.put_between((ROOT / "docs/hardware.md").read_text(), "new", "docs/hardware.md")
+            pace.PLACE.put(wrong, "new", "x.md")
+    pace.PLACE.put((ROOT / "docs/hardware.md").read_text(), "new", "docs/hardware.md")
 
 
 def test_it_runs_emulator_and_client_and_prints_and_writes_the_table(pace, tmp_path, capsys):
     file = tmp_path / "pace.md"
-    file.write_text(f"{pace.BEGIN}\n{pace.END}\n")
+    file.write_text(f"{pace.PLACE.begin}\n{pace.PLACE.end}\n")
     arguments = ["--set", SHORT, "--set-robot", PATIENT, "--pace", "0.1", "--repeats", "1"]
     assert pace.main([*arguments, "--address", free_address(), "--output", str(file)]) == 0
     printed = capsys.readouterr().out

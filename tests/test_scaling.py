@@ -53,12 +53,12 @@ def test_tables_say_what_was_measured_and_go_between_the_marks(scaling, tmp_path
     assert "| PostgreSQL | 150 | 200 | 10000 | 20000 |" in lines
     model = scaling.model_table({"PostgreSQL": runs}, limits, None)
     assert "| 1 | 2 (100 %) |" in model
-    page = f"before\n{scaling.BEGIN}\nold\n{scaling.END}\nafter\n"
-    text = scaling.put_between(page, "\n".join(model), "page.md")
+    page = f"before\n{scaling.PLACE.begin}\nold\n{scaling.PLACE.end}\nafter\n"
+    text = scaling.PLACE.put(page, "\n".join(model), "page.md")
     assert "old" not in text and text.startswith("before\n") and text.endswith("\nafter\n")
-    assert scaling.put_between(text, "old", "page.md") == page
+    assert scaling.PLACE.put(text, "old", "page.md") == page
     with pytest.raises(ValueError, match="page.md has not the lines"):
-        scaling.put_between("no marks", "", "page.md")
+        scaling.PLACE.put("no marks", "", "page.md")
     # The page that ships has both.
     shipped = (ROOT / "docs/scaling.md").read_text(encoding="utf-8")
-    assert scaling.put_between(shipped, "", "docs/scaling.md")
+    assert scaling.PLACE.put(shipped, "", "docs/scaling.md")
