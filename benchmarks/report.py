@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from sliceit_drake.learning.comparison import PAPER
+
 __all__ = ["Row", "page"]
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -259,8 +261,6 @@ def learning_rows(docs: Docs) -> Iterator[Row]:
     )
 
 
-PAPER_RATIOS = {"cucumber": 0.61, "tomato": 0.68, "potato": 0.67, "carrot": 0.77}
-"""Of the contact force in the figure of the SliceIt! paper, dual simulation over spring only."""
 BOARD_RATIO = 0.4
 USUAL_BOARD = 3e4
 
@@ -276,7 +276,7 @@ def slicing_rows(docs: Docs) -> Iterator[Row]:
     by_case = {(f["world"], f["food"]): f for f in facts if f["board_stiffness"] == USUAL_BOARD}
     for world in ("curves", "stand_in"):
         name = world.replace("_", "-")
-        for food, paper in PAPER_RATIOS.items():
+        for food, paper in PAPER.items():
             case = by_case.get((world, food))
             for metric, of, least in (
                 ("median_force", "contact force", paper),

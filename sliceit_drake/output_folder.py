@@ -25,12 +25,7 @@ def check_folder(folder: Path, field: str) -> None:
         os.close(handle)
         os.unlink(name)
     except OSError as error:
-        raise ConfigurationError(
-            f"cannot be written to ({error.strerror or error})",
-            source=str(folder),
-            field=field,
-            fix="Give a folder of yours on a disk with room.",
-        ) from error
+        raise _refusal(folder, error, field, "a folder of yours on a disk with room") from error
 
 
 def check_output(output: Path, field: str = "--output") -> None:
@@ -47,14 +42,18 @@ def check_output(output: Path, field: str = "--output") -> None:
         try:
             output.open("ab").close()
         except OSError as error:
-            raise ConfigurationError(
-                f"cannot be written to ({error.strerror or error})",
-                source=str(output),
-                field=field,
-                fix="Give another file.",
-            ) from error
+            raise _refusal(output, error, field, "another file") from error
         return
     place = output.absolute()
     while not place.exists():
         place = place.parent
     check_folder(place, field)
+
+
+def _refusal(place: Path, error: OSError, field: str, instead: str) -> ConfigurationError:
+    return ConfigurationError(
+        f"cannot be written to ({error.strerror or error})",
+        source=str(place),
+        field=field,
+        fix=f"Give {instead}.",
+    )

@@ -413,7 +413,7 @@ def test_a_pressing_agent_cuts_the_stand_in_on_the_station():
 
 
 def test_a_start_that_the_solver_loses_is_found_all_the_same():
-    # SNOPT ends far away from these, 3 of 1,500 random starts.
+    # SNOPT ends hundreds of millimetres away from them.
     scenario, make_cutting = CurvesWorld().scenario("cucumber", 0)
     station = MakeSlicingStation(scenario, make_cutting=make_cutting)
     for turn, along, down in (

@@ -89,19 +89,15 @@ def find_file(name: str, kind: str, example: str) -> Path:
         ConfigurationError: There is none.
     """
     from sliceit_drake.configuration import ConfigurationError
-    from sliceit_drake.resources import resource_path
 
-    file = Path(name)
+    file = here_or_shipped(Path(name))
     if file.exists():
         return file
-    try:
-        return resource_path(name)
-    except (FileNotFoundError, ValueError):
-        raise ConfigurationError(
-            f"there is no such {kind}, neither here nor in the package",
-            source=name,
-            fix=f"Give a YAML file; {example} is one to start from.",
-        ) from None
+    raise ConfigurationError(
+        f"there is no such {kind}, neither here nor in the package",
+        source=name,
+        fix=f"Give a YAML file; {example} is one to start from.",
+    )
 
 
 def here_or_shipped(path: Path) -> Path:

@@ -97,8 +97,11 @@ def _requirements(judgements: Sequence[Judgement]) -> list[dict[str, Any]]:
     unknown, poor = _of(judgements, "unknown"), _of(judgements, "poor")
     rows: list[dict[str, Any]] = []
 
-    def add(what: str, asked: str, r: Rate, enough: bool, shown: str = "") -> None:
-        rows.append({"what": what, "asked": asked, **_rate_facts(r), "shown": shown, "met": enough})
+    def add(
+        what: str, asked: str, r: Rate, enough: bool, shown: str = "", few: bool = False
+    ) -> None:
+        facts = {"what": what, "asked": asked, "few": few, **_rate_facts(r)}
+        rows.append(facts | {"shown": shown, "met": enough})
 
     r = rate(single)
     add(
@@ -125,11 +128,13 @@ def _requirements(judgements: Sequence[Judgement]) -> list[dict[str, Any]]:
         "<= 16 of >= 200",
         alarms,
         alarms.runs >= 200 and alarms.share <= 0.08,
+        few=True,
     )
     r = rate(unknown)
     add("unknown effects called so", ">= 90 % of >= 60", r, r.runs >= 60 and r.share >= 0.90)
     named = Rate(sum(j.verdict in NAMING for j in unknown), len(unknown))
-    add("unknown effects given a name", "<= 5 %", named, named.runs >= 60 and named.share <= 0.05)
+    enough = named.runs >= 60 and named.share <= 0.05
+    add("unknown effects given a name", "<= 5 %", named, enough, few=True)
     r = rate(_of(judgements, "pairs"))
     add("two causes, both named", ">= 80 %", r, r.runs >= 40 and r.share >= 0.80)
     r = rate(poor)
@@ -214,8 +219,8 @@ def report(
     for row in _requirements(judgements):
         shown = f"{row['hits']} of {row['runs']}" + (f" ({row['shown']})" if row["shown"] else "")
         met = ("yes" if row["met"] else "no") if row["runs"] else "not run"
-        few = row["asked"].startswith("<=")
-        bound = f"{'<=' if few else '>='} {_percent(row['upper_bound' if few else 'lower_bound'])}"
+        sign, side = ("<=", "upper_bound") if row["few"] else (">=", "lower_bound")
+        bound = f"{sign} {_percent(row[side])}"
         lines.append(
             f"| {row['what']} | {row['asked']} | {shown} | {_percent(row['share'])} "
             f"| {bound if row['runs'] else _percent(None)} | {met} |"

@@ -11,6 +11,7 @@ from sliceit_drake.learning.evaluation import SliceTrace
 from sliceit_drake.learning.metrics import Ratio, bootstrap_ratio
 
 __all__ = [
+    "PAPER",
     "Comparison",
     "claim",
     "compare",

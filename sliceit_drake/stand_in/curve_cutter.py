@@ -38,9 +38,9 @@ STILL_SPEED = 1e-4
 YIELDING = 4e-4
 """Travel over which the forces turn round with the motion, metres: that by which the food yields
 along the edge. Where a draw turns round, the force of the calibrated foods' finite elements is zero
-after 0.17 to 0.33 mm (0.28 mm here) and turned after 0.5 to 0.9 mm; the paper's foods were pressed
-alone. At a quarter of it a carrot would be as stiff as 400 kN/m, four boards, and shake with the
-robot, which learns of the force 2 ms late."""
+after 0.17 to 0.33 mm (0.28 mm here; tests/test_slicing_worlds.py repeats the cucumber's) and turned
+after 0.5 to 0.9 mm; the paper's foods were pressed alone. At a quarter of it a carrot would be as
+stiff as 400 kN/m, four boards, and shake with the robot, which learns of the force 2 ms late."""
 
 
 @functools.cache
