@@ -2,8 +2,9 @@
 
 All in one process or one after the other on one machine: compare rows, not machines. The steps of
 the environment and the updates are timed alone first; then both overlap as in `sliceit train`, for
-the cutting simulator and the spring-only baseline, and 80,000 steps are extrapolated from the rate
-after the warm-up. A decision is timed with the exported network, torch not imported.
+the cutting simulator and the spring-only baseline, with one environment and with two side by side,
+and 80,000 steps are extrapolated from the rate after the warm-up. A decision is timed with the
+exported network, torch not imported.
 
 --output puts the tables into a Markdown file, between the lines
   <!-- learning_speed -->
@@ -27,6 +28,7 @@ from results import write_results
 warp.config.log_level = warp.LOG_ERROR
 PLACE = Place("learning_speed")
 WARM_UP, STEPS = 300, 2000
+ENVIRONMENTS = (1, 2)
 DECISION = """
 import sys, time, numpy as np
 from sliceit_drake.systems.agent import AgentConfig
@@ -59,13 +61,16 @@ def environment_step(simulator: str, count: int = 400) -> float:
     return 1e3 * (time.perf_counter() - begin) / count
 
 
-def training_rate(simulator: str, output: Path) -> float:
+def training_rate(simulator: str, environments: int, output: Path) -> float:
     """Decisions in a second, learning included."""
     from sliceit_drake.learning.task import TaskConfig
     from sliceit_drake.learning.training import TrainingConfig, train
 
     config = TrainingConfig(
-        task=TaskConfig(simulator=simulator), steps=WARM_UP + STEPS, warm_up=WARM_UP
+        task=TaskConfig(simulator=simulator),
+        steps=WARM_UP + STEPS,
+        warm_up=WARM_UP,
+        environments=environments,
     )
     marks: list[tuple[float, int]] = []
     outcome = train(config, output, lambda n, _: marks.append((time.perf_counter(), n)))
@@ -112,33 +117,40 @@ def main() -> None:
     import torch
 
     torch.set_num_threads(1)
-    rows, update = {}, update_time()
+    update, rates, lines = update_time(), {}, []
+    lines = [
+        "| simulator | simulating a decision | an update | environments | training "
+        "| 80,000 decisions |",
+        "|---|---|---|---|---|---|",
+    ]
     with tempfile.TemporaryDirectory() as folder:
         for simulator in ("cutting", "spring"):
             step = environment_step(simulator)
-            rows[simulator] = step, training_rate(simulator, Path(folder) / simulator)
-        policy = str(Path(folder) / "cutting" / "policy.onnx")
+            for count in ENVIRONMENTS:
+                output = Path(folder) / f"{simulator}_{count}"
+                rates[simulator, count] = rate = training_rate(simulator, count, output)
+                lines.append(
+                    f"| {simulator} | {step:.1f} ms | {update:.1f} ms | {count} "
+                    f"| {rate:.1f} decisions/s | {80_000 / rate / 60:.0f} min |"
+                )
         printed = subprocess.run(
-            [sys.executable, "-c", DECISION, policy], check=True, capture_output=True, text=True
+            [sys.executable, "-c", DECISION, str(Path(folder) / "cutting_1" / "policy.onnx")],
+            check=True,
+            capture_output=True,
+            text=True,
         ).stdout
     median, late = map(float, printed.split()[-2:])
-    lines = [
-        "| simulator | simulating a decision | an update | training | 80,000 decisions |",
-        "|---|---|---|---|---|",
-    ]
-    for simulator, (step, rate) in rows.items():
-        lines.append(
-            f"| {simulator} | {step:.1f} ms | {update:.1f} ms | {rate:.1f} decisions/s | "
-            f"{80_000 / rate / 60:.0f} min |"
-        )
-    ratio = rows["spring"][1] / rows["cutting"][1]
+    ratios = {count: rates["spring", count] / rates["cutting", count] for count in ENVIRONMENTS}
     if options.json is not None:
-        rates = {f"{name}_decisions_a_second": rate for name, (_, rate) in rows.items()}
-        minutes = {f"{name}_80000_min": 80_000 / rate / 60 for name, (_, rate) in rows.items()}
-        write_results(options.json, rates | minutes | {"cutting_over_spring": ratio})
+        found = {f"{name}_{n}_decisions_a_second": rate for (name, n), rate in rates.items()}
+        found |= {f"{name}_{n}_80000_min": 80_000 / rate / 60 for (name, n), rate in rates.items()}
+        write_results(
+            options.json, found | {f"{n}_cutting_over_spring": r for n, r in ratios.items()}
+        )
+    taken = " and ".join(f"{r:.2f} with {n}" for n, r in ratios.items())
     lines += [
         "",
-        f"The cutting simulator takes {ratio:.2f} times as long as the spring. A decision of the "
+        f"The cutting simulator takes {taken} times as long as the spring. A decision of the "
         f"exported network takes {median:.3f} ms (99 %: {late:.3f} ms).",
         "",
         f"`{command}`, {os.cpu_count()} cores.",

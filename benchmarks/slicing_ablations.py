@@ -32,6 +32,7 @@ VARIANTS = {
     "uniform replay": "{priority: 0.0}",
     "action mapping of the authors' code": "{task: {agent: {mapping: upper}}}",
     "uniform noise, not the posterior": "{task: {randomization: {foods: uniform}}}",
+    "two environments side by side": "{environments: 2}",
 }
 PLACE = Place("slicing_ablations")
 LAST = 20

@@ -15,7 +15,7 @@ SOURCES = ("speed.md", "calibration.md", "verification.json", "hidden_effects.js
 
 @pytest.fixture
 def docs(tmp_path):
-    for name in (*SOURCES, "learning.md", "random_slices.md"):
+    for name in (*SOURCES, "random_slices.md"):
         shutil.copy(ROOT / "docs" / name, tmp_path)
     (tmp_path / "benchmarks").mkdir()
     return tmp_path
@@ -58,15 +58,15 @@ def test_where_nothing_was_measured_the_page_says_so_and_names_the_command(tmp_p
         ("diagnosis_speed", {"records": 18.0, "cold_s": 1.0}, "the same again,", ("warm_s", 60.0)),
         (
             "learning_speed",
-            {"spring_decisions_a_second": 1.0},
+            {"spring_2_decisions_a_second": 1.0},
             "80,000",
-            ("cutting_decisions_a_second", -80_000 / 2400),
+            ("cutting_2_decisions_a_second", -80_000 / 2400),
         ),
         (
             "learning_speed",
-            {"spring_decisions_a_second": 130.0},
+            {"spring_2_decisions_a_second": 130.0},
             "the same against",
-            ("cutting_decisions_a_second", -100.0),
+            ("cutting_2_decisions_a_second", -100.0),
         ),
     ],
 )

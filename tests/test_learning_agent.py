@@ -150,6 +150,25 @@ def test_a_full_buffer_overwrites_its_oldest():
     assert len(buffer._filled) == 4
 
 
+def test_transitions_of_several_environments_are_kept_each_for_itself():
+    buffer = buffer_of(5, 0, n_envs=2)
+    rng = np.random.default_rng(0)
+    old, new = rng.normal(size=(2, 2, SIZE)).astype(np.float32)
+    action, info = rng.uniform(-1.0, 1.0, (2, 6)).astype(np.float32), {"TimeLimit.truncated": True}
+    buffer.add(old, new, action, np.array([3.0, 4.0]), np.array([True, True]), [{}, info])
+    batch = buffer.sample_prioritized(64)
+    assert set(batch.places) == {0, 1}
+    for place, *row in zip(batch.places, *batch.transitions[:5], strict=True):
+        found = [part.numpy() for part in row]
+        expected = old[place], action[place], new[place], place == 0, 3.0 + place
+        for one, other in zip(found, expected, strict=True):
+            assert np.array_equal(one.squeeze(), np.asarray(other, np.float32))
+    for _ in range(2):
+        buffer.add(old, new, action, np.array([5.0, 6.0]), np.zeros(2, bool), [{}, {}])
+    # The sixth overwrote the first.
+    assert buffer.rewards[:, 0].tolist() == [6.0, 4.0, 5.0, 6.0, 5.0]
+
+
 def test_a_transition_that_the_time_limit_ended_is_not_an_end():
     buffer = buffer_of(4, 0)
     add(buffer, 0, done=True)
@@ -341,16 +360,22 @@ def lines(folder):
     return [json.loads(line) for line in (folder / training.EPISODES).read_text().splitlines()]
 
 
-def test_a_training_that_was_stopped_goes_on_as_if_it_had_not(tmp_path, one_process, monkeypatch):
+@pytest.mark.parametrize("environments", [1, 2, 3])
+def test_a_training_that_was_stopped_goes_on_as_if_it_had_not(
+    environments, tmp_path, one_process, monkeypatch
+):
     # So few that a policy is chosen before the stop and compared with those after it.
     monkeypatch.setattr(training, "SELECTION", 3)
-    config = training_of(checkpoint_interval=25)
+    config = training_of(checkpoint_interval=25, environments=environments)
     straight = train(config, tmp_path / "straight")
     assert straight.best_return is not None
-    first = train(config, tmp_path / "halves", is_stopped=lambda: True)
-    assert first.episodes == 1 and first.steps < 50
+    asked: list[None] = []
+    # In the midst of a slice.
+    stopped = lambda: asked.append(None) or len(asked) > 7  # noqa: E731
+    first = train(config, tmp_path / "halves", is_stopped=stopped)
+    assert first.episodes == 0 and first.steps == 7 * environments
     half = train(config, tmp_path / "halves", stop_after=50)
-    assert 50 <= half.steps < 120
+    assert 50 <= half.steps < 50 + environments
     assert not (tmp_path / "halves" / training.POLICY).exists()
     # What was logged after the checkpoint is dropped.
     with (tmp_path / "halves" / training.EPISODES).open("a") as file:
@@ -360,7 +385,8 @@ def test_a_training_that_was_stopped_goes_on_as_if_it_had_not(tmp_path, one_proc
     assert policies[0] == policies[1]
     assert lines(tmp_path / "straight") == lines(tmp_path / "halves")
     assert dc.replace(straight, wall_time=0.0) == dc.replace(whole, wall_time=0.0)
-    assert straight.steps == 120 and straight.episodes == 8 and straight.failed is None
+    assert straight.steps == 120 and straight.failed is None
+    assert straight.episodes == environments * (120 // environments // 15)
 
 
 def test_another_seed_gives_another_policy(tmp_path, one_process):
@@ -386,17 +412,17 @@ def test_a_checkpoint_of_another_training_is_refused(tmp_path, one_process):
 
 
 def test_a_training_whose_environment_dies_says_so_and_goes_on(tmp_path):
-    config = training_of(steps=40, checkpoint_interval=15)
+    config = training_of(steps=40, checkpoint_interval=15, environments=2)
 
     def kill(steps: int, _: str) -> None:
         if steps >= 20:
             for process in multiprocessing.active_children():
                 process.kill()
 
-    with pytest.raises(RuntimeError, match="process ended.*last checkpoint"):
+    with pytest.raises(RuntimeError, match="environment ended.*last checkpoint"):
         train(config, tmp_path, kill)
     before = torch.load(tmp_path / training.CHECKPOINT, weights_only=False)
-    assert before["watch"]["episodes"] >= 1
+    assert before["watch"]["steps"] == 16 and before["watch"]["episodes"] == 0
     assert train(config, tmp_path).steps == 40
     straight = tmp_path / "straight"
     train(config, straight)

@@ -91,21 +91,29 @@ def test_the_foods_before_do_not_matter_either():
     assert np.array_equal(rollout(used, 4, seed=9), rollout(fresh, 4, seed=9))
 
 
-def test_an_episode_is_repeated_from_its_random_state(spring):
-    rollout(spring, 1, seed=3)
-    rollout(spring, 1)
-    state, expected = None, None
-    expected = rollout(spring, 3)
-    state = spring.random_state()
-    rollout(spring, 2)
-    other = SlicingEnv(spring.task)
-    for env in (spring, other):
-        if env is other:
-            env.reset(seed=77)
-        env.set_random_state(state)
-        assert np.array_equal(rollout(env, 3), expected)
-        # And so is the one after it.
-    assert np.array_equal(rollout(spring, 2), rollout(other, 2))
+@pytest.mark.parametrize("options", [None, {"food": "tomato"}])
+def test_an_episode_goes_on_from_a_moment_of_it(options):
+    env, other = (SlicingEnv(task_of(foods=["cucumber", "tomato"])) for _ in range(2))
+    env.reset(seed=3)
+    env.reset(options=options)
+    actions = np.random.default_rng(5).uniform(-1.0, 1.0, (5, 6))
+    seen = [env.step(action)[0] for action in actions[:3]]
+    moment = env.moment()
+    expected = [env.step(action)[:4] for action in actions[3:]]
+    following, info = env.reset()
+    other.reset(seed=77)
+    assert np.array_equal(other.return_to(moment), seen[-1])
+    for action, (observation, *rest) in zip(actions[3:], expected, strict=True):
+        found = other.step(action)
+        assert np.array_equal(found[0], observation) and list(found[1:4]) == rest
+    # And so does all after it.
+    again, its = other.reset()
+    assert np.array_equal(again, following) and its == info
+
+
+def test_an_environment_without_an_episode_has_no_moment():
+    with pytest.raises(RuntimeError, match="reset"):
+        SlicingEnv(task_of()).moment()
 
 
 def test_the_time_limit_truncates():

@@ -25,7 +25,7 @@ Writes to --output:
   summary.json      ends of episodes, guards of the simulation that ended any
   checkpoint.pt     all that is needed to go on; the same command goes on from it
 
-Ctrl-C ends the training with a checkpoint after the slice that is being cut.
+Ctrl-C ends the training with a checkpoint.
 Ends with status 1 if guards of the simulation ended more than 0.1 % of the episodes.
 """
 
@@ -66,7 +66,7 @@ def _stop_by(asked: threading.Event) -> Iterator[None]:
         if asked.is_set():
             raise KeyboardInterrupt
         asked.set()
-        print("\nStopping at the end of this slice; Ctrl-C again stops at once", file=sys.stderr)
+        print("\nStopping with a checkpoint; Ctrl-C again stops at once", file=sys.stderr)
 
     before = {}
     if threading.current_thread() is threading.main_thread():

@@ -21,14 +21,22 @@ class Limits:
     torque: float
     workspace: tuple[float, float, float]
 
-    def broken(self, wrench: np.ndarray, error: np.ndarray) -> str:
-        """What is broken: collision, workspace, or nothing.
+    def end(
+        self, at_goal: bool, time: float, until: float, wrench: np.ndarray, error: np.ndarray
+    ) -> str:
+        """Why a slice ends after a decision: goal, collision, workspace, or nothing if it goes on.
 
         Args:
+            at_goal: Whether the goal was held for long enough.
+            time: Of the simulation, s; before `until` where the station's monitor ended a run that
+                shakes.
+            until: To which it was to advance, s.
             wrench: Moment and force at the sensor [6].
             error: To the final pose [3], m, m, rad.
         """
+        if at_goal:
+            return "goal"
         torque, force = np.abs(wrench).reshape(2, 3).max(axis=1)
-        if torque > self.torque or force > self.force:
+        if time < until - 1e-6 or torque > self.torque or force > self.force:
             return "collision"
         return "workspace" if (np.abs(error) > self.workspace).any() else ""

@@ -52,19 +52,32 @@ class SlicingEnv(gymnasium.Env):
         self._current: tuple[AgentStation, Simulator] | None = None
         self._decisions = 0
         self._potential = 0.0
-        self._before_reset: dict | None = None
+        self._moment: dict[str, Any] = {}
 
     def set_progress(self, progress: float) -> None:
         """Says which share of the training is done, for the reward's schedule."""
         self.progress = progress
 
-    def random_state(self) -> dict | None:
-        """State of the random numbers before the last reset; for `set_random_state`."""
-        return self._before_reset
+    def moment(self) -> dict[str, Any]:
+        """Where the episode is, for `return_to`: how it began, and the actions since.
 
-    def set_random_state(self, state: dict) -> None:
-        """Lets the next reset repeat that before which the state was taken."""
-        self.np_random.bit_generator.state = copy.deepcopy(state)
+        Raises:
+            RuntimeError: The environment was not reset.
+        """
+        if not self._moment:
+            raise RuntimeError("moment() before reset(): call reset() first.")
+        return copy.deepcopy(self._moment)
+
+    def return_to(self, moment: dict[str, Any]) -> np.ndarray:
+        """Repeats an episode up to a moment of it; all goes on from there as it did then.
+
+        The moment may be of another environment with the same task. Returns the observation.
+        """
+        self.np_random.bit_generator.state = copy.deepcopy(moment["random"])
+        observation, _ = self.reset(options=moment["options"])
+        for action in moment["actions"]:
+            observation, *_ = self.step(action)
+        return observation
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -80,7 +93,8 @@ class SlicingEnv(gymnasium.Env):
         """
         super().reset(seed=seed)
         rng = self.np_random
-        self._before_reset = copy.deepcopy(rng.bit_generator.state)
+        state = copy.deepcopy(rng.bit_generator.state)
+        self._moment = {"random": state, "options": options, "actions": []}
         foods, randomization = self.task.foods, self.task.randomization
         food = foods[int(rng.integers(len(foods)))]
         low, high = randomization.height
@@ -113,6 +127,7 @@ class SlicingEnv(gymnasium.Env):
         station, simulator = self._current
         context = simulator.get_mutable_context()
         station.GetInputPort("action").FixValue(context, action)
+        self._moment["actions"].append(action.copy())
         self._decisions += 1
         config, end, guard, message = self.task.reward, "", "", ""
         try:
@@ -180,11 +195,8 @@ class SlicingEnv(gymnasium.Env):
         """Why the episode ends, or nothing."""
         assert self._current is not None
         station, simulator = self._current
-        context, task = simulator.get_context(), self.task
-        if station.GetOutputPort("at_goal").Eval(context)[0] > task.agent.goal_decisions:
-            return "goal"
-        # A run that the station's monitor ended shakes.
-        if context.get_time() < self._decisions * task.agent.period - 1e-6:
-            return "collision"
+        context, agent = simulator.get_context(), self.task.agent
+        at_goal = station.GetOutputPort("at_goal").Eval(context)[0] > agent.goal_decisions
         wrench = station.GetOutputPort("sensor_wrench").Eval(context).get_coeffs()
-        return task.limits().broken(wrench, error)
+        until = self._decisions * agent.period
+        return self.task.limits().end(at_goal, context.get_time(), until, wrench, error)

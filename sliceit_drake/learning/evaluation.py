@@ -101,14 +101,10 @@ def cut_slice(
             break
         error = system.GetOutputPort("error").Eval(own)
         wrench = station.GetOutputPort("sensor_wrench").Eval(station_context).get_coeffs()
-        if system.GetOutputPort("at_goal").Eval(own)[0] > agent.goal_decisions:
-            end = "goal"
-        elif context.get_time() < until - 1e-6:  # The station's monitor ended it: it shakes.
-            end = "collision"
-        else:
-            end = limits.broken(wrench, error)
-            if not end and context.get_time() >= longest:
-                end = "time"
+        at_goal = system.GetOutputPort("at_goal").Eval(own)[0] > agent.goal_decisions
+        end = limits.end(at_goal, context.get_time(), until, wrench, error)
+        if not end and context.get_time() >= longest:
+            end = "time"
     time, food, board, cut = _logged(logs, simulator)
     metrics = slice_metrics(time, food, board, cut, end)
     return SliceTrace(time, food, board, cut, np.array(heights), np.array(actions), metrics)

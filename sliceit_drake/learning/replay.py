@@ -44,10 +44,13 @@ class PrioritizedReplayBuffer(ReplayBuffer):
     by the greatest of their batch: by that of the whole buffer a single transition with a small
     error would make all others' steps small.
 
+    Transitions of several environments are kept in a row, one after the other.
+
     Args:
         alpha: Power of the priority; 0 draws uniformly.
         beta: Power of the importance weights at the start; `set_beta` raises it.
         floor: Added to each error.
+        n_envs: Environments whose transitions are added together.
     """
 
     def __init__(
@@ -56,9 +59,11 @@ class PrioritizedReplayBuffer(ReplayBuffer):
         alpha: float = 0.6,
         beta: float = 0.4,
         floor: float = 0.01,
+        n_envs: int = 1,
         **options: Any,
     ) -> None:
-        super().__init__(*arguments, **options)
+        super().__init__(*arguments, n_envs=1, **options)
+        self._environments = n_envs
         self._filled = _Filled()
         self._sampler = PrioritizedSampler(self.buffer_size, alpha=alpha, beta=beta, eps=floor)
         self._generator = torch.Generator().manual_seed(0)
@@ -77,9 +82,24 @@ class PrioritizedReplayBuffer(ReplayBuffer):
         """Sets the power of the importance weights."""
         self._sampler.beta = beta
 
-    def add(self, *arguments: Any, **options: Any) -> None:
+    def add(
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Keeps a transition of each environment [n_envs, ...]."""
+        for k in range(self._environments):
+            one = slice(k, k + 1)
+            parts = obs[one], next_obs[one], action[one], reward[one], done[one], infos[one]
+            self._add_one(*parts)
+
+    def _add_one(self, *transition: Any) -> None:
         place = self.pos
-        super().add(*arguments, **options)
+        super().add(*transition)
         self._filled.size = self.buffer_size if self.full else self.pos
         # With the greatest priority so far, so that each is seen once.
         self._sampler.extend(torch.tensor([place]))

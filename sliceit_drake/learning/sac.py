@@ -26,7 +26,7 @@ TRACE = 0.01
 class OverlapVecEnv(VecEnvWrapper):
     """Lets something be done while the environments' processes simulate.
 
-    The newest transition is one update late. Nothing depends on which of the two is the faster.
+    The newest transitions are one step late. Nothing depends on which of the two is the faster.
 
     Args:
         venv: With processes of its own.
@@ -78,10 +78,10 @@ class PrioritizedSAC(SAC):
             learning_rate = module.optimizer.param_groups[0]["lr"]
             module.optimizer = torch.optim.Adam(module.parameters(), lr=learning_rate, fused=True)
 
-    def update_once(self) -> None:
-        """One update, once the warm-up is over."""
+    def update(self) -> None:
+        """As many updates as there are environments, once the warm-up is over."""
         if self.num_timesteps > self.learning_starts:
-            self.train(1, self.batch_size)
+            self.train(self.n_envs, self.batch_size)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         done = 1.0 - self._current_progress_remaining

@@ -80,8 +80,16 @@ class TrainingConfig:
     )
     history: bool = True
     """Whether the network sees the force/torque history."""
+    environments: int = quantity(
+        1,
+        "",
+        low=1,
+        high=64,
+        doc="That simulate side by side, each a process; there is an update for each decision. "
+        "Another number gives another policy.",
+    )
     checkpoint_interval: int = quantity(
-        5000, "", low=1, high=10**9, doc="Decisions between checkpoints, at episodes' ends."
+        5000, "", low=1, high=10**9, doc="Decisions between checkpoints."
     )
 
 
@@ -154,11 +162,11 @@ def train(
         output: Folder for checkpoint, training.yaml, episodes.jsonl, TensorBoard and policy.onnx.
         progress: Called with the steps so far and a line about the last episodes.
         stop_after: Ends at the first checkpoint after so many steps; None to go on to the end.
-        is_stopped: Asked at each episode's end whether to end with a checkpoint there.
+        is_stopped: Asked at each decision whether to end with a checkpoint there.
 
     Raises:
         ConfigurationError: `output` has a checkpoint of another configuration.
-        RuntimeError: The environment's process ended.
+        RuntimeError: The process of an environment ended.
     """
     output.mkdir(parents=True, exist_ok=True)
     described = json.dumps(dc.asdict(config), sort_keys=True)
@@ -168,18 +176,23 @@ def train(
     check_task(config.task)
     torch.set_num_threads(1)
     with deaf_children():
-        processes = SubprocVecEnv([functools.partial(_environment, config.task)], "forkserver")
+        make = functools.partial(_environment, config.task)
+        processes = SubprocVecEnv([make] * config.environments, "forkserver")
     environments = OverlapVecEnv(processes)
     try:
         model = make_model(config, environments)
         model.set_logger(configure(str(output), ["tensorboard"]))
-        environments.meanwhile = model.update_once
+        environments.meanwhile = model.update
         callback = _Watch(config, output, described, progress, stop_after, is_stopped)
         if saved is not None:
-            # The first reset takes the seed; the next repeats the one of the checkpoint.
             environments.reset()
-            environments.env_method("set_random_state", saved["environment"])
             model.set_training_state(saved["model"])
+            model._last_obs = np.concatenate(
+                [
+                    environments.env_method("return_to", moment, indices=k)
+                    for k, moment in enumerate(saved["environments"])
+                ]
+            )
             done = model.num_timesteps / config.steps
             model._current_progress_remaining = 1.0 - done
             if config.task.reward.schedule != "constant":
@@ -203,7 +216,7 @@ def train(
         return outcome
     except (EOFError, ConnectionError) as error:
         raise RuntimeError(
-            "The environment's process ended; if by an error, that is printed above. The same "
+            "The process of an environment ended; if by an error, that is printed above. The same "
             f"command goes on from the last checkpoint in {output}."
         ) from error
     finally:
@@ -219,7 +232,8 @@ def make_model(config: TrainingConfig, environments: OverlapVecEnv) -> Prioritiz
         "MlpPolicy",
         environments,
         learning_rate=config.learning_rate,
-        buffer_size=config.steps,
+        # The last step of several environments can go beyond.
+        buffer_size=config.steps + config.environments - 1,
         learning_starts=config.warm_up,
         batch_size=config.batch,
         tau=config.tau,
@@ -227,7 +241,7 @@ def make_model(config: TrainingConfig, environments: OverlapVecEnv) -> Prioritiz
         ent_coef=f"auto_{config.entropy:.9g}",
         value_limit=value_limit(config.task.reward),
         train_freq=1,
-        # Updates are made while the environment simulates.
+        # Updates are made while the environments simulate.
         gradient_steps=0,
         replay_buffer_kwargs={"alpha": config.priority},
         policy_kwargs={
@@ -304,10 +318,10 @@ class _Watch(BaseCallback):
         self._config, self._output, self._described = config, output, described
         self._progress, self._stop_after, self._is_stopped = progress, stop_after, is_stopped
         self.episodes, self.was_stopped = 0, False
-        self._saved_at, self._is_due, self._is_enough = 0, False, False
+        self._saved_at = 0
         self._ends: Counter[str] = Counter()
         self._guards: Counter[str] = Counter()
-        self._sums: dict[str, float] = {}
+        self._sums: list[dict[str, float]] = [{} for _ in range(config.environments)]
         self._returns: deque[float] = deque(maxlen=SELECTION)
         self.best_return, self.best_steps = -math.inf, 0
         self.best_actor: dict[str, torch.Tensor] | None = None
@@ -317,6 +331,7 @@ class _Watch(BaseCallback):
         self.episodes, self._saved_at = state["episodes"], state["steps"]
         self._ends, self._guards = Counter(state["ends"]), Counter(state["guards"])
         self._returns.extend(state["returns"])
+        self._sums = state["sums"]
         self.best_return, self.best_steps, self.best_actor = state["best"]
 
     def outcome(self, wall_time: float) -> Outcome:
@@ -339,35 +354,32 @@ class _Watch(BaseCallback):
         )
 
     def _on_step(self) -> bool:
-        info, reward = self.locals["infos"][0], float(self.locals["rewards"][0])
-        for name, value in (
-            ("return", reward),
-            ("length", 1.0),
-            ("force", info["force"]),
-            *((f"reward_{name}", value) for name, value in info["reward_terms"].items()),
-        ):
-            self._sums[name] = self._sums.get(name, 0.0) + value
-        self._sums["peak"] = max(self._sums.get("peak", 0.0), info["force"])
+        each = (self.locals[name] for name in ("infos", "rewards", "dones"))
+        for sums, info, reward, done in zip(self._sums, *each, strict=True):
+            for name, value in (
+                ("return", float(reward)),
+                ("length", 1.0),
+                ("force", info["force"]),
+                *((f"reward_{name}", value) for name, value in info["reward_terms"].items()),
+            ):
+                sums[name] = sums.get(name, 0.0) + value
+            sums["peak"] = max(sums.get("peak", 0.0), info["force"])
+            if done:
+                self._finish_episode(info, dict(sums))
+                sums.clear()
         if self._schedule:
             share = self.num_timesteps / self._config.steps
             self.training_env.env_method("set_progress", share)
-        if not self.locals["dones"][0]:
-            return True
-        self._finish_episode(info)
-        due = self.num_timesteps - self._saved_at >= self._config.checkpoint_interval
-        self._is_enough = (
-            self._stop_after is not None and self.num_timesteps >= self._stop_after
-        ) or (self._is_stopped is not None and self._is_stopped())
-        self._is_due = due or self._is_enough
         return True
 
     def _on_rollout_start(self) -> None:
-        # Only here the episode's last transition is in the buffer.
-        if not self._is_due:
-            return
-        self._is_due = False
-        self._save()
-        if self._is_enough:
+        # Only here the last transitions are in the buffer.
+        is_enough = (self._stop_after is not None and self.num_timesteps >= self._stop_after) or (
+            self._is_stopped is not None and self._is_stopped()
+        )
+        if is_enough or self.num_timesteps - self._saved_at >= self._config.checkpoint_interval:
+            self._save()
+        if is_enough:
             self.was_stopped = True
             raise _Stopped
 
@@ -377,13 +389,14 @@ class _Watch(BaseCallback):
         state = {
             "config": self._described,
             "model": self.model.training_state(),
-            "environment": self.training_env.env_method("random_state")[0],
+            "environments": self.training_env.env_method("moment"),
             "watch": {
                 "episodes": self.episodes,
                 "steps": self.num_timesteps,
                 "ends": dict(self._ends),
                 "guards": dict(self._guards),
                 "returns": list(self._returns),
+                "sums": copy.deepcopy(self._sums),
                 "best": (self.best_return, self.best_steps, self.best_actor),
             },
         }
@@ -392,12 +405,11 @@ class _Watch(BaseCallback):
         torch.save(state, part)
         os.replace(part, self._output / CHECKPOINT)
 
-    def _finish_episode(self, info: dict[str, Any]) -> None:
+    def _finish_episode(self, info: dict[str, Any], sums: dict[str, float]) -> None:
         self.episodes += 1
         self._ends[info["end"]] += 1
         if "guard_error" in info:
             self._guards[info["guard_error"]] += 1
-        sums, self._sums = self._sums, {}
         length = sums["length"]
         row = {
             "steps": self.num_timesteps,
