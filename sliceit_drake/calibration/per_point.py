@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from sliceit_drake.calibration.adam import Adam
 from sliceit_drake.calibration.prediction import Predictor
 from sliceit_drake.cutting.solver import CuttingError
 
@@ -16,7 +17,6 @@ PRIOR = 0.5
 NOISE = 0.3
 """Error that the prior is weighed against, N."""
 RATE, LEAST_RATE = 0.1, 0.01
-DECAYS = (0.9, 0.999)
 EPSILON = 1e-12
 
 
@@ -55,7 +55,7 @@ def fit_points(
     """
     model = predictor.targets[0].model
     points = len(model.point_nodes)
-    x, m, v = np.zeros(points), np.zeros(points), np.zeros(points)
+    x, adam = np.zeros(points), Adam.of(points)
     best, best_x = np.inf, x
     weight = NOISE**2 / (PRIOR**2 * float(predictor.used.sum()))
     for k in range(steps):
@@ -65,17 +65,13 @@ def fit_points(
         except CuttingError:
             if k == 0:
                 raise
-            x, m = 0.5 * (x + best_x), 0.0 * m
+            x, adam.m = 0.5 * (x + best_x), 0.0 * adam.m
             continue
         if square < best:
             best, best_x = square, x.copy()
         slope = gradient * np.exp(x) + 2.0 * weight * x
-        m = DECAYS[0] * m + (1.0 - DECAYS[0]) * slope
-        v = DECAYS[1] * v + (1.0 - DECAYS[1]) * slope**2
-        mean = m / (1.0 - DECAYS[0] ** (k + 1))
-        spread = np.sqrt(v / (1.0 - DECAYS[1] ** (k + 1)))
         rate = RATE * (LEAST_RATE / RATE) ** (k / max(steps - 1, 1))
-        x = x - rate * mean / (spread + EPSILON)
+        x = x + rate * adam.descent(slope, k, EPSILON)
         if progress is not None:
             progress(k + 1, float(np.sqrt(best)))
     return PointFit(np.exp(best_x), model.split.points[:, [0, 2]], float(np.sqrt(best)))

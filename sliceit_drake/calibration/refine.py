@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sliceit_drake.calibration.adam import Adam
 from sliceit_drake.calibration.prediction import Predictor
 from sliceit_drake.cutting.solver import CuttingError
 
@@ -16,7 +17,6 @@ RATE = 0.2
 quarter."""
 RIDGE = 1e-3
 """Least curvature that is told apart, relative to the greatest."""
-DECAYS = (0.9, 0.999)
 EPSILON = 1e-8
 BACK_OFF = 0.5
 LEAST_RATE = 1e-6
@@ -59,11 +59,12 @@ def refine(
         progress: Called with the steps done and the best error so far, N.
     """
     axes = _principal_axes(predictor, start, checkpoint)
-    state = _State(start.copy(), np.zeros_like(start), np.zeros_like(start), 1.0)
+    state = _State(start.copy(), Adam.of(len(start)), 1.0)
     best, errors, last = (start.copy(), np.inf), [], start.copy()
     if checkpoint is not None and checkpoint.exists():
         with np.load(checkpoint) as saved:
-            state = _State(saved["unit"], saved["m"], saved["v"], float(saved["factor"]))
+            adam = Adam(saved["m"], saved["v"])
+            state = _State(saved["unit"], adam, float(saved["factor"]))
             best, errors = (saved["best"], float(saved["error"])), saved["errors"].tolist()
             last = saved["last"]
     while len(errors) < steps:
@@ -78,13 +79,9 @@ def refine(
                 best = (state.unit.copy(), error)
             last = state.unit.copy()
             slope = axes.T @ gradient
-            state.m = DECAYS[0] * state.m + (1.0 - DECAYS[0]) * slope
-            state.v = DECAYS[1] * state.v + (1.0 - DECAYS[1]) * slope**2
-            mean = state.m / (1.0 - DECAYS[0] ** (k + 1))
-            spread = np.sqrt(state.v / (1.0 - DECAYS[1] ** (k + 1)))
             rate = state.factor * RATE * (0.1 if 4 * k >= 3 * steps else 1.0)
-            move = rate * axes @ (mean / (spread + EPSILON))
-            state.unit = np.clip(last - move, 0.0, 1.0)
+            move = rate * axes @ state.adam.descent(slope, k, EPSILON)
+            state.unit = np.clip(last + move, 0.0, 1.0)
         else:
             state.factor *= BACK_OFF
             state.unit = last + BACK_OFF * (state.unit - last)
@@ -120,8 +117,7 @@ def _principal_axes(predictor: Predictor, start: np.ndarray, checkpoint: Path | 
 @dc.dataclass
 class _State:
     unit: np.ndarray
-    m: np.ndarray
-    v: np.ndarray
+    adam: Adam
     factor: float
 
 
@@ -132,8 +128,8 @@ def _save(
     np.savez(
         partial,
         unit=state.unit,
-        m=state.m,
-        v=state.v,
+        m=state.adam.m,
+        v=state.adam.v,
         factor=state.factor,
         best=best[0],
         error=best[1],

@@ -59,6 +59,15 @@ class Cylinder:
         doc="Distances of the element layers from y = 0, on both sides; the rest is one layer.",
     )
 
+    @property
+    def section(self) -> tuple[float, float]:
+        """Width and height of the section through the middle, metres."""
+        return self.diameter, self.diameter
+
+    def scaled(self, scale: float) -> "Cylinder":
+        """Another size of the section."""
+        return dc.replace(self, diameter=scale * self.diameter)
+
     def mesh(self, refinement: float = 1.0) -> TetrahedralMesh:
         """The mesh in F, with `refinement` times as many elements along each edge, rounded."""
         return self.between(_both_sides(self.layers, 0.5 * self.length, refinement), refinement)
@@ -96,6 +105,16 @@ class Box:
         doc="Distances of the element layers from y = 0, on both sides; the rest is one layer.",
     )
 
+    @property
+    def section(self) -> tuple[float, float]:
+        """Width and height of the section through the middle, metres."""
+        return self.size[0], self.size[2]
+
+    def scaled(self, scale: float) -> "Box":
+        """Another size of the section."""
+        x, y, z = self.size
+        return dc.replace(self, size=[scale * x, y, scale * z])
+
     def mesh(self, refinement: float = 1.0) -> TetrahedralMesh:
         """The mesh in F, with `refinement` times as many elements along each edge, rounded."""
         return self.between(_both_sides(self.layers, self.reach, refinement), refinement)
@@ -127,6 +146,16 @@ class Ellipsoid:
     refinements: int = quantity(
         3, "", low=0, high=5, doc="Halvings of the 20 tetrahedra of an icosahedron."
     )
+
+    @property
+    def section(self) -> tuple[float, float]:
+        """Width and height of the section through the middle, metres."""
+        return self.diameters[0], self.diameters[2]
+
+    def scaled(self, scale: float) -> "Ellipsoid":
+        """Another size of the section."""
+        x, y, z = self.diameters
+        return dc.replace(self, diameters=[scale * x, y, scale * z])
 
     def mesh(self, refinement: float = 1.0) -> TetrahedralMesh:
         """The mesh in F; `refinement` is rounded to a power of two."""

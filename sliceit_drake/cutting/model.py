@@ -162,11 +162,14 @@ class CuttingModel(CutGeometry):
             raise TypeError(f"a cut has no {', '.join(changes)} to change")
         geometry = {f.name: getattr(self, f.name) for f in dc.fields(CutGeometry)}
         derived = type(self)(**geometry, **given, **_derived(self, **given))
-        # What only depends on the geometry is computed once.
-        for name in ("blocks", "shape", "_gradient_products", "section_area"):
-            if name in self.__dict__:
-                derived.__dict__[name] = self.__dict__[name]
+        derived.share_geometry(self)
         return derived
+
+    def share_geometry(self, other: "CuttingModel") -> None:
+        """Takes what another model of the same geometry has computed of it, which is costly."""
+        for name in ("blocks", "shape", "_gradient_products", "section_area"):
+            if name in other.__dict__:
+                self.__dict__[name] = other.__dict__[name]
 
 
 def make_cutting_model(

@@ -29,9 +29,6 @@ if TYPE_CHECKING:
 
 __all__ = ["active", "on_cluster", "run_jobs"]
 
-GEOMETRIC = ("blocks", "shape", "_gradient_products", "section_area")
-"""What a cut keeps that only depends on its geometry; see `CuttingModel.derive`."""
-
 _CLIENT: ContextVar[Any] = ContextVar("client", default=None)
 
 
@@ -107,9 +104,7 @@ def _rebuilt(shared: CuttingModel, own: dict[str, Any]) -> CuttingModel:
     fields = {f.name: getattr(shared, f.name) for f in dc.fields(shared)} | own
     model = type(shared)(**fields)
     if not set(own) & {f.name for f in dc.fields(CutGeometry)}:
-        for name in GEOMETRIC:
-            if name in shared.__dict__:
-                model.__dict__[name] = shared.__dict__[name]
+        model.share_geometry(shared)
     return model
 
 

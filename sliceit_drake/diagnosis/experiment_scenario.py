@@ -263,11 +263,8 @@ def _start(scenario: Scenario, setup: CalibrationSetup) -> Pose:
 
 def _section(food: Food, setup: CalibrationSetup) -> tuple[float, float]:
     """Width and height of the section, metres."""
-    shape = food.shape
-    if isinstance(shape, Cylinder):
-        return shape.diameter, shape.diameter
-    if isinstance(shape, Box):
-        return shape.size[0], shape.size[2]
+    if isinstance(food.shape, Cylinder | Box | Ellipsoid):
+        return food.shape.section
     model = make_food_model(food, setup.knife, setup.numerics, setup.refinement)
     low, high = model.span
     return float(high - low), float(start_pose(model, 0.0).p[2])
@@ -276,14 +273,8 @@ def _section(food: Food, setup: CalibrationSetup) -> tuple[float, float]:
 def _scaled(food: Food, scale: float) -> Food:
     """A copy of another size of section; the same where the shape cannot be scaled."""
     food = copy.deepcopy(food)
-    shape = food.shape
-    if isinstance(shape, Cylinder):
-        shape.diameter *= scale
-    elif isinstance(shape, Box):
-        shape.size = [scale * shape.size[0], shape.size[1], scale * shape.size[2]]
-    elif isinstance(shape, Ellipsoid):
-        x, y, z = shape.diameters
-        shape.diameters = [scale * x, y, scale * z]
+    if isinstance(food.shape, Cylinder | Box | Ellipsoid):
+        food.shape = food.shape.scaled(scale)
     return food
 
 

@@ -1,6 +1,5 @@
 """A protocol: the slices of one session at the bench, in YAML, and in which order they are cut."""
 
-import copy
 import dataclasses as dc
 
 import numpy as np
@@ -164,19 +163,7 @@ def scaled_food(food: Food, scale: float) -> Food:
     Raises:
         ConfigurationError: It has no shape that can be scaled.
     """
-    if scale == 1.0:
-        return food
-    shape = copy.deepcopy(food.shape)
-    if isinstance(shape, Cylinder):
-        shape.diameter *= scale
-    elif isinstance(shape, Box):
-        shape.size = [scale * shape.size[0], shape.size[1], scale * shape.size[2]]
-    elif isinstance(shape, Ellipsoid):
-        x, y, z = shape.diameters
-        shape.diameters = [scale * x, y, scale * z]
-    else:
-        raise _no_plain_shape()
-    return dc.replace(food, shape=shape)
+    return food if scale == 1.0 else dc.replace(food, shape=_plain_shape(food).scaled(scale))
 
 
 def section_size(food: Food, scale: float = 1.0) -> tuple[float, float]:
@@ -185,18 +172,13 @@ def section_size(food: Food, scale: float = 1.0) -> tuple[float, float]:
     Raises:
         ConfigurationError: It has no shape that says so.
     """
-    shape = scaled_food(food, scale).shape
-    if isinstance(shape, Cylinder):
-        return shape.diameter, shape.diameter
-    if isinstance(shape, Box):
-        return shape.size[0], shape.size[2]
-    if isinstance(shape, Ellipsoid):
-        return shape.diameters[0], shape.diameters[2]
-    raise _no_plain_shape()
+    return _plain_shape(food).scaled(scale).section
 
 
-def _no_plain_shape() -> ConfigurationError:
-    return ConfigurationError(
+def _plain_shape(food: Food) -> Cylinder | Box | Ellipsoid:
+    if isinstance(food.shape, Cylinder | Box | Ellipsoid):
+        return food.shape
+    raise ConfigurationError(
         "is no cylinder, box or ellipsoid",
         field="protocol.food.shape",
         fix="Describe the food by one of these shapes.",
