@@ -14,6 +14,7 @@ from sliceit_drake.calibration.gauss_newton import residuals_at
 from sliceit_drake.calibration.oscillation import Oscillation, fit_oscillation
 from sliceit_drake.calibration.per_point import fit_points
 from sliceit_drake.calibration.prediction import Predictor
+from sliceit_drake.calibration.record_target import _turning
 from sliceit_drake.calibration.refine import refine
 from sliceit_drake.calibration.search import open_study, search
 from sliceit_drake.calibration.setup import (
@@ -139,6 +140,49 @@ def test_samples_that_are_held_out_do_not_count(records):
     other = Predictor(coarse_setup(), spoiled).holding_out(hidden)
     assert other.mean_square_and_gradient(unit)[0] == error
     np.testing.assert_array_equal(other.mean_square_and_gradient(unit)[1], gradient)
+
+
+def test_the_knife_is_not_compared_while_it_turns_round_in_the_food(records):
+    predictor = Predictor(coarse_setup(), records[:1])
+    (target,) = predictor.targets
+    turn, left_out = int(target.depth.argmax()), np.flatnonzero(~target.compared)
+    assert turn - 3 <= left_out[0] <= turn + 3 and np.all(np.diff(left_out) == 1)
+    back = target.depth[turn] - target.depth
+    assert not target.compared[turn:][back[turn:] < 1e-3].any()
+    assert target.time[left_out[-1]] - target.time[left_out[0]] == pytest.approx(0.03, abs=0.005)
+    # Nor does it count what is measured there.
+    spoiled = copy.deepcopy(records[:1])
+    at = np.searchsorted(spoiled[0].time, target.time[left_out])
+    spoiled[0].force[at] += 50.0
+    unit = truth(predictor)
+    errors = [p.error(*p.predict([unit])) for p in (predictor, Predictor(coarse_setup(), spoiled))]
+    assert errors[0] == errors[1] < 0.12
+
+
+@pytest.mark.parametrize(
+    ("way", "left_out"),
+    [
+        # Knots of time [s] and depth [mm]; spans that are left out [s].
+        ([(0, -5), (1, 20)], []),
+        ([(0, -5), (1, 20), (1.5, 20), (2, 15)], [(1.5, 1.6)]),
+        # Quick: the masses swing on.
+        ([(0, -5), (1, 20), (1.1, 10)], [(1.0, 1.03)]),
+        # Back by less than the force takes to turn round.
+        ([(0, -5), (1, 20), (1.5, 19.5), (2, 22)], []),
+        ([(0, -5), (1, 20), (2, 10), (3, 25), (4, 15)], [(1.0, 1.1), (3.0, 3.1)]),
+        ([(0, -15), (1, -5), (2, -15)], []),
+    ],
+)
+def test_a_turn_is_one_in_the_food_and_ends_when_the_knife_is_back(way, left_out):
+    knots = np.array(way, float)
+    time = np.arange(0.0, knots[-1, 0], 2e-3)
+    depth = 1e-3 * np.interp(time, *knots.T)
+    depth += 4e-6 * np.random.default_rng(0).uniform(-1.0, 1.0, len(depth))
+    found = _turning(time, depth)
+    expected = np.zeros(len(time), bool)
+    for begin, end in left_out:
+        expected |= (time >= begin) & (time < end)
+    assert np.count_nonzero(found ^ expected) <= 3 * len(left_out)
 
 
 def test_the_filters_of_a_record_are_repeated_on_its_prediction(records):

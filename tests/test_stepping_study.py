@@ -117,7 +117,7 @@ def test_foods_are_those_that_the_scenarios_cut():
     assert whole.held_sides == "both" and isinstance(whole.shape, Cylinder)
     assert middle.shape.thickness == 3e-3
     labels = [c.label for c in stepping_cases([(whole, Knife(), Numerics())])]
-    assert len(set(labels)) == len(labels) == 7
+    assert len(set(labels)) == len(labels) == 9
 
 
 def test_a_scenario_held_half_way_goes_as_far_as_before():

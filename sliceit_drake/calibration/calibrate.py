@@ -345,6 +345,5 @@ def _held_out(predictor: Predictor, fitted: Predictor, unit: np.ndarray) -> dict
     (row,) = predictor.predict([at])
     errors = {}
     for target, prediction in zip(predictor.targets, row, strict=True):
-        residual = prediction.predicted - target.measured
-        errors[target.record.name] = float(np.sqrt(np.mean(residual**2)))
+        errors[target.record.name] = target.rms_error(prediction.predicted)
     return errors

@@ -125,7 +125,9 @@ class Predictor:
             self.targets.append(RecordTarget(record, models[key], setup))
         self.board = dc.replace(setup.board, height=0.0)
         self.parameters = self._list_parameters()
-        self.used = np.ones(self.measured.size, bool)
+        self.used = np.concatenate(
+            [np.repeat(t.compared, t.measured.shape[1]) for t in self.targets]
+        )
         self.point_factors: dict[str, np.ndarray] = {}
         self._simulator = BatchSimulator(EXCHANGE_PERIOD, self.board, workers)
         self._adjoints: dict[int, SliceAdjoint] = {}
@@ -280,7 +282,7 @@ class Predictor:
     def holding_out(self, held_out: np.ndarray) -> "Predictor":
         """The same predictor, fitting without these entries of `measured`, mask [M]."""
         other = copy.copy(self)
-        other.used = ~held_out
+        other.used = self.used & ~held_out
         return other
 
     def error(self, row: Sequence[Prediction]) -> float:

@@ -29,6 +29,11 @@ EXCHANGE_PERIOD = 2e-3
 CLEARANCE = 5e-4
 """Height of the edge over the food below which rows are compared, beside the range of the record's
 own height, metres."""
+TURN_TRAVEL, TURN_TIME, STILL = 1e-3, 0.03, 2e-5
+"""Where the knife turns round in the food, the rows that are not compared: until it is as far back,
+metres, and for as long, s, counted from where it was last as deep but for `STILL`, metres. The
+force turns round over some tenths of a millimetre, in which scaled masses err by half of it
+(docs/stepping.md)."""
 ONSET = 0.02
 """Share of a record's greatest force at which contact is taken to begin, where its height is not
 known."""
@@ -61,8 +66,8 @@ class RecordTarget:
 
     The force is compared by component in F where the record has them, else by its norm, in all rows
     from the first to the last in which the edge comes near the food: a prediction of zero above it
-    is a prediction. Prediction and measurement went through the same filters:
-    `records.preprocessing.as_measured`.
+    is a prediction, but not where the knife turns round in the food. Prediction and measurement
+    went through the same filters: `records.preprocessing.as_measured`.
 
     Args:
         record: The record.
@@ -77,6 +82,7 @@ class RecordTarget:
         time: Of the compared samples [m], s.
         measured: Force at them [m, channels], N; channels are x, y, z of F, or the norm.
         depth: Of the edge below the top of the cut at them [m], metres, as the record says.
+        compared: Whether a sample is compared [m].
         by_norm: Whether only the norm is known.
         unknown_speed: Whether the speed of the motion is known but for a factor.
         operator: From forces of the exchanges to what would have been measured [m, E].
@@ -109,6 +115,7 @@ class RecordTarget:
         self._rotation = Slerp(record.time, rotation)(at).as_matrix()
         self.time = record.time[self._first : self._last + 1]
         self.depth = -height[self._first : self._last + 1]
+        self.compared = ~_turning(self.time, self.depth)
         if self.by_norm:
             self.measured = record.force_magnitude[self._first : self._last + 1, None]
         else:
@@ -145,6 +152,11 @@ class RecordTarget:
         seen = self.operator @ force
         return np.linalg.norm(seen, axis=1)[:, None] if self.by_norm else seen
 
+    def rms_error(self, predicted: np.ndarray) -> float:
+        """Root mean square over the compared samples of channels [m, channels], N."""
+        rest = (predicted - self.measured)[self.compared]
+        return float(np.sqrt(np.mean(rest**2)))
+
     def adjoint(self, force: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Adjoint of `compare` at `force`: of the channels [m, channels] to forces [E, 3]."""
         if self.by_norm:
@@ -152,6 +164,22 @@ class RecordTarget:
             norm = np.maximum(np.linalg.norm(seen, axis=1), 1e-9)[:, None]
             weights = weights * seen / norm
         return np.asarray(self.operator.T @ weights)
+
+
+def _turning(time: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Whether the knife has just turned back in the food, at samples [m] of its depth, metres."""
+    turning, deepest, is_down = np.zeros(len(depth), bool), 0, True
+    for k in range(len(depth)):
+        if is_down == (depth[k] > depth[deepest]):
+            deepest = k
+        elif abs(depth[deepest] - depth[k]) > TURN_TRAVEL:
+            if is_down and depth[deepest] > 0.0:
+                bottom = np.flatnonzero(depth[deepest : k + 1] > depth[deepest] - STILL)
+                first = deepest + int(bottom[-1])
+                after = np.searchsorted(time, time[first] + TURN_TIME, side="right")
+                turning[first : max(k, int(after))] = True
+            deepest, is_down = k, not is_down
+    return turning
 
 
 def poses_in_food(

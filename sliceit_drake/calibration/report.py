@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from sliceit_drake.calibration.calibrate import Calibration
@@ -71,16 +70,27 @@ def figure(calibration: Calibration) -> Figure:
             upper.plot(target.time, prediction.predicted[:, c], style, color=PREDICTED, lw=1.2)
             rest = target.measured[:, c] - prediction.predicted[:, c]
             lower.plot(target.time, rest, style, color="#475569", lw=1.0, label=name)
-        rms = np.sqrt(np.mean((prediction.predicted - target.measured) ** 2))
+        rms = target.rms_error(prediction.predicted)
         upper.set(title=f"{target.record.name}: RMS {rms:.2f} N", ylabel="force on the knife [N]")
         upper.plot([], [], color=MEASURED, label="measured")
         upper.plot([], [], color=PREDICTED, label="calibrated")
-        upper.legend(frameon=False)
         lower.set(xlabel="time [s]", ylabel="rest [N]")
-        if len(channels) > 1:
-            lower.legend(frameon=False, fontsize=7, ncols=3)
         for axis in (upper, lower):
             axis.grid(alpha=0.25)
+            axis.fill_between(
+                target.time,
+                0.0,
+                1.0,
+                where=(~target.compared).tolist(),
+                transform=axis.get_xaxis_transform(),
+                color="#94a3b8",
+                alpha=0.35,
+                lw=0.0,
+                label="" if target.compared.all() or axis is lower else "turns round: not compared",
+            )
+        upper.legend(frameon=False)
+        if len(channels) > 1:
+            lower.legend(frameon=False, fontsize=7, ncols=3)
     return sheet
 
 

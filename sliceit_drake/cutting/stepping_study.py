@@ -11,7 +11,7 @@ import numpy as np
 from sliceit_drake.cutting.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel, Numerics, TimeStepError
-from sliceit_drake.cutting.motion import Hold, Motion, MotionPlan, PressAndDraw, Segment
+from sliceit_drake.cutting.motion import Hold, Motion, MotionPlan, PressAndDraw, Retract, Segment
 from sliceit_drake.cutting.simulate import ENERGY_RATIO_LIMIT, KnifePath, energy_ratio
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
 
@@ -38,6 +38,7 @@ STEPS = (1e-5, 2e-5, 5e-5, 1e-4, 2.5e-4, 5e-4, 1e-3)
 EXCHANGE = 2e-3
 CLEARANCE = 5e-4
 RAMP = 1.0  # Acceleration of the sequences' knife, m/s^2.
+RETRACT = 0.01  # m.
 CHECK_TRAVEL = 2e-4  # Of the knife between two looks at the energies, m.
 SETTLED = 0.02  # After a stop, s: the force drop ends here and creep begins.
 
@@ -52,6 +53,7 @@ class SteppingCase:
         draw_ratio: Draw over press speed.
         depth: Share of the section's height that the edge goes down.
         hold: Rest after a stop there, s; 0 for none.
+        retract: Way back from there at the same speed, metres; 0 for none.
         acceleration: Of the ramps, m/s^2; None if the velocity steps.
         true_masses: Compare with true masses at a stable step, and try them at every step; else
             compare with scaled masses at the smallest step.
@@ -64,6 +66,7 @@ class SteppingCase:
     draw_ratio: float = 0.0
     depth: float = 1.0
     hold: float = 0.0
+    retract: float = 0.0
     acceleration: float | None = None
     true_masses: bool = False
 
@@ -72,6 +75,8 @@ class SteppingCase:
         """What the knife does."""
         if self.hold:
             return "hold after a ramp" if self.acceleration else "hold after a sudden stop"
+        if self.retract:
+            return "press and retract"
         return "draw" if self.draw_ratio else "press"
 
     @property
@@ -97,7 +102,11 @@ class SteppingCase:
             draw_ratio=self.draw_ratio,
             acceleration=self.acceleration,
         )
-        segments: list[Segment] = [press, Hold(self.hold)] if self.hold else [press]
+        segments: list[Segment] = [press]
+        if self.hold:
+            segments.append(Hold(self.hold))
+        if self.retract:
+            segments.append(Retract(self.retract, self.press_speed, self.acceleration))
         offset = -0.5 * self.draw_ratio * distance
         return Motion(MotionPlan(segments), start_pose(model, CLEARANCE, offset))
 
@@ -166,7 +175,7 @@ class StepCost:
 def stepping_cases(
     foods: Sequence[tuple[Food, Knife, Numerics]], speeds: Sequence[float] = (0.02, 0.1)
 ) -> list[SteppingCase]:
-    """Press through, draw to 40 % of the depth and hold at 30 % of it, for each food and speed.
+    """For each food and speed: press, that and 10 mm back, draw to 40 %, hold at 30 % of the depth.
 
     At the fastest the hold is also reached by a ramp. Only that speed is compared with true masses:
     it is short, and inertia is largest.
@@ -177,7 +186,8 @@ def stepping_cases(
             fastest = speed == max(speeds)
             press = SteppingCase(food, knife, numerics, speed, true_masses=fastest)
             hold = dc.replace(press, depth=0.3, hold=0.15)
-            cases += [press, dc.replace(press, draw_ratio=1.0, depth=0.4), hold]
+            back = dc.replace(press, retract=RETRACT)
+            cases += [press, back, dc.replace(press, draw_ratio=1.0, depth=0.4), hold]
             if fastest:
                 cases.append(dc.replace(hold, acceleration=RAMP))
     return cases
@@ -220,7 +230,7 @@ def stepping_study(
 
     def work(index: int) -> float:
         case, step, _ = runs[index]
-        return (case.depth * 0.03 / case.press_speed + case.hold) / step
+        return ((case.depth * 0.03 + case.retract) / case.press_speed + case.hold) / step
 
     total, done = sum(map(work, range(len(runs)))), 0.0
     outcomes: dict[int, tuple[StepResult, np.ndarray]] = {}

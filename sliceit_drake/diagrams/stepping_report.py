@@ -186,7 +186,7 @@ def plot_stepping(results: Sequence[StepResult], costs: Sequence[StepCost], file
     foods = list(dict.fromkeys(r.case.food.name for r in results))
     speeds = sorted({r.case.press_speed for r in results})
     # Okabe and Ito's palette by motion, marker and line by speed.
-    colours = {"press": "#0072B2", "draw": "#009E73"}
+    colours = {"press": "#0072B2", "press and retract": "#E69F00", "draw": "#009E73"}
     colours |= {"hold after a sudden stop": "#D55E00", "hold after a ramp": "#CC79A7"}
     styles = dict(zip(speeds, (("--", "o"), ("-", "s")), strict=False))
     figure = Figure(figsize=(4.0 * len(foods), 4.6), layout="constrained")
