@@ -137,7 +137,7 @@ def test_quick_study_writes_the_kinds_of_tables_that_are_committed(tmp_path, cap
     assert quick == committed - {"in the station"}
     with (tmp_path / "stepping.csv").open() as stream:
         rows = list(csv.DictReader(stream))
-    assert len(rows) == 4 * 4
+    assert len(rows) == 5 * 4
     assert all(float(row["wall_per_simulated"]) > 0.0 for row in rows)
     assert (tmp_path / "stepping.png").stat().st_size > 1e4
 
@@ -152,5 +152,8 @@ def test_in_the_committed_tables_the_default_step_errs_at_most_two_percent():
     # True masses swing after this stop, which damped ones do not (docs/stepping.md).
     swinging = errors.pop("tomato, hold after a sudden stop, 100 mm/s")
     assert float(swinging) < 2.5
+    # Nor do heavy nodes follow a blade that turns round in flesh that clamps it.
+    for speed in ("20", "100"):
+        assert 2.0 < float(errors.pop(f"cucumber, press and retract, {speed} mm/s")) < 6.0
     # A star would mark what a simulation refuses.
     assert all(float(error) <= 100.0 * LIMIT for error in errors.values())
