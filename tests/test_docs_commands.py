@@ -223,17 +223,21 @@ READ_ONLY = {
         sliceit study verification --output docs/verification.md
         """,  # noqa: E501
     "measures times or draws figures, whose results stand in docs": """
+        python benchmarks/batch_speed.py --output docs/speed.md
         python benchmarks/condensed_scheme.py
         python benchmarks/cutting_speed.py --json docs/benchmarks/cutting_speed.json
         python benchmarks/cutting_speed.py --repeats 3 --output docs/figures/cutting_speed.png
         python benchmarks/diagnosis_speed.py --json docs/benchmarks/diagnosis_speed.json
         python benchmarks/effects_figure.py
+        python benchmarks/endurance.py --minutes 60 --output docs/endurance.md
         python benchmarks/first_run.py --json docs/benchmarks/first_run.json
         python benchmarks/foods_page.py --cut --output docs/foods.md
         python benchmarks/learning_speed.py --output docs/learning.md --json docs/benchmarks/learning_speed.json
+        python benchmarks/policy_and_motion.py models/policies/cutting_0 --output docs/learning.md
         python benchmarks/safety_layer.py
         python benchmarks/scaling.py --output docs/scaling.md
         python benchmarks/scaling.py --trials 24 --slices 4 --tasks 500 --seconds 2 --output docs/scaling.md
+        python benchmarks/slicing_ablations.py --folder output/ablations --output docs/learning.md
         python benchmarks/split_step_limit.py
         python benchmarks/stand_in_figure.py
         python benchmarks/station_speed.py
@@ -254,7 +258,7 @@ READERS = {
     "food.yaml": "docs/next_experiment.md, where it is said how to write it",
     "output/cucumber": "`sliceit simulate` without --output",
 }
-WRITES = ("--output", "--figure", "--json", "--next-experiment")
+WRITES = ("--output", "--folder", "--figure", "--json", "--next-experiment")
 PLACEHOLDER = re.compile(r"[A-Z_]{3,}|.*/NAME\.\w+|\w+://.*")
 
 
