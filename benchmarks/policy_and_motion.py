@@ -33,7 +33,6 @@ from sliceit_drake.diagrams.run import prepare_run, simulate
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.learning.evaluation import cut_slice
 from sliceit_drake.learning.metrics import SliceMetrics, slice_metrics
-from sliceit_drake.learning.training import POLICY, load_policy_folder
 from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.slicing_worlds import StandInWorld
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
@@ -103,6 +102,8 @@ def main() -> None:
     parser.add_argument("--output", type=Path, help="Markdown file with the two lines")
     options = parser.parse_args()
     PLACE.check(options.output)
+    from sliceit_drake.learning.training import POLICY, load_policy_folder
+
     config = load_policy_folder(options.policy)
     agent = dc.replace(config.task.agent, network=str(options.policy / POLICY))
     decide, stiff = load_network(agent), load_scenario(resource_path(STIFF)).controller
