@@ -124,6 +124,8 @@ TESTED = {
         "sliceit evaluate models/policies/*_[0-4] --output docs/slicing_evaluation.jsonl",
         "sliceit evaluate models/policies/*_[0-4] --foods cucumber --board-stiffness 3e3 3e5"
         " --output docs/slicing_evaluation.jsonl",
+        "sliceit evaluate models/policies/*_[0-4] --world curves --board-stiffness 3e3 3e5"
+        " --output docs/slicing_evaluation.jsonl",
     ],
     "tests/test_learning_comparison.py::test_a_trained_policy_runs_in_a_scenario": [
         "sliceit simulate scenarios/cucumber_agent.yaml",
