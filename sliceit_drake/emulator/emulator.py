@@ -42,7 +42,8 @@ class Clock:
         lockstep: Whether, while a client servos, a cycle waits for its next ``servoJ`` instead of
             for the pace. One package, one cycle: the same run every time, on any machine.
         patience: Wall time that a cycle in lockstep waits, s. Then it runs without, and the pace
-            holds until the next ``servoJ``. ur_rtde gives up a connection that is silent for about 2 s.
+            holds until the next ``servoJ``. ur_rtde gives up a connection after some 2 s of
+            silence.
     """
 
     pace: float = 1.0
