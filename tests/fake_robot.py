@@ -26,7 +26,9 @@ class FakeRobot:
         self.call_time = 0.0
         self.frozen = False
         self.time = 100.0
-        self.sent = []  # (time, target)
+        # Targets, each with the time of the state read before it: under load the clock has gone on.
+        self.sent = []
+        self._read_time = self.time
         self.log = []
         self.watchdog = None
         self.move = None  # Where a planned motion goes, and how fast.
@@ -70,8 +72,9 @@ class FakeRobot:
         return self.time
 
     def read(self):
+        self._read_time = self.time
         return RobotState(
-            self.time, self.q, self.qd, self.wrench, self.runtime, self.bits, self.payload
+            self._read_time, self.q, self.qd, self.wrench, self.runtime, self.bits, self.payload
         )
 
     def is_connected(self):
@@ -82,7 +85,7 @@ class FakeRobot:
             raise RuntimeError("a target before the watchdog")
         clock.sleep(self.call_time)
         if self.accepts:
-            self.sent.append((self.time, list(q)))
+            self.sent.append((self._read_time, list(q)))
             self.target = list(q)
         return self.accepts
 
