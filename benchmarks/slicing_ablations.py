@@ -31,6 +31,7 @@ VARIANTS = {
     "tilt: 0.0}}}",
     "uniform replay": "{priority: 0.0}",
     "action mapping of the authors' code": "{task: {agent: {mapping: upper}}}",
+    "draws up to 150 mm/s, not 40": "{task: {agent: {draw_increment: 7.5e-3}}}",
     "uniform noise, not the posterior": "{task: {randomization: {foods: uniform}}}",
     "two environments side by side": "{environments: 2}",
 }

@@ -122,9 +122,7 @@ TESTED = {
     "tests/test_learning_comparison.py::test_an_evaluation_goes_on_over_batches_of_processes_and_"
     "runs": [
         "sliceit evaluate models/policies/*_[0-4] --output docs/slicing_evaluation.jsonl",
-        "sliceit evaluate models/policies/*_[0-4] --foods cucumber --board-stiffness 3e3 3e5"
-        " --output docs/slicing_evaluation.jsonl",
-        "sliceit evaluate models/policies/*_[0-4] --world curves --board-stiffness 3e3 3e5"
+        "sliceit evaluate models/policies/*_[0-4] --board-stiffness 3e3 3e5"
         " --output docs/slicing_evaluation.jsonl",
     ],
     "tests/test_learning_comparison.py::test_a_trained_policy_runs_in_a_scenario": [

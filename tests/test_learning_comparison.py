@@ -111,8 +111,28 @@ def test_the_claim_holds_where_the_interval_ends_below_one(tmp_path):
     assert page.count("\n") == 3 and "12 of 12, 12 of 12" in page and "| 0.61 |" in page
     # A food that the paper did not cut has no ratio of the paper's.
     assert comparison_page([dc.replace(lower[0], food="leek")]).endswith(" |  |")
+    # Who gives slices up on which it met little has not cut with less force.
+    given_up = rows()
+    for row in given_up:
+        if row["simulator"] == "cutting" and row["food"] == "potato" and row["slice"] < 3:
+            row["completed"] = False
+    potato = compare(given_up)[1]
+    assert potato.ratios["median_force"].high < 1.0 < potato.strict.high
+    # Nine of the twelve count as the worst of the baseline's: 10 N, 0.3 N and 0.1 N.
+    kept = [6.0 + 0.3 + 0.05 * seed for seed in range(3)]
+    counted = (9 * 10.4 + sum(kept)) / 12.0
+    assert potato.strict.value == pytest.approx(counted / 10.2)
+    assert "on cucumber; not shown on potato; ours completed 62 %" in claim(compare(given_up))[0]
     plot_boxes(lower, tmp_path / "boxes.png")
     assert (tmp_path / "boxes.png").stat().st_size > 5000
+
+
+def test_comparisons_are_in_the_order_of_worlds_and_boards():
+    both = [dict(row, board_stiffness=3e5) for row in rows()] + rows()
+    both += rows(world="curves")
+    found = [(each.world, each.board_stiffness, each.food) for each in compare(both)]
+    boards = (("curves", 3e4), ("stand_in", 3e4), ("stand_in", 3e5))
+    assert found == [(*board, food) for board in boards for food in ("cucumber", "potato")]
 
 
 def test_policies_that_did_not_cut_the_same_slices_are_not_compared():
