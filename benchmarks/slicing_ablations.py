@@ -34,7 +34,10 @@ VARIANTS = {
     "draws up to 150 mm/s, not 40": "{task: {agent: {draw_increment: 7.5e-3}}}",
     "uniform noise, not the posterior": "{task: {randomization: {foods: uniform}}}",
     "two environments side by side": "{environments: 2}",
+    "two environments, 60,000 decisions": "{environments: 2}",
 }
+STEPS = {"two environments, 60,000 decisions": 60_000}
+"""Of a training that is not as long as the others."""
 PLACE = Place("slicing_ablations")
 LAST = 20
 """Slices at the end of a training whose return is given."""
@@ -70,7 +73,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--folder", type=Path, required=True, help="where trainings are kept")
-    parser.add_argument("--steps", type=int, default=15_000, help="of a training; 15000")
+    parser.add_argument("--steps", type=int, default=15_000, help="of most trainings; 15000")
     parser.add_argument("--seed", type=int, default=0, help="of all of them; 0")
     parser.add_argument("--slices", type=int, default=5, help="of each food; 5")
     parser.add_argument("--output", type=Path, help="Markdown file with the two lines")
@@ -82,7 +85,8 @@ def main() -> int:
         folder = folders[variant]
         if not (folder / "policy.onnx").exists():
             print(f"{variant}:")
-            given = ["--steps", str(options.steps), "--seed", str(options.seed)]
+            steps = STEPS.get(variant, options.steps)
+            given = ["--steps", str(steps), "--seed", str(options.seed)]
             code = sliceit(["train", "--output", str(folder), "--set", settings, *given])
             if code != 0:
                 return code
@@ -92,7 +96,8 @@ def main() -> int:
         return code
     cuts = [json.loads(line) for line in evaluation.read_text(encoding="utf-8").splitlines()]
     lines = [
-        "What of the agent matters, one thing changed at a time:",
+        f"What of the agent matters, one thing changed at a time; {options.steps} decisions where "
+        "no other number stands:",
         "",
         "| variant | return of the last slices | completed | cucumber | tomato | potato | carrot "
         "| board's peak, cucumber |",

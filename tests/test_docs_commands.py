@@ -242,6 +242,7 @@ READ_ONLY = {
         python benchmarks/stand_in_figure.py
         python benchmarks/station_speed.py
         python benchmarks/station_speed.py --json docs/benchmarks/station_speed.json
+        python benchmarks/unfinished_slices.py docs/slicing_evaluation.jsonl --output docs/learning.md
         """,  # noqa: E501
 }
 
