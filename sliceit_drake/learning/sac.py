@@ -130,8 +130,8 @@ class PrioritizedSAC(SAC):
             actor_loss=actor_loss.item(),
             critic_loss=critic_loss.item(),
             ent_coef=float(alpha),
-            entropy=-float(log_density.mean()),
-            value=float(worth.mean()),
+            entropy=-log_density.mean().item(),
+            value=worth.mean().item(),
         )
 
     def _act(self, observations: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
