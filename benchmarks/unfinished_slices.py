@@ -64,7 +64,9 @@ def main() -> int:
     options = parser.parse_args()
     PLACE.check(options.output)
     names = [field.name for field in dc.fields(Case)]
-    rows = [json.loads(line) for line in options.evaluation.read_text("utf-8").splitlines()]
+    rows = [
+        json.loads(line) for line in options.evaluation.read_text(encoding="utf-8").splitlines()
+    ]
     of_board = [r for r in rows if r["board_stiffness"] == options.board_stiffness]
     cases = [Case(**{name: r[name] for name in names}) for r in of_board if not r["completed"]]
     lines = [

@@ -204,17 +204,20 @@ def test_5_a_cause_a_food_and_a_cutting_system_of_ones_own(tmp_path, tmp_path_fa
 
 
 def test_6_the_hardware_diagram_slices_on_the_emulator(tmp_path, tmp_path_factory):
-    notebook = stored(6)
-    found = executed(
-        notebook,
-        tmp_path,
-        tmp_path_factory,
-        address="ADDRESS",
-        stopped="made.stopped",
-        peak="float(np.abs(robot['sensor_wrench_f_z']).max())",
-        apart="float(np.abs(difference).max())",
-        after="status['runtime_state']",
-    )
+    values = {
+        "address": "ADDRESS",
+        "stopped": "made.stopped",
+        "peak": "float(np.abs(robot['sensor_wrench_f_z']).max())",
+        "apart": "float(np.abs(difference).max())",
+        "after": "status['runtime_state']",
+    }
+    for attempt in ("first", "second"):
+        notebook = stored(6)
+        (tmp_path / attempt).mkdir()
+        found = executed(notebook, tmp_path / attempt, tmp_path_factory, **values)
+        # A shared machine that stands for the 2 s of this limit is stopped rightly, and cuts again.
+        if not (found["stopped"] or "").startswith("state_age"):
+            break
     assert found["address"].startswith("127.")
     assert found["stopped"] is None and found["after"] == "STOPPED"
     assert 11.0 < found["peak"] < 20.0
