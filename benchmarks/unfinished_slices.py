@@ -20,21 +20,17 @@ from marked_page import Place
 from tqdm import tqdm
 
 from sliceit_drake.cli.evaluate import Case, trace
-from sliceit_drake.systems.agent import ACTIONS
+from sliceit_drake.systems.agent import ACTIONS, AgentConfig
 
 PLACE = Place("unfinished_slices")
 LAST = 5.0
 """How long before the end is looked at, s."""
-DECISION = 0.05
-"""Between two decisions, s."""
-ENDS = {"time": "time", "collision": "force"}
-"""How they ended, as a reader says it."""
 
 
 def row(case: Case) -> str:
     """A slice's line of the table."""
     cut = trace(case)
-    count = round(LAST / DECISION)
+    count = round(LAST / AgentConfig().period)
     height, actions = 1e3 * cut.height[-count:], cut.actions[-count:]
     press = actions[:, [ACTIONS.index("press"), ACTIONS.index("p_z")]].mean(axis=0)
     draw = actions[:, ACTIONS.index("draw")]
@@ -44,7 +40,7 @@ def row(case: Case) -> str:
         Path(case.policy).name,
         case.world.replace("_", "-"),
         f"{case.food} {case.slice + 1}",
-        f"{ENDS.get(cut.metrics.end, cut.metrics.end)}, {cut.time[-1]:.1f} s",
+        f"{cut.metrics.end}, {cut.time[-1]:.1f} s",
         f"{100 * cut.metrics.cut:.1f} %",
         f"{height.min():.2f} to {height.max():.2f} mm",
         f"{draw.min():+.2f} to {draw.max():+.2f}",
