@@ -292,7 +292,7 @@ class Spring(KnifeForceSystem):
 
     STIFFNESS = 1000.0
 
-    def advance(self, context, state, X_WK, V_WK):
+    def advance(self, context, state, X_WK):
         depth = max(0.0, 1.0 - X_WK.translation()[2])
         return np.array([0.0, 0.0, 0.0, 0.0, 0.0, self.STIFFNESS * depth]), depth
 

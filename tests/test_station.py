@@ -135,7 +135,7 @@ def test_analytic_food_gives_toughness_times_width():
 class Spring(KnifeForceSystem):
     """A user's cutting system: a spring below the start."""
 
-    def advance(self, context, state, X_WK, V_WK):
+    def advance(self, context, state, X_WK):
         depth = max(0.0, START_HEIGHT - 0.005 - X_WK.translation()[2])
         return np.array([0.0, 0.0, 0.0, 0.0, 0.0, 2000.0 * depth]), 0.0
 

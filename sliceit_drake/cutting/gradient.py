@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from sliceit_drake.cutting.kernel_types import PARAMETERS
+from sliceit_drake.cutting.kernel_types import ACCUMULATED, PARAMETERS
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.mounting import Mounting
-from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError, knife_wrenches
-from sliceit_drake.cutting.workspace import DIRECT, Workspace, interpolate_motion
+from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError
+from sliceit_drake.cutting.workspace import DIRECT, Workspace
 
 __all__ = ["SliceAdjoint", "SliceGradient", "SliceRun"]
 
@@ -117,7 +117,7 @@ class SliceAdjoint:
         """
         model = model or self.model
         _give(model)
-        ws, n = self._forward, self._forward.substeps
+        ws = self._forward
         ws.set_models([model])
         mounting = Mounting.of(model.effects, tolerance=1e-12)
         state = ws.initial_state() if state is None else np.asarray(state, ws.dtype)
@@ -128,21 +128,15 @@ class SliceAdjoint:
             while not balanced:
                 rise, shift = mounting.given.tolist()
                 run.p[e + 1] = p[e + 1] + [-shift, 0.0, rise]
-                ws.advance(run.states[e][None], self._motion(run, e))
-                total, buried = ws.sum("total", 2)[0, 0], ws.sum("buried", 2)[0, 0]
-                if not np.isfinite(total).all():
+                ws.advance(run.states[e][None], run.R[None, e : e + 2], run.p[None, e : e + 2])
+                wrenches = ws.result("wrenches")[0, 0]
+                if not np.isfinite(wrenches).all():
                     raise CuttingError(f"at {(e + 1) * self.exchange_period:.4g} s {NOT_FINITE}")
-                blade = ws.sum("blade_sums")[0, 0]
-                parts = knife_wrenches(total, blade, buried, run.R[e + 1], n)
-                run.wrenches[e] = parts.sum(0)
+                run.wrenches[e] = wrenches.sum(0)
                 draw, _, rise = (-run.wrenches[e, 3:]).tolist()
                 balanced = mounting.rigid or mounting.balanced(-rise, draw, 0.0, None)
             run.states.append(ws.read(ws.states[-1])[0].copy())
         return run
-
-    def _motion(self, run: SliceRun, e: int) -> np.ndarray:
-        at, ws = slice(e, e + 2), self._w
-        return interpolate_motion(run.R[None, at], run.p[None, at], ws.substeps, ws.exchange_period)
 
     def gradient(self, run: SliceRun, weights: np.ndarray) -> SliceGradient:
         """Gradient of sum(weights * wrenches).
@@ -157,7 +151,7 @@ class SliceAdjoint:
         adj_p, adj_R = np.zeros_like(run.p), np.zeros_like(run.R)
         of_give, axes = np.zeros(3), np.flatnonzero(give)
         for e in reversed(range(count)):
-            ws.advance(run.states[e][None], self._motion(run, e))
+            ws.advance(run.states[e][None], run.R[None, e : e + 2], run.p[None, e : e + 2])
             back = self._adjoint_of_exchange(run, e, weights[e], adj_state)
             if len(axes):
                 # Ko's position p holds the force F(p) that it gives: p = command + give F(p). With
@@ -218,13 +212,13 @@ class SliceAdjoint:
         """Adjoint of `knife_wrenches`: of the sums as the workspace holds them, and of Ky."""
         ws, n = self._w, self._w.substeps
         of_moment, of_force = weights[:3], weights[3:]
-        blade, buried = ws.sum("blade_sums")[0, 0], ws.sum("buried", 2)[0, 0]
+        blade, buried = ws.result("blade")[0, 0], ws.result("point_sums")[0, 0, ACCUMULATED:]
         lateral = (blade[1] - blade[2]) / n * R[:, 1]
         middle = buried[:3] / buried[3] if buried[3] > 0.0 else np.zeros(3)
         of_lateral = of_force + _cross(of_moment, middle)
         of_middle = _cross(lateral, of_moment)
         adjoint = np.zeros(ws.sums.shape[1])
-        total = np.zeros(22)
+        total = np.zeros(ACCUMULATED)
         total[:9], total[9:18] = [*of_force / n] * 3, [*of_moment / n] * 3
         points = len(self.model.point_nodes)
         adjoint[ws.sum_layout["total"]] = np.tile(total, points)

@@ -11,6 +11,7 @@ import types
 from typing import Any
 
 from sliceit_drake.cutting.element_kernels import element_kernels
+from sliceit_drake.cutting.exchange_kernels import exchange_kernels
 from sliceit_drake.cutting.kernel_types import kernel_types
 from sliceit_drake.cutting.node_kernels import node_kernels
 from sliceit_drake.cutting.point_kernels import point_kernels
@@ -29,4 +30,5 @@ def kernels(real: Any, gradients: bool = False) -> types.SimpleNamespace:
         **vars(element_kernels(real, module, gradients)),
         **vars(point_kernels(real, module, gradients)),
         **vars(node_kernels(real, module, gradients)),
+        **vars(exchange_kernels(real, module)),
     )

@@ -32,6 +32,7 @@ __all__ = [
     "Segment",
     "Velocity",
     "Waypoints",
+    "small_turn",
 ]
 
 _NO_TURN = np.eye(3)
@@ -63,6 +64,23 @@ class Velocity(typing.NamedTuple):
 
     w: np.ndarray
     v: np.ndarray
+
+
+def small_turn(R0: np.ndarray, R1: np.ndarray) -> np.ndarray:
+    """Axis times sine of the angle of the turn from R0 to R1 [3], in the frame of both, rad."""
+    a, b = R0.tolist(), R1.tolist()
+
+    def element(i: int, j: int) -> float:
+        """Of R1 R0^T."""
+        return b[i][0] * a[j][0] + b[i][1] * a[j][1] + b[i][2] * a[j][2]
+
+    return 0.5 * np.array(
+        [
+            element(2, 1) - element(1, 2),
+            element(0, 2) - element(2, 0),
+            element(1, 0) - element(0, 1),
+        ]
+    )
 
 
 class _Path(typing.Protocol):

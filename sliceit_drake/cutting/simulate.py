@@ -143,8 +143,9 @@ def _check_ends(model: CuttingModel, X_CK: Pose, time: float) -> None:
     """
     low, high = model.span
     px, _, pz = X_CK.p.tolist()
+    ax, _, az = X_CK.R[:, 0].tolist()
     for end in (-0.5 * model.knife.length, 0.5 * model.knife.length):
-        x, z = px + end * X_CK.R[0, 0], pz + end * X_CK.R[2, 0]
+        x, z = px + end * ax, pz + end * az
         if low < x < high and z < model.top:
             raise CuttingError(
                 f"at {time:.4g} s an end of the knife is over the cut, {1e3 * (x - low):.3g} mm "
@@ -161,10 +162,11 @@ def check_in_plane(model: CuttingModel, X_CK: Pose, time: float) -> None:
         CuttingError: The edge is in the food and the blade is off the plane, turned out of it, or
             drawn so far that one of its ends is over the cut.
     """
-    if X_CK.p[2] > model.top or X_CK.p[2] < model.bottom - model.knife.height:
+    _, y, z = X_CK.p.tolist()
+    if z > model.top or z < model.bottom - model.knife.height:
         return
-    offset, lean = abs(X_CK.p[1]), abs(X_CK.R[1, 2])
-    turn = abs(X_CK.R[1, 0])
+    turn, _, lean = np.abs(X_CK.R[1]).tolist()
+    offset = abs(y)
     if offset > LATERAL_LIMIT or lean > TILT_LIMIT or turn > TILT_LIMIT:
         raise CuttingError(
             f"at {time:.4g} s the blade is {1e3 * offset:.3g} mm off the cut plane, leans "

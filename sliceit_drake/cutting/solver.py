@@ -7,8 +7,8 @@ import numpy as np
 
 from sliceit_drake.cutting.kernel_types import LANES
 from sliceit_drake.cutting.model import CuttingModel
-from sliceit_drake.cutting.motion import Pose
-from sliceit_drake.cutting.workspace import Workspace, interpolate_motion, parameter_row
+from sliceit_drake.cutting.motion import Pose, small_turn
+from sliceit_drake.cutting.workspace import Workspace, parameter_row
 
 __all__ = [
     "NOT_FINITE",
@@ -17,7 +17,6 @@ __all__ = [
     "Energies",
     "Exchange",
     "Exchanges",
-    "knife_wrenches",
     "run_exchanges",
 ]
 
@@ -102,47 +101,14 @@ class Energies:
     least_element: int
 
 
+CUT_AREA, BOARD_LOSS, INTERNAL_WORK = 21, 3, 4
+"""Where they stand in the sums over cut points and over nodes."""
+
 NOT_FINITE = (
     "the knife's force is not finite: elements inverted or the step became unstable. "
     "Use a smaller numerics.time_step or a finer mesh near the cut."
 )
 """What is said of a cut that broke down."""
-
-YZX, ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
-
-
-def knife_wrenches(
-    total: np.ndarray, blade: np.ndarray, buried: np.ndarray, R: np.ndarray, substeps: int
-) -> np.ndarray:
-    """Mean wrenches on the knife from the sums of an exchange.
-
-    Args:
-        total: Sums over the cut points [..., 22].
-        blade: Sums of the blade [..., 3].
-        buried: Area in front of the flanks with its moment about Ko, at the end [..., 4].
-        R: Rotation of the knife at the end [..., 3, 3].
-        substeps: Of the exchange.
-
-    Returns:
-        Moment about Ko and force by mechanism [..., 3, 6]: edge, flank pressure with the blade's
-        bending, friction.
-    """
-    impulse = total[..., :18] / substeps
-    parts = impulse.shape[:-1]
-    wrenches = np.concatenate(
-        [impulse[..., 9:18].reshape(*parts, 3, 3), impulse[..., :9].reshape(*parts, 3, 3)], axis=-1
-    )
-    # The flanks push the blade, and the blade's spring and damper the knife's body. The difference
-    # acts at the middle of the buried flanks.
-    lateral = ((blade[..., 1] - blade[..., 2]) / substeps)[..., None] * R[..., :, 1]
-    area = buried[..., 3:]
-    middle = np.divide(buried[..., :3], area, out=np.zeros_like(lateral), where=area > 0.0)
-    # np.cross takes longer.
-    moment = middle.take(YZX, -1) * lateral.take(ZXY, -1)
-    moment -= middle.take(ZXY, -1) * lateral.take(YZX, -1)
-    wrenches[..., 1, :3] += moment
-    wrenches[..., 1, 3:] += lateral
-    return wrenches
 
 
 def run_exchanges(
@@ -159,31 +125,23 @@ def run_exchanges(
     Returns:
         One result a cut; what is not finite is left so.
     """
-    n, T = ws.substeps, ws.exchange_period
-    motion = interpolate_motion(R, p, n, T)
-    ws.advance(states, motion)
+    ws.advance(states, R, p)
     new = ws.read(ws.states[0]).copy()
-    total, blade = ws.sum("total", 2), ws.sum("blade_sums")
-    wrenches = knife_wrenches(total, blade, ws.sum("buried", 2), R[:, 1:], n)
-    both = wrenches.sum(2)
-    K = ws.steps
-    v, w = (
-        motion[:, a * K : (a + 3) * K].reshape(ws.cuts, ws.exchanges, n, 3)[:, :, 0]
-        for a in (12, 15)
+    sums, nodes, blade, wrenches, work = (
+        ws.result(name).copy() for name in ("point_sums", "node_sums", "blade", "wrenches", "work")
     )
-    # Moments are about Ko at each sub-step; its mean position is half a period back.
-    work = -((both[..., 3:] * v).sum(-1) + (both[..., :3] * w).sum(-1)) * T
-    internal, board = ws.sum("internal_work", 1), ws.sum("board_loss", 1)
-    nodes = ws.layout["x"]
+    x = ws.layout["x"]
     return [
         Exchanges(
             state=new[c],
             wrenches=wrenches[c],
             work=work[c],
-            dissipation=np.array([*total[c, :, 18:21].sum(0), blade[c, :, 0].sum(), board[c]]),
-            internal_work=float(internal[c]),
-            gravity_work=float(model.weight.ravel() @ (new[c, nodes] - states[c, nodes])),
-            cut=total[c, :, 21] / model.section_area,
+            dissipation=np.array(
+                [*sums[c, :, 18:21].sum(0), blade[c, :, 0].sum(), nodes[c, BOARD_LOSS]]
+            ),
+            internal_work=float(nodes[c, INTERNAL_WORK]),
+            gravity_work=float(model.weight.ravel() @ (new[c, x] - states[c, x])),
+            cut=sums[c, :, CUT_AREA] / model.section_area,
         )
         for c, model in enumerate(ws.models)
     ]
@@ -264,40 +222,33 @@ class CuttingSolver:
         Raises:
             CuttingError: A force is not finite, or the knife left the region that is modelled.
         """
-        m, n, T, ws = self.model, self.substeps, self.exchange_period, self._workspace
+        m, ws = self.model, self._workspace
         R, p = np.array([[start.R, end.R]]), np.array([[start.p, end.p]])
-        motion = interpolate_motion(R, p, n, T)
-        v, w = motion[0, 12 * n : 12 * n + 3], motion[0, 15 * n : 15 * n + 3]
         with self._lock:
-            ws.advance(state[None], motion)
+            ws.advance(state[None], R, p)
             new = ws.read(ws.states[0])[0].copy()
-            total, buried = ws.sum("total", 2)[0, 0], ws.sum("buried", 2)[0, 0]
-            blade = ws.sum("blade_sums")[0, 0]
-            board_force = ws.sum("board_force", 1)[0]
-            board_loss = float(ws.sum("board_loss", 1)[0])
-            internal_work = float(ws.sum("internal_work", 1)[0])
-        if not np.isfinite(total).all():
+            row = ws.read(ws.results)[0].copy()
+        if not np.isfinite(row).all():
             raise CuttingError(NOT_FINITE)
-        wrenches = knife_wrenches(total, blade, buried, end.R, n)
-        wrench = wrenches.sum(0)
-        nodes = ws.layout["x"]
+        sums, nodes, blade, parts, work = (row[where] for where in ws.result_layout.values())
+        edge, normal, friction = wrenches = parts.reshape(3, 6)
+        x = ws.layout["x"]
         return Exchange(
             state=new,
-            wrench=wrench,
-            edge=wrenches[0],
-            normal=wrenches[1],
-            friction=wrenches[2],
-            # Moments are about Ko at each sub-step; its mean position is half a period back.
-            work=-float(wrench[3:] @ v + wrench[:3] @ w) * T,
-            edge_dissipation=float(total[18]),
-            opening_dissipation=float(total[19]),
-            friction_dissipation=float(total[20]),
-            internal_work=internal_work,
+            wrench=wrenches.sum(0),
+            edge=edge,
+            normal=normal,
+            friction=friction,
+            work=float(work[0]),
+            edge_dissipation=float(sums[18]),
+            opening_dissipation=float(sums[19]),
+            friction_dissipation=float(sums[20]),
+            internal_work=float(nodes[INTERNAL_WORK]),
             blade_dissipation=float(blade[0]),
-            board_force=board_force / n,
-            board_dissipation=board_loss,
-            gravity_work=float(m.weight.ravel() @ (new[nodes] - state[nodes])),
-            cut=float(total[21]) / m.section_area,
+            board_force=nodes[:3] / self.substeps,
+            board_dissipation=float(nodes[BOARD_LOSS]),
+            gravity_work=float(m.weight.ravel() @ (new[x] - state[x])),
+            cut=float(sums[CUT_AREA]) / m.section_area,
         )
 
     def exchanges(self, state: np.ndarray, R: np.ndarray, p: np.ndarray) -> Exchanges:
@@ -349,13 +300,11 @@ class CuttingSolver:
             start, end: Knife poses in C between which it moved.
         """
         T, ws = self.exchange_period, self._workspace
-        motion = interpolate_motion(
-            np.array([[start.R, end.R]]), np.array([[start.p, end.p]]), 1, T
-        )[0]
+        v, w = (end.p - start.p) / T, small_turn(start.R, end.R) / T
         away = end._replace(p=end.p + 10.0 * end.R[:, 0])
         with self._lock:
             self._place(state, end)
-            self._place_knife(end, motion[12:15], motion[15:18])
+            self._place_knife(end, v, w)
             both = ws.point_forces()
             # What is left with the knife beyond the food are the bonds, in the same state.
             self._place_knife(away, np.zeros(3), np.zeros(3))

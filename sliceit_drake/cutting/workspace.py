@@ -12,14 +12,11 @@ from sliceit_drake.cutting.kernel_types import ACCUMULATED, GATHER, LANES, PARAM
 from sliceit_drake.cutting.kernels import kernels
 from sliceit_drake.cutting.model import CuttingModel, TimeStepError
 
-__all__ = ["DIRECT", "Workspace", "interpolate_motion", "parameter_row"]
+__all__ = ["DIRECT", "Workspace", "parameter_row"]
 
 DIRECT = threading.RLock()
 """Held while kernels are made, in a capture, which takes in the launches of all threads, and in
 launches outside of one."""
-
-SKEW = np.array([[7, 2, 3], [5, 6, 1]])
-"""Where R - R^T holds x, y and z of twice the axis times sine: these elements of R, less those."""
 
 PER_POINT = ("toughness", "flank_scale", "friction_scale", "unloading")
 """Parameters that each cut point has for itself, in the order of the kernels' arguments."""
@@ -95,7 +92,7 @@ class Workspace:
         Returns:
             The arrays, and where each stands in a row.
         """
-        item = np.dtype(self.dtype).itemsize
+        item = wp.types.type_size_in_bytes(base.dtype)
         arrays, layout, start = {}, {}, 0
         for name, shape, dtype, width in fields:
             strides = [width * item]
@@ -159,6 +156,9 @@ class Workspace:
         self.w, self.motion_layout = self._rows(
             self.motion, [(name, (K,), dtype, width) for name, dtype, width in motion]
         )
+        # At the ends of the exchanges, as they are given.
+        self.w["R"] = wp.zeros((C, E + 1), dtype=wp.mat33d, device=self.device)
+        self.w["p"] = wp.zeros((C, E + 1), dtype=wp.vec3d, device=self.device)
         # Padded with a row of zeros, which fills up the nodes' lists of entries.
         self.force = wp.zeros((C, (B * 12 + 3) * LANES), dtype=real, device=self.device)
         item = np.dtype(self.dtype).itemsize
@@ -188,9 +188,19 @@ class Workspace:
         size = sum(int(np.prod(shape)) * width for _, shape, _, width in sums)
         self.sums = self.array((C, size))
         arrays, self.sum_layout = self._rows(self.sums, sums)
-        self._sum_shapes = {
-            name: (*shape, width) if width > 1 else shape for name, shape, _, width in sums
-        }
+        self.w |= arrays
+        double = wp.float64
+        results = [
+            ("point_sums", (E, ACCUMULATED + 4), double, 1),
+            ("node_sums", (5,), double, 1),
+            ("blade", (E, 3), double, 1),
+            ("wrenches", (E, 3, 6), double, 1),
+            ("work", (E,), double, 1),
+        ]
+        size = sum(int(np.prod(shape)) for _, shape, _, _ in results)
+        self.results = wp.zeros((C, size), dtype=double, device=self.device)
+        arrays, self.result_layout = self._rows(self.results, results)
+        self._result_shapes = {name: shape for name, shape, _, _ in results}
         self.w |= arrays
         self.w["point_force"] = wp.zeros(
             (C, P, 2), dtype=vec3, device=self.device, requires_grad=self._gradients
@@ -281,20 +291,18 @@ class Workspace:
         state[self.layout["heading"]].reshape(-1, 3)[:, 2] = -1.0
         return state
 
-    def sum(self, name: str, axis: int | None = None) -> np.ndarray:
-        """Sums of the last launch by name [C, ...], added up along an axis, double precision."""
-        values = self.read(self.sums)[:, self.sum_layout[name]]
-        values = values.reshape(self.cuts, *self._sum_shapes[name])
-        if axis is None:
-            return values.astype(np.float64)
-        return values.sum(axis, dtype=np.float64)
+    def result(self, name: str) -> np.ndarray:
+        """Results of the last launch by name [C, ...]: point_sums, node_sums, blade, wrenches, work
+        (`exchange_kernels`)."""
+        values = self.read(self.results)[:, self.result_layout[name]]
+        return values.reshape(self.cuts, *self._result_shapes[name])
 
     def write(self, array: wp.array, values: np.ndarray) -> None:
         """Sets an array from host memory."""
         if self.device.is_cpu:
             self.read(array)[...] = values
         else:
-            array.assign(values.astype(self.dtype))
+            array.assign(values)
 
     def read(self, array: wp.array) -> np.ndarray:
         """An array in host memory; on the CPU a view, made once."""
@@ -433,24 +441,55 @@ class Workspace:
         wp.load_module(self.kernels.module, device=self.device)
         with wp.ScopedCapture(device=self.device) as capture:
             self.sums.zero_()
+            self._launch_motion()
             # Later sub-steps need it for held nodes only, which never move.
             for k in range(len(self.ahead)):
                 arguments = self.look_ahead_arguments(k)
                 self.launch(self.kernels.look_ahead, len(self.model.nodes), arguments)
             for k in range(self.steps):
                 self.launch_substep(k)
+            self._launch_results()
         return capture.graph
 
-    def advance(self, states: np.ndarray, motion: np.ndarray) -> None:
-        """Advances `states` [C, state_size] along `motion` [C, 18 K] (`interpolate_motion`).
+    def _timing(self) -> list[Any]:
+        return [self.substeps, wp.float64(self.exchange_period)]
 
-        The new states are in `states[-1]`, the sums in `sum`.
+    def _launch_motion(self) -> None:
+        """The knife's motion, from its poses at the ends of the exchanges."""
+        w, motion = self.w, [self.w[name] for name in ("R_CK", "p_CK", "v_CK", "w_CK")]
+        self.launch(self.kernels.move_knife, self.steps, [w["R"], w["p"], *self._timing(), *motion])
+
+    def _launch_results(self) -> None:
+        """What the exchanges add up to."""
+        w, kern, C, E = self.w, self.kernels, self.cuts, self.exchanges
+        outputs = [w["blade"], w["wrenches"], w["work"]]
+        wp.launch(
+            kern.add_points,
+            dim=(C, E, ACCUMULATED + 4),
+            inputs=[w["total"], w["buried"], w["point_sums"]],
+            device=self.device,
+        )
+        at_nodes = [w["board_force"], w["board_loss"], w["internal_work"], w["node_sums"]]
+        self.launch(kern.add_nodes, 5, at_nodes)
+        sums = [w["point_sums"], w["blade_sums"], w["R"], w["p"]]
+        self.launch(kern.knife_wrenches, E, [*sums, *self._timing(), *outputs])
+
+    def advance(self, states: np.ndarray, R: np.ndarray, p: np.ndarray) -> None:
+        """Advances all cuts by the workspace's exchanges.
+
+        The new states are in `states[-1]`, the rest in `result`.
+
+        Args:
+            states: [C, state_size].
+            R: Rotations of the knives in C at the ends of the exchanges [C, E + 1, 3, 3].
+            p: Positions of Ko there [C, E + 1, 3], metres.
         """
         self.capture()
         # Held nodes are never written, so every slot needs them.
         for state in self.states:
             self.write(state, states)
-        self.write(self.motion, motion)
+        self.write(self.w["R"], R)
+        self.write(self.w["p"], p)
         wp.capture_launch(self._graph)
 
     def stored_energies(self) -> tuple[float, np.ndarray, float]:
@@ -527,41 +566,6 @@ def parameter_row(model: CuttingModel) -> np.ndarray:
             volume,
         ]
     )
-
-
-def interpolate_motion(R: np.ndarray, p: np.ndarray, substeps: int, period: float) -> np.ndarray:
-    """Knife poses at the ends of the sub-steps, constant velocity and rotation rate in an exchange.
-
-    Rotation matrices are interpolated linearly: for a turn of angle a between exchanges they are
-    orthonormal to a^2 / 8, 1e-6 at 1 rad/s and 2 ms.
-
-    Args:
-        R: Rotations at the exchanges [C, E + 1, 3, 3].
-        p: Positions of Ko [C, E + 1, 3], metres.
-        substeps: Sub-steps of an exchange.
-        period: Duration of an exchange, s.
-
-    Returns:
-        The workspace's motion [C, 18 E substeps]: rotations, positions, velocities, rates.
-    """
-    C, E, n = R.shape[0], R.shape[1] - 1, substeps
-    out = np.empty((C, 18 * E * n))
-    rotation, position, velocity, rate = (
-        out[:, a * E * n : b * E * n].reshape(C, E, n, b - a)
-        for a, b in ((0, 9), (9, 12), (12, 15), (15, 18))
-    )
-    share = (np.arange(1, n + 1) / n)[:, None]
-    R0, R1 = R[:, :-1], R[:, 1:]
-    np.multiply(share, (R1 - R0).reshape(C, E, 1, 9), out=rotation)
-    rotation += R0.reshape(C, E, 1, 9)
-    dp = (p[:, 1:] - p[:, :-1])[:, :, None]
-    np.multiply(share, dp, out=position)
-    position += p[:, :-1, None]
-    velocity[:] = dp * (1.0 / period)
-    turn = (R1 @ R0.transpose(0, 1, 3, 2)).reshape(C, E, 9)
-    twice = turn.take(SKEW[0], -1) - turn.take(SKEW[1], -1)
-    rate[:] = (twice * (0.5 / period))[:, :, None]
-    return out
 
 
 def _element_gather(

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.multibody.math import SpatialVelocity
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.framework import Context, DiagramBuilder, State
@@ -123,7 +122,7 @@ class _SpringContact(KnifeForceSystem):
         self._height = height
 
     def advance(
-        self, context: Context, state: State, X_WK: RigidTransform, V_WK: SpatialVelocity
+        self, context: Context, state: State, X_WK: RigidTransform
     ) -> tuple[np.ndarray, float]:
         force = -self._stiffness * (X_WK.translation()[2] - self._height)
         return np.array([0.0, 0.0, 0.0, 0.0, 0.0, force]), 0.0

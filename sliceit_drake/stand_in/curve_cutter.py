@@ -12,7 +12,6 @@ import functools
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.multibody.math import SpatialVelocity
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import BasicVector, Context, State
 
@@ -143,7 +142,7 @@ class CurveCutter(KnifeForceSystem):
         self._set(state, self._cut, CutState(place).vector())
 
     def advance(
-        self, context: Context, state: State, X_WK: RigidTransform, V_WK: SpatialVelocity
+        self, context: Context, state: State, X_WK: RigidTransform
     ) -> tuple[np.ndarray, float]:
         toughness, friction, height = context.get_numeric_parameter(self._slice).value().tolist()
         section = _section(self.food.width, height)

@@ -4,7 +4,6 @@ import dataclasses as dc
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.multibody.math import SpatialVelocity
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context, State
 
@@ -47,7 +46,7 @@ class AnalyticCutter(KnifeForceSystem):
         self._set(state, self._surface, [X_WK.translation()[2]])
 
     def advance(
-        self, context: Context, state: State, X_WK: RigidTransform, V_WK: SpatialVelocity
+        self, context: Context, state: State, X_WK: RigidTransform
     ) -> tuple[np.ndarray, float]:
         diameter = self._food.diameter
         z = X_WK.translation()[2]

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.multibody.math import SpatialVelocity
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import BasicVector, Context, State
 
@@ -173,22 +172,26 @@ class CuttingSystem(KnifeForceSystem):
 
     def _in_cut_frame(self, index: int, X_WK: np.ndarray) -> Pose:
         """X_CK from X_WK [3, 4]."""
-        X_CK = self._R_CW[index] @ X_WK
+        X_CK = self._R_CW[index].dot(X_WK)
         return Pose(X_CK[:, :3], X_CK[:, 3] - self._offset[index])
 
-    def _index_to_cut(self, context: Context, X_WK: RigidTransform) -> int:
+    def _index_to_cut(self, context: Context, index: int, X_WK: np.ndarray) -> int:
         """The food that the next exchange cuts: the one after this, if the knife is ready for it.
+
+        Args:
+            context: Of this system.
+            index: This food.
+            X_WK: The knife's pose now [3, 4].
 
         Raises:
             CuttingError: The knife is in the next plane and has not cut the last section through.
         """
-        index = self.food_index(context)
         if not self._in_sequence or index + 1 == len(self._solvers):
             return index
         model = self._solvers[index + 1].model
         # The exchange goes from the last pose to this one; tables blur by one spacing.
         clear = model.top + model.tables.spacing
-        poses = (self.last_pose(context), X_WK.GetAsMatrix34())
+        poses = (self.last_pose(context), X_WK)
         for following in (self._in_cut_frame(index + 1, X) for X in poses):
             lowest = following.p[2] - 0.5 * model.knife.length * abs(following.R[2, 0])
             if lowest <= clear or abs(following.p[1]) > INDEXED:
@@ -210,31 +213,33 @@ class CuttingSystem(KnifeForceSystem):
         check_clear(self._solvers[index].model, self._in_cut_frame(index, X_WK.GetAsMatrix34()))
 
     def advance(
-        self, context: Context, state: State, X_WK: RigidTransform, V_WK: SpatialVelocity
+        self, context: Context, state: State, X_WK: RigidTransform
     ) -> tuple[np.ndarray, float]:
-        index = self._index_to_cut(context, X_WK)
-        solver, time = self._solvers[index], context.get_time()
-        old, old_energy = self.food_state(context), context.get_discrete_state(self._energy).value()
-        old_ledger = context.get_discrete_state(self._ledger).value()
-        spent_before = float(context.get_discrete_state(self._spent_before).value()[0])
-        if index != self.food_index(context):
-            old, old_energy = solver.initial_state(), np.array(NO_ENERGY)
-            spent_before = float(old_ledger[SPENT].sum())
-            self._set(state, self._food_index, [index])
-            self._set(state, self._energy, old_energy)
-            self._set(state, self._spent_before, [spent_before])
-        last = self._in_cut_frame(index, self.last_pose(context))
-        pose = self._in_cut_frame(index, X_WK.GetAsMatrix34())
+        x, new = context.get_discrete_state(), state.get_mutable_discrete_state()
+        before, time = int(x.value(self._food_index)[0]), context.get_time()
+        now = X_WK.GetAsMatrix34()
+        index = self._index_to_cut(context, before, now)
+        solver = self._solvers[index]
+        old_ledger = x.value(self._ledger)
+        if index == before:
+            old = x.value(self._food)[: solver.state_size]
+        else:
+            old = solver.initial_state()
+            new.set_value(self._food_index, [index])
+            new.set_value(self._energy, NO_ENERGY)
+            new.set_value(self._spent_before, [old_ledger[SPENT].sum()])
+        last = self._in_cut_frame(index, x.value(self._last_pose).reshape(3, 4))
+        pose = self._in_cut_frame(index, now)
         check_in_plane(solver.model, pose, time)
         try:
             step = solver.exchange(old, last, pose)
         except CuttingError as error:
             raise CuttingError(f"at {time:.4g} s {error}") from error
-        food = state.get_mutable_discrete_state(self._food).get_mutable_value()
+        food = new.get_mutable_value(self._food)
         food[: len(old)] = step.state
-        R_WC = self._R_CW[index].T
-        forces = np.array([step.edge[3:], step.normal[3:], step.friction[3:]]) @ R_WC.T
-        self._set(state, self._components, forces.ravel())
+        R_CW = self._R_CW[index]
+        forces = np.array([step.edge[3:], step.normal[3:], step.friction[3:]]).dot(R_CW)
+        new.set_value(self._components, forces.ravel())
         change = [
             step.work,
             step.gravity_work,
@@ -246,23 +251,23 @@ class CuttingSystem(KnifeForceSystem):
             step.internal_work,
         ]
         ledger = old_ledger + change
-        self._set(state, self._ledger, ledger)
+        new.set_value(self._ledger, ledger)
         if round(time / self.exchange_period) % self._check_every == 0:
             energies = solver.energies(step.state, pose)
-            spent = float(ledger[SPENT].sum()) - spent_before
+            spent = float(ledger[SPENT].sum() - new.value(self._spent_before)[0])
             ratio = check_energies(energies, spent, solver.model, time)
-            self._set(
-                state,
+            *_, largest, least = new.value(self._energy).tolist()
+            new.set_value(
                 self._energy,
                 [
                     energies.elastic,
                     energies.interface,
                     energies.kinetic,
-                    max(ratio, old_energy[3]),
-                    min(energies.least_volume_ratio, old_energy[4]),
+                    max(ratio, largest),
+                    min(energies.least_volume_ratio, least),
                 ],
             )
-        return (step.wrench.reshape(2, 3) @ R_WC.T).ravel(), step.cut
+        return step.wrench.reshape(2, 3).dot(R_CW).ravel(), step.cut
 
     def _calc_surface(self, context: Context, output: BasicVector) -> None:
         index = self.food_index(context)

@@ -6,7 +6,9 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce, SpatialVelocity
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce
 from pydrake.multibody.tree import BodyIndex
-from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+from pydrake.systems.framework import Context, EventStatus, LeafSystem, State
+
+from sliceit_drake.cutting.motion import small_turn
 
 __all__ = ["KnifeForceSystem"]
 
@@ -73,20 +75,23 @@ class KnifeForceSystem(LeafSystem):
         """Called once at initialization; a subclass may check the start and set its state."""
 
     def advance(
-        self, context: Context, state: State, X_WK: RigidTransform, V_WK: SpatialVelocity
+        self, context: Context, state: State, X_WK: RigidTransform
     ) -> tuple[np.ndarray, float]:
         """Advances the food to the context's time.
 
         Args:
-            context: Before the update.
+            context: Before the update; `knife_velocity` of it is that of the knife now.
             state: To write to.
             X_WK: Pose of the knife now.
-            V_WK: Velocity of the knife now.
 
         Returns:
             Wrench F_K_W on the knife, moment and force [6], and the share that is cut.
         """
         raise NotImplementedError
+
+    def knife_velocity(self, context: Context) -> SpatialVelocity:
+        """V_WK now."""
+        return self._velocity_input.Eval(context)
 
     def last_pose(self, context: Context) -> np.ndarray:
         """X_WK at the previous exchange, as [3, 4]."""
@@ -104,27 +109,25 @@ class KnifeForceSystem(LeafSystem):
         return EventStatus.Succeeded()
 
     def _update(self, context: Context, state: State) -> EventStatus:
-        if context.get_time() <= context.get_discrete_state(self._start_time).value()[0]:
+        x = context.get_discrete_state()
+        if context.get_time() <= x.value(self._start_time)[0]:
             return EventStatus.DidNothing()
         X_WK = self._pose_input.Eval(context)
-        V_WK = self._velocity_input.Eval(context)
-        wrench, progress = self.advance(context, state, X_WK, V_WK)
-        last = self.last_pose(context)
-        now = X_WK.GetAsMatrix34()
-        dR = now[:, :3] @ last[:, :3].T
-        turn = 0.5 * np.array([dR[2, 1] - dR[1, 2], dR[0, 2] - dR[2, 0], dR[1, 0] - dR[0, 1]])
+        wrench, progress = self.advance(context, state, X_WK)
+        last, now = x.value(self._last_pose).reshape(3, 4), X_WK.GetAsMatrix34()
+        turn = small_turn(last[:, :3], now[:, :3])
         moved = np.concatenate([turn, now[:, 3] - last[:, 3]])
-        error = context.get_discrete_state(self._coupling).value()[0]
-        self._set(state, self._coupling, [error + (self.wrench(context) - wrench) @ moved])
-        self._set(state, self._wrench, wrench)
-        self._set(state, self._progress, [progress])
-        self._set(state, self._last_pose, now.ravel())
+        error = x.value(self._coupling)[0] + (x.value(self._wrench) - wrench).dot(moved)
+        new = state.get_mutable_discrete_state()
+        new.set_value(self._coupling, [error])
+        new.set_value(self._wrench, wrench)
+        new.set_value(self._progress, [progress])
+        new.set_value(self._last_pose, now.ravel())
         return EventStatus.Succeeded()
 
     @staticmethod
     def _set(state: State, index: int, value: np.ndarray | list[float]) -> None:
-        vector: BasicVector = state.get_mutable_discrete_state(index)
-        vector.SetFromVector(value)
+        state.get_mutable_discrete_state().set_value(index, value)
 
     def _calc_food_wrench(self, context: Context, output: Value) -> None:
         wrench = self.wrench(context)

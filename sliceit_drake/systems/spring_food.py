@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.multibody.math import SpatialVelocity
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import BasicVector, Context, State
 
@@ -175,7 +174,7 @@ class SpringCutter(KnifeForceSystem):
         self._set(state, self._button, [max(depth, 0.0), 0.0])
 
     def advance(
-        self, context: Context, state: State, X_WK: RigidTransform, V_WK: SpatialVelocity
+        self, context: Context, state: State, X_WK: RigidTransform
     ) -> tuple[np.ndarray, float]:
         stiffness, damping = self.spring(context)
         mass, h = self.food.mass, self.exchange_period / self._steps
