@@ -16,7 +16,8 @@ __all__ = ["element_kernels"]
 def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespace:
     """The kernels for scalars `real`, in the Warp module `module`, with adjoints if `gradients`."""
     t = kernel_types(real)
-    vec3, mat33, lanes, indices = t.vec3, t.mat33, t.lanes, t.indices
+    vec3, vec4, mat33, lanes, indices = t.vec3, t.vec4, t.mat33, t.lanes, t.indices
+    padded = t.padded
     MU, LAM, DAMPING_TIME = t.MU, t.LAM, t.DAMPING_TIME
 
     @wp.func
@@ -33,7 +34,7 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
 
     @wp.func
     def corner8(
-        x: wp.array2d(dtype=vec3),
+        x: wp.array2d(dtype=Any),
         cut: wp.int32,
         nodes: wp.array2d(dtype=indices),
         block: wp.int32,
@@ -64,7 +65,7 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
 
     @wp.func
     def gradient8(
-        x: wp.array2d(dtype=vec3),
+        x: wp.array2d(dtype=Any),
         cut: wp.int32,
         nodes: wp.array2d(dtype=indices),
         block: wp.int32,
@@ -134,7 +135,7 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
 
     @wp.kernel(enable_backward=False, module=module)
     def elements(
-        x: wp.array2d(dtype=vec3),
+        x: wp.array2d(dtype=vec4),
         nodes: wp.array2d(dtype=indices),
         shape: wp.array2d(dtype=lanes),
         stiff_volume: wp.array2d(dtype=lanes),
@@ -144,9 +145,10 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
     ):
         """Nodal forces of the elements, eight at a time: minus the gradient of the energy at x.
 
-        `x` is `ahead`: positions plus tau times velocities. Evaluating at x + tau v is Kelvin-Voigt
-        damping with viscosity tau times the tangent stiffness; invariant under translation, and
-        under rotation to second order in tau times its rate.
+        `x` is `ahead`: positions plus tau times velocities, in fours, which are loaded faster than
+        threes. Evaluating at x + tau v is Kelvin-Voigt damping with viscosity tau times the tangent
+        stiffness; invariant under translation, and under rotation to second order in tau times its
+        rate.
         """
         cut, chunk = wp.tid()
         mu = P[cut, MU]
@@ -182,11 +184,11 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
         x: wp.array2d(dtype=vec3),
         v: wp.array2d(dtype=vec3),
         P: wp.array2d(dtype=real),
-        ahead: wp.array2d(dtype=vec3),
+        ahead: wp.array2d(dtype=vec4),
     ):
         """Positions at which the elements are evaluated."""
         cut, i = wp.tid()
-        ahead[cut, i] = x[cut, i] + P[cut, DAMPING_TIME] * v[cut, i]
+        ahead[cut, i] = padded(x[cut, i] + P[cut, DAMPING_TIME] * v[cut, i])
 
     @wp.kernel(enable_backward=False, module=module)
     def element_energy(
@@ -237,7 +239,7 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
     # In three kernels: in one, the compiler finds no vectors any more, and it takes twice as long.
     @wp.kernel(enable_backward=False, module=module)
     def strains(
-        x: wp.array2d(dtype=vec3),
+        x: wp.array2d(dtype=vec4),
         direction: wp.array2d(dtype=vec3),
         nodes: wp.array2d(dtype=indices),
         shape: wp.array2d(dtype=lanes),

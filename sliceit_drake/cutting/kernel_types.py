@@ -52,8 +52,8 @@ ACCUMULATED = 22
 
 @functools.cache
 def kernel_types(real: Any) -> types.SimpleNamespace:
-    """Types for `real` = wp.float32 or wp.float64, and `slide`, `place` and `table`."""
-    vec3 = wp.types.vector(3, real)
+    """Types for `real` = wp.float32 or wp.float64, `slide`, `padded`, `place`, `table`."""
+    vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
     tiny = wp.constant(real(1.0e-20))
 
     @wp.func
@@ -75,6 +75,10 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         return new_slip, stiffness * lost
 
     @wp.func
+    def padded(a: vec3):
+        return vec4(a[0], a[1], a[2], real(0.0))
+
+    @wp.func
     def place(s: real, reach: real, per_spacing: real, size: wp.int32):
         """Interval of a table with `size` entries over [-reach, reach] and the share of its end."""
         u = (s + reach) * per_spacing
@@ -89,7 +93,7 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         real=real,
         vec2=wp.types.vector(2, real),
         vec3=vec3,
-        vec4=wp.types.vector(4, real),
+        vec4=vec4,
         mat33=wp.types.matrix((3, 3), real),
         lanes=wp.types.vector(LANES, real),
         indices=wp.types.vector(LANES, wp.int32),
@@ -98,6 +102,7 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         entries=wp.types.vector(GATHER, wp.int32),
         TINY=tiny,
         slide=slide,
+        padded=padded,
         place=place,
         table=table,
         **{name.upper(): wp.constant(k) for k, name in enumerate(PARAMETERS)},

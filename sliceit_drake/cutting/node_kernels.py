@@ -13,7 +13,8 @@ __all__ = ["node_kernels"]
 def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespace:
     """The kernels for scalars `real`, in the Warp module `module`, with adjoints if `gradients`."""
     t = kernel_types(real)
-    vec2, vec3, strided, entries, slide = t.vec2, t.vec3, t.strided, t.entries, t.slide
+    vec2, vec3, vec4, strided, entries = t.vec2, t.vec3, t.vec4, t.strided, t.entries
+    slide, padded = t.slide, t.padded
     DAMPING_TIME, BOARD_STIFFNESS = t.DAMPING_TIME, t.BOARD_STIFFNESS
     BOARD_FRICTION, BOARD_DAMPING_TIME = t.BOARD_FRICTION, t.BOARD_DAMPING_TIME
     BLADE_STIFFNESS, BLADE_DAMPING, BLADE_MASS = t.BLADE_STIFFNESS, t.BLADE_DAMPING, t.BLADE_MASS
@@ -182,7 +183,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         board_force: wp.array2d(dtype=vec3),
         board_loss: wp.array2d(dtype=real),
         internal_work: wp.array2d(dtype=real),
-        ahead: wp.array2d(dtype=vec3),
+        ahead: wp.array2d(dtype=vec4),
         per_thread: wp.int32,
     ):
         """Gathers the forces of each moving node and steps it in place, semi-implicit Euler."""
@@ -217,7 +218,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
             x1 = xi + v1 * dt
             v[cut, i] = v1
             x[cut, i] = x1
-            ahead[cut, i] = x1 + P[cut, DAMPING_TIME] * v1
+            ahead[cut, i] = padded(x1 + P[cut, DAMPING_TIME] * v1)
 
     # Sums in loops have kernels of their own: an adjoint would not know their value after the loop.
     @wp.kernel(enable_backward=gradients, module=module)
@@ -325,7 +326,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         internal_work: wp.array2d(dtype=real),
         x_next: wp.array2d(dtype=vec3),
         v_next: wp.array2d(dtype=vec3),
-        ahead_next: wp.array2d(dtype=vec3),
+        ahead_next: wp.array2d(dtype=vec4),
         per_thread: wp.int32,
     ):
         """What `move_nodes` does with the forces, into other arrays, so that it has an adjoint."""
@@ -357,7 +358,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
             x1 = xi + v1 * dt
             v_next[cut, i] = v1
             x_next[cut, i] = x1
-            ahead_next[cut, i] = x1 + P[cut, DAMPING_TIME] * v1
+            ahead_next[cut, i] = padded(x1 + P[cut, DAMPING_TIME] * v1)
 
     @wp.kernel(enable_backward=False, module=module)
     def gather_adjoint(
@@ -365,16 +366,15 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         change: wp.array2d(dtype=strided),
         element_start: wp.array(dtype=wp.int32),
         element_entry: wp.array(dtype=entries),
-        adj_ahead: wp.array2d(dtype=vec3),
+        adj_ahead: wp.array2d(dtype=vec4),
         per_thread: wp.int32,
     ):
         """Adds the elements' adjoints of `ahead` to those of moving nodes."""
         cut, chunk = wp.tid()
         for entry in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, moving.shape[0])):
             i = moving[entry]
-            adj_ahead[cut, i] = adj_ahead[cut, i] + gather_elements(
-                cut, i, change, element_start, element_entry
-            )
+            adjoint = gather_elements(cut, i, change, element_start, element_entry)
+            adj_ahead[cut, i] = adj_ahead[cut, i] + padded(adjoint)
 
     @wp.kernel(enable_backward=False, module=module)
     def spread_adjoint(

@@ -142,10 +142,10 @@ class Workspace:
         self.slots = [arrays for arrays, _ in split]
         self.layout = split[0][1]
         kept = K + 1 if self._gradients else 1
-        self.ahead = [self._vectors(N) for _ in range(kept)]
+        self.ahead = [self._vectors(N, k.vec4) for _ in range(kept)]
         # What each sub-step's nodes got from elements, bulk (elements after relaxation) and points.
         self.from_elements, self.from_bulk, self.from_points = (
-            [self._vectors(N) for _ in range(K if self._gradients else 0)] for _ in range(3)
+            [self._vectors(N, vec3) for _ in range(K if self._gradients else 0)] for _ in range(3)
         )
 
         if M == 0:
@@ -253,12 +253,9 @@ class Workspace:
         arrays, self.parameter_layout = self._rows(self.parameters, parameters)
         self.w |= arrays
 
-    def _vectors(self, count: int) -> wp.array:
+    def _vectors(self, count: int, dtype: Any) -> wp.array:
         return wp.zeros(
-            (self.cuts, count),
-            dtype=self.kernels.vec3,
-            device=self.device,
-            requires_grad=self._gradients,
+            (self.cuts, count), dtype=dtype, device=self.device, requires_grad=self._gradients
         )
 
     def set_models(self, models: Sequence[CuttingModel]) -> None:

@@ -28,7 +28,13 @@ import numpy as np
 from pydrake.common.value import AbstractValue, Value
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    LeafSystem,
+    ValueProducer,
+)
 
 from sliceit_drake.configuration import ConfigurationError, choice, quantity
 from sliceit_drake.cutting.motion import MotionPlan
@@ -247,6 +253,15 @@ class AgentSystem(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(config.reading_period, 0.0, self._read)
         held = {self.discrete_state_ticket(self._state)}
         moving = held | {self.time_ticket()}
+        # Until the knife is lifted the target moves at decisions alone, but is read far more often.
+        self._waiting = self.DeclareCacheEntry(
+            "target until the lift",
+            ValueProducer(
+                allocate=lambda: Value(object()),
+                calc=lambda context, value: value.set_value(self._target_until_lift(context)),
+            ),
+            held,
+        )
         self.DeclareAbstractOutputPort(
             "target_pose", lambda: Value(RigidTransform()), self._calc_target_pose, moving
         )
@@ -367,9 +382,17 @@ class AgentSystem(LeafSystem):
         risen = self._config.lift_speed * (context.get_time() - x[_LIFT])
         return np.array([x[_TARGET][0], max(x[_TARGET][1] - risen, 0.0)])
 
-    def _calc_target_pose(self, context: Context, output: AbstractValue) -> None:
+    def _target_pose(self, context: Context) -> RigidTransform:
         x, z = self._target(context)
-        output.set_value(self._X_WK @ RigidTransform([x, 0.0, z]))
+        return self._X_WK @ RigidTransform([x, 0.0, z])
+
+    def _target_until_lift(self, context: Context) -> RigidTransform | None:
+        lifted = context.get_discrete_state(self._state).value()[_LIFT] >= 0.0
+        return None if lifted else self._target_pose(context)
+
+    def _calc_target_pose(self, context: Context, output: AbstractValue) -> None:
+        waiting = self._waiting.Eval(context)
+        output.set_value(self._target_pose(context) if waiting is None else waiting)
 
     def _calc_offset(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._target(context))
