@@ -1,10 +1,11 @@
 """Cost of a training and of a decision: python benchmarks/learning_speed.py [--output FILE].
 
-All in one process or one after the other on one machine: compare rows, not machines. The steps of
-the environment and the updates are timed alone first; then both overlap as in `sliceit train`, for
-the cutting simulator and the spring-only baseline, with one environment and with two side by side,
-and 80,000 steps are extrapolated from the rate after the warm-up. A decision is timed with the
-exported network, torch not imported.
+All in one process or one after the other on one machine: compare rows, not machines. In each of
+--rounds the steps of the environment and the updates are timed alone; then both overlap as in
+`sliceit train`, for the cutting simulator and the spring-only baseline, with one environment and
+with two side by side, and 80,000 steps are extrapolated from the rate after the warm-up. Medians of
+the rounds are shown, and of the rounds' ratios, since other work on a machine comes and goes. A
+decision is timed with the exported network, torch not imported.
 
 --output puts the tables into a Markdown file, between the lines
   <!-- learning_speed -->
@@ -12,6 +13,7 @@ exported network, torch not imported.
 """
 
 import argparse
+import functools
 import os
 import shlex
 import subprocess
@@ -19,6 +21,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import warp
@@ -27,8 +30,9 @@ from results import write_results
 
 warp.config.log_level = warp.LOG_ERROR
 PLACE = Place("learning_speed")
-WARM_UP, STEPS = 300, 2000
+WARM_UP, STEPS = 300, 900
 ENVIRONMENTS = (1, 2)
+SIMULATORS = ("cutting", "spring")
 DECISION = """
 import sys, time, numpy as np
 from sliceit_drake.systems.agent import AgentConfig
@@ -105,59 +109,152 @@ def update_time(count: int = 200) -> float:
     return 1e3 * (time.perf_counter() - begin) / count
 
 
+class Watch:
+    """Time spent in methods, less that in watched methods that they call."""
+
+    def __init__(self) -> None:
+        self.spent: dict[str, float] = {}
+        self._inner: list[float] = []
+
+    def method(self, owner: type, name: str, part: str) -> None:
+        """Watches a method from now on; systems bind theirs when they are made."""
+        original = getattr(owner, name)
+        self.spent.setdefault(part, 0.0)
+
+        @functools.wraps(original)
+        def watched(*arguments: Any, **options: Any) -> Any:
+            self._inner.append(0.0)
+            begin = time.perf_counter()
+            try:
+                return original(*arguments, **options)
+            finally:
+                whole = time.perf_counter() - begin
+                self.spent[part] += whole - self._inner.pop()
+                if self._inner:
+                    self._inner[-1] += whole
+
+        setattr(owner, name, watched)
+
+
+def shares(rounds: int) -> list[str]:
+    """Where the time of a decision goes, as a table. The last thing done: it changes methods."""
+    from sliceit_drake.cutting.workspace import Workspace
+    from sliceit_drake.learning.environment import SlicingEnv
+    from sliceit_drake.systems.agent import AgentSystem
+    from sliceit_drake.systems.compliance_controller import ComplianceController
+    from sliceit_drake.systems.contact_monitor import ContactMonitor
+    from sliceit_drake.systems.knife_force import KnifeForceSystem
+    from sliceit_drake.systems.wrench_sensor import WrenchSensor
+
+    watch = Watch()
+    for owner, name, part in (
+        (SlicingEnv, "step", "plant, servo, Drake"),
+        (SlicingEnv, "reset", "start of a slice"),
+        (Workspace, "advance", "the food's kernels"),
+        (KnifeForceSystem, "_update", "food around them, or spring"),
+        (ComplianceController, "_update", "compliance control"),
+        (WrenchSensor, "_update", "sensor"),
+        (ContactMonitor, "_update", "watch on the gains"),
+        (AgentSystem, "_decide", "agent"),
+        (AgentSystem, "_read", "agent"),
+        (AgentSystem, "_calc_target_pose", "agent"),
+        (AgentSystem, "observe", "agent"),
+    ):
+        watch.method(owner, name, part)
+    found: dict[str, dict[str, list[float]]] = {name: {} for name in SIMULATORS}
+    for _ in range(rounds):
+        for name in SIMULATORS:
+            watch.spent = dict.fromkeys(watch.spent, 0.0)
+            environment_step(name)
+            whole = sum(watch.spent.values())
+            for part, spent in watch.spent.items():
+                found[name].setdefault(part, []).append(spent / whole)
+    rows = [(part, [np.median(found[name][part]) for name in SIMULATORS]) for part in watch.spent]
+    return [
+        "Where the time of simulating goes, in shares of it:",
+        "",
+        "| | " + " | ".join(SIMULATORS) + " |",
+        "|---|" + "---|" * len(SIMULATORS),
+        *(
+            f"| {part} | " + " | ".join(f"{100 * share:.0f} %" for share in both) + " |"
+            for part, both in sorted(rows, key=lambda row: -row[1][0])
+        ),
+    ]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--output", type=Path, help="Markdown file with the two lines")
+    parser.add_argument("--rounds", type=int, default=3, help="of everything; 3")
     parser.add_argument("--json", type=Path, help="also write the values there")
     options = parser.parse_args()
+    if options.rounds < 1:
+        parser.error("--rounds: at least 1")
     PLACE.check(options.output)
     command = shlex.join(["python", "benchmarks/learning_speed.py", *sys.argv[1:]])
     import torch
 
     torch.set_num_threads(1)
-    update, rates, lines = update_time(), {}, []
-    lines = [
-        "| simulator | simulating a decision | an update | environments | training "
-        "| 80,000 decisions |",
-        "|---|---|---|---|---|---|",
-    ]
+    updates: list[float] = []
+    alone: dict[str, list[float]] = {name: [] for name in SIMULATORS}
+    rates: dict[tuple[str, int], list[float]] = {
+        (name, count): [] for name in SIMULATORS for count in ENVIRONMENTS
+    }
     with tempfile.TemporaryDirectory() as folder:
-        for simulator in ("cutting", "spring"):
-            step = environment_step(simulator)
+        for k in range(options.rounds):
+            updates.append(update_time())
+            for name in SIMULATORS:
+                alone[name].append(environment_step(name))
             for count in ENVIRONMENTS:
-                output = Path(folder) / f"{simulator}_{count}"
-                rates[simulator, count] = rate = training_rate(simulator, count, output)
-                lines.append(
-                    f"| {simulator} | {step:.1f} ms | {update:.1f} ms | {count} "
-                    f"| {rate:.1f} decisions/s | {80_000 / rate / 60:.0f} min |"
-                )
+                for name in SIMULATORS:
+                    output = Path(folder) / f"{name}_{count}_{k}"
+                    rates[name, count].append(training_rate(name, count, output))
         printed = subprocess.run(
-            [sys.executable, "-c", DECISION, str(Path(folder) / "cutting_1" / "policy.onnx")],
+            [sys.executable, "-c", DECISION, str(Path(folder) / "cutting_1_0" / "policy.onnx")],
             check=True,
             capture_output=True,
             text=True,
         ).stdout
     median, late = map(float, printed.split()[-2:])
-    ratios = {count: rates["spring", count] / rates["cutting", count] for count in ENVIRONMENTS}
-    if options.json is not None:
-        found = {f"{name}_{n}_decisions_a_second": rate for (name, n), rate in rates.items()}
-        found |= {f"{name}_{n}_80000_min": 80_000 / rate / 60 for (name, n), rate in rates.items()}
-        write_results(
-            options.json, found | {f"{n}_cutting_over_spring": r for n, r in ratios.items()}
+    lines = [
+        "| simulator | simulating a decision | an update | environments | training "
+        "| 80,000 decisions |",
+        "|---|---|---|---|---|---|",
+    ]
+    found: dict[str, float] = {}
+    for (name, count), measured in rates.items():
+        rate = float(np.median(measured))
+        minutes = 80_000 / rate / 60
+        found[f"{name}_{count}_decisions_a_second"] = rate
+        found[f"{name}_{count}_80000_min"] = minutes
+        lines.append(
+            f"| {name} | {np.median(alone[name]):.1f} ms | {np.median(updates):.1f} ms | {count} "
+            f"| {rate:.1f} decisions/s ({min(measured):.1f} to {max(measured):.1f}) "
+            f"| {minutes:.0f} min |"
         )
-    taken = " and ".join(f"{r:.2f} with {n}" for n, r in ratios.items())
+    cutting, spring = SIMULATORS
+    taken = []
+    for count in ENVIRONMENTS:
+        ratios = np.divide(rates[spring, count], rates[cutting, count])
+        found[f"{count}_cutting_over_spring"] = float(np.median(ratios))
+        taken.append(
+            f"{np.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f}) with {count}"
+        )
+    if options.json is not None:
+        write_results(options.json, found)
     lines += [
         "",
-        f"The cutting simulator takes {taken} times as long as the spring. A decision of the "
+        f"Medians of {options.rounds} rounds, least and greatest in brackets. The cutting "
+        f"simulator takes {' and '.join(taken)} times as long as the spring. A decision of the "
         f"exported network takes {median:.3f} ms (99 %: {late:.3f} ms).",
+        "",
+        *shares(options.rounds),
         "",
         f"`{command}`, {os.cpu_count()} cores.",
     ]
-    text = "\n".join(lines)
-    print(text)
-    PLACE.write(options.output, text)
+    PLACE.show(options.output, lines)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Puts what a benchmark measured into a Markdown page, between two lines that mark the place."""
 
 import dataclasses as dc
+from collections.abc import Sequence
 from pathlib import Path
 
 from sliceit_drake.configuration import ConfigurationError
@@ -67,3 +68,13 @@ class Place:
         if file is not None:
             page = self.put(file.read_text(encoding="utf-8"), text, str(file))
             file.write_text(page, encoding="utf-8")
+
+    def show(self, file: Path | None, lines: Sequence[str]) -> None:
+        """Prints lines and puts them there; None is no page.
+
+        Raises:
+            ConfigurationError: As `put`.
+        """
+        text = "\n".join(lines)
+        print(text)
+        self.write(file, text)

@@ -127,9 +127,7 @@ def main() -> None:
         lines += [f"| {food} | {row('policy', agents)}", f"| | {row(what, planned)}"]
     command = shlex.join(["python", "benchmarks/policy_and_motion.py", *sys.argv[1:]])
     lines += ["", f"`{command}`: means of {options.slices} slices of the stand-in world."]
-    text = "\n".join(lines)
-    print(text)
-    PLACE.write(options.output, text)
+    PLACE.show(options.output, lines)
 
 
 if __name__ == "__main__":

@@ -111,9 +111,7 @@ def main() -> int:
         f"Means of the median force, {options.slices} slices of each food in the world of measured "
         f"curves, seed {options.seed}. `{command}`",
     ]
-    text = "\n".join(lines)
-    print(text)
-    PLACE.write(options.output, text)
+    PLACE.show(options.output, lines)
     return 0
 
 

@@ -78,9 +78,7 @@ def main() -> int:
         "Actions go from -1 to 1; p_z is the gain downwards. "
         f"`{shlex.join(['python', 'benchmarks/unfinished_slices.py', *sys.argv[1:]])}`",
     ]
-    text = "\n".join(lines)
-    print(text)
-    PLACE.write(options.output, text)
+    PLACE.show(options.output, lines)
     return 0
 
 

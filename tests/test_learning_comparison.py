@@ -15,6 +15,7 @@ from sliceit_drake.diagrams.agent_gains import AgentGains
 from sliceit_drake.diagrams.run import prepare_run, simulate
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.learning.comparison import claim, compare, comparison_page, plot_boxes
+from sliceit_drake.learning.ending import Limits
 from sliceit_drake.learning.evaluation import LIMITS, cut_slice
 from sliceit_drake.learning.metrics import bootstrap_ratio, slice_metrics
 from sliceit_drake.resources import resource_path
@@ -39,7 +40,7 @@ def test_the_median_is_over_contact_and_the_resultant_of_food_and_board():
     assert found.duration == pytest.approx(0.008) and found.completed
 
 
-@pytest.mark.parametrize(("cut", "end"), [(0.99, "goal"), (1.0, "time"), (1.0, "collision")])
+@pytest.mark.parametrize(("cut", "end"), [(0.99, "goal"), (1.0, "time"), (1.0, "shaking")])
 def test_a_slice_is_completed_only_if_it_is_cut_and_brought_to_its_end(cut, end):
     one = forces(1.0)
     assert not slice_metrics(np.zeros(1), one, one, np.array([cut]), end).completed
@@ -213,4 +214,22 @@ def test_a_slice_ends_by_time_and_by_force_where_a_policy_goes_on():
     short = cut_slice(scenario(), AgentConfig(), press, longest=0.3)
     assert short.metrics.end == "time" and not short.metrics.completed
     weak = cut_slice(scenario(), AgentConfig(), press, limits=dc.replace(LIMITS, force=3.0))
-    assert weak.metrics.end == "collision"
+    assert weak.metrics.end == "force"
+
+
+@pytest.mark.parametrize(
+    ("at_goal", "time", "wrench", "error", "end"),
+    [
+        (True, 0.9, [11.0] * 6, [1.0, 0.0, 0.0], "goal"),
+        (False, 0.9, [0.0] * 6, [0.0, 0.0, 0.0], "shaking"),
+        (False, 1.0, [0.0, 0.0, 0.0, 0.0, -51.0, 0.0], [0.0, 0.0, 0.0], "force"),
+        (False, 1.0, [0.0, -11.0, 0.0, 0.0, 49.0, 0.0], [0.0, 0.0, 0.0], "torque"),
+        (False, 1.0, [9.0, 0.0, 0.0, 0.0, 49.0, 0.0], [0.0, 0.0, -0.3], "workspace"),
+        (False, 1.0, [9.0, 0.0, 0.0, 0.0, 49.0, 0.0], [0.1, 0.1, 0.1], ""),
+    ],
+)
+def test_a_slice_ends_by_the_first_of_goal_shaking_force_torque_and_workspace(
+    at_goal, time, wrench, error, end
+):
+    limits = Limits(force=50.0, torque=10.0, workspace=(0.2, 0.2, 0.2))
+    assert limits.end(at_goal, time, 1.0, np.array(wrench), np.array(error)) == end

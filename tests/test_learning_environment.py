@@ -137,8 +137,8 @@ def weighted(info, config=None):
     [
         ({"agent": {"goal": [1.0, 1.0, 1.0], "goal_decisions": 0}}, "goal", 15.0),
         ({"workspace": [1.0, 0.001, 1.0]}, "workspace", -15.0),
-        ({"force_limit": 0.1}, "collision", -15.0),
-        ({"torque_limit": 0.1}, "collision", -15.0),
+        ({"force_limit": 0.1}, "force", -15.0),
+        ({"torque_limit": 0.1}, "torque", -15.0),
     ],
 )
 def test_an_end_terminates_with_its_reward(values, end, bonus):

@@ -24,7 +24,10 @@ class Limits:
     def end(
         self, at_goal: bool, time: float, until: float, wrench: np.ndarray, error: np.ndarray
     ) -> str:
-        """Why a slice ends after a decision: goal, collision, workspace, or nothing if it goes on.
+        """Why a slice ends after a decision, or nothing if it goes on.
+
+        It is the goal, a collision (force, torque, or shaking, which the station's monitor finds)
+        or workspace.
 
         Args:
             at_goal: Whether the goal was held for long enough.
@@ -36,7 +39,11 @@ class Limits:
         """
         if at_goal:
             return "goal"
+        if time < until - 1e-6:
+            return "shaking"
         torque, force = np.abs(wrench).reshape(2, 3).max(axis=1)
-        if time < until - 1e-6 or torque > self.torque or force > self.force:
-            return "collision"
+        if force > self.force:
+            return "force"
+        if torque > self.torque:
+            return "torque"
         return "workspace" if (np.abs(error) > self.workspace).any() else ""

@@ -30,8 +30,8 @@ class SlicingEnv(gymnasium.Env):
     `step` returns in `info`: `reward_terms` (before their weights), `shaping` (the reward that the
     potential gives), `cut_progress`, `height` of the edge over the board, m, `force`: the norm of
     food's and board's force on the knife at the decision, N, and at an episode's end `end`: goal,
-    collision, workspace, guard or time. A guard of the simulation that ends an episode (an inverted
-    element, say) is `guard_error`, its kind.
+    a collision (force, torque or shaking), workspace, guard or time. A guard of the simulation that
+    ends an episode (an inverted element, say) is `guard_error`, its kind.
 
     A seed given to `reset` fixes all that follows. The variants of the foods come from a seed of
     their own, the same in every environment of a task.

@@ -29,7 +29,7 @@ class SliceMetrics:
         duration: From the start to the end of the slice, s.
         completed: Whether the section was cut through and the policy brought the slice to its end.
         cut: Share of the section that was cut.
-        end: Why the slice ended: goal, collision, workspace, guard or time.
+        end: Why the slice ended: goal, force, torque, shaking, workspace, guard or time.
     """
 
     median_force: float
