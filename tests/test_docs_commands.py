@@ -114,10 +114,15 @@ TESTED = {
         "sliceit train --output policy",
         "sliceit train --output output/ours --seed 0",
         "sliceit train --output output/baseline --seed 0 --simulator spring",
+        "sliceit train --output output/draws/cutting_0 --seed 0 --steps 15000"
+        ' --set "{task: {agent: {draw_increment: 7.5e-3}}}"',
+        "sliceit train --output output/draws/spring_0 --seed 0 --steps 15000 --simulator spring"
+        ' --set "{task: {agent: {draw_increment: 7.5e-3}}}"',
     ],
     "tests/test_learning_comparison.py::test_a_pressing_policy_completes_a_slice_and_its_forces_"
     "are_those_of_food_and_board": [
         "sliceit evaluate output/ours output/baseline --output output/evaluation.jsonl",
+        "sliceit evaluate output/draws/*_[0-2] --output docs/faster_draws.jsonl",
     ],
     "tests/test_learning_comparison.py::test_an_evaluation_goes_on_over_batches_of_processes_and_"
     "runs": [
@@ -230,6 +235,7 @@ READ_ONLY = {
         python benchmarks/diagnosis_speed.py --json docs/benchmarks/diagnosis_speed.json
         python benchmarks/effects_figure.py
         python benchmarks/endurance.py --minutes 60 --output docs/endurance.md
+        python benchmarks/faster_draws.py docs/slicing_evaluation.jsonl docs/faster_draws.jsonl --output docs/learning.md
         python benchmarks/first_run.py --json docs/benchmarks/first_run.json
         python benchmarks/foods_page.py --cut --output docs/foods.md
         python benchmarks/learning_speed.py --output docs/learning.md --json docs/benchmarks/learning_speed.json

@@ -2,6 +2,8 @@
 
 import dataclasses as dc
 import json
+import math
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +77,17 @@ def test_slices_under_one_policy_are_no_replicates_of_the_training():
     found = bootstrap_ratio(ours, baseline, rng)
     assert found.value == pytest.approx(0.7, abs=0.01)
     assert found.low < 0.55 and found.high > 0.85
+
+
+def test_a_ratio_has_no_upper_limit_where_policies_of_the_baseline_meet_nothing():
+    baseline = np.array([[2.0] * 4, [0.0] * 4, [0.0] * 4])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = bootstrap_ratio(np.ones((3, 4)), baseline, np.random.default_rng(0))
+        nothing = bootstrap_ratio(np.ones((3, 4)), 0.0 * baseline, np.random.default_rng(0))
+    assert (found.value, found.high) == (pytest.approx(1.5), math.inf)
+    assert found.low == pytest.approx(0.5)
+    assert (nothing.value, nothing.low, nothing.high) == (math.inf, math.inf, math.inf)
 
 
 def rows(ours=6.0, baseline=10.0, world="stand_in", foods=("cucumber", "potato")):

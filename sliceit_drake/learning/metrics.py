@@ -90,7 +90,7 @@ def bootstrap_ratio(
         ours: A number for each policy and slice [policies, slices].
         baseline: Likewise, of other policies on the same slices.
         rng: Draws policies of each kind, and slices, the same for both.
-        draws: Of the bootstrap.
+        draws: Of the bootstrap; a ratio is infinite where the baseline drawn is zero.
     """
     slices = rng.integers(ours.shape[1], size=(draws, ours.shape[1]))
 
@@ -100,6 +100,14 @@ def bootstrap_ratio(
             [values[np.ix_(p, s)].mean() for p, s in zip(policies, slices, strict=True)]
         )
 
-    ratios = means(ours) / means(baseline)
-    low, high = np.quantile(ratios, [0.025, 0.975])
-    return Ratio(float(ours.mean() / baseline.mean()), float(low), float(high))
+    def over(above: np.ndarray, below: np.ndarray) -> np.ndarray:
+        return np.divide(above, below, out=np.full(above.shape, np.inf), where=below > 0.0)
+
+    ratios = over(means(ours), means(baseline))
+    with np.errstate(invalid="ignore"):
+        limits = np.quantile(ratios, [0.025, 0.975])
+    # Between two infinite ratios NumPy finds none.
+    low, high = np.where(np.isnan(limits), np.inf, limits).tolist()
+    return Ratio(
+        float(over(ours.mean(keepdims=True), baseline.mean(keepdims=True))[0, 0]), low, high
+    )
