@@ -62,17 +62,15 @@ def row(slow: Comparison, fast: Comparison) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("evaluation", type=Path, help="of the policies as they are")
-    parser.add_argument("faster", type=Path, help="of those with faster draws")
-    parser.add_argument("--output", type=Path, help="Markdown file with the two lines")
-    options = parser.parse_args()
-    PLACE.check(options.output)
-    slow = {(e.world, e.food, e.board_stiffness): e for e in read(options.evaluation)}
-    fast = {(e.world, e.food, e.board_stiffness): e for e in read(options.faster)}
+def table(evaluation: Path, faster: Path, command: str) -> list[str]:
+    """The table's lines.
+
+    Args:
+        evaluation, faster: What `sliceit evaluate` wrote.
+        command: That made it.
+    """
+    slow = {(e.world, e.food, e.board_stiffness): e for e in read(evaluation)}
+    fast = {(e.world, e.food, e.board_stiffness): e for e in read(faster)}
     policies = [
         {
             kind: len(next(iter(found.values())).values[kind][METRIC])
@@ -80,7 +78,7 @@ def main() -> int:
         }
         for found in (slow, fast)
     ]
-    lines = [
+    return [
         "| world | food | ours: as it is, faster | ratio | baseline: as it is, faster "
         "| ours over baseline: as it is, faster | paper's | board's peak likewise "
         "| ours completed, faster |",
@@ -90,9 +88,21 @@ def main() -> int:
         f"Means of the slices' median force over {policies[0]['cutting']} and "
         f"{policies[0]['spring']} policies as they are, {policies[1]['cutting']} and "
         f"{policies[1]['spring']} with faster draws; intervals of 95 %. "
-        f"`{shlex.join(['python', 'benchmarks/faster_draws.py', *sys.argv[1:]])}`",
+        f"`{command}`",
     ]
-    PLACE.show(options.output, lines)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("evaluation", type=Path, help="of the policies as they are")
+    parser.add_argument("faster", type=Path, help="of those with faster draws")
+    parser.add_argument("--output", type=Path, help="Markdown file with the two lines")
+    options = parser.parse_args()
+    PLACE.check(options.output)
+    command = shlex.join(["python", "benchmarks/faster_draws.py", *sys.argv[1:]])
+    PLACE.show(options.output, table(options.evaluation, options.faster, command))
     return 0
 
 

@@ -20,7 +20,7 @@ from sliceit_drake.learning.comparison import claim, compare, comparison_page, p
 from sliceit_drake.learning.ending import Limits
 from sliceit_drake.learning.evaluation import LIMITS, cut_slice
 from sliceit_drake.learning.metrics import bootstrap_ratio, slice_metrics
-from sliceit_drake.resources import resource_path
+from sliceit_drake.resources import load_module, resource_path
 from sliceit_drake.systems.agent import AgentConfig
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 
@@ -186,6 +186,15 @@ def test_the_page_is_that_of_the_slices(tmp_path, capsys):
     for name in ("slicing_results.md", "slicing_results.json"):
         assert (tmp_path / name).read_text() == (ROOT / "docs" / name).read_text()
     capsys.readouterr()
+
+
+def test_the_table_of_faster_draws_is_that_of_the_slices():
+    page = load_module("faster_draws", ROOT / "benchmarks/faster_draws.py")
+    text = (ROOT / "docs/learning.md").read_text(encoding="utf-8")
+    files = ["docs/slicing_evaluation.jsonl", "docs/faster_draws.jsonl"]
+    command = f"python benchmarks/faster_draws.py {' '.join(files)} --output docs/learning.md"
+    table = page.table(*(ROOT / file for file in files), command)
+    assert page.PLACE.put(text, "\n".join(table), "docs/learning.md") == text, command
 
 
 def test_the_readme_says_what_the_policies_are_worth():
