@@ -18,21 +18,17 @@ from pathlib import Path
 import numpy as np
 from marked_page import Place
 
-from sliceit_drake.learning.comparison import PAPER, Comparison, compare
-from sliceit_drake.learning.metrics import Ratio, bootstrap_ratio
+from sliceit_drake.learning.comparison import PAPER, Comparison, compare, interval, share
+from sliceit_drake.learning.metrics import bootstrap_ratio
 
 PLACE = Place("faster_draws")
 METRIC = "median_force"
 
 
-def read(file: Path) -> list[Comparison]:
-    """The comparisons of an evaluation."""
-    return compare([json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()])
-
-
-def interval(ratio: Ratio) -> str:
-    """A ratio as it stands in the table."""
-    return f"**{ratio.value:.2f}** ({ratio.low:.2f} to {ratio.high:.2f})"
+def read(file: Path) -> dict[tuple[str, str, float], Comparison]:
+    """The comparisons of an evaluation by world, food and board."""
+    rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+    return {(e.world, e.food, e.board_stiffness): e for e in compare(rows)}
 
 
 def row(slow: Comparison, fast: Comparison) -> str:
@@ -45,7 +41,6 @@ def row(slow: Comparison, fast: Comparison) -> str:
     if ours.shape[1] != faster.shape[1]:
         raise ValueError(f"{ours.shape[1]} and {faster.shape[1]} slices of {slow.food}")
     gain = bootstrap_ratio(faster, ours, np.random.default_rng([*map(ord, slow.world + slow.food)]))
-    done = fast.completed["cutting"]
     boards = [each.ratios["board_peak"].value for each in (slow, fast)]
     forces = [each.values["spring"][METRIC].mean() for each in (slow, fast)]
     cells = [
@@ -57,7 +52,7 @@ def row(slow: Comparison, fast: Comparison) -> str:
         f"{slow.ratios[METRIC].value:.2f}, {interval(fast.ratios[METRIC])}",
         f"{PAPER[slow.food]:.2f}" if slow.food in PAPER else "",
         f"{boards[0]:.2f}, {boards[1]:.2f}",
-        f"{done.sum()} of {done.size}",
+        share(fast.completed["cutting"]),
     ]
     return "| " + " | ".join(cells) + " |"
 
@@ -69,8 +64,7 @@ def table(evaluation: Path, faster: Path, command: str) -> list[str]:
         evaluation, faster: What `sliceit evaluate` wrote.
         command: That made it.
     """
-    slow = {(e.world, e.food, e.board_stiffness): e for e in read(evaluation)}
-    fast = {(e.world, e.food, e.board_stiffness): e for e in read(faster)}
+    slow, fast = read(evaluation), read(faster)
     policies = [
         {
             kind: len(next(iter(found.values())).values[kind][METRIC])

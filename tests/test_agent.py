@@ -283,9 +283,11 @@ def test_a_slice_ends_after_more_than_so_many_decisions_at_the_goal_and_the_knif
         assert out(simulator, agent, "at_goal") == [k + 1]
         assert agent.is_done(agent.GetMyContextFromRoot(simulator.get_context())) == (k == 3)
     # It goes up from where the knife was at t = 0.15 s, and stays at the start's height.
-    for time, down in ((0.17, 0.0349), (0.35, 0.0169), (0.6, 0.0)):
+    for time, down in ((0.165, 0.0354), (0.17, 0.0349), (0.35, 0.0169), (0.6, 0.0)):
         simulator.AdvanceTo(time)
         assert out(simulator, agent, "target_offset") == pytest.approx([0.004, down], abs=1e-12)
+        X_WK = out(simulator, agent, "target_pose")
+        assert X_WK.IsNearlyEqualTo(START @ RigidTransform([0.004, 0.0, down]), 1e-12)
     assert len(times) == 4
 
 

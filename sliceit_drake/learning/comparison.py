@@ -16,8 +16,10 @@ __all__ = [
     "claim",
     "compare",
     "comparison_page",
+    "interval",
     "plot_boxes",
     "plot_two_slices",
+    "share",
 ]
 
 METRICS = ("median_force", "peak_force", "board_peak", "duration")
@@ -149,23 +151,25 @@ def comparison_page(found: Sequence[Comparison]) -> str:
             f"{each.board_stiffness:.0e}".replace("e+0", "e"),
             each.food,
             f"{shape[0]} and {len(baseline[METRICS[0]])}, {shape[1]}",
-            f"{_share(each.completed[OURS])}, {_share(each.completed[BASELINE])}",
+            f"{share(each.completed[OURS])}, {share(each.completed[BASELINE])}",
         ]
         for metric in METRICS:
             unit = "s" if metric == "duration" else "N"
             means = f"{ours[metric].mean():.1f} {unit}, {baseline[metric].mean():.1f} {unit}"
-            cells += [means, _interval(each.ratios[metric])]
-        cells.append(_interval(each.strict))
+            cells += [means, interval(each.ratios[metric])]
+        cells.append(interval(each.strict))
         paper = f"{PAPER[each.food]:.2f}" if each.food in PAPER else ""
         lines.append("| " + " | ".join([*cells, paper]) + " |")
     return "\n".join(lines)
 
 
-def _interval(ratio: Ratio) -> str:
+def interval(ratio: Ratio) -> str:
+    """A ratio as it stands in a table."""
     return f"**{ratio.value:.2f}** ({ratio.low:.2f} to {ratio.high:.2f})"
 
 
-def _share(completed: np.ndarray) -> str:
+def share(completed: np.ndarray) -> str:
+    """How many slices were completed, as it stands in a table."""
     return f"{int(completed.sum())} of {completed.size}"
 
 
