@@ -19,19 +19,19 @@ import numpy as np
 from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate
 from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.cutting.batch import simulate_batch
-from sliceit_drake.cutting.effects import Adhesion, Effects, Relaxation, Skin, ToughnessRate
-from sliceit_drake.cutting.food import Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood, load_calibrated_food
+from sliceit_drake.cutting.foods.effects import Adhesion, Effects, Relaxation, Skin, ToughnessRate
+from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.gradient import SliceAdjoint
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.material import Material
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan, Retract
 from sliceit_drake.cutting.parameters import pull_back
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagnosis.diagnose import diagnose, setup_of_food
-from sliceit_drake.diagnosis.one_slice import diagnose_slice, setup_of_slice
-from sliceit_drake.diagrams.calibrated_food import CalibratedFood, load_calibrated_food
+from sliceit_drake.diagnosis.one_slice.diagnose_slice import diagnose_slice, setup_of_slice
 from sliceit_drake.diagrams.run import prepare_run, simulate
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.learning.environment import SlicingEnv

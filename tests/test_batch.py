@@ -7,10 +7,10 @@ import pytest
 
 from sliceit_drake.cutting.batch import BatchSlice, _Runner, simulate_batch
 from sliceit_drake.cutting.board import Board
-from sliceit_drake.cutting.effects import Compliance, Effects, Relaxation
-from sliceit_drake.cutting.food import Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.effects import Compliance, Effects, Relaxation
+from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.material import Material
 from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan, PressAndDraw
 from sliceit_drake.cutting.parameters import with_parameters

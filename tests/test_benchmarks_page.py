@@ -9,7 +9,7 @@ import pytest
 from sliceit_drake.resources import load_module
 
 ROOT = Path(__file__).resolve().parent.parent
-report = load_module("report", ROOT / "benchmarks/report.py")
+report = load_module("report", ROOT / "studies/project/aims.py")
 SOURCES = ("speed.md", "calibration.md", "verification.json", "hidden_effects.json")
 
 
@@ -33,7 +33,7 @@ def line(text: str, begin: str) -> str:
 
 def test_the_page_is_what_its_command_makes():
     page = (ROOT / "docs/benchmarks.md").read_text(encoding="utf-8")
-    assert page == report.page(), "python benchmarks/report.py"
+    assert page == report.page(), "python studies/project/aims.py"
 
 
 def test_where_nothing_was_measured_the_page_says_so_and_names_the_command(tmp_path):

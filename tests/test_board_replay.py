@@ -8,11 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import ConfigurationError, validate
 from sliceit_drake.cutting.board import Board, impact_peak_loss
-from sliceit_drake.cutting.food import Cylinder, Food, make_food_model
+from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan, Recorded, Retract
 from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
-from sliceit_drake.diagrams.record import Record
+from sliceit_drake.diagrams.outputs.run_log import Record
 from sliceit_drake.diagrams.run import prepare_run, simulate
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.station import MakeSlicingStation

@@ -24,16 +24,16 @@ from sliceit_drake.calibration.setup import (
     setup_names,
 )
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
-from sliceit_drake.cutting.distribution import ParameterDistribution
-from sliceit_drake.cutting.food import Cylinder, Food
-from sliceit_drake.cutting.material import Material
-from sliceit_drake.cutting.model import Numerics
-from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
-from sliceit_drake.diagrams.calibrated_food import (
+from sliceit_drake.cutting.foods.calibrated_food import (
     CalibratedFood,
     calibrated_food_names,
     load_calibrated_food,
 )
+from sliceit_drake.cutting.foods.distribution import ParameterDistribution
+from sliceit_drake.cutting.foods.food import Cylinder, Food
+from sliceit_drake.cutting.foods.material import Material
+from sliceit_drake.cutting.model import Numerics
+from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.records.preprocessing import low_pass
 from sliceit_drake.records.slice_record import SliceRecord

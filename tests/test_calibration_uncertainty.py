@@ -8,14 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sliceit_drake.calibration.coverage import (
-    Problem,
-    Replicate,
-    coverage_page,
-    coverage_share,
-    coverage_study,
-    synthetic_predictor,
-)
 from sliceit_drake.calibration.gauss_newton import gauss_newton
 from sliceit_drake.calibration.held_out import blocked_error
 from sliceit_drake.calibration.noise import NoiseModel, group_series
@@ -24,6 +16,14 @@ from sliceit_drake.calibration.prediction import Parameter
 from sliceit_drake.calibration.uncertainty import estimate, estimate_posterior, profile_likelihood
 from sliceit_drake.configuration import ConfigurationError, dump_yaml, load_yaml
 from sliceit_drake.cutting.solver import CuttingError
+from studies.calibration.coverage import (
+    Problem,
+    Replicate,
+    coverage_page,
+    coverage_share,
+    coverage_study,
+    synthetic_predictor,
+)
 
 
 class MapModel:

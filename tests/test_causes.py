@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from sliceit_drake.calibration.setup import CalibrationSetup
-from sliceit_drake.cli.identifiability import nominal_records, protocol_setup
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.motion import (
     ConstantSpeed,
@@ -25,14 +24,19 @@ from sliceit_drake.diagnosis.cause import EXPERIMENTS, FAMILIES, Cause, CausePar
 from sliceit_drake.diagnosis.causes import BUILT_IN
 from sliceit_drake.diagnosis.causes.mounting import FoodSlip
 from sliceit_drake.diagnosis.causes.robot import StickSlip, Vibration
-from sliceit_drake.diagnosis.jumps import unlike_others
+from sliceit_drake.diagnosis.evidence.jumps import unlike_others
+from sliceit_drake.diagnosis.evidence.sensitivity import (
+    RecordSensitivity,
+    Sensitivities,
+    sensitivities,
+)
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.diagnosis.registry import all_causes, load_cause, open_causes
-from sliceit_drake.diagnosis.sensitivity import RecordSensitivity, Sensitivities, sensitivities
 from sliceit_drake.diagnosis.slices import Meshing
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.protocol import Condition, Protocol, load_protocol
+from studies.commands.identifiability import nominal_records, protocol_setup
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 GRAVITY = 9.81

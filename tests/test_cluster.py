@@ -13,19 +13,19 @@ from sliceit_drake import cluster
 from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
-from sliceit_drake.cutting.food import Cylinder, Food
+from sliceit_drake.cutting.foods.food import Cylinder, Food
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagnosis.causes.material import SkinToughness
 from sliceit_drake.diagnosis.cluster import active, on_cluster
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.diagnosis.simulator import Runner
 from sliceit_drake.diagnosis.slices import Meshing
-from sliceit_drake.hidden_study import runner
-from sliceit_drake.hidden_study.bench import model_food
-from sliceit_drake.hidden_study.cases import Case, Hidden
-from sliceit_drake.hidden_study.runner import food_file, run_case
-from sliceit_drake.hidden_study.study import run_study
 from sliceit_drake.stand_in.protocol import Condition, Protocol
+from studies.hidden_effects import runner
+from studies.hidden_effects.bench import model_food
+from studies.hidden_effects.cases import Case, Hidden
+from studies.hidden_effects.runner import food_file, run_case
+from studies.hidden_effects.study import run_study
 
 distributed = pytest.importorskip("distributed")
 

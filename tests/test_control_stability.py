@@ -15,16 +15,6 @@ from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagrams.agent_gains import ERROR_FACTOR, AgentGains, agent_box
 from sliceit_drake.diagrams.contact_loop import ContactLoop, directional_stiffness
 from sliceit_drake.diagrams.contact_margin import check_contact_margin
-from sliceit_drake.diagrams.control_study import (
-    VERTICAL,
-    factor_row,
-    factor_table,
-    run_in_contact,
-    stability_limits,
-    station_growth,
-    study_scenario,
-    with_lag,
-)
 from sliceit_drake.diagrams.run import prepare_run, simulate
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.station import MakeSlicingStation
@@ -37,6 +27,16 @@ from sliceit_drake.systems.contact_monitor import (
     ContactMonitorConfig,
 )
 from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig
+from studies.robot.control import (
+    VERTICAL,
+    factor_row,
+    factor_table,
+    run_in_contact,
+    stability_limits,
+    station_growth,
+    study_scenario,
+    with_lag,
+)
 
 CONTROL_DOC = Path(__file__).parents[1] / "docs/control.md"
 SMALL_FOOD = "food: {shape: !Cylinder {rings: 3, layers: [0.0, 0.004, 0.012]}}, "
@@ -205,7 +205,7 @@ def test_explosive_growth_is_caught_within_a_few_swings():
     assert np.exp(80.0 * time) < 1000.0
 
 
-# Middle, lowest, highest and a random point; `sliceit study control` runs all corners.
+# Middle, lowest, highest and a random point; `python -m studies control` runs all corners.
 POINTS = [AgentGains(), *(agent_box(1)[k] for k in (0, 31, 32))]
 
 

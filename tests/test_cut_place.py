@@ -5,15 +5,15 @@ import dataclasses as dc
 import numpy as np
 import pytest
 
-from sliceit_drake.cutting.food import Box, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
+from sliceit_drake.cutting.foods.food import Box, Food, make_food_model, start_pose
 from sliceit_drake.cutting.motion import ConstantSpeed, MotionPlan
 from sliceit_drake.diagnosis.diagnose import setup_of_food
-from sliceit_drake.diagnosis.experiment_scenario import (
+from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
+from sliceit_drake.diagnosis.experiments.scenario_of_experiment import (
     experiment_of_record,
     scenario_of,
 )
-from sliceit_drake.diagnosis.sensitivity import sensitivities
-from sliceit_drake.diagrams.calibrated_food import CalibratedFood
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Placement
 from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings

@@ -11,7 +11,7 @@ from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
 
-from sliceit_drake.cutting.food import Box, Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.food import Box, Cylinder, Food, make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.solver import CuttingSolver

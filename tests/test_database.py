@@ -10,14 +10,14 @@ import optuna
 import pytest
 from example_slices import HEIGHT, short_press
 
-from sliceit_drake.calibration.local_database import NoServerError, find_server, local_database
 from sliceit_drake.calibration.prediction import Predictor
 from sliceit_drake.calibration.search import open_study, search
 from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.calibration.storage import keeps_answering, without_password
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.food import Cylinder, Food
+from sliceit_drake.cutting.foods.food import Cylinder, Food
+from studies.scaling.local_database import NoServerError, find_server, local_database
 
 
 @pytest.fixture(scope="module")
@@ -136,8 +136,8 @@ def test_passwords_of_urls_are_not_kept_in_a_command():
 
 
 def test_a_machine_without_a_server_says_so(monkeypatch, tmp_path):
-    monkeypatch.setattr("sliceit_drake.calibration.local_database.PACKAGES", ("no_such_package",))
-    monkeypatch.setattr("sliceit_drake.calibration.local_database.DISTRIBUTION", tmp_path)
+    monkeypatch.setattr("studies.scaling.local_database.PACKAGES", ("no_such_package",))
+    monkeypatch.setattr("studies.scaling.local_database.DISTRIBUTION", tmp_path)
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(NoServerError, match="pgserver"):
         find_server()

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from sliceit_drake.diagnosis.effect_size import effect_in_noise
-from sliceit_drake.diagnosis.held_out import fitted_changes, held_out_gain
-from sliceit_drake.diagnosis.linear import LinearProblem
-from sliceit_drake.diagnosis.noise_levels import ChannelNoise
-from sliceit_drake.diagnosis.sensitivity import Column, RecordSensitivity, Sensitivities
-from sliceit_drake.diagnosis.verdict import foretold, reach_verdict
+from sliceit_drake.diagnosis.evidence.effect_size import effect_in_noise
+from sliceit_drake.diagnosis.evidence.held_out import fitted_changes, held_out_gain
+from sliceit_drake.diagnosis.evidence.linear import LinearProblem
+from sliceit_drake.diagnosis.evidence.noise_levels import ChannelNoise
+from sliceit_drake.diagnosis.evidence.sensitivity import Column, RecordSensitivity, Sensitivities
+from sliceit_drake.diagnosis.evidence.verdict import foretold, reach_verdict
 
 ROWS = 300
 NOISE = 0.1

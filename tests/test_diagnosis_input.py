@@ -13,7 +13,7 @@ from example_slices import example_slice
 
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.food import Food
+from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.diagnosis import diagnose as diagnosis_module
 from sliceit_drake.diagnosis.cause import Cause, CauseParameter
 from sliceit_drake.diagnosis.causes import BUILT_IN

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from sliceit_drake.diagnosis import experiment_proposal, next_experiment, verdict
+from sliceit_drake.diagnosis.evidence import verdict
+from sliceit_drake.diagnosis.experiments import next_experiment, proposal
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 
@@ -38,7 +39,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
         (
             "next_experiment",
             f"least {100 * (1.0 - next_experiment.ALIKE_GAIN):g} % as much and are within "
-            f"{verdict.CLASS_ANGLE + experiment_proposal.MARGIN:g} degrees",
+            f"{verdict.CLASS_ANGLE + proposal.MARGIN:g} degrees",
         ),
     ],
 )

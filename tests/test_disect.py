@@ -8,21 +8,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sliceit_drake.cutting import disect
-from sliceit_drake.cutting.disect import load_case, load_reference, run_case
-from sliceit_drake.cutting.effects import Edge, Effects
-from sliceit_drake.cutting.food import Box, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.effects import Edge, Effects
+from sliceit_drake.cutting.foods.food import Box, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.material import Material
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan, Pose
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
-from sliceit_drake.diagrams import disect_page
-from sliceit_drake.diagrams.disect_settings import SETTINGS
-from sliceit_drake.diagrams.disect_study import Curve, Difference, DisectStudy, MeasuredCurves
 from sliceit_drake.records.force_profile import load_force_profile
 from sliceit_drake.resources import resource_path
+from studies.disect import case as disect
+from studies.disect import page as disect_page
+from studies.disect.case import load_case, load_reference, run_case
+from studies.disect.settings import SETTINGS
+from studies.disect.study import Curve, Difference, DisectStudy, MeasuredCurves
 
 ROOT = Path(__file__).resolve().parent.parent
 TOUGHNESS = 300.0

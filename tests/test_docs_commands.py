@@ -17,7 +17,7 @@ import pytest
 from docs_commands import Command, commands_of
 
 from sliceit_drake.cli.main import main, make_parser
-from sliceit_drake.cutting.mesh import MeshError
+from sliceit_drake.cutting.mesh.tetrahedra import MeshError
 from sliceit_drake.resources import load_module
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -48,7 +48,7 @@ TESTED = {
         "sliceit simulate radish.yaml",
     ],
     "tests/test_foods_page.py::test_tables_are_made_from_the_files_of_foods_and_knives": [
-        "python benchmarks/foods_page.py --output docs/foods.md",
+        "python studies/physics/foods_page.py --output docs/foods.md",
     ],
     "tests/test_paraview.py::test_the_series_of_a_run_has_its_body_its_knife_and_its_forces": [
         "sliceit simulate --paraview vtu",
@@ -71,7 +71,7 @@ TESTED = {
         "sliceit record --output records/b --seed 1 --backend dask --scheduler tcp://10.0.0.5:8786",
     ],
     "tests/test_cluster.py::test_a_sweep_on_a_cluster_is_that_of_one_process": [
-        "sliceit study hidden --output output/hidden --backend dask"
+        "python -m studies hidden --output output/hidden --backend dask"
         " --scheduler tcp://10.0.0.5:8786",
     ],
     "tests/test_cluster.py::test_a_backend_without_its_scheduler_is_refused": [
@@ -106,8 +106,8 @@ TESTED = {
     ],
     "tests/test_hidden_effects_page.py::test_the_page_is_made_from_the_runs_and_says_how_they_"
     "were": [
-        "sliceit score docs/hidden_effects.jsonl --output docs",
-        "sliceit score output/hidden --output docs",
+        "python -m studies score docs/hidden_effects.jsonl --output docs",
+        "python -m studies score output/hidden --output docs",
     ],
     "tests/test_learning_agent.py::test_a_training_that_was_stopped_goes_on_as_if_it_had_not": [
         "sliceit train --output DIR",
@@ -134,8 +134,8 @@ TESTED = {
         "sliceit simulate scenarios/cucumber_agent.yaml",
     ],
     "tests/test_learning_comparison.py::test_the_study_writes_its_page_and_says_what_it_lacks": [
-        "sliceit study slicing output/evaluation.jsonl --output docs",
-        "sliceit study slicing docs/slicing_evaluation.jsonl --policies models/policies/cutting_0"
+        "python -m studies slicing output/evaluation.jsonl --output docs",
+        "python -m studies slicing docs/slicing_evaluation.jsonl --policies models/policies/cutting_0"
         " models/policies/spring_0 --output docs",
     ],
     "tests/test_motion_optimization.py::test_the_command_leaves_a_scenario_that_simulate_takes": [
@@ -166,9 +166,9 @@ TESTED = {
         "sliceit hardware SCENARIO --host ADDRESS --robot my.yaml --dry-run",
     ],
     "tests/test_hardware_pace.py::test_it_runs_emulator_and_client_and_prints_and_writes_the_"
-    "table": ["python benchmarks/hardware_pace.py --output docs/hardware.md"],
+    "table": ["python studies/robot/hardware_pace.py --output docs/hardware.md"],
     "tests/test_benchmarks_page.py::test_the_page_is_what_its_command_makes": [
-        "python benchmarks/report.py",
+        "python studies/project/aims.py",
     ],
     "tests/test_rosbag.py::test_the_command_cuts_a_slice_out_of_a_bag": [
         "sliceit records import rosbag",
@@ -215,40 +215,40 @@ READ_ONLY = {
         sliceit record next.yaml --replicates 3 --effect skin --refinement 0.7 --seed 132 --output new
         """,  # noqa: E501
     "a study of minutes to hours, whose results stand in docs": """
-        sliceit study calibration --output FOLDER
-        sliceit study control --output FOLDER
-        sliceit study coverage --replicates 24 --output docs
-        sliceit study disect --output docs
-        sliceit study hidden --output output/hidden --seed 1 --replicates 100
-        sliceit study identifiability --output docs/identifiability.md --figure docs/figures/identifiability.png
-        sliceit study random --count 200 --seed 1 --output docs
-        sliceit study real --output docs
-        sliceit study stepping --output FOLDER
-        sliceit study verification --fit
-        sliceit study verification --output docs/verification.md
+        python -m studies calibration --output FOLDER
+        python -m studies control --output FOLDER
+        python -m studies coverage --replicates 24 --output docs
+        python -m studies disect --output docs
+        python -m studies hidden --output output/hidden --seed 1 --replicates 100
+        python -m studies identifiability --output docs/identifiability.md --figure docs/figures/identifiability.png
+        python -m studies random --count 200 --seed 1 --output docs
+        python -m studies real --output docs
+        python -m studies stepping --output FOLDER
+        python -m studies verification --fit
+        python -m studies verification --output docs/verification.md
         """,  # noqa: E501
     "measures times or draws figures, whose results stand in docs": """
-        python benchmarks/batch_speed.py --output docs/speed.md
-        python benchmarks/condensed_scheme.py
-        python benchmarks/cutting_speed.py --json docs/benchmarks/cutting_speed.json
-        python benchmarks/cutting_speed.py --repeats 3 --output docs/figures/cutting_speed.png
-        python benchmarks/diagnosis_speed.py --json docs/benchmarks/diagnosis_speed.json
-        python benchmarks/effects_figure.py
-        python benchmarks/endurance.py --minutes 60 --output docs/endurance.md
-        python benchmarks/faster_draws.py docs/slicing_evaluation.jsonl docs/faster_draws.jsonl --output docs/learning.md
-        python benchmarks/first_run.py --json docs/benchmarks/first_run.json
-        python benchmarks/foods_page.py --cut --output docs/foods.md
-        python benchmarks/learning_speed.py --output docs/learning.md --json docs/benchmarks/learning_speed.json
-        python benchmarks/policy_and_motion.py models/policies/cutting_0 --output docs/learning.md
-        python benchmarks/safety_layer.py
-        python benchmarks/scaling.py --output docs/scaling.md
-        python benchmarks/scaling.py --trials 24 --slices 4 --tasks 500 --seconds 2 --output docs/scaling.md
-        python benchmarks/slicing_ablations.py --folder output/ablations --output docs/learning.md
-        python benchmarks/split_step_limit.py
-        python benchmarks/stand_in_figure.py
-        python benchmarks/station_speed.py
-        python benchmarks/station_speed.py --json docs/benchmarks/station_speed.json
-        python benchmarks/unfinished_slices.py docs/slicing_evaluation.jsonl --output docs/learning.md
+        python studies/physics/batch_speed.py --output docs/speed.md
+        python studies/physics/condensed_scheme.py
+        python studies/physics/cutting_speed.py --json docs/benchmarks/cutting_speed.json
+        python studies/physics/cutting_speed.py --repeats 3 --output docs/figures/cutting_speed.png
+        python studies/diagnosis/diagnosis_speed.py --json docs/benchmarks/diagnosis_speed.json
+        python studies/physics/effects_figure.py
+        python studies/robot/endurance.py --minutes 60 --output docs/endurance.md
+        python studies/learning/faster_draws.py docs/slicing_evaluation.jsonl docs/faster_draws.jsonl --output docs/learning.md
+        python studies/project/first_run.py --json docs/benchmarks/first_run.json
+        python studies/physics/foods_page.py --cut --output docs/foods.md
+        python studies/learning/learning_speed.py --output docs/learning.md --json docs/benchmarks/learning_speed.json
+        python studies/learning/policy_and_motion.py models/policies/cutting_0 --output docs/learning.md
+        python studies/robot/safety_layer.py
+        python studies/scaling/scaling.py --output docs/scaling.md
+        python studies/scaling/scaling.py --trials 24 --slices 4 --tasks 500 --seconds 2 --output docs/scaling.md
+        python studies/learning/slicing_ablations.py --folder output/ablations --output docs/learning.md
+        python studies/physics/split_step_limit.py
+        python studies/diagnosis/stand_in_figure.py
+        python studies/robot/station_speed.py
+        python studies/robot/station_speed.py --json docs/benchmarks/station_speed.json
+        python studies/learning/unfinished_slices.py docs/slicing_evaluation.jsonl --output docs/learning.md
         """,  # noqa: E501
 }
 

@@ -10,7 +10,7 @@ from scipy.optimize import curve_fit
 from sliceit_drake.configuration import ConfigurationError, load_yaml
 from sliceit_drake.cutting.batch import BatchSlice, simulate_batch
 from sliceit_drake.cutting.board import Board
-from sliceit_drake.cutting.effects import (
+from sliceit_drake.cutting.foods.effects import (
     Adhesion,
     Bluntness,
     Centre,
@@ -24,9 +24,9 @@ from sliceit_drake.cutting.effects import (
     Slip,
     ToughnessRate,
 )
-from sliceit_drake.cutting.food import Box, Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.food import Box, Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.material import Material
 from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan, Retract
 from sliceit_drake.cutting.simulate import SliceResult, simulate_slice

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from sliceit_drake.configuration import ConfigurationError, validate
-from sliceit_drake.cutting.food import (
+from sliceit_drake.cutting.foods.food import (
     Box,
     Cylinder,
     Ellipsoid,
@@ -15,15 +15,15 @@ from sliceit_drake.cutting.food import (
     make_food_model,
     start_pose,
 )
+from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.material import Material
-from sliceit_drake.cutting.mesh import TetrahedralMesh
-from sliceit_drake.cutting.mesh_surface import bodies
+from sliceit_drake.cutting.mesh.manifold import bodies
+from sliceit_drake.cutting.mesh.split import CutPlane, split_mesh
+from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
-from sliceit_drake.cutting.split import CutPlane, split_mesh
 from sliceit_drake.diagrams.sequence import SliceSequence
 
 CARROT = Tapered(diameters=[0.014, 0.030], length=0.12)

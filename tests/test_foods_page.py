@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from sliceit_drake.calibration.setup import load_setup
-from sliceit_drake.cutting.food import make_food_model
-from sliceit_drake.diagrams.named_knife import load_knife
+from sliceit_drake.cutting.foods.food import make_food_model
+from sliceit_drake.cutting.named_knife import load_knife
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.resources import load_module
 
@@ -17,9 +17,9 @@ PAGE = (ROOT / "docs/foods.md").read_text(encoding="utf-8")
 
 @pytest.mark.parametrize("name", ["foods", "knives"])
 def test_tables_are_made_from_the_files_of_foods_and_knives(name):
-    page = load_module("foods_page", ROOT / "benchmarks/foods_page.py")
+    page = load_module("foods_page", ROOT / "studies/physics/foods_page.py")
     table = {"foods": page.foods_table, "knives": page.knives_table}[name]()
-    command = "python benchmarks/foods_page.py --output docs/foods.md"
+    command = "python studies/physics/foods_page.py --output docs/foods.md"
     assert page.Place(name).put(PAGE, table, "docs/foods.md") == PAGE, command
 
 

@@ -10,13 +10,13 @@ from emulator_bench import Bench
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan, Retract
-from sliceit_drake.diagrams.plan_check import plan_joints
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.diagrams.station import MakeSlicingStation
 from sliceit_drake.emulator.pendant import PENDANT_PORT
 from sliceit_drake.emulator.robot_model import CYCLE
 from sliceit_drake.emulator.station_robot import StationRobot
 from sliceit_drake.resources import resource_path
+from sliceit_drake.robot_run.plan_check import plan_joints
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.servo import ServoConfig
 

@@ -11,7 +11,7 @@ import warp as wp
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.batch import simulate_batch
-from sliceit_drake.cutting.food import Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
@@ -55,7 +55,9 @@ def test_a_device_that_is_not_there_is_named_with_those_that_are():
 
 
 def test_the_benchmark_goes_on_without_a_gpu_and_says_why(monkeypatch, capsys, tmp_path):
-    spec = importlib.util.spec_from_file_location("batch_speed", ROOT / "benchmarks/batch_speed.py")
+    spec = importlib.util.spec_from_file_location(
+        "batch_speed", ROOT / "studies/physics/batch_speed.py"
+    )
     module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     monkeypatch.setattr(module.wp, "is_cuda_available", lambda: False)

@@ -5,7 +5,7 @@ import dataclasses as dc
 import numpy as np
 import pytest
 
-from sliceit_drake.cutting.effects import (
+from sliceit_drake.cutting.foods.effects import (
     Adhesion,
     Bluntness,
     Centre,
@@ -18,10 +18,10 @@ from sliceit_drake.cutting.effects import (
     Slip,
     ToughnessRate,
 )
-from sliceit_drake.cutting.food import Cylinder, Food, make_food_model
+from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model
+from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.gradient import SliceAdjoint, SliceGradient, SliceRun
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.material import Material
 from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.cutting.parameters import (
     POINT_PARAMETERS,

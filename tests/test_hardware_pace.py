@@ -19,7 +19,7 @@ PATIENT = "{watchdog: 5.0, limits: {state_age: 0.1, command_age: 0.1, joint_step
 
 @pytest.fixture(scope="module")
 def pace():
-    file = ROOT / "benchmarks/hardware_pace.py"
+    file = ROOT / "studies/robot/hardware_pace.py"
     spec = importlib.util.spec_from_file_location("hardware_pace", file)
     module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -103,5 +103,5 @@ def test_it_runs_emulator_and_client_and_prints_and_writes_the_table(pace, tmp_p
     # How the machine keeps up is its own affair; that targets went out is not.
     assert row[1] in ("1 of 1", "0 of 1")
     assert int(row[2]) > 20, printed
-    assert "python benchmarks/hardware_pace.py --set" in printed
+    assert "python studies/robot/hardware_pace.py --set" in printed
     assert re.search(r"\| 0\.1 \|.*", printed)[0] in file.read_text()

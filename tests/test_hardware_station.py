@@ -15,11 +15,9 @@ from fake_robot import FakeRobot
 from sliceit_drake.cli import hardware as command
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.diagrams.hardware_run import prepare_hardware_run, write_hardware_outputs
 from sliceit_drake.diagrams.hardware_station import MakeHardwareStation, make_safety_layer
-from sliceit_drake.diagrams.plan_check import check_plan, plan_joints
+from sliceit_drake.diagrams.outputs.slice_record_of_run import slice_record_of
 from sliceit_drake.diagrams.ports import check_station_ports
-from sliceit_drake.diagrams.run_record import slice_record_of
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.diagrams.station import MakeSlicingStation
 from sliceit_drake.hardware.checks import check_facts, check_start
@@ -31,6 +29,8 @@ from sliceit_drake.hardware.configuration import (
 from sliceit_drake.hardware.limits import SafetyLimits
 from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.resources import resource_path
+from sliceit_drake.robot_run.hardware_run import prepare_hardware_run, write_hardware_outputs
+from sliceit_drake.robot_run.plan_check import check_plan, plan_joints
 
 PACE = 0.15
 # A machine that other tests keep busy may be late: these runs are about what is done, not when.

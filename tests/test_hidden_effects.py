@@ -12,20 +12,20 @@ import warp
 from scipy.stats import binomtest
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
-from sliceit_drake.cutting.effects import Effects
+from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
+from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.diagnosis.registry import all_causes
-from sliceit_drake.diagrams.calibrated_food import load_calibrated_food
-from sliceit_drake.hidden_study import runner
-from sliceit_drake.hidden_study.archive import pack, unpack
-from sliceit_drake.hidden_study.bench import PROTOCOLS, QuietBench, model_food, protocol_named
-from sliceit_drake.hidden_study.cases import KINDS, PAIRS, Case, Hidden, make_cases
-from sliceit_drake.hidden_study.report import numbers, plot_curves, report
-from sliceit_drake.hidden_study.runner import food_file, is_done, run_case
-from sliceit_drake.hidden_study.score import Judgement, Rate, judge, judge_study
-from sliceit_drake.hidden_study.sizes import ProtocolSizes, SizeCurve
-from sliceit_drake.hidden_study.study import StudyOptions, load_cases, prepare
-from sliceit_drake.hidden_study.truth import BASE_OF, CAUSE_OF, UNKNOWN
 from sliceit_drake.stand_in.registry import EFFECTS, make_effect
+from studies.hidden_effects import runner
+from studies.hidden_effects.archive import pack, unpack
+from studies.hidden_effects.bench import PROTOCOLS, QuietBench, model_food, protocol_named
+from studies.hidden_effects.cases import KINDS, PAIRS, Case, Hidden, make_cases
+from studies.hidden_effects.report import numbers, plot_curves, report
+from studies.hidden_effects.runner import food_file, is_done, run_case
+from studies.hidden_effects.score import Judgement, Rate, judge, judge_study
+from studies.hidden_effects.sizes import ProtocolSizes, SizeCurve
+from studies.hidden_effects.study import StudyOptions, load_cases, prepare
+from studies.hidden_effects.truth import BASE_OF, CAUSE_OF, UNKNOWN
 
 COARSE = dc.replace(runner.WORLD, refinement=0.6, time_step=4e-4)
 
@@ -299,7 +299,7 @@ def test_a_study_that_goes_on_has_the_runs_that_it_was_begun_with(tmp_path, monk
     facts = {"seed": 3, "replicates": 100}
     for name, values in (("study", facts), ("near", {}), ("classes", {}), ("cases", listed)):
         (begun / f"{name}.json").write_text(json.dumps(values))
-    monkeypatch.setattr("sliceit_drake.hidden_study.study.protocol_classes", refused)
+    monkeypatch.setattr("studies.hidden_effects.study.protocol_classes", refused)
     assert prepare(begun, options, refused) == cases
     assert pack(begun, tmp_path / "runs.jsonl") == 0
     unpack(tmp_path / "runs.jsonl", again)

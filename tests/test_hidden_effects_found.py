@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from sliceit_drake.configuration import dump_yaml
-from sliceit_drake.hidden_study.bench import model_food, protocol_named
-from sliceit_drake.hidden_study.cases import Case, Hidden
-from sliceit_drake.hidden_study.runner import food_file, run_case
-from sliceit_drake.hidden_study.score import judge_study
-from sliceit_drake.hidden_study.sizes import ProtocolSizes
-from sliceit_drake.hidden_study.study import run_study
-from sliceit_drake.hidden_study.truth import CAUSE_OF
+from studies.hidden_effects.bench import model_food, protocol_named
+from studies.hidden_effects.cases import Case, Hidden
+from studies.hidden_effects.runner import food_file, run_case
+from studies.hidden_effects.score import judge_study
+from studies.hidden_effects.sizes import ProtocolSizes
+from studies.hidden_effects.study import run_study
+from studies.hidden_effects.truth import CAUSE_OF
 
 REPLICATES = 100
 SHARES = {"single": 0.95, "nothing": 0.92, "unknown": 0.90, "pairs": 0.80, "poor": 0.90}

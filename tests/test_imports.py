@@ -21,18 +21,10 @@ LAYERS: dict[str, set[str]] = {
     "diagrams": {"cutting", "systems", "records", "hardware"},
     "stand_in": {"cutting", "systems", "diagrams", "records"},
     "learning": {"cutting", "systems", "diagrams", "records"},
-    "calibration": {"cutting", "systems", "diagrams", "records"},
+    "calibration": {"cutting", "records"},
     "diagnosis": {"cutting", "systems", "diagrams", "records", "calibration"},
+    "robot_run": {"cutting", "systems", "diagrams", "records", "hardware"},
     "emulator": {"cutting", "systems", "diagrams", "records"},
-}
-LAYERS["hidden_study"] = {
-    "cutting",
-    "systems",
-    "diagrams",
-    "records",
-    "stand_in",
-    "calibration",
-    "diagnosis",
 }
 LAYERS["cli"] = set(LAYERS)
 

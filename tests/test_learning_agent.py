@@ -433,7 +433,7 @@ def test_a_training_whose_guards_end_episodes_has_failed(tmp_path, one_process, 
     def fail(*_):
         raise CuttingError("an element is inverted")
 
-    monkeypatch.setattr("sliceit_drake.systems.spring_food.SpringCutter.advance", fail)
+    monkeypatch.setattr("sliceit_drake.systems.spring_cutter.SpringCutter.advance", fail)
     outcome = train(training_of(steps=5), tmp_path)
     assert outcome.guard_errors == {"CuttingError": 5} and outcome.ends == {"guard": 5}
     assert "5 of 5 episodes" in outcome.failed and "0.1 %" in outcome.failed

@@ -16,13 +16,13 @@ from sliceit_drake.cli.main import main
 from sliceit_drake.diagrams.agent_gains import AgentGains
 from sliceit_drake.diagrams.run import prepare_run, simulate
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
-from sliceit_drake.learning.comparison import claim, compare, comparison_page, plot_boxes
 from sliceit_drake.learning.ending import Limits
 from sliceit_drake.learning.evaluation import LIMITS, cut_slice
 from sliceit_drake.learning.metrics import bootstrap_ratio, slice_metrics
 from sliceit_drake.resources import load_module, resource_path
 from sliceit_drake.systems.agent import AgentConfig
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
+from studies.learning.comparison import claim, compare, comparison_page, plot_boxes
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -189,10 +189,10 @@ def test_the_page_is_that_of_the_slices(tmp_path, capsys):
 
 
 def test_the_table_of_faster_draws_is_that_of_the_slices():
-    page = load_module("faster_draws", ROOT / "benchmarks/faster_draws.py")
+    page = load_module("faster_draws", ROOT / "studies/learning/faster_draws.py")
     text = (ROOT / "docs/learning.md").read_text(encoding="utf-8")
     files = ["docs/slicing_evaluation.jsonl", "docs/faster_draws.jsonl"]
-    command = f"python benchmarks/faster_draws.py {' '.join(files)} --output docs/learning.md"
+    command = f"python studies/learning/faster_draws.py {' '.join(files)} --output docs/learning.md"
     table = page.table(*(ROOT / file for file in files), command)
     assert page.PLACE.put(text, "\n".join(table), "docs/learning.md") == text, command
 

@@ -182,7 +182,7 @@ def test_any_other_error_ends_the_training(monkeypatch, spring):
         raise ZeroDivisionError("a bug")
 
     with monkeypatch.context() as patch:
-        patch.setattr("sliceit_drake.systems.spring_food.SpringCutter.advance", fail)
+        patch.setattr("sliceit_drake.systems.spring_cutter.SpringCutter.advance", fail)
         with pytest.raises(ZeroDivisionError, match="a bug"):
             spring.step(PRESS)
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import ConfigurationError, validate
-from sliceit_drake.cutting.material import (
+from sliceit_drake.cutting.foods.material import (
     Material,
     energy_density,
     first_piola_stress,

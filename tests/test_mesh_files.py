@@ -10,10 +10,22 @@ import pytest
 
 from sliceit_drake.calibration.setup import CalibrationSetup, load_setup
 from sliceit_drake.configuration import dump_yaml
-from sliceit_drake.cutting.food import Box, Cylinder, Ellipsoid, Food, MeshFile, make_food_model
+from sliceit_drake.cutting.foods.food import (
+    Box,
+    Cylinder,
+    Ellipsoid,
+    Food,
+    MeshFile,
+    make_food_model,
+)
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.mesh import MeshError, TetrahedralMesh, boundary_faces, box_mesh
-from sliceit_drake.cutting.mesh_surface import surface_crossings
+from sliceit_drake.cutting.mesh.manifold import surface_crossings
+from sliceit_drake.cutting.mesh.tetrahedra import (
+    MeshError,
+    TetrahedralMesh,
+    boundary_faces,
+    box_mesh,
+)
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 

@@ -11,13 +11,13 @@ import pytest
 from fake_robot import FakeRobot
 from test_hardware_station import CONFIG, PACE, spring_scenario
 
-from sliceit_drake.diagrams.hardware_run import prepare_hardware_run
 from sliceit_drake.diagrams.hardware_station import make_knife_kinematics
-from sliceit_drake.diagrams.move_to_start import MoveToStart
 from sliceit_drake.diagrams.station import MakeSlicingStation
 from sliceit_drake.hardware.client import RobotUnavailableError
 from sliceit_drake.hardware.configuration import HardwareConfig
 from sliceit_drake.hardware.interruption import catch_signals
+from sliceit_drake.robot_run.hardware_run import prepare_hardware_run
+from sliceit_drake.robot_run.move_to_start import MoveToStart
 
 
 @pytest.fixture(scope="module")

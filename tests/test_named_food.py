@@ -5,9 +5,9 @@ import pytest
 
 from sliceit_drake.calibration.setup import load_setup, setup_names
 from sliceit_drake.cli.main import main
+from sliceit_drake.cutting.foods.calibrated_food import calibrated_food_names, load_calibrated_food
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.diagrams.calibrated_food import calibrated_food_names, load_calibrated_food
-from sliceit_drake.diagrams.named_knife import load_knife
+from sliceit_drake.cutting.named_knife import load_knife
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.resources import resource_path

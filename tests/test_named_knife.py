@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml, validate
-from sliceit_drake.cutting.food import Box, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.food import Box, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.knife import UNSUPPORTED, Knife
-from sliceit_drake.cutting.material import Material
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
+from sliceit_drake.cutting.named_knife import NamedKnife, knife_names, load_knife
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
-from sliceit_drake.diagrams.named_knife import NamedKnife, knife_names, load_knife
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.resources import resource_path
 

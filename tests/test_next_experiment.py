@@ -8,24 +8,24 @@ import numpy as np
 import pytest
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.effects import Effects
-from sliceit_drake.cutting.food import Cylinder
-from sliceit_drake.diagnosis import next_experiment as proposing
+from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
+from sliceit_drake.cutting.foods.effects import Effects
+from sliceit_drake.cutting.foods.food import Cylinder
 from sliceit_drake.diagnosis.diagnose import Diagnosis, setup_of_food
-from sliceit_drake.diagnosis.experiment_proposal import NEEDED, NextExperiment
-from sliceit_drake.diagnosis.experiment_scenario import (
+from sliceit_drake.diagnosis.evidence.linear import LinearProblem
+from sliceit_drake.diagnosis.evidence.sensitivity import Sensitivities, sensitivities
+from sliceit_drake.diagnosis.evidence.verdict import CLASS_ANGLE, reach_verdict
+from sliceit_drake.diagnosis.experiments import next_experiment as proposing
+from sliceit_drake.diagnosis.experiments.designs import Scale, menu
+from sliceit_drake.diagnosis.experiments.next_experiment import next_experiment
+from sliceit_drake.diagnosis.experiments.proposal import NEEDED, NextExperiment
+from sliceit_drake.diagnosis.experiments.scenario_of_experiment import (
     experiment_of_record,
     planned_record,
     scale_of,
     scenario_of,
 )
-from sliceit_drake.diagnosis.linear import LinearProblem
-from sliceit_drake.diagnosis.motion_menu import Scale, menu
-from sliceit_drake.diagnosis.next_experiment import next_experiment
 from sliceit_drake.diagnosis.registry import open_causes
-from sliceit_drake.diagnosis.sensitivity import Sensitivities, sensitivities
-from sliceit_drake.diagnosis.verdict import CLASS_ANGLE, reach_verdict
-from sliceit_drake.diagrams.calibrated_food import CalibratedFood
 from sliceit_drake.diagrams.run import prepare_run, simulate
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.records.slice_record import SliceRecord

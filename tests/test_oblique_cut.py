@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.food import Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.material import Material
-from sliceit_drake.cutting.mesh import MeshError, TetrahedralMesh
+from sliceit_drake.cutting.mesh.split import CutPlane
+from sliceit_drake.cutting.mesh.tetrahedra import MeshError, TetrahedralMesh
 from sliceit_drake.cutting.model import CuttingModel, Numerics, make_cutting_model
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
-from sliceit_drake.cutting.split import CutPlane
 
 HOLD = 0.012
 PLANES = {

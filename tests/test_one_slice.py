@@ -14,17 +14,17 @@ from sliceit_drake.calibration.noise import MarkovCovariance
 from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import dump_yaml
-from sliceit_drake.cutting.food import Cylinder, Food
+from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
+from sliceit_drake.cutting.foods.food import Cylinder, Food
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.causes.material import SkinToughness
-from sliceit_drake.diagnosis.one_slice_evidence import LEVEL, SliceEvidence, slice_evidence
-from sliceit_drake.diagnosis.one_slice_problem import estimate_slice_noise
-from sliceit_drake.diagnosis.one_slice_result import KIND
+from sliceit_drake.diagnosis.evidence.sensitivity import Column, Sensitivities
+from sliceit_drake.diagnosis.one_slice.slice_evidence import LEVEL, SliceEvidence, slice_evidence
+from sliceit_drake.diagnosis.one_slice.slice_fit import depth_blocks, fit_slice
+from sliceit_drake.diagnosis.one_slice.slice_problem import estimate_slice_noise
+from sliceit_drake.diagnosis.one_slice.slice_result import KIND
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
-from sliceit_drake.diagnosis.sensitivity import Column, Sensitivities
-from sliceit_drake.diagnosis.slice_fit import depth_blocks, fit_slice
 from sliceit_drake.diagnosis.slices import Meshing
-from sliceit_drake.diagrams.calibrated_food import CalibratedFood
 from sliceit_drake.records.slice_record import SliceRecord, write_record
 
 BROAD = Column("cause", "broad", "size", size=1.0)

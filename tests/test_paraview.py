@@ -9,11 +9,11 @@ import pytest
 
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.body import food_body
-from sliceit_drake.cutting.food import Cylinder, Food, make_food_model
+from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model
 from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.mesh.body import food_body
 from sliceit_drake.cutting.model import Numerics
-from sliceit_drake.diagrams.paraview import FoodFrames, write_series
+from sliceit_drake.diagrams.outputs.paraview import FoodFrames, write_series
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.resources import resource_path

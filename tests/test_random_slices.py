@@ -5,9 +5,9 @@ import dataclasses as dc
 import numpy as np
 import pytest
 
-from sliceit_drake.cutting import random_slices
-from sliceit_drake.cutting.food import Box
-from sliceit_drake.cutting.random_slices import (
+from sliceit_drake.cutting.foods.food import Box
+from studies.physics import random_slices
+from studies.physics.random_slices import (
     Outcome,
     cut_drawn,
     cut_random_slice,
@@ -28,7 +28,9 @@ def easy():
 
 
 def test_drawn_slices_are_cut_or_say_why_not():
-    outcomes = [cut_drawn(11, index) for index in range(4)]  # `sliceit study random` draws more.
+    outcomes = [
+        cut_drawn(11, index) for index in range(4)
+    ]  # `python -m studies random` draws more.
     assert not [o for o in outcomes if o.kind == "unexplained"], outcomes
     assert sum(o.kind == "cut" for o in outcomes) >= 2
     assert all(o.reason for o in outcomes if o.kind != "cut")
@@ -83,6 +85,6 @@ def test_the_page_counts_all_and_quotes_a_reason_once():
         Outcome("stopped", "at 2.0 s it stands", "cylinder"),
         Outcome("unexplained", "KeyError: 'x'", "box"),
     ]
-    page = random_slices_page(outcomes, 3, "sliceit study random")
+    page = random_slices_page(outcomes, 3, "python -m studies random")
     assert "| box | 1 | 0 | 1 | 1 |" in page and "| all | 1 | 0 | 2 | 1 |" in page
     assert "| 2 | at 1.0 s it stands |" in page and "| 1 | KeyError: 'x' |" in page

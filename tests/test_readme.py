@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from sliceit_drake.calibration import coverage
 from sliceit_drake.cli.main import main
 from sliceit_drake.diagrams.ports import ports_as_markdown
 from sliceit_drake.resources import load_module
+from studies.calibration import coverage
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "sliceit_drake"
@@ -120,7 +120,7 @@ def test_each_file_of_numbers_has_a_test_that_its_page_says_them():
 
 def test_the_page_on_coverage_is_that_of_its_replicates(tmp_path, monkeypatch):
     page = (ROOT / "docs/coverage.md").read_text()
-    (command,) = re.findall(r"^    (sliceit study coverage .*)$", page, re.M)
+    (command,) = re.findall(r"^    (python -m studies coverage .*)$", page, re.M)
     file = tmp_path / "coverage.jsonl"
     file.write_bytes((ROOT / "docs/coverage.jsonl").read_bytes())
     count = int(re.search(r"--replicates (\d+)", command)[1])

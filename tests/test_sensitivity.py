@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from test_causes import BOARD, DRAW, TURNED, bench, push
 
-from sliceit_drake.cli.identifiability import study
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
@@ -18,15 +17,16 @@ from sliceit_drake.diagnosis.causes.material import SkinToughness, ToughnessBySp
 from sliceit_drake.diagnosis.causes.mounting import BoardLaw
 from sliceit_drake.diagnosis.causes.sensor import SensorGain
 from sliceit_drake.diagnosis.clock import BLOCK, Clock
-from sliceit_drake.diagnosis.identifiability import ANGLE, Evidence, NoiseLevel
+from sliceit_drake.diagnosis.evidence.sensitivity import Column, Sensitivities, sensitivities
+from sliceit_drake.diagnosis.experiments.identifiability import ANGLE, Evidence, NoiseLevel
 from sliceit_drake.diagnosis.identifiability_report import Study, report
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.diagnosis.registry import load_cause
-from sliceit_drake.diagnosis.sensitivity import Column, Sensitivities, sensitivities
 from sliceit_drake.diagnosis.slices import Meshing
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.protocol import Condition, Protocol, load_protocol
+from studies.commands.identifiability import study
 
 Z = 2
 EVEN = Clock(longest=1)

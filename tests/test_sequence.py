@@ -7,13 +7,13 @@ import pytest
 from pydrake.systems.analysis import InitializeParams, Simulator
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
-from sliceit_drake.cutting.food import Ellipsoid, Remainder
+from sliceit_drake.cutting.foods.food import Ellipsoid, Remainder
 from sliceit_drake.diagrams.holder_arm import FINGERTIPS, HoldingArm
+from sliceit_drake.diagrams.outputs.sequence_report import slice_reports
 from sliceit_drake.diagrams.run import _imbalance, prepare_run, simulate
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
 from sliceit_drake.diagrams.sequence import SliceSequence
-from sliceit_drake.diagrams.sequence_report import slice_reports
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.cutting_system import COMPLETE
 

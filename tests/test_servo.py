@@ -10,8 +10,8 @@ from pydrake.systems.primitives import LogVectorOutput, TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
 from sliceit_drake.configuration import ConfigurationError, validate
-from sliceit_drake.diagrams.servo_study import servo_study
 from sliceit_drake.systems.servo import JOINTS, Servo, ServoConfig, ServoLaw
+from studies.robot.servo import servo_study
 
 PERIOD = 1e-3
 START = np.array([0.4, -1.2, 1.5, -1.8, -1.6, 0.3])

@@ -14,13 +14,13 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 
 from sliceit_drake.configuration import ConfigurationError, validate
-from sliceit_drake.cutting.food import Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
+from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model, start_pose
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan, Pose, Retract
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.agent_station import AgentStation
-from sliceit_drake.diagrams.calibrated_food import load_calibrated_food
 from sliceit_drake.diagrams.start import solve_start_joints
 from sliceit_drake.diagrams.station import MakeSlicingStation
 from sliceit_drake.stand_in import slicing_worlds

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
+from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.material import Material
-from sliceit_drake.cutting.mesh import (
+from sliceit_drake.cutting.mesh.manifold import bodies
+from sliceit_drake.cutting.mesh.split import CutPlane, split_mesh
+from sliceit_drake.cutting.mesh.tetrahedra import (
     MeshError,
     TetrahedralMesh,
     box_mesh,
     cylinder_mesh,
     ellipsoid_mesh,
 )
-from sliceit_drake.cutting.mesh_surface import bodies
 from sliceit_drake.cutting.model import Numerics, make_cutting_model
-from sliceit_drake.cutting.split import CutPlane, split_mesh
 
 BODIES = ("box", "cylinder", "ellipsoid")
 PLANES = 334

@@ -12,6 +12,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 
 from sliceit_drake.configuration import ConfigurationError, validate
+from sliceit_drake.cutting.foods.spring_food import SpringFood, calibrate_spring
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagrams.ports import check_station_ports
@@ -21,7 +22,7 @@ from sliceit_drake.diagrams.station import MakeSlicingStation
 from sliceit_drake.records.force_profile import load_force_profile
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
-from sliceit_drake.systems.spring_food import SpringCutter, SpringFood, calibrate_spring
+from sliceit_drake.systems.spring_cutter import SpringCutter
 
 PERIOD = 0.002
 FOOD = SpringFood(height=0.03, stiffness=500.0, damping=2.0, mass=0.01, time_step=1e-3)

@@ -489,8 +489,8 @@ def imports(module: str) -> set[str]:
 
 
 FINITE_ELEMENTS = (
-    *("batch", "cut_surface", "element_kernels", "geometry", "gradient", "kernels", "mesh"),
-    *("model", "mounting", "node_kernels", "parameters", "point_kernels", "sensitivity"),
+    *("batch", "cut_surface", "elements", "cut_geometry", "gradient", "precision", "tetrahedra"),
+    *("model", "mounting", "nodes", "parameters", "points", "sensitivity"),
     *("simulate", "solver", "split", "surface", "workspace", "material", "effects"),
 )
 
@@ -504,14 +504,16 @@ def test_the_world_of_curves_has_no_import_of_the_finite_elements(module):
 
 
 def test_the_world_of_curves_runs_without_mesh_model_and_solver(monkeypatch):
-    from sliceit_drake.cutting import food, mesh, model, solver
+    from sliceit_drake.cutting import model, solver
+    from sliceit_drake.cutting.foods import food
+    from sliceit_drake.cutting.mesh import tetrahedra
 
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("the finite elements were used")
 
     monkeypatch.setattr(solver.CuttingSolver, "__init__", refuse)
     monkeypatch.setattr(model.CuttingModel, "__init__", refuse)
-    monkeypatch.setattr(mesh.TetrahedralMesh, "__init__", refuse)
+    monkeypatch.setattr(tetrahedra.TetrahedralMesh, "__init__", refuse)
     monkeypatch.setattr(food.Cylinder, "mesh", refuse)
     record = Session(bench("push"), [make_effect("skin")], "curves", 1).record(0)
     assert record.force[:, 2].max() > 5.0
@@ -526,7 +528,7 @@ def test_effects_are_coded_without_the_parameter_groups_of_the_simulator():
     users = [
         file.stem
         for file in (PACKAGE / "stand_in").glob("*.py")
-        if "sliceit_drake.cutting.effects" in imports(file.stem)
+        if "sliceit_drake.cutting.foods.effects" in imports(file.stem)
     ]
     assert users == ["protocol"]
 

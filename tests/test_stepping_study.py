@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 
 from sliceit_drake.cli.main import main
-from sliceit_drake.cutting.food import Cylinder, Food
+from sliceit_drake.cutting.foods.food import Cylinder, Food
+from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.material import Material
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.simulate import check_energies
 from sliceit_drake.cutting.solver import CuttingSolver
-from sliceit_drake.cutting.stepping_study import (
+from sliceit_drake.diagrams.scenario import load_scenario
+from sliceit_drake.resources import resource_path
+from studies.physics.stepping import (
     STEPS,
     SteppingCase,
     energy_ratio,
@@ -26,9 +28,7 @@ from sliceit_drake.cutting.stepping_study import (
     stepping_study,
     true_step,
 )
-from sliceit_drake.diagrams.scenario import load_scenario
-from sliceit_drake.diagrams.stepping_report import held_half_way, sliced_food
-from sliceit_drake.resources import resource_path
+from studies.physics.stepping_report import held_half_way, sliced_food
 
 SMALL = Food(
     shape=Cylinder(rings=3, layers=[0.0, 0.004, 0.012]),

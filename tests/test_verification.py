@@ -6,19 +6,19 @@ from pathlib import Path
 
 import pytest
 
-from sliceit_drake.cutting.verification import check_patch
-from sliceit_drake.cutting.verification_contact import check_edge, check_friction, check_hold
-from sliceit_drake.diagrams import verification as study
-from sliceit_drake.diagrams.measured_curves import (
+from sliceit_drake.records.force_profile import load_force_profile
+from sliceit_drake.resources import resource_path
+from studies.physics import verification as study
+from studies.physics.bulk_checks import check_patch
+from studies.physics.contact_checks import check_edge, check_friction, check_hold
+from studies.physics.measured_curves import (
     FITTED,
     cut_measured_food,
     load_measured_foods,
     save_measured_foods,
 )
-from sliceit_drake.diagrams.verification import EDGE_CASES, FRICTION_CASES, food_numbers, limits
-from sliceit_drake.diagrams.verification_page import verification_page
-from sliceit_drake.records.force_profile import load_force_profile
-from sliceit_drake.resources import resource_path
+from studies.physics.verification import EDGE_CASES, FRICTION_CASES, food_numbers, limits
+from studies.physics.verification_page import verification_page
 
 PAGE = Path(__file__).parents[1] / "docs" / "verification.md"
 RESULTS = json.loads(PAGE.with_suffix(".json").read_text(encoding="utf-8"))
@@ -26,7 +26,7 @@ FOODS = load_measured_foods(resource_path("calibration/verification_foods.yaml")
 
 # The numbers are kept to six digits, and another machine rounds single precision elsewhere.
 ROUNDING = 1e-3
-REMEDY = "run: sliceit study verification --output docs/verification.md"
+REMEDY = "run: python -m studies verification --output docs/verification.md"
 
 
 def assert_same(found, stored, where="", tolerance=ROUNDING, scale=0.0):

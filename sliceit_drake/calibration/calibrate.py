@@ -20,11 +20,11 @@ from sliceit_drake.calibration.search import SearchResult, error_of, open_study,
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.calibration.uncertainty import estimate_posterior
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
+from sliceit_drake.cutting.foods.spring_food import calibrate_spring
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.cutting.workers import worker_processes
-from sliceit_drake.diagrams.calibrated_food import CalibratedFood
 from sliceit_drake.records.slice_record import SliceRecord
-from sliceit_drake.systems.spring_food import calibrate_spring
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

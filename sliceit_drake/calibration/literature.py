@@ -10,12 +10,12 @@ from sliceit_drake.calibration.record_target import EXCHANGE_PERIOD
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.batch import simulate_batch
-from sliceit_drake.cutting.distribution import ParameterDistribution, from_unit
-from sliceit_drake.cutting.food import make_food_model, start_pose
+from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
+from sliceit_drake.cutting.foods.distribution import ParameterDistribution, from_unit
+from sliceit_drake.cutting.foods.food import make_food_model, start_pose
+from sliceit_drake.cutting.foods.spring_food import calibrate_spring
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.parameters import with_parameters
-from sliceit_drake.diagrams.calibrated_food import CalibratedFood
-from sliceit_drake.systems.spring_food import calibrate_spring
 
 __all__ = ["food_from_literature"]
 

@@ -5,7 +5,11 @@ import dataclasses as dc
 import numpy as np
 
 from sliceit_drake.configuration import quantity
-from sliceit_drake.cutting.distribution import DETERMINED, PRIOR_DEVIATION, ParameterDistribution
+from sliceit_drake.cutting.foods.distribution import (
+    DETERMINED,
+    PRIOR_DEVIATION,
+    ParameterDistribution,
+)
 
 __all__ = ["Posterior"]
 

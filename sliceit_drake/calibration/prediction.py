@@ -17,8 +17,8 @@ from sliceit_drake.calibration.record_target import (
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.batch import BatchSimulator, BatchSlice
-from sliceit_drake.cutting.distribution import from_unit, to_unit
-from sliceit_drake.cutting.food import make_food_model
+from sliceit_drake.cutting.foods.distribution import from_unit, to_unit
+from sliceit_drake.cutting.foods.food import make_food_model
 from sliceit_drake.cutting.gradient import SliceAdjoint
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel, TimeStepError

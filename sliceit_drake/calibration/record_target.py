@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.food import Box, Cylinder, Ellipsoid, Food, start_pose
+from sliceit_drake.cutting.foods.food import Box, Cylinder, Ellipsoid, Food, start_pose
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from sliceit_drake.calibration.calibrate import Calibration
 from sliceit_drake.configuration import dump_yaml
-from sliceit_drake.cutting.distribution import ParameterDistribution
+from sliceit_drake.cutting.foods.distribution import ParameterDistribution
 
 __all__ = ["calibration_table", "figure", "food_table", "write_results"]
 

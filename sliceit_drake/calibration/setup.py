@@ -6,9 +6,9 @@ from pathlib import Path
 
 from sliceit_drake.configuration import ConfigurationError, choice, load_yaml, quantity
 from sliceit_drake.cutting.board import Board
-from sliceit_drake.cutting.food import Food, make_food_model
+from sliceit_drake.cutting.foods.food import Food, make_food_model
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.mesh import MeshError
+from sliceit_drake.cutting.mesh.tetrahedra import MeshError
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.parameters import POINT_PARAMETERS, parameter_names
 from sliceit_drake.resources import named_yaml, resource_path

@@ -144,7 +144,7 @@ def _from_literature(options: argparse.Namespace) -> int:
 
 def _show(name: str) -> int:
     from sliceit_drake.calibration.report import food_table
-    from sliceit_drake.diagrams.calibrated_food import load_calibrated_food
+    from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
 
     food = load_calibrated_food(name)
     print(f"{food.food.name}, from {', '.join(food.records)} ({food.date})")
@@ -216,10 +216,10 @@ def _calibrate(options: argparse.Namespace) -> int:
 
 def _start(name: str) -> "dict[str, float]":
     """Values of a calibrated food's parameters."""
-    from sliceit_drake.cutting.food import make_food_model
+    from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
+    from sliceit_drake.cutting.foods.food import make_food_model
     from sliceit_drake.cutting.model import Numerics
     from sliceit_drake.cutting.parameters import get_parameter
-    from sliceit_drake.diagrams.calibrated_food import load_calibrated_food
 
     given = load_calibrated_food(name)
     numerics = Numerics(flank_stiffness=given.flank_stiffness)

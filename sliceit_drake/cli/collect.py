@@ -232,7 +232,7 @@ def _put_fresh_food(options: argparse.Namespace, scenario: "Scenario") -> None:
 
 
 def _write(made: "Run", specimen: "Specimen", directory: Path, is_real: bool) -> None:
-    from sliceit_drake.diagrams.run_record import slice_record_of
+    from sliceit_drake.diagrams.outputs.slice_record_of_run import slice_record_of
     from sliceit_drake.records.metadata import slice_name
     from sliceit_drake.records.slice_record import write_record
 

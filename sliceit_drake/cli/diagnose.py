@@ -11,8 +11,8 @@ from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.cli.scenario_argument import here_or_shipped
 
 if TYPE_CHECKING:
+    from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
     from sliceit_drake.diagnosis.cause import Cause
-    from sliceit_drake.diagrams.calibrated_food import CalibratedFood
     from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = ["add_parser"]
@@ -98,9 +98,9 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 def _run(options: argparse.Namespace) -> int:
     """Runs the command."""
     from sliceit_drake.configuration import ConfigurationError
+    from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
     from sliceit_drake.diagnosis.cluster import on_cluster
     from sliceit_drake.diagnosis.registry import load_cause
-    from sliceit_drake.diagrams.calibrated_food import load_calibrated_food
     from sliceit_drake.output_folder import check_folder
     from sliceit_drake.records.validation import load_sessions
 
@@ -151,7 +151,7 @@ def _diagnose(
 ) -> int:
     """Diagnoses several slices."""
     from sliceit_drake.diagnosis.diagnose import diagnose, setup_of_food
-    from sliceit_drake.diagnosis.next_experiment import next_experiment
+    from sliceit_drake.diagnosis.experiments.next_experiment import next_experiment
 
     with StageBars() as bars:
         result = diagnose(
@@ -190,7 +190,7 @@ def _one_slice(
     """Says what one slice shows."""
     from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.diagnosis.input_checks import check_records
-    from sliceit_drake.diagnosis.one_slice import diagnose_slice, setup_of_slice
+    from sliceit_drake.diagnosis.one_slice.diagnose_slice import diagnose_slice, setup_of_slice
 
     if options.next_experiment is not None:
         raise ConfigurationError(

@@ -25,10 +25,10 @@ Slices are the paper's unless --slices is given: cucumber 15, tomato 5, potato 1
 policies cut the same slices. Everything here is simulated.
 
 Writes a line for each slice to --output, a .jsonl file, and goes on where it is.
-`sliceit study slicing` compares the policies of both simulators.
+`python -m studies slicing` compares the policies of both simulators.
 """
 SLICES = 25
-"""That a process cuts: pydrake frees no station that it has built (benchmarks/endurance.py)."""
+"""That a process cuts: pydrake frees no station that it has built (studies/robot/endurance.py)."""
 WORLDS = ("stand_in", "curves")
 FOODS = ("cucumber", "tomato", "potato", "carrot")
 

@@ -58,7 +58,7 @@ def _run(options: argparse.Namespace) -> int:
     import numpy as np
     from tqdm import tqdm
 
-    from sliceit_drake.diagrams.paraview import FoodFrames, write_series
+    from sliceit_drake.diagrams.outputs.paraview import FoodFrames, write_series
     from sliceit_drake.diagrams.run import prepare_run, simulate
     from sliceit_drake.diagrams.scenario import load_scenario
     from sliceit_drake.tables import read_columns

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 from sliceit_drake.cli.scenario_argument import add_scenario_arguments, find_file, scenario_of
 
 if TYPE_CHECKING:
-    from sliceit_drake.diagrams.hardware_run import HardwareRun
     from sliceit_drake.diagrams.run import Run
     from sliceit_drake.diagrams.scenario import Scenario
     from sliceit_drake.hardware.checks import Check
     from sliceit_drake.hardware.client import RobotClient
     from sliceit_drake.hardware.configuration import HardwareConfig
     from sliceit_drake.hardware.rtde_link import RobotLink
+    from sliceit_drake.robot_run.hardware_run import HardwareRun
 
 __all__ = [
     "add_parser",
@@ -124,7 +124,7 @@ def _run(options: argparse.Namespace) -> int:
     scenario = scenario_of(options)
     config = robot_config(options)
 
-    from sliceit_drake.diagrams.run_record import slice_record_of
+    from sliceit_drake.diagrams.outputs.slice_record_of_run import slice_record_of
     from sliceit_drake.records.slice_record import write_record
 
     directory = options.output or Path("output") / f"{scenario.name}_robot"
@@ -146,8 +146,8 @@ def run_confirmed(
     Returns:
         The run; None if the robot was not ready or the operator did not confirm.
     """
-    from sliceit_drake.diagrams.hardware_run import prepare_hardware_run
     from sliceit_drake.diagrams.run import make_meshcat
+    from sliceit_drake.robot_run.hardware_run import prepare_hardware_run
 
     if options.move_to_start and not options.dry_run:
         if not move_confirmed(options, scenario, config):
@@ -178,8 +178,8 @@ def move_confirmed(
     Returns:
         False if the robot was not ready or did not move, or the operator did not confirm.
     """
-    from sliceit_drake.diagrams.hardware_run import prepare_hardware_run
-    from sliceit_drake.diagrams.move_to_start import MoveToStart
+    from sliceit_drake.robot_run.hardware_run import prepare_hardware_run
+    from sliceit_drake.robot_run.move_to_start import MoveToStart
 
     with _connected(options, config) as client:
         hardware = prepare_hardware_run(scenario, config, client, options.pace)
@@ -215,9 +215,9 @@ def touch_board(
     Raises:
         ConfigurationError: The board is not where it is expected.
     """
-    from sliceit_drake.diagrams.board_touch import BoardTouch, check_height
-    from sliceit_drake.diagrams.hardware_run import prepare_hardware_run
     from sliceit_drake.hardware.guarded_touch import TouchError
+    from sliceit_drake.robot_run.board_touch import BoardTouch, check_height
+    from sliceit_drake.robot_run.hardware_run import prepare_hardware_run
 
     field = "scenario.board.height" if config.board_height is None else "board_height"
     if config.board_height is None:
@@ -306,7 +306,7 @@ def _slice(hardware: "HardwareRun", duration: float, directory: Path) -> "Run":
     """Runs, writes and reports."""
     from tqdm import tqdm
 
-    from sliceit_drake.diagrams.hardware_run import write_hardware_outputs
+    from sliceit_drake.robot_run.hardware_run import write_hardware_outputs
 
     with tqdm(
         total=duration,

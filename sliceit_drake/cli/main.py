@@ -23,22 +23,19 @@ from sliceit_drake.cli import (
     optimize_motion,
     record,
     records,
-    score,
     simulate,
-    study,
     train,
 )
 from sliceit_drake.cutting.warp_start import start_warp
 from sliceit_drake.output_folder import check_output
 
-__all__ = ["main", "make_parser"]
+__all__ = ["main", "make_parser", "run_program"]
 
 GROUPS = {
     "run a slice": (simulate, hardware, emulate, collect),
     "records and foods": (record, records, calibrate, diagnose),
     "motions and policies": (train, evaluate, optimize_motion),
     "look at it": (diagram, export),
-    "study the simulation": (study, score),
 }
 BAD_INPUT = 2
 INTERRUPTED = 130
@@ -97,9 +94,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0 on success, 1 if a run stopped early, 2 for bad input, 130 for Ctrl-C outside a run (and
         for a polite kill, or a terminal that is closed).
     """
+    return run_program(make_parser(), arguments)
+
+
+def run_program(parser: argparse.ArgumentParser, arguments: Sequence[str] | None = None) -> int:
+    """Parses the command line and runs the command; bad input becomes a message.
+
+    Args and Returns: as `main`.
+    """
     # The arrays are small; threads of the linear algebra library would only wait beside the run.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    options = make_parser().parse_args(arguments)
+    options = parser.parse_args(arguments)
     try:
         with _ended_by_signals():
             if isinstance(getattr(options, "output", None), Path):
@@ -143,7 +148,7 @@ def _ended_by_signals() -> Iterator[None]:
 def _is_bad_input(error: Exception) -> bool:
     """Whether an error tells a user what to change; anything else is a fault of ours."""
     from sliceit_drake.configuration import ConfigurationError
-    from sliceit_drake.cutting.mesh import MeshError
+    from sliceit_drake.cutting.mesh.tetrahedra import MeshError
     from sliceit_drake.cutting.model import TimeStepError
     from sliceit_drake.cutting.solver import CuttingError
     from sliceit_drake.hardware.client import RobotUnavailableError

@@ -56,7 +56,7 @@ def _run(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from sliceit_drake.configuration import ConfigurationError, dump_yaml, validate
-    from sliceit_drake.cutting.food import Food, make_food_model
+    from sliceit_drake.cutting.foods.food import Food, make_food_model
     from sliceit_drake.cutting.motion import Hold, MotionPlan, PressAndDraw, Retract
     from sliceit_drake.cutting.motion_optimization import MotionLimits, optimize_motion
 

@@ -127,8 +127,8 @@ def _protocol(options: argparse.Namespace) -> "Protocol":
     import yaml
 
     from sliceit_drake.configuration import ConfigurationError
-    from sliceit_drake.cutting.effects import Effects
-    from sliceit_drake.cutting.food import Food
+    from sliceit_drake.cutting.foods.effects import Effects
+    from sliceit_drake.cutting.foods.food import Food
     from sliceit_drake.diagrams.scenario import load_scenario
     from sliceit_drake.stand_in.protocol import load_protocol, protocol_of_scenario
 

@@ -84,7 +84,7 @@ def _run(options: argparse.Namespace) -> int:
         viewing_instructions,
         wait_for_browser,
     )
-    from sliceit_drake.diagrams.paraview import FoodFrames, write_series
+    from sliceit_drake.diagrams.outputs.paraview import FoodFrames, write_series
     from sliceit_drake.diagrams.run import make_meshcat, prepare_run, simulate, write_outputs
 
     if options.duration is not None and not options.duration > 0.0:

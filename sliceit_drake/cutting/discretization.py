@@ -5,7 +5,7 @@ import dataclasses as dc
 import numpy as np
 
 from sliceit_drake.cutting.board import Board
-from sliceit_drake.cutting.food import Food, make_food_model
+from sliceit_drake.cutting.foods.food import Food, make_food_model
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import Motion

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from sliceit_drake.cutting.kernel_types import ACCUMULATED, PARAMETERS
+from sliceit_drake.cutting.kernels.types import ACCUMULATED, PARAMETERS
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.mounting import Mounting
 from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError

@@ -7,13 +7,13 @@ from typing import Any, Self
 import numpy as np
 
 from sliceit_drake.configuration import choice, quantity
-from sliceit_drake.cutting.effects import Effects
-from sliceit_drake.cutting.geometry import CutGeometry, make_cut_geometry
-from sliceit_drake.cutting.kernel_types import PARAMETERS
+from sliceit_drake.cutting.foods.effects import Effects
+from sliceit_drake.cutting.foods.material import Material
+from sliceit_drake.cutting.kernels.types import PARAMETERS
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.material import Material
-from sliceit_drake.cutting.mesh import TetrahedralMesh
-from sliceit_drake.cutting.split import CutPlane
+from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry, make_cut_geometry
+from sliceit_drake.cutting.mesh.split import CutPlane
+from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh
 
 __all__ = [
     "GRAVITY",

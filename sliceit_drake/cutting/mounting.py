@@ -5,7 +5,7 @@ import dataclasses as dc
 import numpy as np
 
 from sliceit_drake.cutting.board import Board
-from sliceit_drake.cutting.effects import Effects
+from sliceit_drake.cutting.foods.effects import Effects
 
 __all__ = ["Mounting"]
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from sliceit_drake.cutting.gradient import SliceGradient
-from sliceit_drake.cutting.kernel_types import PARAMETERS
+from sliceit_drake.cutting.kernels.types import PARAMETERS
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.workspace import parameter_row
 

@@ -5,7 +5,7 @@ import threading
 
 import numpy as np
 
-from sliceit_drake.cutting.kernel_types import LANES
+from sliceit_drake.cutting.kernels.types import LANES
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose, small_turn
 from sliceit_drake.cutting.workspace import Workspace, parameter_row

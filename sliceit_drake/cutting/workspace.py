@@ -8,8 +8,8 @@ import numpy as np
 import warp as wp
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.kernel_types import ACCUMULATED, GATHER, LANES, PARAMETERS
-from sliceit_drake.cutting.kernels import kernels
+from sliceit_drake.cutting.kernels.precision import kernels
+from sliceit_drake.cutting.kernels.types import ACCUMULATED, GATHER, LANES, PARAMETERS
 from sliceit_drake.cutting.model import CuttingModel, TimeStepError
 
 __all__ = ["DIRECT", "Workspace", "parameter_row"]

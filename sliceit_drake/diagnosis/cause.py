@@ -29,7 +29,7 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.model import CuttingModel
 
 if TYPE_CHECKING:
-    from sliceit_drake.diagnosis.sensitivity import RecordSensitivity
+    from sliceit_drake.diagnosis.evidence.sensitivity import RecordSensitivity
 
 __all__ = [
     "EXPERIMENTS",

@@ -20,7 +20,7 @@ import numpy as np
 from sliceit_drake.cluster import CONNECT, connected
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.board import Board
-from sliceit_drake.cutting.geometry import CutGeometry
+from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.diagnosis.clock import Stretches
 

@@ -12,22 +12,28 @@ import numpy as np
 
 from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
-from sliceit_drake.cutting.food import make_food_model
+from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
+from sliceit_drake.cutting.foods.food import make_food_model
 from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.clock import Clock
-from sliceit_drake.diagnosis.confirm import Confirmation, confirm
-from sliceit_drake.diagnosis.experiment_proposal import NextExperiment
-from sliceit_drake.diagnosis.held_out import HeldOutGain, held_out_gain, held_out_share
+from sliceit_drake.diagnosis.evidence.confirm import Confirmation, confirm
+from sliceit_drake.diagnosis.evidence.held_out import HeldOutGain, held_out_gain, held_out_share
+from sliceit_drake.diagnosis.evidence.linear import LinearProblem
+from sliceit_drake.diagnosis.evidence.own_values import at_own_values
+from sliceit_drake.diagnosis.evidence.sensitivity import Sensitivities, sensitivities
+from sliceit_drake.diagnosis.evidence.verdict import (
+    ALARM,
+    Finding,
+    Verdict,
+    foretold,
+    reach_verdict,
+)
+from sliceit_drake.diagnosis.experiments.proposal import NextExperiment
 from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
-from sliceit_drake.diagnosis.linear import LinearProblem
-from sliceit_drake.diagnosis.own_values import at_own_values
 from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import is_users, open_causes
-from sliceit_drake.diagnosis.sensitivity import Sensitivities, sensitivities
 from sliceit_drake.diagnosis.slices import Meshing
-from sliceit_drake.diagnosis.verdict import ALARM, Finding, Verdict, foretold, reach_verdict
-from sliceit_drake.diagrams.calibrated_food import CalibratedFood
 from sliceit_drake.records.slice_record import SliceRecord
 
 if TYPE_CHECKING:

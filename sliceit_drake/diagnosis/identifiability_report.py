@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from sliceit_drake.diagnosis.cause import Cause
-from sliceit_drake.diagnosis.identifiability import ANGLE, SHIFT, SHOWS, Identifiability
-from sliceit_drake.diagnosis.sensitivity import Sensitivities
+from sliceit_drake.diagnosis.evidence.sensitivity import Sensitivities
+from sliceit_drake.diagnosis.experiments.identifiability import ANGLE, SHIFT, SHOWS, Identifiability
 
 __all__ = ["Study", "classes", "plot_angles", "report", "short"]
 
@@ -117,7 +117,7 @@ HEAD = """\
 
 Which causes of a misfit a set of slices can tell apart, computed before anything is measured:
 
-    sliceit study identifiability --output docs/identifiability.md --figure {figure}
+    python -m studies identifiability --output docs/identifiability.md --figure {figure}
 
 For each cause the change of the predicted forces at a plausible size; less what free base
 parameters can take up ({base}), and differences from slice to slice (5 % in

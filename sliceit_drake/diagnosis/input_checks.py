@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.food import Box, Cylinder, Ellipsoid, Food
+from sliceit_drake.cutting.foods.food import Box, Cylinder, Ellipsoid, Food
 from sliceit_drake.diagnosis.slices import is_bare
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.records.validation import check_record

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
-from sliceit_drake.diagnosis.held_out import fitted_changes
+from sliceit_drake.diagnosis.evidence.held_out import fitted_changes
 from sliceit_drake.diagnosis.html_page import html_page, image
 
 if TYPE_CHECKING:

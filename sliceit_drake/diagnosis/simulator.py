@@ -205,7 +205,7 @@ def cutting_source() -> bytes:
     """Digest of the code that a simulation runs through."""
     folder = Path(sliceit_drake.cutting.__file__).parent
     h = hashlib.sha256()
-    for file in (*sorted(folder.glob("*.py")), Path(__file__)):
+    for file in (*sorted(folder.rglob("*.py")), Path(__file__)):
         h.update(file.read_bytes())
     return h.digest()
 

@@ -10,7 +10,7 @@ from sliceit_drake.calibration.record_target import food_of, knife_of, poses_in_
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.board import Board
-from sliceit_drake.cutting.food import make_food_model, start_pose
+from sliceit_drake.cutting.foods.food import make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import GRAVITY, CuttingModel, Numerics
 from sliceit_drake.cutting.simulate import board_wrenches

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.board import Board, edge_contact_positions
-from sliceit_drake.cutting.food import start_pose
+from sliceit_drake.cutting.foods.food import start_pose
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver

@@ -1,6 +1,6 @@
 """What a slice record says of the knife and of the food's shape, from their descriptions."""
 
-from sliceit_drake.cutting.food import Box, Cylinder, Ellipsoid, Food
+from sliceit_drake.cutting.foods.food import Box, Cylinder, Ellipsoid, Food
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.records.metadata import KnifeFacts
 

@@ -16,20 +16,24 @@ from pydrake.systems.analysis import Simulator, SimulatorStatus
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.discretization import estimate_discretization_error
-from sliceit_drake.cutting.food import Food, start_pose
-from sliceit_drake.cutting.mesh import MeshError
+from sliceit_drake.cutting.foods.food import Food, start_pose
+from sliceit_drake.cutting.mesh.tetrahedra import MeshError
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Motion
 from sliceit_drake.cutting.solver import CuttingError
-from sliceit_drake.diagrams.comparison import Comparison, can_compare, compare_with_measurement
 from sliceit_drake.diagrams.contact_margin import ContactMargin, check_contact_margin
-from sliceit_drake.diagrams.figures import CONTACT_THRESHOLD, plot_force
 from sliceit_drake.diagrams.live_view import LiveControls
-from sliceit_drake.diagrams.record import Record
+from sliceit_drake.diagrams.outputs.figures import CONTACT_THRESHOLD, plot_force
+from sliceit_drake.diagrams.outputs.measurement_comparison import (
+    Comparison,
+    can_compare,
+    compare_with_measurement,
+)
+from sliceit_drake.diagrams.outputs.run_log import Record
+from sliceit_drake.diagrams.outputs.sequence_report import plot_sequence, slice_reports
+from sliceit_drake.diagrams.outputs.snapshot import Snapshot, take_snapshot
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram, ScenarioDiagram
-from sliceit_drake.diagrams.sequence_report import plot_sequence, slice_reports
-from sliceit_drake.diagrams.snapshot import Snapshot, take_snapshot
 from sliceit_drake.diagrams.station import SlicingStation
 from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile

@@ -8,13 +8,14 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from sliceit_drake.configuration import ConfigurationError, choice, load_yaml, quantity, validate
 from sliceit_drake.cutting.board import Board
-from sliceit_drake.cutting.effects import Effects
-from sliceit_drake.cutting.food import Food
+from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
+from sliceit_drake.cutting.foods.effects import Effects
+from sliceit_drake.cutting.foods.food import Food
+from sliceit_drake.cutting.foods.spring_food import SpringFood
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import MotionPlan
-from sliceit_drake.diagrams.calibrated_food import load_calibrated_food
-from sliceit_drake.diagrams.named_knife import load_knife
+from sliceit_drake.cutting.named_knife import load_knife
 from sliceit_drake.diagrams.robot import RobotConfig
 from sliceit_drake.diagrams.sequence import SliceSequence
 from sliceit_drake.systems.agent import AgentConfig
@@ -22,7 +23,6 @@ from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
 from sliceit_drake.systems.contact_monitor import ContactMonitorConfig
 from sliceit_drake.systems.policy import PolicyConfig
-from sliceit_drake.systems.spring_food import SpringFood
 from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig
 
 __all__ = ["Measurement", "Placement", "Preparation", "Scenario", "Start", "load_scenario"]

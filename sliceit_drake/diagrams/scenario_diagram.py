@@ -5,7 +5,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSyst
 
 from sliceit_drake.cutting.motion import Motion
 from sliceit_drake.diagrams.agent_station import add_agent
-from sliceit_drake.diagrams.record import Record, Recorder, add_recorder
+from sliceit_drake.diagrams.outputs.run_log import Record, Recorder, add_recorder
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.station import MakeSlicingStation
 from sliceit_drake.diagrams.station_interface import Station

@@ -12,7 +12,8 @@ from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import Demultiplexer
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.food import Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.spring_food import SpringFood
 from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.holder_arm import add_holding_arm
@@ -40,7 +41,7 @@ from sliceit_drake.systems.knife_force import KnifeForceSystem
 from sliceit_drake.systems.knife_kinematics import BoardContact, KnifeKinematics
 from sliceit_drake.systems.motion_sources import placed_motion
 from sliceit_drake.systems.servo import JOINTS
-from sliceit_drake.systems.spring_food import SpringCutter, SpringFood
+from sliceit_drake.systems.spring_cutter import SpringCutter
 from sliceit_drake.systems.spring_visualizer import SpringVisualizer
 from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
 from sliceit_drake.systems.wrench_sensor import WrenchSensor

@@ -8,13 +8,13 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError, choice, quantity
 from sliceit_drake.cutting.board import Board
-from sliceit_drake.cutting.food import Cylinder, Food, make_food_model
+from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood, load_calibrated_food
+from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.parameters import with_parameters
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.agent_gains import AgentGains
 from sliceit_drake.diagrams.agent_station import AgentStation
-from sliceit_drake.diagrams.calibrated_food import CalibratedFood, load_calibrated_food
 from sliceit_drake.diagrams.scenario import Scenario, Start
 from sliceit_drake.diagrams.station import MakeSlicingStation
 from sliceit_drake.learning.ending import Limits

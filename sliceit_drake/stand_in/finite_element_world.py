@@ -1,6 +1,6 @@
 """The finite-element world: the base model on a finer mesh, with effects coded beside it.
 
-Of `cutting` it takes the base model alone, with all parameter groups of `cutting.effects` at their
+Of `cutting` it takes the base model alone, with all parameter groups of `cutting.foods.effects` at
 null. What an effect changes, it changes from outside: places of the mesh's vertices, factors on
 toughness and stiffness of the tissue, in each stretch of the path the knife's pose and factors on
 toughness and friction, and at the end the forces by mechanism.
@@ -16,9 +16,9 @@ import numpy as np
 
 from sliceit_drake.configuration import quantity
 from sliceit_drake.cutting.board import board_wrench
-from sliceit_drake.cutting.cut_surface import depth_below, distance_inside
-from sliceit_drake.cutting.food import Box, Cylinder, Food, start_pose
-from sliceit_drake.cutting.mesh import TetrahedralMesh
+from sliceit_drake.cutting.foods.food import Box, Cylinder, Food, start_pose
+from sliceit_drake.cutting.mesh.cut_surface import depth_below, distance_inside
+from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh
 from sliceit_drake.cutting.model import CuttingModel, Numerics, PointScales, make_cutting_model
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.simulate import (

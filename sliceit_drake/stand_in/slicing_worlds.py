@@ -25,10 +25,10 @@ import numpy as np
 from pydrake.multibody.tree import RigidBody
 
 from sliceit_drake.configuration import ConfigurationError, quantity
-from sliceit_drake.cutting.food import Cylinder, Food
+from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood, load_calibrated_food
+from sliceit_drake.cutting.foods.food import Cylinder, Food
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.diagrams.agent_gains import AgentGains
-from sliceit_drake.diagrams.calibrated_food import CalibratedFood, load_calibrated_food
 from sliceit_drake.diagrams.scenario import Placement, Scenario, Start
 from sliceit_drake.stand_in.curve_cutter import CurveCutter, CurveFood
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
@@ -77,7 +77,7 @@ DELAY = 4e-3
 
 @dc.dataclass(frozen=True)
 class _Hidden:
-    """Effects of the stand-in that no training has, in the parameter groups of `cutting.effects`.
+    """Effects of the stand-in that no training has, in parameter groups of `cutting.foods.effects`.
 
     Attributes:
         rate: Exponent of the toughness by the edge's speed.

@@ -7,10 +7,10 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import BasicVector, Context, State
 
+from sliceit_drake.cutting.mesh.surface import FoodSurface, food_surface
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.simulate import check_clear, check_energies, check_in_plane
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
-from sliceit_drake.cutting.surface import FoodSurface, food_surface
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 
 __all__ = ["COMPLETE", "ENERGY_NAMES", "LEDGER_NAMES", "CuttingSystem"]

@@ -5,7 +5,7 @@ from pydrake.geometry import Cylinder, Meshcat, Rgba
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, EventStatus, LeafSystem
 
-from sliceit_drake.systems.spring_food import SpringFood
+from sliceit_drake.cutting.foods.spring_food import SpringFood
 
 __all__ = ["SpringVisualizer"]
 

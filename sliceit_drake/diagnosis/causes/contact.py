@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sliceit_drake.cutting.effects import Bluntness
+from sliceit_drake.cutting.foods.effects import Bluntness
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan, SliceFacts
 from sliceit_drake.diagnosis.causes.material import tougher

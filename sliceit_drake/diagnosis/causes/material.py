@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sliceit_drake.cutting.effects import Core, Relaxation, Skin, SlicePush, ToughnessRate
+from sliceit_drake.cutting.foods.effects import Core, Relaxation, Skin, SlicePush, ToughnessRate
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.diagnosis.cause import Cause, CauseParameter, ForceSeries, Scan, SliceFacts
 

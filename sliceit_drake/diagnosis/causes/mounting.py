@@ -9,10 +9,10 @@ from scipy.signal import lfilter
 
 from sliceit_drake.cutting.model import CuttingModel, PointScales
 from sliceit_drake.diagnosis.cause import Cause, CauseParameter, ForceSeries, Scan, SliceFacts
-from sliceit_drake.diagnosis.jumps import largest_jump, unlike_others
+from sliceit_drake.diagnosis.evidence.jumps import largest_jump, unlike_others
 
 if TYPE_CHECKING:
-    from sliceit_drake.diagnosis.sensitivity import RecordSensitivity
+    from sliceit_drake.diagnosis.evidence.sensitivity import RecordSensitivity
 
 __all__ = [
     "ArmCompliance",

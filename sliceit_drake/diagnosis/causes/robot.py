@@ -9,10 +9,10 @@ import numpy as np
 
 from sliceit_drake.cutting.model import GRAVITY
 from sliceit_drake.diagnosis.cause import Cause, CauseParameter, ForceSeries, Scan, SliceFacts
-from sliceit_drake.diagnosis.periodicity import strongest_frequencies
+from sliceit_drake.diagnosis.evidence.periodicity import strongest_frequencies
 
 if TYPE_CHECKING:
-    from sliceit_drake.diagnosis.sensitivity import RecordSensitivity
+    from sliceit_drake.diagnosis.evidence.sensitivity import RecordSensitivity
 
 __all__ = ["StickSlip", "ToolWeight", "Vibration"]
 

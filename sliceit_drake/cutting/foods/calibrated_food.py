@@ -1,0 +1,83 @@
+"""Calibrated foods: what a calibration leaves, in files that scenarios load by name."""
+
+import copy
+import dataclasses as dc
+from pathlib import Path
+
+from sliceit_drake.configuration import ConfigurationError, load_yaml, quantity
+from sliceit_drake.cutting.foods.distribution import ParameterDistribution
+from sliceit_drake.cutting.foods.effects import Compliance
+from sliceit_drake.cutting.foods.food import Food
+from sliceit_drake.cutting.foods.spring_food import SpringFood
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.resources import named_yaml, resource_path
+
+__all__ = ["CalibratedFood", "calibrated_food_names", "load_calibrated_food"]
+
+FOLDER = "calibration/foods"
+
+
+@dc.dataclass
+class CalibratedFood:
+    """A food with the parameters that a calibration found, and how sure it is of them.
+
+    Attributes:
+        food: With the calibrated values; its shape is that of the records.
+        knife: That the records were taken with, as far as known.
+        distribution: Of the parameters; randomisation draws from it.
+        spring: The spring-only baseline from the same records, or null.
+        records: That it was calibrated on, or the sources of a food without records.
+        date, command: When and how.
+        note: What it cannot be used for.
+    """
+
+    food: Food = dc.field(default_factory=Food)
+    knife: Knife = dc.field(default_factory=Knife)
+    flank_stiffness: float = quantity(
+        4.0, "E/h", low=0.01, high=1e3, doc="Of the numerics: a parameter of the food as well."
+    )
+    distribution: ParameterDistribution = dc.field(default_factory=ParameterDistribution)
+    spring: SpringFood | None = None
+    rms_error: float | None = quantity(None, "N", low=0.0, high=1e6, doc="On the records.")
+    held_out_error: float | None = quantity(
+        None, "N", low=0.0, high=1e6, doc="On blocks of depth that were held out, each in turn."
+    )
+    records: list[str] = dc.field(default_factory=list)
+    date: str = ""
+    command: str = ""
+    note: str = ""
+
+    def apply_to(self, food: Food) -> Food:
+        """A food of the given shape with the calibrated material and effects.
+
+        The compliance of arm and holder is left out: it belongs to the robot of the records.
+        """
+        effects = dc.replace(copy.deepcopy(self.food.effects), compliance=Compliance())
+        return dc.replace(food, material=copy.deepcopy(self.food.material), effects=effects)
+
+
+def calibrated_food_names() -> list[str]:
+    """Foods that ship calibrated."""
+    return sorted(path.stem for path in resource_path(FOLDER).glob("*.yaml"))
+
+
+def load_calibrated_food(name: str | Path) -> CalibratedFood:
+    """Reads a calibrated food.
+
+    Args:
+        name: A food of `calibrated_food_names`, or a YAML file.
+
+    Raises:
+        ConfigurationError: Naming file, field and fix.
+    """
+    file = named_yaml(name, FOLDER)
+    if file is None:
+        raise ConfigurationError(
+            f"{name!r} is not calibrated; there are {', '.join(calibrated_food_names())}",
+            field="calibration",
+            fix="Name one of them, or give the food.yaml of a calibration.",
+        )
+    food = load_yaml(CalibratedFood, file)
+    assert isinstance(food, CalibratedFood)
+    food.food.look_beside(file)
+    return food

@@ -1,0 +1,1 @@
+"""The Warp kernels of the food, by what they run over."""

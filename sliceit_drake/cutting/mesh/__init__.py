@@ -1,0 +1,1 @@
+"""Meshes: tetrahedra, their split by the cut, and the surfaces that are drawn."""

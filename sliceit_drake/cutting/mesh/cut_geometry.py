@@ -1,0 +1,285 @@
+"""Everything about one cut that neither material nor knife nor step decides."""
+
+import dataclasses as dc
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.kernels.types import LANES
+from sliceit_drake.cutting.mesh.cut_surface import (
+    EdgeTables,
+    depth_below,
+    distance_inside,
+    edge_tables,
+)
+from sliceit_drake.cutting.mesh.split import CutPlane, SplitMesh, split_mesh
+from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh, boundary_faces
+
+__all__ = ["CutGeometry", "make_cut_geometry"]
+
+LEAST_SHARE = 0.05
+"""Least share of a split element's stiffness that a copy gets; the other gets the rest.
+
+A corner of material that is much smaller than its element would be held by a share of the stiffness
+that vanishes as its size cubed, but pushed by the edge in proportion to its size: it would invert.
+Volume, mass and weight keep their true shares, and the two copies together their stiffness.
+"""
+
+
+@dc.dataclass
+class CutGeometry:
+    """One cut through one mesh. Arrays are NumPy, double precision, in the frame C of the cut.
+
+    Only nodes and elements that can move are computed; `computed` maps them to `split`.
+
+    Attributes:
+        split: The two half bodies.
+        X_FC_rotation, X_FC_position: Pose of C in the food frame.
+        up: Opposite of gravity [3].
+        computed: Node of `split` for each computed node [N].
+        moving: Computed nodes that are not held [K].
+        nodes: Rest positions of computed nodes [N, 3].
+        tetrahedra: Computed nodes of the elements [T, 4].
+        inverse: Inverse rest edges [T, 3, 3], 1/m.
+        stiff_volume: Volume of the elements that is stiff [T], m^3.
+        node_volume: Material volume lumped to the nodes [N], m^3.
+        weight_volume: The same for weight, which acts at the material's centroids [N], m^3.
+        vertex_volume: Lumped volume of each node's vertex in the uncut mesh [N], m^3.
+        element_distance: Distance of the elements' centroids from the outline, inwards [T], metres.
+        tables: Edge tables of the cut points.
+        point_nodes, point_weights: Embedding of cut points [P, 4] (minus ends, plus ends), [P, 2].
+        point_depth: Depth of the cut points below the outline [P], metres.
+        point_distance: Their distance from it, inwards [P], metres.
+        board_area: Area of food surface that may rest on the board, by node [N], m^2.
+        board: Board plane n . x = d: (n, d) [4].
+        element_size: Mean edge length of computed elements, metres.
+    """
+
+    split: SplitMesh
+    X_FC_rotation: np.ndarray
+    X_FC_position: np.ndarray
+    up: np.ndarray
+    computed: np.ndarray
+    moving: np.ndarray
+    nodes: np.ndarray
+    tetrahedra: np.ndarray
+    inverse: np.ndarray
+    stiff_volume: np.ndarray
+    node_volume: np.ndarray
+    weight_volume: np.ndarray
+    vertex_volume: np.ndarray
+    element_distance: np.ndarray
+    tables: EdgeTables
+    point_nodes: np.ndarray
+    point_weights: np.ndarray
+    point_depth: np.ndarray
+    point_distance: np.ndarray
+    board_area: np.ndarray
+    board: np.ndarray
+    element_size: float
+
+    @property
+    def element_count(self) -> int:
+        """Elements that are computed."""
+        return len(self.tetrahedra)
+
+    @functools.cached_property
+    def section_area(self) -> float:
+        """Area of the cut, m^2."""
+        return float(self.tables.area.sum())
+
+    @functools.cached_property
+    def top(self) -> float:
+        """Height of the highest cut point in C, metres."""
+        return float(self.split.points[:, 2].max())
+
+    @functools.cached_property
+    def bottom(self) -> float:
+        """Height of the lowest cut point in C, metres."""
+        return float(self.split.points[:, 2].min())
+
+    @functools.cached_property
+    def span(self) -> tuple[float, float]:
+        """Least and greatest coordinate of the cut points along the edge, metres."""
+        x = self.split.points[:, 0]
+        return float(x.min()), float(x.max())
+
+    @functools.cached_property
+    def blocks(self) -> np.ndarray:
+        """Nodes of the elements, eight an entry [B, 4, LANES]; filled up with the last element."""
+        return self.in_blocks(self.tetrahedra).transpose(0, 2, 1)
+
+    @functools.cached_property
+    def shape(self) -> np.ndarray:
+        """Inverse rest edges by block, row major [B, 9, LANES]."""
+        return self.in_blocks(self.inverse.reshape(-1, 9)).transpose(0, 2, 1)
+
+    def in_blocks(self, values: np.ndarray) -> np.ndarray:
+        """Values of the elements [T, ...] as [B, LANES, ...]."""
+        count = self.element_count
+        fill = np.minimum(np.arange(-(-count // LANES) * LANES), count - 1)
+        return values[fill].reshape(-1, LANES, *values.shape[1:])
+
+    def to_cut_frame(self, p_F: np.ndarray) -> np.ndarray:
+        """Points [..., 3] from F to C."""
+        return (np.asarray(p_F) - self.X_FC_position) @ self.X_FC_rotation
+
+    @functools.cached_property
+    def _gradient_products(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lengths [T, 4] and scalar products [T, 4, 4] of the shape functions' gradients."""
+        gradients = np.concatenate([-self.inverse.sum(1, keepdims=True), self.inverse], axis=1)
+        products = gradients @ gradients.transpose(0, 2, 1)
+        return np.sqrt(np.einsum("tii->ti", products)), products
+
+    def stiffness_bound(self, volume: np.ndarray, mu: float, lam: float) -> np.ndarray:
+        """Gershgorin bound of the bulk stiffness at each node [N], N/m.
+
+        The sum over the elements of the spectral norms of their blocks
+        V (lam a b^T + mu b a^T + mu (a . b) I), with gradients a and b (in closed form: the first
+        two act in the plane of a and b).
+
+        Args:
+            volume: Stiff volumes of the elements [T], m^3.
+            mu, lam: Lame's moduli, Pa.
+        """
+        length, dot = self._gradient_products
+        both = (length[:, :, None] * length[:, None, :]) ** 2
+        c = mu * dot
+        square = (lam**2 + mu**2) * both + 2.0 * lam * mu * dot**2
+        square += 2.0 * c**2 + 2.0 * c * (lam + mu) * dot
+        determinant = c**2 + c * (lam + mu) * dot - lam * mu * (both - dot**2)
+        root = np.sqrt(np.maximum(square**2 - 4.0 * determinant**2, 0.0))
+        norm = np.maximum(np.sqrt(0.5 * (square + root)), np.abs(c)).sum(-1)
+        bound = np.zeros(len(self.nodes))
+        np.add.at(bound, self.tetrahedra, volume[:, None] * norm)
+        return bound
+
+
+def make_cut_geometry(
+    mesh: TetrahedralMesh,
+    plane: CutPlane,
+    held: np.ndarray,
+    up: Sequence[float] = (0.0, 0.0, 1.0),
+    board_height: float | None = 0.0,
+) -> CutGeometry:
+    """Splits the mesh and prepares what follows from the geometry alone.
+
+    Args:
+        mesh: The food in F.
+        plane: The cut plane in F.
+        held: Vertices of the mesh that cannot move, mask [V].
+        up: Opposite of gravity in F [3].
+        board_height: Height of the board's top along `up` in F, metres; None for no board.
+
+    Raises:
+        MeshError: Bad mesh, or the plane misses it.
+        ConfigurationError: Nothing can move.
+    """
+    mesh.check()
+    split = split_mesh(mesh, plane)
+    R_FC = plane.rotation()
+    p_FC = np.asarray(plane.point, float)
+    upward = np.asarray(up, float) / np.linalg.norm(up)
+    up_C = upward @ R_FC
+
+    held_node = held[split.node_source]
+    active = ~held_node[split.tetrahedra].all(1)
+    if not active.any():
+        raise ConfigurationError(
+            "every element at the cut is held",
+            field="food.hold_distance",
+            fix="Hold the food farther from the cut plane.",
+        )
+    tetrahedra = split.tetrahedra[active]
+    computed, t = np.unique(tetrahedra, return_inverse=True)
+    t = t.reshape(-1, 4)
+    number = np.full(len(split.nodes), -1)
+    number[computed] = np.arange(len(computed))
+    nodes = split.nodes[computed]
+    fraction, centroid = split.fraction[active], split.centroid[active]
+
+    edges = np.stack([nodes[t[:, k]] - nodes[t[:, 0]] for k in (1, 2, 3)], axis=-1)
+    whole = np.linalg.det(edges) / 6.0
+    volume = whole * fraction
+    node_volume, weight_volume = np.zeros(len(nodes)), np.zeros(len(nodes))
+    np.add.at(node_volume, t, np.repeat(0.25 * volume[:, None], 4, axis=1))
+    np.add.at(weight_volume, t, volume[:, None] * centroid)
+
+    point_nodes = number[split.point_nodes].reshape(-1, 4)
+    free = (point_nodes >= 0).all(1)
+    if not free.all():
+        raise ConfigurationError(
+            f"{np.count_nonzero(~free)} of {len(free)} points of the cut lie in elements that are "
+            "held",
+            field="food.hold_distance",
+            fix="Hold the food farther from the cut plane.",
+        )
+    board = np.concatenate([up_C, [0.0]])
+    board_area = np.zeros(len(nodes))
+    if board_height is not None:
+        board[3] = board_height - upward @ p_FC
+        board_area = _downward_area(split, up_C)[computed]
+
+    section = split.points[:, [0, 2]]
+    return CutGeometry(
+        split=split,
+        X_FC_rotation=R_FC,
+        X_FC_position=p_FC,
+        up=up_C,
+        computed=computed,
+        moving=np.flatnonzero(~held_node[computed]),
+        nodes=nodes,
+        tetrahedra=t,
+        inverse=np.linalg.inv(edges),
+        # Both copies of a split element share its stiffness; see `LEAST_SHARE`.
+        stiff_volume=whole * _stiffness_share(fraction),
+        node_volume=node_volume,
+        weight_volume=weight_volume,
+        vertex_volume=_vertex_volume(split)[split.node_source[computed]],
+        element_distance=distance_inside(section, split.triangles, nodes[t].mean(1)[:, [0, 2]]),
+        tables=edge_tables(section, split.triangles),
+        point_nodes=point_nodes,
+        point_weights=split.point_weights,
+        point_depth=depth_below(section, split.triangles, section),
+        point_distance=distance_inside(section, split.triangles, section),
+        board_area=board_area,
+        board=board,
+        element_size=TetrahedralMesh(nodes, t).mean_edge_length(),
+    )
+
+
+def _stiffness_share(fraction: np.ndarray) -> np.ndarray:
+    return np.where(fraction < 1.0, np.clip(fraction, LEAST_SHARE, 1.0 - LEAST_SHARE), 1.0)
+
+
+def _vertex_volume(split: SplitMesh) -> np.ndarray:
+    """Volume lumped to the vertices of the uncut mesh [V], m^3."""
+    volume = TetrahedralMesh(split.vertex_position, split.source_tetrahedra).volumes()
+    lumped = np.zeros(len(split.vertex_position))
+    np.add.at(lumped, split.source_tetrahedra, np.repeat(0.25 * volume[:, None], 4, axis=1))
+    return lumped
+
+
+def _downward_area(split: SplitMesh, up_C: np.ndarray) -> np.ndarray:
+    """Area of material surface that faces down, lumped to the material nodes [N], m^2.
+
+    A face that the plane crosses gives each side the area of its material corners' share.
+    """
+    faces, _ = boundary_faces(split.source_tetrahedra)
+    p = split.vertex_position[faces]
+    normal = 0.5 * np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    down = -(normal @ up_C)
+    horizontal = down > 0.2 * np.linalg.norm(normal, axis=1)
+    material = np.zeros((len(split.vertex_position), 2), bool)
+    material[split.node_source, split.node_side] = split.node_is_material
+    # Corners on the plane are of both sides, and a face that touches it there of one.
+    sides = material[faces] / material[faces].sum(2, keepdims=True)
+    whole = material[faces].all(1)
+    one = whole.sum(1) == 1
+    sides[one] = whole[one][:, None]
+    area = np.zeros(material.shape)
+    third = np.where(horizontal, down, 0.0)[:, None, None] / 3.0
+    np.add.at(area, faces, third * sides)
+    return area[split.node_source, split.node_side]

@@ -1,0 +1,1 @@
+"""What the residuals of records say of each cause, and the verdict."""

@@ -1,0 +1,155 @@
+"""Confirms a diagnosis by simulation: the named causes are put into the simulator itself.
+
+The statistics rest on derivatives. Here slices are simulated once more with the causes and base
+parameters at the values that were found, these are corrected by a Gauss-Newton step from there, and
+simulated again. What the causes are worth is then what the simulator does with them, not what its
+derivatives promise.
+"""
+
+import dataclasses as dc
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from sliceit_drake.cutting.parameters import get_parameter
+from sliceit_drake.diagnosis.cause import Cause
+from sliceit_drake.diagnosis.evidence.linear import LinearProblem
+from sliceit_drake.diagnosis.evidence.sensitivity import MESH
+from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
+
+__all__ = ["Confirmation", "confirm"]
+
+ROUNDS = 2
+WORTH = 0.5
+"""Least share of the gain that the derivatives promise which a simulation must show."""
+
+
+@dc.dataclass
+class Confirmation:
+    """What simulations with the causes in them say.
+
+    Attributes:
+        problem: The moments with the predictions of those simulations.
+        values: Of the causes' parameters, by cause and name.
+        factors: Of the base parameters, by name.
+        promised, gained: Twice the gain in log-likelihood by causes, as the derivatives have it and
+            as simulated.
+    """
+
+    problem: LinearProblem
+    values: dict[str, dict[str, float]]
+    factors: dict[str, float]
+    promised: float
+    gained: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether the simulation bears out what the derivatives promise."""
+        return self.gained >= WORTH * self.promised
+
+
+def confirm(
+    problem: LinearProblem,
+    predictor: SlicePredictor,
+    causes: Sequence[tuple[Cause, Mapping[str, float]]],
+    progress: Callable[[int, int], None] | None = None,
+) -> Confirmation:
+    """Simulates all records with causes in the simulator.
+
+    Args:
+        problem: Of the records, at the base model.
+        predictor: Of the same records; the first meshing is that of the sensitivities.
+        causes: At the values that were found. Those with values for each record act as they were
+            found, linearly, and are left out here.
+        progress: Called with the simulations done and in all.
+    """
+    found = problem.found
+    causes = [(cause, values) for cause, values in causes if not cause.per_record]
+    columns = {
+        cause.name: [
+            k
+            for k in found.index("cause", cause.name)
+            if found.columns[k].scan in (None, _scan(cause, values))
+        ]
+        for cause, values in causes
+    }
+    shared = [k for ks in columns.values() for k in ks]
+    _, start = _fit(problem, problem.base, shared)
+    theta, end = _fit(problem, [*problem.base, *shared], shared)
+    promised = start - end
+    at = {cause.name: dict(values) for cause, values in causes}
+    logs = {k: float(x) * found.columns[k].size for k, x in zip(problem.base, theta, strict=False)}
+    best: tuple[float, LinearProblem, dict[str, dict[str, float]], dict[int, float]] | None = None
+    for _ in range(ROUNDS):
+        moved = _at_point(problem, predictor, causes, at, logs, progress)
+        step, chi_square = _fit(moved, [*moved.base, *shared], shared)
+        if best is None or chi_square < best[0]:
+            best = chi_square, moved, {n: dict(v) for n, v in at.items()}, dict(logs)
+        for k, change in zip([*moved.base, *shared], step, strict=True):
+            column = found.columns[k]
+            if k in logs:
+                logs[k] += float(np.clip(change, -3.0, 3.0)) * column.size
+                continue
+            cause = next(c for c, _ in causes if c.name == column.name)
+            parameter = next(p for p in cause.parameters if p.name == column.parameter)
+            value = at[column.name][column.parameter] + float(change) * column.size
+            at[column.name][column.parameter] = float(np.clip(value, parameter.low, parameter.high))
+    assert best is not None
+    chi_square, moved, at, logs = best
+    return Confirmation(
+        problem=moved,
+        values=at,
+        factors={found.columns[k].name: float(np.exp(x)) for k, x in logs.items()},
+        promised=promised,
+        gained=start - chi_square,
+    )
+
+
+def _scan(cause: Cause, values: Mapping[str, float]) -> float | None:
+    return None if cause.scan is None else values.get(cause.scan.name)
+
+
+def _fit(
+    problem: LinearProblem, columns: list[int], not_usual: list[int]
+) -> tuple[np.ndarray, float]:
+    """Coefficients of columns [n], and twice the negative log-likelihood but for a constant."""
+    own, variance = problem.own_prior(without=not_usual)
+    total = problem.reduced(own, variance).sum(0)
+    usual = [k for k in problem.usual if k not in not_usual]
+    chosen = [*problem.numerical, *problem.spline, *usual, *columns]
+    theta, _ = problem.fit_shared(total, chosen, columns)
+    y = problem.size
+    return np.asarray(theta[-len(columns) :]), float(total[y, y] - total[chosen, y] @ theta)
+
+
+def _at_point(
+    problem: LinearProblem,
+    predictor: SlicePredictor,
+    causes: Sequence[tuple[Cause, Mapping[str, float]]],
+    at: Mapping[str, Mapping[str, float]],
+    logs: Mapping[int, float],
+    progress: Callable[[int, int], None] | None,
+) -> LinearProblem:
+    """The problem with what slices simulated there predict."""
+    found = problem.found
+    values = {}
+    for k, change in logs.items():
+        name = found.columns[k].name
+        models = next(t.models for t in predictor.targets if t.models)
+        start = float(get_parameter(models[predictor.meshings[0]], name))
+        values[name] = start * float(np.exp(change))
+    active = tuple(ActiveCause(cause, at[cause.name]) for cause, _ in causes)
+    before, after = predictor.predict([Point(), Point(values=values, causes=active)], progress)
+    mesh = next((k for k in problem.numerical if found.columns[k] == MESH), None)
+    moved = []
+    for record, target, first, second in zip(
+        found.records, predictor.targets, before, after, strict=True
+    ):
+        assert first is not None and second is not None
+        seen = target.compare(np.stack([first.wrench, second.wrench], axis=2))
+        predicted = seen[:, :, 1]
+        if mesh is not None:
+            # Of the finer mesh, as the prediction is; its difference is taken from the base model.
+            predicted = predicted - record.columns[:, :, mesh]
+        moved.append(predicted)
+    return problem.predicting(moved)

@@ -1,0 +1,512 @@
+"""Which causes the residuals support: likelihood ratios, calibrated by a bootstrap of records."""
+
+import dataclasses as dc
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from sliceit_drake.diagnosis.evidence.linear import LinearProblem, scaled_inverse
+
+__all__ = ["CauseEvidence", "Screening", "screen"]
+
+FLAT = 1e8
+"""Variance of a coefficient of which nothing is known, in the column's size."""
+CORRECTION_VARIANCE = 1e4
+"""Of the nonparametric correction, N^2."""
+UNUSUAL = 0.98
+"""Quantile of the gain beyond the usual from which on what a sensor has a little of is a cause."""
+LEAST_DEVIATION = 0.5
+"""Least standard deviation of a gain where nothing is wrong: one that is always nought there is no
+proof of anything by being a little more."""
+PRESENT = 5.0
+"""Gain for each number of a cause from which on it shows in a record."""
+JITTER = 1e-9
+"""Added to the diagonal of Gram matrices of unit columns, some of which are the same."""
+BATCH = 100
+"""Replicates of the bootstrap that are computed in one go."""
+
+
+@dc.dataclass
+class CauseEvidence:
+    """What the records say of one cause.
+
+    Attributes:
+        name: Of the cause.
+        gain: Twice the gain in log-likelihood by the cause, at the best value of its scan. Of a
+            cause that every sensor has a little of (`linear.USUAL`) the gain beyond that; where
+            that is not to be had by chance, all that it gains.
+        expected, deviation: Mean and standard deviation of `gain` where nothing is wrong.
+        limit: Its 95 % quantile there.
+        scan: The best value of the scan, or None.
+        parameters: Names of its parameters.
+        coefficients: Of its columns, in their sizes; mean over the records where each has its own.
+        errors: Standard errors of the coefficients.
+        sizes: Of the columns: a coefficient times its size is the parameter's distance from null.
+        units: Of the parameters.
+        per_record: Whether each record has coefficients of its own.
+        by_record: These [R, n]; empty where they are shared.
+        presence: Share of the records that it could show in in which it does; 1 where coefficients
+            are shared.
+    """
+
+    name: str
+    gain: float
+    expected: float
+    deviation: float
+    limit: float
+    scan: float | None
+    parameters: list[str]
+    coefficients: list[float]
+    errors: list[float]
+    sizes: list[float]
+    units: list[str]
+    per_record: bool
+    by_record: list[list[float]] = dc.field(default_factory=list)
+    presence: float = 1.0
+
+    @property
+    def score(self) -> float:
+        """Gain beyond what chance gives in 95 % of cases."""
+        return self.gain - self.limit
+
+    @property
+    def deviations(self) -> float:
+        """Gain beyond its mean under the null, in its standard deviations there."""
+        return (self.gain - self.expected) / max(self.deviation, LEAST_DEVIATION)
+
+
+@dc.dataclass
+class Screening:
+    """Evidence for all causes.
+
+    Attributes:
+        causes: By decreasing score.
+        p_value: Of the largest gain over all causes, in standard deviations, under the null.
+        misfit: Gain by the nonparametric correction of each condition: all that could be gained.
+        expected_misfit: Its mean where nothing is wrong.
+        misfit_p_value: Of `misfit`.
+        angles: Between the projected sensitivities of causes [n, n], degrees, in the order of
+            `names`; for several parameters and scans the least.
+        visible: Norm of each cause's projected sensitivity at its plausible size, in noise.
+        names: Of the causes.
+        projected: Gram matrix of all columns and y beside what is free in any case.
+    """
+
+    causes: list[CauseEvidence]
+    p_value: float
+    misfit: float
+    expected_misfit: float
+    misfit_p_value: float
+    angles: np.ndarray
+    visible: np.ndarray
+    names: list[str]
+    projected: np.ndarray
+
+    def evidence(self, name: str) -> CauseEvidence:
+        """Of one cause."""
+        return next(c for c in self.causes if c.name == name)
+
+    def angle_to(self, problem: LinearProblem, effect: CauseEvidence, other: str) -> float:
+        """Between the effect of a cause as it was found and all that another can do, degrees.
+
+        A cause with several numbers explains more than one with few, so that this is not the same
+        both ways.
+        """
+        G = self.projected
+        own = problem.found.index("cause", effect.name, effect.scan)
+        e = np.array(effect.coefficients)
+        norm = float(e @ G[np.ix_(own, own)] @ e)
+        best = 0.0
+        for scan in problem.found.scans(other):
+            columns = problem.found.index("cause", other, scan)
+            b = G[np.ix_(columns, own)] @ e
+            best = max(best, float(b @ scaled_inverse(G[np.ix_(columns, columns)], 1e-8) @ b))
+        return float(np.degrees(np.arccos(np.sqrt(min(best / max(norm, 1e-12), 1.0)))))
+
+
+class _Statistics:
+    """Gains of all causes, given what is assumed already.
+
+    The columns are the same whatever was measured, so that all that is solved is solved once and
+    many measurements [n] are tested in one go. A measurement is given by its products with the
+    columns of each record [n, R, K]. Gains are differences, so that its square is not needed.
+    """
+
+    def __init__(self, problem: LinearProblem, assumed: Sequence[tuple[str, float | None]]) -> None:
+        self.problem = problem
+        found = problem.found
+        self.prior = problem.prior()
+        self.null = [*problem.base, *problem.numerical, *problem.spline, *problem.usual]
+        self.own_extra: list[int] = []
+        for name, scan in assumed:
+            columns = found.index("cause", name, scan)
+            if found.columns[columns[0]].per_record:
+                self.own_extra += columns
+            else:
+                self.null += columns
+        # At another value of its scan an assumed cause may still add something.
+        self.options: list[tuple[str, float | None, list[int]]] = [
+            (name, scan, found.index("cause", name, scan))
+            for name in found.causes
+            for scan in found.scans(name)
+            if (name, scan) not in assumed
+        ]
+        self.names = list(dict.fromkeys(name for name, _, _ in self.options))
+        self.per_record = {
+            name: any(found.columns[k].per_record for k in found.index("cause", name))
+            for name in self.names
+        }
+        own, variance = problem.own_prior()
+        variance = np.concatenate([variance, np.full(len(self.own_extra), FLAT)])
+        self.own = [*own, *self.own_extra]
+        y = problem.size
+        self.reduced, self.own_weights = [], []
+        for G in problem.moments.gram:
+            A, weights, _ = _integrated(G[:y, :y], self.own, variance)
+            self.reduced.append(A)
+            self.own_weights.append(weights)
+        total = np.sum(self.reduced, axis=0)
+        self.null_covariance = self._null_covariance(total)
+        self.null_weights = total[:, self.null] @ self.null_covariance
+        self.projected = total - self.null_weights @ total[self.null]
+        self._eliminated = {
+            columns[0]: self._eliminate([[r] for r in range(len(self.reduced))], columns, FLAT)
+            for name, _, columns in self.options
+            if self.per_record[name]
+        }
+        self._corrected = self._eliminate(
+            list(problem.conditions.values()), problem.correction, CORRECTION_VARIANCE
+        )
+
+    def _null_covariance(self, total: np.ndarray) -> np.ndarray:
+        null = self.null
+        return scaled_inverse(total[np.ix_(null, null)] + np.diag(self.prior[null]))
+
+    def _eliminate(
+        self, groups: Sequence[Sequence[int]], columns: list[int], variance: float
+    ) -> "_Eliminated":
+        weights, inverses, total = [], [], np.zeros_like(self.projected)
+        for members in groups:
+            A = np.sum([self.reduced[r] for r in members], axis=0)
+            A, weight, inverse = _integrated(A, columns, np.full(len(columns), variance))
+            total += A
+            weights.append(weight)
+            inverses.append(inverse)
+        return _Eliminated(groups, columns, weights, inverses, self._null_covariance(total))
+
+    def products(self, b: np.ndarray) -> np.ndarray:
+        """Without what is each record's own [n, R, K]."""
+        own = b[:, :, self.own]
+        out = b.copy()
+        for r, weights in enumerate(self.own_weights):
+            out[:, r] -= own[:, r] @ weights.T
+        return out
+
+    def project(self, reduced: np.ndarray) -> np.ndarray:
+        """Products with all columns beside the null's [n, K]."""
+        total = reduced.sum(1)
+        return np.asarray(total - total[:, self.null] @ self.null_weights.T)
+
+    def gains(
+        self, b: np.ndarray
+    ) -> tuple[dict[str, tuple[np.ndarray, list[float | None]]], np.ndarray, np.ndarray]:
+        """Of each cause the largest gains [n] and their scans; gains by a correction of each
+        condition [n]; and the products beside the null's columns [n, K]."""
+        reduced = self.products(b)
+        projected = self.project(reduced)
+        of_null = _squares(reduced.sum(1)[:, self.null], self.null_covariance)
+        out: dict[str, tuple[np.ndarray, list[float | None]]] = {}
+        for name, scan, columns in self.options:
+            if self.per_record[name]:
+                gain = self._eliminated[columns[0]].gain(reduced, self.null) - of_null
+            else:
+                gain = self._bounded(projected, columns)[0]
+            if name not in out:
+                out[name] = gain, [scan] * len(gain)
+                continue
+            before, scans = out[name]
+            better = gain > before
+            scans = [scan if new else old for new, old in zip(better, scans, strict=True)]
+            out[name] = np.where(better, gain, before), scans
+        return out, self._corrected.gain(reduced, self.null) - of_null, projected
+
+    def _bounded(
+        self, projected: np.ndarray, columns: list[int]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Gains [n], coefficients and their errors [n, c], within the bounds of one-sided
+        parameters."""
+        kinds = [self.problem.found.columns[k] for k in columns]
+        A, b = self.projected[np.ix_(columns, columns)], projected[:, columns]
+        visible = np.diag(A) > 1e-9
+        best = np.zeros(len(b))
+        values, errors = np.zeros(b.shape), np.full(b.shape, np.inf)
+        # So few parameters that every set of active ones is tried.
+        for bits in range(1, 2 ** len(columns)):
+            active = [k for k in range(len(columns)) if bits >> k & 1 and visible[k]]
+            if not active:
+                continue
+            inverse = np.linalg.pinv(A[np.ix_(active, active)], rcond=1e-10, hermitian=True)
+            g = b[:, active] @ inverse
+            bounded = [i for i, k in enumerate(active) if kinds[k].one_sided]
+            gain = (b[:, active] * g).sum(1)
+            better = (gain > best) & (g[:, bounded] >= 0.0).all(1)
+            best = np.where(better, gain, best)
+            value, error = np.zeros(b.shape), np.full(b.shape, np.inf)
+            value[:, active] = g
+            error[:, active] = np.sqrt(np.maximum(np.diag(inverse), 0.0))
+            values[better], errors[better] = value[better], error[better]
+        return best, values, errors
+
+    def gain_with_usual(self, b: np.ndarray, columns: list[int]) -> float:
+        """Gain of a cause for one measurement [1, R, K] against a model without what is usual of
+        it; 0 for one of which nothing is usual."""
+        problem = self.problem
+        mine = set(columns)
+        if not mine & {*problem.usual, *problem.usual_own}:
+            return 0.0
+        own, variance = problem.own_prior(without=columns)
+        variance = np.concatenate([variance, np.full(len(self.own_extra), FLAT)])
+        own = [*own, *self.own_extra]
+        null = [k for k in self.null if k not in mine]
+        prior = self.prior.copy()
+        prior[columns] = 0.0
+        y = problem.size
+        total, products = np.zeros((y, y)), np.zeros(y)
+        for G, measured in zip(problem.moments.gram, b[0], strict=True):
+            A, weights, _ = _integrated(G[:y, :y], own, variance)
+            total = total + A
+            products = products + measured - weights @ measured[own]
+        gains = []
+        for chosen in (null, [*null, *columns]):
+            inner = total[np.ix_(chosen, chosen)] + np.diag(prior[chosen])
+            seen = products[chosen]
+            gains.append(float(seen @ scaled_inverse(inner) @ seen))
+        return gains[1] - gains[0]
+
+    def coefficients(self, b: np.ndarray, columns: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Of a cause's columns for one measurement [1, R, K]; where each record has its own their
+        mean and its standard error."""
+        reduced = self.products(b)
+        kinds = self.problem.found.columns
+        if not kinds[columns[0]].per_record:
+            _, value, error = self._bounded(self.project(reduced), columns)
+            return value[0], error[0]
+        own = self.own_fits(b, columns)[0]
+        own = own[np.abs(own).max(1) > 0.0]
+        if not len(own):
+            return np.zeros(len(columns)), np.full(len(columns), np.inf)
+        spread = np.std(own, axis=0, ddof=1) if len(own) > 1 else np.full(len(columns), np.inf)
+        return np.mean(own, axis=0), spread / np.sqrt(len(own))
+
+    def own_fits(self, b: np.ndarray, columns: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Coefficients of columns for each record by itself [R, n], and what they gain there [R];
+        0 where a record knows nothing of them."""
+        out, gains = np.zeros((b.shape[1], len(columns))), np.zeros(b.shape[1])
+        for r, (A, y) in enumerate(zip(self.reduced, self.products(b)[0], strict=True)):
+            inner = A[np.ix_(columns, columns)]
+            if np.diag(inner).min() > 1e-9:
+                out[r] = np.linalg.lstsq(inner, y[columns], rcond=1e-9)[0]
+                gains[r] = float(out[r] @ y[columns])
+        return out, gains
+
+
+@dc.dataclass
+class _Eliminated:
+    """Columns of which each group of records has coefficients of its own, integrated out.
+
+    Attributes:
+        groups: Numbers of records.
+        columns: Numbers of the columns.
+        weights: Of each group [K, c].
+        inverses: Of each group [c, c].
+        covariance: Of the null's columns with these integrated out.
+    """
+
+    groups: Sequence[Sequence[int]]
+    columns: list[int]
+    weights: list[np.ndarray]
+    inverses: list[np.ndarray]
+    covariance: np.ndarray
+
+    def gain(self, reduced: np.ndarray, null: list[int]) -> np.ndarray:
+        """By these columns and the null's together [n]."""
+        gain, total = np.zeros(len(reduced)), np.zeros((len(reduced), reduced.shape[2]))
+        for members, weight, inverse in zip(self.groups, self.weights, self.inverses, strict=True):
+            b = reduced[:, members].sum(1)
+            gain += _squares(b[:, self.columns], inverse)
+            total += b - b[:, self.columns] @ weight.T
+        return gain + _squares(total[:, null], self.covariance)
+
+
+def _squares(b: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """b' inverse b of each row [n]."""
+    return np.asarray(np.einsum("nk,nk->n", b @ inverse, b))
+
+
+def _integrated(
+    A: np.ndarray, own: list[int], variance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A Gram matrix without normal coefficients of these columns, the weights [K, c] with which
+    their products are taken from the others', and the inverse [c, c]."""
+    inner = A[np.ix_(own, own)] + np.diag(1.0 / np.maximum(variance, 1e-12))
+    inverse = scaled_inverse(inner, 1e-15)
+    weights = A[:, own] @ inverse
+    return A - weights @ A[own], weights, inverse
+
+
+def screen(
+    problem: LinearProblem,
+    replicates: int = 200,
+    seed: int = 0,
+    assumed: Sequence[tuple[str, float | None]] = (),
+    progress: Callable[[int], None] | None = None,
+) -> Screening:
+    """Tests all causes against the records.
+
+    The gains' distribution where nothing is wrong is that of records drawn anew: what differs from
+    slice to slice is drawn for each record, its standard deviation itself from what its estimate
+    leaves open, and noise is added; the discretisation's error is drawn once for all.
+
+    Args:
+        problem: The records' moments.
+        replicates: Of the bootstrap.
+        seed: Of the bootstrap.
+        assumed: Causes, each at a value of its scan, that are part of the model already.
+        progress: Called with a number of replicates each time that these are done.
+    """
+    statistics = _Statistics(problem, assumed)
+    y = problem.size
+    measured = problem.moments.gram[None, :, :y, y]
+    gains, misfit, _ = statistics.gains(measured)
+    draw = _Bootstrap(problem, np.random.default_rng(seed))
+    null_gains: dict[str, list[float]] = {name: [] for name in statistics.names}
+    null_misfits: list[float] = []
+    while len(null_misfits) < replicates:
+        count = min(BATCH, replicates - len(null_misfits))
+        own, of_correction, _ = statistics.gains(draw(count))
+        for name, (gain, _) in own.items():
+            null_gains[name] += gain.tolist()
+        null_misfits += of_correction.tolist()
+        if progress is not None:
+            progress(count)
+    evidence = []
+    for name in statistics.names:
+        gain, (scan,) = gains[name]
+        columns = problem.found.index("cause", name, scan)
+        value, error = statistics.coefficients(measured, columns)
+        kinds = [problem.found.columns[c] for c in columns]
+        fits, presence = np.zeros((0, 0)), 1.0
+        if statistics.per_record[name]:
+            fits, own_gains = statistics.own_fits(measured, columns)
+            shown = own_gains > kinds[0].searched + PRESENT * len(columns)
+            presence = float(shown.sum() / max((own_gains > 0.0).sum(), 1))
+        searched = _searched(problem, columns)
+        null_gains[name] = [g + searched for g in null_gains[name]]
+        null = np.array(null_gains[name])
+        evidence.append(
+            CauseEvidence(
+                name=name,
+                gain=float(gain[0]),
+                expected=float(null.mean()),
+                deviation=float(null.std()),
+                limit=float(np.quantile(null, 0.95)),
+                scan=scan,
+                parameters=[c.parameter for c in kinds],
+                coefficients=value.tolist(),
+                errors=error.tolist(),
+                sizes=[c.size for c in kinds],
+                units=[c.unit for c in kinds],
+                per_record=statistics.per_record[name],
+                by_record=fits.tolist(),
+                presence=presence,
+            )
+        )
+    means = np.array([[e.expected] for e in evidence])
+    spreads = np.array([[max(e.deviation, LEAST_DEVIATION)] for e in evidence])
+    null = (np.array([null_gains[e.name] for e in evidence]) - means) / spreads
+    largest = max(e.deviations for e in evidence)
+    p = (1.0 + (null.max(0) >= largest).sum()) / (replicates + 1.0)
+    for e in evidence:
+        if e.gain > float(np.quantile(null_gains[e.name], UNUSUAL)):
+            columns = problem.found.index("cause", e.name, e.scan)
+            e.gain = max(e.gain, statistics.gain_with_usual(measured, columns))
+    p_misfit = (1.0 + (np.array(null_misfits) >= misfit[0]).sum()) / (replicates + 1.0)
+    angles, visible = _angles(statistics)
+    return Screening(
+        causes=sorted(evidence, key=lambda e: -e.score),
+        p_value=float(p),
+        misfit=float(misfit[0]),
+        expected_misfit=float(np.mean(null_misfits)),
+        misfit_p_value=float(p_misfit),
+        angles=angles,
+        visible=visible,
+        names=statistics.names,
+        projected=statistics.projected,
+    )
+
+
+def _searched(problem: LinearProblem, columns: list[int]) -> float:
+    """Gain by a cause that looked for itself in records where there is nothing."""
+    touched = sum(bool(r.columns[:, :, columns].any()) for r in problem.found.records)
+    return problem.found.columns[columns[0]].searched * touched
+
+
+class _Bootstrap:
+    """Measurements in which nothing is wrong, by their products with the columns."""
+
+    def __init__(self, problem: LinearProblem, rng: np.random.Generator) -> None:
+        self.problem, self.rng = problem, rng
+        y = problem.size
+        self.gram = problem.moments.gram[:, :y, :y]
+        scale = np.sqrt(np.maximum(np.diagonal(self.gram, axis1=1, axis2=2), 1e-30))
+        unit = self.gram / scale[:, :, None] / scale[:, None, :] + JITTER * np.eye(y)
+        self.roots = scale[:, :, None] * np.linalg.cholesky(unit)
+
+    def __call__(self, number: int) -> np.ndarray:
+        """Draws some [number, R, K]."""
+        problem, rng = self.problem, self.rng
+        count, y = len(self.gram), problem.size
+        samples = max(problem.variation_samples, 1)
+        chi = rng.chisquare(samples, (number, 1, len(problem.own)))
+        spread = problem.variation * np.sqrt(samples / np.maximum(chi, 0.1 * samples))
+        shared = np.zeros((number, 1, y))
+        for columns, deviation in (
+            (problem.numerical, 1.0),
+            (problem.spline, problem.discretisation),
+            (list(problem.usual), np.array(list(problem.usual.values()))),
+        ):
+            shared[:, 0, columns] = deviation * rng.normal(size=(number, len(columns)))
+        coefficients = np.repeat(shared, count, axis=1)
+        coefficients[:, :, problem.own] = spread * rng.normal(
+            size=(number, count, len(problem.own))
+        )
+        for k, deviation in problem.usual_own.items():
+            coefficients[:, :, k] += deviation * rng.normal(size=(number, count))
+        noise = rng.normal(size=(number, count, y))
+        out = np.empty((number, count, y))
+        for r in range(count):
+            out[:, r] = coefficients[:, r] @ self.gram[r] + noise[:, r] @ self.roots[r].T
+        return out
+
+
+def _angles(statistics: _Statistics) -> tuple[np.ndarray, np.ndarray]:
+    """Least angles between causes [n, n], degrees, and norms of their sensitivities [n]."""
+    names, projected = statistics.names, statistics.projected
+    groups = {
+        name: [c for n, _, cs in statistics.options if n == name for c in cs] for name in names
+    }
+    norm = np.sqrt(np.maximum(np.diag(projected), 1e-12))
+    cosine = np.abs(projected) / np.outer(norm, norm)
+    # What the null's columns take away entirely has no direction.
+    seen = np.diag(projected) > 1e-6
+    angles = np.full((len(names), len(names)), 90.0)
+    visible = np.zeros(len(names))
+    for i, one in enumerate(names):
+        rows = [c for c in groups[one] if seen[c]]
+        visible[i] = max((norm[c] for c in rows), default=0.0)
+        for j, other in enumerate(names):
+            columns = [c for c in groups[other] if seen[c]]
+            if rows and columns:
+                largest = min(float(cosine[np.ix_(rows, columns)].max()), 1.0)
+                angles[i, j] = np.degrees(np.arccos(largest))
+    return angles, visible

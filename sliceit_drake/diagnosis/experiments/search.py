@@ -1,0 +1,236 @@
+"""The search for the motions that part the causes of a class with the fewest slices."""
+
+import dataclasses as dc
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sliceit_drake.diagnosis.evidence.linear import LinearProblem, integrate_out, scaled_inverse
+from sliceit_drake.diagnosis.evidence.screen import CauseEvidence, Screening
+from sliceit_drake.diagnosis.evidence.sensitivity import (
+    Progress,
+    RecordSensitivity,
+    Sensitivities,
+    sensitivities,
+)
+from sliceit_drake.diagnosis.evidence.verdict import LEAST_REPLICATES
+from sliceit_drake.diagnosis.experiments.designs import Experiment
+from sliceit_drake.diagnosis.experiments.proposal import NextExperiment, Pair, Step
+from sliceit_drake.diagnosis.experiments.scenario_of_experiment import (
+    next_knife_slice,
+    planned_record,
+    scenario_of,
+    template_of,
+)
+from sliceit_drake.records.slice_record import SliceRecord
+
+if TYPE_CHECKING:
+    from sliceit_drake.diagnosis.diagnose import Diagnosis
+
+__all__ = ["CauseClass", "ExperimentSearch"]
+
+SLICE_COST, HAND_COST = 1.0, 5.0
+"""What a slice, and handwork, must bring: degrees nearer to `WANTED`, over all pairs."""
+MOST_SLICES = 12
+"""More slices of one motion are not proposed."""
+MOST_STEPS = 3
+"""More motions are not proposed."""
+USUAL = ("sensor_delay", "sensor_zero")
+"""Causes that every record has a little of; they are fitted beside."""
+
+
+@dc.dataclass(frozen=True)
+class CauseClass:
+    """Causes to be told apart, their evidence, and what is in the model beside."""
+
+    evidence: list[CauseEvidence]
+    screening: Screening
+    assumed: tuple[tuple[str, float | None], ...]
+
+
+@dc.dataclass
+class _Choice:
+    """Slices of experiments, by the number of the experiment, and what they do."""
+
+    counts: dict[int, int]
+    pairs: list[Pair]
+    by_hand: int
+
+    @property
+    def cost(self) -> float:
+        """What is missing and what it takes, degrees."""
+        missing = sum(p.missing for p in self.pairs)
+        return missing + SLICE_COST * sum(self.counts.values()) + HAND_COST * self.by_hand
+
+    @property
+    def key(self) -> tuple[float, float]:
+        """The smaller the better."""
+        return self.cost, -min(p.after for p in self.pairs)
+
+
+class ExperimentSearch:
+    """The motions of the menu against the classes of a verdict.
+
+    Args:
+        diagnosis: Of the records.
+        experiments: The menu.
+        classes: To be told apart.
+        records: The records at hand.
+        cache: Folder for finished simulations; None for none.
+        workers: Threads.
+        progress: See `sensitivity.Progress`.
+    """
+
+    def __init__(
+        self,
+        diagnosis: "Diagnosis",
+        experiments: list[Experiment],
+        classes: list[CauseClass],
+        records: Sequence[SliceRecord],
+        cache: Path | None,
+        workers: int | None,
+        progress: Progress | None,
+    ) -> None:
+        self.experiments, self.classes = experiments, classes
+        setup, template = diagnosis.setup, template_of(records)
+        knife = next_knife_slice(records)
+        self.scenarios = [scenario_of(e, setup, template, knife) for e in self.experiments]
+        first = 1 + max(r.metadata.slice_index for r in records)
+        planned = [
+            planned_record(s, setup, template, f"planned {s.name}", first) for s in self.scenarios
+        ]
+        found = diagnosis.problem.found
+        names = {e.name for c in self.classes for e in c.evidence} | set(USUAL)
+        names |= {name for c in self.classes for name, _ in c.assumed}
+        causes = [diagnosis.causes[n] for n in found.causes if n in names]
+        new = sensitivities(
+            setup,
+            planned,
+            causes,
+            cache=cache,
+            workers=workers,
+            progress=progress,
+        )
+        self.warnings = new.warnings
+        self.problem = _joined(diagnosis.problem, new, names)
+        own, variance = self.problem.own_prior()
+        reduced = [integrate_out(G, own, variance) for G in self.problem.moments.gram]
+        count = len(found.records)
+        self.old = np.sum(reduced[:count], axis=0)
+        self.new = reduced[count:]
+        self._before = self._angles(self.old)
+
+    def _projected(
+        self, total: np.ndarray, assumed: Sequence[tuple[str, float | None]]
+    ) -> np.ndarray:
+        """What is left of a summed Gram matrix beside what is fitted in any case."""
+        problem = self.problem
+        null = [*problem.base, *problem.numerical, *problem.spline, *problem.usual]
+        for name, scan in assumed:
+            null += problem.found.index("cause", name, scan)
+        null = list(dict.fromkeys(null))
+        inverse = scaled_inverse(total[np.ix_(null, null)] + np.diag(problem.prior()[null]))
+        return np.asarray(total - total[:, null] @ inverse @ total[null])
+
+    def _angles(self, total: np.ndarray) -> list[tuple[str, str, float, float]]:
+        """Of each ordered pair the angle, degrees, and the expected gain."""
+        out = []
+        for members in self.classes:
+            screening = dc.replace(
+                members.screening, projected=self._projected(total, members.assumed)
+            )
+            for a, b in itertools.permutations(members.evidence, 2):
+                own = self.problem.found.index("cause", a.name, a.scan)
+                e = np.array(a.coefficients)
+                square = float(e @ screening.projected[np.ix_(own, own)] @ e)
+                angle = screening.angle_to(self.problem, a, b.name) if square > 0.0 else 0.0
+                gain = square * float(np.sin(np.radians(angle))) ** 2
+                out.append((a.name, b.name, angle, gain))
+        return out
+
+    def pairs(self, counts: Mapping[int, int]) -> list[Pair]:
+        """What slices of experiments do, by the number of the experiment."""
+        total = self.old + np.sum([n * self.new[k] for k, n in counts.items()], axis=0)
+        return [
+            Pair(a, b, was, angle, gain, (gain - start) / sum(counts.values()))
+            for (a, b, was, start), (_, _, angle, gain) in zip(
+                self._before, self._angles(total), strict=True
+            )
+        ]
+
+    def _further(self, choice: _Choice) -> _Choice:
+        """The best with one experiment more."""
+        choices = []
+        for number, experiment in enumerate(self.experiments):
+            if number in choice.counts:
+                continue
+            by_hand = choice.by_hand + bool(experiment.by_hand)
+            for slices in range(LEAST_REPLICATES, MOST_SLICES + 1):
+                counts = {**choice.counts, number: slices}
+                choices.append(_Choice(counts, self.pairs(counts), by_hand))
+        return min(choices, key=lambda c: c.key)
+
+    def result(self) -> NextExperiment:
+        """The motions that part most with least."""
+        choice = _Choice(
+            {}, [Pair(a, b, angle, angle, gain, 0.0) for a, b, angle, gain in self._before], 0
+        )
+        while len(choice.counts) < MOST_STEPS and not all(p.parts for p in choice.pairs):
+            further = self._further(choice)
+            if further.cost >= choice.cost:
+                break
+            choice = further
+        counts, pairs = choice.counts, choice.pairs
+        steps = [Step(self.experiments[k], self.scenarios[k], n) for k, n in counts.items()]
+        classes = "; ".join("{" + ", ".join(e.name for e in c.evidence) + "}" for c in self.classes)
+        if all(p.parts for p in pairs) and not steps:
+            reason = f"nothing to split: the records at hand part {classes}"
+            return NextExperiment("none", reason, [], pairs)
+        if not steps:
+            number, angle = self._largest()
+            reason = (
+                f"no motion of the menu parts more of {classes} at the sizes found; the largest "
+                f"least angle, {angle:.0f} degrees, is that of {self.experiments[number].name}"
+            )
+            return NextExperiment("none", reason, [], self.pairs({number: MOST_SLICES}))
+        left = sorted({tuple(sorted((p.true, p.fitted))) for p in pairs if not p.parts})
+        reason = f"to split {classes}"
+        if left:
+            reason += "; not parted: " + ", ".join(f"{a} from {b}" for a, b in left)
+        return NextExperiment("split", reason, steps, pairs)
+
+    def _largest(self) -> tuple[int, float]:
+        """The experiment of the largest least angle."""
+        angles = [
+            min(p.after for p in self.pairs({k: MOST_SLICES})) for k in range(len(self.experiments))
+        ]
+        best = int(np.argmax(angles))
+        return best, angles[best]
+
+
+def _joined(problem: LinearProblem, new: Sensitivities, names: set[str]) -> LinearProblem:
+    """The problem of old and new records, with the noise and the variation of the old."""
+    old = problem.found
+    kept = [k for k, c in enumerate(old.columns) if c.kind != "cause" or c.name in names]
+    columns = [old.columns[k] for k in kept]
+    place = {column: k for k, column in enumerate(new.columns)}
+    at = [place.get(column) for column in columns]
+
+    def picked(values: np.ndarray) -> np.ndarray:
+        # What differs where something is not known, as a speed, is known of a planned record.
+        absent = np.zeros((*values.shape[:2], 1), values.dtype)
+        padded = np.concatenate([values, absent], axis=2)
+        return padded[:, :, [-1 if k is None else k for k in at]]
+
+    records: list[RecordSensitivity] = [
+        dc.replace(r, columns=r.columns[:, :, kept], even=r.even[:, :, kept]) for r in old.records
+    ]
+    records += [dc.replace(r, columns=picked(r.columns), even=picked(r.even)) for r in new.records]
+    elements = max(old.elements, new.elements)
+    found = Sensitivities(columns, records, [], elements)
+    joint = LinearProblem(found, problem.noise, problem.variation)
+    joint.variation_samples = problem.variation_samples
+    return joint

@@ -1,0 +1,1 @@
+"""What a single record shows."""

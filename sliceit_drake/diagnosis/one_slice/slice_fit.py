@@ -1,0 +1,329 @@
+"""Fits one slice by simulation: base parameters, where the knife was, and a cause.
+
+Least squares over all rows of one record, with the whole simulation in each step (Gauss-Newton on
+differences), and the error on blocks of depth that were left out. Nothing here says anything of a
+second slice.
+"""
+
+import dataclasses as dc
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from sliceit_drake.calibration.setup import ParameterRange
+from sliceit_drake.cutting.parameters import get_parameter
+from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.diagnosis.cause import Cause
+from sliceit_drake.diagnosis.evidence.sensitivity import LINEAR_STEP, LOG_STEP
+from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
+
+__all__ = ["BLOCKS", "OWN", "SliceFit", "Unknown", "depth_blocks", "fit_slice"]
+
+BLOCKS = 5
+STEPS = 8
+HELD_OUT_STEPS = 2
+AS_GOOD = 1.03
+"""Ratio of sums of squares up to which two fits are as good."""
+LONGEST = 6.0
+"""Longest step of an unknown, in its sizes."""
+ENOUGH = 1e-3
+"""Relative gain below which a fit is at its end."""
+BASE_SPREAD = 0.5
+"""Plausible standard deviation of the logarithm of a base parameter about its calibrated value."""
+
+
+@dc.dataclass(frozen=True)
+class Unknown:
+    """A number that is fitted, counted from its start in its `size`.
+
+    Attributes:
+        kind: base, own (of the record) or cause.
+        name: Dotted parameter, record effect, or parameter of the cause.
+        size: Step of the differences, in the parameter's unit or its logarithm.
+        start: Value at 0.
+        log: Whether `size` is of the logarithm.
+        low, high: Range, in sizes.
+        spread: Plausible standard deviation about 0, in sizes.
+    """
+
+    kind: str
+    name: str
+    size: float
+    start: float
+    log: bool
+    low: float
+    high: float
+    spread: float
+
+    def value(self, theta: float) -> float:
+        """The parameter."""
+        if self.log:
+            return float(self.start * np.exp(theta * self.size))
+        return float(self.start + theta * self.size)
+
+
+OWN = {"height": (1e-4, 2e-3), "speed": (0.01, 0.15)}
+"""Of what a record does not say of its motion: step, and plausible standard deviation; m, log."""
+
+
+def _unknowns(
+    predictor: SlicePredictor, parameters: Sequence[ParameterRange], cause: Cause | None = None
+) -> list[Unknown]:
+    """What is fitted: base parameters, where the knife was as far as it is unknown, a cause."""
+    (target,) = predictor.targets
+    model = target.models[predictor.meshings[0]]
+    out = []
+    for p in parameters:
+        start = float(get_parameter(model, p.name))
+        if p.scale == "log":
+            low, high = (float(np.log(v / start)) / LOG_STEP for v in (p.low, p.high))
+            size, log, spread = LOG_STEP, True, BASE_SPREAD / LOG_STEP
+        else:
+            size, log = LINEAR_STEP * (p.high - p.low), False
+            low, high = (p.low - start) / size, (p.high - start) / size
+            spread = 0.25 * (p.high - p.low) / size
+        # A calibration may have ended on the end of its range.
+        low, high = min(low, -1e-6), max(high, 1e-6)
+        out.append(Unknown("base", p.name, size, start, log, low, high, spread))
+    setup = predictor.setup
+    height, speed = np.array(setup.height_offset), np.log(setup.speed_factor)
+    free = [
+        ("height", target.height_unknown, height),
+        ("speed", target.speed_unknown, speed),
+    ]
+    for name, unknown, ends in free:
+        if unknown:
+            size, spread = OWN[name]
+            low, high = (ends / size).tolist()
+            out.append(Unknown("own", name, size, 0.0, False, low, high, spread / size))
+    for q in cause.parameters if cause else ():
+        sign = -1.0 if q.one_sided and q.null == q.high else 1.0
+        low, high = sorted((bound - q.null) / (sign * q.size) for bound in (q.low, q.high))
+        out.append(Unknown("cause", q.name, sign * q.size, q.null, False, low, high, 1e3))
+    return out
+
+
+@dc.dataclass
+class SliceFit:
+    """A fit of one slice.
+
+    Attributes:
+        unknowns: What was fitted [n].
+        theta: In their sizes [n].
+        cause, scan: That was fitted beside, and the value of its scan; None without.
+        point: Of the fit.
+        predicted: At the rows [m, c].
+        jacobian: Change of the prediction by each unknown at the fit [m, c, n].
+        held_out: Prediction of each row from the fit without its block of depth [m, c].
+        failures: Simulations that broke down on the way.
+    """
+
+    unknowns: list[Unknown]
+    theta: np.ndarray
+    cause: Cause | None
+    scan: float | None
+    point: Point
+    predicted: np.ndarray
+    jacobian: np.ndarray
+    held_out: np.ndarray
+    failures: int
+
+    def values(self, kind: str) -> dict[str, float]:
+        """Values of a kind of unknowns."""
+        pairs = zip(self.unknowns, self.theta, strict=True)
+        return {u.name: u.value(float(x)) for u, x in pairs if u.kind == kind}
+
+
+def depth_blocks(depth: np.ndarray, inside: np.ndarray, count: int = BLOCKS) -> np.ndarray:
+    """Number of each row's block of depth [m]; what is above the food belongs to the first.
+
+    Args:
+        depth: Of the edge in the food [m], metres.
+        inside: Rows in contact [m].
+        count: Blocks of equal depth.
+    """
+    edges = np.linspace(0.0, float(depth[inside].max()), count + 1)
+    return np.clip(np.searchsorted(edges, depth, side="right") - 1, 0, count - 1)
+
+
+def fit_slice(
+    predictor: SlicePredictor,
+    parameters: Sequence[ParameterRange],
+    block: np.ndarray,
+    cause: Cause | None = None,
+    scan: float | None = None,
+    start: Mapping[str, float] | None = None,
+    noise: float = 0.1,
+) -> SliceFit:
+    """Fits a slice, and predicts each block of depth from a fit to the others.
+
+    What is the record's own stays as fitted to all of it: where the knife was is not what is
+    predicted.
+
+    Args:
+        predictor: Of one record.
+        parameters: Base parameters.
+        block: Number of each row's block [m].
+        cause, scan: Fitted beside them.
+        start: Places of unknowns to start from, by name, in their sizes.
+        noise: Standard deviation of a row, against what is plausible beforehand, N.
+
+    Raises:
+        CuttingError: The slice breaks down where the fit begins.
+    """
+    unknowns = _unknowns(predictor, parameters, cause)
+    given = start or {}
+    theta = np.array([np.clip(given.get(u.name, 0.0), u.low, u.high) for u in unknowns])
+    work = _Work(predictor, unknowns, cause, scan, noise)
+    theta, predicted, jacobian = work.fit(theta)
+    held_out = np.empty_like(predicted)
+    shared = np.array([u.kind != "own" for u in unknowns])
+    for number in np.unique(block):
+        rows = block == number
+        held_out[rows] = work.without(theta, predicted, jacobian, rows, shared)[rows]
+    return SliceFit(
+        unknowns,
+        theta,
+        cause,
+        scan,
+        work.point(theta),
+        predicted,
+        jacobian,
+        held_out,
+        work.failures,
+    )
+
+
+class _Work:
+    def __init__(
+        self,
+        predictor: SlicePredictor,
+        unknowns: list[Unknown],
+        cause: Cause | None,
+        scan: float | None,
+        noise: float,
+    ) -> None:
+        self.predictor, self.unknowns, self.cause, self.scan = predictor, unknowns, cause, scan
+        (self.target,) = predictor.targets
+        self.noise = noise
+        self.low = np.array([u.low for u in unknowns])
+        self.high = np.array([u.high for u in unknowns])
+        self.spread = np.array([u.spread for u in unknowns])
+        self.failures = 0
+
+    def point(self, theta: np.ndarray) -> Point:
+        values: dict[str, dict[str, float]] = {"base": {}, "own": {}, "cause": {}}
+        for u, x in zip(self.unknowns, theta, strict=True):
+            values[u.kind][u.name] = u.value(float(x))
+        causes: tuple[ActiveCause, ...] = ()
+        if self.cause is not None:
+            own = self.cause.nulls() | values["cause"]
+            if self.cause.scan is not None and self.scan is not None:
+                own[self.cause.scan.name] = self.scan
+            causes = (ActiveCause(self.cause, own),)
+        return Point(values["base"], {self.target.facts.name: values["own"]}, causes)
+
+    def predict(self, thetas: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Predictions at the rows [m, c]; not finite where the slice broke down."""
+        out = []
+        for (series,) in self.predictor.predict([self.point(t) for t in thetas]):
+            assert series is not None
+            seen = self.target.compare(series.wrench[:, :, None])[:, :, 0]
+            self.failures += not np.isfinite(seen).all()
+            out.append(seen)
+        return out
+
+    def cost(self, theta: np.ndarray, predicted: np.ndarray, rows: np.ndarray) -> float:
+        """Sum of squares over some rows, with what is plausible beforehand; infinite for a slice
+        that broke."""
+        if not np.isfinite(predicted).all():
+            return np.inf
+        rest = (self.target.measured - predicted)[rows].ravel() / self.noise
+        return float(rest @ rest + ((theta / self.spread) ** 2).sum())
+
+    def fit(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        (predicted,) = self.predict([theta])
+        everything = np.ones(len(predicted), bool)
+        cost = self.cost(theta, predicted, everything)
+        if not np.isfinite(cost):
+            raise CuttingError(
+                f"{self.target.facts.name}: the prediction broke down where its fit begins"
+            )
+        free = np.ones(len(theta), bool)
+        for _ in range(STEPS):
+            jacobian = self.jacobian(theta, predicted)
+            aim = self.refit(theta, predicted, jacobian, everything, free)
+            tries, seen, costs = self.search(theta, aim, everything)
+            best = int(np.argmin(costs))
+            if not costs[best] < (1.0 - ENOUGH) * cost:
+                break
+            theta, predicted, cost = tries[best], seen[best], costs[best]
+        return theta, predicted, jacobian
+
+    def without(
+        self,
+        theta: np.ndarray,
+        predicted: np.ndarray,
+        jacobian: np.ndarray,
+        rows: np.ndarray,
+        free: np.ndarray,
+    ) -> np.ndarray:
+        """The prediction by a fit to the other rows, with the derivatives of the fit to all.
+
+        It begins where all rows were fitted, so that one that stayed there would have seen what it
+        predicts. The first step is taken even where it makes the rest a little worse: as good a
+        fit to the rest as it can tell, and one without the rows.
+        """
+        cost = AS_GOOD * self.cost(theta, predicted, ~rows)
+        for _ in range(HELD_OUT_STEPS):
+            aim = self.refit(theta, predicted, jacobian, ~rows, free)
+            tries, seen, costs = self.search(theta, aim, ~rows)
+            # The longest step that is nearly as good as the best one.
+            best = int(np.argmax(np.array(costs) <= AS_GOOD * min(costs)))
+            if not costs[best] < (1.0 - ENOUGH) * cost:
+                break
+            theta, predicted, cost = tries[best], seen[best], costs[best]
+        return predicted
+
+    def search(
+        self, theta: np.ndarray, aim: np.ndarray, rows: np.ndarray
+    ) -> tuple[list[np.ndarray], list[np.ndarray], list[float]]:
+        """Places on the way to an aim, their predictions and their costs over some rows."""
+        tries = [theta + share * (aim - theta) for share in (1.0, 0.5, 0.2)]
+        seen = self.predict(tries)
+        return tries, seen, [self.cost(t, p, rows) for t, p in zip(tries, seen, strict=True)]
+
+    def jacobian(self, theta: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+        """Change by each unknown, towards the side that has room [m, c, n]."""
+        n = len(theta)
+        sides = np.where(theta + 1.0 <= self.high, 1.0, -1.0)
+        seen = self.predict([theta + sides[k] * np.eye(n)[k] for k in range(n)])
+        out = np.zeros((*predicted.shape, n))
+        for k, there in enumerate(seen):
+            if np.isfinite(there).all():
+                out[:, :, k] = sides[k] * (there - predicted)
+        return out
+
+    def refit(
+        self,
+        theta: np.ndarray,
+        predicted: np.ndarray,
+        jacobian: np.ndarray,
+        rows: np.ndarray,
+        free: np.ndarray,
+    ) -> np.ndarray:
+        """One Gauss-Newton step over some rows and some unknowns, within their ranges."""
+        A = jacobian[rows][:, :, free].reshape(-1, int(free.sum())) / self.noise
+        b = (self.target.measured - predicted)[rows].ravel() / self.noise
+        prior = np.diag(1.0 / self.spread[free])
+        low = np.maximum(self.low, theta - LONGEST)[free] - theta[free]
+        high = np.minimum(self.high, theta + LONGEST)[free] - theta[free]
+        step = lsq_linear(
+            np.vstack([A, prior]),
+            np.concatenate([b, -theta[free] / self.spread[free]]),
+            (np.minimum(low, -1e-9), np.maximum(high, 1e-9)),
+        ).x
+        out = theta.copy()
+        out[free] += step
+        return out

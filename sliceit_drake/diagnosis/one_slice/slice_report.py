@@ -1,0 +1,132 @@
+"""Figures and report of what one slice shows."""
+
+import html
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from sliceit_drake.diagnosis.html_page import html_page, image
+from sliceit_drake.diagnosis.one_slice.slice_evidence import LEVEL
+from sliceit_drake.diagnosis.one_slice.slice_result import OneSlice
+
+__all__ = ["evidence_table", "report_html", "slice_figure"]
+
+MEASURED, FITTED, LEFT_OUT, CAUSE = "#111827", "#2563eb", "#c2410c", "#047857"
+
+
+def slice_figure(results: Sequence[OneSlice], titles: Sequence[str]) -> Figure:
+    """Force over depth, what the fit leaves, and what is left of depth that was left out.
+
+    Args:
+        results: Of one slice, by simulations that differ; one column each.
+        titles: Of the columns.
+    """
+    count = len(results)
+    figure = Figure(figsize=(5.6 * count + 0.6, 6.4), layout="constrained")
+    axes = figure.subplots(
+        2, count, squeeze=False, sharex="col", sharey="row", height_ratios=(3.0, 2.0)
+    )
+    for (top, bottom), result, title in zip(axes.T, results, titles, strict=True):
+        record, channel = result.record, result.shown
+        depth = 1e3 * record.depth
+        measured = record.measured[:, channel]
+        top.plot(depth, measured, color=MEASURED, lw=1.8, label="measured")
+        top.plot(
+            depth, result.fit.predicted[:, channel], "--", color=FITTED, lw=1.6, label="fitted"
+        )
+        best = next(iter(result.supported), None)
+        bottom.axhline(0.0, color="0.6", lw=0.8)
+        for axis in (top, bottom):
+            _blocks(axis, result)
+            axis.grid(alpha=0.25)
+        bottom.plot(
+            depth,
+            measured - result.fit.predicted[:, channel],
+            "--",
+            color=FITTED,
+            lw=1.4,
+            label=f"fitted to all depth ({result.error(result.fit.predicted):.2f} N RMS)",
+        )
+        bottom.plot(
+            depth,
+            measured - result.fit.held_out[:, channel],
+            color=LEFT_OUT,
+            lw=1.4,
+            label=f"each block left out ({result.error(result.fit.held_out):.2f} N)",
+        )
+        if best is not None:
+            own = result.fits[best.name]
+            bottom.plot(
+                depth,
+                measured - own.held_out[:, channel],
+                ":",
+                color=CAUSE,
+                lw=1.8,
+                label=f"left out, with {best.name} ({result.error(own.held_out):.2f} N)",
+            )
+        top.set_title(title, loc="left", fontsize=11)
+        bottom.set_xlabel("depth of the edge, as the record says [mm]")
+        top.legend(frameon=False, fontsize=9, loc="upper left")
+        bottom.legend(frameon=False, fontsize=9, loc="lower left")
+    rest = np.concatenate(
+        [
+            (r.record.measured - p)[:, r.shown]
+            for r in results
+            for p in (r.fit.predicted, r.fit.held_out)
+        ]
+    )
+    low, high = float(rest.min()), float(rest.max())
+    # Room for the legend below the curves.
+    axes[1, 0].set_ylim(low - 0.55 * (high - low), high + 0.1 * (high - low))
+    what = "force" if results[0].record.channels[0] == "force_norm" else "vertical force"
+    axes[0, 0].set_ylabel(f"{what} [N]")
+    axes[1, 0].set_ylabel("measured - simulated [N]")
+    return figure
+
+
+def _blocks(axis: Axes, result: OneSlice) -> None:
+    """Shades every other block of depth."""
+    depth = 1e3 * result.record.depth
+    for k in np.unique(result.block)[1::2]:
+        rows = result.block == k
+        axis.axvspan(depth[rows].min(), depth[rows].max(), color="0.5", alpha=0.10, lw=0)
+
+
+def evidence_table(result: OneSlice, most: int = 8) -> str:
+    """Evidence of the causes that come nearest, in Markdown."""
+    lines = [
+        "| cause | gain | p | left out, linear [N] | by simulation [N] | blocks better "
+        "| ratio without its best block |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    before = result.error(result.fit.held_out)
+    blocks = len(np.unique(result.block))
+    lines.append(f"| none | | | {result.evidence.held_out:.2f} | {before:.2f} | | |")
+    shown = [c for k, c in enumerate(result.evidence.causes) if k < most or c.confirmed is not None]
+    names = {c.name for c in result.supported}
+    for c in shown:
+        own = "" if c.confirmed is None else f"{c.confirmed:.2f}"
+        better = "" if c.confirmed is None else f"{c.blocks_better} of {blocks}"
+        ratio = "" if c.confirmed is None else f"{c.without_best:.2f}"
+        name = f"**`{c.name}`**" if c.name in names else f"`{c.name}`"
+        lines.append(
+            f"| {name} | {c.gain:.1f} | {c.p_value:.3f} | {c.held_out:.2f} | {own} | {better} "
+            f"| {ratio} |"
+        )
+    return "\n".join(lines)
+
+
+def report_html(result: OneSlice) -> str:
+    """The report as one self-contained page."""
+    parts = [
+        "<h1>What the simulation gets wrong in one slice</h1>",
+        "<p>This describes one slice. It is no diagnosis: how slices vary is unknown, so that what"
+        f" is found may be this slice's own. p is that of a gain as large, by any cause, where"
+        f" nothing is wrong; below {LEVEL:g} it counts.</p>",
+        f"<pre>{html.escape(result.table())}</pre>",
+        "<h2>Measured and simulated</h2>",
+        image(slice_figure([result], [result.record.name])),
+    ]
+    return html_page("One slice", parts)

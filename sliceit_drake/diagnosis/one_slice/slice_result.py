@@ -1,0 +1,235 @@
+"""What one slice shows, as a result: what follows from it, its table, and its files."""
+
+import dataclasses as dc
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sliceit_drake.diagnosis.cause import EXPERIMENTS, Cause
+from sliceit_drake.diagnosis.evidence.sensitivity import RecordSensitivity
+from sliceit_drake.diagnosis.evidence.verdict import LEAST_REPLICATES
+from sliceit_drake.diagnosis.experiments.identifiability import SHOWS, Identifiability
+from sliceit_drake.diagnosis.identifiability_report import classes, short
+from sliceit_drake.diagnosis.one_slice.slice_evidence import LEVEL, CauseInSlice, SliceEvidence
+from sliceit_drake.diagnosis.one_slice.slice_fit import SliceFit
+from sliceit_drake.diagnosis.registry import is_users
+
+__all__ = ["KIND", "LEAST_GAIN", "OneSlice"]
+
+KIND = "one_slice"
+"""The verdict on a single record, whatever it shows."""
+LEAST_GAIN = 0.1
+"""Least share of the error on left-out depth that such a cause removes."""
+
+
+@dc.dataclass
+class OneSlice:
+    """What one slice shows; prints as a table, saves to a folder.
+
+    Attributes:
+        record: Measured, and predicted by the fit, with sensitivities there.
+        evidence: Of all causes.
+        fit: Without a cause.
+        fits: With those that were confirmed, by name.
+        block: Number of each row's block of depth.
+        angles: Between causes, from projected sensitivities.
+        causes: All that were tested, by name.
+        remarks: What a reader must know.
+        elements: Tetrahedra of the food.
+    """
+
+    record: RecordSensitivity
+    evidence: SliceEvidence
+    fit: SliceFit
+    fits: dict[str, SliceFit]
+    block: np.ndarray
+    angles: Identifiability
+    causes: dict[str, Cause]
+    remarks: list[str]
+    elements: int = 0
+
+    kind = KIND
+
+    @property
+    def supported(self) -> list[CauseInSlice]:
+        """Causes that explain more than chance would, and predict depth that was left out."""
+        before = self.error(self.fit.held_out)
+        return [
+            c
+            for c in self.evidence.causes
+            if c.p_value <= LEVEL
+            and c.confirmed is not None
+            and c.confirmed <= (1.0 - LEAST_GAIN) * before
+            and c.without_best <= 1.0 - LEAST_GAIN
+        ]
+
+    @property
+    def supported_classes(self) -> list[list[str]]:
+        """Those causes with what this slice cannot tell from each; one that is in the class of
+        another has none of its own."""
+        out: list[list[str]] = []
+        for c in self.supported:
+            if not any(c.name in group for group in out):
+                out.append([c.name, *c.others])
+        return out
+
+    @property
+    def verdict(self) -> str:
+        """In a sentence."""
+        found = self.supported
+        if not found:
+            untried = [
+                c.name for c in self.evidence.causes if c.p_value <= LEVEL and c.confirmed is None
+            ]
+            return (
+                "in this slice no cause that was fitted explains more of what is left than chance"
+                " would and predicts depth that was left out"
+                + (f" (not fitted by simulation: {', '.join(untried)})" if untried else "")
+            )
+        names = "; ".join(" or ".join(map(short, group)) for group in self.supported_classes)
+        return f"this slice is described better with {names}; another slice may show otherwise"
+
+    @property
+    def classes(self) -> list[list[str]]:
+        """What this motion cannot tell apart; they may overlap."""
+        groups = classes(self.angles)
+        return [g for g in groups if not any(set(g) < set(other) for other in groups)]
+
+    @property
+    def drowned(self) -> list[str]:
+        """Causes that could show, but not above what this simulation gets wrong in this slice."""
+        small = [c.name for c in self.evidence.causes if c.shows < SHOWS]
+        return sorted(set(small) - set(self.hidden))
+
+    @property
+    def hidden(self) -> list[str]:
+        """Causes that such a slice could not show at their plausible size, were all else right."""
+        names = self.angles.names
+        return [
+            names[k] for k in range(self.angles.shifts, len(names)) if not self.angles.visible[k]
+        ]
+
+    def error(self, predicted: np.ndarray, rows: np.ndarray | None = None) -> float:
+        """RMS error of the forces of a prediction, N."""
+        keep = [k for k, c in enumerate(self.record.channels) if c.startswith("force")]
+        rest = (self.record.measured - predicted)[:, keep]
+        rest = rest if rows is None else rest[rows]
+        return float(np.sqrt((rest**2).sum(1).mean())) if len(rest) else 0.0
+
+    def by_depth(self) -> list[tuple[str, int, float, float, float]]:
+        """Of the air and each block of depth: name, rows, mean and RMS of what the fit leaves, RMS
+        where it was left out, N."""
+        record, out = self.record, []
+        depth = record.depth
+        parts = [("before contact", ~record.in_contact & (depth <= 0.0))]
+        for k in range(int(self.block.max()) + 1):
+            rows = (self.block == k) & record.in_contact
+            if rows.any():
+                low, high = 1e3 * depth[rows].min(), 1e3 * depth[rows].max()
+                parts.append((f"{low:.1f} to {high:.1f} mm", rows))
+        channel = self.shown
+        for name, rows in parts:
+            if rows.any():
+                rest = (record.measured - self.fit.predicted)[rows, channel]
+                errors = self.error(self.fit.predicted, rows), self.error(self.fit.held_out, rows)
+                out.append((name, int(rows.sum()), float(rest.mean()), *errors))
+        return out
+
+    @property
+    def shown(self) -> int:
+        """Number of the channel that figures and tables show."""
+        channels = self.record.channels
+        return channels.index("force_z") if "force_z" in channels else 0
+
+    def experiments(self) -> list[str]:
+        """Experiments that part what this slice cannot tell apart or does not show, those that
+        serve most causes first."""
+        names = {n for group in self.classes for n in group} | set(self.hidden)
+        asked = [self.causes[n].experiment for n in sorted(names) if n in self.causes]
+        asked += ["repeats"] * len(self.supported)
+        return sorted(set(asked), key=lambda e: (-asked.count(e), e))
+
+    def table(self) -> str:
+        """The result in a minute."""
+        lines = [
+            f"1 record: {self.record.name}",
+            f"Verdict: {KIND.replace('_', ' ')}, no diagnosis: {self.verdict}",
+            f"Error of the fit {self.error(self.fit.predicted):.3f} N, on depth that was left out "
+            f"{self.error(self.fit.held_out):.3f} N; "
+            + ", ".join(
+                f"{k} {v:.3g}"
+                for k, v in (self.fit.values("base") | self.fit.values("own")).items()
+            ),
+            "",
+            f"{'depth':>18}{'rows':>6}{'mean left N':>13}{'RMS N':>8}{'left out N':>12}",
+        ]
+        for name, rows, mean, rms, out in self.by_depth():
+            lines.append(f"{name:>18}{rows:6d}{mean:13.2f}{rms:8.2f}{out:12.2f}")
+        lines += ["", f"{'cause':20}{'gain':>8}{'p':>8}{'left out N':>12}{'by simulation':>15}"]
+        mine = [c for c in self.evidence.causes[10:] if is_users(self.causes[c.name])]
+        for c in (*self.evidence.causes[:10], *mine):
+            own = "" if c.confirmed is None else f"{c.confirmed:.3f}"
+            lines.append(f"{c.name:20}{c.gain:8.1f}{c.p_value:8.3f}{c.held_out:12.3f}{own:>15}")
+        lines.append(
+            f"{'without a cause':20}{'':16}{self.evidence.held_out:12.3f}"
+            f"{self.error(self.fit.held_out):15.3f}"
+        )
+        lines.append("")
+        for group in self.classes:
+            lines.append(f"Not told apart by such a slice: {', '.join(map(short, group))}")
+        if self.hidden:
+            lines.append(f"Such a slice cannot show: {', '.join(self.hidden)}")
+        if self.drowned:
+            lines.append(
+                f"Not above what the simulation gets wrong here: {', '.join(self.drowned)}"
+            )
+        lines += self.needed()
+        return "\n".join(lines + self.remarks)
+
+    def needed(self) -> list[str]:
+        """What would make a diagnosis of it."""
+        lines = [
+            f"Needed for a diagnosis: at least {LEAST_REPLICATES} slices of each condition (one"
+            " slice says nothing of how slices vary)."
+        ]
+        for name in self.experiments()[:3]:
+            lines.append(f"  Next: {EXPERIMENTS[name]} ({name})")
+        return lines
+
+    def facts(self) -> dict[str, Any]:
+        """The result as plain values."""
+        return {
+            "verdict": KIND,
+            "reason": self.verdict,
+            "record": self.record.name,
+            "supported_in_this_slice": self.supported_classes,
+            "error_N": self.error(self.fit.predicted),
+            "held_out_depth_error_N": self.error(self.fit.held_out),
+            "values": self.fit.values("base") | self.fit.values("own"),
+            "by_depth": [
+                dict(zip(("part", "rows", "mean_N", "rms_N", "left_out_N"), row, strict=True))
+                for row in self.by_depth()
+            ],
+            "evidence": [dc.asdict(c) for c in self.evidence.causes],
+            "noise": {
+                c: dc.asdict(n)
+                for c, n in zip(self.record.channels, self.evidence.noise, strict=True)
+            },
+            "not_told_apart": self.classes,
+            "cannot_show": self.hidden,
+            "not_above_what_is_left": self.drowned,
+            "experiments": self.experiments(),
+            "slices_needed_of_each_condition": LEAST_REPLICATES,
+            "remarks": self.remarks,
+        }
+
+    def save(self, directory: Path) -> None:
+        """Writes diagnosis.json and report.html; no food is extended by what one slice shows."""
+        from sliceit_drake.diagnosis.one_slice.slice_report import report_html
+
+        directory.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(self.facts(), indent=2) + "\n"
+        (directory / "diagnosis.json").write_text(text, encoding="utf-8")
+        (directory / "report.html").write_text(report_html(self), encoding="utf-8")

@@ -1,0 +1,1 @@
+"""What a run leaves: its log, figures, slice records, series for ParaView."""

@@ -1,0 +1,123 @@
+"""The guarded touch of a scenario: plan, limits, and what the found height means for a run."""
+
+import dataclasses as dc
+
+import numpy as np
+
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.motion import ConstantSpeed, MotionPlan
+from sliceit_drake.diagrams.hardware_station import make_knife_kinematics, make_safety_layer
+from sliceit_drake.hardware.checks import Check
+from sliceit_drake.hardware.guarded_touch import GuardedTouch, Touch, TouchError
+from sliceit_drake.hardware.rtde_link import RobotLink
+from sliceit_drake.robot_run.hardware_run import HardwareRun, steady_python
+from sliceit_drake.robot_run.plan_check import JointPlan, check_plan, plan_joints
+from sliceit_drake.systems.motion_sources import placed_motion
+
+__all__ = ["BoardTouch", "check_height"]
+
+SAMPLE = 1e-3
+"""Between the postures that the path is made of, m."""
+
+
+@dc.dataclass
+class BoardTouch:
+    """A touch that finds the board straight under the start of a scenario.
+
+    Attributes:
+        hardware: Whose robot, start and limits are used; the height of its scenario's board is the
+            one that is expected.
+        depth: Farthest way down, m.
+        plan: The way down to there in joint space.
+        link: To the robot, once it ran.
+    """
+
+    hardware: HardwareRun
+    depth: float = dc.field(init=False)
+    plan: JointPlan = dc.field(init=False)
+    link: RobotLink | None = dc.field(init=False, default=None)
+
+    def __post_init__(self) -> None:
+        twin, touch = self.hardware.twin, self.hardware.config.touch
+        start = twin.start_pose
+        self.depth = float(start.translation()[2]) - self.expected + touch.below
+        way = MotionPlan([ConstantSpeed(distance=self.depth, speed=touch.speed)])
+        self.plan = plan_joints(twin, placed_motion(way, start), SAMPLE / touch.speed)
+
+    @property
+    def expected(self) -> float:
+        """Height of the board that is expected, m."""
+        return self.hardware.scenario.board.height
+
+    def checks(self) -> list[Check]:
+        """The checks of the way down; under the board it goes on purpose."""
+        hardware = self.hardware
+        checks = check_plan(self.plan, hardware.twin, hardware.config, hardware.client)
+        return [check for check in checks if check.name != "depth at the board"]
+
+    def execute(self) -> Touch:
+        """Touches the board and goes back up; always stops the robot's program.
+
+        All limits of the robot's file hold, force and speed as far as the touch needs them, and the
+        depth from the lowest height at which it looks.
+
+        Raises:
+            TouchError: The board was not found, or a limit stopped the robot.
+        """
+        hardware, touch = self.hardware, self.hardware.config.touch
+        limits = hardware.config.limits
+        fastest = 2.0 * max(touch.speed, touch.retract_speed)
+        limits = dc.replace(
+            limits,
+            force=min(limits.force, touch.force_limit),
+            knife_speed=min(limits.knife_speed, fastest),
+        )
+        floor = self.expected - touch.below
+        link = self.link = RobotLink(
+            hardware.client, make_safety_layer(hardware.twin, limits, floor),
+            hardware.config.watchdog, hardware.pace,
+        )  # fmt: skip
+        status = link.start()
+        depths = touch.speed * self.plan.time
+
+        def path(way: float) -> np.ndarray:
+            return np.array([np.interp(way, depths, q) for q in self.plan.q.T])
+
+        reason = "the touch ended by an error"
+        try:
+            problem = hardware.not_ready(status.state)
+            if problem is not None:
+                raise TouchError(problem)
+            with steady_python():
+                found = GuardedTouch(
+                    link, path, self.depth, make_knife_kinematics(hardware.twin), touch,
+                    hardware.pace,
+                ).run()  # fmt: skip
+            reason = "the touch is complete"
+        finally:
+            link.finish(reason)
+        return found
+
+
+def check_height(found: Touch, expected: float, tolerance: float, field: str) -> None:
+    """Compares the board that was found with the one that was expected.
+
+    Args:
+        found: By the touch.
+        expected: m.
+        tolerance: m.
+        field: Where the expected height stands.
+
+    Raises:
+        ConfigurationError: They differ by more; it names both, and the field.
+    """
+    if abs(found.height - expected) <= tolerance:
+        return
+    raise ConfigurationError(
+        f"is {expected:.4f} m, but the knife met the board at {found.height:.4f} m (+- "
+        f"{1e3 * found.uncertainty:.2f} mm): {1e3 * (found.height - expected):+.2f} mm, allowed "
+        f"{1e3 * tolerance:g} mm",
+        field=field,
+        fix=f"See that nothing lies on the board; then write board_height: {found.height:.4f} in "
+        "the robot's file.",
+    )

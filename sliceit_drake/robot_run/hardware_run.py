@@ -1,0 +1,300 @@
+"""Runs a scenario on a robot: the diagram follows the controller's clock."""
+
+import dataclasses as dc
+import gc
+import sys
+import time as clock
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from pydrake.geometry import Meshcat
+from pydrake.systems.analysis import Simulator, SimulatorStatus
+
+from sliceit_drake.cutting.motion import Motion
+from sliceit_drake.diagrams.contact_margin import check_contact_margin
+from sliceit_drake.diagrams.hardware_station import (
+    PERIOD,
+    HardwareStation,
+    MakeHardwareStation,
+    make_safety_layer,
+)
+from sliceit_drake.diagrams.run import Run, measured_profile, write_outputs
+from sliceit_drake.diagrams.scenario import Scenario
+from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
+from sliceit_drake.diagrams.station import FRAMES_PER_SECOND, MakeSlicingStation, SlicingStation
+from sliceit_drake.hardware.checks import (
+    Check,
+    check_facts,
+    check_payload,
+    check_sensor,
+    check_start,
+)
+from sliceit_drake.hardware.client import RobotClient
+from sliceit_drake.hardware.configuration import HardwareConfig
+from sliceit_drake.hardware.interruption import raise_if_interrupted
+from sliceit_drake.hardware.robot_state import RobotState
+from sliceit_drake.hardware.rtde_link import RobotLink
+from sliceit_drake.robot_run.plan_check import JointPlan, check_plan, plan_joints
+from sliceit_drake.systems.motion_sources import placed_motion
+
+__all__ = ["HardwareRun", "prepare_hardware_run", "steady_python", "write_hardware_outputs"]
+
+SENSOR_SAMPLES = 50
+WARM_UP = 0.05
+"""Simulated in another context before the run, s."""
+NO_DATA = 1.0
+"""Controller time without data after which a run ends, s."""
+
+
+@dc.dataclass
+class HardwareRun:
+    """A scenario on a robot.
+
+    Attributes:
+        scenario: What is run, with the board's measured height.
+        config: The robot's file.
+        client: Connected.
+        twin: The simulated station of the same scenario, for model, start and replay.
+        plan: The motion in joint space.
+        pace: Controller seconds in a second.
+        run: Diagram and results, once it ran.
+        link: Likewise.
+    """
+
+    scenario: Scenario
+    config: HardwareConfig
+    client: RobotClient
+    twin: SlicingStation
+    plan: JointPlan
+    pace: float = 1.0
+    run: Run | None = None
+    link: RobotLink | None = None
+
+    @property
+    def motion(self) -> Motion:
+        """What the knife shall do."""
+        return placed_motion(self.twin.motion_plan, self.twin.start_pose)
+
+    def check_facts(self) -> list[Check]:
+        """Checks of the robot itself."""
+        return check_facts(self.client.facts(), self.config)
+
+    def check_before(self) -> list[Check]:
+        """Checks that need nothing to be done to the robot."""
+        return [
+            *self.check_facts(),
+            *check_plan(self.plan, self.twin, self.config, self.client),
+        ]
+
+    def check_at_start(self) -> list[Check]:
+        """Checks the start pose, zeroes the force sensor there, and checks what it shows."""
+        start = self.twin.start_joints.tolist()
+        checks = check_start(self.client.read(), start, self.config)
+        if all(check.passed for check in checks):
+            self.client.zero_sensor()
+            checks += check_sensor(self._some_states(), self.config, SENSOR_SAMPLES)
+        return checks
+
+    def not_ready(self, state: RobotState) -> str | None:
+        """What has changed while the operator read the plan, or None: the arm, or the payload."""
+        start = self.twin.start_joints.tolist()
+        checks = [
+            *check_start(state, start, self.config),
+            *check_payload(state.payload, self.config),
+        ]
+        return next((str(check) for check in checks if not check.passed), None)
+
+    def execute(
+        self,
+        duration: float | None = None,
+        progress: Callable[[float, float], None] | None = None,
+        *,
+        moves: bool = True,
+    ) -> Run:
+        """Runs the scenario to its end, or to the first fault; always stops the robot's program.
+
+        Args:
+            duration: s; None for the motion's.
+            progress: Called with run time and wall time, s, now and then.
+            moves: False to let the diagram follow the robot's data without sending anything.
+
+        Returns:
+            The run; `stopped` says why it ended early, or None.
+        """
+        link = self.link = RobotLink(
+            self.client, make_safety_layer(self.twin, self.config.limits),
+            self.config.watchdog, self.pace,
+        )  # fmt: skip
+        link.start()
+        reason = "the program ended by an error"
+        try:
+            run = self.run = self._prepare(link)
+            with steady_python():
+                self._follow(run, link, duration or run.motion.duration, progress, moves)
+            reason = run.stopped or "the motion is complete"
+        except KeyboardInterrupt:
+            reason = "interrupted by the user"
+            if self.run is None:
+                raise
+            self.run.stopped = reason
+        finally:
+            stop = link.finish(reason)
+        if stop.limit != "end":
+            self.run.stopped = str(stop)
+        return self.run
+
+    def _prepare(self, link: RobotLink) -> Run:
+        station = MakeHardwareStation(self.twin, link, self.pace)
+        diagram = MakeScenarioDiagram(self.scenario, None, station)
+        simulator = Simulator(diagram)
+        diagram.SetStart(simulator.get_mutable_context())
+        margin = check_contact_margin(self.twin)
+        # What runs for the first time is slow: it runs in another context before it counts.
+        rehearsal = Simulator(diagram, simulator.get_context().Clone())
+        rehearsal.Initialize()
+        rehearsal.AdvanceTo(WARM_UP)
+        return Run(self.scenario, diagram, simulator, measured_profile(self.scenario), margin)
+
+    def _follow(
+        self,
+        run: Run,
+        link: RobotLink,
+        duration: float,
+        progress: Callable[[float, float], None] | None,
+        moves: bool,
+    ) -> None:
+        station, simulator, policy = run.station, run.simulator, run.diagram.policy
+        assert isinstance(station, HardwareStation)
+        if policy is not None:
+            assert self.scenario.policy is not None
+            period = self.scenario.policy.period
+            policy.watch = lambda: link.deadline("policy", period)
+        context = simulator.get_mutable_context()
+        rtde = station.rtde
+        own = rtde.GetMyMutableContextFromRoot(context)
+        if moves:
+            stop = self.not_ready(link.latest().state) or link.arm()
+            if stop is not None:
+                run.stopped = str(stop)
+                rtde.receive(own)
+                simulator.Initialize()
+                return
+        status = link.latest()
+        rtde.receive(own, status)
+        simulator.Initialize()
+        zero, begin = status.state.time, clock.perf_counter()
+        shown = 0.0
+        while True:
+            raise_if_interrupted()
+            newer = link.wait(status, NO_DATA / self.pace)
+            if newer is None:
+                run.stopped = "no data from the robot"
+                return
+            is_new, status = newer.state is not status.state, newer
+            # A time that goes back is a fault; the diagram cannot follow it.
+            now = round((status.state.time - zero) / PERIOD) * PERIOD
+            if rtde.receive(own, status) is not None:
+                run.stopped = str(status.stop)
+                return
+            if not is_new:
+                continue
+            simulator.AdvanceTo(now)
+            outcome = simulator.AdvancePendingEvents()
+            if moves:
+                rtde.send(own)
+            run.wall_time = clock.perf_counter() - begin
+            if outcome.reason() == SimulatorStatus.ReturnReason.kReachedTerminationCondition:
+                run.stopped = outcome.message()
+                return
+            if now >= duration - 1e-9:
+                return
+            if progress is not None and now > shown + 0.1:
+                shown = now
+                progress(now, run.wall_time)
+
+    def _some_states(self) -> list[RobotState]:
+        """States of as many cycles from now on; fewer if the data do not go on."""
+        states: list[RobotState] = []
+        before, deadline = self.client.timestamp(), clock.perf_counter() + NO_DATA / self.pace
+        while len(states) < SENSOR_SAMPLES and clock.perf_counter() < deadline:
+            if self.client.timestamp() != before:
+                states.append(self.client.read())
+                before = states[-1].time
+            clock.sleep(1e-3)
+        return states
+
+
+def prepare_hardware_run(
+    scenario: Scenario,
+    config: HardwareConfig,
+    client: RobotClient,
+    pace: float = 1.0,
+    meshcat: Meshcat | None = None,
+) -> HardwareRun:
+    """Makes a scenario ready for a robot.
+
+    Args:
+        scenario: What to run; its board's height is replaced by the measured one.
+        config: The robot's file.
+        client: Connected.
+        pace: Controller seconds in a second; 1 for all robots.
+        meshcat: To draw the replay in, or None.
+
+    Raises:
+        ConfigurationError, MeshError, TimeStepError, CuttingError: The scenario cannot start.
+    """
+    if config.board_height is not None:
+        scenario.board.height = config.board_height
+    twin = MakeSlicingStation(scenario, meshcat)
+    return HardwareRun(scenario, config, client, twin, plan_joints(twin), pace)
+
+
+def write_hardware_outputs(hardware: HardwareRun, directory: Path) -> dict:
+    """Writes the files of `run.write_outputs` from what the robot measured.
+
+    And robot.csv: what came and what went out in every cycle, braking included; `robot` in the
+    summary has the timing. The replay shows the measured motion; the food in it is not cut.
+
+    Returns:
+        The summary.
+    """
+    run, link = hardware.run, hardware.link
+    assert run is not None and link is not None, "execute first"
+    meshcat = hardware.twin.meshcat
+    if meshcat is not None:
+        _draw(hardware, meshcat)
+    summary = write_outputs(run, directory, meshcat, {"robot": link.timing()})
+    link.write_log(directory / "robot.csv")
+    return summary
+
+
+def _draw(hardware: HardwareRun, meshcat: Meshcat) -> None:
+    """Publishes the measured motion to the viewer, frame by frame."""
+    assert hardware.run is not None
+    record, twin = hardware.run.record(), hardware.twin
+    context = twin.CreateDefaultContext()
+    model = twin.plant.GetMyMutableContextFromRoot(context)
+    joints, time = record.vector("q", "123456"), record["time"]
+    meshcat.StartRecording(frames_per_second=FRAMES_PER_SECOND)
+    for at in np.arange(0.0, time[-1] + 1e-9, 1.0 / FRAMES_PER_SECOND):
+        context.SetTime(at)
+        twin.plant.SetPositions(model, joints[min(np.searchsorted(time, at), len(time) - 1)])
+        twin.ForcedPublish(context)
+
+
+@contextmanager
+def steady_python() -> Iterator[None]:
+    """Keeps the interpreter from making a cycle late: no garbage walks, quick thread switches."""
+    interval = sys.getswitchinterval()
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    sys.setswitchinterval(1e-4)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(interval)
+        gc.enable()
+        gc.unfreeze()

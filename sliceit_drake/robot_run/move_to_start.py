@@ -1,0 +1,165 @@
+"""Moves the joints straight to the start of a run, watched, and never faster than the limits."""
+
+import dataclasses as dc
+import time as clock
+
+import numpy as np
+
+from sliceit_drake.diagrams.hardware_station import make_knife_kinematics
+from sliceit_drake.hardware.checks import Check
+from sliceit_drake.hardware.client import RobotUnavailableError
+from sliceit_drake.hardware.interruption import raise_if_interrupted
+from sliceit_drake.hardware.robot_state import RobotState
+from sliceit_drake.hardware.safety import robot_fault
+from sliceit_drake.robot_run.hardware_run import HardwareRun
+
+__all__ = ["MoveToStart"]
+
+SPEED = 0.3
+"""Of the fastest joint at most, rad/s."""
+ACCELERATION = 0.5
+"""Likewise, rad/s2."""
+SAMPLES = 200
+WATCHDOG = 10.0
+"""Inputs a second below which the controller stops the motion, Hz."""
+POLL = 5e-3
+NO_DATA = 0.1
+"""Controller time without data after which the motion is stopped, s."""
+SETTLING = 2.0
+AT_REST = 1e-3
+ARRIVED = 1e-3
+"""Distance of each joint from the start, rad: less than a short motion begins with."""
+
+
+@dc.dataclass
+class MoveToStart:
+    """The way from where the arm is to the start of a run: a line in joint space.
+
+    Nothing looks for obstacles, but for the board: the edge may not go below it, nor lower than it
+    is at the beginning, if that is below it already.
+
+    Attributes:
+        hardware: Whose robot, start and limits are used.
+        begin: Where the arm is.
+        speed: Of the fastest joint, rad/s.
+        knife_speed: Of the faster end of the edge then, m/s.
+        lowest: Least height of the edge on the way, m.
+        floor: Least height that is allowed, m.
+    """
+
+    hardware: HardwareRun
+    begin: RobotState = dc.field(init=False)
+    speed: float = dc.field(init=False)
+    knife_speed: float = dc.field(init=False)
+    lowest: float = dc.field(init=False)
+    floor: float = dc.field(init=False)
+
+    def __post_init__(self) -> None:
+        self.begin = self.hardware.client.read()
+        limits = self.hardware.config.limits
+        kinematics = make_knife_kinematics(self.hardware.twin)
+        q, turn = np.array(self.begin.q), self._turn
+        shares = np.linspace(0.0, 1.0, SAMPLES)
+        ends = np.array([kinematics.edge((q + s * turn).tolist())[:2] for s in shares])
+        self.lowest = float(ends[:, :, 2].min())
+        board = self.hardware.scenario.board.height
+        self.floor = min(board - limits.board_depth, float(ends[0, :, 2].min()) - 1e-4)
+        # Way of the knife's faster end for each radian of the fastest joint.
+        way = np.linalg.norm(np.diff(ends, axis=0), axis=2).max() * (SAMPLES - 1)
+        largest = float(np.abs(turn).max())
+        ratio = float(way) / largest if largest > 0.0 else 0.0
+        self.speed = min(SPEED, *limits.joint_speed)
+        if ratio > 0.0:
+            self.speed = min(self.speed, limits.knife_speed / ratio)
+        self.knife_speed = ratio * self.speed
+
+    @property
+    def _turn(self) -> np.ndarray:
+        return np.array(self.hardware.twin.start_joints) - self.begin.q
+
+    def checks(self) -> list[Check]:
+        """What must be true of the way."""
+        hardware, limits = self.hardware, self.hardware.config.limits
+        board = hardware.scenario.board.height
+        q, end = np.array(self.begin.q), np.array(hardware.twin.start_joints)
+        room = min(
+            float(np.min([np.array(limits.joint_upper) - x, x - np.array(limits.joint_lower)]))
+            for x in (q, end)
+        )
+        turn = self._turn
+        return [
+            Check(
+                "way to the start",
+                self.lowest >= self.floor,
+                f"edge down to {1e3 * (self.lowest - board):+.1f} mm over the board, knife up to "
+                f"{1e3 * self.knife_speed:.0f} mm/s",
+                "Move the arm to the start, or over it, by hand.",
+            ),
+            Check(
+                "joints on the way",
+                room >= 0.0 and bool((np.abs(turn) < np.pi).all()),
+                f"turn by {np.abs(turn).max():.3f} rad, allowed {np.pi:.3f}; {room:.3f} rad from a "
+                "limit",
+                "Turn them back by hand, and look at the cables.",
+            ),
+        ]
+
+    def execute(self) -> str | None:
+        """Moves, with the controller's watchdog set, and stops the robot's program at the end.
+
+        It stops at the first fault of robot or link, at the limit of force, and when the caller is
+        interrupted.
+
+        Returns:
+            Why the arm is not at the start; None if it is.
+
+        Raises:
+            RobotUnavailableError: The robot does not say that it has stopped.
+        """
+        client, hardware = self.hardware.client, self.hardware
+        try:
+            if not client.set_watchdog(WATCHDOG):
+                return "the controller did not accept the watchdog"
+            now = client.read().q
+            if max(abs(a - b) for a, b in zip(now, self.begin.q, strict=True)) > 1e-2:
+                return "somebody has moved the arm since the way was checked"
+            start = hardware.twin.start_joints.tolist()
+            if not client.start_move(start, self.speed, ACCELERATION):
+                return "the robot did not take the motion"
+            return self._watch(start)
+        finally:
+            try:
+                client.stop()
+            except RuntimeError as error:
+                raise RobotUnavailableError(
+                    f"The robot did not confirm that its program is stopped ({error}). Use the "
+                    "emergency stop before you go near it."
+                ) from error
+
+    def _watch(self, start: list[float]) -> str | None:
+        """Follows the motion; why it has to be stopped, or None when it is done."""
+        hardware, client, pace = self.hardware, self.hardware.client, self.hardware.pace
+        limits = hardware.config.limits
+        duration = float(np.abs(self._turn).max()) / self.speed + self.speed / ACCELERATION
+        deadline = clock.perf_counter() + (1.5 * duration + SETTLING) / pace
+        state, arrival = client.read(), clock.perf_counter()
+        while True:
+            raise_if_interrupted()
+            client.kick()
+            newer, now = client.read(), clock.perf_counter()
+            if newer.time != state.time:
+                state, arrival = newer, now
+            if now - arrival > NO_DATA / pace or not client.is_connected():
+                return "no data from the robot"
+            fault = robot_fault(state)
+            if fault is not None:
+                return str(fault)
+            force = float(np.linalg.norm(state.wrench[:3]))
+            if not force <= limits.force:
+                return f"the tool meets a force: {force:.3g} N, allowed {limits.force:g}"
+            off = max(abs(a - b) for a, b in zip(state.q, start, strict=True))
+            if off < ARRIVED and max(map(abs, state.qd)) < AT_REST:
+                return None
+            if now > deadline:
+                return f"it takes too long; a joint is {off:.3f} rad off the start"
+            clock.sleep(POLL)

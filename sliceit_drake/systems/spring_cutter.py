@@ -1,0 +1,130 @@
+"""The spring-only baseline of SliceIt!: the food is a button on a spring, and nothing is cut."""
+
+import math
+
+import numpy as np
+from pydrake.math import RigidTransform
+from pydrake.multibody.tree import BodyIndex
+from pydrake.systems.framework import BasicVector, Context, State
+
+from sliceit_drake.cutting.foods.spring_food import SpringFood
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.systems.knife_force import KnifeForceSystem
+
+__all__ = ["SpringCutter"]
+
+
+class SpringCutter(KnifeForceSystem):
+    """The knife on the button; see `KnifeForceSystem` and `SpringFood`.
+
+    The edge pushes at its point nearest to the button's axis, as far as the button reaches, and
+    never pulls; a rising knife leaves the button behind, which follows at the spring's own pace.
+    Within an exchange the edge goes straight from its last pose to this one in steps of at most
+    `time_step`, and the button by backward Euler as in ODE, its contact solved exactly: stable at
+    any stiffness, with half a step times the stiffness of damping on top. An impact is without
+    rebound: the button's momentum goes into one step.
+    `cut_progress` is the largest compression so far over the travel.
+
+    Further output port:
+        compression: Of the button, m, and its rate, m/s [2].
+
+    Args:
+        food: The spring.
+        knife: Whose edge pushes.
+        X_WF: Pose of the food frame: the button's axis is Fz, the board is at its origin.
+        knife_body: Index of the knife's body.
+        exchange_period: s.
+    """
+
+    def __init__(
+        self,
+        food: SpringFood,
+        knife: Knife,
+        X_WF: RigidTransform,
+        knife_body: BodyIndex,
+        exchange_period: float,
+    ) -> None:
+        super().__init__(knife_body, exchange_period)
+        self.food = food
+        self._half_edge = 0.5 * knife.length
+        self._p_WT = X_WF.translation() + [0.0, 0.0, food.height]
+        self._steps = math.ceil(exchange_period / food.time_step - 1e-9)
+        self._button = self.DeclareDiscreteState(2)
+        self._spring = self.DeclareNumericParameter(BasicVector([food.stiffness, food.damping]))
+        self.DeclareStateOutputPort("compression", self._button)
+
+    def spring(self, context: Context) -> tuple[float, float]:
+        """Stiffness, N/m, and damping, Ns/m, in this context."""
+        stiffness, damping = context.get_numeric_parameter(self._spring).value().tolist()
+        return stiffness, damping
+
+    def SetSpring(self, context: Context, stiffness: float, damping: float) -> None:
+        """Puts a released button with another spring into the context; N/m and Ns/m."""
+        context.get_mutable_numeric_parameter(self._spring).SetFromVector([stiffness, damping])
+        for part in (self._button, self._wrench, self._progress, self._coupling):
+            context.SetDiscreteState(part, np.zeros(context.get_discrete_state(part).size()))
+
+    def randomize_context(self, context: Context, rng: np.random.Generator) -> None:
+        """Puts a released button into the context, ERP drawn within `erp_noise` at constant CFM.
+
+        A relative noise: ODE's default ERP of 0.2 less an absolute 0.3 would be no spring.
+        """
+        food = self.food
+        erp = food.erp() * (1.0 + food.erp_noise * rng.uniform(-1.0, 1.0))
+        drawn = food.with_erp_cfm(erp, food.cfm())
+        self.SetSpring(context, drawn.stiffness, drawn.damping)
+
+    def start(self, context: Context, state: State, X_WK: RigidTransform) -> None:
+        depth, _ = self._contact(X_WK.GetAsMatrix34())
+        self._set(state, self._button, [max(depth, 0.0), 0.0])
+
+    def advance(
+        self, context: Context, state: State, X_WK: RigidTransform
+    ) -> tuple[np.ndarray, float]:
+        stiffness, damping = self.spring(context)
+        mass, h = self.food.mass, self.exchange_period / self._steps
+        compression, rate = context.get_discrete_state(self._button).value().tolist()
+        begin, _ = self._contact(self.last_pose(context))
+        end, arm = self._contact(X_WK.GetAsMatrix34())
+        impulse = 0.0
+        deepest = float(context.get_discrete_state(self._progress).value()[0])
+        for k in range(1, self._steps + 1):
+            # An edge that was beside the button has no depth to come from.
+            edge = end if begin == -math.inf else begin + (end - begin) * k / self._steps
+            edge = min(edge, self.food.height)
+            free = (mass * rate - h * stiffness * compression) / (
+                mass + h * damping + h * h * stiffness
+            )
+            reached = max(compression + h * free, 0.0)
+            pushed = edge > reached
+            if pushed:
+                reached = edge
+            new_rate = (reached - compression) / h
+            if pushed:
+                push = stiffness * reached + damping * new_rate + mass * (new_rate - rate) / h
+                impulse += push * h
+            # The stop at the top takes the button's momentum.
+            compression, rate = reached, new_rate if reached > 0.0 else 0.0
+            deepest = max(deepest, compression / self.food.height)
+        self._set(state, self._button, [compression, rate])
+        force = impulse / self.exchange_period
+        moment_x, moment_y = arm[1] * force, -arm[0] * force
+        return np.array([moment_x, moment_y, 0.0, 0.0, 0.0, force]), min(deepest, 1.0)
+
+    def _contact(self, X_WK: np.ndarray) -> tuple[float, tuple[float, float]]:
+        """Depth of the edge below the button's released top, metres, and the arm from Ko to it.
+
+        Args:
+            X_WK: As [3, 4].
+
+        Returns:
+            Depth, -inf where the edge passes beside the button, and the arm along Wx and Wy.
+        """
+        ax, ay, az = X_WK[:, 0].tolist()
+        dx, dy, dz = (self._p_WT - X_WK[:, 3]).tolist()
+        level = ax * ax + ay * ay
+        s = (ax * dx + ay * dy) / level if level > 0.0 else 0.0
+        s = min(max(s, -self._half_edge), self._half_edge)
+        if math.hypot(dx - s * ax, dy - s * ay) > 0.5 * self.food.diameter:
+            return -math.inf, (s * ax, s * ay)
+        return dz - s * az, (s * ax, s * ay)

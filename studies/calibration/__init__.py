@@ -1,0 +1,1 @@
+"""Studies of the calibration: coverage of its intervals, the paper's curves."""

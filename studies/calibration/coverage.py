@@ -1,0 +1,330 @@
+"""How often intervals of calibrations hold the truth: cuts with known parameters, calibrated."""
+
+import dataclasses as dc
+import json
+import textwrap
+from collections.abc import Callable, Sequence
+from concurrent.futures import as_completed
+from pathlib import Path
+
+import numpy as np
+from scipy.special import ndtri
+
+from sliceit_drake.calibration.gauss_newton import gauss_newton
+from sliceit_drake.calibration.noise import NoiseModel, group_series
+from sliceit_drake.calibration.prediction import Predictor
+from sliceit_drake.calibration.setup import CalibrationSetup, load_setup
+from sliceit_drake.calibration.uncertainty import estimate
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.foods.food import Cylinder
+from sliceit_drake.cutting.workers import worker_processes
+from sliceit_drake.records.metadata import FoodFacts, NominalMotion, SliceMetadata
+from sliceit_drake.records.slice_record import SliceRecord, velocities
+
+__all__ = [
+    "Problem",
+    "Replicate",
+    "coarse_setup",
+    "coverage_page",
+    "coverage_share",
+    "coverage_study",
+    "synthetic_predictor",
+]
+
+LEVEL = 0.9
+LEAST, MOST = 0.80, 0.98
+"""Between which the share of 90 % intervals that hold the truth must be."""
+LIMITS = """\
+The records come from the model itself, so that this tests the statistics and not the model: on real
+food the model lacks something, and that error is in no interval. Held-out errors show it. Where a
+height may be off by more than a part of the force's waves over the elements (some millimetres), or
+may bring the knife to the board, there are several fits that noise does not tell apart, and no
+normal distribution covers them.
+"""
+LEAST_SQUARES_STEPS = 5
+"""Before the weighted fit."""
+CLEARANCE, REST = 2.5e-3, 6e-3
+"""Of the knife above the food at the start, and above the board at the end, m: no record's height
+brings it to the board, where the force has a kink that no normal distribution describes."""
+
+
+@dc.dataclass(frozen=True)
+class Problem:
+    """What is simulated and calibrated in each replicate.
+
+    Attributes:
+        names: Shared parameters that are searched.
+        speeds: Of the press, m/s; each is a condition.
+        records: Of each condition.
+        rate: Samples a second.
+        time_step: Sub-step, s.
+        ar, tau, white: Noise of each channel: autoregressive part [N], its time [s], white part.
+        record_scale: Relative standard deviation of the force between slices.
+        height_offset: Range of each record's height to both sides, m. The force on coarse elements
+            has waves of some millimetres in depth; beyond a part of one there are several fits.
+        middle: Part of the unit range, about its middle, that true values are drawn from.
+        start_error: Standard deviation of the start from the truth, in the unit range.
+    """
+
+    names: tuple[str, ...] = ("material.toughness", "material.youngs_modulus", "material.friction")
+    speeds: tuple[float, ...] = (0.05, 0.15)
+    records: int = 3
+    rate: float = 200.0
+    time_step: float = 5e-4
+    ar: float = 0.06
+    tau: float = 0.02
+    white: float = 0.02
+    record_scale: float = 0.05
+    height_offset: float = 5e-4
+    middle: float = 0.5
+    start_error: float = 0.1
+
+
+@dc.dataclass(frozen=True)
+class Replicate:
+    """One calibration of simulated records.
+
+    Attributes:
+        number: Its seed.
+        problem: As text, to tell results of other problems.
+        names: Parameters [d].
+        truth, mean, deviation: Places of the truth and the estimate, its standard deviation [d].
+        inside: Whether the 90 % interval holds the truth [d].
+        record_scale: Estimated.
+        tau: Estimated, mean of all series, s.
+        rms: Error of the fit, N.
+    """
+
+    number: int
+    problem: str
+    names: list[str]
+    truth: list[float]
+    mean: list[float]
+    deviation: list[float]
+    inside: list[bool]
+    record_scale: float
+    tau: float
+    rms: float
+
+
+def coarse_setup(problem: Problem) -> CalibrationSetup:
+    """The cucumber's setup on some 300 tetrahedra with only the problem's parameters searched."""
+    setup = load_setup("cucumber")
+    assert isinstance(setup.food.shape, Cylinder)
+    setup.food.shape.rings, setup.food.shape.layers = 2, [0.0, 4e-3, 12e-3]
+    setup.parameters = [p for p in setup.parameters if p.name in problem.names]
+    setup.height_offset = [-problem.height_offset, problem.height_offset]
+    setup.oscillation = None
+    return setup
+
+
+def _press_record(name: str, height: float, speed: float, rate: float) -> SliceRecord:
+    """A press through a food of this height at constant speed, without a force as yet."""
+    time = np.arange(0.0, (height + CLEARANCE - REST) / speed, 1.0 / rate)
+    position = np.zeros((len(time), 3))
+    position[:, 2] = height + CLEARANCE - speed * time
+    rotation = np.tile(np.eye(3), (len(time), 1, 1))
+    metadata = SliceMetadata(
+        name=name,
+        condition=f"press at {speed:g} m/s",
+        food=FoodFacts(position=[0.0, 0.0, 0.0], yaw=0.0),
+        motion=NominalMotion(speed=speed, draw_ratio=0.0),
+    )
+    v, w = velocities(time, position, rotation)
+    return SliceRecord(metadata, time, position, rotation, v, w, force=np.zeros_like(position))
+
+
+def synthetic_predictor(
+    problem: Problem, truth: np.ndarray | None, rng: np.random.Generator
+) -> tuple[Predictor, np.ndarray]:
+    """Records made by the predictor's own model with noise, and the true places.
+
+    Args:
+        problem: What is simulated.
+        truth: Places [d]; drawn if None.
+        rng: Of truth and noise.
+
+    Raises:
+        ConfigurationError: A slice breaks down at the truth.
+    """
+    setup = coarse_setup(problem)
+    assert isinstance(setup.food.shape, Cylinder)
+    records = [
+        _press_record(f"{k}-{n}", setup.food.shape.diameter, speed, problem.rate)
+        for k, speed in enumerate(problem.speeds)
+        for n in range(problem.records)
+    ]
+    predictor = Predictor(setup, records, problem.time_step, "float64", workers=1)
+    d = len(predictor.parameters)
+    if truth is None:
+        truth = rng.uniform(0.5 - problem.middle / 2.0, 0.5 + problem.middle / 2.0, d)
+    (row,) = predictor.predict([truth])
+    force = np.concatenate([p.predicted.ravel() for p in row])
+    if not np.isfinite(force).all():
+        raise ConfigurationError("a slice breaks down at the truth", field="Problem")
+    groups = group_series(
+        predictor.used,
+        predictor.time,
+        predictor.record_of,
+        [3] * len(records),
+        predictor.conditions,
+    )
+    ar, tau, white = (np.full(len(groups), v) for v in (problem.ar, problem.tau, problem.white))
+    scales = force[:, None] * (predictor.record_of[:, None] == np.arange(len(records)))
+    noise = NoiseModel(groups, ar, tau, white, problem.record_scale, scales)
+    measured = predictor.split(force + noise.sample(rng, len(force)))
+    for target, series in zip(predictor.targets, measured, strict=True):
+        target.measured = series
+    return predictor, truth
+
+
+def _run_replicate(problem: Problem, number: int) -> Replicate:
+    """Simulates records, calibrates from near the truth and compares.
+
+    Raises:
+        ConfigurationError: A slice breaks down at the truth.
+        CuttingError: One breaks down near the estimate.
+    """
+    rng = np.random.default_rng(number)
+    predictor, truth = synthetic_predictor(problem, None, rng)
+    start = np.clip(truth + rng.normal(0.0, problem.start_error, len(truth)), 0.02, 0.98)
+    fit = gauss_newton(predictor, start, steps=LEAST_SQUARES_STEPS)
+    found = estimate(predictor, fit.unit)
+    mean, deviation = found.unit, found.posterior.deviation
+    reach = float(ndtri(0.5 + LEVEL / 2.0)) * deviation
+    low, high = np.clip(mean - reach, 0.0, 1.0), np.clip(mean + reach, 0.0, 1.0)
+    return Replicate(
+        number,
+        repr(problem),
+        [p.name for p in predictor.parameters],
+        truth.tolist(),
+        mean.tolist(),
+        deviation.tolist(),
+        ((low <= truth) & (truth <= high)).tolist(),
+        float(found.noise.record_scale or 0.0),
+        float(found.noise.tau.mean()),
+        predictor.error(predictor.predict([found.unit])[0]),
+    )
+
+
+def coverage_study(
+    problem: Problem,
+    replicates: int,
+    file: Path | None = None,
+    workers: int = 2,
+    progress: Callable[[int], None] | None = None,
+) -> list[Replicate]:
+    """Runs replicates, each in a process of its own kind, and returns them by number.
+
+    Args:
+        problem: What is simulated.
+        replicates: Number of them.
+        file: JSON lines to which each is written when it is done, and from which the study goes on.
+        workers: Processes.
+        progress: Called with the number of replicates done.
+
+    Raises:
+        ConfigurationError: The file holds results of another problem.
+    """
+    done: dict[int, Replicate] = {}
+    if file is not None and file.exists():
+        for line, text in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
+            replicate = Replicate(**json.loads(text))
+            if replicate.problem != repr(problem):
+                raise ConfigurationError(
+                    "is of another problem", source=f"{file}, line {line}", fix="Remove the file."
+                )
+            done[replicate.number] = replicate
+    missing = [n for n in range(replicates) if n not in done]
+    if progress is not None:
+        progress(replicates - len(missing))
+    # Processes that share a simulator's threads would hinder each other.
+    with worker_processes(min(workers, max(len(missing), 1))) as pool:
+        futures = [pool.submit(_run_replicate, problem, n) for n in missing]
+        for future in as_completed(futures):
+            replicate = future.result()
+            done[replicate.number] = replicate
+            if file is not None:
+                with open(file, "a", encoding="utf-8") as stream:
+                    stream.write(json.dumps(dc.asdict(replicate)) + "\n")
+            if progress is not None:
+                progress(sum(n in done for n in range(replicates)))
+    return [done[n] for n in range(replicates)]
+
+
+def coverage_page(problem: Problem, replicates: Sequence[Replicate], command: str) -> str:
+    """The page docs/coverage.md.
+
+    Args:
+        problem: What was simulated.
+        replicates: From `coverage_study`.
+        command: That repeats it.
+    """
+    names = replicates[0].names
+    shared = [n for n in names if ":" not in n]
+    kinds = [*shared, *dict.fromkeys(n.split(":", 1)[0] for n in names if ":" in n)]
+    rows = []
+    for kind in kinds:
+        members = [k for k, n in enumerate(names) if n == kind or n.startswith(f"{kind}:")]
+        inside = [r.inside[k] for r in replicates for k in members]
+        errors = np.array([r.mean[k] - r.truth[k] for r in replicates for k in members])
+        sd = np.array([r.deviation[k] for r in replicates for k in members])
+        rows.append(
+            f"| {kind} | {sum(inside)} of {len(inside)} | {100.0 * np.mean(inside):.0f} % "
+            f"| {np.sqrt(np.mean(errors**2)):.4f} | {np.sqrt(np.mean(sd**2)):.4f} "
+            f"| {errors.mean():+.4f} |"
+        )
+    share = coverage_share(replicates)
+    verdict = "within" if LEAST <= share <= MOST else "outside"
+    n = len(replicates)
+    # Of a share of n independent replicates.
+    error = np.sqrt(LEVEL * (1.0 - LEVEL) / n)
+    scale = np.array([r.record_scale for r in replicates])
+    tau = np.array([r.tau for r in replicates])
+    speeds = " and ".join(f"{1e3 * s:g} mm/s" for s in problem.speeds)
+    method = f"""How often the 90 % interval of a calibrated parameter holds the true value. Each of
+        {n}
+        replicates draws true values from the middle {100.0 * problem.middle:.0f} % of the ranges
+        and presses through a coarse cucumber with them, {problem.records} times at each of
+        {speeds}. It adds noise: first-order autoregressive ({problem.ar:g} N,
+        {1e3 * problem.tau:g} ms) and white ({problem.white:g} N) in each channel, and a scale of
+        each record's force ({100.0 * problem.record_scale:g} %). A record's height may be up to
+        {1e3 * problem.height_offset:g} mm off. Then it calibrates from a start
+        {problem.start_error:g} of the range away, without knowing the noise: least squares, then
+        the fit weighted with the noise that it estimates. `studies/calibration/coverage.py`
+        has the details."""
+    result = f"""All parameters together: **{100.0 * share:.1f} %**, {verdict}
+        {100.0 * LEAST:.0f} to {100.0 * MOST:.0f} %. With {n} replicates the share of a parameter
+        that all records share has a standard error of {100.0 * error:.0f} %. Errors and standard
+        deviations are in parts of the range."""
+    noise = f"""The noise as it was estimated (median, and 10 and 90 % quantiles of the replicates):
+        scale between records {_quantiles(100.0 * scale)} % of {100.0 * problem.record_scale:g} %,
+        correlation time {_quantiles(1e3 * tau)} ms of {1e3 * problem.tau:g} ms."""
+    header = (
+        "| parameter | inside | coverage | RMS error | stated standard deviation | mean error |",
+        "|---|---|---|---|---|---|",
+    )
+    parts = [
+        "# Coverage of calibration intervals",
+        _paragraph(method),
+        f"    {command}",
+        _paragraph(result),
+        "\n".join((*header, *rows)),
+        _paragraph(noise),
+        _paragraph(LIMITS),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def coverage_share(replicates: Sequence[Replicate]) -> float:
+    """Share of all intervals that hold the truth."""
+    return float(np.mean([inside for r in replicates for inside in r.inside]))
+
+
+def _paragraph(text: str) -> str:
+    return textwrap.fill(" ".join(text.split()), 100)
+
+
+def _quantiles(values: np.ndarray) -> str:
+    low, middle, high = np.quantile(values, (0.1, 0.5, 0.9))
+    return f"{middle:.1f} ({low:.1f} to {high:.1f})"

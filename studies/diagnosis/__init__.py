@@ -1,0 +1,1 @@
+"""Studies of the diagnosis on measured slices, and what it costs."""

@@ -1,0 +1,309 @@
+"""The page on what the simulation gets wrong in the paper's three measured slices."""
+
+import dataclasses as dc
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sliceit_drake.diagnosis.cause import EXPERIMENTS
+from sliceit_drake.diagnosis.evidence.verdict import LEAST_REPLICATES
+from sliceit_drake.diagnosis.experiments.identifiability import ANGLE
+from sliceit_drake.diagnosis.identifiability_report import short
+from sliceit_drake.diagnosis.one_slice.slice_evidence import LEVEL
+from sliceit_drake.diagnosis.one_slice.slice_report import evidence_table, slice_figure
+from sliceit_drake.diagnosis.one_slice.slice_result import LEAST_GAIN, OneSlice
+
+__all__ = ["SIMULATIONS", "MeasuredSlice", "draw", "page"]
+
+SIMULATIONS = {
+    "calibrated": "the calibrated food",
+    "plain": "the same without skin, core and centre",
+}
+
+CLAIMS = (
+    ("skin apart (7)", "apart", [("skin", "section_shape"), ("skin", "core")]),
+    ("shape and core as one class (11, 12)", "together", [("section_shape", "core")]),
+    ("slip apart, as an event (15)", "apart", [("slip", "core")]),
+    ("sensor's zero apart (16)", "apart", [("sensor_zero", "material.toughness")]),
+    ("delay or height as one class (19, dz)", "together", [("sensor_delay", "own.height")]),
+    (
+        "relaxation, rate, toughness, gain not apart (1, 2, 6, 17)",
+        "together",
+        [
+            ("viscoelasticity", "material.toughness"),
+            ("toughness_rate", "material.toughness"),
+            ("sensor_gain", "material.toughness"),
+        ],
+    ),
+    (
+        "friction and toughness not apart (4, 6)",
+        "together",
+        [("material.friction", "material.toughness")],
+    ),
+    ("friction and adhesion not apart (4, 5)", "together", [("material.friction", "adhesion")]),
+    (
+        "compliance of the arm and modulus not apart (14, E)",
+        "together",
+        [("arm_compliance", "material.youngs_modulus")],
+    ),
+)
+"""What a list of causes, made beforehand, says of one push cut at one speed."""
+
+HEAD = """\
+# What the simulation gets wrong
+
+In the paper's cucumber, tomato and potato: one recording each, one speed, a push, the norm of the
+force, read off a figure (calibration/measured/README.md). Written by
+
+    {command}
+
+**What such a recording can carry.** The unit of replication is the slice. There is one of each
+food, so that nothing here says how slices vary, and no cause is named: what is found holds *in this
+slice*, and another may show otherwise. `sliceit diagnose` gives such a record the verdict
+`one_slice`, whatever it shows, and extends no food by it.
+
+**How.** The simulation is fitted to the slice: all parameters that its calibration fitted, and
+height and speed of the knife within the ranges of the calibration. *Left out*: five contiguous
+blocks of depth, each predicted from a fit to the other four; where the knife was stays as fitted.
+*Gain*: twice the log-likelihood that a cause adds by generalised least squares, where all that the
+fit leaves is taken for an autocorrelated process within the slice (restricted maximum likelihood).
+*p*: that of a gain as large, relative to its spread, by any cause of the list where nothing is
+wrong, from {replicates} draws of that process. A cause is **supported in this slice** if p is at
+most {level:g}, and a fit by simulation with it takes {least:.0f} % or more off the error on
+left-out depth, also without the block where it gains most. *Linear* errors come from the
+derivatives at the fit; by these and by p the causes are chosen that are fitted by simulation. No
+interval stands beside the errors: blocks of one slice are no replicates. {elements}
+
+Two simulations: {simulations}. The first was calibrated on these very records; the second shows
+what its layers are worth.
+"""
+
+
+@dc.dataclass
+class MeasuredSlice:
+    """One food.
+
+    Attributes:
+        food: Its name.
+        results: By the names of `SIMULATIONS`.
+    """
+
+    food: str
+    results: dict[str, OneSlice]
+
+
+def draw(item: MeasuredSlice, folder: Path) -> Path:
+    """Draws the figure of a food."""
+    titles = [f"{item.food}: {SIMULATIONS[name]}" for name in item.results]
+    figure = slice_figure(list(item.results.values()), titles)
+    file = folder / f"one_slice_{item.food}.png"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file, dpi=110)
+    return file
+
+
+def page(items: Sequence[MeasuredSlice], replicates: int, command: str) -> str:
+    """The page in Markdown.
+
+    Args:
+        items: One a food.
+        replicates: Of the bootstrap.
+        command: That wrote it.
+    """
+    simulations = " and ".join(f"*{k}* ({v})" for k, v in SIMULATIONS.items())
+    counts = ", ".join(f"{i.food} {i.results['plain'].elements}" for i in items)
+    parts = [
+        HEAD.format(
+            command=command,
+            replicates=replicates,
+            level=LEVEL,
+            least=100 * LEAST_GAIN,
+            elements=f"Tetrahedra: {counts}.",
+            simulations=simulations,
+        ),
+        "## In short",
+        _summary(items),
+        *(_food(item) for item in items),
+        "## Against what was expected",
+        _claims(items),
+        "## What to record next",
+        _next(items),
+    ]
+    return "\n\n".join(part.strip() for part in parts) + "\n"
+
+
+def _summary(items: Sequence[MeasuredSlice]) -> str:
+    lines = [
+        "| food | simulation | RMS of the fit [N] | left out [N] | supported in this slice "
+        "| left out with it [N] |",
+        "|---|---|---|---|---|---|",
+    ]
+    for item in items:
+        for name, result in item.results.items():
+            found = result.supported
+            causes = "; ".join(" or ".join(map(short, g)) for g in result.supported_classes)
+            errors = "; ".join(f"{c.name} {c.confirmed:.2f}" for c in found)
+            lines.append(
+                f"| {item.food} | {name} | {result.error(result.fit.predicted):.2f} "
+                f"| {result.error(result.fit.held_out):.2f} | {causes or 'none'} | {errors} |"
+            )
+    layers = []
+    for item in items:
+        given, plain = (item.results[k] for k in ("calibrated", "plain"))
+        with_them, without = given.error(given.fit.held_out), plain.error(plain.fit.held_out)
+        if abs(without - with_them) > LEAST_GAIN * without:
+            how = "better" if with_them < without else "worse"
+            layers.append(
+                f"the {item.food}'s predict left-out depth {how} ({with_them:.2f} N with them, "
+                f"{without:.2f} N without)"
+            )
+        else:
+            layers.append(
+                f"the {item.food}'s make no difference there ({with_them:.2f} N and"
+                f" {without:.2f} N)"
+            )
+    return "\n".join(lines) + f"\n\nLayers from the calibration: {'; '.join(layers)}."
+
+
+def _food(item: MeasuredSlice) -> str:
+    parts = [f"## {item.food.capitalize()}"]
+    parts.append(f"![{item.food}](figures/one_slice_{item.food}.png)")
+    for name, result in item.results.items():
+        parts.append(f"**{SIMULATIONS[name].capitalize()}**: {result.verdict}. {_worst(result)}")
+        parts.append(_by_depth(result))
+        parts.append(evidence_table(result))
+        parts.append(_fitted(result))
+    plain = item.results["plain"]
+    groups = "; ".join("{" + ", ".join(map(short, g)) + "}" for g in plain.classes)
+    lines = [
+        f"Not told apart by such a recording: {groups or 'nothing that shows'}.",
+        f"It cannot show at a plausible size, were all else right: {_list(plain.hidden)}.",
+        f"Not above what this simulation gets wrong anyway: {_list(plain.drowned)}.",
+    ]
+    parts.append("\n".join(f"- {line}" for line in lines))
+    return "\n\n".join(parts)
+
+
+def _list(names: Sequence[str]) -> str:
+    return ", ".join(names) if names else "nothing"
+
+
+def _worst(result: OneSlice) -> str:
+    """Where most is left, in a sentence."""
+    rows = result.by_depth()
+    fit = max(rows, key=lambda row: row[3])
+    out = max(rows, key=lambda row: row[4])
+    noise = result.evidence.noise[0]
+    span = float(result.record.time[-1] - result.record.time[0])
+    text = (
+        f"The fit leaves most at {fit[0]} ({fit[3]:.2f} N RMS, mean {fit[2]:+.2f} N); left out,"
+        f" most is wrong at {out[0]} ({out[4]:.2f} N). What is left goes with itself over "
+        f"{1e3 * noise.tau:.0f} ms ({noise.ar:.2f} N; without memory {noise.white:.2f} N): a model "
+        "error or the slice's own structure, not noise of the sensor."
+    )
+    if noise.tau > 0.45 * span:
+        text += (
+            " That is the longest time that was allowed: what is left is no process with a level of"
+            " its own, and p is not to be trusted here."
+        )
+    return text
+
+
+def _by_depth(result: OneSlice) -> str:
+    lines = ["| depth | rows | mean left [N] | RMS left [N] | RMS left out [N] |"]
+    lines.append("|---|---|---|---|---|")
+    for name, rows, mean, rms, out in result.by_depth():
+        lines.append(f"| {name} | {rows} | {mean:+.2f} | {rms:.2f} | {out:.2f} |")
+    return "\n".join(lines)
+
+
+def _fitted(result: OneSlice) -> str:
+    shown = []
+    for c in result.evidence.causes:
+        if c.confirmed is not None:
+            values = ", ".join(
+                f"{k} {v:.2g} {p.unit}".rstrip()
+                for k, v in c.values.items()
+                for p in result.causes[c.name].parameters
+                if p.name == k and abs(v - p.null) > 1e-3 * p.size
+            )
+            scan = result.causes[c.name].scan
+            at = "" if scan is None or c.scan is None else f" at {scan.name} {c.scan:g} {scan.unit}"
+            shown.append(f"`{c.name}`{at.rstrip()}: {values or 'none of it'}")
+    base = {
+        k.removeprefix("material.").removeprefix("effects.").removeprefix("numerics."): v
+        for k, v in result.fit.values("base").items()
+    }
+    own = result.fit.values("own")
+    text = "Fitted: " + ", ".join(f"{k} {v:.3g}" for k, v in base.items())
+    if "height" in own:
+        text += f"; knife {1e3 * own['height']:+.2f} mm lower than the onset of the force says"
+    if "speed" in own:
+        text += f", {100 * (np.exp(own['speed']) - 1.0):+.0f} % faster than nominal"
+    return text + (f". With a cause: {'; '.join(shown)}." if shown else ".")
+
+
+def _claims(items: Sequence[MeasuredSlice]) -> str:
+    lines = [
+        "A list of causes, made before anything was computed, says of one push cut at one speed",
+        "what can be told apart. Here two are one class where the angle between their projected",
+        f"sensitivities is below {ANGLE:g} degrees; a cause that does not show at its plausible",
+        "size is part of what takes it up. Simulation: plain; noise as in docs/identifiability.md.",
+        "",
+        "| expected | " + " | ".join(i.food for i in items) + " |",
+        "|---|" + "---|" * len(items),
+    ]
+    for text, expected, pairs in CLAIMS:
+        cells = [_cell(item.results["plain"], expected, pairs) for item in items]
+        lines.append(f"| {text} | " + " | ".join(cells) + " |")
+    lines += ["", WHY_OTHER]
+    return "\n".join(lines)
+
+
+WHY_OTHER = """\
+Where it says no: the list speaks of the form of a residual in any simulation. These angles come
+from one simulation, after base parameters, height and speed were refitted, and trust that the
+section is round and that the pressure on the flank is that of the finite elements. What the fits
+above leave shows that the simulation is not right to that level. So where the two differ, the list
+is the safer reading, and more slices decide. What does not show is taken up by the refit entirely:
+that is the extreme of not being told apart."""
+
+
+def _cell(result: OneSlice, expected: str, pairs: Sequence[tuple[str, str]]) -> str:
+    """Whether it is as expected, with the angle of each pair."""
+    angles, names = result.angles, result.angles.names
+    out, verdicts = [], []
+    for a, b in pairs:
+        if a not in names or b not in names:
+            continue
+        i, j = names.index(a), names.index(b)
+        silent = [n for n, k in ((a, i), (b, j)) if not angles.visible[k]]
+        if silent:
+            out.append(f"{short(silent[0])} does not show")
+            verdicts.append(expected == "together")
+        else:
+            angle = min(angles.angles[i, j], angles.angles[j, i])
+            out.append(f"{short(a)} / {short(b)} {angle:.0f} deg")
+            verdicts.append(angles.equivalent(i, j) == (expected == "together"))
+    return f"{'yes' if all(verdicts) else 'no'}: {'; '.join(dict.fromkeys(out))}"
+
+
+def _next(items: Sequence[MeasuredSlice]) -> str:
+    lines = [
+        f"At least {LEAST_REPLICATES} slices of each condition, in random order: without them no"
+        " difference can be told from a slice. Then what reveals the causes that these recordings"
+        " cannot show or part, those first that serve most of them:",
+        "",
+    ]
+    for item in items:
+        plain = item.results["plain"]
+        names = ", then ".join(f"{EXPERIMENTS[e]} (`{e}`)" for e in plain.experiments()[:5])
+        lines.append(f"- {item.food}: {names}.")
+    lines += [
+        "",
+        "All channels of the wrench, the commanded and the measured height, half a second of air"
+        " before contact, and the size of the section at the cut belong to it. With two records or"
+        " more `sliceit diagnose --next-experiment FILE` writes the motion.",
+    ]
+    return "\n".join(lines)

@@ -1,0 +1,1 @@
+"""DiSECt's reference case, cut here."""

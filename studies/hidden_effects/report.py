@@ -1,0 +1,373 @@
+"""The report of the study: docs/hidden_effects.md, its numbers as JSON, and a figure."""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from studies.hidden_effects.cases import KINDS
+from studies.hidden_effects.score import NAMING, Judgement, Rate, rate
+from studies.hidden_effects.truth import BASE_OF
+
+__all__ = ["numbers", "plot_curves", "report"]
+
+HEAD = """\
+# Hidden effects: how often the diagnosis is right
+
+Does the diagnosis name the right cause, and does it keep silent where there is none? Effects are
+hidden in records of the stand-in ([stand_in.md](stand_in.md)), which cuts on another mesh and with
+another step than the diagnosis, by laws that are written otherwise. `sliceit diagnose` runs as a
+process of its own and is given the folder of records and the food without any effect, nothing else.
+Then its diagnosis.json is compared with what was hidden. Everything here is simulated.
+
+    {command}
+    python -m studies score output/hidden --output docs
+
+Many runs take hours; the study can be stopped, and goes on. `hidden_effects.jsonl` beside this page
+has what was said in each run: `python -m studies score docs/hidden_effects.jsonl --output docs` judges it
+again and writes this page, the first command with `--runs-from docs/hidden_effects.jsonl` goes on
+from there.
+
+An effect has the size at which its strength delta is a number drawn from 2 to 3: the root mean
+square, over samples in contact, of what is left of its noise-free change of the forces once the
+base parameters and what is each slice's own are refitted, over the noise in contact
+(`python -m studies sizes`).
+
+What counts as right:
+
+- **one cause**: the verdict is one cause; its class holds the one that was hidden, and nothing that
+  these slices could tell from it: all others must mimic what was hidden to within 20 degrees, or
+  to within 3 degrees of what the cause itself can do as it is modelled here, computed from the
+  effect's noise-free change of the forces. A second finding is a miss, and so is a class
+  that is too large.
+- **nothing hidden**: any other verdict than "nothing" is an alarm.
+- **unknown**: the effect stands in no list of causes; "unknown" is right, a name is wrong.
+- **two causes**: two findings, one of each.
+- **poor**: as one cause, for effects that the poor protocol cannot tell from others; then the
+  proposed experiment is cut on the same bench, and all records together must name the one cause.
+- A run that breaks down is a miss.
+"""
+
+
+def numbers(judgements: Sequence[Judgement]) -> dict[str, Any]:
+    """All numbers of the report as plain values."""
+    out: dict[str, Any] = {"runs": len(judgements), "requirements": _requirements(judgements)}
+    out["by_effect"] = {
+        kind: {name: _rate_facts(rate(js)) for name, js in _by_effect(judgements, kind).items()}
+        for kind in ("single", "unknown", "pairs", "poor", "base")
+    }
+    out["confusion"] = {name: dict(counts) for name, counts in _confusion(judgements).items()}
+    out["curves"] = {
+        effect: {f"{delta:g}": _rate_facts(r) for delta, r in points.items()}
+        for effect, points in _curves(judgements, lambda j: j.right).items()
+    }
+    sizes = [len(c) for j in judgements for c in j.classes if j.case.kind == "single"]
+    out["mean_class_size"] = float(np.mean(sizes)) if sizes else None
+    return out
+
+
+def _of(judgements: Sequence[Judgement], kind: str) -> list[Judgement]:
+    return [j for j in judgements if j.case.kind == kind]
+
+
+def _by_effect(judgements: Sequence[Judgement], kind: str) -> dict[str, list[Judgement]]:
+    out: dict[str, list[Judgement]] = {}
+    for j in _of(judgements, kind):
+        out.setdefault(j.effects, []).append(j)
+    return dict(sorted(out.items()))
+
+
+def _rate_facts(r: Rate) -> dict[str, float | int | None]:
+    share = None if math.isnan(r.share) else r.share
+    return {
+        "hits": r.hits,
+        "runs": r.runs,
+        "share": share,
+        "lower_bound": r.lower if r.runs else None,
+        "upper_bound": r.upper if r.runs else None,
+    }
+
+
+def _requirements(judgements: Sequence[Judgement]) -> list[dict[str, Any]]:
+    """What is asked for, what was reached, and whether that is enough."""
+    single, nothing = _of(judgements, "single"), _of(judgements, "nothing")
+    unknown, poor = _of(judgements, "unknown"), _of(judgements, "poor")
+    rows: list[dict[str, Any]] = []
+
+    def add(
+        what: str, asked: str, r: Rate, enough: bool, shown: str = "", few: bool = False
+    ) -> None:
+        facts = {"what": what, "asked": asked, "few": few, **_rate_facts(r)}
+        rows.append(facts | {"shown": shown, "met": enough})
+
+    r = rate(single)
+    add(
+        "one cause",
+        ">= 95 % of >= 200, lower bound >= 90 %",
+        r,
+        r.runs >= 200 and r.share >= 0.95 and r.lower >= 0.90,
+    )
+    worst = min(
+        ((rate(js), name) for name, js in _by_effect(judgements, "single").items()),
+        key=lambda pair: pair[0].share,
+        default=(Rate(0, 0), ""),
+    )
+    add(
+        "one cause, the worst",
+        ">= 7 of 10",
+        worst[0],
+        worst[0].runs >= 10 and worst[0].share >= 0.7,
+        worst[1],
+    )
+    alarms = Rate(sum(j.verdict != "nothing" for j in nothing), len(nothing))
+    add(
+        "alarms with nothing hidden",
+        "<= 16 of >= 200",
+        alarms,
+        alarms.runs >= 200 and alarms.share <= 0.08,
+        few=True,
+    )
+    r = rate(unknown)
+    add("unknown effects called so", ">= 90 % of >= 60", r, r.runs >= 60 and r.share >= 0.90)
+    named = Rate(sum(j.verdict in NAMING for j in unknown), len(unknown))
+    enough = named.runs >= 60 and named.share <= 0.05
+    add("unknown effects given a name", "<= 5 %", named, enough, few=True)
+    r = rate(_of(judgements, "pairs"))
+    add("two causes, both named", ">= 80 %", r, r.runs >= 40 and r.share >= 0.80)
+    r = rate(poor)
+    add("poor protocol, the class", ">= 90 % of >= 60", r, r.runs >= 60 and r.share >= 0.90)
+    followed = [j for j in poor if j.resolved is not None]
+    r = Rate(sum(bool(j.resolved) for j in followed), len(followed))
+    add("the next experiment resolves it", ">= 90 %", r, r.runs >= 60 and r.share >= 0.90)
+    both = [(j.gain or 0.0, j.oracle) for j in single if j.oracle is not None and j.oracle > 0.0]
+    good = Rate(sum(g >= 0.9 * o for g, o in both), len(both))
+    ratio = sum(g for g, _ in both) / sum(o for _, o in both) if both else math.nan
+    add(
+        "held-out gain of an oracle's",
+        ">= 90 % in the mean",
+        good,
+        bool(both) and ratio >= 0.90,
+        f"mean {100 * ratio:.0f} %" if both else "",
+    )
+    return rows
+
+
+def _confusion(judgements: Sequence[Judgement]) -> dict[str, Counter[str]]:
+    """For each effect what was said where that was not right."""
+    out: dict[str, Counter[str]] = {}
+    for j in judgements:
+        if j.case.kind in ("curve", "pairs") or j.right:
+            continue
+        said = " + ".join("{" + ", ".join(c) + "}" for c in j.classes) or j.verdict
+        out.setdefault(f"{j.case.kind}: {j.effects}", Counter())[said] += 1
+    return dict(sorted(out.items()))
+
+
+def _curves(
+    judgements: Sequence[Judgement], hit: Callable[[Judgement], bool]
+) -> dict[str, dict[float, Rate]]:
+    found: dict[str, dict[float, list[bool]]] = {}
+    for j in _of(judgements, "curve"):
+        delta = j.case.hidden[0].delta
+        assert delta is not None
+        found.setdefault(j.effects, {}).setdefault(delta, []).append(hit(j))
+    return {
+        effect: {delta: Rate(sum(hits), len(hits)) for delta, hits in sorted(points.items())}
+        for effect, points in sorted(found.items())
+    }
+
+
+def _shown(r: Rate) -> str:
+    return f"{r.hits} of {r.runs}"
+
+
+def _percent(value: float | None) -> str:
+    return "" if value is None or math.isnan(value) else f"{100 * value:.0f} %"
+
+
+def _command(judgements: Sequence[Judgement], options: Mapping[str, Any]) -> str:
+    """What was run."""
+    kinds = [kind for kind in KINDS if _of(judgements, kind)]
+    words = ["python -m studies hidden --output output/hidden"]
+    words += [f"--{name} {options[name]}" for name in ("seed", "replicates") if name in options]
+    if len(kinds) < len(KINDS):
+        words.append(f"--kinds {' '.join(kinds)}")
+    return " ".join(words)
+
+
+def report(
+    judgements: Sequence[Judgement],
+    figure: str | None,
+    options: Mapping[str, Any] | None = None,
+) -> str:
+    """The report in Markdown.
+
+    Args:
+        judgements: All runs that are done.
+        figure: Of the detection curves, relative to the report; None for none.
+        options: Seed and replicates of the study, as its study.json has them.
+    """
+    head = HEAD.format(command=_command(judgements, options or {}))
+    lines = [head, f"{len(judgements)} runs.", ""]
+    lines += [
+        "| what | asked for | reached | share | one-sided bound, 95 % | met |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in _requirements(judgements):
+        shown = f"{row['hits']} of {row['runs']}" + (f" ({row['shown']})" if row["shown"] else "")
+        met = ("yes" if row["met"] else "no") if row["runs"] else "not run"
+        sign, side = ("<=", "upper_bound") if row["few"] else (">=", "lower_bound")
+        bound = f"{sign} {_percent(row[side])}"
+        lines.append(
+            f"| {row['what']} | {row['asked']} | {shown} | {_percent(row['share'])} "
+            f"| {bound if row['runs'] else _percent(None)} | {met} |"
+        )
+    lines.append("")
+    sizes = [len(c) for j in _of(judgements, "single") for c in j.classes]
+    seconds = [j.seconds for j in judgements if not math.isnan(j.seconds)]
+    if sizes:
+        lines += [
+            f"Causes in a class that was named for one cause: {np.mean(sizes):.2f} in the mean."
+        ]
+    if seconds:
+        lines += [f"A diagnosis took {np.median(seconds):.0f} s in the middle."]
+    versions = len({j.code for j in judgements})
+    if versions > 1:
+        lines += [f"The runs are of {versions} versions of the package."]
+    lines += ["", *_effect_table(judgements), *_base_table(judgements), *_curve_table(judgements)]
+    if figure is not None and _of(judgements, "curve"):
+        lines += [f"![Detection curves]({figure})", ""]
+    confusion = _confusion(judgements)
+    if confusion:
+        lines += [
+            "## What was said where it was not right",
+            "",
+            "| run | said | times |",
+            "|---|---|---|",
+        ]
+        for name, counts in confusion.items():
+            lines += [f"| {name} | {said} | {n} |" for said, n in counts.most_common()]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _effect_table(judgements: Sequence[Judgement]) -> list[str]:
+    lines = []
+    titles = {
+        "single": "One cause",
+        "nothing": "Nothing hidden",
+        "unknown": "Unknown effects",
+        "pairs": "Two causes",
+        "poor": "The poor protocol",
+    }
+    for kind, title in titles.items():
+        of_kind = _of(judgements, kind)
+        if not of_kind:
+            continue
+        lines += [
+            f"## {title}",
+            "",
+            "| hidden | protocol | right | verdicts |",
+            "|---|---|---|---|",
+        ]
+        groups: dict[tuple[str, str], list[Judgement]] = {}
+        for j in of_kind:
+            groups.setdefault((j.effects, j.case.protocol), []).append(j)
+        for (effects, protocol), js in sorted(groups.items()):
+            verdicts = Counter(j.verdict for j in js).most_common()
+            said = ", ".join(f"{v.replace('_', ' ')} {n}" for v, n in verdicts)
+            lines.append(f"| {effects} | {protocol} | {_shown(rate(js))} | {said} |")
+        lines.append("")
+    return lines
+
+
+def _base_table(judgements: Sequence[Judgement]) -> list[str]:
+    """Shifts of base parameters against those of runs with nothing hidden: what the mesh shifts is
+    in both."""
+    groups = _by_effect(judgements, "base")
+    if not groups:
+        return []
+    lines = [
+        "## Shifts of base parameters",
+        "",
+        "These are no causes: nothing else may be named, and the shift is reported. A coarse mesh",
+        "shifts the parameters as well, so the shift is compared with that of runs with nothing",
+        "hidden.",
+        "",
+        "| hidden | nothing else named | hidden shift | found, less that without | +- |",
+        "|---|---|---|---|---|",
+    ]
+    for name, js in groups.items():
+        parameter = BASE_OF[name]
+        null = [
+            math.log(j.shifts[parameter][0])
+            for j in _of(judgements, "nothing")
+            if j.case.protocol == js[0].case.protocol and parameter in j.shifts
+        ]
+        zero = float(np.mean(null)) if null else 0.0
+        found = [math.log(j.shifts[parameter][0]) - zero for j in js if parameter in j.shifts]
+        sign = -1.0 if name == "stiffness" else 1.0
+        true = [math.log1p(sign * j.case.hidden[0].size) for j in js]
+        if found:
+            lines.append(
+                f"| {name} | {_shown(rate(js))} | {_change(float(np.mean(true)))} "
+                f"| {_change(float(np.mean(found)))} | {100 * np.std(found):.0f} % |"
+            )
+    return [*lines, ""]
+
+
+def _change(log_factor: float) -> str:
+    return f"{100 * math.expm1(log_factor):+.0f} %"
+
+
+def _curve_table(judgements: Sequence[Judgement]) -> list[str]:
+    named = _curves(judgements, lambda j: j.right)
+    alarms = _curves(judgements, lambda j: j.verdict != "nothing")
+    if not named:
+        return []
+    deltas = sorted({delta for points in named.values() for delta in points})
+    head = " | ".join(f"delta {delta:g}" for delta in deltas)
+    lines = [
+        "## Detection curves",
+        "",
+        'Rich protocol: named rightly (in brackets: anything but "nothing" said).',
+        "",
+        f"| hidden | {head} |",
+        "|---" * (1 + len(deltas)) + "|",
+    ]
+    for effect, points in named.items():
+        cells = [
+            f"{_shown(points[d])} ({alarms[effect][d].hits})" if d in points else "" for d in deltas
+        ]
+        lines.append(f"| {effect} | {' | '.join(cells)} |")
+    return [*lines, ""]
+
+
+def plot_curves(judgements: Sequence[Judgement], file: Path) -> None:
+    """Draws how often each effect is named rightly against its strength."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    named = _curves(judgements, lambda j: j.right)
+    figure = Figure(figsize=(6.4, 4.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    for k, (effect, points) in enumerate(named.items()):
+        deltas = list(points)
+        shares = [points[d].share for d in deltas]
+        # Apart by a little, so that equal curves are both seen.
+        shifted = [d * (1.0 + 0.02 * (k - 0.5 * len(named))) for d in deltas]
+        axes.plot(shifted, shares, "osD^vP*X"[k % 8] + "-", label=effect, color=f"C{k}")
+    axes.set_xscale("log")
+    axes.set_xticks([0.5, 1.0, 2.0, 4.0], ["0.5", "1", "2", "4"])
+    axes.minorticks_off()
+    axes.set_xlabel("what a refit leaves of the effect, over the noise")
+    axes.set_ylabel("share of runs with the right cause")
+    axes.set_ylim(-0.05, 1.05)
+    axes.set_title("One hidden cause in the rich protocol")
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file, dpi=130)

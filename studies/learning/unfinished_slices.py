@@ -1,0 +1,86 @@
+"""Why slices stay unfinished: python studies/learning/unfinished_slices.py EVALUATION [--output FILE].
+
+Cuts again each slice of `sliceit evaluate` that was not completed on one board, and says what the
+knife and the policy did in its last seconds.
+
+--output puts the table into a Markdown file, between the lines
+  <!-- unfinished_slices -->
+  <!-- end of unfinished_slices -->
+"""
+
+import argparse
+import dataclasses as dc
+import json
+import shlex
+import sys
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from sliceit_drake.cli.evaluate import Case, trace
+from sliceit_drake.systems.agent import ACTIONS, AgentConfig
+from studies.marked_page import Place
+
+PLACE = Place("unfinished_slices")
+LAST = 5.0
+"""How long before the end is looked at, s."""
+
+
+def row(case: Case) -> str:
+    """A slice's line of the table."""
+    cut = trace(case)
+    count = round(LAST / AgentConfig().period)
+    height, actions = 1e3 * cut.height[-count:], cut.actions[-count:]
+    press = actions[:, [ACTIONS.index("press"), ACTIONS.index("p_z")]].mean(axis=0)
+    draw = actions[:, ACTIONS.index("draw")]
+    force = (cut.food + cut.board)[cut.time > cut.time[-1] - LAST]
+    along = np.hypot(force[:, 0], force[:, 1]).mean()
+    cells = [
+        Path(case.policy).name,
+        case.world.replace("_", "-"),
+        f"{case.food} {case.slice + 1}",
+        f"{cut.metrics.end}, {cut.time[-1]:.1f} s",
+        f"{100 * cut.metrics.cut:.1f} %",
+        f"{height.min():.2f} to {height.max():.2f} mm",
+        f"{draw.min():+.2f} to {draw.max():+.2f}",
+        f"{press[0]:+.2f}, {press[1]:+.2f}",
+        f"{along:.0f} N, {force[:, 2].mean():.0f} N",
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("evaluation", type=Path, help="what `sliceit evaluate` wrote")
+    parser.add_argument("--board-stiffness", type=float, default=3e4, help="N/m; 3e4")
+    parser.add_argument("--output", type=Path, help="Markdown file with the two lines")
+    options = parser.parse_args()
+    PLACE.check(options.output)
+    names = [field.name for field in dc.fields(Case)]
+    rows = [
+        json.loads(line) for line in options.evaluation.read_text(encoding="utf-8").splitlines()
+    ]
+    of_board = [r for r in rows if r["board_stiffness"] == options.board_stiffness]
+    cases = [Case(**{name: r[name] for name in names}) for r in of_board if not r["completed"]]
+    lines = [
+        f"{len(cases)} of the {len(of_board)} slices on the board of "
+        f"{options.board_stiffness / 1e3:g} kN/m are unfinished. What happened in their last "
+        f"{LAST:g} s:",
+        "",
+        "| policy | world | slice | ended by | cut | edge over the board | draw "
+        "| mean of press and p_z | mean force along the board, up |",
+        "|---|---|---|---|---|---|---|---|---|",
+        *(row(case) for case in tqdm(cases, desc="slices")),
+        "",
+        "Actions go from -1 to 1; p_z is the gain downwards. "
+        f"`{shlex.join(['python', 'studies/learning/unfinished_slices.py', *sys.argv[1:]])}`",
+    ]
+    PLACE.show(options.output, lines)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Studies of the cutting physics: verification, steps, meshes, speed."""

@@ -1,0 +1,114 @@
+"""Slices a second against batch size, on the CPU and on a CUDA device where there is one.
+
+    python studies/physics/batch_speed.py [--output docs/speed.md]
+
+One kernel source for both: on the CPU a slice runs in one thread, on a GPU all cuts of a batch
+advance side by side. The forces of the devices are compared. Without a CUDA device the reason is
+printed, and the CPU is measured alone.
+
+--output puts the table into a Markdown file, between the lines
+  <!-- batch_speed -->
+  <!-- end of batch_speed -->
+"""
+
+import argparse
+import dataclasses as dc
+import os
+import shlex
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+import warp as wp
+
+from sliceit_drake.cutting.batch import BatchSimulator
+from sliceit_drake.cutting.foods.food import make_food_model, start_pose
+from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
+from sliceit_drake.cutting.parameters import with_parameters
+from sliceit_drake.diagrams.scenario import load_scenario
+from sliceit_drake.resources import resource_path
+from studies.marked_page import Place
+
+wp.config.log_level = wp.LOG_ERROR
+PLACE = Place("batch_speed")
+PERIOD = 2e-3
+CPU_BATCHES, GPU_BATCHES = (1, 2, 4, 8, 16), (1, 4, 16, 64, 256, 1024)
+
+
+def devices() -> list[str]:
+    """The CPU, and the first CUDA device if there is one; if not, says why."""
+    if wp.is_cuda_available():
+        return ["cpu", "cuda:0"]
+    print("The GPU is skipped: there is no CUDA device (Warp finds no NVIDIA driver, or no GPU).")
+    return ["cpu"]
+
+
+def variants(device: str, count: int, refinement: float) -> tuple[list[CuttingModel], Motion]:
+    """Cuts of one cucumber with toughnesses of their own, and a press to the board at 20 mm/s."""
+    scenario = load_scenario(resource_path("scenarios/cucumber.yaml"))
+    numerics = dc.replace(scenario.numerics, device=device)
+    base = make_food_model(scenario.food, scenario.knife, numerics, refinement)
+    plan = MotionPlan([ConstantSpeed(distance=base.top + 6e-4, speed=0.02)])
+    motion = Motion(plan, start_pose(base, 6e-4))
+    toughness = 300.0 + 100.0 * np.arange(count) / max(count, 1)
+    return [with_parameters(base, {"material.toughness": float(r)}) for r in toughness], motion
+
+
+def rate(device: str, count: int, refinement: float, repeats: int) -> tuple[float, np.ndarray, int]:
+    """Slices a second, forces of the first slice [n, 3], N, and number of tetrahedra."""
+    models, motion = variants(device, count, refinement)
+    simulator = BatchSimulator(PERIOD)
+    forces = simulator.run(models, [motion])[0].food_wrench[:, 3:]
+    best = np.inf
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        simulator.run(models, [motion])
+        best = min(best, time.perf_counter() - begin)
+    return count / best, forces, models[0].element_count
+
+
+def measure(options: argparse.Namespace) -> list[str]:
+    """The table."""
+    lines, first, elements = [], None, 0
+    for device in devices():
+        batches = options.batches or (CPU_BATCHES if device == "cpu" else GPU_BATCHES)
+        for count in batches:
+            slices, forces, elements = rate(device, count, options.refinement, options.repeats)
+            first = forces if first is None else first
+            difference = np.sqrt(((forces - first) ** 2).mean() / (first**2).mean())
+            lines.append(f"| {device} | {count} | {slices:.2f} | {100 * difference:.4f} % |")
+            print(lines[-1], flush=True)
+    title = "| device | cuts in one call | slices a second | force against the CPU's, RMS |"
+    caption = f"{elements} tetrahedra, {os.cpu_count()} cores; least of {options.repeats} times."
+    return [title, "|---|---|---|---|", *lines, "", caption]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measures, prints and writes."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--output", type=Path, help="Markdown file with the two marks")
+    parser.add_argument("--batches", type=int, nargs="+", help="cuts in one call")
+    parser.add_argument("--refinement", type=float, default=1.0, help="of the mesh (default 1)")
+    parser.add_argument("--repeats", type=int, default=3, help="of each time (default 3)")
+    options = parser.parse_args(arguments)
+    PLACE.check(options.output)
+    load = os.getloadavg()[0]
+    lines = measure(options)
+    given = sys.argv[1:] if arguments is None else arguments
+    command = shlex.join(["python", "studies/physics/batch_speed.py", *given])
+    lines.append(f"`{command}`, load {load:.2f} in the minute before.")
+    if not wp.is_cuda_available():
+        lines.append("No CUDA device was at hand: the kernels have not been run on one.")
+    table = "\n".join(lines)
+    print(table)
+    PLACE.write(options.output, table)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

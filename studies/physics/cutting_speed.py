@@ -1,0 +1,214 @@
+"""Cost of a cut without a robot: slice, sub-step, gradient, against mesh and batch size.
+
+Prints a table and writes a figure; each cost stands beside the error of the same mesh. Times are
+the least of several repeats, taken in turns, since a shared machine only ever adds to them:
+
+    python studies/physics/cutting_speed.py --output docs/figures/cutting_speed.png \
+        --json docs/benchmarks/cutting_speed.json
+"""
+
+import argparse
+import dataclasses as dc
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+from sliceit_drake.cutting.batch import simulate_batch
+from sliceit_drake.cutting.foods.food import make_food_model, start_pose
+from sliceit_drake.cutting.gradient import SliceAdjoint
+from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
+from sliceit_drake.cutting.parameters import with_parameters
+from sliceit_drake.cutting.simulate import KnifePath, SliceResult, simulate_slice
+from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.diagrams.scenario import Scenario, load_scenario
+from sliceit_drake.resources import resource_path
+from studies.results import write_results
+
+PERIOD = 2e-3
+CLEARANCE = 6e-4
+REFINEMENTS = (0.5, 0.75, 1.0, 1.5, 2.0)
+LARGER_STEPS = ((1.0, 5e-4), (1.0, 1e-3))
+BATCHES = (1, 2, 4, 8, 16)
+
+
+def through(model: CuttingModel, depth: float) -> Motion:
+    """A press cut at 20 mm/s to the board, from above the top of the finest mesh."""
+    plan = MotionPlan([ConstantSpeed(distance=depth + CLEARANCE, speed=0.02)])
+    return Motion(plan, start_pose(model, CLEARANCE))
+
+
+def least_times(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+    """Least wall time of each call, in turns, after one that compiles, s."""
+    for call in calls.values():
+        call()
+    best = dict.fromkeys(calls, np.inf)
+    for _ in tqdm(range(repeats), desc="repeats"):
+        for name, call in calls.items():
+            start = time.perf_counter()
+            call()
+            best[name] = min(best[name], time.perf_counter() - start)
+    return best
+
+
+def difference(a: SliceResult, b: SliceResult) -> float:
+    """RMS difference of the forces over the RMS of b's."""
+    fa, fb = a.food_wrench[:, 3:], b.food_wrench[:, 3:]
+    return float(np.sqrt(((fa - fb) ** 2).sum(1).mean() / (fb**2).sum(1).mean()))
+
+
+def sub_step_time(solver: CuttingSolver, motion: Motion, repeats: int = 20) -> float:
+    """Time of a sub-step in mid-cut within a captured graph, s."""
+    path = KnifePath(solver.model, motion, PERIOD)
+    middle = path.exchanges // 2 // 10 * 10
+    state = solver.initial_state()
+    for k in range(0, middle, 10):
+        ends = slice(k, k + 11)
+        state = solver.exchanges(state, path.R_CK[ends], path.p_CK[ends]).state
+    ws = solver._workspace
+    steps = 50 * ws.steps
+    with wp.ScopedCapture(device=ws.device) as capture:
+        for k in range(steps):
+            ws.launch_substep(k % ws.steps)
+    best = np.inf
+    for _ in range(repeats):
+        ws.write(ws.states[0], state[None])
+        start = time.perf_counter()
+        wp.capture_launch(capture.graph)
+        best = min(best, time.perf_counter() - start)
+    return best / steps
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--output", type=Path, help="figure (.png)")
+    parser.add_argument("--json", type=Path, help="also write the values there")
+    parser.add_argument("--repeats", type=int, default=5)
+    options = parser.parse_args()
+    scenario: Scenario = load_scenario(resource_path("scenarios/cucumber.yaml"))
+    diameter = scenario.food.shape.diameter
+    models = {
+        r: make_food_model(scenario.food, scenario.knife, scenario.numerics, r)
+        for r in {*REFINEMENTS, *(r for r, _ in LARGER_STEPS)}
+    }
+    base = models[1.0]
+    motion = through(base, diameter)
+    solvers = {r: CuttingSolver(models[r], PERIOD) for r in REFINEMENTS}
+    results = {r: simulate_slice(s, motion) for r, s in tqdm(solvers.items(), desc="meshes")}
+    reference = results[REFINEMENTS[-1]]
+    fine = base.derive(numerics=dc.replace(base.numerics, time_step=5e-5))
+    exact = simulate_slice(CuttingSolver(fine, PERIOD), motion)
+    steppers = {
+        (r, step): CuttingSolver(
+            models[r].derive(numerics=dc.replace(base.numerics, time_step=step)), PERIOD
+        )
+        for r, step in LARGER_STEPS
+    }
+
+    variants = [
+        with_parameters(base, {"material.toughness": 350.0 + 5.0 * c}) for c in range(max(BATCHES))
+    ]
+    adjoint = SliceAdjoint(base, PERIOD)
+    path = KnifePath(base, motion, PERIOD)
+    weights = np.ones((path.exchanges, 6))
+    cores = os.cpu_count() or 1
+    calls: dict[str, Callable[[], object]] = {
+        f"slice {r}": lambda r=r: simulate_slice(solvers[r], motion) for r in REFINEMENTS
+    }
+    for key, solver in steppers.items():
+        calls[f"stepped {key}"] = lambda solver=solver: simulate_slice(solver, motion)
+    calls["gradient"] = lambda: adjoint.gradient(adjoint.run(path.R_CK, path.p_CK), weights)
+    for workers in {1, cores}:
+        for n in BATCHES:
+            calls[f"batch {n} {workers}"] = lambda n=n, w=workers: simulate_batch(
+                variants[:n], [motion], PERIOD, workers=w
+            )
+    times = least_times(calls, options.repeats)
+    rows = []
+    for r in REFINEMENTS:
+        m = models[r]
+        rows.append(
+            (
+                m.element_count,
+                1e6 * sub_step_time(solvers[r], motion),
+                times[f"slice {r}"],
+                difference(results[r], reference) if r < REFINEMENTS[-1] else np.nan,
+            )
+        )
+    print(
+        f"\nPress cut through {1e3 * diameter:g} mm of cucumber at 20 mm/s, {PERIOD:g} s exchange,"
+    )
+    print(f"sub-step {base.numerics.time_step:g} s, {base.numerics.precision}, one thread")
+    print("| tetrahedra | sub-step [us] | slice [s] | force error against the finest mesh |")
+    print("|---|---|---|---|")
+    for count, step, total, error in rows:
+        shown = "-" if np.isnan(error) else f"{100 * error:.2f} %"
+        print(f"| {count} | {step:.1f} | {total:.3f} | {shown} |")
+    step_error = difference(results[1.0], exact)
+    print(f"\nforce error of the sub-step against 5e-5 s: {100 * step_error:.2f} % RMS")
+    print("\n| tetrahedra | sub-step [s] | slice [s] | force error of the sub-step |")
+    print("|---|---|---|---|")
+    reference_force, errors = reference, {}
+    for (r, step), solver in steppers.items():
+        small = dc.replace(base.numerics, time_step=5e-5)
+        reference = simulate_slice(CuttingSolver(models[r].derive(numerics=small), PERIOD), motion)
+        error = errors[r, step] = difference(simulate_slice(solver, motion), reference)
+        total = times[f"stepped {(r, step)}"]
+        print(f"| {models[r].element_count} | {step:g} | {total:.3f} | {100 * error:.2f} % |")
+    ratio = times["gradient"] / times["slice 1.0"]
+    print(f"gradient by all parameters and the path: {ratio:.2f} slices")
+    print("\n| cuts in one call | " + " | ".join(f"{w} threads" for w in sorted({1, cores})) + " |")
+    print("|---|" + "---|" * len({1, cores}))
+    for n in BATCHES:
+        shares = [times[f"batch {n} {w}"] / n for w in sorted({1, cores})]
+        print(f"| {n} | " + " | ".join(f"{s:.3f} s a cut" for s in shares) + " |")
+    if options.json is not None:
+        whole, searched = difference(results[1.0], reference_force), (1.0, 1e-3)
+        write_results(
+            options.json,
+            {
+                "tetrahedra": base.element_count,
+                "slice_s": times["slice 1.0"],
+                "sub_step_us": rows[REFINEMENTS.index(1.0)][1],
+                "mesh_error": whole,
+                "step_error": step_error,
+                "search_slice_s": times[f"stepped {searched}"],
+                "search_step_error": errors[searched],
+                "gradient_slices": ratio,
+            },
+        )
+    if options.output:
+        plot(rows, times, sorted({1, cores}), options.output)
+
+
+def plot(rows: list, times: dict[str, float], workers: list[int], file: Path) -> None:
+    """Cost against mesh and against batch size."""
+    figure = Figure(figsize=(8.0, 3.2), layout="constrained")
+    mesh, batch = figure.subplots(1, 2)
+    counts = [row[0] for row in rows]
+    mesh.loglog(counts, [row[2] for row in rows], "o-", color="#c2410c")
+    mesh.set(xlabel="tetrahedra", ylabel="time of a slice [s]", title="one slice, one thread")
+    error = mesh.twinx()
+    error.loglog(counts[:-1], [100 * row[3] for row in rows[:-1]], "s--", color="#475569")
+    error.set_ylabel("force error [%]", color="#475569")
+    for w in workers:
+        batch.plot(
+            BATCHES, [times[f"batch {n} {w}"] / n for n in BATCHES], "o-", label=f"{w} threads"
+        )
+    batch.set(xlabel="cuts in one call", ylabel="time a cut [s]", title="many slices")
+    batch.set_ylim(bottom=0.0)
+    batch.legend(frameon=False)
+    for axes in (mesh, batch):
+        axes.grid(alpha=0.25)
+    figure.savefig(file, dpi=150)
+
+
+if __name__ == "__main__":
+    main()

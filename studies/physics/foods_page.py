@@ -1,0 +1,174 @@
+"""Tables of docs/foods.md: python studies/physics/foods_page.py [--cut] [--output docs/foods.md].
+
+Foods and knives are read from calibration/foods and calibration/knives. --cut presses knives
+through foods as well, without a robot, which takes a minute. --output puts the tables into a
+Markdown file, between lines such as
+  <!-- foods -->
+  <!-- end of foods -->
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import warp
+
+from sliceit_drake.cutting.foods.calibrated_food import calibrated_food_names, load_calibrated_food
+from sliceit_drake.cutting.foods.food import (
+    Box,
+    Cylinder,
+    Ellipsoid,
+    Food,
+    make_food_model,
+    start_pose,
+)
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
+from sliceit_drake.cutting.named_knife import knife_names, load_knife
+from sliceit_drake.cutting.simulate import simulate_slice
+from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.diagrams.scenario import Scenario, load_scenario
+from sliceit_drake.resources import resource_path
+from studies.marked_page import Place
+
+PERIOD, SPEED, CLEARANCE = 2e-3, 0.02, 1e-3
+
+
+def row(*cells: object) -> str:
+    return "| " + " | ".join(str(cell) for cell in cells) + " |"
+
+
+def shape(food: Food) -> str:
+    """Name and size of a food's shape, mm."""
+    body = food.shape
+    if isinstance(body, Cylinder):
+        size = [body.diameter, body.length]
+    elif isinstance(body, Box):
+        size = body.size
+    else:
+        assert isinstance(body, Ellipsoid)
+        size = body.diameters
+    return f"{type(body).__name__.lower()} {' x '.join(f'{1e3 * s:.3g}' for s in size)}"
+
+
+def foods_table() -> str:
+    lines = [
+        row("food", "shape [mm]", "E [MPa]", "nu", "kg/m3", "R [J/m2]", "mu", "from", "error"),
+        row(*["---"] * 9),
+    ]
+    notes = []
+    for name in calibrated_food_names():
+        entry = load_calibrated_food(name)
+        material = entry.food.material
+        recorded = entry.rms_error is not None
+        error = f"{entry.rms_error:.2f} N, {entry.held_out_error:.2f} N" if recorded else "unknown"
+        lines.append(
+            row(
+                name,
+                shape(entry.food),
+                f"{1e-6 * material.youngs_modulus:.3g}",
+                material.poisson_ratio,
+                f"{material.density:.0f}",
+                f"{material.toughness:.0f}",
+                f"{material.friction:.3g}",
+                "a measured cut" if recorded else "**published values**",
+                error,
+            )
+        )
+        if not recorded:
+            sources = "".join(f"\n  - {source}" for source in entry.records)
+            notes.append(f"- **{name}**: {entry.note} Sources:{sources}")
+    legend = "R: toughness. mu: friction on the blade. Error: RMS on the record, and held out."
+    lines += ["", legend, "", *notes]
+    return "\n".join(lines)
+
+
+def knives_table() -> str:
+    lines = [
+        row("knife", "spine [mm]", "edge [mm]", "height [mm]", "length [mm]", "degrees a side"),
+        row(*["---"] * 6),
+    ]
+    notes = []
+    for name in knife_names():
+        entry = load_knife(name)
+        knife = entry.knife
+        lines.append(
+            row(
+                name,
+                f"{1e3 * knife.spine_thickness:.3g}",
+                f"{1e3 * knife.edge_thickness:.2g}",
+                f"{1e3 * (knife.height + knife.tip_height):.3g}",
+                f"{1e3 * knife.length:.3g}",
+                f"{bevel(knife):.0f}",
+            )
+        )
+        by_text: dict[str, list[str]] = {}
+        for field, text in entry.sources.items():
+            by_text.setdefault(text, []).append(field)
+        sources = "".join(f"\n  - {', '.join(f)}: {text}" for text, f in by_text.items())
+        notes.append(f"- **{name}**: {entry.note or 'one knife.'}{sources}")
+    edge = "Edge: thickness where the bevel begins. Height: from the edge to the spine."
+    return "\n".join([*lines, "", edge, "", *notes])
+
+
+def bevel(knife: Knife) -> float:
+    """Angle of the edge's bevel to the blade, degrees."""
+    return float(np.degrees(np.arctan2(0.5 * knife.edge_thickness, knife.tip_height)))
+
+
+def cuts_table() -> str:
+    lines = [
+        row("food", "held", "knife", "peak [N]", "work [J/m2]", "of it friction"),
+        row(*["---"] * 6),
+    ]
+    for scenario in ("cucumber", "cucumber_end_slice", "apple"):
+        loaded = load_scenario(resource_path(f"scenarios/{scenario}.yaml"))
+        for sides in (loaded.food.held_sides,) if scenario != "apple" else ("plus", "both"):
+            loaded.food.held_sides = sides
+            lines += _cuts(loaded)
+    command = (
+        "`python studies/physics/foods_page.py --cut --output docs/foods.md`: pressed through at\n"
+        f"{SPEED:g} m/s without a robot. A knife that is lower than the food is left out."
+    )
+    return "\n".join([*lines, "", command])
+
+
+def _cuts(scenario: Scenario) -> list[str]:
+    lines = []
+    for name in knife_names():
+        knife = load_knife(name).knife
+        model = make_food_model(scenario.food, knife, scenario.numerics)
+        if knife.height < model.top - model.bottom:
+            continue
+        plan = MotionPlan([ConstantSpeed(distance=model.top + CLEARANCE, speed=SPEED)])
+        motion = Motion(plan, start_pose(model, CLEARANCE))
+        result = simulate_slice(CuttingSolver(model, PERIOD), motion)
+        force = np.linalg.norm(result.food_wrench[:, 3:], axis=1).max()
+        work = result.ledger.work
+        held = "on both sides" if scenario.food.held_sides == "both" else "on one side"
+        share = 100.0 * result.ledger.friction / work
+        cells = (f"{force:.1f}", f"{work / model.section_area:.0f}", f"{share:.0f} %")
+        lines.append(row(scenario.food.name, held, name, *cells))
+    return lines
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--cut", action="store_true", help="press knives through foods too")
+    parser.add_argument("--output", type=Path, metavar="FILE", help="page to write into")
+    options = parser.parse_args()
+    warp.config.log_level = warp.LOG_ERROR
+    tables = {"foods": foods_table(), "knives": knives_table()}
+    if options.cut:
+        tables["cuts"] = cuts_table()
+    print("\n\n".join(tables.values()))
+    for name in tables:
+        Place(name).check(options.output)
+    for name, text in tables.items():
+        Place(name).write(options.output, text)
+
+
+if __name__ == "__main__":
+    main()

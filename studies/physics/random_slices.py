@@ -1,0 +1,257 @@
+"""Random foods, planes, knives and motions: what comes of them is a cut or a reason.
+
+A slice is drawn from wide ranges of what people cut and how, cut on a prescribed motion, and judged
+by what any slice must keep: finite forces, a cut that never closes, books of energy that balance.
+A slice may be refused, or stopped by a guard, with its reason; anything else is unexplained.
+"""
+
+import collections
+import dataclasses as dc
+import math
+
+import numpy as np
+
+from sliceit_drake.configuration import ConfigurationError, validate
+from sliceit_drake.cutting.board import Board
+from sliceit_drake.cutting.foods.food import (
+    Box,
+    Cylinder,
+    Ellipsoid,
+    Food,
+    Tapered,
+    make_food_model,
+    start_pose,
+)
+from sliceit_drake.cutting.foods.material import Material
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.mesh.tetrahedra import MeshError
+from sliceit_drake.cutting.model import CuttingModel, Numerics, TimeStepError
+from sliceit_drake.cutting.motion import Hold, Motion, MotionPlan, PressAndDraw, Retract, Segment
+from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
+from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
+
+__all__ = [
+    "Outcome",
+    "RandomSlice",
+    "cut_drawn",
+    "cut_random_slice",
+    "draw_slice",
+    "random_slices_page",
+]
+
+EXCHANGE_PERIOD = 2e-3
+CLEARANCE = 2e-3
+OVERTRAVEL = 5e-4
+"""Of the edge into the board, metres: under the blade a soft food sinks into it."""
+IMBALANCE = 0.02
+"""Greatest work that the books may lack, over the work of the knife."""
+LEFT = 0.01
+"""Share of the section that the last elements may keep."""
+YIELDS = 2.0
+"""Of toughness over modulus, the way that a food gives before it parts: as much may be left at the
+board, into which the edge presses it."""
+
+
+@dc.dataclass
+class RandomSlice:
+    """A food, a knife and what is done with it.
+
+    Attributes:
+        food, knife, numerics: As in a scenario.
+        speed: Of the press, m/s.
+        draw_ratio: Draw over press speed.
+        hold: At the board, s.
+    """
+
+    food: Food
+    knife: Knife
+    numerics: Numerics
+    speed: float
+    draw_ratio: float
+    hold: float
+
+
+@dc.dataclass
+class Outcome:
+    """What came of a slice.
+
+    Attributes:
+        kind: cut, refused, stopped or unexplained.
+        reason: Of the last three.
+        shape: Of the food.
+        peak: Greatest force of the food, N; of a cut.
+    """
+
+    kind: str
+    reason: str
+    shape: str
+    peak: float = math.nan
+
+
+def draw_slice(rng: np.random.Generator) -> RandomSlice:
+    """Draws a slice: modulus 50 kPa to 10 MPa, toughness 20 to 800 J/m2, speed 5 to 100 mm/s."""
+
+    def between(low: float, high: float) -> float:
+        return float(rng.uniform(low, high))
+
+    def scales(low: float, high: float) -> float:
+        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+    layers = [0.0, 3e-3, 7e-3, 13e-3]
+    kind = int(rng.integers(4))
+    shape: Cylinder | Tapered | Box | Ellipsoid
+    if kind == 3:
+        wide = between(0.02, 0.05)
+        ends = [wide, between(0.4, 1.0) * wide]
+        shape = Tapered(ends, between(0.06, 0.15), int(rng.integers(2, 4)), layers)
+    elif kind == 0:
+        shape = Cylinder(between(0.02, 0.06), between(0.06, 0.15), int(rng.integers(2, 4)), layers)
+    elif kind == 1:
+        size = [between(0.015, 0.05), between(0.06, 0.15), between(0.015, 0.05)]
+        shape = Box(size, rng.integers(4, 8, 2).tolist(), layers)
+    else:
+        shape = Ellipsoid([between(0.04, 0.07) for _ in range(3)], 2)
+    lean, turn = between(-0.35, 0.35), between(-0.5, 0.5)
+    is_oblique = rng.random() < 0.5
+    normal = [
+        math.sin(turn) * math.cos(lean),
+        math.cos(turn) * math.cos(lean),
+        math.sin(lean),
+    ]
+    food = Food(
+        name="random",
+        shape=shape,
+        material=Material(
+            youngs_modulus=scales(5e4, 1e7),
+            poisson_ratio=between(0.2, 0.47),
+            density=between(400.0, 1200.0),
+            toughness=scales(20.0, 800.0),
+            strength=scales(5e4, 2e6),
+            friction=between(0.0, 0.6),
+        ),
+        cut_point=[0.0, between(-0.01, 0.01), 0.0],
+        cut_normal=normal if is_oblique else [0.0, 1.0, 0.0],
+        held_sides=str(rng.choice(["both", "minus", "plus"])),
+        hold_distance=between(0.008, 0.015),
+    )
+    knife = Knife(
+        spine_thickness=scales(8e-4, 4e-3),
+        edge_thickness=scales(3e-5, 3e-4),
+        height=between(0.025, 0.08),
+        length=between(0.12, 0.30),
+    )
+    return RandomSlice(
+        food,
+        knife,
+        Numerics(),
+        speed=scales(5e-3, 0.1),
+        draw_ratio=float(rng.choice([0.0, between(-2.0, 2.0)])),
+        hold=between(0.0, 0.1),
+    )
+
+
+def cut_drawn(seed: int, index: int) -> Outcome:
+    """Draws and cuts one slice of a study; the same for the same numbers."""
+    return cut_random_slice(draw_slice(np.random.default_rng([seed, index])))
+
+
+def cut_random_slice(case: RandomSlice) -> Outcome:
+    """Cuts a slice and judges it."""
+    shape = type(case.food.shape).__name__.lower()
+    try:
+        for part in (case.food, case.knife, case.numerics):
+            validate(part, type(part).__name__.lower())
+        model = make_food_model(case.food, case.knife, case.numerics)
+        start = start_pose(model, CLEARANCE)
+        distance = -start.p[2] / start.R[2, 2] + OVERTRAVEL
+        segments: list[Segment] = [
+            PressAndDraw(case.speed, distance, case.draw_ratio, acceleration=2.0),
+            *([Hold(case.hold)] if case.hold > 0.01 else []),
+            Retract(0.5 * distance, 0.1, acceleration=2.0),
+        ]
+        solver = CuttingSolver(model, EXCHANGE_PERIOD)
+        result = simulate_slice(solver, Motion(MotionPlan(segments), start), Board(height=0.0))
+    except (ConfigurationError, MeshError, TimeStepError) as error:
+        return Outcome("refused", str(error), shape)
+    except CuttingError as error:
+        return Outcome("stopped", str(error), shape)
+    except Exception as error:  # What nobody foresaw is what is looked for.
+        return Outcome("unexplained", f"{type(error).__name__}: {error}", shape)
+    wrong = _wrong(result, model)
+    peak = float(np.linalg.norm(result.food_wrench[:, 3:], axis=1).max())
+    return Outcome("unexplained" if wrong else "cut", wrong, shape, peak)
+
+
+def _wrong(result: SliceResult, model: CuttingModel) -> str:
+    """What no slice may do, or nothing."""
+    material, height = model.material, model.top - model.bottom
+    left = max(LEFT, YIELDS * material.toughness / (material.youngs_modulus * height))
+    rows = np.column_stack([result.food_wrench, result.board_wrench, result.cut])
+    if not np.isfinite(rows).all():
+        return f"a force is not finite at {result.time[~np.isfinite(rows).all(1)][0]:.4g} s"
+    if np.diff(result.cut).min() < -1e-6:
+        return "the cut closes"
+    if result.cut[-1] < 1.0 - left:
+        return f"the knife went to the board and {100 * result.cut[-1]:.1f} % are cut"
+    ledger = result.ledger
+    for name in ("edge", "opening", "friction", "board_friction"):
+        if getattr(ledger, name) < -1e-9:
+            return f"{name} gives energy: {getattr(ledger, name):.3g} J"
+    lack = abs(ledger.imbalance(result.energies)) / max(abs(ledger.work), 1e-6)
+    if lack > IMBALANCE:
+        return f"the books lack {100 * lack:.1f} % of the knife's work"
+    return ""
+
+
+def random_slices_page(outcomes: list[Outcome], seed: int, command: str) -> str:
+    """The page of a study."""
+    shapes = sorted({outcome.shape for outcome in outcomes})
+    kinds = ("cut", "refused", "stopped", "unexplained")
+    counts = collections.Counter((o.shape, o.kind) for o in outcomes)
+    lines = [
+        "# Random slices",
+        "",
+        f"    {command}",
+        "",
+        f"{len(outcomes)} slices from seed {seed}: modulus 50 kPa to 10 MPa, toughness 20 to 800 "
+        "J/m2, friction 0 to 0.6, speed 5 to 100 mm/s, draw up to twice the press, half of the "
+        "planes oblique, knives 0.8 to 4 mm thick; many of these pairs no food has. A slice is "
+        "cut, is refused or stopped with a reason, or is unexplained: an error that nobody "
+        "foresaw, a force that is not finite, a cut that closes, or of which more is left at the "
+        "board than 1 % or twice toughness over modulus, the way that a food gives before it "
+        f"parts, or books of energy that lack more than {100 * IMBALANCE:g} % of the knife's work.",
+        "",
+        "| food | " + " | ".join(kinds) + " |",
+        "|---|" + "---:|" * len(kinds),
+        *(
+            f"| {shape} | " + " | ".join(str(counts[shape, kind]) for kind in kinds) + " |"
+            for shape in shapes
+        ),
+        "| all | " + " | ".join(str(sum(counts[s, kind] for s in shapes)) for kind in kinds) + " |",
+        "",
+    ]
+    peaks = [o.peak for o in outcomes if o.kind == "cut"]
+    if peaks:
+        low, middle, high = np.quantile(peaks, [0.05, 0.5, 0.95])
+        lines += [
+            f"Peak force of the food in those cut: median {middle:.1f} N, 5 to 95 % {low:.2g} to "
+            f"{high:.0f} N.",
+            "",
+        ]
+    for kind in kinds[1:]:
+        found = [o for o in outcomes if o.kind == kind]
+        if found:
+            lines += [f"## {kind.capitalize()}", "", "| slices | the first of them says |"]
+            lines += ["|---:|---|"]
+            groups: dict[str, list[Outcome]] = {}
+            for outcome in found:
+                groups.setdefault(_gist(outcome.reason), []).append(outcome)
+            for group in sorted(groups.values(), key=len, reverse=True):
+                lines.append(f"| {len(group)} | {group[0].reason.replace('|', '/')} |")
+            lines.append("")
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _gist(reason: str) -> str:
+    """A reason without its numbers."""
+    return "".join(c for c in reason if c.isalpha() or c == " ").split("is")[0][:60]

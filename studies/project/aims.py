@@ -1,0 +1,446 @@
+"""Writes docs/benchmarks.md: python studies/project/aims.py. Measures nothing.
+
+Each aim of the project with the value that its command last wrote, into a page or a JSON file of
+docs. A test fails where the page is not what this makes of them.
+"""
+
+import dataclasses as dc
+import json
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from studies.learning.comparison import PAPER
+
+__all__ = ["Row", "page"]
+
+ROOT = Path(__file__).resolve().parents[2]
+NOT_MEASURED = "not measured"
+
+HEAD = """\
+# Aims and what is reached
+
+Written by
+
+    python studies/project/aims.py
+
+from what the commands in the tables wrote last; it measures nothing itself. "Not measured" means
+that no value of that command is kept in these pages. Times are of shared servers and hold for the
+machine of their command only; each speed stands beside the error and the number of tetrahedra of
+the same run. All is simulated.
+"""
+
+
+@dc.dataclass(frozen=True)
+class Row:
+    """An aim.
+
+    Attributes:
+        what: Is aimed at.
+        aim: In words.
+        value: What was measured, or None.
+        met: Whether it is reached; None without a value.
+        command: That measures it.
+        source: Where its value stands, relative to docs.
+    """
+
+    what: str
+    aim: str
+    value: str | None
+    met: bool | None
+    command: str
+    source: str
+
+    def cells(self) -> str:
+        """A line of a table."""
+        if self.value is None:
+            verdict, value = "-", NOT_MEASURED
+        else:
+            verdict, value = ("reached" if self.met else "**missed**"), self.value
+        name = f"[{Path(self.source).name}]({self.source})" if self.value else ""
+        return f"| {self.what} | {self.aim} | {value} | {verdict} | `{self.command}` | {name} |"
+
+
+class Docs:
+    """What stands in a folder of pages.
+
+    Args:
+        folder: With pages, and with `benchmarks/NAME.json`.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def text(self, name: str) -> str:
+        """A page; empty where there is none."""
+        file = self.folder / name
+        return file.read_text(encoding="utf-8") if file.exists() else ""
+
+    def values(self, name: str) -> Mapping[str, float]:
+        """What a benchmark wrote; empty where it has not run."""
+        text = self.text(f"benchmarks/{name}.json")
+        return json.loads(text)["values"] if text else {}
+
+    def facts(self, name: str) -> Any:
+        """A JSON file of a study; None where there is none."""
+        text = self.text(name)
+        return json.loads(text) if text else None
+
+    def numbers(self, name: str, pattern: str) -> tuple[float, ...] | None:
+        """The groups of a pattern in a page; None where it is not there.
+
+        Raises:
+            ValueError: It is there several times.
+        """
+        found = re.findall(pattern, self.text(name), re.M)
+        if len(found) > 1:
+            raise ValueError(f"{name} has {pattern!r} {len(found)} times")
+        if not found:
+            return None
+        groups = found[0] if isinstance(found[0], tuple) else (found[0],)
+        return tuple(float(group) for group in groups)
+
+
+def measured(
+    what: str,
+    aim: str,
+    command: str,
+    source: str,
+    values: Mapping[str, float] | None,
+    show: Callable[[Mapping[str, float]], tuple[str, bool]],
+) -> Row:
+    """The row of an aim, of values that may be absent."""
+    value, met = show(values) if values else (None, None)
+    return Row(what, aim, value, met, command, source)
+
+
+def cutting(docs: Docs) -> tuple[Mapping[str, float], str]:
+    """What a cut costs, and where that stands: JSON, or the page of an older run."""
+    values = docs.values("cutting_speed")
+    if values:
+        return values, "benchmarks/cutting_speed.json"
+    row = docs.numbers("speed.md", r"^\| 1728 \| (\d+\.\d) \| ([\d.]+) \| ([\d.]+) % \|$")
+    step = docs.numbers("speed.md", r"^Force error of the sub-step against 5e-5 s: ([\d.]+) %")
+    search = docs.numbers("speed.md", r"^\| 1728 \| 0\.001 \| ([\d.]+) \| ([\d.]+) % \|$")
+    gradient = docs.numbers("speed.md", r"parameters and the path: ([\d.]+) slices")
+    if row is None or step is None or search is None or gradient is None:
+        return {}, "speed.md"
+    return {
+        "tetrahedra": 1728.0,
+        "sub_step_us": row[0],
+        "slice_s": row[1],
+        "mesh_error": row[2] / 100.0,
+        "step_error": step[0] / 100.0,
+        "search_slice_s": search[0],
+        "search_step_error": search[1] / 100.0,
+        "gradient_slices": gradient[0],
+    }, "speed.md"
+
+
+def station(docs: Docs) -> tuple[Mapping[str, float], str]:
+    """Real-time factors of the station, and where they stand."""
+    values = docs.values("station_speed")
+    if values:
+        return values, "benchmarks/station_speed.json"
+    found = docs.numbers(
+        "speed.md", r"runs at ([\d.]+) of real time while it cuts, ([\d.]+) with the spring"
+    )
+    names = ("real_time_factor", "spring_real_time_factor")
+    return dict(zip(names, found or (), strict=False)), "speed.md"
+
+
+def speed_rows(docs: Docs) -> Iterator[Row]:
+    """Aims for the simulation's cost."""
+    command = "python studies/physics/cutting_speed.py --json docs/benchmarks/cutting_speed.json"
+    values, source = cutting(docs)
+    yield measured(
+        "27 mm of cucumber, no robot, one core, defaults",
+        "<= 0.10 s, >= 1,200 tetrahedra",
+        command,
+        source,
+        values,
+        lambda v: (
+            f"{v['slice_s']:.3f} s: {v['tetrahedra']:.0f} tetrahedra, error of the mesh "
+            f"{v['mesh_error']:.2%}, of the sub-step {v['step_error']:.2%} (with the sub-step of 1 "
+            f"ms of a search {v['search_slice_s']:.3f} s, {v['search_step_error']:.2%})",
+            v["slice_s"] <= 0.1 and v["tetrahedra"] >= 1200,
+        ),
+    )
+    yield measured(
+        "a sub-step of 1,500 tetrahedra, one core",
+        "<= 36 us",
+        command,
+        source,
+        values,
+        lambda v: (
+            f"{v['sub_step_us'] * 1500 / v['tetrahedra']:.1f} us, from {v['sub_step_us']:.1f} us "
+            f"of {v['tetrahedra']:.0f}",
+            v["sub_step_us"] * 1500 / v["tetrahedra"] <= 36.0,
+        ),
+    )
+    yield measured(
+        "gradient of a slice by all parameters and the path",
+        "<= 6 slices",
+        command,
+        source,
+        values,
+        lambda v: (f"{v['gradient_slices']:.2f} slices", v["gradient_slices"] <= 6.0),
+    )
+    values, source = station(docs)
+    yield measured(
+        "station with arm and control while it cuts, one core",
+        ">= 4 times real time",
+        "python studies/robot/station_speed.py --json docs/benchmarks/station_speed.json",
+        source,
+        values,
+        lambda v: (
+            f"{v['real_time_factor']:.2g} (spring-only baseline "
+            f"{v['spring_real_time_factor']:.2g})",
+            v["real_time_factor"] >= 4.0,
+        ),
+    )
+    values = docs.values("first_run")
+    yield measured(
+        "from the installed wheel to the first picture, kernels compiled",
+        "<= 60 s",
+        "python studies/project/first_run.py --json docs/benchmarks/first_run.json",
+        "benchmarks/first_run.json",
+        values,
+        lambda v: (
+            f"{v['first_picture_s']:.0f} s (the second {v['second_picture_s']:.0f} s; installing "
+            f"took {v['install_s']:.0f} s)",
+            v["first_picture_s"] <= 60.0,
+        ),
+    )
+
+
+def learning_rows(docs: Docs) -> Iterator[Row]:
+    """Aims for the cost of learning."""
+    values, source = docs.values("learning_speed"), "benchmarks/learning_speed.json"
+    command = (
+        "python studies/learning/learning_speed.py --output docs/learning.md "
+        "--json docs/benchmarks/learning_speed.json"
+    )
+
+    def rate(name: str) -> float:
+        return values[f"{name}_2_decisions_a_second"]
+
+    def minutes(name: str) -> float:
+        return 80_000 / rate(name) / 60.0
+
+    yield measured(
+        "80,000 decisions of SAC, two cores, two environments, learning included",
+        "<= 40 min",
+        command,
+        source,
+        values,
+        lambda _: (
+            f"{minutes('cutting'):.0f} min, from {rate('cutting'):.1f} decisions a second",
+            minutes("cutting") <= 40.0,
+        ),
+    )
+    yield measured(
+        "the same against the spring-only baseline",
+        "<= 1.3 times its time",
+        command,
+        source,
+        values,
+        lambda _: (
+            f"{rate('spring') / rate('cutting'):.2f} ({rate('cutting'):.1f} and "
+            f"{rate('spring'):.1f} decisions a second)",
+            rate("spring") / rate("cutting") <= 1.3,
+        ),
+    )
+
+
+BOARD_RATIO = 0.4
+USUAL_BOARD = 3e4
+
+
+def slicing_rows(docs: Docs) -> Iterator[Row]:
+    """Aims for what a policy of the cutting simulator is worth, on the usual board but for one."""
+    command = (
+        "python -m studies slicing docs/slicing_evaluation.jsonl --policies models/policies/cutting_0 "
+        "models/policies/spring_0 --output docs"
+    )
+    source = "slicing_results.md"
+    facts = docs.facts("slicing_results.json") or []
+    by_case = {(f["world"], f["food"]): f for f in facts if f["board_stiffness"] == USUAL_BOARD}
+    highest = value = None
+    if facts:
+        highest = max(max(f["ratios"]["median_force"][2], f["strict_ratio"][2]) for f in facts)
+        boards = sorted({f["board_stiffness"] for f in facts})
+        listed = ", ".join(f"{board / 1e3:g}" for board in boards)
+        value = f"<= {highest:.2f} in {len(facts)} cases, boards of {listed} kN/m"
+    yield Row(
+        "contact force, ours over spring only, unfinished slices of ours counted as the worst of "
+        "the baseline's: every food, world and board",
+        "interval below 1",
+        value,
+        None if highest is None else highest < 1.0,
+        command,
+        source,
+    )
+    for world in ("curves", "stand_in"):
+        name = world.replace("_", "-")
+        for food, paper in PAPER.items():
+            case = by_case.get((world, food))
+            for metric, of, least in (
+                ("median_force", "contact force", paper),
+                ("board_peak", "board's peak", BOARD_RATIO),
+            ):
+                value = met = None
+                if case is not None:
+                    ratio, low, high = case["ratios"][metric]
+                    value = f"{ratio:.2f} ({low:.2f} to {high:.2f})"
+                    met = ratio <= least and high < 1.0
+                yield Row(
+                    f"{of}, ours over spring only: {food}, {name} world",
+                    f"<= {least:g}, interval below 1",
+                    value,
+                    met,
+                    command,
+                    source,
+                )
+        done = [f["completed"]["cutting"] for (w, _), f in by_case.items() if w == world]
+        share = f"{100 * sum(done) / len(done):.1f} % in the mean of foods" if done else None
+        met = min(done) == 1.0 if done else None
+        yield Row(f"slices completed by ours, {name} world", "all", share, met, command, source)
+
+
+def calibration_rows(docs: Docs) -> Iterator[Row]:
+    """Aims for the calibration on the paper's curves."""
+    command, source = "python -m studies calibration --output FOLDER", "calibration.md"
+    for food in ("cucumber", "tomato", "potato"):
+        found = docs.numbers(
+            source, rf"^\| {food} \| ([\d.]+) \| [\d.]+ \| [\d.]+ \| [\d.]+ \| ([\d.]+) \|"
+        )
+        values = dict(zip(("ratio", "minutes"), found or (), strict=False))
+        yield measured(
+            f"calibrating {food}: 500 trials, two starts of 100 steps of Adam, two cores",
+            "<= 10 min for one start",
+            command,
+            source,
+            values,
+            lambda v: (f"{v['minutes']:.1f} min", v["minutes"] <= 10.0),
+        )
+        yield measured(
+            f"error on the measured {food}",
+            "<= half of DiSECt's",
+            command,
+            source,
+            values,
+            lambda v: (f"{v['ratio']:.2f} of that half", v["ratio"] <= 1.0),
+        )
+
+
+def accuracy_rows(docs: Docs) -> Iterator[Row]:
+    """Aims for what the physics computes."""
+    results = docs.facts("verification.json")
+    values = results and {"mesh": results["mesh"]["estimate"], "step": results["step"]["estimate"]}
+    yield measured(
+        "discretisation error of mesh and step at the defaults (Richardson)",
+        "<= 3 % RMS",
+        "python -m studies verification --output docs/verification.md",
+        "verification.md",
+        values,
+        lambda v: (
+            f"{v['mesh']:.1%} of the mesh, {v['step']:.2%} of the sub-step",
+            v["mesh"] + v["step"] <= 0.03,
+        ),
+    )
+    counts = docs.numbers("random_slices.md", r"^\| all \| (\d+) \| (\d+) \| (\d+) \| (\d+) \|$")
+    names = ("cut", "refused", "stopped", "unexplained")
+    yield measured(
+        "200 random slices: cut, or a reason",
+        "none unexplained",
+        "python -m studies random --count 200 --seed 1 --output docs",
+        "random_slices.md",
+        dict(zip(names, counts or (), strict=False)),
+        lambda v: (
+            ", ".join(f"{v[name]:.0f} {name}" for name in names),
+            v["unexplained"] == 0.0 and sum(v.values()) >= 200,
+        ),
+    )
+
+
+def diagnosis_rows(docs: Docs) -> Iterator[Row]:
+    """Aims for the diagnosis."""
+    command = (
+        "python studies/diagnosis/diagnosis_speed.py --json docs/benchmarks/diagnosis_speed.json"
+    )
+    for key, what, limit in (
+        ("cold_s", "diagnosis of 18 records, all causes", 600.0),
+        ("warm_s", "the same again, with what it has kept", 60.0),
+    ):
+        yield measured(
+            what,
+            f"<= {limit:.0f} s",
+            command,
+            "benchmarks/diagnosis_speed.json",
+            docs.values("diagnosis_speed"),
+            lambda v, key=key, limit=limit: (
+                f"{v[key]:.0f} s, {v['records']:.0f} records",
+                v[key] <= limit and v["records"] >= 18,
+            ),
+        )
+    study = docs.facts("hidden_effects.json") or {"requirements": []}
+    for row in study["requirements"]:
+        shown = f", {row['shown']}" if row["shown"] else ""
+        yield Row(
+            f"hidden effects: {row['what']}",
+            row["asked"],
+            f"{row['hits']} of {row['runs']}{shown}",
+            row["met"],
+            "python -m studies score docs/hidden_effects.jsonl --output docs",
+            "hidden_effects.md",
+        )
+
+
+SECTIONS = {
+    "Cost of the simulation": speed_rows,
+    "Accuracy": accuracy_rows,
+    "Calibration": calibration_rows,
+    "Diagnosis": diagnosis_rows,
+    "Learning": learning_rows,
+    "Slicing with what was learnt": slicing_rows,
+}
+
+
+def page(folder: Path = ROOT / "docs") -> str:
+    """The page of what stands in a folder."""
+    docs, parts, all_rows = Docs(folder), [], []
+    for title, rows_of in SECTIONS.items():
+        rows = list(rows_of(docs))
+        all_rows += rows
+        parts += [
+            f"\n## {title}\n",
+            "| what | aim | value | | measured by | from |",
+            "|---|---|---|---|---|---|",
+            *(row.cells() for row in rows),
+        ]
+    known = [row for row in all_rows if row.value is not None]
+    met = sum(bool(row.met) for row in known)
+    count = (
+        f"\nOf {len(all_rows)} aims {met} are reached, {len(known) - met} are missed, "
+        f"{len(all_rows) - len(known)} are not measured."
+    )
+    machines = []
+    for file in sorted((folder / "benchmarks").glob("*.json")):
+        facts = json.loads(file.read_text(encoding="utf-8"))
+        machines.append(f"- {file.name}: {facts['machine']}")
+    if machines:
+        parts += ["\n## Machines\n", *machines]
+    return "\n".join([HEAD + count, *parts]) + "\n"
+
+
+def main() -> int:
+    """Writes the page."""
+    (ROOT / "docs" / "benchmarks.md").write_text(page(), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

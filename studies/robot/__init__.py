@@ -1,0 +1,1 @@
+"""Studies of station, control, servo and hardware path."""

@@ -1,0 +1,133 @@
+"""How much the exchange between food and plant, and the plant's step, matter."""
+
+import copy
+import dataclasses as dc
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.diagrams.outputs.run_log import Record
+from sliceit_drake.diagrams.run import prepare_run, simulate
+from sliceit_drake.diagrams.scenario import Scenario
+
+__all__ = ["CouplingCase", "coupling_study", "coupling_table"]
+
+BIN = 4e-3
+
+
+@dc.dataclass
+class CouplingCase:
+    """One combination and its difference from the reference, the finest one.
+
+    Attributes:
+        exchange_period: s.
+        plant_time_step: s.
+        force_error: RMS difference of the force on the knife over its RMS, while the food is cut.
+        motion_error: RMS difference of the knife's path over the RMS of the tracking error.
+        work_error: Largest coupling work error over the work of cutting.
+        board_peak: N.
+        real_time_factor: Simulated over wall time.
+    """
+
+    exchange_period: float
+    plant_time_step: float
+    force_error: float
+    motion_error: float
+    work_error: float
+    board_peak: float
+    real_time_factor: float
+
+
+def coupling_study(
+    scenario: Scenario,
+    combinations: Sequence[tuple[float, float]],
+    progress: Callable[[int, int], None] | None = None,
+) -> list[CouplingCase]:
+    """Runs a scenario at several exchange periods and plant steps.
+
+    The controller keeps its own period, and the food one sub-step, that of the finest exchange, so
+    that only the coupling differs. Forces are compared as means over bins of 4 ms.
+
+    Args:
+        scenario: A cut.
+        combinations: Exchange period and plant step, s; the last is the reference.
+        progress: Called with the number of runs done and their total.
+
+    Raises:
+        ConfigurationError: A run broke off.
+    """
+    sub_step = min([scenario.numerics.time_step, *(exchange for exchange, _ in combinations)])
+    results: list[tuple[Record, float]] = []
+    for done, (exchange, step) in enumerate(combinations):
+        case = copy.deepcopy(scenario)
+        case.measurement = None
+        case.exchange_period = exchange
+        case.robot.plant_time_step = step
+        case.numerics.time_step = sub_step
+        run = prepare_run(case)
+        simulate(run)
+        if run.stopped:
+            raise ConfigurationError(
+                f"the run with an exchange of {exchange:g} s broke off: {run.stopped}",
+                field="scenario",
+                fix="Give a scenario that `sliceit simulate` runs to its end at this exchange.",
+            )
+        record = run.record()
+        results.append((record, float(record["time"][-1] / run.wall_time)))
+        if progress is not None:
+            progress(done + 1, len(combinations))
+    reference = results[-1][0]
+    return [
+        _compare(exchange, step, record, reference, speed)
+        for (exchange, step), (record, speed) in zip(combinations, results, strict=True)
+    ]
+
+
+def _compare(
+    exchange: float, step: float, record: Record, reference: Record, speed: float
+) -> CouplingCase:
+    bins = np.arange(0.0, reference["time"][-1], BIN)
+
+    def binned(source: Record, values: np.ndarray) -> np.ndarray:
+        # A row holds what acted over the exchange that ends at its time.
+        index = np.maximum(np.searchsorted(bins, source["time"] - 1e-9) - 1, 0)
+        total = np.zeros((len(bins), values.shape[1]))
+        np.add.at(total, index, values)
+        return total / np.maximum(np.bincount(index, minlength=len(bins)), 1)[:, None]
+
+    force = binned(record, record.vector("food_wrench_f"))
+    true_force = binned(reference, reference.vector("food_wrench_f"))
+    cutting = np.linalg.norm(true_force, axis=1) > 0.5
+    path = binned(record, record.vector("knife_pose_p"))
+    true_path = binned(reference, reference.vector("knife_pose_p"))
+    target = binned(reference, reference.vector("target_pose_p"))
+
+    def rms(values: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(values[cutting] ** 2)))
+
+    return CouplingCase(
+        exchange_period=exchange,
+        plant_time_step=step,
+        force_error=rms(force - true_force) / rms(true_force),
+        motion_error=rms(path - true_path) / rms(true_path - target),
+        work_error=float(np.abs(record["coupling_work_error"]).max() / record["energy_work"].max()),
+        board_peak=float(record["board_wrench_f_z"].max()),
+        real_time_factor=speed,
+    )
+
+
+def coupling_table(cases: Sequence[CouplingCase]) -> str:
+    """The cases as a table for people."""
+    lines = [
+        "| exchange [ms] | plant step [ms] | force error | path error | work error "
+        "| board peak [N] | x real time |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for c in cases:
+        lines.append(
+            f"| {1e3 * c.exchange_period:g} | {1e3 * c.plant_time_step:g} | "
+            f"{100 * c.force_error:.2f} % | {100 * c.motion_error:.2f} % | "
+            f"{100 * c.work_error:.2f} % | {c.board_peak:.2f} | {c.real_time_factor:.2f} |"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,1 @@
+"""Studies of many machines: databases and clusters."""
