@@ -16,10 +16,10 @@ from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.foods.food import Cylinder, Food
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagnosis.causes.material import SkinToughness
-from sliceit_drake.diagnosis.cluster import active, on_cluster
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
-from sliceit_drake.diagnosis.simulator import Runner
 from sliceit_drake.diagnosis.slices import Meshing
+from sliceit_drake.prediction.cluster import active, on_cluster
+from sliceit_drake.prediction.simulator import Runner
 from sliceit_drake.stand_in.protocol import Condition, Protocol
 from studies.hidden_effects import runner
 from studies.hidden_effects.bench import model_food

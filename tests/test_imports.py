@@ -21,8 +21,9 @@ LAYERS: dict[str, set[str]] = {
     "diagrams": {"cutting", "systems", "records", "hardware"},
     "stand_in": {"cutting", "systems", "diagrams", "records"},
     "learning": {"cutting", "systems", "diagrams", "records"},
-    "calibration": {"cutting", "records"},
-    "diagnosis": {"cutting", "systems", "diagrams", "records", "calibration"},
+    "prediction": {"cutting", "records"},
+    "calibration": {"cutting", "prediction", "records"},
+    "diagnosis": {"cutting", "systems", "diagrams", "records", "prediction", "calibration"},
     "robot_run": {"cutting", "systems", "diagrams", "records", "hardware"},
     "emulator": {"cutting", "systems", "diagrams", "records"},
 }

@@ -16,13 +16,13 @@ from sliceit_drake.diagnosis.causes.contact import BluntEdge, FlankAdhesion
 from sliceit_drake.diagnosis.causes.material import SkinToughness, ToughnessBySpeed
 from sliceit_drake.diagnosis.causes.mounting import BoardLaw
 from sliceit_drake.diagnosis.causes.sensor import SensorGain
-from sliceit_drake.diagnosis.clock import BLOCK, Clock
 from sliceit_drake.diagnosis.evidence.sensitivity import Column, Sensitivities, sensitivities
 from sliceit_drake.diagnosis.experiments.identifiability import ANGLE, Evidence, NoiseLevel
 from sliceit_drake.diagnosis.identifiability_report import Study, report
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.diagnosis.registry import load_cause
 from sliceit_drake.diagnosis.slices import Meshing
+from sliceit_drake.prediction.clock import BLOCK, Clock
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.protocol import Condition, Protocol, load_protocol

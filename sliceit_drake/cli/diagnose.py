@@ -99,9 +99,9 @@ def _run(options: argparse.Namespace) -> int:
     """Runs the command."""
     from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
-    from sliceit_drake.diagnosis.cluster import on_cluster
     from sliceit_drake.diagnosis.registry import load_cause
     from sliceit_drake.output_folder import check_folder
+    from sliceit_drake.prediction.cluster import on_cluster
     from sliceit_drake.records.validation import load_sessions
 
     options.records = list(map(here_or_shipped, options.records))

@@ -16,7 +16,6 @@ from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
 from sliceit_drake.cutting.foods.food import make_food_model
 from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.diagnosis.cause import Cause
-from sliceit_drake.diagnosis.clock import Clock
 from sliceit_drake.diagnosis.evidence.confirm import Confirmation, confirm
 from sliceit_drake.diagnosis.evidence.held_out import HeldOutGain, held_out_gain, held_out_share
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
@@ -34,6 +33,7 @@ from sliceit_drake.diagnosis.input_checks import check_records, without_lone_tor
 from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import is_users, open_causes
 from sliceit_drake.diagnosis.slices import Meshing
+from sliceit_drake.prediction.clock import Clock
 from sliceit_drake.records.slice_record import SliceRecord
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import GRAVITY, CuttingModel, Numerics
 from sliceit_drake.cutting.simulate import board_wrenches
 from sliceit_drake.diagnosis.cause import Cause, ForceSeries, SharedFacts, SliceFacts
-from sliceit_drake.diagnosis.clock import Clock, Stretches
-from sliceit_drake.diagnosis.simulator import Run
+from sliceit_drake.prediction.clock import Clock, Stretches
+from sliceit_drake.prediction.simulator import Run
 from sliceit_drake.records.preprocessing import as_measured
 from sliceit_drake.records.slice_record import SliceRecord
 

@@ -28,7 +28,7 @@ from sliceit_drake.diagnosis.evidence.linear import USUAL, LinearProblem
 from sliceit_drake.diagnosis.evidence.screen import screen
 from sliceit_drake.diagnosis.evidence.sensitivity import Column, Sensitivities, sensitivities
 from sliceit_drake.diagnosis.registry import all_causes, open_causes
-from sliceit_drake.diagnosis.simulator import cutting_source
+from sliceit_drake.prediction.simulator import cutting_source
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.stand_in import effect as effect_module
 from sliceit_drake.stand_in import finite_element_world, quiet, sensor, session, world

@@ -43,10 +43,10 @@ from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.cutting.parameters import get_parameter
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagnosis.cause import Cause, ForceSeries
-from sliceit_drake.diagnosis.clock import Clock
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
-from sliceit_drake.diagnosis.simulator import cutting_source
 from sliceit_drake.diagnosis.slices import Meshing, SliceTarget
+from sliceit_drake.prediction.clock import Clock
+from sliceit_drake.prediction.simulator import cutting_source
 from sliceit_drake.records.preprocessing import as_measured
 from sliceit_drake.records.slice_record import SliceRecord
 

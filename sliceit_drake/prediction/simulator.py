@@ -18,8 +18,8 @@ from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.simulate import KnifePath
 from sliceit_drake.cutting.solver import NOT_FINITE, run_exchanges
 from sliceit_drake.cutting.workspace import Workspace, parameter_row
-from sliceit_drake.diagnosis import cluster
-from sliceit_drake.diagnosis.clock import BLOCK, Clock, Stretches
+from sliceit_drake.prediction import cluster
+from sliceit_drake.prediction.clock import BLOCK, Clock, Stretches
 
 __all__ = ["Job", "Run", "Runner", "Simulator", "cutting_source"]
 

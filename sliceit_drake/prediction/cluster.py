@@ -22,10 +22,10 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry
 from sliceit_drake.cutting.model import CuttingModel
-from sliceit_drake.diagnosis.clock import Stretches
+from sliceit_drake.prediction.clock import Stretches
 
 if TYPE_CHECKING:
-    from sliceit_drake.diagnosis.simulator import Job, Run
+    from sliceit_drake.prediction.simulator import Job, Run
 
 __all__ = ["active", "on_cluster", "run_jobs"]
 
@@ -120,7 +120,7 @@ def _run_there(
     board: Board,
 ) -> "tuple[str, Run]":
     """Runs a job on a worker, which keeps what it needs from one to the next."""
-    from sliceit_drake.diagnosis.simulator import Job, Runner
+    from sliceit_drake.prediction.simulator import Job, Runner
 
     runners: dict[tuple[float, str], Runner] = _THREAD.__dict__.setdefault("runners", {})
     place = (period, repr(board))
