@@ -135,8 +135,8 @@ TESTED = {
     ],
     "tests/test_learning_comparison.py::test_the_study_writes_its_page_and_says_what_it_lacks": [
         "python -m studies slicing output/evaluation.jsonl --output docs",
-        "python -m studies slicing docs/slicing_evaluation.jsonl --policies models/policies/cutting_0"
-        " models/policies/spring_0 --output docs",
+        "python -m studies slicing docs/slicing_evaluation.jsonl"
+        " --policies models/policies/cutting_0 models/policies/spring_0 --output docs",
     ],
     "tests/test_motion_optimization.py::test_the_command_leaves_a_scenario_that_simulate_takes": [
         "sliceit optimize-motion SCENARIO --output DIR",
