@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 from emulator_bench import free_address
-from test_hardware_end_to_end import CLIENT_PACE, PATIENT, ROBOT, emulated
+from hardware_bench import CLIENT_PACE, PATIENT, ROBOT, emulated
 
 from sliceit_drake.cli.main import main
 from sliceit_drake.diagrams.scenario import load_scenario

@@ -1,7 +1,6 @@
 """The emulated controller under the clients that people use: ur_rtde, and Universal Robots' own."""
 
 import contextlib
-import faulthandler
 import os
 import signal
 import subprocess
@@ -28,12 +27,7 @@ from sliceit_drake.resources import resource_path
 SERVO = (0.0, 0.0, 0.002, 0.03, 2000.0)
 
 
-@pytest.fixture(autouse=True)
-def no_test_hangs():
-    # The client's constructors hold Python's lock while they wait: only this ends them.
-    faulthandler.dump_traceback_later(90.0, exit=True)
-    yield
-    faulthandler.cancel_dump_traceback_later()
+pytestmark = pytest.mark.usefixtures("no_test_hangs")
 
 
 @contextlib.contextmanager

@@ -9,11 +9,11 @@ import time
 
 import numpy as np
 import pytest
-from test_hardware_end_to_end import emulated, no_test_hangs, run_hardware
+from hardware_bench import emulated, run_hardware
 
 from sliceit_drake.resources import resource_path
 
-__all__ = ["no_test_hangs"]
+pytestmark = pytest.mark.usefixtures("no_test_hangs")
 
 SPRING = resource_path("scenarios/cucumber_spring.yaml")
 # Two seconds in the air: no fault may come after the end.

@@ -9,12 +9,12 @@ import time
 import numpy as np
 import pytest
 from emulator_bench import free_address
-from test_hardware_end_to_end import PATIENT, ROBOT, no_test_hangs
+from hardware_bench import PATIENT, ROBOT
 
 from sliceit_drake.emulator.process import EmulatorProcess
 from sliceit_drake.resources import resource_path
 
-__all__ = ["no_test_hangs"]
+pytestmark = pytest.mark.usefixtures("no_test_hangs")
 
 SPRING = resource_path("scenarios/cucumber_spring.yaml")
 PACE = 0.2

@@ -11,6 +11,7 @@ import time as clock
 import numpy as np
 import pytest
 from fake_robot import FakeRobot
+from fake_station import CONFIG, PACE, spring_scenario
 
 from sliceit_drake.cli import hardware as command
 from sliceit_drake.cli.main import main
@@ -18,7 +19,6 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.hardware_station import MakeHardwareStation, make_safety_layer
 from sliceit_drake.diagrams.outputs.slice_record_of_run import slice_record_of
 from sliceit_drake.diagrams.ports import check_station_ports
-from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.diagrams.station import MakeSlicingStation
 from sliceit_drake.hardware.checks import check_facts, check_start
 from sliceit_drake.hardware.configuration import (
@@ -26,23 +26,12 @@ from sliceit_drake.hardware.configuration import (
     differing,
     load_hardware_config,
 )
-from sliceit_drake.hardware.limits import SafetyLimits
 from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.resources import resource_path
 from sliceit_drake.robot_run.hardware_run import prepare_hardware_run, write_hardware_outputs
 from sliceit_drake.robot_run.plan_check import check_plan, plan_joints
 
-PACE = 0.15
-# A machine that other tests keep busy may be late: these runs are about what is done, not when.
-PATIENT = SafetyLimits(state_age=0.1, command_age=0.1, joint_step=0.1)
-CONFIG = dict(payload=1.2, payload_cog=[0.0, 0.0, 0.06], board_height=0.05, limits=PATIENT)
-
-
 OPTIONS = argparse.Namespace(duration=0.1, dry_run=False, host="127.0.0.1")
-
-
-def spring_scenario():
-    return load_scenario(resource_path("scenarios/cucumber_spring.yaml"))
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import time as clock
 import numpy as np
 import pytest
 from fake_robot import FakeRobot
-from test_hardware_station import CONFIG, PACE, spring_scenario
+from fake_station import CONFIG, PACE, spring_scenario
 
 from sliceit_drake.diagrams.hardware_station import make_knife_kinematics
 from sliceit_drake.diagrams.station import MakeSlicingStation

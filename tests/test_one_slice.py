@@ -8,7 +8,7 @@ import json
 import numpy as np
 import pytest
 from example_slices import short_press
-from test_diagnosis import COLUMNS, NOISE, record
+from synthetic_records import COLUMNS, NOISE, record
 
 from sliceit_drake.calibration.noise import MarkovCovariance
 from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange

@@ -5,8 +5,8 @@ import time as clock
 
 import numpy as np
 import pytest
+from arm_at_start import BOARD, LENGTH, START, X_TK, X_WB, chain_pose
 from fake_robot import FakeRobot
-from test_safety import BOARD, LENGTH, START, X_TK, X_WB, chain_pose
 
 from sliceit_drake.hardware.client import RobotUnavailableError
 from sliceit_drake.hardware.knife_kinematics import KnifeKinematics

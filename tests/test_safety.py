@@ -6,6 +6,7 @@ import os
 
 import numpy as np
 import pytest
+from arm_at_start import BOARD, LENGTH, START, X_TK, X_WB, chain_pose
 from scipy.optimize import brentq
 
 from sliceit_drake.configuration import ConfigurationError
@@ -14,15 +15,8 @@ from sliceit_drake.hardware.knife_kinematics import KnifeKinematics
 from sliceit_drake.hardware.limits import SafetyLimits, loosened
 from sliceit_drake.hardware.robot_state import PLAYING, RobotState
 from sliceit_drake.hardware.safety import LatchedError, SafetyLayer
-from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
 
 PERIOD = 0.002
-# Near the start of scenarios/cucumber.yaml: the edge level, along Wy, 50 mm above the board.
-START = [1.35559, -1.48188, 1.94802, -2.03694, -1.57079, 1.35559]
-BOARD = 0.05
-LENGTH = 0.15
-X_TK = np.array([[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0.21]])
-X_WB = np.eye(4)[:3]
 COMMANDS = int(os.environ.get("SLICEIT_HOSTILE_COMMANDS", "100000"))
 
 
@@ -44,17 +38,6 @@ def at_height(q, height):
         return 0.5 * (edge.heel[2] + edge.tip[2]) - BOARD - height
 
     return [q[0], float(brentq(missed, q[1] - 0.3, q[1] + 0.3)), *q[2:]]
-
-
-def chain_pose(q):
-    """X_WK by the chain of the compliance controller."""
-    from pydrake.math import RigidTransform, RotationMatrix
-
-    chain = ur5e_chain(RigidTransform(X_TK))
-    X = RigidTransform(X_WB)
-    for joint, angle in zip(chain.joints, q, strict=True):
-        X = X @ joint.X_PL @ RigidTransform(RotationMatrix.MakeZRotation(angle), [0, 0, 0])
-    return X @ chain.X_LE
 
 
 def test_the_edge_is_where_the_controllers_chain_has_it():

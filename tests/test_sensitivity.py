@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
-from test_causes import BOARD, DRAW, TURNED, bench, push
+from cause_bench import BOARD, DRAW, TURNED, bench, push
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.model import CuttingModel

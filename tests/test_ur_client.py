@@ -6,13 +6,12 @@ import time
 import numpy as np
 import pytest
 from emulator_bench import free_address
-from test_emulator_clients import no_test_hangs
 
 from sliceit_drake.emulator.process import EmulatorProcess
 from sliceit_drake.hardware.rtde_link import HALT_TIME
 from sliceit_drake.hardware.ur_client import ATTEMPT, UrClient
 
-__all__ = ["no_test_hangs"]
+pytestmark = pytest.mark.usefixtures("no_test_hangs")
 
 
 class DeafControl:
