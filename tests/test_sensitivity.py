@@ -18,7 +18,6 @@ from sliceit_drake.diagnosis.causes.mounting import BoardLaw
 from sliceit_drake.diagnosis.causes.sensor import SensorGain
 from sliceit_drake.diagnosis.evidence.sensitivity import Column, Sensitivities, sensitivities
 from sliceit_drake.diagnosis.experiments.identifiability import ANGLE, Evidence, NoiseLevel
-from sliceit_drake.diagnosis.identifiability_report import Study, report
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.diagnosis.registry import load_cause
 from sliceit_drake.diagnosis.slices import Meshing
@@ -27,6 +26,7 @@ from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.protocol import Condition, Protocol, load_protocol
 from studies.commands.identifiability import study
+from studies.diagnosis.identifiability_page import Study, report
 
 Z = 2
 EVEN = Clock(longest=1)

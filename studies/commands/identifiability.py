@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from sliceit_drake.calibration.setup import CalibrationSetup
     from sliceit_drake.diagnosis.cause import Cause
-    from sliceit_drake.diagnosis.identifiability_report import Study
     from sliceit_drake.records.slice_record import SliceRecord
     from sliceit_drake.stand_in.protocol import Protocol
+    from studies.diagnosis.identifiability_page import Study
 
 __all__ = ["add_identifiability", "nominal_records", "protocol_setup", "study"]
 
@@ -112,7 +112,7 @@ def study(
     """
     from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
     from sliceit_drake.diagnosis.experiments.identifiability import Evidence, identifiability
-    from sliceit_drake.diagnosis.identifiability_report import Study
+    from studies.diagnosis.identifiability_page import Study
 
     records: list[SliceRecord] = []
     ranges = []
@@ -140,10 +140,10 @@ def _run(options: argparse.Namespace) -> int:
     """Runs the study."""
     from tqdm import tqdm
 
-    from sliceit_drake.diagnosis.identifiability_report import plot_angles, report
     from sliceit_drake.diagnosis.registry import load_cause, open_causes
     from sliceit_drake.resources import resource_path
     from sliceit_drake.stand_in.protocol import load_protocol
+    from studies.diagnosis.identifiability_page import plot_angles, report
 
     protocols = [
         load_protocol(str(resource_path(f"calibration/protocols/{name}.yaml")))

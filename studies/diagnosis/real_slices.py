@@ -8,8 +8,7 @@ import numpy as np
 
 from sliceit_drake.diagnosis.cause import EXPERIMENTS
 from sliceit_drake.diagnosis.evidence.verdict import LEAST_REPLICATES
-from sliceit_drake.diagnosis.experiments.identifiability import ANGLE
-from sliceit_drake.diagnosis.identifiability_report import short
+from sliceit_drake.diagnosis.experiments.identifiability import ANGLE, short
 from sliceit_drake.diagnosis.one_slice.slice_evidence import LEVEL
 from sliceit_drake.diagnosis.one_slice.slice_report import evidence_table, slice_figure
 from sliceit_drake.diagnosis.one_slice.slice_result import LEAST_GAIN, OneSlice

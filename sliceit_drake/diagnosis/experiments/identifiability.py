@@ -22,7 +22,9 @@ __all__ = [
     "Evidence",
     "Identifiability",
     "NoiseLevel",
+    "classes",
     "identifiability",
+    "short",
 ]
 
 ANGLE = 20.0
@@ -378,3 +380,19 @@ def _delta(
             count += int(rows.sum())
         values.append(float(np.sqrt((squares / max(count, 1)).max())))
     return float(np.median(values))
+
+
+def classes(result: Identifiability) -> list[list[str]]:
+    """Groups of what shows and cannot be told apart, larger than one; they may overlap."""
+    groups: list[list[str]] = []
+    for a, name in enumerate(result.names):
+        if result.visible[a]:
+            members = sorted(result.equivalence_class(name), key=result.names.index)
+            if len(members) > 1 and members not in groups:
+                groups.append(members)
+    return groups
+
+
+def short(name: str) -> str:
+    """A base parameter or cause as the tables name it."""
+    return f"shift of {name.rsplit('.', 1)[-1].replace('youngs_', '')}" if "." in name else name

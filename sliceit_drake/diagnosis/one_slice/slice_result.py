@@ -10,8 +10,12 @@ import numpy as np
 from sliceit_drake.diagnosis.cause import EXPERIMENTS, Cause
 from sliceit_drake.diagnosis.evidence.sensitivity import RecordSensitivity
 from sliceit_drake.diagnosis.evidence.verdict import LEAST_REPLICATES
-from sliceit_drake.diagnosis.experiments.identifiability import SHOWS, Identifiability
-from sliceit_drake.diagnosis.identifiability_report import classes, short
+from sliceit_drake.diagnosis.experiments.identifiability import (
+    SHOWS,
+    Identifiability,
+    classes,
+    short,
+)
 from sliceit_drake.diagnosis.one_slice.slice_evidence import LEVEL, CauseInSlice, SliceEvidence
 from sliceit_drake.diagnosis.one_slice.slice_fit import SliceFit
 from sliceit_drake.diagnosis.registry import is_users

@@ -8,9 +8,16 @@ import numpy as np
 
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.evidence.sensitivity import Sensitivities
-from sliceit_drake.diagnosis.experiments.identifiability import ANGLE, SHIFT, SHOWS, Identifiability
+from sliceit_drake.diagnosis.experiments.identifiability import (
+    ANGLE,
+    SHIFT,
+    SHOWS,
+    Identifiability,
+    classes,
+    short,
+)
 
-__all__ = ["Study", "classes", "plot_angles", "report", "short"]
+__all__ = ["Study", "plot_angles", "report"]
 
 
 @dc.dataclass
@@ -26,11 +33,6 @@ class Study:
     results: list[Identifiability]
     causes: Sequence[Cause]
     found: Sensitivities
-
-
-def short(name: str) -> str:
-    """A base parameter or cause as the tables name it."""
-    return f"shift of {name.rsplit('.', 1)[-1].replace('youngs_', '')}" if "." in name else name
 
 
 def _table(result: Identifiability) -> str:
@@ -99,17 +101,6 @@ def _scan_angles(found: Sensitivities) -> dict[str, float]:
                 angle = float(np.degrees(np.arccos(np.clip(dot / np.sqrt(aa * bb), -1.0, 1.0))))
                 out.setdefault(name, []).append(angle)
     return {name: float(np.median(values)) for name, values in out.items()}
-
-
-def classes(result: Identifiability) -> list[list[str]]:
-    """Groups of what shows and cannot be told apart, larger than one; they may overlap."""
-    groups: list[list[str]] = []
-    for a, name in enumerate(result.names):
-        if result.visible[a]:
-            members = sorted(result.equivalence_class(name), key=result.names.index)
-            if len(members) > 1 and members not in groups:
-                groups.append(members)
-    return groups
 
 
 HEAD = """\
