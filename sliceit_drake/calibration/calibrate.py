@@ -1,35 +1,29 @@
 """A calibration from records to a food: search, refinement, polish, uncertainty, held-out error."""
 
-import copy
 import dataclasses as dc
 import hashlib
 import multiprocessing
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import wait
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from sliceit_drake.calibration.gauss_newton import gauss_newton
 from sliceit_drake.calibration.held_out import blocked_error
-from sliceit_drake.calibration.posterior import Posterior
 from sliceit_drake.calibration.prediction import Prediction, Predictor
 from sliceit_drake.calibration.refine import Refinement, refine
+from sliceit_drake.calibration.result import Calibration
 from sliceit_drake.calibration.search import SearchResult, error_of, open_study, search
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.calibration.uncertainty import estimate_posterior
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
-from sliceit_drake.cutting.foods.spring_food import calibrate_spring
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.cutting.workers import worker_processes
 from sliceit_drake.records.slice_record import SliceRecord
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-__all__ = ["Calibration", "CalibrationOptions", "Progress", "calibrate"]
+__all__ = ["CalibrationOptions", "Progress", "calibrate"]
 
 Progress = Callable[[str, int, int, float], None]
 """Called with what is done, steps done, steps in all, best error so far in N."""
@@ -60,74 +54,6 @@ class CalibrationOptions:
     storage: str | None = None
     blocks: int = 5
     start: Mapping[str, float] | None = None
-
-
-@dc.dataclass
-class Calibration:
-    """What a calibration found; prints as a table, plots itself.
-
-    Attributes:
-        setup: What was searched.
-        predictor: Of the records that were fitted, at the setup's sub-step.
-        unit: Places of the parameters in their ranges [d].
-        predictions: One a record.
-        rms: On the records, N.
-        search_rms: Best of the search alone, N; of the start where there was no search.
-        refined_rms: Best after Adam, N; the same.
-        posterior: Of the parameters.
-        blocks: RMS error on each block of depth when it was held out, N.
-        held_out_rms: On all of them, N; None if none was held out.
-        held_out_records: RMS error by name on records that were not fitted, N.
-        failures: Trials that broke down.
-    """
-
-    setup: CalibrationSetup
-    predictor: Predictor
-    unit: np.ndarray
-    predictions: list[Prediction]
-    rms: float
-    search_rms: float
-    refined_rms: float
-    posterior: Posterior
-    blocks: list[float]
-    held_out_rms: float | None
-    held_out_records: dict[str, float]
-    failures: int
-
-    def table(self) -> str:
-        """Parameters with 90 % intervals, which of them are not determined, and errors."""
-        from sliceit_drake.calibration.report import calibration_table
-
-        return calibration_table(self)
-
-    def plot(self) -> "Figure":
-        """Measured and predicted force of the first three records, and what is left."""
-        from sliceit_drake.calibration.report import figure
-
-        return figure(self)
-
-    def calibrated_food(self, date: str = "", command: str = "", note: str = "") -> CalibratedFood:
-        """The food as scenarios load it."""
-        values = self.predictor.values(self.unit)
-        target = self.predictor.targets[0]
-        model = self.predictor.model(target, values)
-        food = copy.deepcopy(self.setup.food)
-        food.material, food.effects = model.material, model.effects
-        force = np.concatenate([t.record.force_magnitude for t in self.predictor.targets])
-        spring = calibrate_spring(force, float(model.top - model.bottom))
-        return CalibratedFood(
-            food=food,
-            knife=model.knife,
-            flank_stiffness=model.numerics.flank_stiffness,
-            distribution=self.posterior.shared(),
-            spring=spring,
-            rms_error=self.rms,
-            held_out_error=self.held_out_rms,
-            records=[t.record.name for t in self.predictor.targets],
-            date=date,
-            command=command,
-            note=note,
-        )
 
 
 def calibrate(

@@ -9,8 +9,8 @@ from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.cli.scenario_argument import here_or_shipped
 
 if TYPE_CHECKING:
-    from sliceit_drake.calibration.calibrate import Calibration
     from sliceit_drake.calibration.per_point import PointFit
+    from sliceit_drake.calibration.result import Calibration
 
 __all__ = ["add_parser", "fit_points_shown"]
 
@@ -120,7 +120,7 @@ def _from_literature(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from sliceit_drake.calibration.literature import food_from_literature
-    from sliceit_drake.calibration.report import food_table
+    from sliceit_drake.calibration.report import parameter_table
     from sliceit_drake.calibration.setup import load_setup
     from sliceit_drake.configuration import dump_yaml
 
@@ -136,20 +136,20 @@ def _from_literature(options: argparse.Namespace) -> int:
     )
     options.output.mkdir(parents=True, exist_ok=True)
     dump_yaml(food, options.output / "food.yaml")
-    print(food_table(food.distribution))
+    print(parameter_table(food.distribution))
     print(food.note)
     print(f"Results in {options.output}/")
     return 0
 
 
 def _show(name: str) -> int:
-    from sliceit_drake.calibration.report import food_table
+    from sliceit_drake.calibration.report import parameter_table
     from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
 
     food = load_calibrated_food(name)
     print(f"{food.food.name}, from {', '.join(food.records)} ({food.date})")
     print(food.command)
-    print(food_table(food.distribution))
+    print(parameter_table(food.distribution))
     for label, value in (("on the records", food.rms_error), ("held out", food.held_out_error)):
         if value is not None:
             print(f"RMS error {label}: {value:.3f} N")
@@ -165,7 +165,6 @@ def _calibrate(options: argparse.Namespace) -> int:
     import sys
 
     from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate
-    from sliceit_drake.calibration.report import write_results
     from sliceit_drake.calibration.setup import load_setup
     from sliceit_drake.calibration.storage import without_password
     from sliceit_drake.configuration import ConfigurationError
@@ -206,7 +205,7 @@ def _calibrate(options: argparse.Namespace) -> int:
         )
     # The command is kept with the food, for others to read.
     command = shlex.join(["sliceit", *(without_password(a) for a in sys.argv[1:])])
-    write_results(result, options.output, command)
+    result.save(options.output, command)
     print(result.table())
     if options.per_point:
         _fit_points(options, result)

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.optimize import minimize_scalar
 
-from sliceit_drake.calibration.calibrate import Calibration
+from sliceit_drake.calibration.result import Calibration
 from sliceit_drake.records.force_profile import ForceProfile
 
 __all__ = ["FoodComparison", "Row", "compare", "plot_comparisons", "table"]

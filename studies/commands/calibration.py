@@ -53,7 +53,6 @@ def _run(options: argparse.Namespace) -> int:
     import time
 
     from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate
-    from sliceit_drake.calibration.report import write_results
     from sliceit_drake.calibration.setup import load_setup
     from sliceit_drake.records.force_profile import load_force_profile
     from sliceit_drake.records.validation import load_record
@@ -80,7 +79,7 @@ def _run(options: argparse.Namespace) -> int:
             f"python -m studies calibration --foods {food} --trials {options.trials} --steps "
             f"{options.steps}"
         )
-        write_results(result, folder, command)
+        result.save(folder, command)
         comparison = compare(result, profile, minutes)
         if options.point_steps:
             comparison.per_point_rms = fit_points_shown(result, options.point_steps).rms

@@ -1,0 +1,124 @@
+"""The result of a calibration: what was found, as a table, a figure, a food and files."""
+
+import copy
+import dataclasses as dc
+import datetime
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sliceit_drake.calibration.posterior import Posterior
+from sliceit_drake.calibration.prediction import Prediction, Predictor
+from sliceit_drake.calibration.report import force_figure, parameter_table
+from sliceit_drake.calibration.setup import CalibrationSetup
+from sliceit_drake.configuration import dump_yaml
+from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
+from sliceit_drake.cutting.foods.spring_food import calibrate_spring
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Calibration"]
+
+
+@dc.dataclass
+class Calibration:
+    """What a calibration found; prints as a table, plots itself, saves to a folder.
+
+    Attributes:
+        setup: What was searched.
+        predictor: Of the records that were fitted, at the setup's sub-step.
+        unit: Places of the parameters in their ranges [d].
+        predictions: One a record.
+        rms: On the records, N.
+        search_rms: Best of the search alone, N; of the start where there was no search.
+        refined_rms: Best after Adam, N; the same.
+        posterior: Of the parameters.
+        blocks: RMS error on each block of depth when it was held out, N.
+        held_out_rms: On all of them, N; None if none was held out.
+        held_out_records: RMS error by name on records that were not fitted, N.
+        failures: Trials that broke down.
+    """
+
+    setup: CalibrationSetup
+    predictor: Predictor
+    unit: np.ndarray
+    predictions: list[Prediction]
+    rms: float
+    search_rms: float
+    refined_rms: float
+    posterior: Posterior
+    blocks: list[float]
+    held_out_rms: float | None
+    held_out_records: dict[str, float]
+    failures: int
+
+    def table(self) -> str:
+        """Parameters with 90 % intervals, which of them are not determined, and errors."""
+        lines = [
+            parameter_table(self.posterior, self.predictor.values(self.unit)),
+            *self.posterior.remarks(),
+            f"RMS error: search {self.search_rms:.3f}, Adam {self.refined_rms:.3f}, "
+            f"polished {self.rms:.3f} N",
+        ]
+        if self.held_out_rms is not None:
+            blocks = ", ".join(f"{b:.2f}" for b in self.blocks)
+            lines.append(f"Held-out blocks of depth: {self.held_out_rms:.3f} N ({blocks})")
+        for name, error in self.held_out_records.items():
+            lines.append(f"Held-out record {name}: {error:.3f} N")
+        return "\n".join(lines)
+
+    def plot(self) -> "Figure":
+        """Measured and predicted force of the first three records, and what is left."""
+        return force_figure(self.predictor.targets, self.predictions)
+
+    def calibrated_food(self, date: str = "", command: str = "", note: str = "") -> CalibratedFood:
+        """The food as scenarios load it."""
+        values = self.predictor.values(self.unit)
+        target = self.predictor.targets[0]
+        model = self.predictor.model(target, values)
+        food = copy.deepcopy(self.setup.food)
+        food.material, food.effects = model.material, model.effects
+        force = np.concatenate([t.record.force_magnitude for t in self.predictor.targets])
+        spring = calibrate_spring(force, float(model.top - model.bottom))
+        return CalibratedFood(
+            food=food,
+            knife=model.knife,
+            flank_stiffness=model.numerics.flank_stiffness,
+            distribution=self.posterior.shared(),
+            spring=spring,
+            rms_error=self.rms,
+            held_out_error=self.held_out_rms,
+            records=[t.record.name for t in self.predictor.targets],
+            date=date,
+            command=command,
+            note=note,
+        )
+
+    def save(self, directory: Path, command: str = "") -> None:
+        """Writes `food.yaml`, `calibration.json` and `fit.png`.
+
+        Args:
+            directory: Where; it exists.
+            command: What was typed, for the food's provenance.
+        """
+        food = self.calibrated_food(datetime.date.today().isoformat(), command)
+        dump_yaml(food, directory / "food.yaml")
+        self.plot().savefig(directory / "fit.png", dpi=150)
+        content = {
+            "food": self.setup.food.name,
+            "records": [t.record.name for t in self.predictor.targets],
+            "rms_N": self.rms,
+            "search_rms_N": self.search_rms,
+            "adam_rms_N": self.refined_rms,
+            "held_out_rms_N": self.held_out_rms,
+            "held_out_blocks_N": self.blocks,
+            "held_out_records_N": self.held_out_records,
+            "failed_trials": self.failures,
+            "parameters": self.predictor.values(self.unit),
+            "oscillation": [dc.asdict(p.oscillation) for p in self.predictions],
+        }
+        text = json.dumps(content, indent=2) + "\n"
+        (directory / "calibration.json").write_text(text, encoding="utf-8")
