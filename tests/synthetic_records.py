@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.signal import lfilter
 
-from sliceit_drake.diagnosis.evidence.sensitivity import Column, RecordSensitivity
+from sliceit_drake.diagnosis.evidence.columns import Column, RecordSensitivity
 
 ROWS = 300
 NOISE = 0.1

@@ -12,8 +12,9 @@ from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
 from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.cutting.foods.food import Cylinder
 from sliceit_drake.diagnosis.diagnose import Diagnosis, setup_of_food
+from sliceit_drake.diagnosis.evidence.columns import Sensitivities
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
-from sliceit_drake.diagnosis.evidence.sensitivity import Sensitivities, sensitivities
+from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.evidence.verdict import CLASS_ANGLE, reach_verdict
 from sliceit_drake.diagnosis.experiments import next_experiment as proposing
 from sliceit_drake.diagnosis.experiments.designs import Scale, menu

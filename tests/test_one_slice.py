@@ -18,7 +18,7 @@ from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
 from sliceit_drake.cutting.foods.food import Cylinder, Food
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.causes.material import SkinToughness
-from sliceit_drake.diagnosis.evidence.sensitivity import Column, Sensitivities
+from sliceit_drake.diagnosis.evidence.columns import Column, Sensitivities
 from sliceit_drake.diagnosis.one_slice.slice_evidence import LEVEL, SliceEvidence, slice_evidence
 from sliceit_drake.diagnosis.one_slice.slice_fit import depth_blocks, fit_slice
 from sliceit_drake.diagnosis.one_slice.slice_problem import estimate_slice_noise

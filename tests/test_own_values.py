@@ -4,9 +4,9 @@ import dataclasses as dc
 
 import numpy as np
 
+from sliceit_drake.diagnosis.evidence.columns import Column, RecordSensitivity, Sensitivities
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.own_values import at_own_values
-from sliceit_drake.diagnosis.evidence.sensitivity import Column, RecordSensitivity, Sensitivities
 
 HEIGHT = 3e-4
 DEVIATION = 0.1

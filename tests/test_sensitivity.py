@@ -11,17 +11,19 @@ from cause_bench import BOARD, DRAW, TURNED, bench, push
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
-from sliceit_drake.diagnosis.cause import Cause, CauseParameter, SliceFacts
+from sliceit_drake.diagnosis.cause import Cause, CauseParameter
 from sliceit_drake.diagnosis.causes.contact import BluntEdge, FlankAdhesion
 from sliceit_drake.diagnosis.causes.material import SkinToughness, ToughnessBySpeed
 from sliceit_drake.diagnosis.causes.mounting import BoardLaw
 from sliceit_drake.diagnosis.causes.sensor import SensorGain
-from sliceit_drake.diagnosis.evidence.sensitivity import Column, Sensitivities, sensitivities
+from sliceit_drake.diagnosis.evidence.columns import Column, Sensitivities
+from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.experiments.identifiability import ANGLE, Evidence, NoiseLevel
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.diagnosis.registry import load_cause
 from sliceit_drake.diagnosis.slices import Meshing
 from sliceit_drake.prediction.clock import BLOCK, Clock
+from sliceit_drake.prediction.series import SliceFacts
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.protocol import Condition, Protocol, load_protocol

@@ -7,13 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from sliceit_drake.calibration.oscillation import Oscillation, fit_oscillation
-from sliceit_drake.calibration.record_target import (
-    EXCHANGE_PERIOD,
-    KnifeMotion,
-    RecordTarget,
-    food_of,
-    knife_of,
-)
+from sliceit_drake.calibration.record_target import EXCHANGE_PERIOD, KnifeMotion, RecordTarget
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.batch import BatchSimulator, BatchSlice
@@ -25,6 +19,7 @@ from sliceit_drake.cutting.model import CuttingModel, TimeStepError
 from sliceit_drake.cutting.parameters import get_parameter, pull_back, with_parameters
 from sliceit_drake.cutting.simulate import KnifePath, board_wrenches
 from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.prediction.placement import food_of, knife_of
 from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = ["Parameter", "Prediction", "Predictor"]

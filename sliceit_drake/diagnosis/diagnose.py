@@ -16,11 +16,12 @@ from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
 from sliceit_drake.cutting.foods.food import make_food_model
 from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.diagnosis.cause import Cause
+from sliceit_drake.diagnosis.evidence.columns import Sensitivities
 from sliceit_drake.diagnosis.evidence.confirm import Confirmation, confirm
 from sliceit_drake.diagnosis.evidence.held_out import HeldOutGain, held_out_gain, held_out_share
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.own_values import at_own_values
-from sliceit_drake.diagnosis.evidence.sensitivity import Sensitivities, sensitivities
+from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.evidence.verdict import (
     ALARM,
     Finding,

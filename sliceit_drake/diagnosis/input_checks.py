@@ -13,7 +13,7 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.food import Box, Cylinder, Ellipsoid, Food
-from sliceit_drake.diagnosis.slices import is_bare
+from sliceit_drake.prediction.placement import is_bare
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.records.validation import check_record
 

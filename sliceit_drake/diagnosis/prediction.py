@@ -10,9 +10,10 @@ from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.parameters import with_parameters
-from sliceit_drake.diagnosis.cause import Cause, ForceSeries
+from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.slices import Meshing, SliceTarget, make_targets
 from sliceit_drake.prediction.clock import Clock
+from sliceit_drake.prediction.series import ForceSeries
 from sliceit_drake.prediction.simulator import Job, Run, Simulator
 from sliceit_drake.records.slice_record import SliceRecord
 

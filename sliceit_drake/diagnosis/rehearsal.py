@@ -6,7 +6,8 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel, Numerics
-from sliceit_drake.diagnosis.cause import Cause, ForceSeries, SliceFacts
+from sliceit_drake.diagnosis.cause import Cause
+from sliceit_drake.prediction.series import ForceSeries, SliceFacts
 
 __all__ = ["rehearse"]
 

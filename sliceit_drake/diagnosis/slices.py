@@ -6,7 +6,6 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from sliceit_drake.calibration.record_target import food_of, knife_of, poses_in_food
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.board import Board
@@ -14,13 +13,15 @@ from sliceit_drake.cutting.foods.food import make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import GRAVITY, CuttingModel, Numerics
 from sliceit_drake.cutting.simulate import board_wrenches
-from sliceit_drake.diagnosis.cause import Cause, ForceSeries, SharedFacts, SliceFacts
+from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.prediction.clock import Clock, Stretches
+from sliceit_drake.prediction.placement import food_of, is_bare, knife_of, poses_in_food
+from sliceit_drake.prediction.series import ForceSeries, SharedFacts, SliceFacts
 from sliceit_drake.prediction.simulator import Run
 from sliceit_drake.records.preprocessing import as_measured
 from sliceit_drake.records.slice_record import SliceRecord
 
-__all__ = ["CHANNELS", "Meshing", "SliceTarget", "is_bare", "make_targets"]
+__all__ = ["CHANNELS", "Meshing", "SliceTarget", "make_targets"]
 
 CHANNELS = ("force_x", "force_y", "force_z", "torque_y")
 """Compared components, in F: along the edge, normal to the blade, vertical, N; moment about Ko and
@@ -321,8 +322,3 @@ def make_targets(
 
 def _numerics(numerics: Numerics, time_step: float) -> Numerics:
     return dc.replace(numerics, time_step=time_step, precision="float32", device="cpu")
-
-
-def is_bare(record: SliceRecord) -> bool:
-    """Whether a record says that there is no food under the knife."""
-    return record.metadata.food.name == "none"

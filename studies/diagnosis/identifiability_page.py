@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sliceit_drake.diagnosis.cause import Cause
-from sliceit_drake.diagnosis.evidence.sensitivity import Sensitivities
+from sliceit_drake.diagnosis.evidence.columns import Sensitivities
 from sliceit_drake.diagnosis.experiments.identifiability import (
     ANGLE,
     SHIFT,

@@ -23,10 +23,11 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.diagnose import BASE, setup_of_food
+from sliceit_drake.diagnosis.evidence.columns import Column, Sensitivities
 from sliceit_drake.diagnosis.evidence.effect_size import effect_in_noise
 from sliceit_drake.diagnosis.evidence.linear import USUAL, LinearProblem
 from sliceit_drake.diagnosis.evidence.screen import screen
-from sliceit_drake.diagnosis.evidence.sensitivity import Column, Sensitivities, sensitivities
+from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.registry import all_causes, open_causes
 from sliceit_drake.prediction.simulator import cutting_source
 from sliceit_drake.records.slice_record import SliceRecord

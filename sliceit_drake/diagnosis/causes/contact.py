@@ -7,8 +7,9 @@ import numpy as np
 
 from sliceit_drake.cutting.foods.effects import Bluntness
 from sliceit_drake.cutting.model import CuttingModel
-from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan, SliceFacts
+from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan
 from sliceit_drake.diagnosis.causes.material import tougher
+from sliceit_drake.prediction.series import SliceFacts
 
 __all__ = ["BluntEdge", "Dulling", "FlankAdhesion", "StaticFriction"]
 

@@ -7,7 +7,8 @@ import numpy as np
 
 from sliceit_drake.cutting.foods.effects import Core, Relaxation, Skin, SlicePush, ToughnessRate
 from sliceit_drake.cutting.model import CuttingModel
-from sliceit_drake.diagnosis.cause import Cause, CauseParameter, ForceSeries, Scan, SliceFacts
+from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan
+from sliceit_drake.prediction.series import ForceSeries, SliceFacts
 
 __all__ = [
     "CoreRatio",

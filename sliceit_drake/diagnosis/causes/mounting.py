@@ -2,17 +2,15 @@
 
 import dataclasses as dc
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.signal import lfilter
 
 from sliceit_drake.cutting.model import CuttingModel, PointScales
-from sliceit_drake.diagnosis.cause import Cause, CauseParameter, ForceSeries, Scan, SliceFacts
+from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan
+from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
 from sliceit_drake.diagnosis.evidence.jumps import largest_jump, unlike_others
-
-if TYPE_CHECKING:
-    from sliceit_drake.diagnosis.evidence.sensitivity import RecordSensitivity
+from sliceit_drake.prediction.series import ForceSeries, SliceFacts
 
 __all__ = [
     "ArmCompliance",
@@ -162,7 +160,7 @@ class FoodSlip(Cause):
     def __init__(self) -> None:
         self._moments: dict[str, float] = {}
 
-    def adapted(self, records: Sequence["RecordSensitivity"]) -> Cause:
+    def adapted(self, records: Sequence[RecordSensitivity]) -> Cause:
         """At the moment of each record at which the residual jumps most, less what its condition
         has in common: what repeats is no slip."""
         assert self.scan is not None

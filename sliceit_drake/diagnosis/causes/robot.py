@@ -3,16 +3,14 @@
 import copy
 import dataclasses as dc
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sliceit_drake.cutting.model import GRAVITY
-from sliceit_drake.diagnosis.cause import Cause, CauseParameter, ForceSeries, Scan, SliceFacts
+from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan
+from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
 from sliceit_drake.diagnosis.evidence.periodicity import strongest_frequencies
-
-if TYPE_CHECKING:
-    from sliceit_drake.diagnosis.evidence.sensitivity import RecordSensitivity
+from sliceit_drake.prediction.series import ForceSeries, SliceFacts
 
 __all__ = ["StickSlip", "ToolWeight", "Vibration"]
 
@@ -77,7 +75,7 @@ class Vibration(Cause):
     range = (3.0, 80.0)
     """Frequencies at which it is looked for, Hz."""
 
-    def adapted(self, records: Sequence["RecordSensitivity"]) -> Cause:
+    def adapted(self, records: Sequence[RecordSensitivity]) -> Cause:
         """At the frequencies at which the residuals of all records are strongest."""
         series = []
         for r in records:
@@ -120,7 +118,7 @@ class StickSlip(Cause):
     range = (3e-4, 4e-3)
     """Pitches at which it is looked for, metres."""
 
-    def adapted(self, records: Sequence["RecordSensitivity"]) -> Cause:
+    def adapted(self, records: Sequence[RecordSensitivity]) -> Cause:
         """At the pitches at which the residuals of all records are strongest."""
         series = []
         for r in records:

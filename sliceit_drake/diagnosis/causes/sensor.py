@@ -5,7 +5,8 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.signal import lfilter
 
-from sliceit_drake.diagnosis.cause import Cause, CauseParameter, ForceSeries, Scan, SliceFacts
+from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan
+from sliceit_drake.prediction.series import ForceSeries, SliceFacts
 
 __all__ = ["SensorDelay", "SensorGain", "SensorTilt", "SensorZero"]
 

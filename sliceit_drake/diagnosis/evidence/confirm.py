@@ -13,8 +13,8 @@ import numpy as np
 
 from sliceit_drake.cutting.parameters import get_parameter
 from sliceit_drake.diagnosis.cause import Cause
+from sliceit_drake.diagnosis.evidence.columns import MESH
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
-from sliceit_drake.diagnosis.evidence.sensitivity import MESH
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 
 __all__ = ["Confirmation", "confirm"]

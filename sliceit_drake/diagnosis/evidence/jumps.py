@@ -1,14 +1,11 @@
 """Where the residual of one slice jumps, and of others like it does not."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
 from sliceit_drake.diagnosis.evidence.replicates import at_times, replicates
-
-if TYPE_CHECKING:
-    from sliceit_drake.diagnosis.evidence.sensitivity import RecordSensitivity
 
 __all__ = ["largest_jump", "unlike_others"]
 
@@ -45,7 +42,7 @@ def largest_jump(time: np.ndarray, values: np.ndarray, inside: np.ndarray, fadin
     return float(time[int(score.argmax())])
 
 
-def unlike_others(records: "Sequence[RecordSensitivity]") -> list[np.ndarray]:
+def unlike_others(records: Sequence[RecordSensitivity]) -> list[np.ndarray]:
     """Residuals less the median of the records of their condition, each [m, c].
 
     The median of three does not see what is in one of them. With fewer nothing is taken off.

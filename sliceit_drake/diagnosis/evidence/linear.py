@@ -17,9 +17,9 @@ from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
+from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, Sensitivities
 from sliceit_drake.diagnosis.evidence.noise_levels import ChannelNoise, differences, estimate_noise
 from sliceit_drake.diagnosis.evidence.replicates import replicates
-from sliceit_drake.diagnosis.evidence.sensitivity import RecordSensitivity, Sensitivities
 
 __all__ = ["USUAL", "LinearProblem", "Moments", "integrate_out", "scaled_inverse"]
 

@@ -12,8 +12,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from sliceit_drake.calibration.noise import MarkovCovariance
+from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
 from sliceit_drake.diagnosis.evidence.replicates import at_times, replicates
-from sliceit_drake.diagnosis.evidence.sensitivity import RecordSensitivity
 
 __all__ = ["ChannelNoise", "differences", "estimate_noise"]
 

@@ -9,9 +9,9 @@ import dataclasses as dc
 
 import numpy as np
 
+from sliceit_drake.diagnosis.evidence.columns import Column, RecordSensitivity, Sensitivities
 from sliceit_drake.diagnosis.evidence.held_out import own_coefficients
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
-from sliceit_drake.diagnosis.evidence.sensitivity import Column, RecordSensitivity, Sensitivities
 
 __all__ = ["at_own_values"]
 

@@ -1,17 +1,15 @@
 """Records that were nominally the same cut, and how their rows are brought to the same times."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from sliceit_drake.diagnosis.evidence.sensitivity import RecordSensitivity
+from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
 
 __all__ = ["at_times", "replicates"]
 
 
-def replicates(records: "Sequence[RecordSensitivity]") -> dict[str, list[int]]:
+def replicates(records: Sequence[RecordSensitivity]) -> dict[str, list[int]]:
     """Numbers of the records of each condition."""
     out: dict[str, list[int]] = {}
     for k, record in enumerate(records):

@@ -36,16 +36,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
 
-from sliceit_drake.calibration.record_target import poses_in_food
 from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.cutting.parameters import get_parameter
 from sliceit_drake.cutting.solver import CuttingError
-from sliceit_drake.diagnosis.cause import Cause, ForceSeries
+from sliceit_drake.diagnosis.cause import Cause
+from sliceit_drake.diagnosis.evidence.columns import MESH, Column, RecordSensitivity, Sensitivities
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.diagnosis.slices import Meshing, SliceTarget
 from sliceit_drake.prediction.clock import Clock
+from sliceit_drake.prediction.placement import poses_in_food
+from sliceit_drake.prediction.series import ForceSeries
 from sliceit_drake.prediction.simulator import cutting_source
 from sliceit_drake.records.preprocessing import as_measured
 from sliceit_drake.records.slice_record import SliceRecord
@@ -54,11 +55,7 @@ __all__ = [
     "FINER",
     "LINEAR_STEP",
     "LOG_STEP",
-    "MESH",
-    "Column",
     "Progress",
-    "RecordSensitivity",
-    "Sensitivities",
     "sensitivities",
 ]
 
@@ -73,148 +70,13 @@ LINEAR_STEP = 0.02
 """Change of one on a linear scale, relative to its range."""
 
 
-@dc.dataclass(frozen=True)
-class Column:
-    """What a column of sensitivities is.
-
-    Attributes:
-        kind: base, record, numerical or cause.
-        name: Of the base parameter, the record's effect or the cause; "step" or "mesh".
-        parameter: Of the cause; "" otherwise.
-        scan: Value of the cause's scan; None without.
-        size: Change of the parameter that the column belongs to.
-        unit: Of it; "" for a logarithm.
-        one_sided: Whether its coefficient cannot be negative.
-        per_record: Whether each record has a coefficient of its own.
-        searched: `Cause.searched`.
-    """
-
-    kind: str
-    name: str
-    parameter: str = ""
-    scan: float | None = None
-    size: float = 1.0
-    unit: str = ""
-    one_sided: bool = False
-    per_record: bool = False
-    searched: float = 0.0
-
-    @property
-    def label(self) -> str:
-        """Name for people."""
-        scan = "" if self.scan is None else f" at {self.scan:g}"
-        return f"{self.name}.{self.parameter}{scan}" if self.parameter else self.name
-
-
-@dc.dataclass
-class RecordSensitivity:
-    """One record: what was measured, what is predicted, and how that would change.
-
-    Attributes:
-        name, condition: Of the record.
-        slice_index, knife_slices: Its place in the session and in the life of the edge.
-        speed, draw_ratio: Of the press, m/s, and the draw over it; 0 where none is given.
-        channels: Names of the channels [c].
-        time: Of the rows [m], s.
-        phase: Label at the rows [m].
-        depth: Of the edge below the top of the food [m], metres.
-        path: Way of the knife since the start [m], metres.
-        in_contact: Whether food or board touch the knife [m].
-        measured, predicted: [m, c], N and Nm.
-        columns: Changes of the prediction [m, c, K].
-        even: Even parts of the changes [m, c, K]; 0 where there is none.
-        bent: Part of the prediction that is beyond the first order of what is the record's own
-            (`own_values`) [m, c]; None where that was not looked at.
-    """
-
-    name: str
-    condition: str
-    slice_index: int
-    knife_slices: int
-    speed: float
-    draw_ratio: float
-    channels: tuple[str, ...]
-    time: np.ndarray
-    phase: np.ndarray
-    depth: np.ndarray
-    path: np.ndarray
-    in_contact: np.ndarray
-    measured: np.ndarray
-    predicted: np.ndarray
-    columns: np.ndarray
-    even: np.ndarray
-    bent: np.ndarray | None = None
-
-    @property
-    def residual(self) -> np.ndarray:
-        """Measured less predicted [m, c]."""
-        return self.measured - self.predicted
-
-    def kinks(self) -> np.ndarray:
-        """Largest second difference of the prediction within `KINK_TIME` of each row [m, c].
-
-        Where the force jumps (the edge leaves the board, the knife turns round), a sample is as
-        wrong as the jump is large if it comes a row too early; elsewhere this is next to nothing.
-        """
-        bend = np.zeros_like(self.predicted)
-        bend[1:-1] = np.abs(np.diff(self.predicted, 2, axis=0))
-        step = float(np.median(np.diff(self.time)))
-        return np.asarray(maximum_filter1d(bend, 2 * round(KINK_TIME / step) + 1, axis=0))
-
-
-SOURCES = (Cause, Clock, SlicePredictor, SliceTarget, as_measured, poses_in_food)
+SOURCES = (Cause, Clock, ForceSeries, Sensitivities, SlicePredictor, SliceTarget)
+SOURCES += (as_measured, poses_in_food)
 """Whose modules a result depends on, beside `cutting` and this one."""
 
-KINK_TIME = 0.02
-"""By which the time of a jump of the force may be wrong, s."""
-
-MESH = Column("numerical", "mesh")
 
 STORED = ("in_contact", "predicted", "columns", "even")
 """Arrays of a record that take simulations."""
-
-
-@dc.dataclass
-class Sensitivities:
-    """Sensitivities of records to causes; see the module.
-
-    Attributes:
-        columns: What the columns are [K].
-        records: One a record.
-        warnings: What a reader should know, as a cause whose slices broke down: its column is 0
-            for that record.
-        elements: Most tetrahedra of a slice's food.
-    """
-
-    columns: list[Column]
-    records: list[RecordSensitivity]
-    warnings: list[str] = dc.field(default_factory=list)
-    elements: int = 0
-
-    def index(self, kind: str, name: str | None = None, scan: float | None = None) -> list[int]:
-        """Numbers of the columns of a kind; of a name, of a value of the scan, if given."""
-        return [
-            k
-            for k, c in enumerate(self.columns)
-            if c.kind == kind and name in (None, c.name) and scan in (None, c.scan)
-        ]
-
-    @property
-    def causes(self) -> list[str]:
-        """Names of the causes."""
-        return list(dict.fromkeys(c.name for c in self.columns if c.kind == "cause"))
-
-    def append(self, more: "Sensitivities") -> None:
-        """Adds columns for the same records."""
-        self.columns += more.columns
-        self.warnings += more.warnings
-        for record, added in zip(self.records, more.records, strict=True):
-            record.columns = np.concatenate([record.columns, added.columns], axis=2)
-            record.even = np.concatenate([record.even, added.even], axis=2)
-
-    def scans(self, cause: str) -> list[float | None]:
-        """Values of a cause's scan; [None] for one without."""
-        return list(dict.fromkeys(self.columns[k].scan for k in self.index("cause", cause)))
 
 
 def _cause_columns(cause: Cause) -> list[tuple[Column, dict[str, float], dict[str, float] | None]]:

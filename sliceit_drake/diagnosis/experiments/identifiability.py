@@ -13,7 +13,7 @@ import numpy as np
 
 from sliceit_drake.calibration.noise import NoiseModel, SeriesGroup
 from sliceit_drake.diagnosis.cause import Cause
-from sliceit_drake.diagnosis.evidence.sensitivity import RecordSensitivity, Sensitivities
+from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, Sensitivities
 
 __all__ = [
     "ANGLE",

@@ -34,7 +34,7 @@ from sliceit_drake.diagnosis.experiments.scenario_of_experiment import (
     template_of,
 )
 from sliceit_drake.diagnosis.experiments.search import CauseClass, ExperimentSearch
-from sliceit_drake.diagnosis.slices import is_bare
+from sliceit_drake.prediction.placement import is_bare
 from sliceit_drake.records.slice_record import SliceRecord
 
 if TYPE_CHECKING:

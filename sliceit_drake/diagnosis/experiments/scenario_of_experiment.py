@@ -11,7 +11,6 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sliceit_drake.calibration.record_target import food_of, knife_of
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.cutting.foods.effects import Compliance, Slip
 from sliceit_drake.cutting.foods.food import (
@@ -24,9 +23,9 @@ from sliceit_drake.cutting.foods.food import (
 )
 from sliceit_drake.cutting.motion import Motion, MotionPlan, Pose, Segment, Waypoints
 from sliceit_drake.diagnosis.experiments.designs import Experiment, Scale
-from sliceit_drake.diagnosis.slices import is_bare
 from sliceit_drake.diagrams.record_facts import shape_facts
 from sliceit_drake.diagrams.scenario import Placement, Preparation, Scenario, Start
+from sliceit_drake.prediction.placement import food_of, is_bare, knife_of
 from sliceit_drake.records.metadata import PHASE_LABELS, FoodFacts, NominalMotion, Phase, ToolFacts
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.systems.analytic_cutter import AnalyticFood

@@ -8,14 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, Sensitivities
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem, integrate_out, scaled_inverse
 from sliceit_drake.diagnosis.evidence.screen import CauseEvidence, Screening
-from sliceit_drake.diagnosis.evidence.sensitivity import (
-    Progress,
-    RecordSensitivity,
-    Sensitivities,
-    sensitivities,
-)
+from sliceit_drake.diagnosis.evidence.sensitivity import Progress, sensitivities
 from sliceit_drake.diagnosis.evidence.verdict import LEAST_REPLICATES
 from sliceit_drake.diagnosis.experiments.designs import Experiment
 from sliceit_drake.diagnosis.experiments.proposal import NextExperiment, Pair, Step

@@ -20,7 +20,8 @@ from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
 from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.diagnose import BASE, Progress
-from sliceit_drake.diagnosis.evidence.sensitivity import Sensitivities, sensitivities
+from sliceit_drake.diagnosis.evidence.columns import Sensitivities
+from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.experiments.identifiability import SHIFT, Evidence, identifiability
 from sliceit_drake.diagnosis.one_slice.slice_evidence import (
     LEVEL,

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sliceit_drake.diagnosis.evidence.columns import Sensitivities
 from sliceit_drake.diagnosis.evidence.linear import USUAL
 from sliceit_drake.diagnosis.evidence.noise_levels import ChannelNoise
-from sliceit_drake.diagnosis.evidence.sensitivity import Sensitivities
 from sliceit_drake.diagnosis.experiments.identifiability import ANGLE
 from sliceit_drake.diagnosis.one_slice.depth_held_out import HeldOutDepth
 from sliceit_drake.diagnosis.one_slice.slice_problem import (

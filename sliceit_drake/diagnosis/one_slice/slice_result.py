@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sliceit_drake.diagnosis.cause import EXPERIMENTS, Cause
-from sliceit_drake.diagnosis.evidence.sensitivity import RecordSensitivity
+from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
 from sliceit_drake.diagnosis.evidence.verdict import LEAST_REPLICATES
 from sliceit_drake.diagnosis.experiments.identifiability import (
     SHOWS,

@@ -1,0 +1,99 @@
+"""The knife's poses relative to the food of a record, and which food and knife these are."""
+
+import copy
+import dataclasses as dc
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.foods.food import Box, Cylinder, Ellipsoid, Food, start_pose
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.records.slice_record import SliceRecord
+
+__all__ = ["food_of", "is_bare", "knife_of", "poses_in_food"]
+
+ONSET = 0.02
+"""Share of a record's greatest force at which contact is taken to begin, where its height is not
+known."""
+
+
+def poses_in_food(
+    record: SliceRecord, model: CuttingModel
+) -> tuple[Rotation, Rotation, np.ndarray]:
+    """Poses of the knife relative to the food that it cuts.
+
+    Where food or heights are not known, contact is taken to begin over the middle of the cut, as
+    high as its top, when the force does.
+
+    Args:
+        record: With n rows.
+        model: The cut.
+
+    Returns:
+        R_FW, R_FK [n], p_FK [n, 3], metres.
+    """
+    facts = record.metadata.food
+    R_FW = Rotation.from_euler("z", -(facts.yaw or 0.0))
+    p = record.position.copy()
+    home = start_pose(model, 0.0)
+    unknown = set(record.metadata.unknown)
+    rotation = R_FW * Rotation.from_matrix(record.rotation)
+    if facts.position is None:
+        p = R_FW.apply(p - p[0]) + home.p
+        rotation = Rotation.from_matrix(home.R) * (rotation[0].inv() * rotation)
+    else:
+        p = R_FW.apply(p - np.array(facts.position))
+    if facts.position is None or "p_WK_z" in unknown or "food.position" in unknown:
+        # Height is measured from where the force begins.
+        force = record.force_magnitude
+        quiet = force[: max(3, len(force) // 50)].max()
+        onset = int(np.argmax(force > quiet + ONSET * force.max()))
+        p[:, 2] += home.p[2] - p[onset, 2]
+    return R_FW, rotation, p
+
+
+def food_of(food: Food, record: SliceRecord) -> Food:
+    """The food with what the record says of its size and support.
+
+    Raises:
+        ConfigurationError: The record is of another shape than the food.
+    """
+    facts = record.metadata.food
+    food = copy.deepcopy(food)
+    if facts.support != "unknown":
+        food.held_sides = "both" if facts.support == "clamped_slab" else "plus"
+    if facts.size is None or facts.shape == "unknown":
+        return food
+    shapes = {"cylinder": Cylinder, "box": Box, "ellipsoid": Ellipsoid}
+    if not isinstance(food.shape, shapes[facts.shape]):
+        raise ConfigurationError(
+            f"is a {facts.shape}, the food of the setup is a {type(food.shape).__name__.lower()}",
+            source=record.file or record.name,
+            field="food.shape",
+            fix="Calibrate it with a setup of that shape (--food FILE.yaml).",
+        )
+    if isinstance(food.shape, Cylinder):
+        food.shape.diameter, food.shape.length = facts.size[2], facts.size[1]
+    elif isinstance(food.shape, Box):
+        food.shape.size = list(facts.size)
+    elif isinstance(food.shape, Ellipsoid):
+        food.shape.diameters = list(facts.size)
+    return food
+
+
+def knife_of(knife: Knife, record: SliceRecord) -> Knife:
+    """The knife with what the record says of it."""
+    facts = record.metadata.knife
+    known = {
+        name: getattr(facts, name)
+        for name in (f.name for f in dc.fields(Knife))
+        if getattr(facts, name, None) is not None
+    }
+    return dc.replace(knife, **known)
+
+
+def is_bare(record: SliceRecord) -> bool:
+    """Whether a record says that there is no food under the knife."""
+    return record.metadata.food.name == "none"
