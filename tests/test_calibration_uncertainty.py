@@ -10,12 +10,12 @@ import pytest
 
 from sliceit_drake.calibration.gauss_newton import gauss_newton
 from sliceit_drake.calibration.held_out import blocked_error
-from sliceit_drake.calibration.noise import NoiseModel, group_series
 from sliceit_drake.calibration.posterior import Posterior
 from sliceit_drake.calibration.prediction import Parameter
 from sliceit_drake.calibration.uncertainty import estimate, estimate_posterior, profile_likelihood
 from sliceit_drake.configuration import ConfigurationError, dump_yaml, load_yaml
 from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.prediction.noise import NoiseModel, group_series
 from studies.calibration.coverage import (
     Problem,
     Replicate,

@@ -10,7 +10,6 @@ import pytest
 from example_slices import short_press
 from synthetic_records import COLUMNS, NOISE, record
 
-from sliceit_drake.calibration.noise import MarkovCovariance
 from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import dump_yaml
@@ -25,6 +24,7 @@ from sliceit_drake.diagnosis.one_slice.slice_problem import estimate_slice_noise
 from sliceit_drake.diagnosis.one_slice.slice_result import KIND
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.diagnosis.slices import Meshing
+from sliceit_drake.prediction.noise import MarkovCovariance
 from sliceit_drake.records.slice_record import SliceRecord, write_record
 
 BROAD = Column("cause", "broad", "size", size=1.0)

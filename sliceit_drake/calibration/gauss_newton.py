@@ -7,8 +7,8 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from sliceit_drake.calibration.noise import NoiseModel
 from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.prediction.noise import NoiseModel
 
 __all__ = [
     "PRIOR_CENTER",

@@ -17,10 +17,10 @@ from sliceit_drake.calibration.gauss_newton import (
     linearise,
     residuals_at,
 )
-from sliceit_drake.calibration.noise import NoiseFit, NoiseModel, fit_noise, group_series
 from sliceit_drake.calibration.posterior import Posterior
 from sliceit_drake.calibration.prediction import Parameter
 from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.prediction.noise import NoiseFit, NoiseModel, fit_noise, group_series
 
 __all__ = [
     "Estimate",

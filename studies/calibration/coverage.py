@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from sliceit_drake.calibration.gauss_newton import gauss_newton
-from sliceit_drake.calibration.noise import NoiseModel, group_series
+from sliceit_drake.prediction.noise import NoiseModel, group_series
 from sliceit_drake.calibration.prediction import Predictor
 from sliceit_drake.calibration.setup import CalibrationSetup, load_setup
 from sliceit_drake.calibration.uncertainty import estimate

@@ -11,9 +11,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from sliceit_drake.calibration.noise import NoiseModel, SeriesGroup
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, Sensitivities
+from sliceit_drake.prediction.noise import NoiseModel, SeriesGroup
 
 __all__ = [
     "ANGLE",

@@ -3,10 +3,10 @@
 import numpy as np
 from scipy.optimize import minimize
 
-from sliceit_drake.calibration.noise import MarkovCovariance
 from sliceit_drake.diagnosis.evidence.columns import Sensitivities
 from sliceit_drake.diagnosis.evidence.linear import scaled_inverse
 from sliceit_drake.diagnosis.evidence.noise_levels import ChannelNoise
+from sliceit_drake.prediction.noise import MarkovCovariance
 
 __all__ = ["SliceProblem", "bounded_gain", "estimate_slice_noise"]
 
