@@ -1,4 +1,4 @@
-"""Fixtures that several test modules use."""
+"""Fixtures that several test modules use, and the two tiers of the tests."""
 
 import faulthandler
 
@@ -11,3 +11,13 @@ def no_test_hangs():
     faulthandler.dump_traceback_later(300.0, exit=True)
     yield
     faulthandler.cancel_dump_traceback_later()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Leaves the second tier to `-m second_tier`, and to who names a file or a test.
+
+    The workers of pytest-xdist take the expression from the process that started them.
+    """
+    whole = config.args_source == pytest.Config.ArgsSource.TESTPATHS
+    if whole and not hasattr(config, "workerinput") and not config.option.markexpr:
+        config.option.markexpr = "not second_tier"

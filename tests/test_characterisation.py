@@ -5,7 +5,10 @@ import json
 import characterisation
 import pytest
 
+pytestmark = pytest.mark.second_tier
+
 STORED = json.loads(characterisation.FILE.read_text(encoding="utf-8"))
+SIMULATED = ("scenario:", "stand_in:", "slices", "gradient")
 SAME_MACHINE = STORED["machine"] == characterisation.machine()
 
 
@@ -15,8 +18,11 @@ def test_every_part_has_its_numbers():
 
 @pytest.mark.parametrize("part", characterisation.PARTS)
 def test_what_is_computed_is_as_it_was(part):
-    """On the machine that stored them bit by bit; elsewhere the last bits of single precision
-    differ, and with them what is chosen among nearly equal trials."""
+    """On the machine that stored them bit by bit. On another the last bits of single precision
+    differ: simulations stay near, and what a search or a test of significance makes of them need
+    not."""
+    if not SAME_MACHINE and not part.startswith(SIMULATED):
+        pytest.skip("compared on the machine that stored it: python tests/characterisation.py")
     found, stored = characterisation.PARTS[part](), STORED["parts"][part]
     assert set(found.numbers) == set(stored["numbers"])
     if SAME_MACHINE:
@@ -24,4 +30,4 @@ def test_what_is_computed_is_as_it_was(part):
         assert found.hash == stored["hash"]
     else:
         for name, value in found.numbers.items():
-            assert value == pytest.approx(stored["numbers"][name], rel=0.02, abs=1e-3), name
+            assert value == pytest.approx(stored["numbers"][name], rel=0.02), name

@@ -16,6 +16,8 @@ from sliceit_drake.stand_in.protocol import load_protocol, schedule
 from sliceit_drake.stand_in.station_cuts import scenario_of_cut
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 
+pytestmark = pytest.mark.second_tier
+
 STATION = "scenarios/cucumber.yaml"
 PROTOCOL = """
 name: short

@@ -180,6 +180,7 @@ CI = """
 python3 -m venv .venv
 pip install -c constraints.txt -e '.[test]'
 pytest -n 2
+pytest -n 2 -m second_tier
 sphinx-build -W -c docs . output/docs
 """
 
@@ -188,6 +189,7 @@ READ_ONLY = {
     "installs": """
         pip install -c constraints.txt -e .
         pip install -c constraints.txt -e '.[docs]'
+        pip install -c constraints.txt -e '.[learn]'
         pip install -c constraints.txt -e '.[notebooks]'
         pip install -e '.[learn]'
         pip install sliceit_drake

@@ -22,7 +22,7 @@ from sliceit_drake.cli.main import main
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.policy import PressByForce
 
-pytestmark = pytest.mark.usefixtures("no_test_hangs")
+pytestmark = [pytest.mark.second_tier, pytest.mark.usefixtures("no_test_hangs")]
 
 CUCUMBER_POLICY = resource_path("scenarios/cucumber_policy.yaml")
 POLICY = """{

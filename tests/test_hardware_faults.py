@@ -13,7 +13,7 @@ from hardware_bench import emulated, run_hardware
 
 from sliceit_drake.resources import resource_path
 
-pytestmark = pytest.mark.usefixtures("no_test_hangs")
+pytestmark = [pytest.mark.second_tier, pytest.mark.usefixtures("no_test_hangs")]
 
 SPRING = resource_path("scenarios/cucumber_spring.yaml")
 # Two seconds in the air: no fault may come after the end.

@@ -14,7 +14,7 @@ from hardware_bench import PATIENT, ROBOT
 from sliceit_drake.emulator.process import EmulatorProcess
 from sliceit_drake.resources import resource_path
 
-pytestmark = pytest.mark.usefixtures("no_test_hangs")
+pytestmark = [pytest.mark.second_tier, pytest.mark.usefixtures("no_test_hangs")]
 
 SPRING = resource_path("scenarios/cucumber_spring.yaml")
 PACE = 0.2

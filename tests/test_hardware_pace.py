@@ -11,6 +11,8 @@ from emulator_bench import free_address
 
 from sliceit_drake.configuration import ConfigurationError
 
+pytestmark = pytest.mark.second_tier
+
 ROOT = Path(__file__).resolve().parent.parent
 SHORT = """{start: {clearance: 0.005}, measurement: null, motion: {segments: [
   !ConstantSpeed {speed: 0.02, distance: 0.008, acceleration: 0.5, label: slice}]}}"""
