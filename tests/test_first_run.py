@@ -68,8 +68,8 @@ def test_a_disk_that_refuses_is_a_message_and_no_traceback(monkeypatch, capsys):
     def refuse(*_):
         raise OSError(28, "No space left on device", "out/record.csv")
 
-    monkeypatch.setattr(program, "start_warp", refuse)
-    assert main(["simulate"]) == 2
+    monkeypatch.setattr(program, "check_output", refuse)
+    assert main(["simulate", "--output", "out"]) == 2
     assert capsys.readouterr().err == "sliceit: out/record.csv: No space left on device\n"
 
 
@@ -124,11 +124,11 @@ def test_a_kill_ends_a_run_as_ctrl_c_does_offline_and_keeps_what_there_is(
 
 
 def test_a_command_that_goes_on_says_so_when_it_is_interrupted(tmp_path, monkeypatch, capsys):
-    def interrupt():
+    def interrupt(*_):
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(10.0)
 
-    monkeypatch.setattr(program, "start_warp", interrupt)
+    monkeypatch.setattr(program, "check_output", interrupt)
     for command, goes_on in ((["calibrate", "x", "--food", "cucumber"], True), (["export"], False)):
         folder = [] if goes_on else [str(tmp_path)]
         assert main([*command, *folder, "--output", str(tmp_path / "out")]) == 130

@@ -74,7 +74,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     )
     parser.add_argument("--end-with-stdin", action="store_true", help=argparse.SUPPRESS)
     # The arm alone needs none.
-    parser.set_defaults(run=_run, warp=False)
+    parser.set_defaults(run=_run)
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -117,11 +117,9 @@ def _robot(options: argparse.Namespace, config: "ControllerConfig") -> "RobotMod
         from sliceit_drake.emulator.robot_model import KinematicRobot
 
         return KinematicRobot()
-    from sliceit_drake.cutting.warp_start import start_warp
     from sliceit_drake.emulator.station_robot import StationRobot
 
     print("Preparing (the first run on a machine compiles the kernels, about 8 s)", flush=True)
-    start_warp()
     robot = StationRobot(scenario_of(options))
     config.payload, config.payload_cog = robot.payload, robot.payload_cog
     config.is_zeroed = robot.is_zeroed

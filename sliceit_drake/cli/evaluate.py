@@ -76,7 +76,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument(
         "--output", metavar="FILE", type=Path, required=True, help=".jsonl file of slices"
     )
-    parser.set_defaults(run=_run, resumes=True, warp=False)
+    parser.set_defaults(run=_run, resumes=True)
 
 
 def _run(options: argparse.Namespace) -> int:

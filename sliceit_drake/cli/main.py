@@ -26,7 +26,6 @@ from sliceit_drake.cli import (
     simulate,
     train,
 )
-from sliceit_drake.cutting.warp_start import start_warp
 from sliceit_drake.output_folder import check_output
 
 __all__ = ["main", "make_parser", "run_program"]
@@ -109,8 +108,6 @@ def run_program(parser: argparse.ArgumentParser, arguments: Sequence[str] | None
         with _ended_by_signals():
             if isinstance(getattr(options, "output", None), Path):
                 check_output(options.output)
-            if getattr(options, "warp", True):
-                start_warp()
             return options.run(options)
     except KeyboardInterrupt:
         goes_on = getattr(options, "resumes", False) and options.output is not None

@@ -71,7 +71,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     check.add_argument(
         "paths", metavar="PATH", nargs="+", type=Path, help="a record (NAME.csv), or a folder"
     )
-    check.set_defaults(run=_run_check, warp=False)
+    check.set_defaults(run=_run_check)
     make = actions.add_parser(
         "import",
         help="make a record from another format",
@@ -134,7 +134,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         default="header",
         help="rosbag: stamps of the messages (the default), or when they were recorded",
     )
-    make.set_defaults(run=_run_import, warp=False)
+    make.set_defaults(run=_run_import)
 
 
 def _run_check(options: argparse.Namespace) -> int:

@@ -1,7 +1,8 @@
-"""Starts Warp as a program wants it: without its messages, with a place for compiled kernels."""
+"""Start of Warp as a program wants it: without its messages, with a place for compiled kernels."""
 
 import atexit
 import contextlib
+import functools
 import os
 import shutil
 import sys
@@ -16,16 +17,18 @@ NO_GPU = b"NVIDIA CUDA driver"
 """In the line that Warp's library prints on a machine without one, whatever its log level is."""
 
 
+@functools.cache
 def start_warp() -> None:
-    """Starts Warp; without its greeting, and without its regret that there is no GPU.
+    """Starts Warp without its banner and its lines about modules; called where it is first used.
 
-    Where Warp cannot keep compiled kernels it would end with an error; they are then compiled for
-    this process and those that it starts, which is said.
+    A log level that the user has set stays. Where Warp cannot keep compiled kernels it would end
+    with an error; they are then compiled for this process and those that it starts, which is said.
     """
     _find_cache()
     import warp
 
-    warp.config.log_level = warp.LOG_ERROR
+    if warp.config.log_level == warp.LOG_INFO:
+        warp.config.log_level = warp.LOG_ERROR
     with _without_line(NO_GPU):
         warp.init()
 

@@ -9,8 +9,6 @@ from contextlib import contextmanager
 from multiprocessing import get_context, resource_tracker
 from typing import Any
 
-from sliceit_drake.cutting.warp_start import start_warp
-
 __all__ = ["deaf_children", "start_worker", "worker_processes"]
 
 
@@ -21,7 +19,7 @@ def worker_processes(
     initializer: Callable[..., None] | None = None,
     arguments: tuple[Any, ...] = (),
 ) -> Iterator[ProcessPoolExecutor]:
-    """Processes in which Warp is started.
+    """Processes that end with the context.
 
     What leaves the context by an error, Ctrl-C included, ends the tasks that run by a SystemExit
     and drops those that wait.
@@ -66,7 +64,6 @@ def start_worker(
     """Readies a process: Ctrl-C, which a terminal sends to all, is for the one that started it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _end)
-    start_warp()
     if initializer is not None:
         initializer(*arguments)
 

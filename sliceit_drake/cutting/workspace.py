@@ -11,6 +11,7 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.kernels.precision import kernels
 from sliceit_drake.cutting.kernels.types import ACCUMULATED, GATHER, LANES, PARAMETERS
 from sliceit_drake.cutting.model import CuttingModel, TimeStepError
+from sliceit_drake.cutting.warp_start import start_warp
 
 __all__ = ["DIRECT", "Workspace", "parameter_row"]
 
@@ -60,6 +61,7 @@ class Workspace:
         self.real: Any = wp.float32 if single else wp.float64
         self.dtype: Any = np.float32 if single else np.float64
         with DIRECT:
+            start_warp()
             self.kernels = kernels(self.real, gradients)
         self.device = _device(model.numerics.device)
         self.model = model

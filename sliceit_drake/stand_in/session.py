@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError, load_yaml
-from sliceit_drake.cutting.warp_start import start_warp
 from sliceit_drake.cutting.workers import worker_processes
 from sliceit_drake.diagrams.record_facts import food_support, knife_facts, shape_facts
 from sliceit_drake.records.metadata import (
@@ -370,7 +369,6 @@ def _record_there(content: bytes, index: int) -> tuple[int, dict[str, bytes]]:
     """
     known: tuple[bytes, Session] | None = getattr(_SESSIONS, "known", None)
     if known is None or known[0] != content:
-        start_warp()
         protocol, effects, world, seed, settings = pickle.loads(content)
         hidden = [make_effect(text) for text in effects]
         known = _SESSIONS.known = (content, Session(protocol, hidden, world, seed, settings))

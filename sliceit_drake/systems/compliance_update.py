@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 from pydrake.math import RigidTransform
 
+from sliceit_drake.cutting.warp_start import start_warp
 from sliceit_drake.cutting.workspace import DIRECT
 from sliceit_drake.systems.compliance_kernel import MODES, mat34d, place_arm, update_arm
 from sliceit_drake.systems.ur5e_kinematics import KinematicChain
@@ -19,6 +20,7 @@ _CPU = "cpu"
 def load_kernels() -> None:
     """Compiles the kernels, once a machine, and loads them, once a process."""
     with DIRECT:
+        start_warp()
         wp.load_module(update_arm.module, device=_CPU)
 
 

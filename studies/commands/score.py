@@ -29,7 +29,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     )
     parser.add_argument("study", metavar="DIR", type=Path, help="folder of the study, or its runs")
     parser.add_argument("--output", metavar="FOLDER", type=Path, help="also write the report there")
-    parser.set_defaults(run=_run, warp=False)
+    parser.set_defaults(run=_run)
 
 
 def _run(options: argparse.Namespace) -> int:
