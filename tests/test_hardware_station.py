@@ -19,7 +19,7 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.hardware_station import MakeHardwareStation, make_safety_layer
 from sliceit_drake.diagrams.outputs.slice_record_of_run import slice_record_of
 from sliceit_drake.diagrams.ports import check_station_ports
-from sliceit_drake.diagrams.station import MakeSlicingStation
+from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation
 from sliceit_drake.hardware.checks import check_facts, check_start
 from sliceit_drake.hardware.configuration import (
     HardwareConfig,
@@ -36,7 +36,7 @@ OPTIONS = argparse.Namespace(duration=0.1, dry_run=False, host="127.0.0.1")
 
 @pytest.fixture(scope="module")
 def twin():
-    return MakeSlicingStation(spring_scenario())
+    return MakeSimulatedStation(spring_scenario())
 
 
 @pytest.fixture

@@ -113,7 +113,7 @@ def test_every_import_points_the_allowed_way():
         ("cutting/__init__.py", "from ..diagrams.a import b", "must not import sliceit_drake.dia"),
         (
             "systems/a.py",
-            "import sliceit_drake.diagrams.station",
+            "import sliceit_drake.diagrams.simulated_station",
             "must not import sliceit_drake.d",
         ),
         ("systems/a.py", "import torch", "only ('learning', 'calibration.gradient') may import"),

@@ -21,8 +21,8 @@ from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.agent_station import AgentStation
+from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation
 from sliceit_drake.diagrams.start import solve_start_joints
-from sliceit_drake.diagrams.station import MakeSlicingStation
 from sliceit_drake.stand_in import slicing_worlds
 from sliceit_drake.stand_in.curve_cutter import CurveCutter, CurveFood, food_curve
 from sliceit_drake.stand_in.curve_laws import measured_curve
@@ -336,7 +336,7 @@ def test_start_sensor_and_board_are_not_those_of_a_training(world):
         scenario, make_cutting = world.scenario("potato", 0, stiffness)
         assert scenario.board.stiffness == stiffness
         assert default / scenario.robot.plant_time_step == pytest.approx(steps)
-    MakeSlicingStation(scenario, make_cutting=make_cutting)
+    MakeSimulatedStation(scenario, make_cutting=make_cutting)
 
 
 def test_the_stand_in_hides_effects_and_shifts_what_was_calibrated(monkeypatch):
@@ -368,7 +368,7 @@ def test_the_stand_in_hides_effects_and_shifts_what_was_calibrated(monkeypatch):
 def sliced(world, food: str, act, slice: int = 0) -> dict[str, typing.Any]:
     """A slice cut by the actions act(k) of an agent."""
     scenario, make_cutting = world.scenario(food, slice)
-    station = MakeSlicingStation(scenario, make_cutting=make_cutting)
+    station = MakeSimulatedStation(scenario, make_cutting=make_cutting)
     descent = float(station.start_pose.translation()[2]) - scenario.board.height
     agent = AgentStation(station, dc.replace(AgentConfig(), descent=descent))
     simulator = Simulator(agent)
@@ -415,7 +415,7 @@ def test_a_pressing_agent_cuts_the_stand_in_on_the_station():
 def test_a_start_that_the_solver_loses_is_found_all_the_same():
     # SNOPT ends hundreds of millimetres away from them.
     scenario, make_cutting = CurvesWorld().scenario("cucumber", 0)
-    station = MakeSlicingStation(scenario, make_cutting=make_cutting)
+    station = MakeSimulatedStation(scenario, make_cutting=make_cutting)
     for turn, along, down in (
         (0.005879094860128468, 0.008603410581129239, 0.007952523063621039),
         (-0.008087904811918664, -0.00754025177348717, -0.01874598279749657),

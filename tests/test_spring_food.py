@@ -18,7 +18,7 @@ from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagrams.ports import check_station_ports
 from sliceit_drake.diagrams.run import prepare_run, simulate
 from sliceit_drake.diagrams.scenario import load_scenario
-from sliceit_drake.diagrams.station import MakeSlicingStation
+from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation
 from sliceit_drake.records.force_profile import load_force_profile
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
@@ -243,7 +243,7 @@ def test_stations_without_elements_keep_the_port_contract_and_complete_a_slice(f
     scenario = spring_scenario()
     if food == "analytic":
         scenario.food, scenario.measurement = AnalyticFood(), None
-    check_station_ports(MakeSlicingStation(scenario))
+    check_station_ports(MakeSimulatedStation(scenario))
     run = prepare_run(scenario)
     simulate(run)
     record = run.record()

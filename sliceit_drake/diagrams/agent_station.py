@@ -7,8 +7,8 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.randomize import randomize
+from sliceit_drake.diagrams.simulated_station import SimulatedStation
 from sliceit_drake.diagrams.start import solve_start_joints
-from sliceit_drake.diagrams.station import SlicingStation
 from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.systems.agent import AgentConfig, AgentSystem, Decide
 
@@ -71,10 +71,10 @@ class AgentStation(Diagram):
         agent: The agent's system.
     """
 
-    def __init__(self, station: SlicingStation, config: AgentConfig) -> None:
+    def __init__(self, station: SimulatedStation, config: AgentConfig) -> None:
         super().__init__()
         builder = DiagramBuilder()
-        self.station: SlicingStation = builder.AddNamedSystem("station", station)
+        self.station: SimulatedStation = builder.AddNamedSystem("station", station)
         self.agent = add_agent(builder, station, config, None)
         builder.ExportInput(self.agent.GetInputPort("action"), "action")
         for name in ("observation", "error", "wrench", "at_goal"):

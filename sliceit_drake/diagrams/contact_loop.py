@@ -29,7 +29,7 @@ from scipy.linalg import block_diag, expm
 
 from sliceit_drake.diagrams.robot import Robot
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.diagrams.station import SlicingStation
+from sliceit_drake.diagrams.simulated_station import SimulatedStation
 from sliceit_drake.systems.compliance_controller import (
     ComplianceControllerConfig,
     make_virtual_model,
@@ -84,7 +84,7 @@ class ContactLoop:
     """
 
     def __init__(
-        self, station: SlicingStation, *, tracking: str = "arm", joints: Sequence[float] = ()
+        self, station: SimulatedStation, *, tracking: str = "arm", joints: Sequence[float] = ()
     ) -> None:
         """Linearises a station about rest.
 
@@ -337,7 +337,7 @@ class ContactLoop:
         return q, v, last_error
 
 
-def _tool_bodies(station: SlicingStation, robot: Robot) -> list[BodyIndex]:
+def _tool_bodies(station: SimulatedStation, robot: Robot) -> list[BodyIndex]:
     """What hangs on the sensor."""
     plant = station.plant
     welded = plant.GetBodiesWeldedTo(robot.knife)

@@ -18,7 +18,7 @@ from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
 from sliceit_drake.diagrams.contact_loop import ContactLoop
-from sliceit_drake.diagrams.station import SlicingStation
+from sliceit_drake.diagrams.simulated_station import SimulatedStation
 from sliceit_drake.systems.cutting_system import CuttingSystem
 
 __all__ = [
@@ -64,7 +64,7 @@ class ContactMargin:
     stiffness: tuple[float, ...]
 
 
-def check_contact_margin(station: SlicingStation) -> ContactMargin:
+def check_contact_margin(station: SimulatedStation) -> ContactMargin:
     """Computes the margins of a station and refuses one that is too close to instability.
 
     Raises:
@@ -86,7 +86,7 @@ def check_contact_margin(station: SlicingStation) -> ContactMargin:
     return margin
 
 
-def contact_margin(station: SlicingStation) -> ContactMargin:
+def contact_margin(station: SimulatedStation) -> ContactMargin:
     """The margins of a station at its start posture, with the configured gains.
 
     Of the foods of a sequence the one with the largest section counts.

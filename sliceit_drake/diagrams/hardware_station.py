@@ -20,7 +20,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.ports import STATION_PORTS
-from sliceit_drake.diagrams.station import SlicingStation
+from sliceit_drake.diagrams.simulated_station import SimulatedStation
 from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.hardware.knife_kinematics import KnifeKinematics
 from sliceit_drake.hardware.limits import SafetyLimits
@@ -166,7 +166,7 @@ class HardwareStation(Station):
         rtde: The robot's system.
     """
 
-    def __init__(self, twin: SlicingStation, link: RobotLink, pace: float = 1.0) -> None:
+    def __init__(self, twin: SimulatedStation, link: RobotLink, pace: float = 1.0) -> None:
         super().__init__()
         scenario = self.scenario = twin.scenario
         if abs(scenario.exchange_period - PERIOD) > 1e-12:
@@ -241,12 +241,12 @@ class HardwareStation(Station):
 
 
 def MakeHardwareStation(
-    twin: SlicingStation, link: RobotLink, pace: float = 1.0
+    twin: SimulatedStation, link: RobotLink, pace: float = 1.0
 ) -> HardwareStation:
     """The hardware station of a scenario, with the ports of the simulated one.
 
     Args:
-        twin: `MakeSlicingStation` of the scenario.
+        twin: `MakeSimulatedStation` of the scenario.
         link: To the robot, watching.
         pace: Controller seconds in a second; 1 for all robots.
 
@@ -265,7 +265,7 @@ def make_knife_kinematics(twin: Station) -> KnifeKinematics:
 
 
 def make_safety_layer(
-    twin: SlicingStation, limits: SafetyLimits, board_height: float | None = None
+    twin: SimulatedStation, limits: SafetyLimits, board_height: float | None = None
 ) -> SafetyLayer:
     """The safety layer for a scenario's knife, board and start.
 

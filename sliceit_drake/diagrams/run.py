@@ -34,7 +34,7 @@ from sliceit_drake.diagrams.outputs.sequence_report import plot_sequence, slice_
 from sliceit_drake.diagrams.outputs.snapshot import Snapshot, take_snapshot
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram, ScenarioDiagram
-from sliceit_drake.diagrams.station import SlicingStation
+from sliceit_drake.diagrams.simulated_station import SimulatedStation
 from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.resources import file_or_resource
@@ -104,7 +104,7 @@ def prepare_run(scenario: Scenario, meshcat: Meshcat | None = None) -> Run:
     profile = measured_profile(scenario)
     diagram = MakeScenarioDiagram(scenario, meshcat)
     station = diagram.station
-    assert isinstance(station, SlicingStation)
+    assert isinstance(station, SimulatedStation)
     margin = check_contact_margin(station)
     simulator = Simulator(diagram)
     diagram.SetStart(simulator.get_mutable_context())

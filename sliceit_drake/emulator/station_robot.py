@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.diagrams.station import MakeSlicingStation, SlicingStation
+from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation, SimulatedStation
 from sliceit_drake.emulator.joint_targets import JointTargets
 from sliceit_drake.emulator.kinematics import forward
 from sliceit_drake.emulator.robot_model import CYCLE, RobotState, SimulationStopped
@@ -125,7 +125,7 @@ class StationRobot:
         self._scenario = scenario
         self.state = self._read()
 
-    def _check_room(self, station: SlicingStation) -> None:
+    def _check_room(self, station: SimulatedStation) -> None:
         """Whether the knife is over the food of a station."""
         food, start = station.scenario.food, station.scenario.start
         if isinstance(food, AnalyticFood) and food.toughness == 0.0:
@@ -143,7 +143,7 @@ class StationRobot:
                 fix="Lift it first.",
             )
 
-    def _copy_arm(self, station: SlicingStation, context: Context) -> None:
+    def _copy_arm(self, station: SimulatedStation, context: Context) -> None:
         """Copies all but the food from this robot's station to another."""
         old, source = self._station, self._simulator.get_context()
         for system in station.GetSystems():
@@ -158,7 +158,7 @@ class StationRobot:
             plant.GetMyMutableContextFromRoot(context), station.robot.arm, x
         )
 
-    def _use(self, station: SlicingStation, simulator: Simulator) -> None:
+    def _use(self, station: SimulatedStation, simulator: Simulator) -> None:
         """Goes on with a station in a simulator, initialized."""
         assert isinstance(station.controller, JointTargets)
         self._station, self._simulator, self._targets = station, simulator, station.controller
@@ -193,5 +193,5 @@ class StationRobot:
             )
 
 
-def _station_of(scenario: Scenario) -> SlicingStation:
-    return MakeSlicingStation(scenario, make_controller=lambda s: JointTargets(s.robot))
+def _station_of(scenario: Scenario) -> SimulatedStation:
+    return MakeSimulatedStation(scenario, make_controller=lambda s: JointTargets(s.robot))

@@ -12,7 +12,7 @@ from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.agent_station import add_agent
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.diagrams.station import MakeSlicingStation
+from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation
 from sliceit_drake.learning.ending import Limits
 from sliceit_drake.learning.metrics import SliceMetrics, slice_metrics
 from sliceit_drake.systems.agent import AgentConfig, Decide
@@ -70,7 +70,7 @@ def cut_slice(
     Raises:
         ConfigurationError: The scenario cannot be built, or is not for an agent.
     """
-    station = MakeSlicingStation(scenario, make_cutting=make_cutting)
+    station = MakeSimulatedStation(scenario, make_cutting=make_cutting)
     agent, builder = dc.replace(agent, descent=station.descent()), DiagramBuilder()
     actions: list[np.ndarray] = []
 

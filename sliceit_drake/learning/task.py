@@ -16,7 +16,7 @@ from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.agent_gains import AgentGains
 from sliceit_drake.diagrams.agent_station import AgentStation
 from sliceit_drake.diagrams.scenario import Scenario, Start
-from sliceit_drake.diagrams.station import MakeSlicingStation
+from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation
 from sliceit_drake.learning.ending import Limits
 from sliceit_drake.learning.reward import RewardConfig
 from sliceit_drake.systems.agent import AgentConfig
@@ -165,7 +165,7 @@ def make_agent_station(task: TaskConfig, food: str, rng: np.random.Generator) ->
                 [CuttingSolver(model, period) for model in models], X_WF, knife.index()
             )
 
-    station = MakeSlicingStation(scenario, make_cutting=make_cutting)
+    station = MakeSimulatedStation(scenario, make_cutting=make_cutting)
     return AgentStation(station, dc.replace(task.agent, descent=station.descent()))
 
 

@@ -23,7 +23,11 @@ from sliceit_drake.diagrams.hardware_station import (
 from sliceit_drake.diagrams.run import Run, measured_profile, write_outputs
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
-from sliceit_drake.diagrams.station import FRAMES_PER_SECOND, MakeSlicingStation, SlicingStation
+from sliceit_drake.diagrams.simulated_station import (
+    FRAMES_PER_SECOND,
+    MakeSimulatedStation,
+    SimulatedStation,
+)
 from sliceit_drake.hardware.checks import (
     Check,
     check_facts,
@@ -66,7 +70,7 @@ class HardwareRun:
     scenario: Scenario
     config: HardwareConfig
     client: RobotClient
-    twin: SlicingStation
+    twin: SimulatedStation
     plan: JointPlan
     pace: float = 1.0
     run: Run | None = None
@@ -247,7 +251,7 @@ def prepare_hardware_run(
     """
     if config.board_height is not None:
         scenario.board.height = config.board_height
-    twin = MakeSlicingStation(scenario, meshcat)
+    twin = MakeSimulatedStation(scenario, meshcat)
     return HardwareRun(scenario, config, client, twin, plan_joints(twin), pace)
 
 

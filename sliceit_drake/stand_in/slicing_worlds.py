@@ -127,7 +127,7 @@ class SlicingWorld(typing.Protocol):
 
         Returns:
             The scenario, with the controller that the agent needs, and what makes the cutting
-            system of `MakeSlicingStation`; None where the scenario's food does.
+            system of `MakeSimulatedStation`; None where the scenario's food does.
 
         Raises:
             ConfigurationError: The food or the index is none.

@@ -18,7 +18,7 @@ from sliceit_drake.diagrams.agent_gains import AgentGains, agent_box
 from sliceit_drake.diagrams.contact_loop import ContactLoop, directional_stiffness
 from sliceit_drake.diagrams.contact_margin import board_stiffness
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.diagrams.station import MakeSlicingStation, SlicingStation
+from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation, SimulatedStation
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
 from sliceit_drake.systems.knife_force import KnifeForceSystem
@@ -90,13 +90,13 @@ def stability_limits(
         on_board: Whether the contact is in the plant, as the board, instead of beyond the exchange.
     """
     limits = []
-    station: SlicingStation | None = None
+    station: SimulatedStation | None = None
     for gain in gains:
         scenario = study_scenario(mode, gain)
         if lag > 0.0:
             scenario = with_lag(scenario, lag)
         if station is None:
-            station = MakeSlicingStation(scenario)
+            station = MakeSimulatedStation(scenario)
         # Only what the loop reads of the scenario differs, not the station's systems.
         station.scenario = scenario
         loop = ContactLoop(station, tracking="arm" if lag > 0.0 else "ideal")
@@ -146,7 +146,7 @@ def station_growth(scenario: Scenario, stiffness: float, duration: float = 2.0) 
     builder = DiagramBuilder()
     station = builder.AddNamedSystem(
         "station",
-        MakeSlicingStation(
+        MakeSimulatedStation(
             scenario,
             make_cutting=lambda knife: _SpringContact(
                 stiffness, knife.index(), scenario.exchange_period, height
@@ -261,7 +261,7 @@ def run_in_contact(
         # Steps of 1 ms would take more than is allowed from the peaks.
         scenario.board.stiffness, scenario.robot.plant_time_step = BOARD_STIFFNESS[0], 5e-4
     builder = DiagramBuilder()
-    station = builder.AddNamedSystem("station", MakeSlicingStation(scenario))
+    station = builder.AddNamedSystem("station", MakeSimulatedStation(scenario))
     builder.ExportInput(station.GetInputPort("target_pose"), "target_pose")
     logs = [
         LogVectorOutput(station.GetOutputPort(name), builder, publish_period=2e-3)
@@ -325,7 +325,7 @@ class FactorRow:
 def factor_row(factor: float, lag: float, tracking: str = "arm") -> FactorRow:
     """Computes a row."""
     scenario = with_lag(Scenario(food=AnalyticFood()), lag)
-    station = MakeSlicingStation(scenario)
+    station = MakeSimulatedStation(scenario)
     R_WK = station.start_pose.rotation().matrix()
     board = board_stiffness(Board(stiffness=BOARD_STIFFNESS[0]), scenario.knife, R_WK)
     food = directional_stiffness(VERTICAL, FOOD_STIFFNESS[1])

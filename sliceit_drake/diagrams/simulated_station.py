@@ -47,7 +47,7 @@ from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
 from sliceit_drake.systems.wrench_sensor import WrenchSensor
 from sliceit_drake.systems.wrench_visualizer import WrenchVisualizer
 
-__all__ = ["FRAMES_PER_SECOND", "MakeSlicingStation", "SlicingStation"]
+__all__ = ["FRAMES_PER_SECOND", "MakeSimulatedStation", "SimulatedStation"]
 
 FRAMES_PER_SECOND = 32
 """Of what is drawn and of replays; fewer where a replay would be too large."""
@@ -60,7 +60,7 @@ FINGER = 0.015
 CAMERA_OFFSET = np.array([0.17, 0.23, 0.17])
 
 
-class SlicingStation(Station):
+class SimulatedStation(Station):
     """Arm, knife, controller, sensor, board and food behind the ports of `ports.STATION_PORTS`.
 
     Attributes:
@@ -285,12 +285,12 @@ class SlicingStation(Station):
         set_joint_positions(root_context, self.plant, self.robot, self._arm, start)
 
 
-def MakeSlicingStation(
+def MakeSimulatedStation(
     scenario: Scenario,
     meshcat: Meshcat | None = None,
     make_cutting: Callable[[RigidBody], KnifeForceSystem] | None = None,
     make_controller: Callable[[Scenario], LeafSystem] | None = None,
-) -> SlicingStation:
+) -> SimulatedStation:
     """The simulated station of a scenario; connect a source of targets to its input ports.
 
     Args:
@@ -304,7 +304,7 @@ def MakeSlicingStation(
     Raises:
         ConfigurationError, MeshError, TimeStepError: The scenario cannot be built.
     """
-    return SlicingStation(scenario, meshcat, make_cutting, make_controller)
+    return SimulatedStation(scenario, meshcat, make_cutting, make_controller)
 
 
 def _compliance_controller(scenario: Scenario) -> ComplianceController:
