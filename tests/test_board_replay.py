@@ -15,7 +15,7 @@ from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.outputs.run_log import Record
 from sliceit_drake.diagrams.run import prepare_run, simulate
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
-from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation
+from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 
@@ -123,10 +123,10 @@ def test_the_peak_loss_is_that_of_a_mass_on_a_backward_euler_spring(x):
 def test_a_board_too_stiff_for_the_plants_step_is_refused_with_a_step_that_does():
     pattern = r"scenario\.board\.stiffness: .* too stiff .*plant_time_step 0\.000181818 s or less"
     with pytest.raises(ConfigurationError, match=pattern) as refused:
-        MakeSimulatedStation(analytic(1e6))
-    assert 0.04 < MakeSimulatedStation(analytic(1e6, PERIOD / 11)).board_peak_loss <= 0.05
+        MakeStation(analytic(1e6))
+    assert 0.04 < MakeStation(analytic(1e6, PERIOD / 11)).board_peak_loss <= 0.05
     stiffness = float(refused.value.fix.split("at most ")[1].split(" N")[0])
-    assert 0.04 < MakeSimulatedStation(analytic(stiffness)).board_peak_loss <= 0.05
+    assert 0.04 < MakeStation(analytic(stiffness)).board_peak_loss <= 0.05
 
 
 def test_a_board_without_a_thickness_is_refused():

@@ -17,7 +17,7 @@ from sliceit_drake.diagrams.contact_loop import ContactLoop, directional_stiffne
 from sliceit_drake.diagrams.contact_margin import check_contact_margin
 from sliceit_drake.diagrams.run import prepare_run, simulate
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
-from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation
+from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
@@ -65,7 +65,7 @@ def test_station_is_stable_up_to_the_limit_of_the_linear_loop_and_not_beyond(mod
 
 def test_a_late_slow_sensor_lowers_the_limit_as_the_loop_says():
     scenario = study_scenario("compliance", 0.1)
-    station = MakeSimulatedStation(scenario)
+    station = MakeStation(scenario)
     ideal = ContactLoop(station).stiffness_limit(VERTICAL)
     scenario.sensor = WrenchSensorConfig(delay=0.003, sample_period=0.004, cutoff_frequency=100.0)
     limit = ContactLoop(station).stiffness_limit(VERTICAL)
@@ -76,7 +76,7 @@ def test_a_late_slow_sensor_lowers_the_limit_as_the_loop_says():
 
 def test_growth_of_the_station_is_that_of_the_loops_least_stable_mode():
     scenario = study_scenario("compliance", 0.1)
-    loop = ContactLoop(MakeSimulatedStation(scenario))
+    loop = ContactLoop(MakeStation(scenario))
     stiffness = 1.15 * loop.stiffness_limit(VERTICAL)
     mode = loop.least_stable_mode(directional_stiffness(VERTICAL, stiffness))
     assert station_growth(scenario, stiffness, 1.0) == pytest.approx(mode.growth, abs=3e-4)
@@ -84,7 +84,7 @@ def test_growth_of_the_station_is_that_of_the_loops_least_stable_mode():
 
 def test_rigid_arm_without_lag_has_the_limit_of_one_axis_by_hand():
     scenario = study_scenario("compliance", 0.025)
-    loop = ContactLoop(MakeSimulatedStation(scenario), tracking="ideal")
+    loop = ContactLoop(MakeStation(scenario), tracking="ideal")
     g, spring = loop.virtual_mobility[2, 2], scenario.controller.stiffness[2]
     h, damping = 0.02, 0.9
 
@@ -101,7 +101,7 @@ def test_rigid_arm_without_lag_has_the_limit_of_one_axis_by_hand():
 
 
 def test_default_cut_has_a_margin_far_above_two():
-    margin = check_contact_margin(MakeSimulatedStation(cucumber()))
+    margin = check_contact_margin(MakeStation(cucumber()))
     assert margin.food is not None
     assert margin.food > 10.0
     assert margin.board > 10.0

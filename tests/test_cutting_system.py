@@ -16,7 +16,7 @@ from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.systems.cutting_system import CuttingSystem
-from sliceit_drake.systems.knife_force import KnifeForceSystem
+from sliceit_drake.systems.knife_force import AppliedForce, KnifeForceSystem
 
 PERIOD = 2e-3
 KNIFE_BODY = BodyIndex(7)
@@ -78,7 +78,7 @@ def build(solvers, system: KnifeForceSystem | None = None) -> Diagram:
     top = max(start_pose(solver.model, 1e-3).p[2] for solver in solvers)
     builder = DiagramBuilder()
     path = builder.AddNamedSystem("path", KnifePath(np.array([0.0, 0.0, top])))
-    cutting = system or CuttingSystem(solvers, RigidTransform(), KNIFE_BODY)
+    cutting = system or CuttingSystem(solvers, RigidTransform())
     builder.AddNamedSystem("cutting", cutting)
     reader = builder.AddNamedSystem("reader", WrenchReader())
     for name in ("knife_pose", "knife_velocity"):
@@ -256,7 +256,10 @@ def test_a_discrete_system_sees_the_wrench_of_the_same_instant_and_it_is_held(di
 def test_applied_force_is_the_food_wrench_at_the_knifes_origin(diagram):
     run = Slice(diagram, 0, (0.04, 0.0, -0.08)).advance(LENGTH)
     wrench = run.cutting.GetOutputPort("food_wrench").Eval(run.context)
-    (force,) = run.cutting.GetOutputPort("applied_force").Eval(run.context)
+    applied = AppliedForce(KNIFE_BODY)
+    context = applied.CreateDefaultContext()
+    applied.get_input_port().FixValue(context, wrench)
+    (force,) = applied.get_output_port().Eval(context)
     assert force.body_index == KNIFE_BODY
     np.testing.assert_array_equal(force.p_BoBq_B, np.zeros(3))
     np.testing.assert_array_equal(force.F_Bq_W.get_coeffs(), wrench.get_coeffs())
@@ -277,7 +280,7 @@ def test_force_turns_with_the_food(solvers):
     top = max(start_pose(solver.model, 1e-3).p[2] for solver in solvers)
     builder = DiagramBuilder()
     path = builder.AddNamedSystem("path", Turned(np.array([0.0, 0.0, top])))
-    cutting = builder.AddNamedSystem("cutting", CuttingSystem(solvers, turn, KNIFE_BODY))
+    cutting = builder.AddNamedSystem("cutting", CuttingSystem(solvers, turn))
     for name in ("knife_pose", "knife_velocity"):
         builder.Connect(path.GetOutputPort(name), cutting.GetInputPort(name))
     there = Slice(builder.Build(), 0).advance(60)
@@ -298,7 +301,7 @@ class Spring(KnifeForceSystem):
 
 
 def test_coupling_work_error_is_what_the_delay_costs():
-    spring = Spring(KNIFE_BODY, PERIOD)
+    spring = Spring(PERIOD)
     builder = DiagramBuilder()
     path = builder.AddNamedSystem("path", KnifePath(np.array([0.0, 0.0, 1.0])))
     builder.AddNamedSystem("cutting", spring)

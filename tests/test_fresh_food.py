@@ -11,7 +11,7 @@ from emulator_bench import Bench
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan, Retract
 from sliceit_drake.diagrams.scenario import load_scenario
-from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation
+from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.emulator.pendant import PENDANT_PORT
 from sliceit_drake.emulator.robot_model import CYCLE
 from sliceit_drake.emulator.station_robot import StationRobot
@@ -41,7 +41,7 @@ def analytic_scenario(**food):
 @pytest.fixture(scope="module")
 def path():
     """Joint targets of each cycle [n, 6]."""
-    plan = plan_joints(MakeSimulatedStation(analytic_scenario()))
+    plan = plan_joints(MakeStation(analytic_scenario()))
     time = np.arange(0.0, plan.time[-1], CYCLE)
     return np.column_stack([np.interp(time, plan.time, q) for q in plan.q.T])
 
@@ -79,7 +79,7 @@ def test_another_food_and_bare_board_take_its_place(path):
 def test_the_board_stays_as_stiff_as_it_was():
     scenario = analytic_scenario(toughness=0.0)
     scenario.motion = MotionPlan([ConstantSpeed(distance=0.0312, speed=0.05, acceleration=2.0)])
-    plan = plan_joints(MakeSimulatedStation(scenario))
+    plan = plan_joints(MakeStation(scenario))
     time = np.arange(0.0, plan.time[-1] + 0.1, CYCLE)
     down = np.column_stack([np.interp(time, plan.time, q) for q in plan.q.T])
     robot = StationRobot(scenario)

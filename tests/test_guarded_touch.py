@@ -10,7 +10,7 @@ from fake_robot import FakeRobot
 from sliceit_drake.cli import hardware as command
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.scenario import load_scenario
-from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation
+from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.hardware.configuration import HardwareConfig, TouchConfig
 from sliceit_drake.hardware.guarded_touch import Touch, TouchError, contact_of
 from sliceit_drake.resources import resource_path
@@ -79,7 +79,7 @@ def test_a_height_that_is_not_the_expected_one_is_refused_with_both_and_the_fiel
 @pytest.mark.parametrize("typed", ["", "\n", "y\n", "slice\n"])
 def test_only_its_own_word_starts_the_touch(typed, monkeypatch, capsys):
     scenario = load_scenario(resource_path("scenarios/cucumber_spring.yaml"))
-    robot = FakeRobot(MakeSimulatedStation(scenario).start_joints.tolist())
+    robot = FakeRobot(MakeStation(scenario).start_joints.tolist())
     monkeypatch.setattr("sys.stdin", io.StringIO(typed))
     options = argparse.Namespace(dry_run=False, move_to_start=False, pace=0.2)
     config = HardwareConfig(payload=1.2, payload_cog=[0.0, 0.0, 0.06])

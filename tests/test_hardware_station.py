@@ -16,17 +16,16 @@ from fake_station import CONFIG, PACE, spring_scenario
 from sliceit_drake.cli import hardware as command
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.diagrams.hardware_station import MakeHardwareStation, make_safety_layer
+from sliceit_drake.diagrams.hardware_station import RobotConnection
 from sliceit_drake.diagrams.outputs.slice_record_of_run import slice_record_of
 from sliceit_drake.diagrams.ports import check_station_ports
-from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation
+from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.hardware.checks import check_facts, check_start
 from sliceit_drake.hardware.configuration import (
     HardwareConfig,
     differing,
     load_hardware_config,
 )
-from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.resources import resource_path
 from sliceit_drake.robot_run.hardware_run import prepare_hardware_run, write_hardware_outputs
 from sliceit_drake.robot_run.plan_check import check_plan, plan_joints
@@ -36,7 +35,7 @@ OPTIONS = argparse.Namespace(duration=0.1, dry_run=False, host="127.0.0.1")
 
 @pytest.fixture(scope="module")
 def twin():
-    return MakeSimulatedStation(spring_scenario())
+    return MakeStation(spring_scenario())
 
 
 @pytest.fixture
@@ -57,8 +56,8 @@ def failed(checks):
 
 
 def test_it_keeps_the_port_contract_of_the_simulated_station(twin, robot):
-    link = RobotLink(robot, make_safety_layer(twin, HardwareConfig().limits), pace=PACE)
-    station = MakeHardwareStation(twin, link, PACE)
+    connection = RobotConnection(robot, HardwareConfig(), PACE, twin)
+    station = MakeStation(twin.scenario, hardware=connection)
     check_station_ports(station)
     for name in ("period", "lateness", "age", "latched", "missed_cycles", "stop_reason"):
         assert station.HasOutputPort(name)

@@ -12,7 +12,7 @@ from fake_robot import FakeRobot
 from fake_station import CONFIG, PACE, spring_scenario
 
 from sliceit_drake.diagrams.hardware_station import make_knife_kinematics
-from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation
+from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.hardware.client import RobotUnavailableError
 from sliceit_drake.hardware.configuration import HardwareConfig
 from sliceit_drake.hardware.interruption import catch_signals
@@ -22,7 +22,7 @@ from sliceit_drake.robot_run.move_to_start import MoveToStart
 
 @pytest.fixture(scope="module")
 def start():
-    return MakeSimulatedStation(spring_scenario()).start_joints
+    return MakeStation(spring_scenario()).start_joints
 
 
 @pytest.fixture

@@ -9,7 +9,6 @@ import pytest
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.math import SpatialVelocity
-from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 
@@ -21,8 +20,8 @@ from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.agent_station import AgentStation
-from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation
 from sliceit_drake.diagrams.start import solve_start_joints
+from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.stand_in import slicing_worlds
 from sliceit_drake.stand_in.curve_cutter import CurveCutter, CurveFood, food_curve
 from sliceit_drake.stand_in.curve_laws import measured_curve
@@ -83,7 +82,7 @@ class Bench:
     def __init__(self, pose, food: CurveFood) -> None:
         builder = DiagramBuilder()
         source = builder.AddSystem(Knife(pose))
-        self.cutter = builder.AddSystem(CurveCutter(food, X_WF, BodyIndex(1), PERIOD))
+        self.cutter = builder.AddSystem(CurveCutter(food, X_WF, PERIOD))
         for name in ("knife_pose", "knife_velocity"):
             builder.Connect(source.GetOutputPort(name), self.cutter.GetInputPort(name))
         self.diagram = builder.Build()
@@ -333,10 +332,10 @@ def test_start_sensor_and_board_are_not_those_of_a_training(world):
         assert scenario.controller.mode == "parallel"
     default = scenarios[0].robot.plant_time_step
     for stiffness, steps in ((3e3, 1.0), (3e4, 1.0), (3e5, 3.5)):
-        scenario, make_cutting = world.scenario("potato", 0, stiffness)
+        scenario, cutting = world.scenario("potato", 0, stiffness)
         assert scenario.board.stiffness == stiffness
         assert default / scenario.robot.plant_time_step == pytest.approx(steps)
-    MakeSimulatedStation(scenario, make_cutting=make_cutting)
+    MakeStation(scenario, cutting=cutting)
 
 
 def test_the_stand_in_hides_effects_and_shifts_what_was_calibrated(monkeypatch):
@@ -367,8 +366,8 @@ def test_the_stand_in_hides_effects_and_shifts_what_was_calibrated(monkeypatch):
 
 def sliced(world, food: str, act, slice: int = 0) -> dict[str, typing.Any]:
     """A slice cut by the actions act(k) of an agent."""
-    scenario, make_cutting = world.scenario(food, slice)
-    station = MakeSimulatedStation(scenario, make_cutting=make_cutting)
+    scenario, cutting = world.scenario(food, slice)
+    station = MakeStation(scenario, cutting=cutting)
     descent = float(station.start_pose.translation()[2]) - scenario.board.height
     agent = AgentStation(station, dc.replace(AgentConfig(), descent=descent))
     simulator = Simulator(agent)
@@ -414,8 +413,8 @@ def test_a_pressing_agent_cuts_the_stand_in_on_the_station():
 
 def test_a_start_that_the_solver_loses_is_found_all_the_same():
     # SNOPT ends hundreds of millimetres away from them.
-    scenario, make_cutting = CurvesWorld().scenario("cucumber", 0)
-    station = MakeSimulatedStation(scenario, make_cutting=make_cutting)
+    scenario, cutting = CurvesWorld().scenario("cucumber", 0)
+    station = MakeStation(scenario, cutting=cutting)
     for turn, along, down in (
         (0.005879094860128468, 0.008603410581129239, 0.007952523063621039),
         (-0.008087904811918664, -0.00754025177348717, -0.01874598279749657),

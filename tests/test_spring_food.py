@@ -7,7 +7,6 @@ import pytest
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.math import SpatialVelocity
-from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 
@@ -18,7 +17,7 @@ from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagrams.ports import check_station_ports
 from sliceit_drake.diagrams.run import prepare_run, simulate
 from sliceit_drake.diagrams.scenario import load_scenario
-from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation
+from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.records.force_profile import load_force_profile
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
@@ -38,9 +37,7 @@ class Press:
         source = KnifeSource(self.pose)
         builder = DiagramBuilder()
         builder.AddSystem(source)
-        self.cutter = builder.AddSystem(
-            SpringCutter(food, Knife(), RigidTransform(), BodyIndex(1), PERIOD)
-        )
+        self.cutter = builder.AddSystem(SpringCutter(food, Knife(), RigidTransform(), PERIOD))
         for name in ("knife_pose", "knife_velocity"):
             builder.Connect(source.GetOutputPort(name), self.cutter.GetInputPort(name))
         self.simulator = Simulator(builder.Build())
@@ -243,7 +240,7 @@ def test_stations_without_elements_keep_the_port_contract_and_complete_a_slice(f
     scenario = spring_scenario()
     if food == "analytic":
         scenario.food, scenario.measurement = AnalyticFood(), None
-    check_station_ports(MakeSimulatedStation(scenario))
+    check_station_ports(MakeStation(scenario))
     run = prepare_run(scenario)
     simulate(run)
     record = run.record()

@@ -12,7 +12,7 @@ from sliceit_drake.diagrams.outputs.run_log import Record
 from sliceit_drake.diagrams.ports import STATION_PORTS, check_station_ports, ports_as_markdown
 from sliceit_drake.diagrams.run import Run, prepare_run, simulate
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
-from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation
+from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.knife_force import KnifeForceSystem
@@ -40,7 +40,7 @@ def test_station_keeps_the_port_contract(food):
     scenario = cucumber()
     if food == "analytic":
         scenario.food = AnalyticFood()
-    check_station_ports(MakeSimulatedStation(scenario))
+    check_station_ports(MakeStation(scenario))
 
 
 def test_contract_check_names_what_is_missing():
@@ -146,9 +146,7 @@ def test_station_takes_a_cutting_system_of_the_users_own():
     builder = DiagramBuilder()
     station = builder.AddNamedSystem(
         "station",
-        MakeSimulatedStation(
-            scenario, make_cutting=lambda knife: Spring(knife.index(), scenario.exchange_period)
-        ),
+        MakeStation(scenario, cutting=Spring(scenario.exchange_period)),
     )
     check_station_ports(station)
     assert station.start_pose.translation()[2] == pytest.approx(START_HEIGHT)
@@ -191,14 +189,14 @@ def test_unreachable_food_is_refused_with_its_place():
     scenario = cucumber()
     scenario.placement.position = [1.5, -1.5]
     with pytest.raises(ConfigurationError, match=r"scenario\.placement.*cannot put the knife"):
-        MakeSimulatedStation(scenario)
+        MakeStation(scenario)
 
 
 def test_a_food_that_is_higher_than_the_blade_is_refused():
     scenario = cucumber()
     scenario.knife.height = 0.02
     with pytest.raises(ConfigurationError, match=r"scenario\.knife\.height.*20 mm.*food 27"):
-        MakeSimulatedStation(scenario)
+        MakeStation(scenario)
 
 
 @pytest.mark.parametrize("group", ["compliance: {arm: 1.0e-5}", "slip: {remaining: 0.2}"])

@@ -23,11 +23,8 @@ from sliceit_drake.diagrams.live_view import (
 )
 from sliceit_drake.diagrams.run import Run, make_meshcat, prepare_run, simulate
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
-from sliceit_drake.diagrams.simulated_station import (
-    FRAMES_PER_SECOND,
-    REPLAY_SIZE,
-    MakeSimulatedStation,
-)
+from sliceit_drake.diagrams.simulated_station import FRAMES_PER_SECOND, REPLAY_SIZE
+from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.cutting_system import CuttingSystem
 from sliceit_drake.systems.food_visualizer import (
@@ -238,7 +235,7 @@ def test_a_long_run_is_drawn_with_fewer_frames_in_about_as_many_bytes():
     stations = {}
     for hold in (0.1, 100.0, 200.0):
         scenario.motion = MotionPlan([Hold(hold)])
-        stations[hold] = MakeSimulatedStation(scenario)
+        stations[hold] = MakeStation(scenario)
     assert stations[0.1].frame_period == 1.0 / FRAMES_PER_SECOND
     size = frame_size(stations[0.1].cutting)
     for hold in (100.0, 200.0):
@@ -370,5 +367,5 @@ def test_a_run_plots_itself_and_says_whose_parameters_it_had(watched):
 def test_a_station_built_by_hand_looks_at_the_knife_too():
     meshcat = make_meshcat()
     assert not meshcat.HasPath("/Background/<object>")
-    MakeSimulatedStation(fast_slice(), meshcat)
+    MakeStation(fast_slice(), meshcat)
     assert meshcat.HasPath("/Background/<object>")

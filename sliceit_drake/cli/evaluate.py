@@ -123,8 +123,8 @@ def trace(case: Case) -> "SliceTrace":
 
     agent, decide, _, _ = _policy(case.policy)
     world: SlicingWorld = {"stand_in": StandInWorld, "curves": CurvesWorld}[case.world](case.seed)
-    scenario, make_cutting = world.scenario(case.food, case.slice, case.board_stiffness)
-    return cut_slice(scenario, agent, decide, make_cutting)
+    scenario, cutting = world.scenario(case.food, case.slice, case.board_stiffness)
+    return cut_slice(scenario, agent, decide, cutting)
 
 
 @lru_cache

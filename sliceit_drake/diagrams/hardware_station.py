@@ -1,9 +1,11 @@
 """The hardware station: the ports of the simulated one, with a real robot behind them."""
 
+import dataclasses as dc
 from collections.abc import Callable, Sequence
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
+from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce, SpatialVelocity
 from pydrake.multibody.plant import MultibodyPlant
@@ -20,23 +22,24 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.ports import STATION_PORTS
+from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.simulated_station import SimulatedStation
-from sliceit_drake.diagrams.station_interface import Station
+from sliceit_drake.diagrams.station_interface import OwnController, Station, make_controller
+from sliceit_drake.hardware.client import RobotClient
+from sliceit_drake.hardware.configuration import HardwareConfig
 from sliceit_drake.hardware.knife_kinematics import KnifeKinematics
 from sliceit_drake.hardware.limits import SafetyLimits
 from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.hardware.rtde_system import RtdeSystem
 from sliceit_drake.hardware.safety import SafetyLayer
-from sliceit_drake.systems.compliance_controller import ComplianceController
 from sliceit_drake.systems.contact_monitor import ContactMonitor
 from sliceit_drake.systems.servo import JOINTS
-from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
 
 __all__ = [
     "PERIOD",
     "HardwareStation",
     "KnifeEstimate",
-    "MakeHardwareStation",
+    "RobotConnection",
     "make_knife_kinematics",
     "make_safety_layer",
 ]
@@ -150,6 +153,23 @@ class KnifeEstimate(LeafSystem):
         output.SetAtIndex(0, self._progress(context))
 
 
+@dc.dataclass
+class RobotConnection:
+    """The robot behind a hardware station.
+
+    Attributes:
+        client: Connected.
+        config: The robot's file.
+        pace: Controller seconds in a second; 1 for all robots.
+        twin: The simulated station of the scenario, where there is one; None to make it.
+    """
+
+    client: RobotClient
+    config: HardwareConfig
+    pace: float = 1.0
+    twin: SimulatedStation | None = None
+
+
 class HardwareStation(Station):
     """A real robot behind `ports.STATION_PORTS`; `hardware_run` advances it.
 
@@ -157,18 +177,38 @@ class HardwareStation(Station):
     missed_cycles, latched, stop_reason.
 
     Args:
-        twin: The simulated station of the same scenario: its model, start and plan are used, its
-            plant does not move.
-        link: To the robot.
-        pace: Controller seconds in a second; 1 for all robots.
+        scenario: What to run; the height of its board is replaced by the one in the robot's file.
+        robot: The robot.
+        meshcat: Viewer for the twin to draw in, or None.
+        controller: See `MakeStation`.
+
+    Raises:
+        ConfigurationError, MeshError, TimeStepError: The scenario cannot be built, or does not fit
+            a robot.
 
     Attributes:
+        twin: The simulated station of the same scenario: its model, start and plan are used, its
+            plant does not move.
+        link: To the robot; `RobotLink.start` it before the diagram's start.
         rtde: The robot's system.
     """
 
-    def __init__(self, twin: SimulatedStation, link: RobotLink, pace: float = 1.0) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        robot: RobotConnection,
+        meshcat: Meshcat | None = None,
+        controller: OwnController | None = None,
+    ) -> None:
         super().__init__()
-        scenario = self.scenario = twin.scenario
+        config, twin = robot.config, robot.twin
+        if twin is None:
+            if config.board_height is not None:
+                board = dc.replace(scenario.board, height=config.board_height)
+                scenario = dc.replace(scenario, board=board)
+            twin = SimulatedStation(scenario, meshcat)
+        self.twin, scenario = twin, twin.scenario
+        self.scenario = scenario
         if abs(scenario.exchange_period - PERIOD) > 1e-12:
             raise ConfigurationError(
                 f"{scenario.exchange_period:.6g} s is not the cycle of the robot's controller",
@@ -179,16 +219,12 @@ class HardwareStation(Station):
         self.motion_plan, self.board_peak_loss = twin.motion_plan, twin.board_peak_loss
         self.start_pose, self.start_joints = twin.start_pose, twin.start_joints
         self.meshcat = self.visualizer = self.food_visualizer = None
-        builder = DiagramBuilder()
-        self.rtde = builder.AddNamedSystem("robot", RtdeSystem(link, pace))
-        controller = builder.AddNamedSystem(
-            "controller",
-            ComplianceController(
-                scenario.controller,
-                ur5e_chain(scenario.robot.X_TK()),
-                X_WB=scenario.robot.X_WB(),
-            ),
+        self.link = RobotLink(
+            robot.client, make_safety_layer(twin, config.limits), config.watchdog, robot.pace
         )
+        builder = DiagramBuilder()
+        self.rtde = builder.AddNamedSystem("robot", RtdeSystem(self.link, robot.pace))
+        controller = builder.AddNamedSystem("controller", make_controller(scenario, controller))
         top = float(twin.start_pose.translation()[2]) - scenario.start.clearance
         estimate = builder.AddNamedSystem(
             "knife_estimate",
@@ -238,22 +274,6 @@ class HardwareStation(Station):
     def sensor_columns(self, reading: Sequence[str]) -> list[str]:
         """Names for the port `sensor_state`: `reading` [6] for the moment and force."""
         return list(reading)
-
-
-def MakeHardwareStation(
-    twin: SimulatedStation, link: RobotLink, pace: float = 1.0
-) -> HardwareStation:
-    """The hardware station of a scenario, with the ports of the simulated one.
-
-    Args:
-        twin: `MakeSimulatedStation` of the scenario.
-        link: To the robot, watching.
-        pace: Controller seconds in a second; 1 for all robots.
-
-    Raises:
-        ConfigurationError: The scenario does not fit a robot.
-    """
-    return HardwareStation(twin, link, pace)
 
 
 def make_knife_kinematics(twin: Station) -> KnifeKinematics:

@@ -7,7 +7,7 @@ from sliceit_drake.cutting.motion import Motion
 from sliceit_drake.diagrams.agent_station import add_agent
 from sliceit_drake.diagrams.outputs.run_log import Record, Recorder, add_recorder
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation
+from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.systems.agent import AgentConfig, AgentSystem
 from sliceit_drake.systems.motion_sources import MotionSource, placed_motion
@@ -32,7 +32,7 @@ class ScenarioDiagram(Diagram):
         super().__init__()
         builder = DiagramBuilder()
         self.station: Station = builder.AddNamedSystem(
-            "station", station or MakeSimulatedStation(scenario, meshcat)
+            "station", station or MakeStation(scenario, meshcat)
         )
         plan, start = self.station.motion_plan, self.station.start_pose
         self.motion: Motion = placed_motion(plan, start)

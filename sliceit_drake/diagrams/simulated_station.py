@@ -1,4 +1,4 @@
-"""The simulated slicing station: a Scenario becomes a Diagram."""
+"""The simulated station: a Scenario becomes a Diagram."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -7,8 +7,7 @@ import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import RigidBody
-from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer
 
 from sliceit_drake.configuration import ConfigurationError
@@ -29,25 +28,26 @@ from sliceit_drake.diagrams.robot import (
 )
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.start import solve_start_joints
-from sliceit_drake.diagrams.station_interface import Station
+from sliceit_drake.diagrams.station_interface import OwnController, Station, make_controller
 from sliceit_drake.diagrams.workspace import add_board, add_holder, add_table
 from sliceit_drake.systems.analytic_cutter import AnalyticCutter, AnalyticFood
-from sliceit_drake.systems.compliance_controller import ComplianceController
 from sliceit_drake.systems.contact_monitor import ContactMonitor
 from sliceit_drake.systems.cutting_system import CuttingSystem
 from sliceit_drake.systems.food_visualizer import FoodVisualizer, frame_size
 from sliceit_drake.systems.frame_visualizer import FrameVisualizer
-from sliceit_drake.systems.knife_force import KnifeForceSystem
+from sliceit_drake.systems.knife_force import AppliedForce, KnifeForceSystem
 from sliceit_drake.systems.knife_kinematics import BoardContact, KnifeKinematics
 from sliceit_drake.systems.motion_sources import placed_motion
 from sliceit_drake.systems.servo import JOINTS
 from sliceit_drake.systems.spring_cutter import SpringCutter
 from sliceit_drake.systems.spring_visualizer import SpringVisualizer
-from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
 from sliceit_drake.systems.wrench_sensor import WrenchSensor
 from sliceit_drake.systems.wrench_visualizer import WrenchVisualizer
 
-__all__ = ["FRAMES_PER_SECOND", "MakeSimulatedStation", "SimulatedStation"]
+__all__ = ["FRAMES_PER_SECOND", "OwnCutting", "SimulatedStation"]
+
+OwnCutting = KnifeForceSystem | Callable[[Scenario], KnifeForceSystem]
+"""A cutting system of a user's own, or what makes it."""
 
 FRAMES_PER_SECOND = 32
 """Of what is drawn and of replays; fewer where a replay would be too large."""
@@ -62,6 +62,15 @@ CAMERA_OFFSET = np.array([0.17, 0.23, 0.17])
 
 class SimulatedStation(Station):
     """Arm, knife, controller, sensor, board and food behind the ports of `ports.STATION_PORTS`.
+
+    Args:
+        scenario: What to simulate.
+        meshcat: Viewer to draw in, or None.
+        cutting: See `MakeStation`.
+        controller: See `MakeStation`.
+
+    Raises:
+        ConfigurationError, MeshError, TimeStepError: The scenario cannot be built.
 
     Attributes:
         scenario: What it was made from.
@@ -83,8 +92,8 @@ class SimulatedStation(Station):
         self,
         scenario: Scenario,
         meshcat: Meshcat | None = None,
-        make_cutting: Callable[[RigidBody], KnifeForceSystem] | None = None,
-        make_controller: Callable[[Scenario], LeafSystem] | None = None,
+        cutting: OwnCutting | None = None,
+        controller: OwnController | None = None,
     ) -> None:
         super().__init__()
         self.scenario = scenario
@@ -100,9 +109,10 @@ class SimulatedStation(Station):
         self.plant.Finalize()
 
         self.cutting: KnifeForceSystem
-        self.cutting, self.start_pose = _make_cutting(scenario, solvers, self.robot.knife)
-        if make_cutting is not None:
-            self.cutting = make_cutting(self.robot.knife)
+        self.cutting, self.start_pose = _make_cutting(scenario, solvers)
+        if cutting is not None:
+            self.cutting = cutting(scenario) if callable(cutting) else cutting
+            _check_period(self.cutting, scenario)
         self.start_joints = solve_start_joints(
             self.plant,
             self.robot.knife,
@@ -116,7 +126,7 @@ class SimulatedStation(Station):
         self._arm: ArmController = connect_arm_controller(
             builder, self.plant, self.robot, scenario.robot
         )
-        self.controller = (make_controller or _compliance_controller)(scenario)
+        self.controller = make_controller(scenario, controller)
         self.sensor = sensor = WrenchSensor(
             self.plant, self.robot.sensor_weld, scenario.exchange_period, scenario.sensor
         )
@@ -125,8 +135,10 @@ class SimulatedStation(Station):
             self.robot.knife.index(), scenario.knife.length, scenario.board.height
         )
         monitor = ContactMonitor(scenario.monitor, scenario.exchange_period, scenario.sensor)
+        applied_force = AppliedForce(self.robot.knife.index())
         named = {
             "cutting": self.cutting,
+            "applied_force": applied_force,
             "controller": self.controller,
             "sensor": sensor,
             "kinematics": kinematics,
@@ -148,10 +160,8 @@ class SimulatedStation(Station):
                 kinematics.GetOutputPort("knife_velocity"),
                 self.cutting.GetInputPort("knife_velocity"),
             ),
-            (
-                self.cutting.GetOutputPort("applied_force"),
-                plant.get_applied_spatial_force_input_port(),
-            ),
+            (self.cutting.GetOutputPort("food_wrench"), applied_force.get_input_port()),
+            (applied_force.get_output_port(), plant.get_applied_spatial_force_input_port()),
             (
                 plant.get_contact_results_output_port(),
                 board_contact.GetInputPort("contact_results"),
@@ -285,31 +295,14 @@ class SimulatedStation(Station):
         set_joint_positions(root_context, self.plant, self.robot, self._arm, start)
 
 
-def MakeSimulatedStation(
-    scenario: Scenario,
-    meshcat: Meshcat | None = None,
-    make_cutting: Callable[[RigidBody], KnifeForceSystem] | None = None,
-    make_controller: Callable[[Scenario], LeafSystem] | None = None,
-) -> SimulatedStation:
-    """The simulated station of a scenario; connect a source of targets to its input ports.
-
-    Args:
-        scenario: What to simulate.
-        meshcat: Viewer to draw in, or None.
-        make_cutting: Makes a cutting system of your own, given the knife's body; None for that of
-            the scenario's food, which still says where the knife starts.
-        make_controller: Makes what commands the joints in place of the compliance controller, with
-            the same ports; None for the latter.
-
-    Raises:
-        ConfigurationError, MeshError, TimeStepError: The scenario cannot be built.
-    """
-    return SimulatedStation(scenario, meshcat, make_cutting, make_controller)
-
-
-def _compliance_controller(scenario: Scenario) -> ComplianceController:
-    robot = scenario.robot
-    return ComplianceController(scenario.controller, ur5e_chain(robot.X_TK()), X_WB=robot.X_WB())
+def _check_period(cutting: KnifeForceSystem, scenario: Scenario) -> None:
+    if abs(cutting.exchange_period - scenario.exchange_period) > 1e-12:
+        raise ConfigurationError(
+            f"is {scenario.exchange_period:g} s, and that of the cutting system that was put in "
+            f"{cutting.exchange_period:g} s",
+            field="scenario.exchange_period",
+            fix="Make the cutting system with the period of the scenario.",
+        )
 
 
 def _set_scene(meshcat: Meshcat, X_WK: RigidTransform) -> None:
@@ -352,7 +345,7 @@ def _motion_plan(scenario: Scenario, solvers: list[CuttingSolver]) -> MotionPlan
 
 
 def _make_cutting(
-    scenario: Scenario, solvers: list[CuttingSolver], knife: RigidBody
+    scenario: Scenario, solvers: list[CuttingSolver]
 ) -> tuple[KnifeForceSystem, RigidTransform]:
     """The cutting system of a scenario and X_WK at the start."""
     period, start, X_WF = scenario.exchange_period, scenario.start, scenario.X_WF()
@@ -363,17 +356,17 @@ def _make_cutting(
             poses = scenario.sequence.poses(scenario.food, X_WF)
         in_sequence = scenario.sequence is not None
         pose = start_pose(solvers[0].model, start.clearance, start.offset)
-        cutting = CuttingSystem(solvers, poses, knife.index(), in_sequence=in_sequence)
+        cutting = CuttingSystem(solvers, poses, in_sequence=in_sequence)
         return cutting, poses[0] @ RigidTransform(RotationMatrix(pose.R), pose.p)
-    food, index = scenario.food, knife.index()
+    food = scenario.food
     assert isinstance(food, AnalyticFood | SpringFood)
     cutter: KnifeForceSystem
     if isinstance(food, SpringFood):
         height = food.height
-        cutter = SpringCutter(food, scenario.knife, scenario.X_WF(), index, period)
+        cutter = SpringCutter(food, scenario.knife, scenario.X_WF(), period)
     else:
         height = food.diameter
-        cutter = AnalyticCutter(food, scenario.board.height, index, period)
+        cutter = AnalyticCutter(food, scenario.board.height, period)
     p_FK = [start.offset, 0.0, height + start.clearance]
     return cutter, X_WF @ RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), p_FK)
 

@@ -1,6 +1,6 @@
 """What all that surrounds a station may ask of it besides its ports, simulated or hardware."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer
@@ -11,9 +11,14 @@ from pydrake.systems.framework import Context, Diagram, LeafSystem
 from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.diagrams.robot import Robot
 from sliceit_drake.diagrams.scenario import Scenario
+from sliceit_drake.systems.compliance_controller import ComplianceController
 from sliceit_drake.systems.food_visualizer import FoodVisualizer
+from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
 
-__all__ = ["Station"]
+__all__ = ["OwnController", "Station", "make_controller"]
+
+OwnController = LeafSystem | Callable[[Scenario], LeafSystem]
+"""What commands the joints in place of the compliance controller, or what makes it."""
 
 
 class Station(Diagram):
@@ -61,3 +66,11 @@ class Station(Diagram):
         context = self.plant.CreateDefaultContext()
         frame_S = self.robot.sensor_weld.frame_on_parent()
         return frame_S.CalcPose(context, self.robot.knife.body_frame())
+
+
+def make_controller(scenario: Scenario, own: OwnController | None) -> LeafSystem:
+    """The system that commands the joints: a user's own, or the compliance controller."""
+    if own is not None:
+        return own(scenario) if callable(own) else own
+    robot = scenario.robot
+    return ComplianceController(scenario.controller, ur5e_chain(robot.X_TK()), X_WB=robot.X_WB())

@@ -13,7 +13,8 @@ from pydrake.systems.framework import Context
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation, SimulatedStation
+from sliceit_drake.diagrams.simulated_station import SimulatedStation
+from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.emulator.joint_targets import JointTargets
 from sliceit_drake.emulator.kinematics import forward
 from sliceit_drake.emulator.robot_model import CYCLE, RobotState, SimulationStopped
@@ -194,4 +195,4 @@ class StationRobot:
 
 
 def _station_of(scenario: Scenario) -> SimulatedStation:
-    return MakeSimulatedStation(scenario, make_controller=lambda s: JointTargets(s.robot))
+    return MakeStation(scenario, controller=lambda s: JointTargets(s.robot))

@@ -1,10 +1,8 @@
 """Lets a policy cut a slice, and measures it."""
 
 import dataclasses as dc
-from collections.abc import Callable
 
 import numpy as np
-from pydrake.multibody.tree import RigidBody
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
@@ -12,11 +10,11 @@ from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.agent_station import add_agent
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation
+from sliceit_drake.diagrams.simulated_station import OwnCutting
+from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.learning.ending import Limits
 from sliceit_drake.learning.metrics import SliceMetrics, slice_metrics
 from sliceit_drake.systems.agent import AgentConfig, Decide
-from sliceit_drake.systems.knife_force import KnifeForceSystem
 
 __all__ = ["LIMITS", "SliceTrace", "cut_slice"]
 
@@ -53,7 +51,7 @@ def cut_slice(
     scenario: Scenario,
     agent: AgentConfig,
     decide: Decide,
-    make_cutting: Callable[[RigidBody], KnifeForceSystem] | None = None,
+    cutting: OwnCutting | None = None,
     limits: Limits = LIMITS,
     longest: float = LONGEST,
 ) -> SliceTrace:
@@ -63,14 +61,14 @@ def cut_slice(
         scenario: World, with the controller in parallel mode.
         agent: What the policy may do; `descent` is taken from the scenario.
         decide: The policy.
-        make_cutting: A cutting system in place of the scenario's food.
+        cutting: A cutting system in place of the scenario's food.
         limits: What ends the slice before its goal.
         longest: After which it ends, s.
 
     Raises:
         ConfigurationError: The scenario cannot be built, or is not for an agent.
     """
-    station = MakeSimulatedStation(scenario, make_cutting=make_cutting)
+    station = MakeStation(scenario, cutting=cutting)
     agent, builder = dc.replace(agent, descent=station.descent()), DiagramBuilder()
     actions: list[np.ndarray] = []
 

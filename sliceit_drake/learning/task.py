@@ -16,7 +16,7 @@ from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.agent_gains import AgentGains
 from sliceit_drake.diagrams.agent_station import AgentStation
 from sliceit_drake.diagrams.scenario import Scenario, Start
-from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation
+from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.learning.ending import Limits
 from sliceit_drake.learning.reward import RewardConfig
 from sliceit_drake.systems.agent import AgentConfig
@@ -155,17 +155,14 @@ def make_agent_station(task: TaskConfig, food: str, rng: np.random.Generator) ->
     """
     calibrated = load_calibrated_food(food)
     scenario = station_scenario(task, calibrated, food)
-    make_cutting = None
+    cutting = None
     if isinstance(scenario.food, Food):
         models = _variants(task, calibrated, scenario, rng)
         X_WF, period = scenario.X_WF(), scenario.exchange_period
 
-        def make_cutting(knife):  # type: ignore[no-untyped-def]
-            return CuttingSystem(
-                [CuttingSolver(model, period) for model in models], X_WF, knife.index()
-            )
+        cutting = CuttingSystem([CuttingSolver(model, period) for model in models], X_WF)
 
-    station = MakeSimulatedStation(scenario, make_cutting=make_cutting)
+    station = MakeStation(scenario, cutting=cutting)
     return AgentStation(station, dc.replace(task.agent, descent=station.descent()))
 
 

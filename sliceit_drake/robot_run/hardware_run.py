@@ -17,17 +17,13 @@ from sliceit_drake.diagrams.contact_margin import check_contact_margin
 from sliceit_drake.diagrams.hardware_station import (
     PERIOD,
     HardwareStation,
-    MakeHardwareStation,
-    make_safety_layer,
+    RobotConnection,
 )
 from sliceit_drake.diagrams.run import Run, measured_profile, write_outputs
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
-from sliceit_drake.diagrams.simulated_station import (
-    FRAMES_PER_SECOND,
-    MakeSimulatedStation,
-    SimulatedStation,
-)
+from sliceit_drake.diagrams.simulated_station import FRAMES_PER_SECOND, SimulatedStation
+from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.hardware.checks import (
     Check,
     check_facts,
@@ -127,16 +123,15 @@ class HardwareRun:
         Returns:
             The run; `stopped` says why it ended early, or None.
         """
-        link = self.link = RobotLink(
-            self.client, make_safety_layer(self.twin, self.config.limits),
-            self.config.watchdog, self.pace,
-        )  # fmt: skip
+        robot = RobotConnection(self.client, self.config, self.pace, self.twin)
+        station = MakeStation(self.scenario, hardware=robot)
+        link = self.link = station.link
         link.start()
         reason = "the program ended by an error"
         try:
-            run = self.run = self._prepare(link)
+            run = self.run = self._prepare(station)
             with steady_python():
-                self._follow(run, link, duration or run.motion.duration, progress, moves)
+                self._follow(run, station, duration or run.motion.duration, progress, moves)
             reason = run.stopped or "the motion is complete"
         except KeyboardInterrupt:
             reason = "interrupted by the user"
@@ -149,8 +144,7 @@ class HardwareRun:
             self.run.stopped = str(stop)
         return self.run
 
-    def _prepare(self, link: RobotLink) -> Run:
-        station = MakeHardwareStation(self.twin, link, self.pace)
+    def _prepare(self, station: HardwareStation) -> Run:
         diagram = MakeScenarioDiagram(self.scenario, None, station)
         simulator = Simulator(diagram)
         diagram.SetStart(simulator.get_mutable_context())
@@ -164,13 +158,12 @@ class HardwareRun:
     def _follow(
         self,
         run: Run,
-        link: RobotLink,
+        station: HardwareStation,
         duration: float,
         progress: Callable[[float, float], None] | None,
         moves: bool,
     ) -> None:
-        station, simulator, policy = run.station, run.simulator, run.diagram.policy
-        assert isinstance(station, HardwareStation)
+        link, simulator, policy = station.link, run.simulator, run.diagram.policy
         if policy is not None:
             assert self.scenario.policy is not None
             period = self.scenario.policy.period
@@ -251,7 +244,7 @@ def prepare_hardware_run(
     """
     if config.board_height is not None:
         scenario.board.height = config.board_height
-    twin = MakeSimulatedStation(scenario, meshcat)
+    twin = MakeStation(scenario, meshcat)
     return HardwareRun(scenario, config, client, twin, plan_joints(twin), pace)
 
 

@@ -12,7 +12,6 @@ import functools
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import BasicVector, Context, State
 
 from sliceit_drake.configuration import choice, quantity
@@ -97,14 +96,11 @@ class CurveCutter(KnifeForceSystem):
     Args:
         food: The food.
         X_WF: Pose of the food frame: the food stands at its origin, the edge is along Fx.
-        knife_body: Index of the knife's body.
         exchange_period: s.
     """
 
-    def __init__(
-        self, food: CurveFood, X_WF: RigidTransform, knife_body: BodyIndex, exchange_period: float
-    ) -> None:
-        super().__init__(knife_body, exchange_period)
+    def __init__(self, food: CurveFood, X_WF: RigidTransform, exchange_period: float) -> None:
+        super().__init__(exchange_period)
         self.food = food
         self._curve = food_curve(food.curve)
         self._R_WF, self._p_WF = X_WF.rotation().matrix(), X_WF.translation()

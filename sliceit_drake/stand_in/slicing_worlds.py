@@ -22,7 +22,6 @@ import zlib
 from collections.abc import Callable
 
 import numpy as np
-from pydrake.multibody.tree import RigidBody
 
 from sliceit_drake.configuration import ConfigurationError, quantity
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood, load_calibrated_food
@@ -44,7 +43,7 @@ __all__ = [
     "paper_slices",
 ]
 
-MakeCutting = Callable[[RigidBody], KnifeForceSystem]
+MakeCutting = Callable[[Scenario], KnifeForceSystem]
 
 PAPER_SLICES = {"cucumber": 15, "tomato": 5, "potato": 10, "carrot": 5}
 SLICING_FOODS = tuple(PAPER_SLICES)
@@ -127,7 +126,7 @@ class SlicingWorld(typing.Protocol):
 
         Returns:
             The scenario, with the controller that the agent needs, and what makes the cutting
-            system of `MakeSimulatedStation`; None where the scenario's food does.
+            system of `MakeStation`; None where the scenario's food does.
 
         Raises:
             ConfigurationError: The food or the index is none.
@@ -271,10 +270,7 @@ class CurvesWorld:
         cut = CurveFood(food, diameter, diameter, tough, rub)
         scenario.food = AnalyticFood(diameter=diameter, toughness=0.0)
 
-        def make_cutting(knife: RigidBody) -> KnifeForceSystem:
-            return CurveCutter(cut, scenario.X_WF(), knife.index(), scenario.exchange_period)
-
-        return scenario, make_cutting
+        return scenario, lambda s: CurveCutter(cut, s.X_WF(), s.exchange_period)
 
     def rng(self, food: str, slice: int) -> np.random.Generator:
         """See `SlicingWorld`."""

@@ -4,7 +4,6 @@ import dataclasses as dc
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context, State
 
 from sliceit_drake.configuration import quantity
@@ -34,10 +33,8 @@ class AnalyticCutter(KnifeForceSystem):
     along when the force reaches that of cutting.
     """
 
-    def __init__(
-        self, food: AnalyticFood, board_height: float, knife_body: BodyIndex, exchange_period: float
-    ) -> None:
-        super().__init__(knife_body, exchange_period)
+    def __init__(self, food: AnalyticFood, board_height: float, exchange_period: float) -> None:
+        super().__init__(exchange_period)
         self._food = food
         self._board_height = board_height
         self._surface = self.DeclareDiscreteState(1)

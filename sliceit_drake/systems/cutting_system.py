@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import BasicVector, Context, State
 
 from sliceit_drake.cutting.mesh.surface import FoodSurface, food_surface
@@ -61,7 +60,6 @@ class CuttingSystem(KnifeForceSystem):
     Args:
         solvers: Prepared foods with one exchange period.
         X_WF: Pose of the food frame, or one for each of the foods.
-        knife_body: Index of the knife's body.
         check_period: Interval of the energy and inversion checks, s.
         in_sequence: Whether each food follows the one before it once that is cut.
     """
@@ -70,11 +68,10 @@ class CuttingSystem(KnifeForceSystem):
         self,
         solvers: Sequence[CuttingSolver],
         X_WF: RigidTransform | Sequence[RigidTransform],
-        knife_body: BodyIndex,
         check_period: float = 0.05,
         in_sequence: bool = False,
     ) -> None:
-        super().__init__(knife_body, solvers[0].exchange_period)
+        super().__init__(solvers[0].exchange_period)
         self._solvers = tuple(solvers)
         self.surfaces: tuple[FoodSurface, ...] = tuple(food_surface(s.model) for s in solvers)
         self._in_sequence = in_sequence

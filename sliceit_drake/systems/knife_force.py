@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context, EventStatus, LeafSystem, State
 
 from sliceit_drake.cutting.motion import small_turn
 
-__all__ = ["KnifeForceSystem"]
+__all__ = ["AppliedForce", "KnifeForceSystem"]
 
 
 class KnifeForceSystem(LeafSystem):
@@ -28,19 +28,16 @@ class KnifeForceSystem(LeafSystem):
     Output ports:
         food_wrench: SpatialForce F_K_W of the food on the knife, at Ko, in W.
         food_wrench_vector: The same as moment and force [6].
-        applied_force: The same as a list of one ExternallyAppliedSpatialForce for the plant.
         cut_progress: Share of the section that is cut [1].
         coupling_work_error: Work that the held wrench did on the knife minus work that the food did
             on it [1], J; it comes from the delay of one exchange.
 
     Args:
-        knife_body: Index of the knife's body, whose frame is K.
         exchange_period: s.
     """
 
-    def __init__(self, knife_body: BodyIndex, exchange_period: float) -> None:
+    def __init__(self, exchange_period: float) -> None:
         super().__init__()
-        self._knife_body = knife_body
         self.exchange_period = exchange_period
         self._pose_input = self.DeclareAbstractInputPort("knife_pose", Value(RigidTransform()))
         self._velocity_input = self.DeclareAbstractInputPort(
@@ -55,12 +52,6 @@ class KnifeForceSystem(LeafSystem):
             "food_wrench",
             lambda: Value(SpatialForce.Zero()),
             self._calc_food_wrench,
-            {self.discrete_state_ticket(self._wrench)},
-        )
-        self.DeclareAbstractOutputPort(
-            "applied_force",
-            lambda: Value[list[ExternallyAppliedSpatialForce]](),
-            self._calc_applied_force,
             {self.discrete_state_ticket(self._wrench)},
         )
         self.DeclareStateOutputPort("food_wrench_vector", self._wrench)
@@ -133,10 +124,34 @@ class KnifeForceSystem(LeafSystem):
         wrench = self.wrench(context)
         output.set_value(SpatialForce(wrench[:3], wrench[3:]))
 
-    def _calc_applied_force(self, context: Context, output: Value) -> None:
-        wrench = self.wrench(context)
+
+class AppliedForce(LeafSystem):
+    """Applies the food's wrench to the knife's body in the plant.
+
+    Input port:
+        food_wrench: SpatialForce F_K_W of the food on the knife, at Ko, in W.
+
+    Output port:
+        applied_force: The same as a list of one ExternallyAppliedSpatialForce.
+
+    Args:
+        knife_body: Index of the knife's body, whose frame is K.
+    """
+
+    def __init__(self, knife_body: BodyIndex) -> None:
+        super().__init__()
+        self._knife_body = knife_body
+        self._wrench = self.DeclareAbstractInputPort("food_wrench", Value(SpatialForce.Zero()))
+        self.DeclareAbstractOutputPort(
+            "applied_force",
+            lambda: Value[list[ExternallyAppliedSpatialForce]](),
+            self._calc,
+            {self._wrench.ticket()},
+        )
+
+    def _calc(self, context: Context, output: Value) -> None:
         force = ExternallyAppliedSpatialForce()
         force.body_index = self._knife_body
         force.p_BoBq_B = np.zeros(3)
-        force.F_Bq_W = SpatialForce(wrench[:3], wrench[3:])
+        force.F_Bq_W = self._wrench.Eval(context)
         output.set_value([force])

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import BasicVector, Context, State
 
 from sliceit_drake.cutting.foods.spring_food import SpringFood
@@ -32,7 +31,6 @@ class SpringCutter(KnifeForceSystem):
         food: The spring.
         knife: Whose edge pushes.
         X_WF: Pose of the food frame: the button's axis is Fz, the board is at its origin.
-        knife_body: Index of the knife's body.
         exchange_period: s.
     """
 
@@ -41,10 +39,9 @@ class SpringCutter(KnifeForceSystem):
         food: SpringFood,
         knife: Knife,
         X_WF: RigidTransform,
-        knife_body: BodyIndex,
         exchange_period: float,
     ) -> None:
-        super().__init__(knife_body, exchange_period)
+        super().__init__(exchange_period)
         self.food = food
         self._half_edge = 0.5 * knife.length
         self._p_WT = X_WF.translation() + [0.0, 0.0, food.height]

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.framework import Context, DiagramBuilder, State
 from pydrake.systems.primitives import LogVectorOutput
@@ -18,7 +17,8 @@ from sliceit_drake.diagrams.agent_gains import AgentGains, agent_box
 from sliceit_drake.diagrams.contact_loop import ContactLoop, directional_stiffness
 from sliceit_drake.diagrams.contact_margin import board_stiffness
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.diagrams.simulated_station import MakeSimulatedStation, SimulatedStation
+from sliceit_drake.diagrams.simulated_station import SimulatedStation
+from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
 from sliceit_drake.systems.knife_force import KnifeForceSystem
@@ -96,7 +96,7 @@ def stability_limits(
         if lag > 0.0:
             scenario = with_lag(scenario, lag)
         if station is None:
-            station = MakeSimulatedStation(scenario)
+            station = MakeStation(scenario)
         # Only what the loop reads of the scenario differs, not the station's systems.
         station.scenario = scenario
         loop = ContactLoop(station, tracking="arm" if lag > 0.0 else "ideal")
@@ -109,15 +109,12 @@ class _SpringContact(KnifeForceSystem):
 
     Args:
         stiffness: N/m.
-        knife_body: Index of the knife's body.
         exchange_period: s.
         height: World height of Ko where it is slack, m.
     """
 
-    def __init__(
-        self, stiffness: float, knife_body: BodyIndex, exchange_period: float, height: float
-    ) -> None:
-        super().__init__(knife_body, exchange_period)
+    def __init__(self, stiffness: float, exchange_period: float, height: float) -> None:
+        super().__init__(exchange_period)
         self._stiffness = stiffness
         self._height = height
 
@@ -146,11 +143,9 @@ def station_growth(scenario: Scenario, stiffness: float, duration: float = 2.0) 
     builder = DiagramBuilder()
     station = builder.AddNamedSystem(
         "station",
-        MakeSimulatedStation(
+        MakeStation(
             scenario,
-            make_cutting=lambda knife: _SpringContact(
-                stiffness, knife.index(), scenario.exchange_period, height
-            ),
+            cutting=_SpringContact(stiffness, scenario.exchange_period, height),
         ),
     )
     builder.ExportInput(station.GetInputPort("target_pose"), "target_pose")
@@ -261,7 +256,7 @@ def run_in_contact(
         # Steps of 1 ms would take more than is allowed from the peaks.
         scenario.board.stiffness, scenario.robot.plant_time_step = BOARD_STIFFNESS[0], 5e-4
     builder = DiagramBuilder()
-    station = builder.AddNamedSystem("station", MakeSimulatedStation(scenario))
+    station = builder.AddNamedSystem("station", MakeStation(scenario))
     builder.ExportInput(station.GetInputPort("target_pose"), "target_pose")
     logs = [
         LogVectorOutput(station.GetOutputPort(name), builder, publish_period=2e-3)
@@ -325,7 +320,7 @@ class FactorRow:
 def factor_row(factor: float, lag: float, tracking: str = "arm") -> FactorRow:
     """Computes a row."""
     scenario = with_lag(Scenario(food=AnalyticFood()), lag)
-    station = MakeSimulatedStation(scenario)
+    station = MakeStation(scenario)
     R_WK = station.start_pose.rotation().matrix()
     board = board_stiffness(Board(stiffness=BOARD_STIFFNESS[0]), scenario.knife, R_WK)
     food = directional_stiffness(VERTICAL, FOOD_STIFFNESS[1])
