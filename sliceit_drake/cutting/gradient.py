@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from sliceit_drake.cutting.kernels.types import ACCUMULATED, PARAMETERS
+from sliceit_drake.cutting.kernels.layouts import ACCUMULATED, BLADE_SUMS, POINT_SUMS
+from sliceit_drake.cutting.kernels.types import PARAMETERS
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.mounting import Mounting
 from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError
@@ -129,7 +130,7 @@ class SliceAdjoint:
                 rise, shift = mounting.given.tolist()
                 run.p[e + 1] = p[e + 1] + [-shift, 0.0, rise]
                 ws.advance(run.states[e][None], run.R[None, e : e + 2], run.p[None, e : e + 2])
-                wrenches = ws.result("wrenches")[0, 0]
+                wrenches = ws.results()["wrenches"][0, 0]
                 if not np.isfinite(wrenches).all():
                     raise CuttingError(f"at {(e + 1) * self.exchange_period:.4g} s {NOT_FINITE}")
                 run.wrenches[e] = wrenches.sum(0)
@@ -212,22 +213,25 @@ class SliceAdjoint:
         """Adjoint of `knife_wrenches`: of the sums as the workspace holds them, and of Ky."""
         ws, n = self._w, self._w.substeps
         of_moment, of_force = weights[:3], weights[3:]
-        blade, buried = ws.result("blade")[0, 0], ws.result("point_sums")[0, 0, ACCUMULATED:]
-        lateral = (blade[1] - blade[2]) / n * R[:, 1]
-        middle = buried[:3] / buried[3] if buried[3] > 0.0 else np.zeros(3)
+        (result,) = ws.results()
+        blade, sums = result["blade"][0], result["point_sums"][0]
+        push, area = blade["on_knife"] - blade["on_blade"], sums["buried_area"]
+        lateral = push / n * R[:, 1]
+        middle = sums["buried_moment"] / area if area > 0.0 else np.zeros(3)
         of_lateral = of_force + _cross(of_moment, middle)
         of_middle = _cross(lateral, of_moment)
         adjoint = np.zeros(ws.sums.shape[1])
-        total = np.zeros(ACCUMULATED)
-        total[:9], total[9:18] = [*of_force / n] * 3, [*of_moment / n] * 3
+        total, bending = np.zeros(1, POINT_SUMS), np.zeros(1, BLADE_SUMS)
+        total["forces"], total["moments"] = of_force / n, of_moment / n
         points = len(self.model.point_nodes)
-        adjoint[ws.sum_layout["total"]] = np.tile(total, points)
+        adjoint[ws.sum_layout["total"]] = np.tile(total.view(float)[:ACCUMULATED], points)
         along = float(of_lateral @ R[:, 1]) / n
-        adjoint[ws.sum_layout["blade_sums"]] = [0.0, along, -along]
-        if buried[3] > 0.0:
-            of_buried = np.concatenate([of_middle, [-(of_middle @ middle)]]) / buried[3]
+        bending["on_knife"], bending["on_blade"] = along, -along
+        adjoint[ws.sum_layout["blade_sums"]] = bending.view(float)
+        if area > 0.0:
+            of_buried = np.concatenate([of_middle, [-(of_middle @ middle)]]) / area
             adjoint[ws.sum_layout["buried"]] = np.tile(of_buried, points)
-        return adjoint, of_lateral * (blade[1] - blade[2]) / n
+        return adjoint, of_lateral * push / n
 
     def _capture_backward(self) -> None:
         if self._backward is not None:

@@ -137,7 +137,7 @@ class Knife:
         )
 
     def parameters(self) -> np.ndarray:
-        """The section as the kernels take it: six coordinates, radius, half length [8]."""
+        """The section as the kernels take it, see `layouts.KNIFE` [8]."""
         return np.concatenate([self.half_section().ravel(), [self.edge_radius, 0.5 * self.length]])
 
 

@@ -101,8 +101,8 @@ class Energies:
     least_element: int
 
 
-CUT_AREA, BOARD_LOSS, INTERNAL_WORK = 21, 3, 4
-"""Where they stand in the sums over cut points and over nodes."""
+LOSSES = ("edge_loss", "opening_loss", "friction_loss")
+"""Energies dissipated at the cut points, in the order of `Exchanges.dissipation`."""
 
 NOT_FINITE = (
     "the knife's force is not finite: elements inverted or the step became unstable. "
@@ -127,23 +127,25 @@ def run_exchanges(
     """
     ws.advance(states, R, p)
     new = ws.read(ws.states[0]).copy()
-    sums, nodes, blade, wrenches, work = (
-        ws.result(name).copy() for name in ("point_sums", "node_sums", "blade", "wrenches", "work")
-    )
+    results = ws.results()
     x = ws.layout["x"]
     return [
         Exchanges(
             state=new[c],
-            wrenches=wrenches[c],
-            work=work[c],
+            wrenches=row["wrenches"],
+            work=row["work"],
             dissipation=np.array(
-                [*sums[c, :, 18:21].sum(0), blade[c, :, 0].sum(), nodes[c, BOARD_LOSS]]
+                [
+                    *np.stack([row["point_sums"][name] for name in LOSSES], axis=1).sum(0),
+                    row["blade"]["loss"].sum(),
+                    row["node_sums"]["board_loss"],
+                ]
             ),
-            internal_work=float(nodes[c, INTERNAL_WORK]),
+            internal_work=float(row["node_sums"]["internal_work"]),
             gravity_work=float(model.weight.ravel() @ (new[c, x] - states[c, x])),
-            cut=sums[c, :, CUT_AREA] / model.section_area,
+            cut=row["point_sums"]["cut_area"] / model.section_area,
         )
-        for c, model in enumerate(ws.models)
+        for c, (model, row) in enumerate(zip(ws.models, results, strict=True))
     ]
 
 
@@ -227,11 +229,12 @@ class CuttingSolver:
         with self._lock:
             ws.advance(state[None], R, p)
             new = ws.read(ws.states[0])[0].copy()
-            row = ws.read(ws.results)[0].copy()
-        if not np.isfinite(row).all():
+            results = ws.results()
+        if not np.isfinite(results.view(np.float64)).all():
             raise CuttingError(NOT_FINITE)
-        sums, nodes, blade, parts, work = (row[where] for where in ws.result_layout.values())
-        edge, normal, friction = wrenches = parts.reshape(3, 6)
+        (result,) = results
+        sums, nodes = result["point_sums"][0], result["node_sums"]
+        edge, normal, friction = wrenches = result["wrenches"][0]
         x = ws.layout["x"]
         return Exchange(
             state=new,
@@ -239,16 +242,16 @@ class CuttingSolver:
             edge=edge,
             normal=normal,
             friction=friction,
-            work=float(work[0]),
-            edge_dissipation=float(sums[18]),
-            opening_dissipation=float(sums[19]),
-            friction_dissipation=float(sums[20]),
-            internal_work=float(nodes[INTERNAL_WORK]),
-            blade_dissipation=float(blade[0]),
-            board_force=nodes[:3] / self.substeps,
-            board_dissipation=float(nodes[BOARD_LOSS]),
+            work=float(result["work"][0]),
+            edge_dissipation=float(sums["edge_loss"]),
+            opening_dissipation=float(sums["opening_loss"]),
+            friction_dissipation=float(sums["friction_loss"]),
+            internal_work=float(nodes["internal_work"]),
+            blade_dissipation=float(result["blade"]["loss"][0]),
+            board_force=nodes["board_force"] / self.substeps,
+            board_dissipation=float(nodes["board_loss"]),
             gravity_work=float(m.weight.ravel() @ (new[x] - state[x])),
-            cut=float(sums[CUT_AREA]) / m.section_area,
+            cut=float(sums["cut_area"]) / m.section_area,
         )
 
     def exchanges(self, state: np.ndarray, R: np.ndarray, p: np.ndarray) -> Exchanges:
@@ -282,12 +285,12 @@ class CuttingSolver:
         self._place_knife(pose, np.zeros(3), np.zeros(3))
 
     def _place_knife(self, pose: Pose, v: np.ndarray, w: np.ndarray) -> None:
-        n = self.substeps
-        motion = np.zeros((1, 18 * n))
-        motion[0, :9] = pose.R.ravel()
-        for k, vector in ((9, pose.p), (12, v), (15, w)):
-            motion[0, k * n : k * n + 3] = vector
-        self._workspace.write(self._workspace.motion, motion)
+        ws = self._workspace
+        motion = np.zeros(ws.motion.shape)
+        knife = {"R_CK": pose.R.ravel(), "p_CK": pose.p, "v_CK": v, "w_CK": w}
+        for name, values in knife.items():
+            motion[0, ws.motion_layout[name].start :][: len(values)] = values
+        ws.write(ws.motion, motion)
 
     def contact_forces(self, state: np.ndarray, start: Pose, end: Pose) -> np.ndarray:
         """Forces on the knife at the end of an exchange, by cut point and face [P, 2, 3], N, in C.

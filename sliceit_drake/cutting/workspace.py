@@ -8,8 +8,9 @@ import numpy as np
 import warp as wp
 
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.kernels import layouts
 from sliceit_drake.cutting.kernels.precision import kernels
-from sliceit_drake.cutting.kernels.types import ACCUMULATED, GATHER, LANES, PARAMETERS
+from sliceit_drake.cutting.kernels.types import GATHER, LANES, PARAMETERS
 from sliceit_drake.cutting.model import CuttingModel, TimeStepError
 from sliceit_drake.cutting.warp_start import start_warp
 
@@ -180,9 +181,9 @@ class Workspace:
             device=self.device,
         )
         sums = [
-            ("total", (E, P, ACCUMULATED), real, 1),
+            ("total", (E, P, layouts.ACCUMULATED), real, 1),
             ("buried", (E, P), k.vec4, 4),
-            ("blade_sums", (E, 3), real, 1),
+            ("blade_sums", (E, layouts.numbers(layouts.BLADE_SUMS)), real, 1),
             ("board_force", (N,), vec3, 3),
             ("board_loss", (N,), real, 1),
             ("internal_work", (N,), real, 1),
@@ -192,17 +193,16 @@ class Workspace:
         arrays, self.sum_layout = self._rows(self.sums, sums)
         self.w |= arrays
         double = wp.float64
-        results = [
-            ("point_sums", (E, ACCUMULATED + 4), double, 1),
-            ("node_sums", (5,), double, 1),
-            ("blade", (E, 3), double, 1),
-            ("wrenches", (E, 3, 6), double, 1),
-            ("work", (E,), double, 1),
-        ]
-        size = sum(int(np.prod(shape)) for _, shape, _, _ in results)
-        self.results = wp.zeros((C, size), dtype=double, device=self.device)
-        arrays, self.result_layout = self._rows(self.results, results)
-        self._result_shapes = {name: shape for name, shape, _, _ in results}
+        self._result_type = layouts.results(E)
+        size = layouts.numbers(self._result_type)
+        self._result_rows = wp.zeros((C, size), dtype=double, device=self.device)
+        arrays, _ = self._rows(
+            self._result_rows,
+            [
+                (name, layouts.field_shape(self._result_type, name), double, 1)
+                for name in self._result_type.names or ()
+            ],
+        )
         self.w |= arrays
         self.w["point_force"] = wp.zeros(
             (C, P, 2), dtype=vec3, device=self.device, requires_grad=self._gradients
@@ -241,7 +241,7 @@ class Workspace:
             self.w[name] = self._constant(values, dtype)
         parameters = [
             ("P", (len(PARAMETERS),), real, 1),
-            ("knife", (8,), real, 1),
+            ("knife", (layouts.numbers(layouts.KNIFE),), real, 1),
             *((name, (P,), real, 1) for name in PER_POINT),
             ("inverse_mass", (N,), real, 1),
             ("local_damping", (N,), real, 1),
@@ -290,11 +290,9 @@ class Workspace:
         state[self.layout["heading"]].reshape(-1, 3)[:, 2] = -1.0
         return state
 
-    def result(self, name: str) -> np.ndarray:
-        """Results of the last launch by name [C, ...]: point_sums, node_sums, blade, wrenches, work
-        (`exchange_kernels`)."""
-        values = self.read(self.results)[:, self.result_layout[name]]
-        return values.reshape(self.cuts, *self._result_shapes[name])
+    def results(self) -> np.ndarray:
+        """A copy of what the last launch gave, by name [C]; see `layouts.results`."""
+        return self.read(self._result_rows).copy().view(self._result_type)[:, 0]
 
     def write(self, array: wp.array, values: np.ndarray) -> None:
         """Sets an array from host memory."""
@@ -464,12 +462,12 @@ class Workspace:
         outputs = [w["blade"], w["wrenches"], w["work"]]
         wp.launch(
             kern.add_points,
-            dim=(C, E, ACCUMULATED + 4),
+            dim=(C, E, layouts.numbers(layouts.POINT_SUMS)),
             inputs=[w["total"], w["buried"], w["point_sums"]],
             device=self.device,
         )
         at_nodes = [w["board_force"], w["board_loss"], w["internal_work"], w["node_sums"]]
-        self.launch(kern.add_nodes, 5, at_nodes)
+        self.launch(kern.add_nodes, layouts.numbers(layouts.NODE_SUMS), at_nodes)
         sums = [w["point_sums"], w["blade_sums"], w["R"], w["p"]]
         self.launch(kern.knife_wrenches, E, [*sums, *self._timing(), *outputs])
 

@@ -237,33 +237,33 @@ class CuttingSystem(KnifeForceSystem):
         R_CW = self._R_CW[index]
         forces = np.array([step.edge[3:], step.normal[3:], step.friction[3:]]).dot(R_CW)
         new.set_value(self._components, forces.ravel())
-        change = [
-            step.work,
-            step.gravity_work,
-            step.edge_dissipation,
-            step.opening_dissipation,
-            step.friction_dissipation,
-            step.board_dissipation,
-            step.blade_dissipation,
-            step.internal_work,
-        ]
-        ledger = old_ledger + change
+        change = {
+            "work": step.work,
+            "gravity": step.gravity_work,
+            "edge": step.edge_dissipation,
+            "opening": step.opening_dissipation,
+            "friction": step.friction_dissipation,
+            "board_friction": step.board_dissipation,
+            "blade": step.blade_dissipation,
+            "internal": step.internal_work,
+        }
+        ledger = old_ledger + [change[name] for name in LEDGER_NAMES]
         new.set_value(self._ledger, ledger)
         if round(time / self.exchange_period) % self._check_every == 0:
             energies = solver.energies(step.state, pose)
             spent = float(ledger[SPENT].sum() - new.value(self._spent_before)[0])
             ratio = check_energies(energies, spent, solver.model, time)
-            *_, largest, least = new.value(self._energy).tolist()
-            new.set_value(
-                self._energy,
-                [
-                    energies.elastic,
-                    energies.interface,
-                    energies.kinetic,
-                    max(ratio, largest),
-                    min(energies.least_volume_ratio, least),
-                ],
-            )
+            last_check = dict(zip(ENERGY_NAMES, new.value(self._energy).tolist(), strict=True))
+            check = {
+                "elastic": energies.elastic,
+                "interface": energies.interface,
+                "kinetic": energies.kinetic,
+                "largest_energy_ratio": max(ratio, last_check["largest_energy_ratio"]),
+                "least_volume_ratio": min(
+                    energies.least_volume_ratio, last_check["least_volume_ratio"]
+                ),
+            }
+            new.set_value(self._energy, [check[name] for name in ENERGY_NAMES])
         return step.wrench.reshape(2, 3).dot(R_CW).ravel(), step.cut
 
     def _calc_surface(self, context: Context, output: BasicVector) -> None:

@@ -8,7 +8,14 @@ from typing import Any
 
 import warp as wp
 
-from sliceit_drake.cutting.kernels.types import ACCUMULATED, kernel_types
+from sliceit_drake.cutting.kernels.layouts import (
+    ACCUMULATED,
+    BLADE_SUMS,
+    NODE_SUMS,
+    POINT_SUMS,
+    first,
+)
+from sliceit_drake.cutting.kernels.types import kernel_types
 
 __all__ = ["exchange_kernels"]
 
@@ -18,8 +25,11 @@ def exchange_kernels(real: Any, module: str) -> types.SimpleNamespace:
     t = kernel_types(real)
     vec3, vec4, mat33 = t.vec3, t.vec4, t.mat33
     vec3d, mat33d, float64 = wp.vec3d, wp.mat33d, wp.float64
-    # Where the sums of `buried` follow those of `total`.
-    BURIED = wp.constant(ACCUMULATED)
+    FORCES, MOMENTS, BURIED_MOMENT, BURIED_AREA = map(
+        wp.constant, first(POINT_SUMS, "forces", "moments", "buried_moment", "buried_area")
+    )
+    BOARD_FORCE, BOARD_LOSS = map(wp.constant, first(NODE_SUMS, "board_force", "board_loss"))
+    ON_KNIFE, ON_BLADE = map(wp.constant, first(BLADE_SUMS, "on_knife", "on_blade"))
 
     @wp.func
     def to_real(a: vec3d):
@@ -93,13 +103,13 @@ def exchange_kernels(real: Any, module: str) -> types.SimpleNamespace:
         internal_work: wp.array2d(dtype=real),
         sums: wp.array2d(dtype=float64),
     ):
-        """Sums over the nodes, a thread for each: board's force [0:3], its loss, bulk's work."""
+        """Sums over the nodes, see `NODE_SUMS`; a thread for each."""
         cut, j = wp.tid()
         s = float64(0.0)
         for i in range(board_loss.shape[1]):
-            if j < 3:
-                s += float64(board_force[cut, i][j])
-            elif j == 3:
+            if j < BOARD_LOSS:
+                s += float64(board_force[cut, i][j - BOARD_FORCE])
+            elif j == BOARD_LOSS:
                 s += float64(board_loss[cut, i])
             else:
                 s += float64(internal_work[cut, i])
@@ -129,19 +139,21 @@ def exchange_kernels(real: Any, module: str) -> types.SimpleNamespace:
         # The flanks push the blade, and the blade's spring and damper the knife's body. The
         # difference acts at the middle of the buried flanks.
         end = R[cut, e + 1]
-        push = (blade[cut, e, 1] - blade[cut, e, 2]) / n
+        push = (blade[cut, e, ON_KNIFE] - blade[cut, e, ON_BLADE]) / n
         lateral = push * vec3d(end[0, 1], end[1, 1], end[2, 1])
-        area = sums[cut, e, BURIED + 3]
+        area = sums[cut, e, BURIED_AREA]
         moment = vec3d()
         if area > float64(0.0):
-            middle = vec3d(sums[cut, e, BURIED], sums[cut, e, BURIED + 1], sums[cut, e, BURIED + 2])
+            middle = vec3d()
+            for c in range(3):
+                middle[c] = sums[cut, e, BURIED_MOMENT + c]
             moment = wp.cross(middle / area, lateral)
         v, w = rates(R, p, cut, e, period)
         power = float64(0.0)
         for m in range(3):
             for c in range(3):
-                M = sums[cut, e, 9 + 3 * m + c] / n
-                F = sums[cut, e, 3 * m + c] / n
+                M = sums[cut, e, MOMENTS + 3 * m + c] / n
+                F = sums[cut, e, FORCES + 3 * m + c] / n
                 if m == 1:
                     M += moment[c]
                     F += lateral[c]

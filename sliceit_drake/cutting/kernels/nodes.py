@@ -5,6 +5,7 @@ from typing import Any
 
 import warp as wp
 
+from sliceit_drake.cutting.kernels.layouts import BLADE_SUMS, first
 from sliceit_drake.cutting.kernels.types import LANES, kernel_types
 
 __all__ = ["node_kernels"]
@@ -18,6 +19,8 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
     DAMPING_TIME, BOARD_STIFFNESS = t.DAMPING_TIME, t.BOARD_STIFFNESS
     BOARD_FRICTION, BOARD_DAMPING_TIME = t.BOARD_FRICTION, t.BOARD_DAMPING_TIME
     BLADE_STIFFNESS, BLADE_DAMPING, BLADE_MASS = t.BLADE_STIFFNESS, t.BLADE_DAMPING, t.BLADE_MASS
+
+    LOSS, ON_KNIFE, ON_BLADE = map(wp.constant, first(BLADE_SUMS, "loss", "on_knife", "on_blade"))
 
     # Nodes slower than this, in m/s, count as at rest.
     REST = wp.constant(real(1.0e-5))
@@ -242,7 +245,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
     ):
         """Steps the blade's lateral deflection and its rate, pushed by the flanks.
 
-        Adds to `blade_sums`: energy lost, force that reaches the knife's body, force of the flanks.
+        Adds to `blade_sums`, see `BLADE_SUMS`.
         """
         cut = wp.tid()
         F = push[cut]
@@ -254,9 +257,9 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         deflection = blade[cut, 0] + dt * rate
         blade_next[cut, 1] = rate
         blade_next[cut, 0] = deflection
-        blade_sums[cut, exchange, 0] += c * rate * rate * dt
-        blade_sums[cut, exchange, 1] += k * deflection + c * rate
-        blade_sums[cut, exchange, 2] += F
+        blade_sums[cut, exchange, LOSS] += c * rate * rate * dt
+        blade_sums[cut, exchange, ON_KNIFE] += k * deflection + c * rate
+        blade_sums[cut, exchange, ON_BLADE] += F
 
     out = types.SimpleNamespace(move_nodes=move_nodes, push_blade=push_blade, bend_blade=bend_blade)
     if not gradients:

@@ -6,6 +6,7 @@ from typing import Any
 import warp as wp
 
 from sliceit_drake.cutting.foods.effects import LINEAR_BELOW
+from sliceit_drake.cutting.kernels.layouts import KNIFE, POINT_SUMS, first
 from sliceit_drake.cutting.kernels.types import kernel_types
 
 __all__ = ["point_kernels"]
@@ -26,6 +27,13 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
     FLANK_EXPONENT, FLANK_SPEED = t.FLANK_EXPONENT, t.FLANK_SPEED
     INITIATION, INITIATION_DEPTH = t.INITIATION, t.INITIATION_DEPTH
     EDGE_SHARE = t.EDGE_SHARE
+    SHOULDER, SPINE, EDGE_RADIUS, HALF_LENGTH = map(
+        wp.constant, first(KNIFE, "shoulder", "spine", "edge_radius", "half_length")
+    )
+    FORCES, MOMENTS = map(wp.constant, first(POINT_SUMS, "forces", "moments"))
+    EDGE_LOSS, OPENING_LOSS, FRICTION_LOSS, CUT_AREA = map(
+        wp.constant, first(POINT_SUMS, "edge_loss", "opening_loss", "friction_loss", "cut_area")
+    )
     # Without gradients, an effect that is off costs nothing; with them its derivative is wanted.
     ALL = wp.constant(gradients)
     LINEAR = wp.constant(real(LINEAR_BELOW**2))
@@ -46,16 +54,16 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         side. The bevel at the edge is left out: what it does to the food is the work of the edge,
         which the toughness holds; its steep normal would count that twice, in spikes.
         """
-        y1 = knife[cut, 2]
-        h1 = knife[cut, 3]
-        y2 = knife[cut, 4]
-        h2 = knife[cut, 5]
+        y1 = knife[cut, SHOULDER]
+        h1 = knife[cut, SHOULDER + 1]
+        y2 = knife[cut, SPINE]
+        h2 = knife[cut, SPINE + 1]
         flank = wp.normalize(vec2(h2 - h1, y1 - y2))
         to_flank = flank[0] * (y - y1) + flank[1] * (wp.max(height, h1) - h1)
         to_spine = height - h2
         phi = wp.max(to_flank, to_spine)
         n = wp.where(to_spine > to_flank, vec2(real(0.0), real(1.0)), flank)
-        return phi - knife[cut, 6], n
+        return phi - knife[cut, EDGE_RADIUS], n
 
     @wp.func
     def flank_contact(
@@ -109,7 +117,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         growth = table(width, i, k_now, w_now)
         rise = table(centroid, i, k_now, w_now)
         r = wp.transpose(R) * (arm + vec3(real(0.0), real(0.0), rise))
-        between = wp.abs(r[0]) < knife[cut, 7]
+        between = wp.abs(r[0]) < knife[cut, HALF_LENGTH]
         normal_force = vec3()
         friction_force = vec3()
         new_slip = vec3()
@@ -217,7 +225,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         # s: depth of the edge below the point. Nothing happens beyond the ends of the blade.
         old_passed = passed[cut, i]
         s = old_passed
-        beyond = wp.abs(wp.dot(arm, knife_x)) >= knife[cut, 7]
+        beyond = wp.abs(wp.dot(arm, knife_x)) >= knife[cut, HALF_LENGTH]
         if not beyond:
             s = -wp.dot(arm, knife_z)
         new_passed = wp.max(old_passed, s)
@@ -362,16 +370,16 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         normal = normal_m + normal_p
         friction = friction_m + friction_p
         for c in range(3):
-            total[cut, exchange, i, c] += -edge[c]
-            total[cut, exchange, i, 3 + c] += -normal[c]
-            total[cut, exchange, i, 6 + c] += -friction[c]
-            total[cut, exchange, i, 9 + c] += -edge_moment[c]
-            total[cut, exchange, i, 12 + c] += -normal_moment[c]
-            total[cut, exchange, i, 15 + c] += -friction_moment[c]
-        total[cut, exchange, i, 18] += edge_loss
-        total[cut, exchange, i, 19] += opening_loss
-        total[cut, exchange, i, 20] += loss_m + loss_p
-        total[cut, exchange, i, 21] = A * D
+            total[cut, exchange, i, FORCES + c] += -edge[c]
+            total[cut, exchange, i, FORCES + 3 + c] += -normal[c]
+            total[cut, exchange, i, FORCES + 6 + c] += -friction[c]
+            total[cut, exchange, i, MOMENTS + c] += -edge_moment[c]
+            total[cut, exchange, i, MOMENTS + 3 + c] += -normal_moment[c]
+            total[cut, exchange, i, MOMENTS + 6 + c] += -friction_moment[c]
+        total[cut, exchange, i, EDGE_LOSS] += edge_loss
+        total[cut, exchange, i, OPENING_LOSS] += opening_loss
+        total[cut, exchange, i, FRICTION_LOSS] += loss_m + loss_p
+        total[cut, exchange, i, CUT_AREA] = A * D
         a = real(0.5) * (area_m + area_p)
         b = real(0.5) * (area_m * (xm - origin) + area_p * (xp - origin))
         buried[cut, exchange, i] = vec4(b[0], b[1], b[2], a)
@@ -424,10 +432,10 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
 
         Advances the history: `passed`, the largest depth of the edge below the point; `parted`, the
         share of the surface energy spent by opening; `edge_force` on the food and its direction
-        `heading`; `slip`, from the friction anchors. Adds to `total`: forces on the knife by edge,
-        flank pressure, friction [0:9], their moments about Ko [9:18], and energies dissipated by
-        the edge 18, by opening 19, by friction 20. Writes the area that is cut, 21, and to `buried`
-        the moment about Ko of the part of it above the edge, and that part.
+        `heading`; `slip`, from the friction anchors. Adds to `total` forces on the
+        knife, their moments about Ko and energies dissipated, and writes the area that is cut; see
+        `POINT_SUMS`. Writes to `buried` the moment about Ko of the part of it above the edge, and
+        that part.
         """
         cut, chunk = wp.tid()
         for i in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, area.shape[0])):
@@ -543,7 +551,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
             share = table(fraction, i, k1, w1)
             rise = table(centroid, i, k1, w1)
             r = wp.transpose(R) * (arm + vec3(real(0.0), real(0.0), rise))
-            if share > real(0.0) and wp.abs(r[0]) < knife[cut, 7]:
+            if share > real(0.0) and wp.abs(r[0]) < knife[cut, HALF_LENGTH]:
                 phi, _n = wedge(sign * (r[1] - blade[cut, 0]), -r[2], cut, knife)
                 if phi < real(0.0):
                     held = slip[cut, i, side]

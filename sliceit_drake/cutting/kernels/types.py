@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-__all__ = ["ACCUMULATED", "GATHER", "LANES", "PARAMETERS", "kernel_types"]
+__all__ = ["GATHER", "LANES", "PARAMETERS", "kernel_types"]
 
 LANES = 8
 """Elements that a thread handles."""
@@ -45,9 +45,6 @@ PARAMETERS = (
     "edge_share",
 )
 """Scalars of a cut that the kernels read, in the order of their array."""
-
-ACCUMULATED = 22
-"""Sums kept for each cut point over an exchange, see `points`."""
 
 
 @functools.cache

@@ -1,0 +1,84 @@
+"""Names of the numbers that the kernels read and write in rows: one layout for them and readers."""
+
+import numpy as np
+
+__all__ = [
+    "ACCUMULATED",
+    "BLADE_SUMS",
+    "KNIFE",
+    "NODE_SUMS",
+    "POINT_SUMS",
+    "field_shape",
+    "first",
+    "numbers",
+    "results",
+]
+
+KNIFE = np.dtype(
+    [
+        ("tip", "f8", 2),
+        ("shoulder", "f8", 2),
+        ("spine", "f8", 2),
+        ("edge_radius", "f8"),
+        ("half_length", "f8"),
+    ]
+)
+"""The knife's section, corners as (|y|, height) drawn in by the radius, and half its length, m."""
+
+POINT_SUMS = np.dtype(
+    [
+        ("forces", "f8", (3, 3)),
+        ("moments", "f8", (3, 3)),
+        ("edge_loss", "f8"),
+        ("opening_loss", "f8"),
+        ("friction_loss", "f8"),
+        ("cut_area", "f8"),
+        ("buried_moment", "f8", 3),
+        ("buried_area", "f8"),
+    ]
+)
+"""Sums over the cut points: forces and moments on the knife by edge, flank pressure and friction,
+and energies dissipated, each summed over the sub-steps of an exchange; at its end the area that is
+cut, and the moment about Ko and the size of that part of the flanks which is in the food."""
+
+NODE_SUMS = np.dtype([("board_force", "f8", 3), ("board_loss", "f8"), ("internal_work", "f8")])
+"""Sums over nodes and sub-steps: the board's force on the food, the energy that it dissipates, and
+the work of the bulk's forces."""
+
+BLADE_SUMS = np.dtype([("loss", "f8"), ("on_knife", "f8"), ("on_blade", "f8")])
+"""Sums over the sub-steps of an exchange: energy lost in the bending blade, the force that it
+passes on to the knife's body, and the force of the flanks on it."""
+
+
+def results(exchanges: int) -> np.dtype:
+    """Results of one cut over E exchanges; the sums over nodes are those of all of them."""
+    return np.dtype(
+        [
+            ("point_sums", POINT_SUMS, (exchanges,)),
+            ("node_sums", NODE_SUMS),
+            ("blade", BLADE_SUMS, (exchanges,)),
+            ("wrenches", "f8", (exchanges, 3, 6)),
+            ("work", "f8", (exchanges,)),
+        ]
+    )
+
+
+def first(layout: np.dtype, *names: str) -> list[int]:
+    """Places of the first number of each named field."""
+    assert layout.fields is not None
+    return [layout.fields[name][1] // 8 for name in names]
+
+
+ACCUMULATED = first(POINT_SUMS, "buried_moment")[0]
+"""Numbers that each cut point keeps in `total`; those of `buried` follow in the sums."""
+
+
+def numbers(layout: np.dtype) -> int:
+    """How many numbers a layout names."""
+    return layout.itemsize // 8
+
+
+def field_shape(layout: np.dtype, name: str) -> tuple[int, ...]:
+    """Shape of a field as an array of numbers."""
+    field = layout[name]
+    return field.shape + ((numbers(field.base),) if field.base.names else ())
