@@ -14,7 +14,8 @@ from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuil
 from sliceit_drake.cutting.foods.food import Box, Cylinder, Food, make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
-from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.cutting.motion import Pose
+from sliceit_drake.cutting.solver import CuttingSolver, SurfaceFactors
 from sliceit_drake.systems.cutting_system import CuttingSystem
 from sliceit_drake.systems.knife_force import AppliedForce, KnifeForceSystem
 
@@ -155,6 +156,27 @@ def test_two_contexts_of_one_diagram_do_not_disturb_each_other(diagram, alone):
         second.advance(1)
     same(first.result(), alone[0])
     same(second.result(), alone[1])
+
+
+def test_factors_of_one_call_do_not_reach_contexts_that_share_its_solver(diagram, solvers, alone):
+    start = start_pose(solvers[0].model, 1e-4)
+    R = solvers[0].model.X_FC_rotation.T
+    above = Pose(R @ start.R, solvers[0].model.to_cut_frame(start.p))
+    below = above._replace(p=above.p - [0.0, 0.0, 4e-4])
+    fresh = solvers[0].initial_state()
+
+    def edge(factors: SurfaceFactors) -> float:
+        return float(solvers[0].exchange(fresh, above, below, factors).edge[5])
+
+    run = Slice(diagram, *MOTIONS[0])
+    for _ in range(LENGTH):
+        run.advance(1)
+        tougher = edge(SurfaceFactors(toughness=3.0))
+    same(run.result(), alone[0])
+    assert tougher > 2.0 * edge(SurfaceFactors()) > 0.0
+    energies = [solvers[0].energies(run.result()[1], below) for _ in range(2)]
+    edge(SurfaceFactors(toughness=3.0))
+    assert solvers[0].energies(run.result()[1], below) == energies[0] == energies[1]
 
 
 def test_two_threads_do_not_disturb_each_other(diagram, alone):

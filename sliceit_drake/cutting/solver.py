@@ -2,6 +2,7 @@
 
 import dataclasses as dc
 import threading
+import typing
 
 import numpy as np
 
@@ -17,12 +18,23 @@ __all__ = [
     "Energies",
     "Exchange",
     "Exchanges",
+    "SurfaceFactors",
     "run_exchanges",
 ]
 
 
 class CuttingError(RuntimeError):
     """The cut became unphysical; the message names time, element and cause."""
+
+
+class SurfaceFactors(typing.NamedTuple):
+    """Factors on the model's toughness and friction at all cut points, for the time of one call.
+
+    For a caller whose food changes with time or speed. They are no part of the food's state.
+    """
+
+    toughness: float = 1.0
+    friction: float = 1.0
 
 
 @dc.dataclass
@@ -101,6 +113,8 @@ class Energies:
     least_element: int
 
 
+UNCHANGED = SurfaceFactors()
+
 LOSSES = ("edge_loss", "opening_loss", "friction_loss")
 """Energies dissipated at the cut points, in the order of `Exchanges.dissipation`."""
 
@@ -173,24 +187,24 @@ class CuttingSolver:
         self.dtype = self._workspace.dtype
         self._lock = threading.Lock()
         self._long: Workspace | None = None
+        # What the workspace holds, to write it only where it changes; each call says what it wants.
+        self._held_factors = UNCHANGED
 
     def initial_state(self) -> np.ndarray:
         """The food at rest, to be cut downwards [state_size]."""
         return self._workspace.initial_state()
 
-    def set_point_factors(self, toughness: float = 1.0, friction: float = 1.0) -> None:
-        """Multiplies toughness and friction of all cut points in every `exchange` from now on.
-
-        The factors stand beside the state and are not in it: for a caller who lets them go with
-        time or speed and gives them anew.
-        """
+    def _take_factors(self, factors: SurfaceFactors) -> None:
+        """Gives the workspace, which the caller has locked, the model's surface times `factors`."""
+        if factors == self._held_factors:
+            return
         ws, row = self._workspace, parameter_row(self.model)
-        row[ws.parameter_layout["toughness"]] *= toughness
-        row[ws.parameter_layout["friction_scale"]] *= friction
+        row[ws.parameter_layout["toughness"]] *= factors.toughness
+        row[ws.parameter_layout["friction_scale"]] *= factors.friction
         # A retreat of a tougher edge must not gain anything.
-        row[ws.parameter_layout["unloading"]] *= max(1.0, toughness)
-        with self._lock:
-            ws.write(ws.parameters, row[None])
+        row[ws.parameter_layout["unloading"]] *= max(1.0, factors.toughness)
+        ws.write(ws.parameters, row[None])
+        self._held_factors = factors
 
     def positions(self, state: np.ndarray) -> np.ndarray:
         """Positions of the computed nodes in C [N, 3], metres."""
@@ -213,13 +227,16 @@ class CuttingSolver:
         with self._lock:
             self._workspace.capture()
 
-    def exchange(self, state: np.ndarray, start: Pose, end: Pose) -> Exchange:
+    def exchange(
+        self, state: np.ndarray, start: Pose, end: Pose, factors: SurfaceFactors = UNCHANGED
+    ) -> Exchange:
         """Advances the food while the knife moves from `start` to `end`.
 
         Args:
             state: The food's state [state_size]; not changed.
             start: Knife pose in C at the beginning.
             end: Knife pose in C at the end.
+            factors: On toughness and friction in this exchange.
 
         Raises:
             CuttingError: A force is not finite, or the knife left the region that is modelled.
@@ -227,6 +244,7 @@ class CuttingSolver:
         m, ws = self.model, self._workspace
         R, p = np.array([[start.R, end.R]]), np.array([[start.p, end.p]])
         with self._lock:
+            self._take_factors(factors)
             ws.advance(state[None], R, p)
             new = ws.read(ws.states[0])[0].copy()
             results = ws.results()
@@ -266,6 +284,7 @@ class CuttingSolver:
             CuttingError: A force is not finite.
         """
         with self._lock:
+            self._take_factors(UNCHANGED)
             ws = self._workspace_for(len(p) - 1)
             result = run_exchanges(ws, state[None], R[None], p[None])
         if not np.isfinite(result[0].wrenches).all():
@@ -279,8 +298,9 @@ class CuttingSolver:
             self._long = Workspace([self.model], self.exchange_period, exchanges)
         return self._long
 
-    def _place(self, state: np.ndarray, pose: Pose) -> None:
+    def _place(self, state: np.ndarray, pose: Pose, factors: SurfaceFactors = UNCHANGED) -> None:
         """Puts food and knife, at rest at `pose`, into the workspace for launches with k = 0."""
+        self._take_factors(factors)
         self._workspace.write(self._workspace.states[0], state[None])
         self._place_knife(pose, np.zeros(3), np.zeros(3))
 
@@ -314,11 +334,13 @@ class CuttingSolver:
             bonds = ws.point_forces()
         return bonds - both
 
-    def energies(self, state: np.ndarray, pose: Pose) -> Energies:
-        """Energies of `state` with the knife at `pose`."""
+    def energies(
+        self, state: np.ndarray, pose: Pose, factors: SurfaceFactors = UNCHANGED
+    ) -> Energies:
+        """Energies of `state` with the knife at `pose`, after an exchange with `factors`."""
         ws, m = self._workspace, self.model
         with self._lock:
-            self._place(state, pose)
+            self._place(state, pose, factors)
             elastic, ratio, interface = ws.stored_energies()
         least = int(ratio.argmin())
         depth = np.maximum(m.board[3] - self.positions(state) @ m.board[:3], 0.0)

@@ -27,7 +27,7 @@ from sliceit_drake.cutting.simulate import (
     check_energies,
     check_in_plane,
 )
-from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.cutting.solver import CuttingSolver, SurfaceFactors
 from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceFacts, Tissue
 from sliceit_drake.stand_in.protocol import Protocol, Specimen, scaled_food, section_size
 from sliceit_drake.stand_in.world import GRAVITY, Path, resampled
@@ -254,7 +254,6 @@ class _Run:
         self.solver = None if model is None else CuttingSolver(model, path.period)
         self.state = np.zeros(0) if self.solver is None else self.solver.initial_state()
         self.fed = Pose(*_in_cut(geometry, path.R[0], path.p[0]))
-        self.factors = (1.0, 1.0)
         self.spent = self.since_check = 0.0
         self.cut = self.travel = self.swept = 0.0
         self.force = np.zeros(3)
@@ -309,18 +308,15 @@ class _Run:
         if self.solver is not None and lowest < self.top + CLEAR:
             assert self.model is not None
             check_in_plane(self.model, pose, now.time + now.period)
-            factors = (now.toughness, now.friction)
-            if factors != self.factors:
-                self.solver.set_point_factors(*factors)
-                self.factors = factors
-            step = self.solver.exchange(self.state, self.fed, pose)
+            factors = SurfaceFactors(now.toughness, now.friction)
+            step = self.solver.exchange(self.state, self.fed, pose, factors)
             self.state, self.cut = step.state, step.cut
             wrenches = np.array([step.edge, step.normal, step.friction])
             parts = (wrenches.reshape(3, 2, 3) @ self.R_FC.T).reshape(3, 6)
             self.spent += step.edge_dissipation + step.opening_dissipation
             self.spent += step.friction_dissipation
             moved = float(np.linalg.norm(pose.p - self.fed.p))
-            self._check(moved, pose, now.time + now.period)
+            self._check(moved, pose, factors, now.time + now.period)
             if pose.p[2] < self.top:
                 self.travel += moved
                 self.swept += 2.0 * moved * self.section.width(float(pose.p[2]))
@@ -332,12 +328,12 @@ class _Run:
             self.force += board_wrench(self.board, self.protocol.knife, path.R[b], p, v, w)[3:]
         return parts
 
-    def _check(self, moved: float, pose: Pose, time: float) -> None:
+    def _check(self, moved: float, pose: Pose, factors: SurfaceFactors, time: float) -> None:
         self.since_check += moved
         if self.since_check > CHECK_TRAVEL:
             assert self.solver is not None and self.model is not None
             self.since_check = 0.0
-            energies = self.solver.energies(self.state, pose)
+            energies = self.solver.energies(self.state, pose, factors)
             check_energies(energies, self.spent, self.model, time)
 
     def _sampled(
