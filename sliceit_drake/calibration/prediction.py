@@ -11,13 +11,14 @@ from sliceit_drake.calibration.record_target import EXCHANGE_PERIOD, KnifeMotion
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.batch import BatchSimulator, BatchSlice
+from sliceit_drake.cutting.board import board_wrenches
 from sliceit_drake.cutting.foods.distribution import from_unit, to_unit
 from sliceit_drake.cutting.foods.food import make_food_model
 from sliceit_drake.cutting.gradient import SliceAdjoint
 from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.knife_path import KnifePath
 from sliceit_drake.cutting.model import CuttingModel, TimeStepError
 from sliceit_drake.cutting.parameters import get_parameter, pull_back, with_parameters
-from sliceit_drake.cutting.simulate import KnifePath, board_wrenches
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.prediction.placement import food_of, knife_of
 from sliceit_drake.records.slice_record import SliceRecord

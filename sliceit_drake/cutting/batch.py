@@ -8,9 +8,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from sliceit_drake.cutting.board import Board
+from sliceit_drake.cutting.board import Board, board_wrenches
+from sliceit_drake.cutting.knife_path import KnifePath, PosedMotion
 from sliceit_drake.cutting.model import CuttingModel
-from sliceit_drake.cutting.simulate import KnifePath, PosedMotion, board_wrenches
 from sliceit_drake.cutting.solver import NOT_FINITE, Exchanges, run_exchanges
 from sliceit_drake.cutting.workspace import Workspace
 

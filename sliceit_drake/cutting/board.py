@@ -12,6 +12,7 @@ __all__ = [
     "EDGE_CONTACTS",
     "Board",
     "board_wrench",
+    "board_wrenches",
     "edge_contact_positions",
     "impact_peak_loss",
 ]
@@ -96,3 +97,25 @@ def board_wrench(
         * np.maximum(0.0, 1.0 + board.dissipation * speed)
     )
     return np.concatenate([np.cross(arm, force).sum(0), force.sum(0)])
+
+
+def board_wrenches(
+    board: Board, knife: Knife, R: np.ndarray, p: np.ndarray, period: float
+) -> np.ndarray:
+    """Wrench of the board on the knife at the end of each exchange [E, 6], in F.
+
+    Args:
+        board: Its height in F.
+        knife: The knife.
+        R: Rotations of the knife in F at the ends of the exchanges [E + 1, 3, 3].
+        p: Positions of Ko in F there [E + 1, 3], metres.
+        period: Of an exchange, s.
+    """
+    wrenches = np.zeros((len(p) - 1, 6))
+    reach = 0.5 * knife.length * np.abs(R[1:, 2, 0])
+    for k in np.flatnonzero(p[1:, 2] - reach < board.height):
+        v = (p[k + 1] - p[k]) / period
+        dR = R[k + 1] @ R[k].T
+        turn = np.array([dR[2, 1] - dR[1, 2], dR[0, 2] - dR[2, 0], dR[1, 0] - dR[0, 1]])
+        wrenches[k] = board_wrench(board, knife, R[k + 1], p[k + 1], v, turn * (0.5 / period))
+    return wrenches

@@ -8,11 +8,10 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.board import Board
+from sliceit_drake.cutting.board import Board, board_wrenches
 from sliceit_drake.cutting.foods.food import make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import GRAVITY, CuttingModel, Numerics
-from sliceit_drake.cutting.simulate import board_wrenches
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.prediction.clock import Clock, Stretches
 from sliceit_drake.prediction.placement import food_of, is_bare, knife_of, poses_in_food

@@ -13,9 +13,9 @@ import numpy as np
 
 import sliceit_drake.cutting
 from sliceit_drake.cutting.board import Board
+from sliceit_drake.cutting.knife_path import KnifePath
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
-from sliceit_drake.cutting.simulate import KnifePath
 from sliceit_drake.cutting.solver import NOT_FINITE, run_exchanges
 from sliceit_drake.cutting.workspace import Workspace, parameter_row
 from sliceit_drake.prediction import cluster

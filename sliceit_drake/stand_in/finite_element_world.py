@@ -15,14 +15,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from sliceit_drake.configuration import quantity
-from sliceit_drake.cutting.board import board_wrench
+from sliceit_drake.cutting.board import board_wrench, board_wrenches
 from sliceit_drake.cutting.foods.food import Box, Cylinder, Food, start_pose
 from sliceit_drake.cutting.mesh.cut_surface import depth_below, distance_inside
 from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh
 from sliceit_drake.cutting.model import CuttingModel, Numerics, PointScales, make_cutting_model
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.simulate import (
-    board_wrenches,
     check_clear,
     check_energies,
     check_in_plane,

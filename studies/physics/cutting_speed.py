@@ -25,7 +25,8 @@ from sliceit_drake.cutting.gradient import SliceAdjoint
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.parameters import with_parameters
-from sliceit_drake.cutting.simulate import KnifePath, SliceResult, simulate_slice
+from sliceit_drake.cutting.knife_path import KnifePath
+from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.resources import resource_path
