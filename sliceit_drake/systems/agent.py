@@ -31,6 +31,7 @@ from pydrake.multibody.math import SpatialForce
 from pydrake.systems.framework import (
     BasicVector,
     Context,
+    DiscreteStateIndex,
     DiscreteValues,
     LeafSystem,
     ValueProducer,
@@ -58,11 +59,6 @@ NEAR = 2e-3
 
 ENVELOPE_SPEED = 0.05
 """Of the way through all places where the knife may go, m/s."""
-
-# Parts of the decisions' state.
-_ERRORS, _ACTION, _OFFSET, _TARGET = slice(0, 9), slice(9, 15), slice(15, 17), slice(17, 19)
-_STIFFNESS, _GAINS, _SCALE = slice(19, 25), slice(25, 31), 31
-_COUNT, _LIFT, _SIZE = 32, 33, 34
 
 
 @dc.dataclass
@@ -241,17 +237,24 @@ class AgentSystem(LeafSystem):
         self._action_in = None
         if decide is None:
             self._action_in = self.DeclareVectorInputPort("action", len(ACTIONS))
-        state = np.zeros(_SIZE)
-        state[_ERRORS] = np.tile([0.0, config.descent, 0.0], 3)
-        state[_STIFFNESS], state[_GAINS] = np.array(stiffness, float), np.array(p_gains, float)
-        state[_SCALE], state[_LIFT] = config.error_scale[0], -1.0
-        self._state = self.DeclareDiscreteState(state)
+        # Errors at the last three decisions, the newest first; the action, and the offset of the
+        # target from the final pose that all actions have added up to; the target's place.
+        self._errors = self.DeclareDiscreteState(np.tile([0.0, config.descent, 0.0], 3))
+        self._action = self.DeclareDiscreteState(len(ACTIONS))
+        self._offset = self.DeclareDiscreteState(2)
+        self._place = self.DeclareDiscreteState(2)
+        self._stiffness = self.DeclareDiscreteState(np.array(stiffness, float))
+        self._p_gains = self.DeclareDiscreteState(np.array(p_gains, float))
+        self._error_scale = self.DeclareDiscreteState([config.error_scale[0]])
+        self._at_goal = self.DeclareDiscreteState(1)
+        # When the slice ended and the target began to rise; negative before.
+        self._lift_time = self.DeclareDiscreteState([-1.0])
         # The oldest of the readings is dropped when the newest is taken, so one fewer is kept.
         self._readings = self.DeclareDiscreteState(np.zeros(3 * (config.history - 1)))
         self.DeclareInitializationDiscreteUpdateEvent(self._begin)
         self.DeclarePeriodicDiscreteUpdateEvent(config.period, 0.0, self._decide)
         self.DeclarePeriodicDiscreteUpdateEvent(config.reading_period, 0.0, self._read)
-        held = {self.discrete_state_ticket(self._state)}
+        held = {self.discrete_state_ticket(each) for each in (self._place, self._lift_time)}
         moving = held | {self.time_ticket()}
         # Until the knife is lifted the target moves at decisions alone, but is read far more often.
         self._waiting = self.DeclareCacheEntry(
@@ -266,19 +269,14 @@ class AgentSystem(LeafSystem):
             "target_pose", lambda: Value(RigidTransform()), self._calc_target_pose, moving
         )
         self.DeclareVectorOutputPort("target_offset", 2, self._calc_offset, moving)
-        for name, part in (
-            ("stiffness", _STIFFNESS),
-            ("p_gains", _GAINS),
-            ("error_scale", slice(_SCALE, _SCALE + 1)),
-            ("at_goal", slice(_COUNT, _COUNT + 1)),
+        for name, state in (
+            ("stiffness", self._stiffness),
+            ("p_gains", self._p_gains),
+            ("error_scale", self._error_scale),
+            ("at_goal", self._at_goal),
         ):
-            size = part.stop - part.start
-            self.DeclareVectorOutputPort(name, size, self._copier(part), held)
-        seen = held | {
-            self.discrete_state_ticket(self._readings),
-            self._wrench_in.ticket(),
-            self._pose_in.ticket(),
-        }
+            self.DeclareStateOutputPort(name, state)
+        seen = {self.xd_ticket(), self._wrench_in.ticket(), self._pose_in.ticket()}
         for name, size, calc in (
             ("observation", config.observation_size(), self.observe),
             ("error", 3, self._error),
@@ -289,26 +287,30 @@ class AgentSystem(LeafSystem):
     def observe(self, context: Context) -> np.ndarray:
         """The observation in this context, float64."""
         config, T = self._config, self._config.period
-        x = context.get_discrete_state(self._state).value()
-        e = np.vstack([self._error(context), x[_ERRORS].reshape(3, 3)])
+        e = np.vstack([self._error(context), self._value(context, self._errors).reshape(3, 3)])
         velocity = (e[1] - e[0]) / T
         jerk = -(e[0] - 3.0 * e[1] + 3.0 * e[2] - e[3]) / T**3
         reach = np.maximum([config.draw, config.overtravel], 1e-9)
+        at_goal = self._value(context, self._at_goal)[0] / max(config.goal_decisions, 1)
         return np.concatenate(
             [
                 e[0] / ERROR,
                 velocity / VELOCITY,
                 jerk / JERK,
-                x[_ACTION],
-                x[_OFFSET] / reach,
-                [np.clip(e[0, 1] / NEAR, -1.0, 1.0), x[_COUNT] / max(config.goal_decisions, 1)],
+                self._value(context, self._action),
+                self._value(context, self._offset) / reach,
+                [np.clip(e[0, 1] / NEAR, -1.0, 1.0), at_goal],
                 (self._history(context) / WRENCH).ravel(),
             ]
         )
 
     def is_done(self, context: Context) -> bool:
         """Whether the goal has been reached and the knife is lifted."""
-        return bool(context.get_discrete_state(self._state).value()[_LIFT] >= 0.0)
+        return bool(self._value(context, self._lift_time)[0] >= 0.0)
+
+    @staticmethod
+    def _value(context: Context, state: DiscreteStateIndex) -> np.ndarray:
+        return context.get_discrete_state(state).value()
 
     def _error(self, context: Context) -> np.ndarray:
         X = (self._X_KW @ self._pose_in.Eval(context)).GetAsMatrix34()
@@ -319,34 +321,32 @@ class AgentSystem(LeafSystem):
         return self._of_wrench @ self._wrench_in.Eval(context).get_coeffs()
 
     def _history(self, context: Context) -> np.ndarray:
-        before = context.get_discrete_state(self._readings).value().reshape(-1, 3)
+        before = self._value(context, self._readings).reshape(-1, 3)
         return np.vstack([before, self._reading(context)])
 
     def _begin(self, context: Context, discrete_state: DiscreteValues) -> None:
         # Wherever the knife is, it rests there: no velocity or jerk comes of the way from X_WK.
-        x = context.get_discrete_state(self._state).value().copy()
-        x[_ERRORS] = np.tile(self._error(context), 3)
-        discrete_state.set_value(self._state, x)
+        discrete_state.set_value(self._errors, np.tile(self._error(context), 3))
 
     def _read(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._readings, self._history(context)[1:].ravel())
 
     def _decide(self, context: Context, discrete_state: DiscreteValues) -> None:
-        x, config = context.get_discrete_state(self._state).value().copy(), self._config
-        error, time = self._error(context), context.get_time()
-        if x[_LIFT] < 0.0:
-            self._act(context, x, error)
-            near = error[1] <= config.goal[1] and bool(
+        config, error = self._config, self._error(context)
+        if not self.is_done(context):
+            self._act(context, discrete_state, error)
+            is_near = error[1] <= config.goal[1] and bool(
                 (np.abs(error[[0, 2]]) <= np.array(config.goal)[[0, 2]]).all()
             )
-            x[_COUNT] = x[_COUNT] + 1 if near else 0
-            if x[_COUNT] > config.goal_decisions:
-                x[_LIFT] = time
-                x[_TARGET] = [-error[0], config.descent - error[1]]
-        x[_ERRORS] = np.concatenate([error, x[_ERRORS][:6]])
-        discrete_state.set_value(self._state, x)
+            count = self._value(context, self._at_goal)[0] + 1 if is_near else 0
+            discrete_state.set_value(self._at_goal, [count])
+            if count > config.goal_decisions:
+                discrete_state.set_value(self._lift_time, [context.get_time()])
+                discrete_state.set_value(self._place, [-error[0], config.descent - error[1]])
+        before = self._value(context, self._errors)
+        discrete_state.set_value(self._errors, np.concatenate([error, before[:6]]))
 
-    def _act(self, context: Context, x: np.ndarray, error: np.ndarray) -> None:
+    def _act(self, context: Context, discrete_state: DiscreteValues, error: np.ndarray) -> None:
         config = self._config
         if self._decide_action is not None:
             with self.watch():
@@ -363,32 +363,45 @@ class AgentSystem(LeafSystem):
         share = 0.5 * (action[:4] + 1.0) if config.mapping == "whole" else np.maximum(action[:4], 0)
         ranges = np.array([config.stiffness_x, config.stiffness_ry, config.p_z, config.p_ry])
         chosen = ranges[:, 0] + share * (ranges[:, 1] - ranges[:, 0])
-        x[_STIFFNESS][[0, 4]], x[_GAINS][[2, 4]] = chosen[:2], chosen[2:]
+        stiffness, p_gains = (
+            self._value(context, state).copy() for state in (self._stiffness, self._p_gains)
+        )
+        stiffness[[0, 4]], p_gains[[2, 4]] = chosen[:2], chosen[2:]
         far, near = config.error_scale
         distance = math.hypot(error[0], error[1])
-        x[_SCALE] = far + (near - far) * (1.0 - math.tanh(100.0 * distance))
-        moved = x[_OFFSET] + action[4:] * [config.draw_increment, config.press_increment]
-        x[_OFFSET] = np.clip(moved, [-config.draw, 0.0], [config.draw, config.overtravel])
-        x[_ACTION] = action
+        scale = far + (near - far) * (1.0 - math.tanh(100.0 * distance))
+        moved = self._value(context, self._offset) + action[4:] * [
+            config.draw_increment,
+            config.press_increment,
+        ]
+        offset = np.clip(moved, [-config.draw, 0.0], [config.draw, config.overtravel])
         place = np.array([-error[0], config.descent - error[1]])
-        final = x[_OFFSET] + [0.0, config.descent]
-        x[_TARGET] = place + config.lead * (final - place)
+        final = offset + [0.0, config.descent]
+        for state, value in (
+            (self._action, action),
+            (self._offset, offset),
+            (self._place, place + config.lead * (final - place)),
+            (self._stiffness, stiffness),
+            (self._p_gains, p_gains),
+            (self._error_scale, [scale]),
+        ):
+            discrete_state.set_value(state, value)
 
     def _target(self, context: Context) -> np.ndarray:
-        """Of the target from the start along Kx and Kz [2], m."""
-        x = context.get_discrete_state(self._state).value()
-        if x[_LIFT] < 0.0:
-            return x[_TARGET]
-        risen = self._config.lift_speed * (context.get_time() - x[_LIFT])
-        return np.array([x[_TARGET][0], max(x[_TARGET][1] - risen, 0.0)])
+        """The target's place from the start, along Kx and Kz [2], m."""
+        place = self._value(context, self._place)
+        if not self.is_done(context):
+            return place
+        lift_time = self._value(context, self._lift_time)[0]
+        risen = self._config.lift_speed * (context.get_time() - lift_time)
+        return np.array([place[0], max(place[1] - risen, 0.0)])
 
     def _target_pose(self, context: Context) -> RigidTransform:
         x, z = self._target(context)
         return self._X_WK @ RigidTransform([x, 0.0, z])
 
     def _target_until_lift(self, context: Context) -> RigidTransform | None:
-        lifted = context.get_discrete_state(self._state).value()[_LIFT] >= 0.0
-        return None if lifted else self._target_pose(context)
+        return None if self.is_done(context) else self._target_pose(context)
 
     def _calc_target_pose(self, context: Context, output: AbstractValue) -> None:
         waiting = self._waiting.Eval(context)
@@ -396,12 +409,6 @@ class AgentSystem(LeafSystem):
 
     def _calc_offset(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._target(context))
-
-    def _copier(self, part: slice) -> Callable[[Context, BasicVector], None]:
-        def calc(context: Context, output: BasicVector) -> None:
-            output.SetFromVector(context.get_discrete_state(self._state).value()[part])
-
-        return calc
 
     @staticmethod
     def _setter(
