@@ -185,7 +185,7 @@ def test_a_buffer_goes_on_from_its_state_as_if_nothing_had_happened():
     torch.save(buffer.state(), file)
     file.seek(0)
     other = buffer_of(8, 2)
-    other.set_state(torch.load(file, weights_only=False))
+    other.set_state(torch.load(file, weights_only=True))
     for each in (buffer, other):
         add(each, 20)
     for _ in range(3):
@@ -421,7 +421,7 @@ def test_a_training_whose_environment_dies_says_so_and_goes_on(tmp_path):
 
     with pytest.raises(RuntimeError, match="environment ended.*last checkpoint"):
         train(config, tmp_path, kill)
-    before = torch.load(tmp_path / training.CHECKPOINT, weights_only=False)
+    before = torch.load(tmp_path / training.CHECKPOINT, weights_only=True)
     assert before["watch"]["steps"] == 16 and before["watch"]["episodes"] == 0
     assert train(config, tmp_path).steps == 40
     straight = tmp_path / "straight"

@@ -59,7 +59,7 @@ class SlicingEnv(gymnasium.Env):
         self.progress = progress
 
     def moment(self) -> dict[str, Any]:
-        """Where the episode is, for `return_to`: how it began, and the actions since.
+        """Where the episode is, for `return_to`, as plain data: how it began, the actions since.
 
         Raises:
             RuntimeError: The environment was not reset.
@@ -127,7 +127,7 @@ class SlicingEnv(gymnasium.Env):
         station, simulator = self._current
         context = simulator.get_mutable_context()
         station.GetInputPort("action").FixValue(context, action)
-        self._moment["actions"].append(action.copy())
+        self._moment["actions"].append(action.tolist())
         self._decisions += 1
         config, end, guard, message = self.task.reward, "", "", ""
         try:

@@ -10,6 +10,9 @@ from torchrl.data.replay_buffers.samplers import PrioritizedSampler
 
 __all__ = ["PrioritizedReplayBuffer", "PrioritizedSamples"]
 
+TREES = ("_sum_tree", "_min_tree")
+"""Trees of priorities in a sampler's state."""
+
 
 class PrioritizedSamples(NamedTuple):
     """A batch.
@@ -67,6 +70,7 @@ class PrioritizedReplayBuffer(ReplayBuffer):
         self._filled = _Filled()
         self._sampler = PrioritizedSampler(self.buffer_size, alpha=alpha, beta=beta, eps=floor)
         self._generator = torch.Generator().manual_seed(0)
+        # torchrl's own buffers hand their generator to a sampler so; it has no other way.
         self._sampler._rng = self._generator
 
     def seed(self, seed: int) -> None:
@@ -122,26 +126,31 @@ class PrioritizedReplayBuffer(ReplayBuffer):
         )
 
     def state(self) -> dict[str, Any]:
-        """All that is needed to go on as if nothing had happened."""
+        """All that is needed to go on as if nothing had happened: tensors and plain values."""
         size = self._filled.size
         names = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-        arrays = {name: getattr(self, name)[:size].copy() for name in names if hasattr(self, name)}
+        sampler = self._sampler.state_dict()
+        for tree in TREES:
+            sampler[tree] = torch.as_tensor(sampler[tree][torch.arange(size)])
         return {
-            "arrays": arrays,
+            "arrays": {name: torch.tensor(getattr(self, name)[:size]) for name in names},
             "size": size,
             "pos": self.pos,
             "full": self.full,
-            "beta": self.beta,
-            "sampler": self._sampler.state_dict(),
+            "sampler": sampler,
             "generator": self._generator.get_state(),
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Takes what `state` gave."""
+        size = self._filled.size = state["size"]
         for name, values in state["arrays"].items():
-            getattr(self, name)[: state["size"]] = values
+            getattr(self, name)[:size] = values.numpy()
         self.pos, self.full = state["pos"], state["full"]
-        self._filled.size = state["size"]
-        self._sampler.load_state_dict(state["sampler"])
-        self.set_beta(state["beta"])
+        # The inner nodes of a tree follow from its leaves.
+        empty = PrioritizedSampler(self.buffer_size, alpha=1.0, beta=1.0).state_dict()
+        for tree in TREES:
+            empty[tree][torch.arange(size)] = state["sampler"][tree]
+        trees = {tree: empty[tree] for tree in TREES}
+        self._sampler.load_state_dict(state["sampler"] | trees)
         self._generator.set_state(state["generator"])

@@ -2,11 +2,11 @@
 
 Haarnoja et al., "Soft Actor-Critic Algorithms and Applications" (2018); the update is that of
 Stable-Baselines3, with importance weights in the critics' loss, for which it has no hook, and less
-work for the same numbers: critics frozen in the actor's step, densities written out, fused Adam.
+work for the same numbers: critics frozen in the actor's step, densities written out.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,23 +24,33 @@ TRACE = 0.01
 
 
 class OverlapVecEnv(VecEnvWrapper):
-    """Lets something be done while the environments' processes simulate.
+    """Environments whose processes simulate while this one learns.
 
     The newest transitions are one step late. Nothing depends on which of the two is the faster.
 
     Args:
-        venv: With processes of its own.
+        venv: Environments in processes of their own.
+        moments: Moments of `SlicingEnv` at which the first reset begins, one for each environment;
+            None to begin slices.
 
     Attributes:
         meanwhile: Called in every step after the actions have been sent.
     """
 
-    def __init__(self, venv: VecEnv) -> None:
+    def __init__(self, venv: VecEnv, moments: Sequence[dict[str, Any]] | None = None) -> None:
         super().__init__(venv)
         self.meanwhile: Callable[[], None] | None = None
+        self._moments = moments
 
     def reset(self) -> Any:
-        return self.venv.reset()
+        observations = self.venv.reset()
+        if self._moments is None:
+            return observations
+        moments, self._moments = self._moments, None
+        returned = [
+            self.env_method("return_to", moment, indices=k) for k, moment in enumerate(moments)
+        ]
+        return np.concatenate(returned)
 
     def step_wait(self) -> Any:
         if self.meanwhile is not None:
@@ -52,7 +62,9 @@ class PrioritizedSAC(SAC):
     """SAC whose replay buffer is a `PrioritizedReplayBuffer`.
 
     Args:
-        beta_end: Power of the importance weights at the end of the training; it grows linearly.
+        beta_end: Power of the importance weights after `beta_steps`; it grows linearly from that
+            of the replay buffer.
+        beta_steps: Steps in which it grows; None to leave it as it is.
         value_limit: From observations [batch, n] to the most that can still be got from there
             [batch, 1]; None for no limit. Where an episode can linger, an overestimated value feeds
             on itself, and fades only with the discount.
@@ -64,19 +76,14 @@ class PrioritizedSAC(SAC):
         self,
         *arguments: Any,
         beta_end: float = 1.0,
+        beta_steps: int | None = None,
         value_limit: Callable[[torch.Tensor], torch.Tensor] | None = None,
         **options: Any,
     ) -> None:
-        self.beta_end, self.value_limit = beta_end, value_limit
+        self.beta_end, self.beta_steps, self.value_limit = beta_end, beta_steps, value_limit
         self.running: dict[str, float] = {}
         super().__init__(*arguments, replay_buffer_class=PrioritizedReplayBuffer, **options)
-
-    def _setup_model(self) -> None:
-        super()._setup_model()
-        self._beta_begin = self.replay_buffer.beta
-        for module in (self.actor, self.critic):
-            learning_rate = module.optimizer.param_groups[0]["lr"]
-            module.optimizer = torch.optim.Adam(module.parameters(), lr=learning_rate, fused=True)
+        self.beta_begin = self.replay_buffer.beta
 
     def update(self) -> None:
         """As many updates as there are environments, once the warm-up is over."""
@@ -84,13 +91,12 @@ class PrioritizedSAC(SAC):
             self.train(self.n_envs, self.batch_size)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        done = 1.0 - self._current_progress_remaining
-        self.replay_buffer.set_beta(self._beta_begin + done * (self.beta_end - self._beta_begin))
+        if self.beta_steps is not None:
+            done = min(self.num_timesteps / self.beta_steps, 1.0)
+            self.replay_buffer.set_beta(self.beta_begin + done * (self.beta_end - self.beta_begin))
         self.policy.set_training_mode(True)
         for _ in range(gradient_steps):
             self._train_batch(batch_size)
-        self._n_updates += gradient_steps
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name, value in self.running.items():
             self.logger.record(f"train/{name}", value)
 
@@ -165,34 +171,29 @@ class PrioritizedSAC(SAC):
             self.running[name] = before + TRACE * (value - before)
 
     def training_state(self) -> dict[str, Any]:
-        """All that is needed to go on as if nothing had happened, but for the environments."""
+        """All that is needed to go on as if nothing had happened, but for the environments.
+
+        It holds tensors and plain values only, for `torch.load(..., weights_only=True)`.
+        """
+        name, keys, *rest = np.random.get_state()
         return {
-            "policy": self.policy.state_dict(),
-            "actor_optimizer": self.actor.optimizer.state_dict(),
-            "critic_optimizer": self.critic.optimizer.state_dict(),
+            "parameters": self.get_parameters(),
             "log_ent_coef": None if self.ent_coef_optimizer is None else self.log_ent_coef.detach(),
-            "ent_coef_optimizer": (
-                None if self.ent_coef_optimizer is None else self.ent_coef_optimizer.state_dict()
-            ),
             "replay": self.replay_buffer.state(),
-            "counts": (self.num_timesteps, self._n_updates, self._episode_num),
+            "num_timesteps": self.num_timesteps,
             "running": dict(self.running),
             "torch": torch.get_rng_state(),
-            "numpy": np.random.get_state(),
+            "numpy": (name, keys.tolist(), *rest),
             "actions": self.action_space.np_random.bit_generator.state,
         }
 
     def set_training_state(self, state: dict[str, Any]) -> None:
         """Takes what `training_state` gave."""
-        self.policy.load_state_dict(state["policy"])
-        self.actor.optimizer.load_state_dict(state["actor_optimizer"])
-        self.critic.optimizer.load_state_dict(state["critic_optimizer"])
-        if self.ent_coef_optimizer is not None:
+        self.set_parameters(state["parameters"])
+        if state["log_ent_coef"] is not None:
             self.log_ent_coef.data.copy_(state["log_ent_coef"])
-            self.ent_coef_optimizer.load_state_dict(state["ent_coef_optimizer"])
         self.replay_buffer.set_state(state["replay"])
-        self.num_timesteps, self._n_updates, self._episode_num = state["counts"]
-        self.running = dict(state["running"])
+        self.num_timesteps, self.running = state["num_timesteps"], dict(state["running"])
         torch.set_rng_state(state["torch"])
         np.random.set_state(state["numpy"])
         self.action_space.np_random.bit_generator.state = state["actions"]

@@ -8,6 +8,7 @@ import json
 import math
 import multiprocessing
 import os
+import pickle
 import time as clock
 from collections import Counter, deque
 from collections.abc import Callable
@@ -178,25 +179,16 @@ def train(
     with deaf_children():
         make = functools.partial(_environment, config.task)
         processes = SubprocVecEnv([make] * config.environments, "forkserver")
-    environments = OverlapVecEnv(processes)
+    environments = OverlapVecEnv(processes, None if saved is None else saved["environments"])
     try:
         model = make_model(config, environments)
         model.set_logger(configure(str(output), ["tensorboard"]))
         environments.meanwhile = model.update
         callback = _Watch(config, output, described, progress, stop_after, is_stopped)
         if saved is not None:
-            environments.reset()
             model.set_training_state(saved["model"])
-            model._last_obs = np.concatenate(
-                [
-                    environments.env_method("return_to", moment, indices=k)
-                    for k, moment in enumerate(saved["environments"])
-                ]
-            )
-            done = model.num_timesteps / config.steps
-            model._current_progress_remaining = 1.0 - done
             if config.task.reward.schedule != "constant":
-                environments.env_method("set_progress", done)
+                environments.env_method("set_progress", model.num_timesteps / config.steps)
             callback.restore(saved["watch"])
             _cut_log(output / EPISODES, callback.episodes)
         else:
@@ -240,11 +232,13 @@ def make_model(config: TrainingConfig, environments: OverlapVecEnv) -> Prioritiz
         gamma=config.task.reward.discount,
         ent_coef=f"auto_{config.entropy:.9g}",
         value_limit=value_limit(config.task.reward),
+        beta_steps=config.steps,
         train_freq=1,
         # Updates are made while the environments simulate.
         gradient_steps=0,
         replay_buffer_kwargs={"alpha": config.priority},
         policy_kwargs={
+            "optimizer_kwargs": {"fused": True},
             "net_arch": list(config.layers),
             "features_extractor_class": HistoryExtractor,
             "features_extractor_kwargs": {
@@ -284,7 +278,15 @@ def _environment(task: TaskConfig) -> SlicingEnv:
 def _load(file: Path, described: str) -> dict[str, Any] | None:
     if not file.exists():
         return None
-    saved = torch.load(file, weights_only=False)
+    try:
+        saved = torch.load(file, weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError) as error:
+        raise ConfigurationError(
+            f"is no checkpoint of this version ({str(error).splitlines()[0]})",
+            field="output",
+            source=str(file),
+            fix="Give another folder, or delete it.",
+        ) from error
     if saved["config"] != described:
         raise ConfigurationError(
             "is of a training with other settings",
