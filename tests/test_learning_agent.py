@@ -8,7 +8,7 @@ import multiprocessing
 import numpy as np
 import pytest
 
-NEEDS = "of the extra [learn], which CI does not install"
+NEEDS = "of the extra [learn]"
 torch = pytest.importorskip("torch", reason=f"torch is {NEEDS}")
 pytest.importorskip("stable_baselines3", reason=f"Stable-Baselines3 is {NEEDS}")
 pytest.importorskip("torchrl", reason=f"torchrl is {NEEDS}")
@@ -32,6 +32,9 @@ from sliceit_drake.learning.training import TrainingConfig, train  # noqa: E402
 from sliceit_drake.systems.agent import AgentConfig, observation_names  # noqa: E402
 from sliceit_drake.systems.network import load_network  # noqa: E402
 
+# torch comes with the second tier.
+pytestmark = pytest.mark.second_tier
+
 AGENT = AgentConfig(history=3)
 SIZE = AGENT.observation_size()
 OBSERVATIONS = gymnasium.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
@@ -41,6 +44,15 @@ POLICY = {
     "features_extractor_class": HistoryExtractor,
     "features_extractor_kwargs": {"history": 3, "features": 8},
 }
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """As in a training: beside busy processes, threads on small networks wait for each other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 # --- The temporal convolution.

@@ -23,7 +23,7 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 LEARN = ("torch", "stable_baselines3", "torchrl")
 needs_learn = pytest.mark.skipif(
     not all(importlib.util.find_spec(name) for name in LEARN),
-    reason=f"{', '.join(LEARN)} are of the extra [learn], which CI does not install",
+    reason=f"{', '.join(LEARN)} are of the extra [learn]",
 )
 
 
