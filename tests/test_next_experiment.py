@@ -11,7 +11,7 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
 from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.cutting.foods.food import Cylinder
-from sliceit_drake.diagnosis.diagnose import Diagnosis, setup_of_food
+from sliceit_drake.diagnosis.diagnose import setup_of_food
 from sliceit_drake.diagnosis.evidence.columns import Sensitivities
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
@@ -27,6 +27,7 @@ from sliceit_drake.diagnosis.experiments.scenario_of_experiment import (
     scenario_of,
 )
 from sliceit_drake.diagnosis.registry import open_causes
+from sliceit_drake.diagnosis.result import Diagnosis
 from sliceit_drake.diagrams.run import prepare_run, simulate
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.records.slice_record import SliceRecord

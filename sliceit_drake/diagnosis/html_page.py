@@ -3,8 +3,10 @@
 import base64
 import io
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-from matplotlib.figure import Figure
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["html_page", "image"]
 
@@ -26,7 +28,7 @@ def html_page(title: str, parts: Sequence[str]) -> str:
     return "\n".join([*head, *parts, "</html>", ""])
 
 
-def image(figure: Figure) -> str:
+def image(figure: "Figure") -> str:
     """A figure as an element of a page."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=110)

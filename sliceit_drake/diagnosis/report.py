@@ -1,16 +1,19 @@
-"""The report of a diagnosis: one HTML file with its figures in it."""
+"""Figures of a diagnosis, and its report as one HTML page. They take the diagnosis's parts, so that
+the result can call them."""
 
 import html
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from sliceit_drake.diagnosis.evidence.held_out import fitted_changes
+from sliceit_drake.diagnosis.evidence.held_out import HeldOutGain, fitted_changes
+from sliceit_drake.diagnosis.evidence.linear import LinearProblem
+from sliceit_drake.diagnosis.evidence.screen import Screening
+from sliceit_drake.diagnosis.evidence.verdict import Verdict
 from sliceit_drake.diagnosis.html_page import html_page, image
 
 if TYPE_CHECKING:
-    from sliceit_drake.diagnosis.diagnose import Diagnosis
+    from matplotlib.figure import Figure
 
 __all__ = ["evidence_figure", "records_figure", "report_html"]
 
@@ -20,16 +23,17 @@ CALM = 0.3
 """Jump of the prediction, N, near which what is left does not set the scale of a plot."""
 
 
-def records_figure(diagnosis: "Diagnosis") -> Figure:
+def records_figure(problem: LinearProblem, verdict: Verdict) -> "Figure":
     """One record of each condition: vertical force measured and predicted, and what is left."""
-    problem = diagnosis.problem
+    from matplotlib.figure import Figure
+
     found = problem.found
     picked = [members[0] for members in problem.conditions.values()][:SHOWN]
     channels = found.records[0].channels
     channel = channels.index("force_z") if "force_z" in channels else 0
     figure = Figure(figsize=(11.0, 2.6 * len(picked)), layout="constrained")
     axes = figure.subplots(len(picked), 2, squeeze=False)
-    named = [(f.evidence.name, f.evidence.scan) for f in diagnosis.verdict.findings]
+    named = [(f.evidence.name, f.evidence.scan) for f in verdict.findings]
     changes = fitted_changes(problem, named)
     for (left, right), r in zip(axes, picked, strict=True):
         record = found.records[r]
@@ -57,9 +61,10 @@ def records_figure(diagnosis: "Diagnosis") -> Figure:
     return figure
 
 
-def evidence_figure(diagnosis: "Diagnosis") -> Figure:
+def evidence_figure(screening: Screening) -> "Figure":
     """Gain of each cause against chance, and angles between causes."""
-    screening = diagnosis.verdict.screening
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(11.0, 4.6), layout="constrained")
     bars, matrix = figure.subplots(1, 2)
     causes = screening.causes[::-1]
@@ -79,23 +84,29 @@ def evidence_figure(diagnosis: "Diagnosis") -> Figure:
     return figure
 
 
-def report_html(diagnosis: "Diagnosis") -> str:
-    """The report as one self-contained page."""
-    problem = diagnosis.problem
+def report_html(
+    table: str, problem: LinearProblem, verdict: Verdict, gain: HeldOutGain | None
+) -> str:
+    """The report as one self-contained page.
+
+    Args:
+        table: The result as text.
+        problem: The records' moments.
+        verdict: The decision and the evidence.
+        gain: Error on records that were left out; None if nothing is named.
+    """
     rows = []
-    if diagnosis.gain is not None:
-        for record, (before, after) in zip(
-            problem.found.records, diagnosis.gain.by_record, strict=True
-        ):
+    if gain is not None:
+        for record, (before, after) in zip(problem.found.records, gain.by_record, strict=True):
             rows.append(f"{record.name:20}{record.condition:20}{before:10.3f}{after:10.3f}")
     held_out = "\n".join([f"{'record':20}{'condition':20}{'before N':>10}{'after N':>10}", *rows])
     parts = [
         "<h1>What the simulation gets wrong</h1>",
-        f"<pre>{html.escape(diagnosis.table())}</pre>",
+        f"<pre>{html.escape(table)}</pre>",
         "<h2>Measured and simulated</h2>",
-        image(diagnosis.plot()),
+        image(records_figure(problem, verdict)),
         "<h2>Evidence</h2>",
-        image(diagnosis.plot_evidence()),
+        image(evidence_figure(verdict.screening)),
     ]
     if rows:
         parts += [

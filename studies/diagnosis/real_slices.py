@@ -9,9 +9,10 @@ import numpy as np
 from sliceit_drake.diagnosis.cause import EXPERIMENTS
 from sliceit_drake.diagnosis.evidence.verdict import LEAST_REPLICATES
 from sliceit_drake.diagnosis.experiments.identifiability import ANGLE, short
+from sliceit_drake.diagnosis.one_slice.fitted_slice import LEAST_GAIN
 from sliceit_drake.diagnosis.one_slice.slice_evidence import LEVEL
-from sliceit_drake.diagnosis.one_slice.slice_report import evidence_table, slice_figure
-from sliceit_drake.diagnosis.one_slice.slice_result import LEAST_GAIN, OneSlice
+from sliceit_drake.diagnosis.one_slice.slice_report import slice_figure
+from sliceit_drake.diagnosis.one_slice.slice_result import OneSlice
 
 __all__ = ["SIMULATIONS", "MeasuredSlice", "draw", "page"]
 
@@ -171,7 +172,7 @@ def _food(item: MeasuredSlice) -> str:
     for name, result in item.results.items():
         parts.append(f"**{SIMULATIONS[name].capitalize()}**: {result.verdict}. {_worst(result)}")
         parts.append(_by_depth(result))
-        parts.append(evidence_table(result))
+        parts.append(_evidence_table(result))
         parts.append(_fitted(result))
     plain = item.results["plain"]
     groups = "; ".join("{" + ", ".join(map(short, g)) + "}" for g in plain.classes)
@@ -305,4 +306,28 @@ def _next(items: Sequence[MeasuredSlice]) -> str:
         " before contact, and the size of the section at the cut belong to it. With two records or"
         " more `sliceit diagnose --next-experiment FILE` writes the motion.",
     ]
+    return "\n".join(lines)
+
+
+def _evidence_table(result: OneSlice, most: int = 8) -> str:
+    """Evidence of the causes that come nearest, in Markdown."""
+    lines = [
+        "| cause | gain | p | left out, linear [N] | by simulation [N] | blocks better "
+        "| ratio without its best block |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    before = result.error(result.fit.held_out)
+    blocks = len(np.unique(result.block))
+    lines.append(f"| none | | | {result.evidence.held_out:.2f} | {before:.2f} | | |")
+    shown = [c for k, c in enumerate(result.evidence.causes) if k < most or c.confirmed is not None]
+    names = {c.name for c in result.supported}
+    for c in shown:
+        own = "" if c.confirmed is None else f"{c.confirmed:.2f}"
+        better = "" if c.confirmed is None else f"{c.blocks_better} of {blocks}"
+        ratio = "" if c.confirmed is None else f"{c.without_best:.2f}"
+        name = f"**`{c.name}`**" if c.name in names else f"`{c.name}`"
+        lines.append(
+            f"| {name} | {c.gain:.1f} | {c.p_value:.3f} | {c.held_out:.2f} | {own} | {better} "
+            f"| {ratio} |"
+        )
     return "\n".join(lines)

@@ -16,7 +16,6 @@ this gives the number of slices.
 import dataclasses as dc
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,11 +33,9 @@ from sliceit_drake.diagnosis.experiments.scenario_of_experiment import (
     template_of,
 )
 from sliceit_drake.diagnosis.experiments.search import CauseClass, ExperimentSearch
+from sliceit_drake.diagnosis.result import Diagnosis
 from sliceit_drake.prediction.placement import is_bare
 from sliceit_drake.records.slice_record import SliceRecord
-
-if TYPE_CHECKING:
-    from sliceit_drake.diagnosis.diagnose import Diagnosis
 
 __all__ = ["next_experiment"]
 
@@ -50,7 +47,7 @@ EXPLORING = ("tour", "draw_3", "draw_1", "air")
 
 
 def next_experiment(
-    diagnosis: "Diagnosis",
+    diagnosis: Diagnosis,
     records: Sequence[SliceRecord],
     cache: Path | None = None,
     workers: int | None = None,
@@ -82,7 +79,7 @@ def next_experiment(
     return search.result()
 
 
-def _repeat(diagnosis: "Diagnosis", records: Sequence[SliceRecord]) -> NextExperiment:
+def _repeat(diagnosis: Diagnosis, records: Sequence[SliceRecord]) -> NextExperiment:
     """The motions at hand once more."""
     count = diagnosis.verdict.slices_needed
     conditions: dict[str, list[SliceRecord]] = {}
@@ -104,7 +101,7 @@ def _repeat(diagnosis: "Diagnosis", records: Sequence[SliceRecord]) -> NextExper
     return NextExperiment("repeat", reason, steps)
 
 
-def _nothing(diagnosis: "Diagnosis", records: Sequence[SliceRecord]) -> NextExperiment:
+def _nothing(diagnosis: Diagnosis, records: Sequence[SliceRecord]) -> NextExperiment:
     """Nothing to split: what these records would not have shown, and motions that may show it."""
     verdict, screening = diagnosis.verdict, diagnosis.verdict.screening
     if verdict.kind != "nothing":
@@ -125,7 +122,7 @@ def _nothing(diagnosis: "Diagnosis", records: Sequence[SliceRecord]) -> NextExpe
     return NextExperiment("explore", reason, _exploring(diagnosis, records))
 
 
-def _exploring(diagnosis: "Diagnosis", records: Sequence[SliceRecord]) -> list[Step]:
+def _exploring(diagnosis: Diagnosis, records: Sequence[SliceRecord]) -> list[Step]:
     choice = {e.name: e for e in _menu(diagnosis, records)}
     names = [n for n in EXPLORING if n in choice]
     if "draw_3" in names:
@@ -137,13 +134,13 @@ def _exploring(diagnosis: "Diagnosis", records: Sequence[SliceRecord]) -> list[S
     ]
 
 
-def _menu(diagnosis: "Diagnosis", records: Sequence[SliceRecord]) -> list[Experiment]:
+def _menu(diagnosis: Diagnosis, records: Sequence[SliceRecord]) -> list[Experiment]:
     shape = diagnosis.setup.food.shape
     fixed = isinstance(shape, MeshFile | Remainder | Tapered)
     return [e for e in menu(scale_of(diagnosis.setup, records)) if e.size == 1.0 or not fixed]
 
 
-def _classes(diagnosis: "Diagnosis") -> list[CauseClass]:
+def _classes(diagnosis: Diagnosis) -> list[CauseClass]:
     """What is to be told apart: of each finding those that the verdict names with it, and those
     that are nearly so, or would be taken for it if they were the ones that act."""
     verdict, problem = diagnosis.verdict, diagnosis.problem
@@ -174,7 +171,7 @@ def _classes(diagnosis: "Diagnosis") -> list[CauseClass]:
     return out
 
 
-def _within_range(diagnosis: "Diagnosis", evidence: CauseEvidence) -> CauseEvidence:
+def _within_range(diagnosis: Diagnosis, evidence: CauseEvidence) -> CauseEvidence:
     """Evidence whose coefficients give values that the cause may have."""
     by_name = {p.name: p for p in diagnosis.causes[evidence.name].parameters}
     coefficients = []

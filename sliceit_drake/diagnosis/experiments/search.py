@@ -4,7 +4,6 @@ import dataclasses as dc
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,10 +20,8 @@ from sliceit_drake.diagnosis.experiments.scenario_of_experiment import (
     scenario_of,
     template_of,
 )
+from sliceit_drake.diagnosis.result import Diagnosis
 from sliceit_drake.records.slice_record import SliceRecord
-
-if TYPE_CHECKING:
-    from sliceit_drake.diagnosis.diagnose import Diagnosis
 
 __all__ = ["CauseClass", "ExperimentSearch"]
 
@@ -82,7 +79,7 @@ class ExperimentSearch:
 
     def __init__(
         self,
-        diagnosis: "Diagnosis",
+        diagnosis: Diagnosis,
         experiments: list[Experiment],
         classes: list[CauseClass],
         records: Sequence[SliceRecord],

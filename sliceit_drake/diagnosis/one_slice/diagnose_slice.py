@@ -23,6 +23,7 @@ from sliceit_drake.diagnosis.diagnose import BASE, Progress
 from sliceit_drake.diagnosis.evidence.columns import Sensitivities
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.experiments.identifiability import SHIFT, Evidence, identifiability
+from sliceit_drake.diagnosis.one_slice.fitted_slice import LEAST_GAIN
 from sliceit_drake.diagnosis.one_slice.slice_evidence import (
     LEVEL,
     CauseInSlice,
@@ -36,7 +37,7 @@ from sliceit_drake.diagnosis.one_slice.slice_fit import (
     depth_blocks,
     fit_slice,
 )
-from sliceit_drake.diagnosis.one_slice.slice_result import LEAST_GAIN, OneSlice
+from sliceit_drake.diagnosis.one_slice.slice_result import OneSlice
 from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import open_causes
 from sliceit_drake.records.slice_record import SliceRecord

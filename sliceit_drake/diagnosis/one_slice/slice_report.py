@@ -1,28 +1,33 @@
-"""Figures and report of what one slice shows."""
+"""Figure of a fitted slice, and the report on it as one HTML page."""
 
 import html
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from sliceit_drake.diagnosis.html_page import html_page, image
+from sliceit_drake.diagnosis.one_slice.fitted_slice import FittedSlice
 from sliceit_drake.diagnosis.one_slice.slice_evidence import LEVEL
-from sliceit_drake.diagnosis.one_slice.slice_result import OneSlice
 
-__all__ = ["evidence_table", "report_html", "slice_figure"]
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["report_html", "slice_figure"]
 
 MEASURED, FITTED, LEFT_OUT, CAUSE = "#111827", "#2563eb", "#c2410c", "#047857"
 
 
-def slice_figure(results: Sequence[OneSlice], titles: Sequence[str]) -> Figure:
+def slice_figure(results: Sequence[FittedSlice], titles: Sequence[str]) -> "Figure":
     """Force over depth, what the fit leaves, and what is left of depth that was left out.
 
     Args:
         results: Of one slice, by simulations that differ; one column each.
         titles: Of the columns.
     """
+    from matplotlib.figure import Figure
+
     count = len(results)
     figure = Figure(figsize=(5.6 * count + 0.6, 6.4), layout="constrained")
     axes = figure.subplots(
@@ -86,7 +91,7 @@ def slice_figure(results: Sequence[OneSlice], titles: Sequence[str]) -> Figure:
     return figure
 
 
-def _blocks(axis: Axes, result: OneSlice) -> None:
+def _blocks(axis: "Axes", result: FittedSlice) -> None:
     """Shades every other block of depth."""
     depth = 1e3 * result.record.depth
     for k in np.unique(result.block)[1::2]:
@@ -94,38 +99,14 @@ def _blocks(axis: Axes, result: OneSlice) -> None:
         axis.axvspan(depth[rows].min(), depth[rows].max(), color="0.5", alpha=0.10, lw=0)
 
 
-def evidence_table(result: OneSlice, most: int = 8) -> str:
-    """Evidence of the causes that come nearest, in Markdown."""
-    lines = [
-        "| cause | gain | p | left out, linear [N] | by simulation [N] | blocks better "
-        "| ratio without its best block |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    before = result.error(result.fit.held_out)
-    blocks = len(np.unique(result.block))
-    lines.append(f"| none | | | {result.evidence.held_out:.2f} | {before:.2f} | | |")
-    shown = [c for k, c in enumerate(result.evidence.causes) if k < most or c.confirmed is not None]
-    names = {c.name for c in result.supported}
-    for c in shown:
-        own = "" if c.confirmed is None else f"{c.confirmed:.2f}"
-        better = "" if c.confirmed is None else f"{c.blocks_better} of {blocks}"
-        ratio = "" if c.confirmed is None else f"{c.without_best:.2f}"
-        name = f"**`{c.name}`**" if c.name in names else f"`{c.name}`"
-        lines.append(
-            f"| {name} | {c.gain:.1f} | {c.p_value:.3f} | {c.held_out:.2f} | {own} | {better} "
-            f"| {ratio} |"
-        )
-    return "\n".join(lines)
-
-
-def report_html(result: OneSlice) -> str:
-    """The report as one self-contained page."""
+def report_html(result: FittedSlice, table: str) -> str:
+    """The report as one self-contained page, with the result as text."""
     parts = [
         "<h1>What the simulation gets wrong in one slice</h1>",
         "<p>This describes one slice. It is no diagnosis: how slices vary is unknown, so that what"
         f" is found may be this slice's own. p is that of a gain as large, by any cause, where"
         f" nothing is wrong; below {LEVEL:g} it counts.</p>",
-        f"<pre>{html.escape(result.table())}</pre>",
+        f"<pre>{html.escape(table)}</pre>",
         "<h2>Measured and simulated</h2>",
         image(slice_figure([result], [result.record.name])),
     ]

@@ -3,12 +3,9 @@
 import dataclasses as dc
 import json
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from sliceit_drake.diagnosis.cause import EXPERIMENTS, Cause
-from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
 from sliceit_drake.diagnosis.evidence.verdict import LEAST_REPLICATES
 from sliceit_drake.diagnosis.experiments.identifiability import (
     SHOWS,
@@ -16,58 +13,37 @@ from sliceit_drake.diagnosis.experiments.identifiability import (
     classes,
     short,
 )
-from sliceit_drake.diagnosis.one_slice.slice_evidence import LEVEL, CauseInSlice, SliceEvidence
-from sliceit_drake.diagnosis.one_slice.slice_fit import SliceFit
+from sliceit_drake.diagnosis.one_slice.fitted_slice import FittedSlice
+from sliceit_drake.diagnosis.one_slice.slice_evidence import LEVEL
+from sliceit_drake.diagnosis.one_slice.slice_report import report_html, slice_figure
 from sliceit_drake.diagnosis.registry import is_users
 
-__all__ = ["KIND", "LEAST_GAIN", "OneSlice"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["KIND", "OneSlice"]
 
 KIND = "one_slice"
 """The verdict on a single record, whatever it shows."""
-LEAST_GAIN = 0.1
-"""Least share of the error on left-out depth that such a cause removes."""
 
 
 @dc.dataclass
-class OneSlice:
-    """What one slice shows; prints as a table, saves to a folder.
+class OneSlice(FittedSlice):
+    """What one slice shows; prints as a table, plots itself, saves to a folder.
 
     Attributes:
-        record: Measured, and predicted by the fit, with sensitivities there.
-        evidence: Of all causes.
-        fit: Without a cause.
-        fits: With those that were confirmed, by name.
-        block: Number of each row's block of depth.
         angles: Between causes, from projected sensitivities.
         causes: All that were tested, by name.
         remarks: What a reader must know.
         elements: Tetrahedra of the food.
     """
 
-    record: RecordSensitivity
-    evidence: SliceEvidence
-    fit: SliceFit
-    fits: dict[str, SliceFit]
-    block: np.ndarray
     angles: Identifiability
     causes: dict[str, Cause]
     remarks: list[str]
     elements: int = 0
 
     kind = KIND
-
-    @property
-    def supported(self) -> list[CauseInSlice]:
-        """Causes that explain more than chance would, and predict depth that was left out."""
-        before = self.error(self.fit.held_out)
-        return [
-            c
-            for c in self.evidence.causes
-            if c.p_value <= LEVEL
-            and c.confirmed is not None
-            and c.confirmed <= (1.0 - LEAST_GAIN) * before
-            and c.without_best <= 1.0 - LEAST_GAIN
-        ]
 
     @property
     def supported_classes(self) -> list[list[str]]:
@@ -114,38 +90,6 @@ class OneSlice:
         return [
             names[k] for k in range(self.angles.shifts, len(names)) if not self.angles.visible[k]
         ]
-
-    def error(self, predicted: np.ndarray, rows: np.ndarray | None = None) -> float:
-        """RMS error of the forces of a prediction, N."""
-        keep = [k for k, c in enumerate(self.record.channels) if c.startswith("force")]
-        rest = (self.record.measured - predicted)[:, keep]
-        rest = rest if rows is None else rest[rows]
-        return float(np.sqrt((rest**2).sum(1).mean())) if len(rest) else 0.0
-
-    def by_depth(self) -> list[tuple[str, int, float, float, float]]:
-        """Of the air and each block of depth: name, rows, mean and RMS of what the fit leaves, RMS
-        where it was left out, N."""
-        record, out = self.record, []
-        depth = record.depth
-        parts = [("before contact", ~record.in_contact & (depth <= 0.0))]
-        for k in range(int(self.block.max()) + 1):
-            rows = (self.block == k) & record.in_contact
-            if rows.any():
-                low, high = 1e3 * depth[rows].min(), 1e3 * depth[rows].max()
-                parts.append((f"{low:.1f} to {high:.1f} mm", rows))
-        channel = self.shown
-        for name, rows in parts:
-            if rows.any():
-                rest = (record.measured - self.fit.predicted)[rows, channel]
-                errors = self.error(self.fit.predicted, rows), self.error(self.fit.held_out, rows)
-                out.append((name, int(rows.sum()), float(rest.mean()), *errors))
-        return out
-
-    @property
-    def shown(self) -> int:
-        """Number of the channel that figures and tables show."""
-        channels = self.record.channels
-        return channels.index("force_z") if "force_z" in channels else 0
 
     def experiments(self) -> list[str]:
         """Experiments that part what this slice cannot tell apart or does not show, those that
@@ -202,6 +146,10 @@ class OneSlice:
             lines.append(f"  Next: {EXPERIMENTS[name]} ({name})")
         return lines
 
+    def plot(self) -> "Figure":
+        """Force over depth, what the fit leaves, and what is left of depth that was left out."""
+        return slice_figure([self], [self.record.name])
+
     def facts(self) -> dict[str, Any]:
         """The result as plain values."""
         return {
@@ -231,9 +179,8 @@ class OneSlice:
 
     def save(self, directory: Path) -> None:
         """Writes diagnosis.json and report.html; no food is extended by what one slice shows."""
-        from sliceit_drake.diagnosis.one_slice.slice_report import report_html
-
         directory.mkdir(parents=True, exist_ok=True)
         text = json.dumps(self.facts(), indent=2) + "\n"
         (directory / "diagnosis.json").write_text(text, encoding="utf-8")
-        (directory / "report.html").write_text(report_html(self), encoding="utf-8")
+        page = report_html(self, self.table())
+        (directory / "report.html").write_text(page, encoding="utf-8")

@@ -1,0 +1,280 @@
+"""The result of a diagnosis: its table, figures, files and the extended food."""
+
+import copy
+import dataclasses as dc
+import datetime
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sliceit_drake.calibration.setup import CalibrationSetup
+from sliceit_drake.configuration import dump_yaml
+from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
+from sliceit_drake.cutting.foods.food import make_food_model
+from sliceit_drake.cutting.parameters import get_parameter, with_parameters
+from sliceit_drake.diagnosis.cause import Cause
+from sliceit_drake.diagnosis.evidence.columns import Sensitivities
+from sliceit_drake.diagnosis.evidence.confirm import Confirmation, confirm
+from sliceit_drake.diagnosis.evidence.held_out import HeldOutGain, held_out_gain, held_out_share
+from sliceit_drake.diagnosis.evidence.linear import LinearProblem
+from sliceit_drake.diagnosis.evidence.verdict import Finding, Verdict
+from sliceit_drake.diagnosis.experiments.proposal import NextExperiment
+from sliceit_drake.diagnosis.prediction import SlicePredictor
+from sliceit_drake.diagnosis.registry import is_users
+from sliceit_drake.diagnosis.report import evidence_figure, records_figure, report_html
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Diagnosis"]
+
+
+@dc.dataclass
+class Diagnosis:
+    """What a diagnosis found; prints as a table, plots itself, saves to a folder.
+
+    Attributes:
+        verdict: The decision and the evidence.
+        problem: The records' moments.
+        setup: The model that was tested.
+        causes: All that were tested, by name.
+        shifts: Changes of the base parameters with the verdict's causes in the model, by name:
+            factor (log scale) and its standard error.
+        gain: Error on records that were left out; None if nothing is named.
+        remarks: What a reader must know.
+        confirmation: What simulations with the named causes say; None before, or if none is named
+            whose numbers all records share.
+        next_experiment: What to cut next, where that was asked for.
+    """
+
+    verdict: Verdict
+    problem: LinearProblem
+    setup: CalibrationSetup
+    causes: dict[str, Cause]
+    shifts: dict[str, tuple[float, float]]
+    gain: HeldOutGain | None
+    remarks: list[str]
+    confirmation: Confirmation | None = None
+    next_experiment: NextExperiment | None = None
+
+    def confirm(
+        self,
+        predictor: SlicePredictor,
+        seed: int = 0,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        """Simulates the records with what is named, and measures its worth from there."""
+        findings = self.verdict.findings
+        named = [(f.evidence.name, f.evidence.scan) for f in findings]
+        shared = [f for f in findings if not f.evidence.per_record]
+        if shared:
+            chosen = [(self.causes[f.evidence.name], self.values(f)) for f in shared]
+            self.confirmation = confirm(self.problem, predictor, chosen, progress)
+        simulated = None
+        if self.confirmation is not None and self.confirmation.holds:
+            simulated = self.confirmation.problem
+            factors = self.confirmation.factors
+            self.shifts = {n: (factors.get(n, f), error) for n, (f, error) in self.shifts.items()}
+        elif self.confirmation is not None:
+            self.remarks.append(
+                "A simulation with the cause in it gains less than half of what its derivatives "
+                "promise: take the values for a direction."
+            )
+        self.gain = held_out_gain(self.problem, named, seed, simulated)
+
+    @property
+    def sensitivities(self) -> Sensitivities:
+        """What the evidence rests on."""
+        return self.problem.found
+
+    def values(self, finding: Finding) -> dict[str, float]:
+        """Parameters of a finding's cause."""
+        e, cause = finding.evidence, self.causes[finding.evidence.name]
+        if self.confirmation is not None and e.name in self.confirmation.values:
+            return dict(self.confirmation.values[e.name])
+        values = cause.nulls()
+        if cause.scan is not None and e.scan is not None:
+            values[cause.scan.name] = e.scan
+        by_name = {p.name: p for p in cause.parameters}
+        for name, coefficient, size in zip(e.parameters, e.coefficients, e.sizes, strict=True):
+            p = by_name[name]
+            values[name] = float(np.clip(p.null + coefficient * size, p.low, p.high))
+        return values
+
+    def table(self) -> str:
+        """The result in a minute."""
+        v, lines = self.verdict, []
+        count, kinds = len(self.problem.found.records), len(self.problem.conditions)
+        lines.append(f"{count} records of {kinds} conditions")
+        lines.append(f"Verdict: {v.kind.replace('_', ' ')}: {v.reason}")
+        for finding in v.findings:
+            lines += self._lines(finding, v.kind != "unknown")
+        lines.append(
+            f"All that the simulation gets wrong: {v.misfit:.2f} of the in-contact noise"
+            f" (p = {v.screening.misfit_p_value:.3f})"
+        )
+        if self.gain is not None:
+            g = self.gain
+            lines.append(
+                f"Held-out error of the force: {g.before:.3f} N before, {g.after:.3f} N after, "
+                f"noise {g.floor:.3f} N: {100 * g.share:.0f} % of the reducible removed (90 % "
+                f"interval {100 * g.interval[0]:.0f} to {100 * g.interval[1]:.0f} %)"
+            )
+        if v.slices_needed:
+            lines.append(
+                f"Needed to tell variation from effect: {v.slices_needed} more slices of each "
+                "condition"
+            )
+        if self.next_experiment is not None:
+            lines += self.next_experiment.lines()
+        lines.append("")
+        lines.append(f"{'cause':20}{'gain':>10}{'by chance':>11}{'95 % limit':>12}{'visible':>9}")
+        screening = v.screening
+        # A user looks for their own cause, whether it matters or not.
+        own = [e for e in screening.causes[8:] if is_users(self.causes[e.name])]
+        for e in (*screening.causes[:8], *own):
+            visible = screening.visible[screening.names.index(e.name)]
+            lines.append(
+                f"{e.name:20}{e.gain:10.1f}{e.expected:11.1f}{e.limit:12.1f}{visible:9.0f}"
+            )
+        for name, (factor, error) in self.shifts.items():
+            if abs(np.log(factor)) > 2.0 * error:
+                lines.append(f"Shift of {name}: times {factor:.3f} (+-{error:.3f})")
+        return "\n".join(lines + self.remarks)
+
+    def plot(self) -> "Figure":
+        """Measured and simulated force of each condition, and what is left."""
+        return records_figure(self.problem, self.verdict)
+
+    def plot_evidence(self) -> "Figure":
+        """Gain of each cause against chance, and the angles between causes."""
+        return evidence_figure(self.verdict.screening)
+
+    def _lines(self, finding: Finding, named: bool) -> list[str]:
+        e, cause = finding.evidence, self.causes[finding.evidence.name]
+        values = self.values(finding)
+        parts = []
+        for name, size, error, unit in zip(e.parameters, e.sizes, e.errors, e.units, strict=True):
+            spread = f" +- {abs(error * size):.2g}" if np.isfinite(error) else ""
+            parts.append(f"{name} = {values[name]:.3g}{spread} {unit}".rstrip())
+        head = "Supported" if named else "Nearest"
+        lines = [
+            f"  {head}: {e.name} ({cause.family}), {', '.join(parts)}; "
+            f"{finding.size:.2f} of the noise, explains {100 * min(finding.share, 1.0):.0f} %"
+        ]
+        if finding.others:
+            lines.append(
+                f"    These records cannot tell it from: {', '.join(finding.others)}. To split "
+                f"them: {', '.join(sorted({self.causes[n].experiment for n in finding.names}))}"
+            )
+            if self.next_experiment is None:
+                lines.append("    --next-experiment FILE finds the motion that does, and writes it")
+        return lines
+
+    def extended(self) -> CalibratedFood:
+        """The food with the named causes and the shifts of the base parameters in it.
+
+        Causes of sensor and robot do not belong to the food; the note names them.
+        """
+        food = copy.deepcopy(self.setup.food)
+        model = make_food_model(food, self.setup.knife, self.setup.numerics)
+        # What is not understood, or may be the slices, is no reason to change a food.
+        sure = self.verdict.kind in ("cause", "causes", "nothing")
+        values = {
+            name: float(get_parameter(model, name)) * factor
+            for name, (factor, _) in self.shifts.items()
+            if sure
+        }
+        model = with_parameters(model, values)
+        left = []
+        named = self.verdict.findings if self.verdict.kind in ("cause", "causes") else []
+        for finding in named:
+            cause = self.causes[finding.evidence.name]
+            changed = cause.extension(model, self.values(finding))
+            if changed is model:
+                left.append(f"{cause.name} ({cause.family})")
+            model = changed
+        food.material, food.effects = model.material, model.effects
+        note = f"Not in the food: {', '.join(left)}." if left else ""
+        return CalibratedFood(
+            food=food,
+            knife=self.setup.knife,
+            flank_stiffness=model.numerics.flank_stiffness,
+            records=[r.name for r in self.problem.found.records],
+            date=datetime.date.today().isoformat(),
+            note=note,
+        )
+
+    def facts(self) -> dict[str, Any]:
+        """The result as plain values."""
+        v = self.verdict
+        return {
+            "verdict": v.kind,
+            "reason": v.reason,
+            "classes": v.names,
+            "findings": [
+                {
+                    "cause": f.evidence.name,
+                    "others": f.others,
+                    "values": self.values(f),
+                    "size_over_noise": f.size,
+                    "share_explained": f.share,
+                }
+                for f in v.findings
+            ],
+            "misfit_over_noise": v.misfit,
+            "p_value": v.screening.p_value,
+            "misfit_p_value": v.screening.misfit_p_value,
+            "simulated_share_of_gain": None
+            if self.confirmation is None
+            else self.confirmation.gained / max(self.confirmation.promised, 1e-9),
+            "slices_needed": v.slices_needed,
+            "gain": None
+            if self.gain is None
+            else {
+                "before_N": self.gain.before,
+                "after_N": self.gain.after,
+                "floor_N": self.gain.floor,
+                "share_removed": self.gain.share,
+                "interval": list(self.gain.interval),
+            },
+            "evidence": [
+                {
+                    "cause": e.name,
+                    "gain": e.gain,
+                    "expected": e.expected,
+                    "limit": e.limit,
+                    "scan": e.scan,
+                    "held_out_share": held_out_share(self.problem, [(e.name, e.scan)]),
+                }
+                for e in v.screening.causes
+            ],
+            "noise": {
+                c: dc.asdict(n)
+                for c, n in zip(
+                    self.problem.found.records[0].channels, self.problem.noise, strict=True
+                )
+            },
+            "variation": {
+                self.problem.found.columns[k].name: float(s) * self.problem.found.columns[k].size
+                for k, s in zip(self.problem.own, self.problem.variation, strict=True)
+            },
+            "shifts": {name: list(pair) for name, pair in self.shifts.items()},
+            "next_experiment": None
+            if self.next_experiment is None
+            else self.next_experiment.facts(),
+            "remarks": self.remarks,
+        }
+
+    def save(self, directory: Path, report: bool = True) -> None:
+        """Writes diagnosis.json, extended.yaml and, if wanted, report.html."""
+        directory.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(self.facts(), indent=2) + "\n"
+        (directory / "diagnosis.json").write_text(text, encoding="utf-8")
+        dump_yaml(self.extended(), directory / "extended.yaml")
+        if report:
+            page = report_html(self.table(), self.problem, self.verdict, self.gain)
+            (directory / "report.html").write_text(page, encoding="utf-8")
