@@ -1,5 +1,7 @@
 """The bonds of the uncut surface: one toughness, spent by opening, by the edge, or by both."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -45,6 +47,22 @@ def test_pulling_the_halves_apart_costs_toughness_times_area_whatever_the_streng
     lost, state = pull_apart(model, solver, solver.initial_state(), distance=8e-3)
     assert np.all(solver.field(state, "parted") == 1.0)
     assert lost == pytest.approx(TOUGHNESS * model.section_area, rel=1e-3)
+
+
+def test_a_strength_that_the_mesh_cannot_hold_is_lowered_and_said():
+    within, _ = bar(strength=2e5)
+    assert within.strength == within.material.strength and within.warnings == ()
+    beyond, _ = bar(strength=5e6)
+    assert 2e5 < beyond.strength < beyond.material.strength == 5e6
+    (warning,) = beyond.warnings
+    assert "material.strength" in warning and f"part at {beyond.strength:.4g} Pa" in warning
+    # Both of the fixes that it names are.
+    strength, stiffness = re.search(
+        r"strength: (\S+), .*bond_stiffness: (\S+) and", warning
+    ).groups()
+    assert bar(strength=float(strength))[0].warnings == ()
+    mended, _ = bar(strength=5e6, bond_stiffness=1.01 * float(stiffness))
+    assert mended.warnings == () and mended.strength == 5e6
 
 
 def test_faces_that_are_not_pulled_to_their_strength_lose_nothing():

@@ -154,3 +154,4 @@ def test_the_summary_of_a_policys_run_estimates_no_error_on_a_motion_that_was_no
     assert run.stopped is None
     summary = write_outputs(run, tmp_path, None)
     assert summary["elements"] > 0 and summary["discretization_error"] is None
+    assert summary["warnings"] == []

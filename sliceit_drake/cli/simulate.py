@@ -141,6 +141,8 @@ def _report(summary: dict, directory: Path) -> None:
             f"Against the measured curve: RMS {m['rms_N']:.2f} N, peak {m['simulated_peak_N']:.1f} "
             f"N (measured {m['measured_peak_N']:.1f} N)"
         )
+    for warning in summary.get("warnings", ()):
+        print(f"Warning: {warning}")
     if summary["stopped"]:
         print(f"Stopped early: {summary['stopped']}. What there is so far is kept.")
     print(f"Results in {directory}/: {', '.join(sorted(p.name for p in directory.iterdir()))}")

@@ -144,6 +144,30 @@ class CuttingModel(CutGeometry):
         """Stepped over true mass of the moving nodes."""
         return float(self.mass[self.moving].sum() / self.true_mass[self.moving].sum())
 
+    @property
+    def strength(self) -> float:
+        """Traction at which the uncut faces part, Pa: the material's, where the mesh allows it.
+
+        A bond that opens elastically by much of what it can open at all has no softening left to
+        follow. Its strength is then lowered at constant toughness; see `warnings`.
+        """
+        return self.parameters["strength"]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Where the computation departs from what the user gave, and how to mend it."""
+        wanted, used = self.material.strength, self.strength
+        if used >= wanted:
+            return ()
+        stiffness = self.numerics.bond_stiffness * (wanted / used) ** 2
+        return (
+            f"material.strength = {wanted:.4g} Pa is more than bonds of "
+            f"{self.material.toughness:g} J/m2 hold on elements of {1e3 * self.element_size:.3g} "
+            f"mm: the faces part at {used:.4g} Pa, with the same toughness. Give strength: "
+            f"{0.999 * used:.4g}, or numerics.bond_stiffness: {stiffness:.3g} and a sub-step to "
+            "match.",
+        )
+
     def edge_forces(self) -> np.ndarray:
         """Greatest force of the edge at each cut point on the grid of its tables [P, G], N."""
         return _edge_forces(self, self.effects, self.toughness, self.outline)
@@ -246,7 +270,8 @@ def _derived(
     bond = numerics.bond_stiffness * scale
     weakest = min(1.0, core.toughness_ratio) * min(1.0, centre.toughness_ratio)
     weakest = max(material.toughness * weakest, 1e-12)
-    strength = min(material.strength, 0.5 * np.sqrt(2.0 * weakest * bond))
+    # A bond holds up to a quarter of its opening at failure, 2 R / strength, or less.
+    strength = min(material.strength, 0.5 * float(np.sqrt(2.0 * weakest * bond)))
     mu, lam = material.stable_neo_hookean()
     parameters = dict.fromkeys(PARAMETERS, 0.0) | {
         "mu": mu,

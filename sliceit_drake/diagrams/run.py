@@ -379,6 +379,7 @@ def _cutting_summary(run: Run, record: Record) -> dict:
     area = sum(m.section_area for m in models[: int(record["food_index"][-1]) + 1])
     motion = Motion(plan, start_pose(model, scenario.start.clearance, scenario.start.offset))
     summary = {
+        "warnings": sorted({text for m in models for text in m.warnings}),
         "elements": model.element_count,
         "cut_points": len(model.point_nodes),
         "sub_step_s": scenario.numerics.time_step,

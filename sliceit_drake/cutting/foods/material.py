@@ -33,7 +33,11 @@ class Material:
         350.0, "J/m2", low=0.0, high=1e5, doc="Energy to part one unit of cut surface."
     )
     strength: float = quantity(
-        3e5, "Pa", low=1e2, high=1e8, doc="Traction at which the uncut faces begin to part."
+        3e5,
+        "Pa",
+        low=1e2,
+        high=1e8,
+        doc="Traction at which the uncut faces begin to part; a mesh may allow less, and says so.",
     )
     friction: float = quantity(0.1, "", low=0.0, high=2.0, doc="Sliding friction on the flanks.")
     static_friction: float = quantity(
