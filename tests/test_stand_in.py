@@ -540,6 +540,14 @@ def test_a_food_with_effects_of_the_simulator_is_refused():
         protocol.check("protocol")
 
 
+def test_a_sensor_whose_readings_fall_between_exchanges_is_refused():
+    protocol = bench("push")
+    for rate, nearest in ((300.0, "250"), (800.0, "500")):
+        protocol.sensor = dc.replace(IDEAL, rate=rate)
+        with pytest.raises(ConfigurationError, match=rf"sensor.rate.*{nearest}"):
+            protocol.check("protocol")
+
+
 def test_exchanges_computed_as_one_give_the_force_of_each_for_itself():
     def force(effects: list[Effect]) -> np.ndarray:
         return Session(bench("slow"), effects, WORLDS[0], 1, COARSE).series(0)[0].force[:, 2]

@@ -109,6 +109,15 @@ class Protocol:
                     field=f"{where}.conditions[{k}].label",
                     fix="Give each condition a name of its own, and replicates for repeats.",
                 )
+        steps = 1.0 / (self.sensor.rate * self.exchange_period)
+        if steps < 1.0 - 1e-9 or abs(steps - round(steps)) > 1e-6 * steps:
+            nearest = 1.0 / (max(1, round(steps)) * self.exchange_period)
+            raise ConfigurationError(
+                f"= {self.sensor.rate:g} Hz: readings are not whole exchange periods of "
+                f"{self.exchange_period:g} s apart",
+                field=f"{where}.sensor.rate",
+                fix=f"Give {nearest:.6g}, or another exchange_period.",
+            )
         if self.food.effects != Effects():
             raise ConfigurationError(
                 "is for the simulator; a stand-in has effects of its own",

@@ -61,7 +61,7 @@ def measured(
     Args:
         wrench: True moment and force in the sensor's axes, mean over each period [N, 6].
         period: Between two rows, s.
-        sensor: The sensor.
+        sensor: The sensor; its readings are a whole number of periods apart.
         rng: For bias, drift and noise.
 
     Returns:
@@ -80,7 +80,7 @@ def measured(
         late = np.arange(count) - sensor.delay / period
         shown = np.column_stack([np.interp(late, np.arange(count), c) for c in shown.T])
     # Between the readings the correlated part goes on; only its readings are drawn.
-    rows = np.arange(0, count, max(1, round(1.0 / (sensor.rate * period))))
+    rows = np.arange(0, count, round(1.0 / (sensor.rate * period)))
     spacing = (rows[1] - rows[0]) * period if len(rows) > 1 else period
     keep = math.exp(-spacing / sensor.correlation_time)
     white, wander = rng.normal(size=(2, len(rows), 6))
