@@ -21,7 +21,6 @@ from sliceit_drake.hardware.robot_state import (
 
 __all__ = ["Decision", "LatchedError", "SafetyLayer", "Stop", "robot_fault"]
 
-RESET_WORD = "reset"
 # Differences of the controller's times and of targets carry rounding errors of this order.
 _ROUNDING = 1e-9
 _REACH = 1.6  # Of the tool's farthest point from the first joint's axis, m, generously.
@@ -67,7 +66,7 @@ class Decision(NamedTuple):
 
 
 class LatchedError(RuntimeError):
-    """The layer is latched; only an operator's reset ends that."""
+    """The layer is latched, for good; a new run begins with a new one."""
 
 
 class SafetyLayer:
@@ -151,7 +150,7 @@ class SafetyLayer:
             LatchedError: If it is latched already.
         """
         if self._stop is not None:
-            raise LatchedError(f"The safety layer is latched ({self._stop}); reset it first.")
+            raise LatchedError(f"The safety layer is latched ({self._stop}); start a new run.")
         self._armed, self._payload = False, None
         stop = robot_fault(state) or self._measurement_fault(state)
         if stop is None:
@@ -173,20 +172,6 @@ class SafetyLayer:
             return stop
         self._armed = True
         return None
-
-    def reset(self, state: RobotState, word: str) -> Stop | None:
-        """Ends a stop, for an operator who typed `RESET_WORD`; continues from the actual position.
-
-        Returns:
-            Why the layer latched at once again, or None.
-
-        Raises:
-            LatchedError: If the word is another.
-        """
-        if word != RESET_WORD:
-            raise LatchedError(f'A stop is reset by the word "{RESET_WORD}", not by {word!r}.')
-        self._stop = None
-        return self.arm(state)
 
     def latch(
         self,
