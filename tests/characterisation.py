@@ -40,9 +40,9 @@ from sliceit_drake.learning.task import TaskConfig
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.records.validation import load_record
 from sliceit_drake.resources import resource_path
+from sliceit_drake.stand_in.effect_registry import make_effect
 from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
 from sliceit_drake.stand_in.protocol import load_protocol
-from sliceit_drake.stand_in.registry import make_effect
 from sliceit_drake.stand_in.session import Session
 
 FILE = Path(__file__).parent / "data" / "characterisation.json"

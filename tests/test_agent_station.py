@@ -10,7 +10,7 @@ from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
 from sliceit_drake.learning.task import RandomizationConfig, TaskConfig, make_agent_station
 from sliceit_drake.systems.agent import AgentConfig, AgentSystem
-from sliceit_drake.systems.network import LAYOUT, layout_of
+from sliceit_drake.systems.exported_network import LAYOUT, layout_of
 
 SCENARIO = """
 controller:

@@ -39,7 +39,7 @@ from sliceit_drake.records.preprocessing import low_pass
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
 from sliceit_drake.stand_in.protocol import Condition, Protocol, Variation
-from sliceit_drake.stand_in.sensor import SensorModel
+from sliceit_drake.stand_in.sensor_model import SensorModel
 from sliceit_drake.stand_in.session import Session
 
 TRUTH = {"material.toughness": 420.0, "material.youngs_modulus": 1.2e6, "material.friction": 0.15}

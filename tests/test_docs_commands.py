@@ -33,7 +33,7 @@ sliceit simulate --set "{food: {cut_normal: [0.2, 1.0, 0.1]}}"
 sliceit calibrate --show cucumber
 sliceit calibrate --show NAME
 sliceit diagram --ports
-python -c "from sliceit_drake.hardware.knife_kinematics import flange_pose; print(flange_pose([q1, q2, q3, q4, q5, q6])[11] - 0.21)"
+python -c "from sliceit_drake.hardware.edge_kinematics import flange_pose; print(flange_pose([q1, q2, q3, q4, q5, q6])[11] - 0.21)"
 """  # noqa: E501
 
 # Run by another test, perhaps on a smaller food.

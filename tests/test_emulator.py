@@ -16,7 +16,7 @@ from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
 from sliceit_drake.emulator.control_script import COMMAND_NAMES, ControlScript
 from sliceit_drake.emulator.controller import ControllerConfig
-from sliceit_drake.emulator.emulator import Clock, Emulator
+from sliceit_drake.emulator.emulator import ControllerClock, Emulator
 from sliceit_drake.emulator.fault_table import FAULTS
 from sliceit_drake.emulator.frames import (
     FrameError,
@@ -33,7 +33,7 @@ from sliceit_drake.emulator.process import PendantClient
 from sliceit_drake.emulator.robot_model import CYCLE, START, KinematicRobot, SimulationStopped
 from sliceit_drake.emulator.station_robot import StationRobot
 from sliceit_drake.emulator.variables import INPUTS, OUTPUTS, TYPES
-from sliceit_drake.hardware.configuration import load_hardware_config
+from sliceit_drake.hardware.hardware_config import load_hardware_config
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.compliance_controller import make_virtual_model
 from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
@@ -672,7 +672,7 @@ def test_every_fault_of_the_table_can_be_injected():
 
 @pytest.mark.parametrize("fault", ["late_packets:0.02", "drop_packets:0.3", "frequency_125"])
 def test_lockstep_does_not_wait_for_the_answer_to_a_package_that_did_not_arrive(fault):
-    clock = Clock(lockstep=True, patience=1.0)
+    clock = ControllerClock(lockstep=True, patience=1.0)
     emulator = Emulator(KinematicRobot(), free_address(), clock)
     controller = emulator.controller
     controller.start_program(ControlScript(controller), "test")
@@ -745,4 +745,4 @@ def test_the_emulated_station_moves_as_the_simulated_one_under_the_same_commands
 
 def test_a_clock_that_cannot_be_is_refused():
     with pytest.raises(ConfigurationError, match="pace"):
-        Clock(pace=0.0)
+        ControllerClock(pace=0.0)

@@ -11,8 +11,8 @@ from sliceit_drake.cli import hardware as command
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.diagrams.station import MakeStation
-from sliceit_drake.hardware.configuration import HardwareConfig, TouchConfig
 from sliceit_drake.hardware.guarded_touch import Touch, TouchError, contact_of
+from sliceit_drake.hardware.hardware_config import HardwareConfig, TouchConfig
 from sliceit_drake.resources import resource_path
 from sliceit_drake.robot_run.board_touch import check_height
 

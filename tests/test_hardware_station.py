@@ -21,7 +21,7 @@ from sliceit_drake.diagrams.outputs.slice_record_of_run import slice_record_of
 from sliceit_drake.diagrams.ports import check_station_ports
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.hardware.checks import check_facts, check_start
-from sliceit_drake.hardware.configuration import (
+from sliceit_drake.hardware.hardware_config import (
     HardwareConfig,
     differing,
     load_hardware_config,

@@ -15,7 +15,7 @@ from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
 from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.diagnosis.registry import all_causes
-from sliceit_drake.stand_in.registry import EFFECTS, make_effect
+from sliceit_drake.stand_in.effect_registry import EFFECTS, make_effect
 from studies.hidden_effects import runner
 from studies.hidden_effects.archive import pack, unpack
 from studies.hidden_effects.bench import PROTOCOLS, QuietBench, model_food, protocol_named

@@ -30,7 +30,7 @@ from sliceit_drake.learning.sac import OverlapVecEnv, PrioritizedSAC  # noqa: E4
 from sliceit_drake.learning.task import RandomizationConfig, TaskConfig  # noqa: E402
 from sliceit_drake.learning.training import TrainingConfig, train  # noqa: E402
 from sliceit_drake.systems.agent import AgentConfig, observation_names  # noqa: E402
-from sliceit_drake.systems.network import load_network  # noqa: E402
+from sliceit_drake.systems.exported_network import load_network  # noqa: E402
 
 # torch comes with the second tier.
 pytestmark = pytest.mark.second_tier

@@ -11,10 +11,10 @@ import pytest
 from fake_robot import FakeRobot
 from fake_station import CONFIG, PACE, spring_scenario
 
-from sliceit_drake.diagrams.hardware_station import make_knife_kinematics
+from sliceit_drake.diagrams.hardware_station import make_edge_kinematics
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.hardware.client import RobotUnavailableError
-from sliceit_drake.hardware.configuration import HardwareConfig
+from sliceit_drake.hardware.hardware_config import HardwareConfig
 from sliceit_drake.hardware.interruption import catch_signals
 from sliceit_drake.robot_run.hardware_run import prepare_hardware_run
 from sliceit_drake.robot_run.move_to_start import MoveToStart
@@ -70,7 +70,7 @@ def test_a_short_way_is_gone_to_its_end(robot, start):
 def test_the_knife_keeps_its_limit_of_speed_on_the_way(most, robot, start):
     limits = dc.replace(CONFIG["limits"], knife_speed=most)
     move = move_of(robot, limits=limits)
-    kinematics = make_knife_kinematics(move.hardware.twin)
+    kinematics = make_edge_kinematics(move.hardware.twin)
     # A fifth of a second of the way at that speed.
     way = start - robot.q
     share = 0.2 * move.speed / np.abs(way).max()

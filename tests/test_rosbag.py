@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.emulator.kinematics import forward
-from sliceit_drake.hardware.knife_kinematics import flange_pose
+from sliceit_drake.hardware.edge_kinematics import flange_pose
 from sliceit_drake.records.importers import pose_matrix
 from sliceit_drake.records.rosbag import import_rosbag
 from sliceit_drake.records.slice_record import SliceRecord, velocities

@@ -9,7 +9,7 @@ from arm_at_start import BOARD, LENGTH, START, X_TK, X_WB, chain_pose
 from fake_robot import FakeRobot
 
 from sliceit_drake.hardware.client import RobotUnavailableError
-from sliceit_drake.hardware.knife_kinematics import KnifeKinematics
+from sliceit_drake.hardware.edge_kinematics import EdgeKinematics
 from sliceit_drake.hardware.limits import SafetyLimits
 from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.hardware.rtde_system import RtdeSystem
@@ -29,7 +29,7 @@ def robot():
 
 
 def make_link(robot):
-    kinematics = KnifeKinematics(X_WB, X_TK, LENGTH)
+    kinematics = EdgeKinematics(X_WB, X_TK, LENGTH)
     safety = SafetyLayer(LIMITS, kinematics, BOARD, START)
     return RobotLink(robot, safety, pace=PACE)
 

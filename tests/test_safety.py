@@ -10,8 +10,8 @@ from arm_at_start import BOARD, LENGTH, START, X_TK, X_WB, chain_pose
 from scipy.optimize import brentq
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.hardware.configuration import load_hardware_config
-from sliceit_drake.hardware.knife_kinematics import KnifeKinematics
+from sliceit_drake.hardware.edge_kinematics import EdgeKinematics
+from sliceit_drake.hardware.hardware_config import load_hardware_config
 from sliceit_drake.hardware.limits import SafetyLimits, loosened
 from sliceit_drake.hardware.robot_state import PLAYING, RobotState
 from sliceit_drake.hardware.safety import LatchedError, SafetyLayer
@@ -22,7 +22,7 @@ COMMANDS = int(os.environ.get("SLICEIT_HOSTILE_COMMANDS", "100000"))
 
 def make_layer(**changes):
     limits = dc.replace(SafetyLimits(), **changes)
-    return SafetyLayer(limits, KnifeKinematics(X_WB, X_TK, LENGTH), BOARD, START, PERIOD)
+    return SafetyLayer(limits, EdgeKinematics(X_WB, X_TK, LENGTH), BOARD, START, PERIOD)
 
 
 def state(time, q, wrench=(0.0,) * 6, qd=(0.0,) * 6, runtime=PLAYING, bits=1):
@@ -31,7 +31,7 @@ def state(time, q, wrench=(0.0,) * 6, qd=(0.0,) * 6, runtime=PLAYING, bits=1):
 
 def at_height(q, height):
     """Joint positions as `q`, but of joint 2, with the edge's middle this high over the board."""
-    kinematics = KnifeKinematics(X_WB, X_TK, LENGTH)
+    kinematics = EdgeKinematics(X_WB, X_TK, LENGTH)
 
     def missed(shoulder):
         edge = kinematics.edge([q[0], shoulder, *q[2:]])
@@ -42,7 +42,7 @@ def at_height(q, height):
 
 def test_the_edge_is_where_the_controllers_chain_has_it():
     rng = np.random.default_rng(0)
-    kinematics = KnifeKinematics(X_WB, X_TK, LENGTH)
+    kinematics = EdgeKinematics(X_WB, X_TK, LENGTH)
     for q in [START, *rng.uniform(-np.pi, np.pi, (50, 6))]:
         X_WK, edge = chain_pose(q), kinematics.edge(q)
         assert np.allclose(edge.heel, X_WK @ np.array([-0.5 * LENGTH, 0, 0]), atol=1e-9)
@@ -55,7 +55,7 @@ class Wire:
 
     def __init__(self, limits, q, time):
         self.limits, self.q, self.v, self.time = limits, np.array(q), np.zeros(6), time
-        self.kinematics = KnifeKinematics(X_WB, X_TK, LENGTH)
+        self.kinematics = EdgeKinematics(X_WB, X_TK, LENGTH)
         self.edge = self._ends(self.q)
         self.count = 0
 
@@ -342,7 +342,7 @@ def test_a_limit_that_nothing_breaks_is_refused(value, tmp_path):
 )
 def test_no_layer_is_made_around_what_is_not_known(start, board):
     with pytest.raises(ConfigurationError, match="not known"):
-        SafetyLayer(SafetyLimits(), KnifeKinematics(X_WB, X_TK, LENGTH), board, start, PERIOD)
+        SafetyLayer(SafetyLimits(), EdgeKinematics(X_WB, X_TK, LENGTH), board, start, PERIOD)
 
 
 @pytest.mark.parametrize("now", [None, (1.2, 0.0, 0.0), (1.2, 0.0, math.nan, 0.06)])

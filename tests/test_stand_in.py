@@ -22,6 +22,7 @@ from sliceit_drake.records.slice_record import read_table
 from sliceit_drake.records.validation import check_table, load_record, load_records
 from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.effect import Effect, Series
+from sliceit_drake.stand_in.effect_registry import EFFECTS, make_effect
 from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
 from sliceit_drake.stand_in.protocol import (
     Condition,
@@ -31,8 +32,7 @@ from sliceit_drake.stand_in.protocol import (
     protocol_of_scenario,
     schedule,
 )
-from sliceit_drake.stand_in.registry import EFFECTS, make_effect
-from sliceit_drake.stand_in.sensor import SensorModel, measured
+from sliceit_drake.stand_in.sensor_model import SensorModel, measured
 from sliceit_drake.stand_in.session import WORLDS, Session, record_session
 
 PACKAGE = Path(__file__).resolve().parent.parent / "sliceit_drake"
@@ -496,7 +496,7 @@ FINITE_ELEMENTS = (
 
 
 @pytest.mark.parametrize(
-    "module", ["curve_world", "curve_laws", "curve_cutter", "world", "effect", "sensor"]
+    "module", ["curve_world", "curve_laws", "curve_cutter", "world", "effect", "sensor_model"]
 )
 def test_the_world_of_curves_has_no_import_of_the_finite_elements(module):
     found = {name.rpartition(".")[2] for name in imports(module) if ".cutting." in name}

@@ -20,7 +20,7 @@ from sliceit_drake.output_folder import check_folder
 if TYPE_CHECKING:
     from sliceit_drake.diagrams.run import Run
     from sliceit_drake.diagrams.scenario import Scenario
-    from sliceit_drake.hardware.configuration import HardwareConfig
+    from sliceit_drake.hardware.hardware_config import HardwareConfig
     from sliceit_drake.stand_in.protocol import Specimen
 
 __all__ = ["add_parser"]

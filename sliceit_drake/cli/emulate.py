@@ -83,9 +83,9 @@ def _run(options: argparse.Namespace) -> int:
 
     from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.emulator.controller import ControllerConfig
-    from sliceit_drake.emulator.emulator import Clock, Emulator
+    from sliceit_drake.emulator.emulator import ControllerClock, Emulator
 
-    clock = Clock(pace=options.pace, lockstep=options.lockstep)
+    clock = ControllerClock(pace=options.pace, lockstep=options.lockstep)
     config = ControllerConfig(version=_version(options.version))
     robot = _robot(options, config)
     try:

@@ -131,7 +131,7 @@ def trace(case: Case) -> "SliceTrace":
 def _policy(folder: str) -> "tuple[AgentConfig, Decide, str, int]":
     """Agent, network, simulator and seed of a training's folder."""
     from sliceit_drake.learning.training import POLICY, load_policy_folder
-    from sliceit_drake.systems.network import load_network
+    from sliceit_drake.systems.exported_network import load_network
 
     config = load_policy_folder(Path(folder))
     agent = dc.replace(config.task.agent, network=str(Path(folder) / POLICY))

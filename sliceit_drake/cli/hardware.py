@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from sliceit_drake.diagrams.scenario import Scenario
     from sliceit_drake.hardware.checks import Check
     from sliceit_drake.hardware.client import RobotClient
-    from sliceit_drake.hardware.configuration import HardwareConfig
+    from sliceit_drake.hardware.hardware_config import HardwareConfig
     from sliceit_drake.hardware.rtde_link import RobotLink
     from sliceit_drake.robot_run.hardware_run import HardwareRun
 
@@ -338,7 +338,7 @@ def robot_config(options: argparse.Namespace) -> "HardwareConfig":
         ConfigurationError: It is missing or wrong, or there is no address.
     """
     from sliceit_drake.configuration import ConfigurationError, validate
-    from sliceit_drake.hardware.configuration import load_hardware_config
+    from sliceit_drake.hardware.hardware_config import load_hardware_config
 
     if not options.host:
         raise ConfigurationError(
@@ -413,7 +413,7 @@ def ask(word: str, options: argparse.Namespace) -> bool:
 
 def plan_text(hardware: "HardwareRun", duration: float) -> str:
     """What is about to happen, for the operator to read."""
-    from sliceit_drake.hardware.configuration import differing
+    from sliceit_drake.hardware.hardware_config import differing
 
     scenario, plan, limits = hardware.scenario, hardware.plan, hardware.config.limits
     board = scenario.board.height

@@ -83,7 +83,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 def _run(options: argparse.Namespace) -> int:
     """Runs the command."""
     if options.list_effects:
-        from sliceit_drake.stand_in.registry import effects_as_markdown
+        from sliceit_drake.stand_in.effect_registry import effects_as_markdown
 
         print(effects_as_markdown())
         return 0

@@ -206,7 +206,7 @@ def _import(options: argparse.Namespace, metadata: "SliceMetadata") -> "SliceRec
     X_WB = importers.pose_matrix(base[:3], base[3:])
     if options.format == "ur_rtde":
         return importers.import_ur_rtde(options.file, metadata, X_TK, X_WB)
-    from sliceit_drake.hardware.knife_kinematics import flange_pose
+    from sliceit_drake.hardware.edge_kinematics import flange_pose
     from sliceit_drake.records.rosbag import import_rosbag
 
     wrench, motion = options.topics

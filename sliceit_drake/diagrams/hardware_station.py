@@ -26,8 +26,8 @@ from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.simulated_station import SimulatedStation
 from sliceit_drake.diagrams.station_interface import OwnController, Station, make_controller
 from sliceit_drake.hardware.client import RobotClient
-from sliceit_drake.hardware.configuration import HardwareConfig
-from sliceit_drake.hardware.knife_kinematics import KnifeKinematics
+from sliceit_drake.hardware.edge_kinematics import EdgeKinematics
+from sliceit_drake.hardware.hardware_config import HardwareConfig
 from sliceit_drake.hardware.limits import SafetyLimits
 from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.hardware.rtde_system import RtdeSystem
@@ -40,7 +40,7 @@ __all__ = [
     "HardwareStation",
     "KnifeEstimate",
     "RobotConnection",
-    "make_knife_kinematics",
+    "make_edge_kinematics",
     "make_safety_layer",
 ]
 
@@ -276,10 +276,10 @@ class HardwareStation(Station):
         return list(reading)
 
 
-def make_knife_kinematics(twin: Station) -> KnifeKinematics:
+def make_edge_kinematics(twin: Station) -> EdgeKinematics:
     """Where the edge of a scenario's knife is."""
     robot = twin.scenario.robot
-    return KnifeKinematics(
+    return EdgeKinematics(
         robot.X_WB().GetAsMatrix34(), robot.X_TK().GetAsMatrix34(), twin.scenario.knife.length
     )
 
@@ -296,4 +296,4 @@ def make_safety_layer(
     """
     height = twin.scenario.board.height if board_height is None else board_height
     start = twin.start_joints.tolist()
-    return SafetyLayer(limits, make_knife_kinematics(twin), height, start, PERIOD)
+    return SafetyLayer(limits, make_edge_kinematics(twin), height, start, PERIOD)

@@ -10,8 +10,8 @@ from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.systems.agent import AgentConfig, AgentSystem
+from sliceit_drake.systems.exported_network import load_network
 from sliceit_drake.systems.motion_sources import MotionSource, placed_motion
-from sliceit_drake.systems.network import load_network
 from sliceit_drake.systems.policy import PolicySystem
 
 __all__ = ["MakeScenarioDiagram", "ScenarioDiagram"]

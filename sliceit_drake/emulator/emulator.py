@@ -19,7 +19,7 @@ from sliceit_drake.emulator.robot_model import CYCLE, RobotModel
 from sliceit_drake.emulator.rtde_server import RtdeServer
 from sliceit_drake.emulator.script_server import ScriptServer
 
-__all__ = ["Clock", "Emulator"]
+__all__ = ["ControllerClock", "Emulator"]
 
 _RTDE_PORT, _DASHBOARD_PORT = 30004, 29999
 _SCRIPT_PORTS = (30003, 30001, 30002)
@@ -34,7 +34,7 @@ _SETTLING = 0.05
 
 
 @dc.dataclass
-class Clock:
+class ControllerClock:
     """How controller time goes beside wall time.
 
     Attributes:
@@ -75,7 +75,7 @@ class Emulator:
         self,
         robot: RobotModel,
         address: str = "127.0.0.1",
-        clock: Clock | None = None,
+        clock: ControllerClock | None = None,
         config: ControllerConfig | None = None,
     ) -> None:
         """Opens the ports.
@@ -92,7 +92,7 @@ class Emulator:
         self.address = address
         self.controller = controller = Controller(robot, config)
         self.late_cycles = self.missed_cycles = 0
-        self._clock = clock or Clock()
+        self._clock = clock or ControllerClock()
         self._stopped = False
         self._served = 0
         self._in_step = False

@@ -2,7 +2,7 @@
 
 A pose [6] is the position, m, and the rotation vector (axis times angle), rad. This is written from
 the published Denavit-Hartenberg parameters, apart on purpose from the model that the simulation
-moves (`systems.ur5e_kinematics`) and from the safety layer's (`hardware.knife_kinematics`): a
+moves (`systems.ur5e_kinematics`) and from the safety layer's (`hardware.edge_kinematics`): a
 controller has a kinematics of its own, and a wrong length or sign in one of the three is found by
 the tests that hold it against another, not shared by all.
 """

@@ -125,7 +125,7 @@ class EmulatorProcess:
             scenario: What is on the table; None for an arm alone that follows without dynamics.
             address: Loopback address; one emulator each.
             pace: Controller time per wall time.
-            lockstep: See `emulator.Clock`.
+            lockstep: See `emulator.ControllerClock`.
             options: More options of the command.
             timeout: Wall time that it may take to start, s.
 

@@ -13,7 +13,7 @@ from sliceit_drake.systems.servo import JOINTS, ServoConfig, ServoLaw
 if TYPE_CHECKING:
     from sliceit_drake.diagrams.scenario import Scenario
 
-__all__ = ["CYCLE", "START", "KinematicRobot", "RobotModel", "RobotState", "SimulationStopped"]
+__all__ = ["CYCLE", "START", "KinematicRobot", "RobotModel", "ArmState", "SimulationStopped"]
 
 CYCLE = 0.002
 """Controller time of one cycle of an e-Series controller, s."""
@@ -29,7 +29,7 @@ class SimulationStopped(RuntimeError):
 
 
 @dc.dataclass
-class RobotState:
+class ArmState:
     """An arm at the end of a cycle.
 
     Attributes:
@@ -55,11 +55,11 @@ class RobotModel(Protocol):
         warnings: What the model could not do as asked, in words; the controller tells its clients.
     """
 
-    state: RobotState
+    state: ArmState
     gravity: np.ndarray
     warnings: list[str]
 
-    def step(self, targets: ArrayLike, servo: ServoConfig | None) -> RobotState:
+    def step(self, targets: ArrayLike, servo: ServoConfig | None) -> ArmState:
         """Advances one cycle.
 
         Args:
@@ -99,11 +99,11 @@ class KinematicRobot:
         """Puts the arm at rest at `positions` [6], rad."""
         q = np.array(positions, float)
         none = np.zeros(JOINTS)
-        self.state = RobotState(q, none, np.zeros(6), none)
+        self.state = ArmState(q, none, np.zeros(6), none)
         self.gravity = np.array(GRAVITY)
         self.warnings: list[str] = []
 
-    def step(self, targets: ArrayLike, servo: ServoConfig | None) -> RobotState:
+    def step(self, targets: ArrayLike, servo: ServoConfig | None) -> ArmState:
         """See `RobotModel`."""
         q, v = self.state.positions, self.state.velocities
         if servo is None:

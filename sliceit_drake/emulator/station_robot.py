@@ -17,7 +17,7 @@ from sliceit_drake.diagrams.simulated_station import SimulatedStation
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.emulator.joint_targets import JointTargets
 from sliceit_drake.emulator.kinematics import forward
-from sliceit_drake.emulator.robot_model import CYCLE, RobotState, SimulationStopped
+from sliceit_drake.emulator.robot_model import CYCLE, ArmState, SimulationStopped
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.servo import ServoConfig
 
@@ -69,7 +69,7 @@ class StationRobot:
         self.warnings: list[str] = []
         self.state = self._read()
 
-    def step(self, targets: ArrayLike, servo: ServoConfig | None) -> RobotState:
+    def step(self, targets: ArrayLike, servo: ServoConfig | None) -> ArmState:
         """See `robot_model.RobotModel`."""
         self._check_servo(servo)
         self._targets.set_targets(self._simulator.get_mutable_context(), targets)
@@ -170,11 +170,11 @@ class StationRobot:
         self._plant_context = station.plant.GetMyContextFromRoot(context)
         self._sensor_context = station.sensor.GetMyMutableContextFromRoot(context)
 
-    def _read(self) -> RobotState:
+    def _read(self) -> ArmState:
         plant, arm = self._station.plant, self._station.robot.arm
         port = self._station.sensor.GetOutputPort("sensor_wrench")
         wrench = port.Eval(self._sensor_context)
-        return RobotState(
+        return ArmState(
             plant.GetPositions(self._plant_context, arm),
             plant.GetVelocities(self._plant_context, arm),
             np.concatenate([wrench.translational(), wrench.rotational()]),

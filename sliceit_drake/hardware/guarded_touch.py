@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sliceit_drake.hardware.configuration import TouchConfig
+from sliceit_drake.hardware.edge_kinematics import EdgeKinematics
+from sliceit_drake.hardware.hardware_config import TouchConfig
 from sliceit_drake.hardware.interruption import raise_if_interrupted
-from sliceit_drake.hardware.knife_kinematics import KnifeKinematics
 from sliceit_drake.hardware.robot_state import RobotState
 from sliceit_drake.hardware.rtde_link import LinkStatus, RobotLink
 
@@ -74,7 +74,7 @@ class GuardedTouch:
         link: RobotLink,
         path: Callable[[float], np.ndarray],
         depth: float,
-        kinematics: KnifeKinematics,
+        kinematics: EdgeKinematics,
         config: TouchConfig,
         pace: float = 1.0,
     ) -> None:

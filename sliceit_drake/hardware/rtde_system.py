@@ -8,7 +8,7 @@ from pydrake.common.value import AbstractValue, Value
 from pydrake.multibody.math import SpatialForce
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from sliceit_drake.hardware.knife_kinematics import flange_pose
+from sliceit_drake.hardware.edge_kinematics import flange_pose
 from sliceit_drake.hardware.rtde_link import LinkStatus, RobotLink
 from sliceit_drake.hardware.safety import Stop
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from sliceit_drake.configuration import ConfigurationError, validate
-from sliceit_drake.hardware.knife_kinematics import Edge, KnifeKinematics
+from sliceit_drake.hardware.edge_kinematics import EdgeKinematics, EdgePose
 from sliceit_drake.hardware.limits import SafetyLimits
 from sliceit_drake.hardware.robot_state import (
     PLAYING,
@@ -95,7 +95,7 @@ class SafetyLayer:
     def __init__(
         self,
         limits: SafetyLimits,
-        kinematics: KnifeKinematics,
+        kinematics: EdgeKinematics,
         board_height: float,
         start: Sequence[float],
         period: float = 0.002,
@@ -383,7 +383,7 @@ class SafetyLayer:
         return [a + late * v for a, v in zip(q, self._command_speed, strict=True)]
 
     def _position_fault(
-        self, q: Sequence[float], edge: Edge, what: str, time: float, margin: float = 0.0
+        self, q: Sequence[float], edge: EdgePose, what: str, time: float, margin: float = 0.0
     ) -> Stop | None:
         for j in range(6):
             if q[j] > self._upper[j]:

@@ -8,7 +8,7 @@ from stable_baselines3.sac.policies import Actor
 from torch import nn
 
 from sliceit_drake.systems.agent import AgentConfig
-from sliceit_drake.systems.network import LAYOUT, layout_of
+from sliceit_drake.systems.exported_network import LAYOUT, layout_of
 
 __all__ = ["export_policy"]
 

@@ -7,11 +7,11 @@ import numpy as np
 
 from sliceit_drake.records.slice_record import SliceTable
 
-__all__ = ["Finding", "Findings", "runs"]
+__all__ = ["RecordFinding", "Findings", "runs"]
 
 
 @dc.dataclass(frozen=True)
-class Finding:
+class RecordFinding:
     """Something about a record that a user should know.
 
     Attributes:
@@ -54,7 +54,7 @@ class Findings:
 
     def __init__(self, table: SliceTable) -> None:
         self._table = table
-        self.found: list[Finding] = []
+        self.found: list[RecordFinding] = []
 
     def error(
         self, kind: str, column: str, problem: str, fix: str, rows: tuple[int, int] | None = None
@@ -71,7 +71,7 @@ class Findings:
     def fact(self, severity: str, kind: str, field: str, problem: str, fix: str) -> None:
         """Reports something about a field of the YAML file."""
         file = str(Path(self._table.file).with_suffix(".yaml"))
-        self.found.append(Finding(severity, kind, file, field, None, problem, fix))
+        self.found.append(RecordFinding(severity, kind, file, field, None, problem, fix))
 
     def has(self, *kinds: str) -> bool:
         """Whether something of these kinds was found."""
@@ -88,7 +88,9 @@ class Findings:
     ) -> None:
         lines = self._table.lines
         place = None if rows is None else (int(lines[rows[0]]), int(lines[rows[1]]))
-        self.found.append(Finding(severity, kind, self._table.file, column, place, problem, fix))
+        self.found.append(
+            RecordFinding(severity, kind, self._table.file, column, place, problem, fix)
+        )
 
 
 def runs(mask: np.ndarray) -> list[tuple[int, int]]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.records import slice_record as fmt
-from sliceit_drake.records.findings import Finding, Findings, runs
+from sliceit_drake.records.findings import Findings, RecordFinding, runs
 from sliceit_drake.records.force_checks import check_force
 from sliceit_drake.records.metadata import SliceMetadata
 from sliceit_drake.records.motion_checks import check_motion
@@ -134,12 +134,12 @@ def record_files(path: Path) -> list[Path]:
     return files
 
 
-def check_record(record: SliceRecord) -> list[Finding]:
+def check_record(record: SliceRecord) -> list[RecordFinding]:
     """What is wrong with a record in memory; see `check_table`."""
     return check_table(record.table())
 
 
-def check_table(table: SliceTable) -> list[Finding]:
+def check_table(table: SliceTable) -> list[RecordFinding]:
     """What is wrong with a record as its files have it.
 
     Args:

@@ -6,7 +6,7 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.motion import ConstantSpeed, MotionPlan
-from sliceit_drake.diagrams.hardware_station import make_knife_kinematics, make_safety_layer
+from sliceit_drake.diagrams.hardware_station import make_edge_kinematics, make_safety_layer
 from sliceit_drake.hardware.checks import Check
 from sliceit_drake.hardware.guarded_touch import GuardedTouch, Touch, TouchError
 from sliceit_drake.hardware.rtde_link import RobotLink
@@ -90,7 +90,7 @@ class BoardTouch:
                 raise TouchError(problem)
             with steady_python():
                 found = GuardedTouch(
-                    link, path, self.depth, make_knife_kinematics(hardware.twin), touch,
+                    link, path, self.depth, make_edge_kinematics(hardware.twin), touch,
                     hardware.pace,
                 ).run()  # fmt: skip
             reason = "the touch is complete"

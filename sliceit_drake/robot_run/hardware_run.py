@@ -32,7 +32,7 @@ from sliceit_drake.hardware.checks import (
     check_start,
 )
 from sliceit_drake.hardware.client import RobotClient
-from sliceit_drake.hardware.configuration import HardwareConfig
+from sliceit_drake.hardware.hardware_config import HardwareConfig
 from sliceit_drake.hardware.interruption import raise_if_interrupted
 from sliceit_drake.hardware.robot_state import RobotState
 from sliceit_drake.hardware.rtde_link import RobotLink

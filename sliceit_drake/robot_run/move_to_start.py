@@ -5,7 +5,7 @@ import time as clock
 
 import numpy as np
 
-from sliceit_drake.diagrams.hardware_station import make_knife_kinematics
+from sliceit_drake.diagrams.hardware_station import make_edge_kinematics
 from sliceit_drake.hardware.checks import Check
 from sliceit_drake.hardware.client import RobotUnavailableError
 from sliceit_drake.hardware.interruption import raise_if_interrupted
@@ -57,7 +57,7 @@ class MoveToStart:
     def __post_init__(self) -> None:
         self.begin = self.hardware.client.read()
         limits = self.hardware.config.limits
-        kinematics = make_knife_kinematics(self.hardware.twin)
+        kinematics = make_edge_kinematics(self.hardware.twin)
         q, turn = np.array(self.begin.q), self._turn
         shares = np.linspace(0.0, 1.0, SAMPLES)
         ends = np.array([kinematics.edge((q + s * turn).tolist())[:2] for s in shares])

@@ -8,11 +8,11 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from scipy.spatial.transform import Rotation
 
 from sliceit_drake.cutting.motion import Motion
-from sliceit_drake.diagrams.hardware_station import make_knife_kinematics
+from sliceit_drake.diagrams.hardware_station import make_edge_kinematics
 from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.hardware.checks import Check
 from sliceit_drake.hardware.client import RobotClient
-from sliceit_drake.hardware.configuration import HardwareConfig
+from sliceit_drake.hardware.hardware_config import HardwareConfig
 from sliceit_drake.systems.motion_sources import placed_motion
 
 __all__ = ["JointPlan", "check_plan", "plan_joints"]
@@ -65,7 +65,7 @@ def plan_joints(
     R, p, _, _ = motion.sample(time)
     plant, knife = station.plant, station.robot.knife
     context, frame, world = plant.CreateDefaultContext(), knife.body_frame(), plant.world_frame()
-    kinematics = make_knife_kinematics(station)
+    kinematics = make_edge_kinematics(station)
     q, path, ends = np.array(station.start_joints, float), [], []
     least, miss, tilt = math.inf, 0.0, 0.0
     for R_WK, p_WK in zip(R, p, strict=True):

@@ -20,7 +20,7 @@ from sliceit_drake.stand_in.curve_laws import (
     food_forces,
     measured_curve,
 )
-from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceFacts, Tissue
+from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceTruth, Tissue
 from sliceit_drake.stand_in.protocol import Protocol, Specimen, section_size
 from sliceit_drake.stand_in.world import GRAVITY, Path, resampled
 
@@ -52,7 +52,7 @@ class CurveWorld:
         """Cuts one slice; see `World`."""
         protocol, condition = self.protocol, specimen.condition
         width, height = section_size(protocol.food, condition.width_scale)
-        facts = SliceFacts(
+        facts = SliceTruth(
             index=specimen.index,
             peeled=condition.peeled,
             height=height,
@@ -77,7 +77,7 @@ class CurveWorld:
         self,
         path: Path,
         specimen: Specimen,
-        facts: SliceFacts,
+        facts: SliceTruth,
         section: EllipticSection,
         effects: Sequence[Effect],
     ) -> Series:
@@ -131,7 +131,7 @@ class CurveWorld:
         self,
         path: Path,
         specimen: Specimen,
-        facts: SliceFacts,
+        facts: SliceTruth,
         section: EllipticSection,
         stretches: np.ndarray,
         forces: np.ndarray,
@@ -184,7 +184,7 @@ class _EdgeEffects:
     """What effects do to the edge's force in a section."""
 
     def __init__(
-        self, section: EllipticSection, facts: SliceFacts, effects: Sequence[Effect]
+        self, section: EllipticSection, facts: SliceTruth, effects: Sequence[Effect]
     ) -> None:
         a, b, up, half = section.a, section.b, section.up, section.half
         self._depth = section.depth

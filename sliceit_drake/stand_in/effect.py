@@ -20,11 +20,11 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
 
-__all__ = ["Effect", "Now", "Series", "SliceFacts", "Tissue"]
+__all__ = ["Effect", "Now", "Series", "SliceTruth", "Tissue"]
 
 
 @dc.dataclass(frozen=True)
-class SliceFacts:
+class SliceTruth:
     """What is the same during one slice.
 
     Attributes:
@@ -119,7 +119,7 @@ class Series:
         other: Of anything else.
     """
 
-    slice: SliceFacts
+    slice: SliceTruth
     time: np.ndarray
     R: np.ndarray
     p: np.ndarray
@@ -196,7 +196,7 @@ class Effect:
                 fix=f"Give at least {self.least:g}; {self.typical:g} is typical.",
             )
 
-    def begin(self, facts: SliceFacts, rng: np.random.Generator) -> None:
+    def begin(self, facts: SliceTruth, rng: np.random.Generator) -> None:
         """Before a slice.
 
         Args:

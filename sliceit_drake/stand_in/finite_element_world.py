@@ -27,7 +27,7 @@ from sliceit_drake.cutting.simulate import (
     check_in_plane,
 )
 from sliceit_drake.cutting.solver import CuttingSolver, SurfaceFactors
-from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceFacts, Tissue
+from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceTruth, Tissue
 from sliceit_drake.stand_in.protocol import Protocol, Specimen, scaled_food, section_size
 from sliceit_drake.stand_in.world import GRAVITY, Path, resampled
 
@@ -162,7 +162,7 @@ class FiniteElementWorld:
         mesh = food.shape.mesh(self.settings.refinement)
         nominal = self._section(food, mesh)
         low, high = nominal.model.span
-        facts = SliceFacts(
+        facts = SliceTruth(
             index=specimen.index,
             peeled=condition.peeled,
             height=nominal.model.top - nominal.model.bottom,
@@ -257,7 +257,7 @@ class _Run:
         self.cut = self.travel = self.swept = 0.0
         self.force = np.zeros(3)
 
-    def series(self, facts: SliceFacts) -> Series:
+    def series(self, facts: SliceTruth) -> Series:
         """Drives the knife along the path."""
         path, settings = self.path, self.world.settings
         reach = 0.5 * self.protocol.knife.length
@@ -337,7 +337,7 @@ class _Run:
 
     def _sampled(
         self,
-        facts: SliceFacts,
+        facts: SliceTruth,
         stretches: np.ndarray,
         parts: np.ndarray,
         shifts: np.ndarray,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceFacts
+from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceTruth
 
 __all__ = ["BluntEdge", "DullingEdge", "FlankAdhesion", "FlankFriction"]
 
@@ -21,7 +21,7 @@ class FlankFriction(Effect):
     stribeck_speed = 8e-3
     viscous = 2.0
 
-    def begin(self, facts: SliceFacts, rng: np.random.Generator) -> None:
+    def begin(self, facts: SliceTruth, rng: np.random.Generator) -> None:
         super().begin(facts, rng)
         self._bristles = 0.0
 
@@ -80,6 +80,6 @@ class DullingEdge(BluntEdge):
     typical = 1.2
     half = 6.0
 
-    def begin(self, facts: SliceFacts, rng: np.random.Generator) -> None:
+    def begin(self, facts: SliceTruth, rng: np.random.Generator) -> None:
         super().begin(facts, rng)
         self.size *= facts.index / (facts.index + self.half)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceFacts
+from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceTruth
 
 __all__ = ["ArmCompliance", "BoardHeight", "BoardLaw", "FoodSlip", "HolderCompliance"]
 
@@ -51,7 +51,7 @@ class ArmCompliance(Effect):
     every_exchange = True
     fast, slow = 0.03, 0.6
 
-    def begin(self, facts: SliceFacts, rng: np.random.Generator) -> None:
+    def begin(self, facts: SliceTruth, rng: np.random.Generator) -> None:
         super().begin(facts, rng)
         self._given = np.zeros(2)
         self._force = self._stiffness = self._place = self._before = 0.0
@@ -102,7 +102,7 @@ class FoodSlip(Effect):
     least = 0.0
     duration = 0.02
 
-    def begin(self, facts: SliceFacts, rng: np.random.Generator) -> None:
+    def begin(self, facts: SliceTruth, rng: np.random.Generator) -> None:
         super().begin(facts, rng)
         self._depth = rng.uniform(0.25, 0.9) * facts.height
         self._side = rng.choice((-1.0, 1.0))

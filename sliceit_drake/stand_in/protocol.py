@@ -11,7 +11,7 @@ from sliceit_drake.cutting.foods.food import Box, Cylinder, Ellipsoid, Food
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.diagrams.scenario import Placement, Preparation, Scenario
-from sliceit_drake.stand_in.sensor import SensorModel
+from sliceit_drake.stand_in.sensor_model import SensorModel
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 
 __all__ = [

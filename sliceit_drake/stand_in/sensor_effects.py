@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.signal import lfilter
 
-from sliceit_drake.stand_in.effect import Effect, Series, SliceFacts
+from sliceit_drake.stand_in.effect import Effect, Series, SliceTruth
 from sliceit_drake.stand_in.world import GRAVITY
 
 __all__ = [
@@ -106,7 +106,7 @@ class DriveVibration(Effect):
     typical = 0.5
     frequency = 31.0
 
-    def begin(self, facts: SliceFacts, rng: np.random.Generator) -> None:
+    def begin(self, facts: SliceTruth, rng: np.random.Generator) -> None:
         super().begin(facts, rng)
         self._phase = rng.uniform(0.0, 2.0 * np.pi, 3)
 

@@ -31,10 +31,10 @@ from sliceit_drake.records.metadata import (
 from sliceit_drake.records.slice_record import SliceRecord, write_record
 from sliceit_drake.stand_in.curve_world import CurveWorld
 from sliceit_drake.stand_in.effect import Effect, Series
+from sliceit_drake.stand_in.effect_registry import make_effect
 from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings, FiniteElementWorld
 from sliceit_drake.stand_in.protocol import Protocol, Specimen, scaled_food, schedule
-from sliceit_drake.stand_in.registry import make_effect
-from sliceit_drake.stand_in.sensor import measured
+from sliceit_drake.stand_in.sensor_model import measured
 from sliceit_drake.stand_in.world import World
 
 if TYPE_CHECKING:

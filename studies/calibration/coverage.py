@@ -11,13 +11,13 @@ import numpy as np
 from scipy.special import ndtri
 
 from sliceit_drake.calibration.gauss_newton import gauss_newton
-from sliceit_drake.prediction.noise import NoiseModel, group_series
 from sliceit_drake.calibration.prediction import Predictor
 from sliceit_drake.calibration.setup import CalibrationSetup, load_setup
 from sliceit_drake.calibration.uncertainty import estimate
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.food import Cylinder
 from sliceit_drake.cutting.workers import worker_processes
+from sliceit_drake.prediction.noise import NoiseModel, group_series
 from sliceit_drake.records.metadata import FoodFacts, NominalMotion, SliceMetadata
 from sliceit_drake.records.slice_record import SliceRecord, velocities
 

@@ -81,7 +81,7 @@ def add_hidden_study(studies: "argparse._SubParsersAction[argparse.ArgumentParse
 def _run_hidden(options: argparse.Namespace) -> int:
     """Runs the study."""
     from sliceit_drake.configuration import ConfigurationError
-    from sliceit_drake.stand_in.registry import make_effect
+    from sliceit_drake.stand_in.effect_registry import make_effect
     from studies.hidden_effects.archive import unpack
     from studies.hidden_effects.cases import KINDS
     from studies.hidden_effects.study import StudyOptions, prepare, run_study
@@ -123,7 +123,7 @@ def _run_sizes(options: argparse.Namespace) -> int:
     """Prints the table."""
     from tqdm import tqdm
 
-    from sliceit_drake.stand_in.registry import EFFECTS
+    from sliceit_drake.stand_in.effect_registry import EFFECTS
     from studies.hidden_effects.sizes import ProtocolSizes, sizes_as_markdown
 
     effects = options.effects or list(EFFECTS)

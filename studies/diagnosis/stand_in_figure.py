@@ -13,9 +13,9 @@ import numpy as np
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.effect import Effect
+from sliceit_drake.stand_in.effect_registry import EFFECTS
 from sliceit_drake.stand_in.protocol import Protocol, Variation, load_protocol
-from sliceit_drake.stand_in.registry import EFFECTS
-from sliceit_drake.stand_in.sensor import SensorModel
+from sliceit_drake.stand_in.sensor_model import SensorModel
 from sliceit_drake.stand_in.session import Session
 
 matplotlib.use("Agg")

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 
-from sliceit_drake.stand_in.registry import EFFECTS
+from sliceit_drake.stand_in.effect_registry import EFFECTS
 from studies.hidden_effects.truth import BASE_OF, CAUSE_OF, UNKNOWN
 
 __all__ = ["KINDS", "PAIRS", "Case", "Hidden", "SizeOf", "make_cases"]

@@ -14,8 +14,8 @@ from sliceit_drake.cluster import code_version
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.records.slice_record import write_record
+from sliceit_drake.stand_in.effect_registry import make_effect
 from sliceit_drake.stand_in.protocol import Protocol, protocol_of_scenario
-from sliceit_drake.stand_in.registry import make_effect
 from sliceit_drake.stand_in.session import Session
 from studies.hidden_effects.bench import DIAGNOSIS_REFINEMENT, WORLD, protocol_named
 from studies.hidden_effects.cases import Case

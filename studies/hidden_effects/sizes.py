@@ -32,9 +32,9 @@ from sliceit_drake.diagnosis.registry import all_causes, open_causes
 from sliceit_drake.prediction.simulator import cutting_source
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.stand_in import effect as effect_module
-from sliceit_drake.stand_in import finite_element_world, quiet, sensor, session, world
+from sliceit_drake.stand_in import finite_element_world, quiet, sensor_model, session, world
+from sliceit_drake.stand_in.effect_registry import EFFECTS, make_effect
 from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
-from sliceit_drake.stand_in.registry import EFFECTS, make_effect
 from sliceit_drake.stand_in.session import Session
 from studies.hidden_effects import bench
 from studies.hidden_effects.bench import (
@@ -161,7 +161,7 @@ class ProtocolSizes:
         if self.cache is None:
             return None
         h = hashlib.sha256(cutting_source())
-        modules = (bench, effect_module, finite_element_world, quiet, sensor, session, world)
+        modules = (bench, effect_module, finite_element_world, quiet, sensor_model, session, world)
         sources = [inspect.getfile(m) for m in modules]
         for source in [*sources, inspect.getfile(EFFECTS[effect])]:
             h.update(Path(source).read_bytes())

@@ -1,6 +1,6 @@
 """What a diagnosis would have to say of an effect: the names of both worlds side by side."""
 
-from sliceit_drake.stand_in.registry import UNLISTED
+from sliceit_drake.stand_in.effect_registry import UNLISTED
 
 __all__ = ["BASE_OF", "CAUSE_OF", "UNKNOWN"]
 

@@ -37,7 +37,7 @@ SIMULATORS = ("cutting", "spring")
 DECISION = """
 import sys, time, numpy as np
 from sliceit_drake.systems.agent import AgentConfig
-from sliceit_drake.systems.network import load_network
+from sliceit_drake.systems.exported_network import load_network
 config = AgentConfig(network=sys.argv[1])
 decide = load_network(config)
 rows = np.random.default_rng(0).normal(size=(2000, config.observation_size()))

@@ -35,7 +35,7 @@ from sliceit_drake.learning.metrics import SliceMetrics, slice_metrics
 from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.slicing_worlds import StandInWorld
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
-from sliceit_drake.systems.network import load_network
+from sliceit_drake.systems.exported_network import load_network
 from studies.marked_page import Place
 
 warp.config.log_level = warp.LOG_ERROR

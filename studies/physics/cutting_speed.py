@@ -22,10 +22,10 @@ from tqdm import tqdm
 from sliceit_drake.cutting.batch import simulate_batch
 from sliceit_drake.cutting.foods.food import make_food_model, start_pose
 from sliceit_drake.cutting.gradient import SliceAdjoint
+from sliceit_drake.cutting.knife_path import KnifePath
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.parameters import with_parameters
-from sliceit_drake.cutting.knife_path import KnifePath
 from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario

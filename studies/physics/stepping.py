@@ -10,9 +10,9 @@ import numpy as np
 
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.knife_path import KnifePath
 from sliceit_drake.cutting.model import CuttingModel, Numerics, TimeStepError
 from sliceit_drake.cutting.motion import Hold, Motion, MotionPlan, PressAndDraw, Retract, Segment
-from sliceit_drake.cutting.knife_path import KnifePath
 from sliceit_drake.cutting.simulate import ENERGY_RATIO_LIMIT, energy_ratio
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
 

@@ -4,7 +4,7 @@ import timeit
 
 import numpy as np
 
-from sliceit_drake.hardware.knife_kinematics import KnifeKinematics
+from sliceit_drake.hardware.edge_kinematics import EdgeKinematics
 from sliceit_drake.hardware.limits import SafetyLimits
 from sliceit_drake.hardware.robot_state import PLAYING, RobotState
 from sliceit_drake.hardware.safety import SafetyLayer
@@ -17,7 +17,7 @@ def main() -> None:
     """Prints the least mean of five runs that pass every command."""
     X_TK = np.eye(4)
     X_TK[2, 3] = 0.21
-    kinematics = KnifeKinematics(np.eye(4), X_TK, 0.15)
+    kinematics = EdgeKinematics(np.eye(4), X_TK, 0.15)
 
     def run() -> None:
         layer = SafetyLayer(SafetyLimits(), kinematics, 0.05, START)

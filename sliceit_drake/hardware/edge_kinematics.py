@@ -16,13 +16,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["Edge", "KnifeKinematics", "flange_pose"]
+__all__ = ["EdgeKinematics", "EdgePose", "flange_pose"]
 
 # Universal Robots, "DH parameters for calculations of kinematics and dynamics", UR5e, metres.
 D1, A2, A3, D4, D5, D6 = 0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996
 
 
-class Edge(NamedTuple):
+class EdgePose(NamedTuple):
     """The edge in the world.
 
     Attributes:
@@ -67,7 +67,7 @@ def flange_pose(q: Sequence[float]) -> tuple[float, ...]:
     )
 
 
-class KnifeKinematics:
+class EdgeKinematics:
     """The edge of a knife on a UR5e's flange.
 
     Args:
@@ -85,7 +85,7 @@ class KnifeKinematics:
         self._tip = tuple((tool[:3, 3] + half).tolist())
         self._down = tuple(tool[:3, 2].tolist())
 
-    def edge(self, q: Sequence[float]) -> Edge:
+    def edge(self, q: Sequence[float]) -> EdgePose:
         """The edge at joint positions `q` [6], rad."""
         nx, ny, nz, ox, oy, oz, ax, ay, az, px, py, pz = flange_pose(q)
         (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self._R
@@ -108,4 +108,4 @@ class KnifeKinematics:
             + zy * (ny * x + oy * y + ay * z)
             + zz * (nz * x + oz * y + az * z)
         )
-        return Edge(ends[0], ends[1], down)
+        return EdgePose(ends[0], ends[1], down)
