@@ -5,8 +5,9 @@ import dataclasses as dc
 import numpy as np
 import pytest
 
-from sliceit_drake.cutting.batch import BatchSlice, _Runner, simulate_batch
+from sliceit_drake.cutting.batch import BatchSlice, cut_together, simulate_batch
 from sliceit_drake.cutting.board import Board
+from sliceit_drake.cutting.driver import Driver, Launch
 from sliceit_drake.cutting.foods.effects import Compliance, Effects, Relaxation
 from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
@@ -67,7 +68,7 @@ def test_each_slice_of_a_batch_is_the_slice_alone(models, motions, one_by_one, w
 
 def test_cuts_side_by_side_are_the_cuts_alone(models, motions, one_by_one):
     # As on a GPU; the second motion is shorter.
-    results = _Runner(PERIOD, BOARD).run([models[0], models[1]], [motions[0], motions[1]])
+    results = cut_together(Driver(PERIOD, BOARD), models[:2], motions[:2])
     for result, alone in zip(results, one_by_one, strict=False):
         np.testing.assert_array_equal(table(result), alone)
 
@@ -80,7 +81,7 @@ def test_a_slice_that_breaks_down_is_reported_and_disturbs_no_other(models, moti
     assert "not finite" in results[0].failure
     assert np.isnan(results[0].food_wrench[-1]).all()
     np.testing.assert_array_equal(table(results[1]), one_by_one[0])
-    together = _Runner(PERIOD, BOARD).run([broken, models[0]], [motions[0]] * 2)
+    together = cut_together(Driver(PERIOD, BOARD), [broken, models[0]], [motions[0]] * 2)
     assert together[0].failure == results[0].failure
     np.testing.assert_array_equal(table(together[1]), one_by_one[0])
 
@@ -93,4 +94,4 @@ def test_numbers_of_models_and_motions_must_agree(models, motions):
 def test_a_workspace_refuses_cuts_of_another_mesh(models):
     other = make_food_model(Food(shape=Cylinder(rings=3)), Knife(), Numerics())
     with pytest.raises(ValueError, match="derived from one model"):
-        _Runner(PERIOD, None)._workspace([models[0], other], 1)
+        Driver(PERIOD).workspace([models[0], other], Launch(0, 1))

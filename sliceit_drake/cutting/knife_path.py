@@ -30,9 +30,11 @@ class KnifePath:
     """Poses of the knife at the exchanges, in F and relative to the food in C.
 
     Attributes:
+        model: The cut.
         exchanges: Their number E.
         R_FK, p_FK: [E + 1, 3, 3] and [E + 1, 3].
         R_CK, p_CK: The same in C; where the mounting gives, relative to the food.
+        rigid: Whether it does not give.
     """
 
     def __init__(self, model: CuttingModel, motion: PosedMotion, period: float) -> None:
@@ -41,10 +43,11 @@ class KnifePath:
         self.R_FK = np.array([X_FK.R for X_FK in poses])
         self.p_FK = np.array([X_FK.p for X_FK in poses])
         self._commands = self.p_FK.copy()
-        self._model = model
+        self.model = model
         self.R_CK = model.X_FC_rotation.T @ self.R_FK
         self.p_CK = model.to_cut_frame(self.p_FK)
         self._mounting = Mounting.of(model.effects)
+        self.rigid = self._mounting.rigid
 
     def pose(self, k: int) -> Pose:
         """X_CK after k exchanges."""
@@ -52,7 +55,7 @@ class KnifePath:
 
     def block(self, k: int) -> int:
         """How many exchanges from the k-th can be advanced at once, without a check."""
-        if not self._mounting.rigid or k + BLOCK > self.exchanges:
+        if not self.rigid or k + BLOCK > self.exchanges:
             return 1
         steps = np.diff(self.p_FK[k : k + BLOCK + 1], axis=0)
         return BLOCK if float(np.linalg.norm(steps, axis=1).sum()) < CHECK_TRAVEL else 1
@@ -62,15 +65,15 @@ class KnifePath:
 
         If not, they have given, and the exchange that ends at the k-th pose is to be repeated.
         """
-        if self._mounting.rigid or k > self.exchanges:
+        if self.rigid or k > self.exchanges:
             return True
-        rise = float((self._model.X_FC_rotation @ force)[2])
+        rise = float((self.model.X_FC_rotation @ force)[2])
         height = float(self._commands[k, 2])
         done = self._mounting.balanced(rise, -float(force[0]), height, board)
         at = k + 1 if done else k
         if at <= self.exchanges:
             rise, shift = self._mounting.given.tolist()
             self.p_FK[at] = self._commands[at] + [0.0, 0.0, rise]
-            self.p_CK[at] = self._model.to_cut_frame(self.p_FK[at])
+            self.p_CK[at] = self.model.to_cut_frame(self.p_FK[at])
             self.p_CK[at, 0] -= shift
         return done

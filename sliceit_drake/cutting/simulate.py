@@ -1,10 +1,12 @@
 """One slice on a prescribed knife motion, without a robot."""
 
 import dataclasses as dc
+from collections.abc import Iterator
 
 import numpy as np
 
 from sliceit_drake.cutting.board import Board, board_wrenches
+from sliceit_drake.cutting.driver import Launch, drive, even_launches
 from sliceit_drake.cutting.knife import signed_distance
 from sliceit_drake.cutting.knife_path import CHECK_TRAVEL, KnifePath
 from sliceit_drake.cutting.model import CuttingModel
@@ -242,26 +244,31 @@ def simulate_slice(
     path = KnifePath(model, motion, T)
     count, R_FC = path.exchanges, model.X_FC_rotation
     every = max(1, round(check_period / T))
-    state = solver.initial_state()
     check_clear(model, path.pose(0))
     ledger = EnergyLedger()
     rows = np.zeros((count, 26))
     norms = np.zeros(count)
     ratio = travel = 0.0
-    k = last_check = 0
-    while k < count:
-        block = 1 if contact_sum else path.block(k)
-        at, ends = slice(k, k + block), slice(k, k + block + 1)
-        for m in range(k + 1, k + block + 1):
-            check_in_plane(model, path.pose(m), m * T)
-        balanced = False
-        while not balanced:
-            try:
-                step = solver.exchanges(state, path.R_CK[ends], path.p_CK[ends])
-            except CuttingError as error:
-                raise CuttingError(f"at {(k + 1) * T:.4g} s {error}") from error
-            balanced = path.balanced(k + block, step.wrenches[-1].sum(0)[3:], board)
-        state = step.state
+    last_check = 0
+
+    def launches() -> Iterator[Launch]:
+        singly = (Launch(k, 1) for k in range(count))
+        for launch in singly if contact_sum else even_launches([path]):
+            for m in range(launch.first + 1, launch.first + launch.exchanges + 1):
+                check_in_plane(model, path.pose(m), m * T)
+            yield launch
+
+    def advance(
+        launch: Launch, states: np.ndarray, R: np.ndarray, p: np.ndarray
+    ) -> list[Exchanges]:
+        try:
+            return [solver.exchanges(states[0], R[0], p[0])]
+        except CuttingError as error:
+            raise CuttingError(f"at {(launch.first + 1) * T:.4g} s {error}") from error
+
+    uncut = solver.initial_state()[None]
+    for (k, block, _), (step,) in drive([path], launches(), uncut, advance, board):
+        at, state = slice(k, k + block), step.state
         ledger.add(step)
         parts = step.wrenches.reshape(block, 3, 2, 3) @ R_FC.T
         rows[at, 4:10] = parts.sum(1).reshape(block, 6)
@@ -270,13 +277,14 @@ def simulate_slice(
         if contact_sum:
             forces = solver.contact_forces(state, path.pose(k), path.pose(k + 1))
             norms[k] = np.linalg.norm(forces, axis=-1).sum()
-        travel += float(np.linalg.norm(np.diff(path.p_FK[ends], axis=0), axis=1).sum())
-        k += block
-        if k - last_check >= every or travel > CHECK_TRAVEL or k == count:
-            travel, last_check = 0.0, k
-            energies = solver.energies(state, path.pose(k))
+        end = k + block
+        moved = np.diff(path.p_FK[k : end + 1], axis=0)
+        travel += float(np.linalg.norm(moved, axis=1).sum())
+        if end - last_check >= every or travel > CHECK_TRAVEL or end == count:
+            travel, last_check = 0.0, end
+            energies = solver.energies(state, path.pose(end))
             spent = ledger.edge + ledger.opening + ledger.friction
-            ratio = max(ratio, check_energies(energies, spent, model, k * T))
+            ratio = max(ratio, check_energies(energies, spent, model, end * T))
     rows[:, 0] = np.arange(1, count + 1) * T
     rows[:, 1:4] = path.p_FK[1:]
     if board is not None:

@@ -93,6 +93,11 @@ class Exchanges:
     gravity_work: float
     cut: np.ndarray
 
+    @property
+    def finite(self) -> bool:
+        """Whether the cut has not broken down; limits on forces can hide a state that has."""
+        return bool(np.isfinite(self.wrenches).all() and np.isfinite(self.state).all())
+
 
 @dc.dataclass
 class Energies:
@@ -287,7 +292,7 @@ class CuttingSolver:
             self._take_factors(UNCHANGED)
             ws = self._workspace_for(len(p) - 1)
             result = run_exchanges(ws, state[None], R[None], p[None])
-        if not np.isfinite(result[0].wrenches).all():
+        if not result[0].finite:
             raise CuttingError(NOT_FINITE)
         return result[0]
 

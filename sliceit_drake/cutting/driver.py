@@ -1,0 +1,192 @@
+"""Steps cuts along the paths of their knives: the loop of single slices, batches and jobs."""
+
+import dataclasses as dc
+import os
+import queue
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from sliceit_drake.cutting.board import Board
+from sliceit_drake.cutting.knife_path import KnifePath
+from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.cutting.solver import Exchanges, run_exchanges
+from sliceit_drake.cutting.workspace import Workspace
+
+__all__ = ["Driver", "DriverPool", "Launch", "drive", "even_launches"]
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+class Launch(NamedTuple):
+    """Exchanges that are advanced at once.
+
+    Attributes:
+        first: Number of the first.
+        exchanges: How many.
+        multiple: Duration of each, and of its sub-step, relative to the shortest.
+    """
+
+    first: int
+    exchanges: int
+    multiple: int = 1
+
+
+Advance = Callable[[Launch, np.ndarray, np.ndarray, np.ndarray], list[Exchanges]]
+
+
+def even_launches(paths: Sequence[KnifePath]) -> Iterator[Launch]:
+    """Launches of exchanges of one duration, as many at once as all paths allow."""
+    k, count = 0, max(path.exchanges for path in paths)
+    while k < count:
+        launch = Launch(k, min(path.block(k) for path in paths))
+        yield launch
+        k += launch.exchanges
+
+
+def drive(
+    paths: Sequence[KnifePath],
+    launches: Iterable[Launch],
+    states: np.ndarray,
+    advance: Advance,
+    board: Board | None = None,
+) -> Iterator[tuple[Launch, list[Exchanges]]]:
+    """Advances cuts along the paths of their knives, launch by launch.
+
+    Where arm or holder give, a launch is repeated until they hold its force. A launch that leaves
+    no cut finite is the last.
+
+    Args:
+        paths: Of the knives, one a cut [C].
+        launches: Each is taken once the one before it was yielded.
+        states: The foods before the first launch [C, state_size].
+        advance: Advances all cuts, given a launch, states [C, state_size], rotations
+            [C, E + 1, 3, 3] and positions [C, E + 1, 3] of the knives in C, metres.
+        board: Board under the knives, its height in F; None for none.
+
+    Yields:
+        Each launch and what it gives, one a cut.
+    """
+    for launch in launches:
+        last = launch.first + launch.exchanges
+        # A knife whose motion is over rests at its end.
+        ends = [np.minimum(np.arange(launch.first, last + 1), path.exchanges) for path in paths]
+        R = np.array([path.R_CK[rows] for path, rows in zip(paths, ends, strict=True)])
+        found: dict[int, Exchanges] = {}
+        unbalanced = list(range(len(paths)))
+        while unbalanced:
+            p = np.array([path.p_CK[rows] for path, rows in zip(paths, ends, strict=True)])
+            tried = advance(launch, states, R, p)
+            found |= {c: tried[c] for c in unbalanced}
+            unbalanced = [
+                c
+                for c in unbalanced
+                if not paths[c].balanced(last, tried[c].wrenches[-1].sum(0)[3:], board)
+            ]
+        steps = [found[c] for c in range(len(paths))]
+        yield launch, steps
+        if not any(step.finite for step in steps):
+            return
+        states = np.array([step.state for step in steps])
+
+
+class Driver:
+    """Drives cuts, keeping the device arrays of each mesh for the cuts that come after.
+
+    Not to be used by several threads at once.
+
+    Args:
+        exchange_period: Of the shortest exchange, s.
+        board: Board under the knife, its height in F; None for none.
+    """
+
+    def __init__(self, exchange_period: float, board: Board | None = None) -> None:
+        self.exchange_period, self.board = exchange_period, board
+        self._workspaces: dict[tuple, Workspace] = {}
+
+    def workspace(self, models: Sequence[CuttingModel], launch: Launch) -> Workspace:
+        """Device arrays for cuts that are all derived from one model."""
+        model = models[0]
+        size = (len(models), launch.exchanges, launch.multiple)
+        key = (id(model.split), len(model.relaxing), *size, *dc.astuple(model.numerics))
+        ws = self._workspaces.get(key)
+        if ws is None:
+            period = launch.multiple * self.exchange_period
+            ws = self._workspaces[key] = Workspace(models, period, launch.exchanges)
+        elif any(old is not new for old, new in zip(ws.models, models, strict=True)):
+            ws.set_models(models)
+        return ws
+
+    def run(
+        self, paths: Sequence[KnifePath], launches: Iterable[Launch] | None = None
+    ) -> Iterator[tuple[Launch, list[Exchanges]]]:
+        """Drives uncut foods side by side; see `drive`.
+
+        Args:
+            paths: Of the knives; their cuts are all derived from one model.
+            launches: `even_launches` by default.
+        """
+        launches = list(even_launches(paths) if launches is None else launches)
+        models = {1: [path.model for path in paths]}
+        for m in {launch.multiple for launch in launches} - {1}:
+            models[m] = [_with_longer_steps(model, m) for model in models[1]]
+
+        def advance(
+            launch: Launch, states: np.ndarray, R: np.ndarray, p: np.ndarray
+        ) -> list[Exchanges]:
+            ws = self.workspace(models[launch.multiple], launch)
+            return run_exchanges(ws, states, R, p)
+
+        ws = self.workspace(models[launches[0].multiple], launches[0])
+        return drive(
+            paths, launches, np.tile(ws.initial_state(), (len(paths), 1)), advance, self.board
+        )
+
+
+def _with_longer_steps(model: CuttingModel, multiple: int) -> CuttingModel:
+    step = multiple * model.numerics.time_step
+    return model.derive(numerics=dc.replace(model.numerics, time_step=step))
+
+
+class DriverPool:
+    """Threads that drive cuts, each with a `Driver` that it keeps from one call to the next.
+
+    Args:
+        exchange_period, board: As `Driver`.
+        threads: The number of processors by default.
+    """
+
+    def __init__(
+        self, exchange_period: float, board: Board | None = None, threads: int | None = None
+    ) -> None:
+        self.exchange_period, self.board = exchange_period, board
+        self.threads = threads or os.cpu_count() or 1
+        self._drivers: list[Driver] = []
+
+    def map(
+        self,
+        work: Callable[[Driver, Item], Result],
+        items: Sequence[Item],
+        threads: int | None = None,
+    ) -> Iterator[Result]:
+        """Does work on items, in their order, at most as many at once as there are threads."""
+        threads = max(1, min(threads or self.threads, len(items)))
+        while len(self._drivers) < threads:
+            self._drivers.append(Driver(self.exchange_period, self.board))
+        # The first come first, as their arrays are those most likely to be there.
+        spare: queue.LifoQueue[Driver] = queue.LifoQueue()
+        for driver in reversed(self._drivers):
+            spare.put(driver)
+
+        def one(item: Item) -> Result:
+            driver = spare.get()
+            try:
+                return work(driver, item)
+            finally:
+                spare.put(driver)
+
+        with ThreadPoolExecutor(threads) as pool:
+            yield from pool.map(one, items)
