@@ -10,10 +10,8 @@ from sliceit_drake.cutting.foods.food import Box, Food, make_food_model, start_p
 from sliceit_drake.cutting.motion import ConstantSpeed, MotionPlan
 from sliceit_drake.diagnosis.diagnose import setup_of_food
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
-from sliceit_drake.diagnosis.experiments.scenario_of_experiment import (
-    experiment_of_record,
-    scenario_of,
-)
+from sliceit_drake.diagnosis.experiments.planned_record import experiment_of_record, planned_slice
+from sliceit_drake.diagrams.planned_scenario import scenario_of_slice
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Placement
 from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
@@ -55,7 +53,7 @@ def test_a_record_is_cut_again_at_the_same_place(protocol):
     setup = setup_of_food(CalibratedFood(food=protocol.food, knife=protocol.knife), 0.5)
     experiment = experiment_of_record(record, setup)
     assert experiment.offset == pytest.approx(5e-3, abs=1e-4)
-    scenario = scenario_of(experiment, setup, record)
+    scenario = scenario_of_slice(planned_slice(experiment, setup, record))
     model = make_food_model(scenario.food, scenario.knife, scenario.numerics)
     start = scenario.X_WF().multiply(start_pose(model, 0.0, experiment.offset).p)
     np.testing.assert_allclose(start[:2], record.position[0, :2], atol=2e-4)

@@ -23,7 +23,7 @@ LAYERS: dict[str, set[str]] = {
     "learning": {"cutting", "systems", "diagrams", "records"},
     "prediction": {"cutting", "records"},
     "calibration": {"cutting", "prediction", "records"},
-    "diagnosis": {"cutting", "systems", "diagrams", "records", "prediction", "calibration"},
+    "diagnosis": {"cutting", "records", "calibration", "prediction"},
     "robot_run": {"cutting", "systems", "diagrams", "records", "hardware"},
     "emulator": {"cutting", "systems", "diagrams", "records"},
 }

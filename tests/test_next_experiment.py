@@ -19,15 +19,16 @@ from sliceit_drake.diagnosis.evidence.verdict import CLASS_ANGLE, reach_verdict
 from sliceit_drake.diagnosis.experiments import next_experiment as proposing
 from sliceit_drake.diagnosis.experiments.designs import Scale, menu
 from sliceit_drake.diagnosis.experiments.next_experiment import next_experiment
-from sliceit_drake.diagnosis.experiments.proposal import NEEDED, NextExperiment
-from sliceit_drake.diagnosis.experiments.scenario_of_experiment import (
+from sliceit_drake.diagnosis.experiments.planned_record import (
     experiment_of_record,
     planned_record,
+    planned_slice,
     scale_of,
-    scenario_of,
 )
+from sliceit_drake.diagnosis.experiments.proposal import NEEDED, NextExperiment
 from sliceit_drake.diagnosis.registry import open_causes
 from sliceit_drake.diagnosis.result import Diagnosis
+from sliceit_drake.diagrams.planned_scenario import scenario_of_slice
 from sliceit_drake.diagrams.run import prepare_run, simulate
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.records.slice_record import SliceRecord
@@ -81,7 +82,13 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
         # The whole menu would take a minute.
         patch.setattr(proposing, "menu", lambda s: [e for e in menu(s) if e.name in MENU])
         proposal = next_experiment(diagnosis, records, workers=2)
-    return Bench(folder, records, diagnosis, proposal, proposal.write(folder / "next.yaml"))
+    return Bench(
+        folder,
+        records,
+        diagnosis,
+        proposal,
+        proposal.write(folder / "next.yaml", scenario_of_slice),
+    )
 
 
 def pair(proposal: NextExperiment, true: str, fitted: str):
@@ -116,7 +123,7 @@ def test_the_proposed_slices_find_what_was_hidden(bench):
 
 def test_station_and_stand_in_run_what_was_written(bench):
     for step, file in zip(bench.proposal.steps, bench.files, strict=True):
-        assert load_scenario(file) == step.scenario
+        assert load_scenario(file) == scenario_of_slice(step.plan)
         text = file.read_text()
         assert f"# Slices: {step.slices}." in text and step.experiment.by_hand in text
     run = prepare_run(load_scenario(bench.files[0], COARSE))
@@ -130,9 +137,9 @@ def test_station_and_stand_in_run_what_was_written(bench):
 def test_a_planned_record_moves_as_the_stand_in_cuts(bench, name, tmp_path):
     template = bench.records[0]
     experiment = next(e for e in menu(scale_of(SETUP, bench.records)) if e.name == name)
-    scenario = scenario_of(experiment, SETUP, template, 6)
-    planned = planned_record(scenario, SETUP, template, name, 6)
-    folder = cut(protocol_of_scenario(scenario, 1), tmp_path / name, 7)
+    plan = planned_slice(experiment, SETUP, template, 6)
+    planned = planned_record(plan, SETUP, template, 6)
+    folder = cut(protocol_of_scenario(scenario_of_slice(plan), 1), tmp_path / name, 7)
     (made,) = load_sessions([folder])
     at = np.searchsorted(made.time, planned.time[1:-1])
     np.testing.assert_allclose(planned.position[1:-1], made.position[at], atol=3e-4)
@@ -166,8 +173,8 @@ def test_too_few_slices_are_to_be_cut_again_by_the_same_motion(bench):
     assert diagnosis.verdict.kind == "too_few_replicates"
     proposal = next_experiment(diagnosis, records)
     (step,) = proposal.steps
-    assert (proposal.kind, step.slices, step.scenario.name) == ("repeat", 1, "press")
-    again = planned_record(step.scenario, SETUP, records[0], "again", 2)
+    assert (proposal.kind, step.slices, step.plan.name) == ("repeat", 1, "press")
+    again = planned_record(step.plan, SETUP, records[0], 2)
     rows = min(len(again), len(records[0]))
     off = again.position[:rows] - records[0].position[:rows]
     assert np.abs(off).max() < 1e-4
@@ -178,7 +185,7 @@ def test_too_few_slices_are_to_be_cut_again_by_the_same_motion(bench):
 def test_what_a_person_must_prepare_is_in_the_scenario(bench, tmp_path):
     experiments = {e.name: e for e in menu(scale_of(SETUP, bench.records))}
     for name, experiment in experiments.items():
-        scenario = scenario_of(experiment, SETUP, bench.records[0], 6)
+        scenario = scenario_of_slice(planned_slice(experiment, SETUP, bench.records[0], 6))
         (condition,) = protocol_of_scenario(scenario).conditions
         assert condition.peeled == (name == "peeled")
         assert condition.without_food == (name in ("board", "weight"))
@@ -187,7 +194,7 @@ def test_what_a_person_must_prepare_is_in_the_scenario(bench, tmp_path):
         assert bool(experiment.by_hand) == (
             name in ("board", "weight", "peeled", "narrow", "sharpened")
         )
-    shape = scenario_of(experiments["narrow"], SETUP, bench.records[0]).food.shape
+    shape = planned_slice(experiments["narrow"], SETUP, bench.records[0]).food.shape
     assert isinstance(shape, Cylinder) and shape.diameter == pytest.approx(0.8 * 0.027)
 
 
@@ -212,9 +219,9 @@ def test_records_of_another_place_are_cut_where_the_station_reaches(bench):
     far = dc.replace(bench.records[0], metadata=copy.deepcopy(bench.records[0].metadata))
     far.metadata.food.position = [3.0, -2.0, 0.9]
     experiment = menu(scale_of(SETUP, bench.records))[0]
-    scenario = scenario_of(experiment, SETUP, far)
+    scenario = scenario_of_slice(planned_slice(experiment, SETUP, far))
     assert scenario.placement == Scenario().placement
-    near = scenario_of(experiment, SETUP, bench.records[0])
+    near = scenario_of_slice(planned_slice(experiment, SETUP, bench.records[0]))
     place = bench.records[0].metadata.food.position
     assert near.placement.position == pytest.approx(place[:2])
     assert near.board.height == pytest.approx(place[2])

@@ -152,6 +152,7 @@ def _diagnose(
     """Diagnoses several slices."""
     from sliceit_drake.diagnosis.diagnose import diagnose, setup_of_food
     from sliceit_drake.diagnosis.experiments.next_experiment import next_experiment
+    from sliceit_drake.diagrams.planned_scenario import scenario_of_slice
 
     with StageBars() as bars:
         result = diagnose(
@@ -173,7 +174,7 @@ def _diagnose(
                 options.workers,
                 lambda done, total: bars.show("motions of the menu", done, total),
             )
-            result.next_experiment.write(options.next_experiment)
+            result.next_experiment.write(options.next_experiment, scenario_of_slice)
     print(result.table())
     result.save(options.output, not options.no_report)
     report = "" if options.no_report else ", report.html"

@@ -32,6 +32,7 @@ __all__ = [
     "Remainder",
     "Tapered",
     "make_food_model",
+    "shape_facts",
     "start_pose",
 ]
 
@@ -476,6 +477,19 @@ def make_food_model(
         food.effects,
         board_height=0.0,
     )
+
+
+def shape_facts(food: Food) -> tuple[str, list[float] | None]:
+    """The shape of a food and its size, metres, as slice records say them (`FoodFacts`); "unknown"
+    and None for a shape that records do not know."""
+    shape = food.shape
+    if isinstance(shape, Cylinder):
+        return "cylinder", [shape.diameter, shape.length, shape.diameter]
+    if isinstance(shape, Box):
+        return "box", list(shape.size)
+    if isinstance(shape, Ellipsoid):
+        return "ellipsoid", list(shape.diameters)
+    return "unknown", None
 
 
 def start_pose(model: CuttingModel, clearance: float, offset: float = 0.0) -> Pose:

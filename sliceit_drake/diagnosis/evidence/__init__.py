@@ -1,1 +1,1 @@
-"""What the residuals of records say of each cause, and the verdict."""
+"""What the residuals of records say of each cause, from sensitivities to a verdict."""

@@ -1,1 +1,1 @@
-"""Which experiment tells causes apart, and what a set of records can tell at all."""
+"""What to cut next so that causes part, and what a set of records could tell at all."""

@@ -24,14 +24,14 @@ from sliceit_drake.diagnosis.evidence.screen import CauseEvidence
 from sliceit_drake.diagnosis.evidence.sensitivity import Progress
 from sliceit_drake.diagnosis.evidence.verdict import CLASS_ANGLE, LEAST_REPLICATES
 from sliceit_drake.diagnosis.experiments.designs import Experiment, menu
-from sliceit_drake.diagnosis.experiments.proposal import MARGIN, NEEDED, NextExperiment, Step
-from sliceit_drake.diagnosis.experiments.scenario_of_experiment import (
+from sliceit_drake.diagnosis.experiments.planned_record import (
     experiment_of_record,
     next_knife_slice,
+    planned_slice,
     scale_of,
-    scenario_of,
     template_of,
 )
+from sliceit_drake.diagnosis.experiments.proposal import MARGIN, NEEDED, NextExperiment, Step
 from sliceit_drake.diagnosis.experiments.search import CauseClass, ExperimentSearch
 from sliceit_drake.diagnosis.result import Diagnosis
 from sliceit_drake.prediction.placement import is_bare
@@ -92,8 +92,8 @@ def _repeat(diagnosis: Diagnosis, records: Sequence[SliceRecord]) -> NextExperim
         if missing > 0:
             own = template if is_bare(members[0]) else members[0]
             experiment = experiment_of_record(members[0], diagnosis.setup)
-            scenario = scenario_of(experiment, diagnosis.setup, own, knife)
-            steps.append(Step(experiment, scenario, missing))
+            plan = planned_slice(experiment, diagnosis.setup, own, knife)
+            steps.append(Step(experiment, plan, missing))
     reason = (
         f"too few slices to tell variation from effect: {count} more of each condition, by the "
         "same motions"
@@ -129,7 +129,9 @@ def _exploring(diagnosis: Diagnosis, records: Sequence[SliceRecord]) -> list[Ste
         names.remove("draw_1")
     template, knife = template_of(records), next_knife_slice(records)
     return [
-        Step(choice[n], scenario_of(choice[n], diagnosis.setup, template, knife), LEAST_REPLICATES)
+        Step(
+            choice[n], planned_slice(choice[n], diagnosis.setup, template, knife), LEAST_REPLICATES
+        )
         for n in names
     ]
 

@@ -1,15 +1,16 @@
 """What to cut next, and what to expect of it: as text, plain values and scenarios."""
 
 import dataclasses as dc
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from scipy.stats import norm
 
 from sliceit_drake.configuration import dump_yaml
+from sliceit_drake.cutting.planned_slice import PlannedSlice
 from sliceit_drake.diagnosis.evidence.verdict import ALARM, CLASS_ANGLE
 from sliceit_drake.diagnosis.experiments.designs import Experiment
-from sliceit_drake.diagrams.scenario import Scenario
 
 __all__ = ["MARGIN", "NEEDED", "NextExperiment", "Pair", "Step"]
 
@@ -60,13 +61,13 @@ class Step:
 
     Attributes:
         experiment: What is done.
-        scenario: As the station runs it.
+        plan: One of the slices.
         slices: How many.
         file: Where it was written; None before.
     """
 
     experiment: Experiment
-    scenario: Scenario
+    plan: PlannedSlice
     slices: int
     file: Path | None = None
 
@@ -92,9 +93,7 @@ class NextExperiment:
         out = [f"Next experiment: {self.reason}"]
         for step in self.steps:
             at = f" ({step.file})" if step.file else ""
-            out.append(
-                f"  {step.slices} slices of {step.scenario.name}{at}: {step.experiment.what}"
-            )
+            out.append(f"  {step.slices} slices of {step.plan.name}{at}: {step.experiment.what}")
             if step.experiment.by_hand:
                 out.append(f"    By hand: {step.experiment.by_hand}")
         if self.pairs and self.steps:
@@ -115,7 +114,7 @@ class NextExperiment:
             "reason": self.reason,
             "steps": [
                 {
-                    "name": s.scenario.name,
+                    "name": s.plan.name,
                     "what": s.experiment.what,
                     "by_hand": s.experiment.by_hand,
                     "slices": s.slices,
@@ -127,8 +126,12 @@ class NextExperiment:
             "gain_needed": NEEDED,
         }
 
-    def write(self, file: Path) -> list[Path]:
+    def write(self, file: Path, scenario_of: Callable[[PlannedSlice], Any]) -> list[Path]:
         """Writes the scenarios: FILE, and FILE_2, FILE_3 beside it for further motions.
+
+        Args:
+            file: The first.
+            scenario_of: Makes a scenario of a slice (`diagrams.planned_scenario`).
 
         Returns:
             The files; none where there is nothing to cut.
@@ -138,10 +141,10 @@ class NextExperiment:
             step.file = file if k == 0 else file.with_name(f"{file.stem}_{k + 1}{file.suffix}")
         for step in self.steps:
             assert step.file is not None
-            step.file.write_text(self._text(step), encoding="utf-8")
+            step.file.write_text(self._text(step, scenario_of(step.plan)), encoding="utf-8")
         return [step.file for step in self.steps if step.file is not None]
 
-    def _text(self, step: Step) -> str:
+    def _text(self, step: Step, scenario: Any) -> str:
         head = [
             f"Next experiment of a diagnosis: {self.reason}",
             f"What: {step.experiment.what}.",
@@ -162,5 +165,5 @@ class NextExperiment:
             f"Stand-in: sliceit record {step.file} --replicates {step.slices} --output NEW",
             "Then:     sliceit diagnose OLD NEW --model FOOD --output DIR",
         ]
-        text = dump_yaml(step.scenario, defaults=Scenario())
+        text = dump_yaml(scenario, defaults=type(scenario)())
         return "".join(f"# {line}\n" for line in head) + text

@@ -13,13 +13,13 @@ from sliceit_drake.diagnosis.evidence.screen import CauseEvidence, Screening
 from sliceit_drake.diagnosis.evidence.sensitivity import Progress, sensitivities
 from sliceit_drake.diagnosis.evidence.verdict import LEAST_REPLICATES
 from sliceit_drake.diagnosis.experiments.designs import Experiment
-from sliceit_drake.diagnosis.experiments.proposal import NextExperiment, Pair, Step
-from sliceit_drake.diagnosis.experiments.scenario_of_experiment import (
+from sliceit_drake.diagnosis.experiments.planned_record import (
     next_knife_slice,
     planned_record,
-    scenario_of,
+    planned_slice,
     template_of,
 )
+from sliceit_drake.diagnosis.experiments.proposal import NextExperiment, Pair, Step
 from sliceit_drake.diagnosis.result import Diagnosis
 from sliceit_drake.records.slice_record import SliceRecord
 
@@ -90,11 +90,9 @@ class ExperimentSearch:
         self.experiments, self.classes = experiments, classes
         setup, template = diagnosis.setup, template_of(records)
         knife = next_knife_slice(records)
-        self.scenarios = [scenario_of(e, setup, template, knife) for e in self.experiments]
+        self.plans = [planned_slice(e, setup, template, knife) for e in self.experiments]
         first = 1 + max(r.metadata.slice_index for r in records)
-        planned = [
-            planned_record(s, setup, template, f"planned {s.name}", first) for s in self.scenarios
-        ]
+        planned = [planned_record(plan, setup, template, first) for plan in self.plans]
         found = diagnosis.problem.found
         names = {e.name for c in self.classes for e in c.evidence} | set(USUAL)
         names |= {name for c in self.classes for name, _ in c.assumed}
@@ -177,7 +175,7 @@ class ExperimentSearch:
                 break
             choice = further
         counts, pairs = choice.counts, choice.pairs
-        steps = [Step(self.experiments[k], self.scenarios[k], n) for k, n in counts.items()]
+        steps = [Step(self.experiments[k], self.plans[k], n) for k, n in counts.items()]
         classes = "; ".join("{" + ", ".join(e.name for e in c.evidence) + "}" for c in self.classes)
         if all(p.parts for p in pairs) and not steps:
             reason = f"nothing to split: the records at hand part {classes}"

@@ -1,1 +1,1 @@
-"""What a single record shows."""
+"""What a single record shows of each cause, which is no diagnosis: slices vary."""

@@ -1,7 +1,8 @@
-"""Experiments as scenarios, and scenarios as the slice records that they would give, without force.
+"""Experiments as planned slices, and the records that these would give, without force.
 
-A scenario is what the station simulates, the stand-in cuts and the robot runs, so a proposal is
-judged by the motion that it would have and by no other.
+A planned slice is what the station simulates, the stand-in cuts and the robot runs
+(`diagrams.planned_scenario`), so a proposal is judged by the motion that it would have and by no
+other.
 """
 
 import copy
@@ -12,39 +13,33 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sliceit_drake.calibration.setup import CalibrationSetup
-from sliceit_drake.cutting.foods.effects import Compliance, Slip
 from sliceit_drake.cutting.foods.food import (
     Box,
     Cylinder,
     Ellipsoid,
     Food,
     make_food_model,
+    shape_facts,
     start_pose,
 )
 from sliceit_drake.cutting.motion import Motion, MotionPlan, Pose, Segment, Waypoints
+from sliceit_drake.cutting.planned_slice import PlannedSlice
 from sliceit_drake.diagnosis.experiments.designs import Experiment, Scale
-from sliceit_drake.diagrams.record_facts import shape_facts
-from sliceit_drake.diagrams.scenario import Placement, Preparation, Scenario, Start
 from sliceit_drake.prediction.placement import food_of, is_bare, knife_of
 from sliceit_drake.records.metadata import PHASE_LABELS, FoodFacts, NominalMotion, Phase, ToolFacts
 from sliceit_drake.records.slice_record import SliceRecord
-from sliceit_drake.systems.analytic_cutter import AnalyticFood
 
 __all__ = [
     "experiment_of_record",
     "next_knife_slice",
     "planned_record",
+    "planned_slice",
     "scale_of",
-    "scenario_of",
     "template_of",
 ]
 
 TOLERANCE = 2e-5
 """By which a motion that is read from a record may be off, metres."""
-REACH = (0.3, 0.7)
-"""Distances from the base at which the arm cuts, metres."""
-GAINS = 200.0
-"""Of the controller in motion mode, as scenarios/cucumber.yaml has it."""
 
 
 def template_of(records: Sequence[SliceRecord]) -> SliceRecord:
@@ -70,13 +65,13 @@ def scale_of(setup: CalibrationSetup, records: Sequence[SliceRecord]) -> Scale:
     return Scale(height=height, width=width, length=knife.length, speed=speed)
 
 
-def scenario_of(
+def planned_slice(
     experiment: Experiment,
     setup: CalibrationSetup,
     template: SliceRecord,
     knife_slices: int = 0,
-) -> Scenario:
-    """What the station runs: the model's food as the records have it, and the experiment.
+) -> PlannedSlice:
+    """A slice of an experiment, of the model's food as the records have it.
 
     Args:
         experiment: The experiment.
@@ -85,67 +80,59 @@ def scenario_of(
         knife_slices: Slices since sharpening, before the first.
     """
     food = _scaled(food_of(setup.food, template), experiment.size)
-    # An arm and a holder that give belong to the station, not to the food.
-    food.effects = dc.replace(food.effects, compliance=Compliance(), slip=Slip())
     if experiment.peeled:
         food.effects.skin = dc.replace(food.effects.skin, toughness=0.0)
-    facts, scenario = template.metadata.food, Scenario(name=experiment.name)
-    scenario.board = dc.replace(setup.board)
-    if facts.position is not None and _in_reach(facts.position, scenario):
-        scenario.placement = Placement(position=facts.position[:2], yaw=facts.yaw or 0.0)
-        scenario.board.height = facts.position[2]
-    scenario.controller.mode = "motion"
-    scenario.controller.error_scale = 1.0
-    scenario.controller.p_gains = [GAINS] * 6
-    scenario.knife = knife_of(setup.knife, template)
-    scenario.numerics.flank_stiffness = setup.numerics.flank_stiffness
-    scenario.food = food
-    if not experiment.food:
-        # Of no toughness, it is a height to start from and no force.
-        scenario.food = AnalyticFood(diameter=_section(food, setup)[1], toughness=0.0)
-    scenario.start = Start(clearance=experiment.clearance, offset=experiment.offset)
-    scenario.motion = copy.deepcopy(experiment.motion)
-    scenario.preparation = Preparation(
+    facts = template.metadata.food
+    return PlannedSlice(
+        name=experiment.name,
+        food=food if experiment.food else None,
+        height=_section(food, setup)[1],
+        knife=knife_of(setup.knife, template),
+        board=setup.board,
+        flank_stiffness=setup.numerics.flank_stiffness,
+        position=facts.position,
+        yaw=facts.yaw or 0.0,
+        clearance=experiment.clearance,
+        offset=experiment.offset,
+        motion=experiment.motion,
         peeled=experiment.peeled,
         weight=experiment.weight,
         knife_slices=0 if experiment.sharpened else knife_slices,
     )
-    return scenario
 
 
 def planned_record(
-    scenario: Scenario, setup: CalibrationSetup, template: SliceRecord, name: str, index: int
+    plan: PlannedSlice, setup: CalibrationSetup, template: SliceRecord, index: int
 ) -> SliceRecord:
-    """The record that a slice of a scenario would give, but with a force of zero.
+    """The record that a planned slice would give, but with a force of zero.
 
     Args:
-        scenario: From `scenario_of`.
+        plan: From `planned_slice`.
         setup: The model.
         template: Record whose sensor and columns it has.
-        name: Of the record.
         index: Place in the session.
     """
-    X_WF = scenario.X_WF()
-    R_WF, p_WF = X_WF.rotation().matrix(), X_WF.translation()
-    start = _start(scenario, setup)
-    motion = Motion(scenario.motion, Pose(R_WF @ start.R, p_WF + R_WF @ start.p))
+    p_WF = np.array([0.0, 0.0, plan.board.height] if plan.position is None else plan.position)
+    c, s = np.cos(plan.yaw), np.sin(plan.yaw)
+    R_WF = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    start = _start(plan, setup)
+    motion = Motion(plan.motion, Pose(R_WF @ start.R, p_WF + R_WF @ start.p))
     step = float(np.median(np.diff(template.time)))
     time = step * np.arange(max(3, round(motion.duration / step) + 1))
     R, p, w, v = motion.sample(time)
     metadata = copy.deepcopy(template.metadata)
-    metadata.name, metadata.condition = name, scenario.name
-    prepared = scenario.preparation or Preparation()
-    metadata.slice_index, metadata.knife_slices = index, prepared.knife_slices
+    metadata.name, metadata.condition = f"planned {plan.name}", plan.name
+    metadata.slice_index, metadata.knife_slices = index, plan.knife_slices
     metadata.motion = _nominal(motion, time, v, R)
-    metadata.board_height = scenario.board.height
+    metadata.board_height = float(p_WF[2])
     metadata.unknown = [
         field
         for field in metadata.unknown
         if field not in ("p_WK_z", "food.position", "motion.speed")
     ]
-    metadata.food = _food_facts(scenario, metadata.food)
-    if prepared.weight > 0.0:
-        metadata.tool = ToolFacts(mass=prepared.weight, center_of_mass=[0.0, 0.0, 0.0])
+    metadata.food = _food_facts(plan, p_WF, metadata.food)
+    if plan.weight > 0.0:
+        metadata.tool = ToolFacts(mass=plan.weight, center_of_mass=[0.0, 0.0, 0.0])
         metadata.wrench.includes = [*metadata.wrench.includes, "gravity"]
     nothing = np.zeros_like(p)
     return SliceRecord(
@@ -158,7 +145,7 @@ def planned_record(
         force=None if template.force is None else nothing,
         torque=None if template.torque is None else nothing.copy(),
         force_norm=np.zeros(len(p)) if template.force is None else None,
-        file=f"{name} (planned)",
+        file=metadata.name,
     )
 
 
@@ -245,26 +232,17 @@ def _legs(time: np.ndarray, values: np.ndarray) -> list[int]:
     return sorted(kept)
 
 
-def _in_reach(position: Sequence[float], scenario: Scenario) -> bool:
-    """Whether the station's arm reaches a place; records of others have their own origin."""
-    away = np.array(position) - scenario.robot.base_position
-    low, high = REACH
-    return bool(low <= np.hypot(*away[:2]) <= high and abs(away[2]) <= low)
-
-
-def _start(scenario: Scenario, setup: CalibrationSetup) -> Pose:
+def _start(plan: PlannedSlice, setup: CalibrationSetup) -> Pose:
     """X_FK at the start."""
-    food, start = scenario.food, scenario.start
-    if isinstance(food, Food):
-        model = make_food_model(food, scenario.knife, setup.numerics, setup.refinement)
-        pose = start_pose(model, start.clearance, start.offset)
-        if isinstance(food.shape, Cylinder | Box):
-            # The clearance is over the food, not over a mesh that conserves its volume.
-            pose.p[2] = _section(food, setup)[1] + start.clearance
-        return pose
-    assert isinstance(food, AnalyticFood)
-    R = np.diag([1.0, -1.0, -1.0])
-    return Pose(R, np.array([start.offset, 0.0, food.diameter + start.clearance]))
+    top = plan.height + plan.clearance
+    if plan.food is None:
+        return Pose(np.diag([1.0, -1.0, -1.0]), np.array([plan.offset, 0.0, top]))
+    model = make_food_model(plan.food, plan.knife, setup.numerics, setup.refinement)
+    pose = start_pose(model, plan.clearance, plan.offset)
+    if isinstance(plan.food.shape, Cylinder | Box):
+        # The clearance is over the food, not over a mesh that conserves its volume.
+        pose.p[2] = top
+    return pose
 
 
 def _section(food: Food, setup: CalibrationSetup) -> tuple[float, float]:
@@ -284,18 +262,17 @@ def _scaled(food: Food, scale: float) -> Food:
     return food
 
 
-def _food_facts(scenario: Scenario, facts: FoodFacts) -> FoodFacts:
-    food, prepared = scenario.food, scenario.preparation or Preparation()
-    if not isinstance(food, Food):
+def _food_facts(plan: PlannedSlice, p_WF: np.ndarray, facts: FoodFacts) -> FoodFacts:
+    if plan.food is None:
         return FoodFacts(name="none")
-    shape, size = shape_facts(food)
+    shape, size = shape_facts(plan.food)
     return dc.replace(
         facts,
         shape=facts.shape if size is None else shape,
         size=size,
-        peeled=prepared.peeled,
-        position=scenario.X_WF().translation().tolist(),
-        yaw=scenario.placement.yaw,
+        peeled=plan.peeled,
+        position=p_WF.tolist(),
+        yaw=plan.yaw,
     )
 
 
