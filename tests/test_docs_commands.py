@@ -441,7 +441,9 @@ def test_it_runs(text, tmp_path, monkeypatch, capsys):
     def not_here(*_):
         raise MeshError("another cut, on a coarser mesh")
 
-    monkeypatch.setattr("sliceit_drake.diagrams.run.estimate_discretization_error", not_here)
+    monkeypatch.setattr(
+        "sliceit_drake.diagrams.prepared_food.estimate_discretization_error", not_here
+    )
     monkeypatch.chdir(tmp_path)
     program, *words = shlex.split(text.replace("NAME", "potato"))
     if program == "python":

@@ -1,5 +1,6 @@
 """Series for ParaView have the food's body, the knife and the forces that the record has."""
 
+import dataclasses as dc
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -166,8 +167,8 @@ def test_what_cannot_be_exported_is_refused(run, tmp_path, capsys):
         FoodFrames(prepare_run(load_scenario(run / "scenario.yaml")), 0.0)
 
 
-def test_a_sequence_is_no_xdmf_series(run, tmp_path, monkeypatch):
+def test_a_sequence_is_no_xdmf_series(run, tmp_path):
     frames = FoodFrames(prepare_run(load_scenario(run / "scenario.yaml")), 10.0)
-    monkeypatch.setattr(frames, "foods", lambda: [0, 1])
+    frames.bodies.append(dc.replace(frames.bodies[0], food=1))
     with pytest.raises(ConfigurationError, match="changes from slice to slice"):
         write_series(frames, tmp_path, "xdmf")

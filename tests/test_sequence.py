@@ -10,7 +10,7 @@ from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.foods.food import Ellipsoid, Remainder
 from sliceit_drake.diagrams.holder_arm import FINGERTIPS, HoldingArm
 from sliceit_drake.diagrams.outputs.sequence_report import slice_reports
-from sliceit_drake.diagrams.run import _imbalance, prepare_run, simulate
+from sliceit_drake.diagrams.run import prepare_run, simulate
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
 from sliceit_drake.diagrams.sequence import SliceSequence
@@ -58,7 +58,7 @@ def test_every_slice_is_cut_off_and_the_last_food_is_reached(indexed):
     run, record = indexed
     assert record["food_index"][-1] == run.scenario.sequence.count - 1
     assert (np.diff(record["food_index"]) >= 0.0).all()
-    reports = slice_reports(record, run.station.cutting)
+    reports = slice_reports(record, run.station.cutting.section_areas())
     assert [report.cut_share for report in reports] == pytest.approx([1.0, 1.0], abs=1e-3)
     # The next food is uncut and gives no force when it is taken.
     taken = int(np.argmax(record["food_index"] == 1))
@@ -97,10 +97,13 @@ def test_knife_stays_in_the_cut_plane_while_it_is_in_the_food(indexed):
 def test_books_run_on_over_the_slices_and_close(by_knife):
     run, record = by_knife
     models = [solver.model for solver in run.station.cutting.solvers]
-    work = [report.work_of_cutting_J for report in slice_reports(record, run.station.cutting)]
+    work = [
+        report.work_of_cutting_J
+        for report in slice_reports(record, run.station.cutting.section_areas())
+    ]
     assert record["energy_work"][-1] == pytest.approx(sum(work))
     assert min(work) > 0.9 * models[0].material.toughness * models[0].section_area
-    assert abs(_imbalance(record)) < 0.01 * sum(work)
+    assert abs(run.station.cutting.summary(record)["energy_imbalance_J"]) < 0.01 * sum(work)
     assert abs(record["coupling_work_error"][-1]) < 0.02 * sum(work)
 
 

@@ -32,7 +32,6 @@ from sliceit_drake.systems.food_visualizer import (
     INTACT,
     SKIN,
     damage_colours,
-    frame_size,
 )
 from sliceit_drake.systems.frame_visualizer import FrameVisualizer
 from sliceit_drake.systems.wrench_visualizer import ArrowScale, WrenchVisualizer, arrow_rotation
@@ -237,7 +236,7 @@ def test_a_long_run_is_drawn_with_fewer_frames_in_about_as_many_bytes():
         scenario.motion = MotionPlan([Hold(hold)])
         stations[hold] = MakeStation(scenario)
     assert stations[0.1].frame_period == 1.0 / FRAMES_PER_SECOND
-    size = frame_size(stations[0.1].cutting)
+    size = stations[0.1].cutting.frame_size()
     for hold in (100.0, 200.0):
         assert 0.5 * REPLAY_SIZE < size * hold / stations[hold].frame_period < REPLAY_SIZE
 

@@ -25,28 +25,30 @@ DISPLACEMENT = 1e-4
 ANGLE = 1e-3
 
 
-def contact_responses(solver: CuttingSolver, offset: float) -> list[np.ndarray] | None:
-    for speed in APPROACH_SPEEDS:
-        with contextlib.suppress(CuttingError):
-            return _food_response(solver, speed, offset)
-    return None
-
-
-def _food_response(solver: CuttingSolver, speed: float, offset: float = 0.0) -> list[np.ndarray]:
+def contact_responses(solver: CuttingSolver, offset: float) -> list[np.ndarray]:
     """How the food answers small motions of the blade in it, at several depths.
-
-    The blade moves within one exchange and then rests. Of both senses of a direction, that which
-    the food resists more counts: pressed further an edge cuts, drawn back it unloads.
 
     Args:
         solver: The food.
-        speed: At which the blade enters it, m/s.
         offset: Shift of the knife along its edge, metres.
 
     Returns:
         For each depth, less the mean wrench over each exchange from the motion's on, per unit
         [RESPONSE, 6, 6], along and about the axes of K at Ko, translations first. The last is
-        the mean of the last `SETTLED`, over the period in which the food rings.
+        the mean of the last `SETTLED`, over the period in which the food rings. Empty if the food
+        cannot be cut at any of `APPROACH_SPEEDS`.
+    """
+    for speed in APPROACH_SPEEDS:
+        with contextlib.suppress(CuttingError):
+            return _responses(solver, speed, offset)
+    return []
+
+
+def _responses(solver: CuttingSolver, speed: float, offset: float) -> list[np.ndarray]:
+    """Those of a blade that enters at a speed, m/s, and then rests.
+
+    It moves within one exchange. Of both senses of a direction, that which the food resists more
+    counts: pressed further an edge cuts, drawn back it unloads.
 
     Raises:
         CuttingError: The food cannot be cut at this speed.

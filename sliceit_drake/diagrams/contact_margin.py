@@ -11,11 +11,9 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.board import Board, edge_contact_positions
-from sliceit_drake.cutting.contact_response import contact_responses
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.diagrams.contact_loop import ContactLoop
 from sliceit_drake.diagrams.simulated_station import SimulatedStation
-from sliceit_drake.systems.cutting_system import CuttingSystem
 
 __all__ = [
     "LEAST_MARGIN",
@@ -34,13 +32,11 @@ class ContactMargin:
     """Margins of a station at rest in contact.
 
     Attributes:
-        food: Factor on the food's response at which the loop becomes unstable; None for a food
-            without elements, or one that cannot be cut at any
-            `contact_response.APPROACH_SPEEDS`. At most
-            `contact_loop.GREATEST_MARGIN`.
+        food: Factor on the food's response at which the loop becomes unstable; None where the
+            response is not known. At most `contact_loop.GREATEST_MARGIN`.
         board: The same for the board's stiffness.
         stiffness: The food's stiffness along and about the axes of K [6], N/m and Nm/rad, the
-            greatest of all depths; empty without elements.
+            greatest of all depths; empty where it is not known.
     """
 
     food: float | None
@@ -71,20 +67,14 @@ def check_contact_margin(station: SimulatedStation) -> ContactMargin:
 
 
 def contact_margin(station: SimulatedStation) -> ContactMargin:
-    """The margins of a station at its start posture, with the configured gains.
-
-    Of the foods of a sequence the one with the largest section counts.
-    """
+    """The margins of a station at its start posture, with the configured gains."""
     loop = ContactLoop(station)
     scenario = station.scenario
     R_WK = station.start_pose.rotation().matrix()
     board = loop.margin(board=board_stiffness(scenario.board, scenario.knife, R_WK))
-    if not isinstance(station.cutting, CuttingSystem):
-        return ContactMargin(None, board, ())
-    solver = max(station.cutting.solvers, key=lambda each: each.model.section_area)
     turn = np.kron(np.eye(2), R_WK)
-    responses = contact_responses(solver, scenario.start.offset)
-    if responses is None:
+    responses = station.cutting.contact_responses(scenario.start.offset)
+    if not responses:
         return ContactMargin(None, board, ())
     margins, stiffness = [], []
     for response in responses:

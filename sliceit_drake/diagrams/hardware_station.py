@@ -15,7 +15,6 @@ from pydrake.systems.framework import (
     Context,
     DiagramBuilder,
     DiscreteValues,
-    LeafSystem,
     ValueProducer,
 )
 from pydrake.systems.primitives import ConstantVectorSource
@@ -33,6 +32,7 @@ from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.hardware.rtde_system import RtdeSystem
 from sliceit_drake.hardware.safety import SafetyLayer
 from sliceit_drake.systems.contact_monitor import ContactMonitor
+from sliceit_drake.systems.cut_report import ReportingSystem
 from sliceit_drake.systems.servo import JOINTS
 
 __all__ = [
@@ -48,7 +48,7 @@ PERIOD = 0.002
 """Of an e-Series controller, s."""
 
 
-class KnifeEstimate(LeafSystem):
+class KnifeEstimate(ReportingSystem):
     """What a robot does not measure itself, from what it does.
 
     Inputs:
@@ -218,7 +218,7 @@ class HardwareStation(Station):
         self.plant, self.robot = twin.plant, twin.robot
         self.motion_plan, self.board_peak_loss = twin.motion_plan, twin.board_peak_loss
         self.start_pose, self.start_joints = twin.start_pose, twin.start_joints
-        self.meshcat = self.visualizer = self.food_visualizer = None
+        self.meshcat = self.visualizer = self.food_visualizer = self.estimate_error = None
         self.link = RobotLink(
             robot.client, make_safety_layer(twin, config.limits), config.watchdog, robot.pace
         )

@@ -15,10 +15,8 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
-from sliceit_drake.cutting.discretization import estimate_discretization_error
-from sliceit_drake.cutting.foods.food import Food, start_pose
+from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError
-from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Motion
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.contact_margin import ContactMargin, check_contact_margin
@@ -38,7 +36,6 @@ from sliceit_drake.diagrams.simulated_station import SimulatedStation
 from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.resources import file_or_resource
-from sliceit_drake.systems.cutting_system import ENERGY_NAMES, LEDGER_NAMES, CuttingSystem
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -186,10 +183,10 @@ def write_outputs(
 
 
 def _figure(run: Run, record: Record, comparison: Comparison | None) -> "Figure":
-    title, caption, cutting = _title(run), _caption(run, comparison), run.station.cutting
-    if run.scenario.sequence is not None and isinstance(cutting, CuttingSystem):
+    title, caption = _title(run), _caption(run, comparison)
+    if areas := _slice_areas(run):
         board = run.scenario.board.height
-        return plot_sequence(record, cutting, title, board, caption, run.snapshot)
+        return plot_sequence(record, areas, title, board, caption, run.snapshot)
     return plot_force(record, title, _top_height(run), comparison, caption, run.snapshot)
 
 
@@ -260,16 +257,10 @@ def _title(run: Run) -> str:
 
 def _caption(run: Run, comparison: Comparison | None) -> str:
     lines = []
-    food, cutting = run.scenario.food, run.station.cutting
-    if isinstance(food, Food) and isinstance(cutting, CuttingSystem):  # A robot's has none.
-        m, dt = food.material, run.scenario.numerics.time_step
+    if described := run.station.cutting.describe():
         named = run.scenario.calibration
         source = "Parameters set by hand" if named is None else f"Calibrated food {named}"
-        elements = _middle_model(cutting).element_count
-        lines.append(
-            f"{source}: E = {m.youngs_modulus:.3g} Pa, toughness {m.toughness:.3g} J/m², flank "
-            f"friction {m.friction:.2g}; {elements} tetrahedra, sub-step {1e3 * dt:.3g} ms."
-        )
+        lines.append(f"{source}: {described}")
     if comparison is not None:
         lines.append(
             "Measured curve digitised from the SliceIt! paper's project page; first contact fitted "
@@ -322,8 +313,11 @@ def _summary(run: Run, record: Record, comparison: Comparison | None) -> dict:
         }
         | {"python": platform.python_version()},
     }
-    if isinstance(station.cutting, CuttingSystem) and isinstance(scenario.food, Food):
-        summary |= _cutting_summary(run, record)
+    summary |= station.cutting.summary(record)
+    if areas := _slice_areas(run):
+        summary["slices"] = [dc.asdict(report) for report in slice_reports(record, areas)]
+    if station.estimate_error is not None:
+        summary["discretization_error"] = _discretization_error(run)
     if comparison is not None:
         summary["measurement"] = {
             "file": scenario.measurement.file if scenario.measurement else None,
@@ -338,21 +332,6 @@ def _summary(run: Run, record: Record, comparison: Comparison | None) -> dict:
     return summary
 
 
-def _imbalance(record: Record) -> float:
-    """Work put into the food less everything that it went into, at the end of the record, J.
-
-    What a food holds when the next takes its place stays in it.
-    """
-    last = {name: float(record[f"energy_{name}"][-1]) for name in LEDGER_NAMES}
-    ends = np.append(np.flatnonzero(np.diff(record["food_index"])), -1)
-    elastic, interface, kinetic = (
-        float(record[f"energy_{name}"][ends].sum()) for name in ENERGY_NAMES[:3]
-    )
-    damping = -last["internal"] - elastic
-    spent = sum(last[name] for name in ("edge", "opening", "friction", "board_friction", "blade"))
-    return last["work"] + last["gravity"] - elastic - interface - kinetic - spent - damping
-
-
 def _motion_times(motion: Motion) -> dict[str, list]:
     """Begin and end of each phase, s; of a phase that occurs again, a list of them."""
     times: dict[str, list] = {}
@@ -361,56 +340,17 @@ def _motion_times(motion: Motion) -> dict[str, list]:
     return {label: spans[0] if len(spans) == 1 else spans for label, spans in times.items()}
 
 
-def _middle_model(cutting: CuttingSystem) -> CuttingModel:
-    """The cut; of a sequence, its middle slice, which stands for all."""
-    return cutting.solvers[len(cutting.solvers) // 2].model
+def _slice_areas(run: Run) -> list[float]:
+    """Sections of a sequence's slices, m^2; empty without a sequence."""
+    return run.station.cutting.section_areas() if run.scenario.sequence is not None else []
 
 
-def _cutting_summary(run: Run, record: Record) -> dict:
-    """Numbers of the finite-element food."""
-    scenario, station = run.scenario, run.station
-    assert isinstance(station.cutting, CuttingSystem) and isinstance(scenario.food, Food)
-    models = [solver.model for solver in station.cutting.solvers]
-    food, plan, model = scenario.food, scenario.motion, _middle_model(station.cutting)
-    if scenario.sequence is not None:
-        food = scenario.sequence.foods(food)[len(models) // 2]
-        plan = scenario.sequence.motion([model.top], scenario.start.clearance)
-    work = float(record["energy_work"][-1])
-    area = sum(m.section_area for m in models[: int(record["food_index"][-1]) + 1])
-    motion = Motion(plan, start_pose(model, scenario.start.clearance, scenario.start.offset))
-    summary = {
-        "warnings": sorted({text for m in models for text in m.warnings}),
-        "elements": model.element_count,
-        "cut_points": len(model.point_nodes),
-        "sub_step_s": scenario.numerics.time_step,
-        "mass_ratio": model.mass_ratio,
-        "section_area_mm2": 1e6 * area,
-        "work_of_cutting_J": work,
-        "work_by_mechanism_J": {
-            name: float(record[f"energy_{name}"][-1])
-            for name in ("edge", "opening", "friction", "board_friction", "blade")
-        },
-        "work_per_area_J_m2": work / area,
-        "energy_imbalance_J": _imbalance(record),
-        "energy_ratio": float(record["energy_largest_energy_ratio"].max()),
-        "least_volume_ratio": float(record["energy_least_volume_ratio"].min()),
-        "coupling_work_error_J": float(record["coupling_work_error"][-1]),
-    }
-    if scenario.sequence is not None:
-        summary["slices"] = [dc.asdict(r) for r in slice_reports(record, station.cutting)]
-    summary["discretization_error"] = None
-    # Of a policy the prescribed motion is not known, and it would decide otherwise on another mesh.
-    if run.stopped is None and scenario.policy is None:
-        try:
-            error = estimate_discretization_error(
-                food,
-                scenario.knife,
-                scenario.numerics,
-                scenario.exchange_period,
-                motion,
-                None,
-            )
-            summary["discretization_error"] = dc.asdict(error)
-        except (CuttingError, MeshError) as problem:
-            summary["discretization_error"] = {"relative_rms": None, "problem": str(problem)}
-    return summary
+def _discretization_error(run: Run) -> dict | None:
+    """What `PreparedFood.estimate_error` says; None where the run ended early."""
+    if run.stopped is not None or run.station.estimate_error is None:
+        return None
+    try:
+        error = run.station.estimate_error()
+        return None if error is None else dc.asdict(error)
+    except (CuttingError, MeshError) as problem:
+        return {"relative_rms": None, "problem": str(problem)}

@@ -1,23 +1,19 @@
 """The simulated station: a Scenario becomes a Diagram."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer
 
-from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
-from sliceit_drake.cutting.foods.spring_food import SpringFood
-from sliceit_drake.cutting.motion import MotionPlan
-from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.holder_arm import add_holding_arm
 from sliceit_drake.diagrams.knife_body import check_plant_step, effective_mass
 from sliceit_drake.diagrams.ports import STATION_PORTS
+from sliceit_drake.diagrams.prepared_food import HeldFood, OwnCutting, food_to_cut
 from sliceit_drake.diagrams.robot import (
     ArmController,
     Robot,
@@ -30,24 +26,17 @@ from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.start import solve_start_joints
 from sliceit_drake.diagrams.station_interface import OwnController, Station, make_controller
 from sliceit_drake.diagrams.workspace import add_board, add_holder, add_table
-from sliceit_drake.systems.analytic_cutter import AnalyticCutter, AnalyticFood
 from sliceit_drake.systems.contact_monitor import ContactMonitor
-from sliceit_drake.systems.cutting_system import CuttingSystem
-from sliceit_drake.systems.food_visualizer import FoodVisualizer, frame_size
+from sliceit_drake.systems.cut_report import FrameRecorder
 from sliceit_drake.systems.frame_visualizer import FrameVisualizer
 from sliceit_drake.systems.knife_force import AppliedForce, KnifeForceSystem
 from sliceit_drake.systems.knife_kinematics import BoardContact, KnifeKinematics
 from sliceit_drake.systems.motion_sources import placed_motion
 from sliceit_drake.systems.servo import JOINTS
-from sliceit_drake.systems.spring_cutter import SpringCutter
-from sliceit_drake.systems.spring_visualizer import SpringVisualizer
 from sliceit_drake.systems.wrench_sensor import WrenchSensor
 from sliceit_drake.systems.wrench_visualizer import WrenchVisualizer
 
-__all__ = ["FRAMES_PER_SECOND", "OwnCutting", "SimulatedStation"]
-
-OwnCutting = KnifeForceSystem | Callable[[Scenario], KnifeForceSystem]
-"""A cutting system of a user's own, or what makes it."""
+__all__ = ["FRAMES_PER_SECOND", "SimulatedStation"]
 
 FRAMES_PER_SECOND = 32
 """Of what is drawn and of replays; fewer where a replay would be too large."""
@@ -98,21 +87,19 @@ class SimulatedStation(Station):
         super().__init__()
         self.scenario = scenario
         self.meshcat = meshcat
-        solvers = _food_solvers(scenario)
-        self.motion_plan: MotionPlan = _motion_plan(scenario, solvers)
+        food = food_to_cut(scenario, cutting)
+        self.motion_plan, self.start_pose = food.motion_plan, food.start_pose
+        self.estimate_error = food.estimate_error
         builder = DiagramBuilder()
         self.plant, scene_graph = add_plant(builder, scenario.robot)
         self.robot: Robot = add_robot(self.plant, scenario.robot, scenario.knife, scenario.board)
         add_table(self.plant, (0.1 if scenario.holder == "clamp" else -0.15, -0.3))
         add_board(self.plant, scenario.board, scenario.X_WF())
-        _add_holder(self.plant, scenario, solvers)
+        if food.held is not None:
+            _add_holder(self.plant, scenario, food.held)
         self.plant.Finalize()
 
-        self.cutting: KnifeForceSystem
-        self.cutting, self.start_pose = _make_cutting(scenario, solvers)
-        if cutting is not None:
-            self.cutting = cutting(scenario) if callable(cutting) else cutting
-            _check_period(self.cutting, scenario)
+        self.cutting: KnifeForceSystem = food.make_cutting()
         self.start_joints = solve_start_joints(
             self.plant,
             self.robot.knife,
@@ -197,15 +184,8 @@ class SimulatedStation(Station):
                 builder.ExportInput(self.controller.GetInputPort(port.name), port.name)
             else:
                 builder.ExportOutput(outputs[port.name], port.name)
-        if isinstance(self.cutting, CuttingSystem):
-            for name in (
-                "force_components",
-                "ledger",
-                "energy",
-                "coupling_work_error",
-                "food_index",
-            ):
-                builder.ExportOutput(self.cutting.GetOutputPort(name), name)
+        for name in self.cutting.recorded():
+            builder.ExportOutput(self.cutting.GetOutputPort(name), name)
         # For records: what the contract gives as typed values, as vectors.
         builder.ExportOutput(self.cutting.GetOutputPort("food_wrench_vector"), "food_wrench_vector")
         builder.ExportOutput(
@@ -216,7 +196,7 @@ class SimulatedStation(Station):
 
         self.frame_period = self._frame_period()
         self.visualizer: MeshcatVisualizer | None = None
-        self.food_visualizer: FoodVisualizer | None = None
+        self.food_visualizer: FrameRecorder | None = None
         if meshcat is not None:
             self._add_visualization(builder, scene_graph, meshcat)
         builder.BuildInto(self)
@@ -229,29 +209,12 @@ class SimulatedStation(Station):
         self.visualizer = MeshcatVisualizer.AddToBuilder(
             builder, scene_graph, meshcat, MeshcatVisualizerParams(publish_period=period)
         )
-        if isinstance(self.cutting, CuttingSystem):
-            self.food_visualizer = builder.AddNamedSystem(
-                "food_visualizer", FoodVisualizer(self.cutting, meshcat, period)
-            )
-            for name in ("surface_vertices", "surface_damage", "food_index"):
-                builder.Connect(
-                    self.cutting.GetOutputPort(name), self.food_visualizer.GetInputPort(name)
-                )
-        elif isinstance(self.cutting, SpringCutter):
-            plates = builder.AddNamedSystem(
-                "spring_visualizer",
-                SpringVisualizer(self.cutting.food, self.scenario.X_WF(), meshcat, period),
-            )
-            builder.Connect(
-                self.cutting.GetOutputPort("compression"), plates.GetInputPort("compression")
-            )
+        self.food_visualizer = self.cutting.add_visualizer(builder, meshcat, period)
         self._add_arrows_and_frames(builder, meshcat)
         _set_scene(meshcat, self.start_pose)
 
     def _frame_period(self) -> float:
-        size = SCENE_FRAME_SIZE
-        if isinstance(self.cutting, CuttingSystem):
-            size += frame_size(self.cutting)
+        size = SCENE_FRAME_SIZE + self.cutting.frame_size()
         frames = FRAMES_PER_SECOND * placed_motion(self.motion_plan, self.start_pose).duration
         return math.ceil(frames * size / REPLAY_SIZE) / FRAMES_PER_SECOND
 
@@ -295,16 +258,6 @@ class SimulatedStation(Station):
         set_joint_positions(root_context, self.plant, self.robot, self._arm, start)
 
 
-def _check_period(cutting: KnifeForceSystem, scenario: Scenario) -> None:
-    if abs(cutting.exchange_period - scenario.exchange_period) > 1e-12:
-        raise ConfigurationError(
-            f"is {scenario.exchange_period:g} s, and that of the cutting system that was put in "
-            f"{cutting.exchange_period:g} s",
-            field="scenario.exchange_period",
-            fix="Make the cutting system with the period of the scenario.",
-        )
-
-
 def _set_scene(meshcat: Meshcat, X_WK: RigidTransform) -> None:
     """Looks at the knife, before a plain background."""
     target = X_WK.translation() + [0.0, 0.0, 0.05]
@@ -315,80 +268,17 @@ def _set_scene(meshcat: Meshcat, X_WK: RigidTransform) -> None:
     meshcat.SetProperty("/Background/<object>", "bottom_color", [0.80, 0.83, 0.86])
 
 
-def _food_solvers(scenario: Scenario) -> list[CuttingSolver]:
-    """The prepared cuts: one, or those of a sequence; none for a food without elements."""
-    food, sequence = scenario.food, scenario.sequence
-    if not isinstance(food, Food):
-        return []
-    foods = sequence.foods(food) if sequence else [food]
-    models = [make_food_model(each, scenario.knife, scenario.numerics) for each in foods]
-    blade = scenario.knife.tip_height + scenario.knife.height
-    highest = max(model.top - model.bottom for model in models)
-    if highest > blade:
-        raise ConfigurationError(
-            f"the blade is {1e3 * blade:.3g} mm high and the food {1e3 * highest:.3g} mm: spine "
-            "and gripper would go into the food",
-            field="scenario.knife.height",
-            fix="Take a higher knife (those of calibration/knives by `knife_name`), or a smaller "
-            "food.",
-        )
-    return [CuttingSolver(model, scenario.exchange_period) for model in models]
-
-
-def _motion_plan(scenario: Scenario, solvers: list[CuttingSolver]) -> MotionPlan:
-    if scenario.policy is not None:
-        return scenario.policy.envelope()
-    if scenario.sequence is None:
-        return scenario.motion
-    tops = [solver.model.top for solver in solvers]
-    return scenario.sequence.motion(tops, scenario.start.clearance)
-
-
-def _make_cutting(
-    scenario: Scenario, solvers: list[CuttingSolver]
-) -> tuple[KnifeForceSystem, RigidTransform]:
-    """The cutting system of a scenario and X_WK at the start."""
-    period, start, X_WF = scenario.exchange_period, scenario.start, scenario.X_WF()
-    if solvers:
-        assert isinstance(scenario.food, Food)
-        poses = [X_WF]
-        if scenario.sequence is not None:
-            poses = scenario.sequence.poses(scenario.food, X_WF)
-        in_sequence = scenario.sequence is not None
-        pose = start_pose(solvers[0].model, start.clearance, start.offset)
-        cutting = CuttingSystem(solvers, poses, in_sequence=in_sequence)
-        return cutting, poses[0] @ RigidTransform(RotationMatrix(pose.R), pose.p)
-    food = scenario.food
-    assert isinstance(food, AnalyticFood | SpringFood)
-    cutter: KnifeForceSystem
-    if isinstance(food, SpringFood):
-        height = food.height
-        cutter = SpringCutter(food, scenario.knife, scenario.X_WF(), period)
-    else:
-        height = food.diameter
-        cutter = AnalyticCutter(food, scenario.board.height, period)
-    p_FK = [start.offset, 0.0, height + start.clearance]
-    return cutter, X_WF @ RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), p_FK)
-
-
-def _add_holder(plant: MultibodyPlant, scenario: Scenario, solvers: list[CuttingSolver]) -> None:
-    """Draws the holder where the food is held, in a sequence behind the last cut."""
-    food = scenario.food
-    if not isinstance(food, Food) or food.held_sides not in ("both", "plus"):
-        return
-    model, distance = solvers[0].model, food.hold_distance + 0.005
-    if scenario.sequence is not None:
-        distance += scenario.sequence.positions(food)[-1]
-    size = np.ptp(model.split.vertex_position @ model.X_FC_rotation.T, axis=0)
+def _add_holder(plant: MultibodyPlant, scenario: Scenario, held: HeldFood) -> None:
+    """Draws the scenario's holder."""
     if scenario.holder == "arm":
-        grip = np.array([0.0, distance + FINGER, 0.5 * size[2]])
+        grip = np.array([0.0, held.distance + FINGER, 0.5 * held.height])
         add_holding_arm(plant, scenario.X_WF(), grip)
         return
     add_holder(
         plant,
         scenario.board,
         scenario.X_WF(),
-        food_width=float(size[0]),
-        food_height=float(size[2]),
-        distance=distance,
+        food_width=held.width,
+        food_height=held.height,
+        distance=held.distance,
     )

@@ -6,8 +6,9 @@ from pydrake.geometry import Meshcat
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.hardware_station import HardwareStation, RobotConnection
+from sliceit_drake.diagrams.prepared_food import OwnCutting
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.diagrams.simulated_station import OwnCutting, SimulatedStation
+from sliceit_drake.diagrams.simulated_station import SimulatedStation
 from sliceit_drake.diagrams.station_interface import OwnController
 
 __all__ = ["MakeStation"]

@@ -8,11 +8,12 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, Diagram, LeafSystem
 
+from sliceit_drake.cutting.discretization import DiscretizationError
 from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.diagrams.robot import Robot
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.systems.compliance_controller import ComplianceController
-from sliceit_drake.systems.food_visualizer import FoodVisualizer
+from sliceit_drake.systems.cut_report import FrameRecorder, ReportingSystem
 from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
 
 __all__ = ["OwnController", "Station", "make_controller"]
@@ -28,26 +29,28 @@ class Station(Diagram):
         scenario: What it was made from.
         plant: Model of arm, gripper and knife; what moves in a simulated station alone.
         robot: Handles of the robot in it.
-        cutting: What says how far the cut is.
+        cutting: What says how far the cut is, and more for the outputs of a run.
         motion_plan: The scenario's segments, those of its sequence, or the bounds of its policy.
         start_pose: X_WK at the start.
         start_joints: Joint positions there [6], rad.
         board_peak_loss: Estimated share of an impact's peak force on a simulated board that the
             plant's steps take.
         meshcat, visualizer, food_visualizer: The viewer, or None.
+        estimate_error: Estimates the error of the food's discretisation, see `PreparedFood`.
     """
 
     scenario: Scenario
     plant: MultibodyPlant
     robot: Robot
-    cutting: LeafSystem
+    cutting: ReportingSystem
     motion_plan: MotionPlan
     start_pose: RigidTransform
     start_joints: np.ndarray
     board_peak_loss: float
     meshcat: Meshcat | None
     visualizer: MeshcatVisualizer | None
-    food_visualizer: FoodVisualizer | None
+    food_visualizer: FrameRecorder | None
+    estimate_error: Callable[[], DiscretizationError | None] | None
 
     def SetStart(self, root_context: Context) -> None:
         """Puts the station at its start, in the context of the whole diagram."""

@@ -9,8 +9,8 @@ from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.agent_station import add_agent
+from sliceit_drake.diagrams.prepared_food import OwnCutting
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.diagrams.simulated_station import OwnCutting
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.learning.ending import Limits
 from sliceit_drake.learning.metrics import SliceMetrics, slice_metrics

@@ -22,7 +22,7 @@ from sliceit_drake.stand_in.curve_laws import (
     food_forces,
     measured_curve,
 )
-from sliceit_drake.systems.knife_force import KnifeForceSystem
+from sliceit_drake.systems.knife_force import CuttingSetup, KnifeForceSystem
 
 __all__ = ["CurveCutter", "CurveFood", "food_curve"]
 
@@ -72,6 +72,10 @@ class CurveFood:
     toughness_spread: float = quantity(0.0, "", low=0.0, high=0.5, doc="From slice to slice.")
     friction_spread: float = quantity(0.0, "", low=0.0, high=0.5, doc="From slice to slice.")
     height_spread: float = quantity(0.0, "", low=0.0, high=0.1, doc="From slice to slice.")
+
+    def make_cutting(self, setup: CuttingSetup) -> "CurveCutter":
+        """The system that this food is in a station."""
+        return CurveCutter(self, setup.X_WF(), setup.exchange_period)
 
 
 @functools.lru_cache(maxsize=64)

@@ -19,7 +19,6 @@ import dataclasses as dc
 import math
 import typing
 import zlib
-from collections.abc import Callable
 
 import numpy as np
 
@@ -29,21 +28,16 @@ from sliceit_drake.cutting.foods.food import Cylinder, Food
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.diagrams.agent_gains import AgentGains
 from sliceit_drake.diagrams.scenario import Placement, Scenario, Start
-from sliceit_drake.stand_in.curve_cutter import CurveCutter, CurveFood
-from sliceit_drake.systems.analytic_cutter import AnalyticFood
-from sliceit_drake.systems.knife_force import KnifeForceSystem
+from sliceit_drake.stand_in.curve_cutter import CurveFood
 from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig
 
 __all__ = [
     "SLICING_FOODS",
     "CurvesWorld",
-    "MakeCutting",
     "SlicingWorld",
     "StandInWorld",
     "paper_slices",
 ]
-
-MakeCutting = Callable[[Scenario], KnifeForceSystem]
 
 PAPER_SLICES = {"cucumber": 15, "tomato": 5, "potato": 10, "carrot": 5}
 SLICING_FOODS = tuple(PAPER_SLICES)
@@ -116,7 +110,7 @@ class SlicingWorld(typing.Protocol):
 
     def scenario(
         self, food: str, slice: int, board_stiffness: float | None = None
-    ) -> tuple[Scenario, MakeCutting | None]:
+    ) -> tuple[Scenario, CurveFood | None]:
         """One slice; the same for the same food and index.
 
         Args:
@@ -125,8 +119,8 @@ class SlicingWorld(typing.Protocol):
             board_stiffness: N/m; None for the default board.
 
         Returns:
-            The scenario, with the controller that the agent needs, and what makes the cutting
-            system of `MakeStation`; None where the scenario's food does.
+            The scenario, with the controller that the agent needs, and what `MakeStation` shall cut
+            in place of the scenario's food, or None.
 
         Raises:
             ConfigurationError: The food or the index is none.
@@ -214,7 +208,7 @@ class StandInWorld:
 
     def scenario(
         self, food: str, slice: int, board_stiffness: float | None = None
-    ) -> tuple[Scenario, MakeCutting | None]:
+    ) -> tuple[Scenario, CurveFood | None]:
         """One slice; see `SlicingWorld`."""
         rng = _rng("stand_in", self.seed, food, slice, SLICE)
         calibrated = load_calibrated_food(food)
@@ -251,16 +245,13 @@ class StandInWorld:
 
 @dc.dataclass
 class CurvesWorld:
-    """Measured curves; see `SlicingWorld` and `curve_cutter`.
-
-    The scenario's own food only says where the knife starts.
-    """
+    """Measured curves in place of the scenario's food; see `SlicingWorld` and `curve_cutter`."""
 
     seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Of all deviations.")
 
     def scenario(
         self, food: str, slice: int, board_stiffness: float | None = None
-    ) -> tuple[Scenario, MakeCutting | None]:
+    ) -> tuple[Scenario, CurveFood | None]:
         """One slice; see `SlicingWorld`."""
         rng = _rng("curves", self.seed, food, slice, SLICE)
         calibrated = load_calibrated_food(food)
@@ -268,9 +259,8 @@ class CurvesWorld:
         diameter = _diameter(calibrated, rng)
         tough, rub = np.exp(SPREAD * _deviations(rng, 2)).tolist()
         cut = CurveFood(food, diameter, diameter, tough, rub)
-        scenario.food = AnalyticFood(diameter=diameter, toughness=0.0)
 
-        return scenario, lambda s: CurveCutter(cut, s.X_WF(), s.exchange_period)
+        return scenario, cut
 
     def rng(self, food: str, slice: int) -> np.random.Generator:
         """See `SlicingWorld`."""

@@ -7,7 +7,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, State
 
 from sliceit_drake.configuration import quantity
-from sliceit_drake.systems.knife_force import KnifeForceSystem
+from sliceit_drake.systems.knife_force import CuttingSetup, KnifeForceSystem
 
 __all__ = ["AnalyticCutter", "AnalyticFood"]
 
@@ -24,6 +24,15 @@ class AnalyticFood:
     stiffness: float = quantity(
         5e3, "N/m", low=1.0, high=1e7, doc="Force over indentation, as a vegetable's."
     )
+
+    @property
+    def height(self) -> float:
+        """Of the top over the board, metres."""
+        return self.diameter
+
+    def make_cutting(self, setup: CuttingSetup) -> "AnalyticCutter":
+        """The system that this food is in a station."""
+        return AnalyticCutter(self, setup.X_WF().translation()[2], setup.exchange_period)
 
 
 class AnalyticCutter(KnifeForceSystem):

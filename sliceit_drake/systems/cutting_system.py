@@ -1,15 +1,23 @@
 """The finite-element food as a Drake system."""
 
+import functools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, State
+from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, State
 
+from sliceit_drake.cutting.contact_response import contact_responses
+from sliceit_drake.cutting.mesh.body import FoodBody, food_body
 from sliceit_drake.cutting.mesh.surface import FoodSurface, food_surface
+from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.simulate import check_clear, check_energies, check_in_plane
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
+from sliceit_drake.systems.cut_report import Columns, FoodBodyFrame, FoodPicture
+from sliceit_drake.systems.food_visualizer import FoodVisualizer, frame_size
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 
 __all__ = ["COMPLETE", "ENERGY_NAMES", "LEDGER_NAMES", "CuttingSystem"]
@@ -25,6 +33,9 @@ LEDGER_NAMES = (
     "internal",
 )
 ENERGY_NAMES = ("elastic", "interface", "kinetic", "largest_energy_ratio", "least_volume_ratio")
+
+MECHANISMS = ("edge", "opening", "friction", "board_friction", "blade")
+"""Where the work of cutting goes for good."""
 
 NO_ENERGY = (0.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -101,6 +112,108 @@ class CuttingSystem(KnifeForceSystem):
         }
         self.DeclareVectorOutputPort("surface_vertices", 3 * corners, self._calc_surface, state)
         self.DeclareVectorOutputPort("surface_damage", corners, self._calc_damage, state)
+
+    def recorded(self) -> dict[str, list[str]]:
+        parts = ("edge", "flank", "friction")
+        return {
+            "force_components": [f"{part}_f_{a}" for part in parts for a in "xyz"],
+            "ledger": [f"energy_{name}" for name in LEDGER_NAMES],
+            "energy": [f"energy_{name}" for name in ENERGY_NAMES],
+            "coupling_work_error": ["coupling_work_error"],
+            "food_index": ["food_index"],
+        }
+
+    def _middle_model(self) -> CuttingModel:
+        """The cut; of a sequence, its middle slice, which stands for all."""
+        return self._solvers[len(self._solvers) // 2].model
+
+    def describe(self) -> str:
+        model = self._middle_model()
+        m, dt = model.material, model.numerics.time_step
+        return (
+            f"E = {m.youngs_modulus:.3g} Pa, toughness {m.toughness:.3g} J/m², flank "
+            f"friction {m.friction:.2g}; {model.element_count} tetrahedra, sub-step "
+            f"{1e3 * dt:.3g} ms."
+        )
+
+    def summary(self, record: Columns) -> dict[str, Any]:
+        model = self._middle_model()
+        work = float(record["energy_work"][-1])
+        area = sum(self.section_areas()[: int(record["food_index"][-1]) + 1])
+        return {
+            "warnings": sorted({text for s in self._solvers for text in s.model.warnings}),
+            "elements": model.element_count,
+            "cut_points": len(model.point_nodes),
+            "sub_step_s": model.numerics.time_step,
+            "mass_ratio": model.mass_ratio,
+            "section_area_mm2": 1e6 * area,
+            "work_of_cutting_J": work,
+            "work_by_mechanism_J": {
+                name: float(record[f"energy_{name}"][-1]) for name in MECHANISMS
+            },
+            "work_per_area_J_m2": work / area,
+            "energy_imbalance_J": _imbalance(record),
+            "energy_ratio": float(record["energy_largest_energy_ratio"].max()),
+            "least_volume_ratio": float(record["energy_least_volume_ratio"].min()),
+            "coupling_work_error_J": float(record["coupling_work_error"][-1]),
+        }
+
+    def section_areas(self) -> list[float]:
+        return [solver.model.section_area for solver in self._solvers]
+
+    def picture(self, context: Context) -> FoodPicture:
+        surface, X_WF = self.surfaces[self.food_index(context)], self.X_WF(context)
+        values = self.GetOutputPort("surface_vertices").Eval(context).reshape(-1, 3)
+        vertices = X_WF.inverse().multiply(values[: len(surface.ends)].T).T
+        return FoodPicture(
+            X_WF,
+            self.solver(context).model.top,
+            vertices[surface.triangles],
+            surface.is_cut_face[surface.triangles[:, 0]],
+        )
+
+    def body(self, context: Context) -> FoodBodyFrame:
+        index, state = self.food_index(context), self.food_state(context)
+        solver, (body, rest) = self._solvers[index], self._bodies[index]
+        model = solver.model
+        passed, parted = (solver.field(state, name) for name in ("passed", "parted"))
+        return FoodBodyFrame(
+            index,
+            _in_world(self.X_WF(context), body.positions(model, solver.positions(state))),
+            rest,
+            body.tetrahedra,
+            body.damage(model, passed, parted),
+            body.side,
+        )
+
+    @functools.cached_property
+    def _bodies(self) -> list[tuple[FoodBody, np.ndarray]]:
+        """The solid of each prepared food, and its corners at rest in W [V, 3], metres."""
+        found = []
+        for solver, X_WF in zip(self._solvers, self._X_WF, strict=True):
+            body = food_body(solver.model)
+            rest = body.positions(solver.model, solver.model.nodes)
+            found.append((body, _in_world(X_WF, rest)))
+        return found
+
+    def contact_responses(self, offset: float) -> list[np.ndarray]:
+        """Those of the food with the largest section; see `ReportingSystem`."""
+        solver = max(self._solvers, key=lambda each: each.model.section_area)
+        return contact_responses(solver, offset)
+
+    def frame_size(self) -> float:
+        return frame_size(self.surfaces)
+
+    def add_visualizer(
+        self, builder: DiagramBuilder, meshcat: Meshcat, period: float
+    ) -> FoodVisualizer:
+        slices_stay = not self._X_WF[0].IsExactlyEqualTo(self._X_WF[-1])
+        visualizer = builder.AddNamedSystem(
+            "food_visualizer", FoodVisualizer(self.surfaces, slices_stay, meshcat, period)
+        )
+        for name in ("surface_vertices", "surface_damage", "food_index"):
+            builder.Connect(self.GetOutputPort(name), visualizer.GetInputPort(name))
+        return visualizer
 
     @staticmethod
     def _padded(values: np.ndarray, size: int) -> np.ndarray:
@@ -270,9 +383,7 @@ class CuttingSystem(KnifeForceSystem):
         index = self.food_index(context)
         solver = self._solvers[index]
         nodes = solver.positions(self.food_state(context))
-        corners = self.surfaces[index].positions(solver.model, nodes)
-        X_WF = self._X_WF[index]
-        p_W = corners @ X_WF.rotation().matrix().T + X_WF.translation()
+        p_W = _in_world(self._X_WF[index], self.surfaces[index].positions(solver.model, nodes))
         values = np.zeros(output.size())
         values[: p_W.size] = p_W.ravel()
         output.SetFromVector(values)
@@ -283,3 +394,23 @@ class CuttingSystem(KnifeForceSystem):
         passed, parted = solver.field(state, "passed"), solver.field(state, "parted")
         damage = self.surfaces[index].damage(solver.model, passed, parted)
         output.SetFromVector(self._padded(damage, output.size()))
+
+
+def _in_world(X_WF: RigidTransform, p_F: np.ndarray) -> np.ndarray:
+    """Points [V, 3] from F to W."""
+    return np.asarray(p_F @ X_WF.rotation().matrix().T + X_WF.translation())
+
+
+def _imbalance(record: Columns) -> float:
+    """Work put into the food less everything that it went into, at the end of the record, J.
+
+    What a food holds when the next takes its place stays in it.
+    """
+    last = {name: float(record[f"energy_{name}"][-1]) for name in LEDGER_NAMES}
+    ends = np.append(np.flatnonzero(np.diff(record["food_index"])), -1)
+    elastic, interface, kinetic = (
+        float(record[f"energy_{name}"][ends].sum()) for name in ENERGY_NAMES[:3]
+    )
+    damping = -last["internal"] - elastic
+    spent = sum(last[name] for name in MECHANISMS)
+    return last["work"] + last["gravity"] - elastic - interface - kinetic - spent - damping

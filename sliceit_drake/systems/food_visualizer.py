@@ -1,10 +1,12 @@
 """Draws the deforming food in Meshcat, live and in a recording."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, EventStatus, LeafSystem
 
-from sliceit_drake.systems.cutting_system import CuttingSystem
+from sliceit_drake.cutting.mesh.surface import FoodSurface
 
 __all__ = ["FLESH", "INTACT", "SKIN", "FoodVisualizer", "damage_colours", "frame_size"]
 
@@ -28,12 +30,12 @@ def damage_colours(damage: np.ndarray) -> np.ndarray:
     return np.array([np.interp(damage, (0.0, 0.5, 1.0), channel) for channel in stops.T])
 
 
-def frame_size(cutting: CuttingSystem) -> float:
-    """Bytes that one frame of the food takes in a replay."""
+def frame_size(surfaces: Sequence[FoodSurface]) -> float:
+    """Bytes that one frame takes in a replay, of the largest of the surfaces."""
     # Positions and colours of vertices and corners of triangles, 4 bytes each, in base 64.
     return max(
         sum(24 * len(corners) + 12 * len(triangles) for corners, triangles in surface.halves)
-        for surface in cutting.surfaces
+        for surface in surfaces
     ) * (4.0 / 3.0)
 
 
@@ -56,28 +58,32 @@ class FoodVisualizer(LeafSystem):
         food_index: Of the `CuttingSystem` [1].
 
     Args:
-        cutting: Where the triangles come from.
+        surfaces: Of the prepared foods.
+        slices_stay: Whether each food lies beside the one before it.
         meshcat: Viewer.
         period: Between frames, s.
         path: In Meshcat's tree.
     """
 
     def __init__(
-        self, cutting: CuttingSystem, meshcat: Meshcat, period: float, path: str = "/drake/food"
+        self,
+        surfaces: Sequence[FoodSurface],
+        slices_stay: bool,
+        meshcat: Meshcat,
+        period: float,
+        path: str = "/drake/food",
     ) -> None:
         super().__init__()
-        self._cutting = cutting
+        self._surfaces, self._slices_stay = tuple(surfaces), slices_stay
         self._meshcat = meshcat
         self._path = path
-        size = cutting.GetOutputPort("surface_damage").size()
+        size = max(len(surface.ends) for surface in surfaces)
         self._vertices = self.DeclareVectorInputPort("surface_vertices", 3 * size)
         self._damage = self.DeclareVectorInputPort("surface_damage", size)
         self._food_index = self.DeclareVectorInputPort("food_index", 1)
         self._recording = False
         self._frames: list[float] = []
         self._foods: list[int] = []
-        first, last = cutting.food_poses[0], cutting.food_poses[-1]
-        self._slices_stay = not first.IsExactlyEqualTo(last)
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
         self.DeclareForcedPublishEvent(self._publish)
 
@@ -115,7 +121,7 @@ class FoodVisualizer(LeafSystem):
     def _publish(self, context: Context) -> EventStatus:
         vertices = self._vertices.Eval(context).reshape(-1, 3)
         food = int(self._food_index.Eval(context)[0])
-        surface = self._cutting.surfaces[food]
+        surface = self._surfaces[food]
         damage = self._damage.Eval(context)[: len(surface.ends)]
         skin = np.array(SKIN)[:, None]
         colours = np.where(surface.is_cut_face, damage_colours(damage), skin)

@@ -1,5 +1,7 @@
 """The ports that every cutting system has; a subclass says what force the food gives."""
 
+from typing import Protocol
+
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
@@ -9,11 +11,22 @@ from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context, EventStatus, LeafSystem, State
 
 from sliceit_drake.cutting.motion import small_turn
+from sliceit_drake.systems.cut_report import ReportingSystem
 
-__all__ = ["AppliedForce", "KnifeForceSystem"]
+__all__ = ["AppliedForce", "CuttingSetup", "KnifeForceSystem"]
 
 
-class KnifeForceSystem(LeafSystem):
+class CuttingSetup(Protocol):
+    """Where and how often a food is cut, as a scenario says."""
+
+    exchange_period: float
+
+    def X_WF(self) -> RigidTransform:
+        """Pose of the food frame, whose origin is on the board."""
+        ...
+
+
+class KnifeForceSystem(ReportingSystem):
     """Exchanges pose for force with a knife, once per `exchange_period`.
 
     At t_k the update takes the knife's pose and velocity and holds the wrench that `advance`

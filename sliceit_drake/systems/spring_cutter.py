@@ -3,12 +3,14 @@
 import math
 
 import numpy as np
+from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, State
+from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, State
 
 from sliceit_drake.cutting.foods.spring_food import SpringFood
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.systems.knife_force import KnifeForceSystem
+from sliceit_drake.systems.spring_visualizer import SpringVisualizer
 
 __all__ = ["SpringCutter"]
 
@@ -43,12 +45,19 @@ class SpringCutter(KnifeForceSystem):
     ) -> None:
         super().__init__(exchange_period)
         self.food = food
+        self._X_WF = X_WF
         self._half_edge = 0.5 * knife.length
         self._p_WT = X_WF.translation() + [0.0, 0.0, food.height]
         self._steps = math.ceil(exchange_period / food.time_step - 1e-9)
         self._button = self.DeclareDiscreteState(2)
         self._spring = self.DeclareNumericParameter(BasicVector([food.stiffness, food.damping]))
         self.DeclareStateOutputPort("compression", self._button)
+
+    def add_visualizer(self, builder: DiagramBuilder, meshcat: Meshcat, period: float) -> None:
+        plates = builder.AddNamedSystem(
+            "spring_visualizer", SpringVisualizer(self.food, self._X_WF, meshcat, period)
+        )
+        builder.Connect(self.GetOutputPort("compression"), plates.GetInputPort("compression"))
 
     def spring(self, context: Context) -> tuple[float, float]:
         """Stiffness, N/m, and damping, Ns/m, in this context."""

@@ -17,11 +17,10 @@ from pydrake.systems.framework import Context, EventStatus
 from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.mesh.body import FoodBody, food_body
 from sliceit_drake.diagrams.knife_body import blade_surface
 from sliceit_drake.diagrams.outputs.run_log import Record
 from sliceit_drake.diagrams.run import Run
-from sliceit_drake.systems.cutting_system import CuttingSystem
+from sliceit_drake.systems.cut_report import FoodBodyFrame
 
 __all__ = ["FORMATS", "FoodFrames", "write_series"]
 
@@ -30,17 +29,8 @@ FORMATS = ("vtu", "xdmf")
 WRENCHES = ("food", "board", "sensor")
 
 
-@dc.dataclass
-class _Frame:
-    """The food at one instant: which of the foods, and its state."""
-
-    time: float
-    food: int
-    state: np.ndarray
-
-
 class FoodFrames:
-    """Keeps the food's state at a fixed rate while a run is simulated.
+    """Keeps the food's body at a fixed rate while a run is simulated.
 
     Frames are at exchanges, as the rows of the record are. Keeping them changes nothing of the run.
 
@@ -49,71 +39,57 @@ class FoodFrames:
         rate: Frames a second, at most one an exchange.
 
     Raises:
-        ConfigurationError: The food is not of finite elements, or the rate is not positive.
+        ConfigurationError: The food has no body, or the rate is not positive.
     """
 
     def __init__(self, run: Run, rate: float) -> None:
-        cutting = run.station.cutting
-        if not isinstance(cutting, CuttingSystem):
+        self.run = run
+        self._times: list[float] = []
+        self._bodies: list[FoodBodyFrame] = []
+        if self._body(run.simulator.get_context()) is None:
             raise ConfigurationError(
-                "only a food of finite elements has a body to show",
+                "this food has no body to show; one of finite elements has",
                 field="scenario.food",
                 fix="Simulate a scenario whose food is one.",
             )
         if not rate > 0.0:
             raise ConfigurationError(f"is {rate:g}", field="--fps", fix="Give frames a second.")
-        self.run = run
-        self._cutting: CuttingSystem = cutting
-        exchange = cutting.exchange_period
+        exchange = run.scenario.exchange_period
         self._period = max(1, round(1.0 / rate / exchange)) * exchange
-        self._frames: list[_Frame] = []
         run.simulator.set_monitor(self._keep)
         self._keep(run.simulator.get_context())
 
+    def _body(self, root: Context) -> FoodBodyFrame | None:
+        cutting = self.run.station.cutting
+        return cutting.body(cutting.GetMyContextFromRoot(root))
+
     def _keep(self, root: Context) -> EventStatus:
-        time, count = root.get_time(), len(self._frames)
-        if time >= count * self._period - 1e-9:
-            context = self._cutting.GetMyContextFromRoot(root)
-            index = self._cutting.food_index(context)
-            self._frames.append(_Frame(time, index, self._cutting.food_state(context).copy()))
+        time = root.get_time()
+        if time >= len(self) * self._period - 1e-9:
+            body = self._body(root)
+            assert body is not None
+            self._times.append(time)
+            self._bodies.append(body)
         return EventStatus.DidNothing()
 
     def end(self, time: float) -> None:
         """Drops the frames after a time, s."""
-        self._frames = [frame for frame in self._frames if frame.time <= time + 1e-9]
+        while self._times and self._times[-1] > time + 1e-9:
+            self._times.pop()
+            self._bodies.pop()
 
     def __len__(self) -> int:
-        return len(self._frames)
+        return len(self._times)
 
     @property
     def times(self) -> np.ndarray:
         """Of the frames [n], s."""
-        return np.array([frame.time for frame in self._frames])
+        return np.array(self._times)
 
-    def foods(self) -> list[int]:
-        """Which of a sequence's foods each frame shows."""
-        return [frame.food for frame in self._frames]
-
-    def body(self, food: int) -> FoodBody:
-        """The body of one of the foods."""
-        return food_body(self._cutting.solvers[food].model)
-
-    def rest(self, food: int, body: FoodBody) -> np.ndarray:
-        """Corners of a body before anything touched it, in W [V, 3], metres."""
-        model = self._cutting.solvers[food].model
-        return self._in_world(food, body.positions(model, model.nodes))
-
-    def shape(self, k: int, body: FoodBody) -> tuple[np.ndarray, np.ndarray]:
-        """Corners of frame k in W [V, 3], metres, and their share of spent toughness [V]."""
-        frame = self._frames[k]
-        solver = self._cutting.solvers[frame.food]
-        corners = body.positions(solver.model, solver.positions(frame.state))
-        passed, parted = (solver.field(frame.state, name) for name in ("passed", "parted"))
-        return self._in_world(frame.food, corners), body.damage(solver.model, passed, parted)
-
-    def _in_world(self, food: int, p_F: np.ndarray) -> np.ndarray:
-        X_WF = self._cutting.food_poses[food]
-        return np.asarray(p_F @ X_WF.rotation().matrix().T + X_WF.translation())
+    @property
+    def bodies(self) -> list[FoodBodyFrame]:
+        """Of the frames."""
+        return self._bodies
 
 
 def write_series(frames: FoodFrames, directory: Path, kind: str = "vtu") -> list[Path]:
@@ -141,7 +117,7 @@ def write_series(frames: FoodFrames, directory: Path, kind: str = "vtu") -> list
         raise ConfigurationError(
             f"{kind!r} is no format", field="--format", fix=f"Give one of {', '.join(FORMATS)}."
         )
-    if kind == "xdmf" and len(set(frames.foods())) > 1:
+    if kind == "xdmf" and len({body.food for body in frames.bodies}) > 1:
         raise ConfigurationError(
             "the mesh changes from slice to slice, which an XDMF series cannot hold",
             field="--format",
@@ -169,7 +145,6 @@ class _Parts:
     def __init__(self, frames: FoodFrames) -> None:
         self._frames = frames
         self._record: Record = frames.run.record()
-        self._foods: dict[int, tuple[FoodBody, np.ndarray]] = {}
         blade = blade_surface(frames.run.scenario.knife)
         self._blade = np.array(blade.vertices())
         self._triangles = np.array(
@@ -178,24 +153,19 @@ class _Parts:
 
     def of(self, k: int) -> Mapping[str, _Part]:
         """Those of frame k."""
-        food, time = self._frames.foods()[k], self._frames.times[k]
-        if food not in self._foods:
-            body = self._frames.body(food)
-            self._foods[food] = (body, self._frames.rest(food, body))
-        body, rest = self._foods[food]
-        points, damage = self._frames.shape(k, body)
+        body, time = self._frames.bodies[k], self._frames.times[k]
         row = int(np.abs(self._record["time"] - time).argmin())
         X_WK, first = self._pose(row), self._pose(0)
         origin = X_WK[:, 3][None]
         return {
             "food": _Part(
-                points,
-                rest,
+                body.points,
+                body.rest,
                 {"tetra": body.tetrahedra},
                 {
-                    "damage": damage,
+                    "damage": body.damage,
                     "side": body.side.astype(float),
-                    "food": np.full(len(points), float(food)),
+                    "food": np.full(len(body.points), float(body.food)),
                 },
             ),
             "knife": _Part(

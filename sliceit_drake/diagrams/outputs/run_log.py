@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 
 from sliceit_drake.cutting.motion import Motion
 from sliceit_drake.diagrams.station_interface import Station
-from sliceit_drake.systems.cutting_system import ENERGY_NAMES, LEDGER_NAMES, CuttingSystem
 
 __all__ = ["Record", "Recorder", "add_recorder"]
 
@@ -170,13 +169,7 @@ def add_recorder(
     }
     if "target_offset" in sources:
         vectors["target_offset"] = ["_target_x", "_target_z"]
-    if isinstance(station.cutting, CuttingSystem):
-        parts = [f"{part}_f_{a}" for part in ("edge", "flank", "friction") for a in "xyz"]
-        vectors["force_components"] = parts
-        vectors["ledger"] = [f"energy_{name}" for name in LEDGER_NAMES]
-        vectors["energy"] = [f"energy_{name}" for name in ENERGY_NAMES]
-        vectors["coupling_work_error"] = ["coupling_work_error"]
-        vectors["food_index"] = ["food_index"]
+    vectors |= {name: list(columns) for name, columns in station.cutting.recorded().items()}
     row = builder.AddNamedSystem(
         "record_row", Multiplexer([len(columns) for columns in vectors.values()])
     )

@@ -1,6 +1,7 @@
 """What came of each slice of a sequence: a table and a figure."""
 
 import dataclasses as dc
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -8,7 +9,6 @@ import numpy as np
 from sliceit_drake.diagrams.outputs.figures import BOARD_PHASE, CONTACT_THRESHOLD, SIMULATED
 from sliceit_drake.diagrams.outputs.run_log import Record
 from sliceit_drake.diagrams.outputs.snapshot import Snapshot, draw_snapshot
-from sliceit_drake.systems.cutting_system import CuttingSystem
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -63,8 +63,13 @@ def _descents(record: Record) -> list[tuple[slice, np.ndarray]]:
     return parts
 
 
-def slice_reports(record: Record, cutting: CuttingSystem) -> list[SliceReport]:
-    """The slices that the record holds, in order; the last may be unfinished."""
+def slice_reports(record: Record, section_areas: Sequence[float]) -> list[SliceReport]:
+    """The slices that the record holds, in order; the last may be unfinished.
+
+    Args:
+        record: The run.
+        section_areas: Of all slices of the sequence, m^2.
+    """
     time, work = record["time"], record["energy_work"]
     food = np.linalg.norm(record.vector("food_wrench_f"), axis=1)
     board = np.linalg.norm(record.vector("board_wrench_f"), axis=1)
@@ -72,7 +77,7 @@ def slice_reports(record: Record, cutting: CuttingSystem) -> list[SliceReport]:
     for k, (rows, contact) in enumerate(_descents(record)):
         before = float(work[rows.start - 1]) if rows.start > 0 else 0.0
         done = float(work[rows.stop - 1]) - before
-        area = cutting.solvers[k].model.section_area
+        area = section_areas[k]
         forces = food[contact] if len(contact) else np.zeros(1)
         quartiles = np.percentile(forces, (25.0, 50.0, 75.0))
         reports.append(
@@ -98,7 +103,7 @@ def slice_reports(record: Record, cutting: CuttingSystem) -> list[SliceReport]:
 
 def plot_sequence(
     record: Record,
-    cutting: CuttingSystem,
+    section_areas: Sequence[float],
     title: str,
     board_height: float,
     caption: str,
@@ -108,7 +113,7 @@ def plot_sequence(
 
     Args:
         record: The run.
-        cutting: The system that was cut.
+        section_areas: Of all slices of the sequence, m^2.
         title: What is shown.
         board_height: World height of the board's top, metres.
         caption: Conditions and provenance, below the plots.
@@ -123,7 +128,7 @@ def plot_sequence(
     board = np.linalg.norm(record.vector("board_wrench_f"), axis=1)
     height = 1e3 * (record["knife_pose_p_z"] - board_height)
     parts = _descents(record)
-    reports = slice_reports(record, cutting)
+    reports = slice_reports(record, section_areas)
 
     figure = Figure(figsize=(12.0, 7.0), layout="constrained")
     FigureCanvasAgg(figure)

@@ -9,7 +9,6 @@ from pydrake.systems.framework import Context
 
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.diagrams.station_interface import Station
-from sliceit_drake.systems.cutting_system import CuttingSystem
 from sliceit_drake.systems.food_visualizer import FLESH, SKIN
 
 __all__ = ["Snapshot", "draw_snapshot", "take_snapshot"]
@@ -38,22 +37,17 @@ class Snapshot:
 
 
 def take_snapshot(station: Station, root_context: Context) -> Snapshot | None:
-    """Knife and food as they are in the context of the diagram; None for an analytic food."""
-    cutting = station.cutting
-    if not isinstance(cutting, CuttingSystem):
+    """Knife and food in the context of the diagram; None for a food without a picture."""
+    food = station.cutting.picture(station.cutting.GetMyContextFromRoot(root_context))
+    if food is None:
         return None
-    context = cutting.GetMyContextFromRoot(root_context)
-    surface = cutting.surfaces[cutting.food_index(context)]
-    values = cutting.GetOutputPort("surface_vertices").Eval(context).reshape(-1, 3)
-    X_FW = cutting.X_WF(context).inverse()
-    vertices = X_FW.multiply(values[: len(surface.ends)].T).T
     X_WK = station.GetOutputPort("knife_pose").Eval(station.GetMyContextFromRoot(root_context))
-    X_FK = X_FW @ X_WK
+    X_FK = food.X_WF.inverse() @ X_WK
     return Snapshot(
         time=root_context.get_time(),
-        depth=cutting.solver(context).model.top - float(X_FK.translation()[2]),
-        triangles=vertices[surface.triangles],
-        is_cut_face=surface.is_cut_face[surface.triangles[:, 0]],
+        depth=food.top - float(X_FK.translation()[2]),
+        triangles=food.triangles,
+        is_cut_face=food.is_cut_face,
         blade=[X_FK.multiply(face.T).T for face in _blade_faces(station.scenario.knife)],
     )
 
