@@ -56,9 +56,9 @@ def impact_peak_loss(stiffness: float, mass: float, time_step: float) -> float:
     period to the peak the force falls to (1 + x^2)^(-pi / (4 atan x)), 1 - pi x / 4 for small x.
 
     Args:
-        stiffness: Of the board, N/m.
-        mass: That the knife carries into the board, kg.
-        time_step: Of the plant, s.
+        stiffness: The board's stiffness, N/m.
+        mass: Mass that the knife carries into the board, kg.
+        time_step: The plant's time step, s.
     """
     x = time_step * math.sqrt(stiffness / mass)
     return 1.0 - math.exp(-0.25 * math.pi * math.log1p(x * x) / math.atan(x))
@@ -105,11 +105,11 @@ def board_wrenches(
     """Wrench of the board on the knife at the end of each exchange [E, 6], in F.
 
     Args:
-        board: Its height in F.
+        board: The board, its height in F.
         knife: The knife.
         R: Rotations of the knife in F at the ends of the exchanges [E + 1, 3, 3].
         p: Positions of Ko in F there [E + 1, 3], metres.
-        period: Of an exchange, s.
+        period: Duration of an exchange, s.
     """
     wrenches = np.zeros((len(p) - 1, 6))
     reach = 0.5 * knife.length * np.abs(R[1:, 2, 0])

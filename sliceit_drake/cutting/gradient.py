@@ -27,11 +27,11 @@ class SliceGradient:
     """Derivatives of a function of the wrenches of a slice.
 
     Attributes:
-        row: By what the kernels read, in the order of `Workspace.parameter_layout`.
-        position: By the commanded position of Ko at each exchange [E + 1, 3], 1/m.
-        rotation: By the entries of its rotation matrix [E + 1, 3, 3].
-        state: By the initial state of the food [state_size].
-        compliance: By the compliances of arm and holder [2], N/m.
+        row: Derivatives by what the kernels read, in the order of `Workspace.parameter_layout`.
+        position: Derivatives by the commanded position of Ko at each exchange [E + 1, 3], 1/m.
+        rotation: Derivatives by the entries of its rotation matrix [E + 1, 3, 3].
+        state: Derivatives by the initial state of the food [state_size].
+        compliance: Derivatives by the compliances of arm and holder [2], N/m.
         layout: Where each array stands in `row`.
     """
 
@@ -43,7 +43,7 @@ class SliceGradient:
     layout: dict[str, slice]
 
     def by(self, name: str) -> np.ndarray:
-        """By an array that the kernels read, as "toughness" [P] or "P" (see `PARAMETERS`)."""
+        """Derivatives by an array of the kernels: "toughness" [P], "P" (see `PARAMETERS`), ..."""
         return self.row[self.layout[name]]
 
 
@@ -83,7 +83,7 @@ class SliceAdjoint:
 
     Args:
         model: The cut, or one that others are derived from.
-        exchange_period: s.
+        exchange_period: Duration of an exchange, s.
     """
 
     def __init__(self, model: CuttingModel, exchange_period: float) -> None:
@@ -182,7 +182,7 @@ class SliceAdjoint:
             run: The slice.
             e: The exchange.
             weights: Adjoint of its wrench [6].
-            adj_state: Of the state at its end.
+            adj_state: Adjoint of the state at its end.
         """
         ws, n, T = self._w, self._w.substeps, self.exchange_period
         share = np.arange(1, n + 1) / n

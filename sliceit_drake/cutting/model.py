@@ -25,7 +25,7 @@ __all__ = [
 ]
 
 GRAVITY = 9.81
-"""As Drake's plants have it, m/s^2."""
+"""Acceleration of gravity, as Drake's plants have it, m/s^2."""
 
 SLIVER = 0.1
 """Share of a vertex's mass below which a node of one side does not set the step."""
@@ -82,7 +82,7 @@ class Numerics:
     )
     precision: str = choice("float32", ("float32", "float64"), doc="Arithmetic of the kernels.")
     device: str = "cpu"
-    """Of Warp's: "cpu", "cuda" or "cuda:1"."""
+    """A device by Warp's name: "cpu", "cuda" or "cuda:1"."""
 
 
 @dc.dataclass
@@ -90,9 +90,9 @@ class PointScales:
     """Factors on the material's values for each cut point [P].
 
     Attributes:
-        toughness: On the surface energy.
-        friction: On the sliding friction of the flanks.
-        flank_stiffness: On the contact stiffness of the flanks.
+        toughness: Factors on the surface energy.
+        friction: Factors on the sliding friction of the flanks.
+        flank_stiffness: Factors on the contact stiffness of the flanks.
     """
 
     toughness: np.ndarray
@@ -246,7 +246,7 @@ def _derived(
     numerics: Numerics,
     point_scales: PointScales,
 ) -> dict[str, Any]:
-    """What follows for the kernels: the fields of `CuttingModel` after `point_scales`."""
+    """The fields of `CuttingModel` after `point_scales`, which follow from the others."""
     g, tables, step = geometry, geometry.tables, numerics.time_step
     true_mass = material.density * g.node_volume
     weight = -GRAVITY * material.density * g.weight_volume[:, None] * g.up

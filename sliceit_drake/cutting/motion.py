@@ -71,7 +71,7 @@ def small_turn(R0: np.ndarray, R1: np.ndarray) -> np.ndarray:
     a, b = R0.tolist(), R1.tolist()
 
     def element(i: int, j: int) -> float:
-        """Of R1 R0^T."""
+        """Element of R1 R0^T."""
         return b[i][0] * a[j][0] + b[i][1] * a[j][1] + b[i][2] * a[j][2]
 
     return 0.5 * np.array(

@@ -22,13 +22,13 @@ __all__ = ["MotionLimits", "Optimum", "mean_force", "optimize_motion"]
 SMOOTH = 0.05
 """Force below which |F| is rounded off, N."""
 CLEARANCE = 1e-3
-"""Of the edge above the food at the start, metres."""
+"""Height of the edge above the food at the start, metres."""
 NAMES = ("amplitude", "frequency", "press_speed")
 
 
 @dc.dataclass
 class MotionLimits:
-    """What a slicing motion may be."""
+    """Limits of a slicing motion."""
 
     duration: float = quantity(3.0, "s", low=0.05, high=600.0, doc="Longest time of the cut.")
     draw_speed: float = quantity(0.15, "m/s", low=1e-4, high=2.0, doc="Greatest, along the edge.")
@@ -42,7 +42,7 @@ class MotionLimits:
         [0.2, 5.0], "Hz", low=1e-2, high=50.0, size=2, doc="Least and greatest."
     )
     margin: float = quantity(
-        0.01, "m", low=0.0, high=0.5, doc="Of the edge that stays beyond the food at each end."
+        0.01, "m", low=0.0, high=0.5, doc="Length of edge that stays beyond the food at each end."
     )
 
     def amplitude(self, model: CuttingModel) -> float:
@@ -70,8 +70,8 @@ class Optimum:
     Attributes:
         motion: The best.
         force: Mean of |F| over the depth with it, N.
-        start_force: With the motion at the start, N.
-        press_force: With a press of the same speed, without a draw, N.
+        start_force: Mean force of the motion at the start, N.
+        press_force: Mean force of a press of the same speed, without a draw, N.
         evaluations: Slices with gradients that were simulated.
         active: Limits that the motion touches.
         converged: Whether the optimiser ended by its own criterion.
@@ -90,8 +90,8 @@ def mean_force(adjoint: SliceAdjoint, motion: PressAndDraw) -> tuple[float, np.n
     """Mean over the depth of the norm of the food's force, and its derivatives.
 
     Args:
-        adjoint: Of the cut.
-        motion: From `CLEARANCE` above the food to its bottom; its ramps are left out.
+        adjoint: The cut and its gradients.
+        motion: A press from `CLEARANCE` above the food to its bottom; its ramps are left out.
 
     Returns:
         Mean, N, and its derivatives by amplitude, frequency and press speed [3].
@@ -140,7 +140,7 @@ def optimize_motion(
     Args:
         model: The cut.
         limits: What the motion may be.
-        start: Where to begin; None for half of what the limits allow.
+        start: Motion to begin with; None for half of what the limits allow.
         period: Exchange period, s.
         iterations: Most of the optimiser.
         progress: Called with the number of slices, the best force so far, N, and its motion.

@@ -1,4 +1,4 @@
-"""What gives between a prescribed motion and the cut: arm and holder."""
+"""Elastic mounting between a prescribed motion and the cut: arm and holder."""
 
 import dataclasses as dc
 
@@ -27,7 +27,7 @@ class Mounting:
         arm, holder: Compliances of knife (vertical) and food (along the edge), m/N.
         resistance: Force along the edge at which the food slips, N; None for never.
         remaining: Share of the resistance that is left while it slips.
-        tolerance: Of the balance of forces, relative to 1 N and the force.
+        tolerance: Tolerance of the balance of forces, relative to 1 N and the force.
         given: Rise of the knife and displacement of the food, metres [2].
         slipped: How far the food has slipped along Cx, metres.
         slipping: Whether it slips.
@@ -68,7 +68,7 @@ class Mounting:
         Args:
             rise: Upward force of the food on the knife, N.
             draw: Force of the knife on the food along Cx, N.
-            height: Of the knife without the arm's spring, z in F, metres.
+            height: Height of the knife without the arm's spring, z in F, metres.
             board: Board under the knife, its height in F; None for none.
         """
         force = np.array([rise, draw])

@@ -17,8 +17,8 @@ class NamedKnife:
     """A knife and its sources.
 
     Attributes:
-        knife: Its measures.
-        sources: Of each measure, by the field's name; a measure without one is chosen freely.
+        knife: Measures of the knife.
+        sources: Source of each measure, by the field's name; a measure without is chosen freely.
         note: What it cannot be used for.
     """
 

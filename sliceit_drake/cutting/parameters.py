@@ -134,8 +134,8 @@ def pull_back(
 
     Args:
         model: The cut at which `gradient` was taken.
-        gradient: Of `SliceAdjoint.gradient`.
-        names: Parameters.
+        gradient: Result of `SliceAdjoint.gradient`.
+        names: Names of the parameters.
     """
     out: dict[str, float | np.ndarray] = {}
     for name in names:

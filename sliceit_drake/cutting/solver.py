@@ -39,16 +39,16 @@ class SurfaceFactors(typing.NamedTuple):
 
 @dc.dataclass
 class Exchange:
-    """What one exchange gives. Wrenches act on the knife, at Ko at the end of the exchange, in C.
+    """Result of one exchange. Wrenches act on the knife, at Ko at the end of the exchange, in C.
 
     Attributes:
         state: The food's new state.
         wrench: Mean moment about Ko and force [6], Nm and N.
-        edge, normal, friction: The same, by mechanism; they sum to `wrench`.
+        edge, normal, friction: Wrenches by mechanism; they sum to `wrench`.
         work: Work done by the knife on the food, J.
-        edge_dissipation, opening_dissipation, friction_dissipation: J, each never negative.
+        edge_dissipation, opening_dissipation, friction_dissipation: Each never negative, J.
         internal_work: Work of the bulk's forces (elastic and damping) on the nodes, J.
-        blade_dissipation: In the bending blade, J.
+        blade_dissipation: Dissipated in the bending blade, J.
         board_force: Mean force of the board on the food [3], N.
         board_dissipation: Friction and damping of the food on the board, J.
         gravity_work: Work of the weight, J.
@@ -74,14 +74,14 @@ class Exchange:
 
 @dc.dataclass
 class Exchanges:
-    """What E exchanges in a row give; see `Exchange`.
+    """Result of E exchanges in a row; see `Exchange`.
 
     Attributes:
         state: The food's new state.
-        wrenches: By mechanism (edge, flank pressure, friction) [E, 3, 6].
-        work: [E], J.
-        dissipation: By edge, opening, friction, blade, board over all exchanges [5], J.
-        internal_work, gravity_work: Over all exchanges, J.
+        wrenches: Wrenches by mechanism (edge, flank pressure, friction) [E, 3, 6].
+        work: Work of each exchange [E], J.
+        dissipation: Energy lost by edge, opening, friction, blade, board over all exchanges [5], J.
+        internal_work, gravity_work: Work over all exchanges, J.
         cut: Share of the section that the edge has passed [E].
     """
 
@@ -104,11 +104,12 @@ class Energies:
     """Energies of a state, J.
 
     Attributes:
-        elastic: Of the bulk.
-        interface: Of bonds, contacts, friction anchors, the edge's unloading and the bent blade.
-        kinetic: Of the stepped (scaled) mass.
+        elastic: Energy of the bulk.
+        interface: Energy of bonds, contacts, friction anchors, the edge's unloading and the bent
+            blade.
+        kinetic: Energy of the stepped (scaled) mass.
         least_volume_ratio: Smallest J of all elements.
-        least_element: Its element.
+        least_element: Element that has it.
     """
 
     elastic: float
@@ -127,7 +128,7 @@ NOT_FINITE = (
     "the knife's force is not finite: elements inverted or the step became unstable. "
     "Use a smaller numerics.time_step or a finer mesh near the cut."
 )
-"""What is said of a cut that broke down."""
+"""Message of a cut that broke down."""
 
 
 def run_exchanges(
@@ -241,7 +242,7 @@ class CuttingSolver:
             state: The food's state [state_size]; not changed.
             start: Knife pose in C at the beginning.
             end: Knife pose in C at the end.
-            factors: On toughness and friction in this exchange.
+            factors: Factors on toughness and friction in this exchange.
 
         Raises:
             CuttingError: A force is not finite, or the knife left the region that is modelled.

@@ -14,7 +14,7 @@ __all__ = ["start_warp"]
 
 CACHE = "WARP_CACHE_PATH"
 NO_GPU = b"NVIDIA CUDA driver"
-"""In the line that Warp's library prints on a machine without one, whatever its log level is."""
+"""Words of the line that Warp's library prints on a machine without one, whatever its log level."""
 
 
 @functools.cache

@@ -32,7 +32,7 @@ class Workspace:
 
     Args:
         models: The cuts; all derived from one model.
-        exchange_period: s; the time step must divide it.
+        exchange_period: Duration of an exchange, s; the time step must divide it.
         exchanges: Exchanges that one launch advances.
         gradients: Whether each sub-step keeps its state, for an adjoint.
 
@@ -457,7 +457,7 @@ class Workspace:
         self.launch(self.kernels.move_knife, self.steps, [w["R"], w["p"], *self._timing(), *motion])
 
     def _launch_results(self) -> None:
-        """What the exchanges add up to."""
+        """Launches the sums of the exchanges."""
         w, kern, C, E = self.w, self.kernels, self.cuts, self.exchanges
         outputs = [w["blade"], w["wrenches"], w["work"]]
         wp.launch(
@@ -490,7 +490,7 @@ class Workspace:
         wp.capture_launch(self._graph)
 
     def stored_energies(self) -> tuple[float, np.ndarray, float]:
-        """Of the first cut: elastic energy, volume ratios [T], energy of the cut points, J."""
+        """Elastic energy, volume ratios [T] and energy of the cut points of the first cut, J."""
         if self._energy_graph is None:
             with DIRECT:
                 self._energy_graph = self._captured_energies()
@@ -521,7 +521,7 @@ class Workspace:
         return capture.graph
 
     def present_forces(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of the first cut: forces of elements [B, 12, LANES] and of cut points [P, 2, 3], N."""
+        """Forces of elements [B, 12, LANES] and cut points [P, 2, 3] of the first cut, N."""
         look_ahead = self.kernels.look_ahead
         with DIRECT:
             self.launch(look_ahead, len(self.model.nodes), self.look_ahead_arguments())
@@ -532,7 +532,7 @@ class Workspace:
         return forces.reshape(B, 12, LANES), point_forces
 
     def point_forces(self) -> np.ndarray:
-        """Of the first cut: forces on both faces at the cut points [P, 2, 3], N."""
+        """Forces on both faces at the cut points of the first cut [P, 2, 3], N."""
         # A step of no duration changes no history that another call reads.
         points = self.point_arguments(0, self.real(0.0))
         with DIRECT:
@@ -541,7 +541,7 @@ class Workspace:
 
 
 def parameter_row(model: CuttingModel) -> np.ndarray:
-    """What a model gives the kernels, in the order of `Workspace.parameter_layout`."""
+    """The numbers that a model gives the kernels, in the order of `Workspace.parameter_layout`."""
     inverse_mass = np.zeros(len(model.nodes))
     inverse_mass[model.moving] = 1.0 / model.mass[model.moving]
     volume = model.in_blocks(model.element_volume).reshape(-1)
@@ -568,7 +568,7 @@ def parameter_row(model: CuttingModel) -> np.ndarray:
 def _element_gather(
     blocks: np.ndarray, count: int, node_count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """For each node, where its entries stand in the element forces, in rows of `GATHER`.
+    """Places of each node's entries in the element forces, in rows of `GATHER`.
 
     Returns:
         First row of each node and the end [N + 1], and the rows [M, GATHER]; what is left of a row
@@ -595,7 +595,7 @@ def _element_gather(
 def _point_gather(
     point_nodes: np.ndarray, weights: np.ndarray, node_count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """For each node, the cut-point forces (2 point + side) that act on it and their weights."""
+    """Cut-point forces (2 point + side) that act on each node, and their weights."""
     P = len(point_nodes)
     entry = 2 * np.arange(P)[:, None] + np.array([0, 0, 1, 1])
     weight = np.tile(weights, (1, 2))

@@ -17,7 +17,7 @@ class Connection:
     """A client.
 
     Attributes:
-        peer: Its address and port.
+        peer: Address and port of the client.
         is_open: Whether anything can still be sent.
     """
 
@@ -66,7 +66,7 @@ class Connection:
         self._service.closed(self)
 
     def fileno(self) -> int:
-        """For the selector."""
+        """File descriptor for the selector."""
         return self._socket.fileno()
 
     def receive(self) -> None:
@@ -84,7 +84,7 @@ class Connection:
 
 
 class Service(Protocol):
-    """What answers on a port."""
+    """Service that answers on a port."""
 
     def opened(self, connection: Connection) -> None:
         """A client has connected."""

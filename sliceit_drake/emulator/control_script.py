@@ -73,7 +73,7 @@ class ControlScript:
         """Prepares to answer commands.
 
         Args:
-            controller: Whose registers and arm it uses.
+            controller: The controller whose registers and arm it uses.
             offset: First register.
         """
         self._controller = controller

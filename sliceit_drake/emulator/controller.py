@@ -36,7 +36,7 @@ _STEADY = 1e-4
 
 @dc.dataclass
 class ControllerConfig:
-    """What kind of controller is emulated.
+    """Kind of controller that is emulated.
 
     Attributes:
         version: Software version: major, minor, bugfix, build.
@@ -45,7 +45,7 @@ class ControllerConfig:
         protective_stop: Whether a protective stop pauses ("pause") or stops ("stop") the program;
             which one a real PolyScope does was not checked.
         unlock_delay: Controller time before a protective stop can be unlocked, s.
-        deceleration: With which the arm stops when its program does, rad/s2; of the order of what
+        deceleration: Deceleration of the arm when its program stops, rad/s2; of the order of what
             Universal Robots publish as stopping times.
         speed_limit: Joint speed that raises a protective stop, rad/s; 191 degrees a second.
         position_limit: Joint position that raises a protective stop, rad; 363 degrees.
@@ -252,8 +252,9 @@ class Controller:
 
         Args:
             mode: The new mode.
-            why: For the log.
-            program: For a protective stop "pause" or "stop"; None for `ControllerConfig`'s.
+            why: Reason, for the log.
+            program: Fate of the program in a protective stop, "pause" or "stop"; None for
+                `ControllerConfig`'s.
         """
         if mode == self.safety:
             return

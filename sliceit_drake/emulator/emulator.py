@@ -63,9 +63,9 @@ class Emulator:
     """One emulated robot on one address; ports are those of a UR.
 
     Attributes:
-        address: Where it listens.
+        address: Address on which it listens.
         controller: The controller.
-        faults: To inject faults.
+        faults: The faults that can be injected.
         rtde: The RTDE service.
         late_cycles: Cycles that began more than half a period late.
         missed_cycles: Cycles in lockstep that ran without a command.

@@ -11,7 +11,7 @@ class Fault:
 
     Attributes:
         usage: Name, with a colon and what may follow it.
-        meaning: For people.
+        meaning: Meaning, for people.
         method: Name of the method of `faults.FaultInjector` that does it.
     """
 
@@ -72,7 +72,7 @@ FAULTS = {
         ),
     )
 }
-"""What can be injected, by name."""
+"""Faults that can be injected, by name."""
 
 
 def faults_as_text() -> str:

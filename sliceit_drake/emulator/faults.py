@@ -33,7 +33,7 @@ class FaultInjector:
         """Prepares.
 
         Args:
-            controller: On which faults act.
+            controller: The controller on which faults act.
             hub: Its ports.
             rtde: Its RTDE service.
             services: Services by the name that ``close`` has for them.
@@ -47,7 +47,7 @@ class FaultInjector:
         """Injects a fault.
 
         Args:
-            fault: As ``"silence:0.1"``, see `FAULTS`.
+            fault: The fault, as ``"silence:0.1"``, see `FAULTS`.
             at: Controller time, s; None for the next cycle.
 
         Raises:
@@ -205,7 +205,7 @@ class FaultInjector:
 
 
 def _discard(_: object) -> None:
-    """For actions whose answer nobody waits for."""
+    """Ignores the answer of an action."""
 
 
 def _nothing(argument: str) -> None:

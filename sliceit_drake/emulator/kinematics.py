@@ -99,7 +99,7 @@ def inverse(X_BT: np.ndarray, q: ArrayLike, X_FT: np.ndarray | None = None) -> n
 
     Args:
         X_BT: Wanted pose of the tool [4, 4].
-        q: Where to start [6], rad.
+        q: Joint positions to start from [6], rad.
         X_FT: Tool in the flange [4, 4]; None for the flange itself.
 
     Returns:

@@ -17,7 +17,7 @@ __all__ = [
 
 
 class RuntimeState(enum.IntEnum):
-    """What the program does."""
+    """State of the program."""
 
     STOPPING = 0
     STOPPED = 1
@@ -51,7 +51,7 @@ class RobotMode(enum.IntEnum):
 
 
 class SafetyMode(enum.IntEnum):
-    """What the safety system allows."""
+    """State of the safety system."""
 
     NORMAL = 1
     REDUCED = 2

@@ -30,8 +30,8 @@ def joint_motion(
     Args:
         start: Joint positions [6], rad.
         end: Joint positions [6], rad.
-        speed: Of the leading joint, rad/s.
-        acceleration: Of the leading joint, rad/s2.
+        speed: Speed of the leading joint, rad/s.
+        acceleration: Acceleration of the leading joint, rad/s2.
         scale: Speed slider.
 
     Raises:
@@ -57,8 +57,8 @@ def line_motion(
         start: Joint positions [6], rad.
         end: Pose of the tool in the base [4, 4].
         X_FT: Tool in the flange [4, 4].
-        speed: Of the tool, m/s.
-        acceleration: Of the tool, m/s2.
+        speed: Speed of the tool, m/s.
+        acceleration: Acceleration of the tool, m/s2.
         scale: Speed slider.
 
     Raises:

@@ -30,9 +30,9 @@ class PendantClient:
         """Connects.
 
         Args:
-            address: Of the emulator.
+            address: Address of the emulator.
             timeout: Wall time to wait for an answer, s.
-            port: Likewise.
+            port: Port of the emulator.
 
         Raises:
             OSError: Nothing answers there.
@@ -64,7 +64,7 @@ class PendantClient:
         self.request(inject=fault, at=at)
 
     def status(self) -> dict:
-        """What `emulator.Emulator.status` says."""
+        """Answer of `emulator.Emulator.status`."""
         return self.request(status=True)
 
     def put_fresh_food(self, scenario: str | None = None) -> None:
@@ -106,8 +106,8 @@ class EmulatorProcess:
     The child ends with this process, however that ends.
 
     Attributes:
-        address: Where it listens.
-        pendant: To inject faults and ask how it does.
+        address: Address on which it listens.
+        pendant: Client that injects faults and asks how it does.
     """
 
     def __init__(
@@ -170,7 +170,7 @@ class EmulatorProcess:
 
     @property
     def pid(self) -> int:
-        """Of the child process."""
+        """Process id of the child."""
         return self._process.pid
 
     @property

@@ -7,7 +7,7 @@ from sliceit_drake.emulator.variables import INPUTS, NOT_FOUND, zero
 __all__ = ["IN_USE", "InputRegisters"]
 
 IN_USE = "IN_USE"
-"""What stands for the type of an input that another client holds."""
+"""Word in place of the type of an input that another client holds."""
 
 
 class InputRegisters:

@@ -1,4 +1,4 @@
-"""What moves when the emulated controller moves: the interface, and an arm without dynamics."""
+"""The arm behind the emulated controller: its interface, and an arm without dynamics."""
 
 import dataclasses as dc
 import functools
@@ -50,7 +50,7 @@ class RobotModel(Protocol):
     """An arm that follows joint targets, one cycle at a time.
 
     Attributes:
-        state: At the end of the last cycle.
+        state: State at the end of the last cycle.
         gravity: Acceleration of gravity in the robot's base [3], m/s2.
         warnings: What the model could not do as asked, in words; the controller tells its clients.
     """
@@ -81,7 +81,7 @@ class RobotModel(Protocol):
         """Puts an uncut food in the place of the one that is there; the arm stays as it is.
 
         Args:
-            scenario: Whose food, numerics and placement on the board are taken; None for the same
+            scenario: Scenario of food, numerics and placement on the board; None for the same
                 food again.
 
         Raises:

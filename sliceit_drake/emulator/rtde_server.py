@@ -35,7 +35,7 @@ _Values = dict[str, int | float | bool | tuple]
 
 @dc.dataclass
 class _Session:
-    """What has been agreed with a client."""
+    """Agreement with a client."""
 
     reader: FrameReader = dc.field(default_factory=FrameReader)
     inputs: list[Recipe] = dc.field(default_factory=list)

@@ -21,7 +21,7 @@ TYPES = {
 """Type names of the protocol, and how `struct` writes them."""
 
 NOT_FOUND = "NOT_FOUND"
-"""What stands for the type of a variable that the controller does not have."""
+"""Word in place of the type of a variable that the controller does not have."""
 
 _OUTPUT_LISTS = {
     "DOUBLE": """timestamp actual_execution_time target_execution_time speed_scaling

@@ -1,4 +1,4 @@
-"""What must be true before a robot may move: each check says what it found and what to do."""
+"""Checks before a robot may move: each says what it found and what to do."""
 
 import dataclasses as dc
 import math
@@ -88,7 +88,7 @@ def check_facts(facts: RobotFacts, config: HardwareConfig) -> list[Check]:
 
 
 def check_payload(payload: Sequence[float] | None, config: HardwareConfig) -> list[Check]:
-    """What the controller subtracts from the force: mass, kg, and centre in the flange, m [4]."""
+    """Payload that the controller subtracts: mass, kg, and centre in the flange, m [4]."""
     wanted, centre = config.payload, config.payload_cog
     if wanted is None or centre is None:
         fix = "Weigh all beyond the flange; write payload and payload_cog in the file."

@@ -1,4 +1,4 @@
-"""What the link needs of a robot: an interface, so that tests and other libraries can stand in."""
+"""Interface of a robot as the link needs it, so that tests and other libraries can stand in."""
 
 import dataclasses as dc
 from typing import Protocol
@@ -14,14 +14,14 @@ class RobotUnavailableError(RuntimeError):
 
 @dc.dataclass
 class RobotFacts:
-    """What a robot says of itself before it is used.
+    """Facts that a robot tells before it is used.
 
     Attributes:
-        model: As the dashboard has it, such as "UR5".
+        model: Model as the dashboard has it, such as "UR5".
         serial: Serial number.
         software: PolyScope's version, as "5.11.1".
-        robot_mode: As the dashboard has it, such as "RUNNING".
-        safety_mode: Likewise, such as "NORMAL".
+        robot_mode: Mode as the dashboard has it, such as "RUNNING".
+        safety_mode: Safety mode as the dashboard has it, such as "NORMAL".
         remote_control: Whether it is in remote control; None where the robot cannot say.
         payload: Mass that the controller was told, kg.
         payload_cog: Its centre of gravity in the flange's frame [3], m.
@@ -70,7 +70,7 @@ class RobotClient(Protocol):
         """
 
     def facts(self) -> RobotFacts:
-        """What the robot says of itself."""
+        """The facts that the robot tells."""
 
     def zero_sensor(self) -> None:
         """Subtracts what the force sensor shows now from all that it shows later."""

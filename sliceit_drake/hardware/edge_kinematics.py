@@ -73,7 +73,7 @@ class EdgeKinematics:
     Args:
         X_WB: Pose of the arm's base in the world [3 or 4, 4].
         X_TK: Pose of the knife frame in the flange frame [3 or 4, 4].
-        length: Of the edge, m; its middle is the origin of K, along Kx, Kz from spine to edge.
+        length: Length of the edge, m; its middle is Ko, Kx along it, Kz from spine to edge.
     """
 
     def __init__(self, X_WB: ArrayLike, X_TK: ArrayLike, length: float) -> None:

@@ -20,20 +20,20 @@ from sliceit_drake.hardware.rtde_link import LinkStatus, RobotLink
 __all__ = ["GuardedTouch", "Touch", "TouchError", "contact_of"]
 
 ACCELERATION = 0.5
-"""Of the knife, m/s2."""
+"""Acceleration of the knife, m/s2."""
 BASELINE = 25
 """States before the motion whose mean force is zero."""
 CONFIRMED = 3
 """States in a row over the threshold that make a contact: one may be noise."""
 CLEAR = 1e-3
-"""Way after the board is left before the knife goes faster, m."""
+"""Distance from the board beyond which the knife goes faster, m."""
 SETTLED = 0.1
 """Time at the start again, before it ends, s."""
 NO_DATA = 1.0
 """How long the robot may be silent, s."""
 LEAST_SAMPLES = 3
 PERIOD = 0.002
-"""Of an e-Series controller, s."""
+"""Period of an e-Series controller, s."""
 
 
 class TouchError(RuntimeError):
@@ -44,10 +44,10 @@ class Touch(NamedTuple):
     """Where the board was found.
 
     Attributes:
-        height: Of its surface under the edge's lowest point, in the world, m.
+        height: Height of its surface under the edge's lowest point, in the world, m.
         uncertainty: Half width, m: way in a cycle, half of what the ways down and up differ by, and
             what the force's noise makes of the height.
-        stiffness: Of board, knife and arm together, N/m.
+        stiffness: Stiffness of board, knife and arm together, N/m.
         peak_force: Greatest force, N.
     """
 
@@ -61,10 +61,10 @@ class GuardedTouch:
     """Drives a touch over a link: `run` once.
 
     Args:
-        link: Started, not armed; its safety layer has the limits of the touch.
+        link: A started link, not armed; its safety layer has the limits of the touch.
         path: Joint positions [6], rad, by the way down from the start, m.
         depth: Farthest way down, m.
-        kinematics: Of the knife.
+        kinematics: Where the knife's edge is.
         config: Speeds and threshold.
         pace: Controller seconds in a second.
     """
@@ -160,7 +160,7 @@ def contact_of(rows: np.ndarray, noise: float, config: TouchConfig) -> Touch:
     Args:
         rows: Height of the edge's lowest point, m, and force, N [n, 2], in the order of time.
         noise: Standard deviation of the force, N.
-        config: With speed and threshold.
+        config: Speed and threshold.
 
     Raises:
         TouchError: There was no contact, or it was too short to tell.

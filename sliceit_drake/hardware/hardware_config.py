@@ -21,10 +21,14 @@ class TouchConfig:
     """
 
     speed: float = quantity(
-        0.005, "m/s", low=5e-4, high=0.02, doc="Of the knife, down and until it is clear again."
+        0.005,
+        "m/s",
+        low=5e-4,
+        high=0.02,
+        doc="Speed of the knife, down and until it is clear again.",
     )
     retract_speed: float = quantity(
-        0.02, "m/s", low=5e-4, high=0.1, doc="Of the knife, when it is clear again."
+        0.02, "m/s", low=5e-4, high=0.1, doc="Speed of the knife when it is clear again."
     )
     force: float = quantity(
         5.0, "N", low=0.5, high=25.0, doc="Change of the force that means contact."
@@ -70,7 +74,7 @@ class HardwareConfig:
         "m",
         low=-1.0,
         high=2.0,
-        doc="Of the board's surface in the world, measured; null: not known, and nothing moves.",
+        doc="Measured height of the board's surface in the world; null: unknown, nothing moves.",
     )
     sensor_force: float = quantity(
         3.0, "N", low=0.1, high=20.0, doc="Most that the sensor may show in the air after zeroing."
@@ -88,8 +92,8 @@ class HardwareConfig:
         high=0.5,
         doc="Least singular value of the knife's Jacobian (m and rad) on the plan.",
     )
-    lookahead_time: float = quantity(0.03, "s", low=0.03, high=0.2, doc="Of servoj.")
-    gain: float = quantity(2000.0, "1/s2", low=100.0, high=2000.0, doc="Of servoj.")
+    lookahead_time: float = quantity(0.03, "s", low=0.03, high=0.2, doc="Argument of servoj.")
+    gain: float = quantity(2000.0, "1/s2", low=100.0, high=2000.0, doc="Argument of servoj.")
     watchdog: float = quantity(
         50.0, "Hz", low=5.0, high=250.0, doc="Inputs a second below which the controller stops."
     )

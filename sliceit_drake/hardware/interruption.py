@@ -35,7 +35,7 @@ def catch_signals() -> Iterator[None]:
 
 
 def raise_if_interrupted() -> None:
-    """For the cycles of a motion.
+    """Ends a motion that was interrupted; called in each of its cycles.
 
     Raises:
         KeyboardInterrupt: A signal came since `catch_signals`.

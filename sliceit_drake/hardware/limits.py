@@ -14,7 +14,7 @@ JOINTS = 6
 
 @dc.dataclass
 class SafetyLimits:
-    """What the safety layer lets through.
+    """Limits of what the safety layer lets through.
 
     The defaults are for slow slicing beside a person who holds the emergency stop. Their sources:
     the UR5e's published ranges and joint limits (Universal Robots' technical details; model file

@@ -1,4 +1,4 @@
-"""What a UR controller reports in one cycle, and what its numbers mean."""
+"""State that a UR controller reports in one cycle, and the meaning of its numbers."""
 
 from typing import NamedTuple
 

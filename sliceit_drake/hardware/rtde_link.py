@@ -46,10 +46,10 @@ class _Task(NamedTuple):
 
 
 class LinkStatus(NamedTuple):
-    """The newest of the link.
+    """The newest state of the link.
 
     Attributes:
-        state: Of the controller.
+        state: State of the controller.
         arrival: Wall time at which it was seen, s (`time.perf_counter`).
         period: Controller time since the state before, s.
         lateness: Wall time since the state before, less the period at the link's pace, s.

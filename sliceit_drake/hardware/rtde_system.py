@@ -35,7 +35,7 @@ class RtdeSystem(LeafSystem):
     Outputs:
         joint_positions, joint_velocities: Measured [6], rad and rad/s.
         sensor_wrench: SpatialForce of the environment on the tool, at the flange, in its axes (S).
-        wrench_vector: The same as moment and force [6], Nm and N.
+        wrench_vector: The wrench as moment and force [6], Nm and N.
         period: Controller time between the last two states, s [1].
         lateness: Wall time between them less that, s [1].
         age: Controller time that would have passed since the state arrived, s [1].
@@ -44,7 +44,7 @@ class RtdeSystem(LeafSystem):
         stop_reason: Why, as text; empty while it has not.
 
     Args:
-        link: To the robot.
+        link: Link to the robot.
         pace: Controller seconds in a second.
     """
 
@@ -84,7 +84,7 @@ class RtdeSystem(LeafSystem):
         """Puts a measurement into the system's own context.
 
         Args:
-            context: Of this system.
+            context: This system's context.
             status: The measurement; None for the link's newest.
 
         Returns:

@@ -37,7 +37,7 @@ class Stop(NamedTuple):
         detail: A sentence for the operator.
         value: What was found; NaN where a number does not tell.
         bound: What was allowed; NaN likewise.
-        time: Of the controller, s.
+        time: Time of the controller, s.
         sends: Whether targets go on out, to brake and hold; after a fault of the link or of the
             robot's program nothing does, so that nothing moves when it comes back.
     """
@@ -54,7 +54,7 @@ class Stop(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """What to do in a cycle.
+    """Decision of one cycle.
 
     Attributes:
         q: Target to send [6], rad; None to send nothing.
@@ -83,10 +83,10 @@ class SafetyLayer:
 
     Args:
         limits: What is allowed.
-        kinematics: Of the knife.
-        board_height: Of the board's surface in the world, m.
+        kinematics: Where the knife's edge is.
+        board_height: Height of the board's surface in the world, m.
         start: Joint positions around which `SafetyLimits.joint_window` lies [6], rad.
-        period: Of the controller, s.
+        period: Period of the controller, s.
 
     Raises:
         ConfigurationError: A limit is out of its range, or a number is none.

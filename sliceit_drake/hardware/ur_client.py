@@ -20,12 +20,12 @@ __all__ = ["UrClient"]
 
 RATE = 500.0
 DECELERATION = 2.0
-"""Of the fastest joint when a planned motion is stopped, rad/s2."""
+"""Deceleration of the fastest joint when a planned motion is stopped, rad/s2."""
 STOP_TIME = 2.0
-"""In which a program ends that is asked to, s; longer means that the link is dead."""
+"""Time in which a program ends that is asked to, s; longer means that the link is dead."""
 ATTEMPT = 1.4
-"""Of each of two ways to stop a robot, s: together less than `RobotLink` waits before it tells the
-operator that the robot does not answer, and lets go of the connections."""
+"""Time for each of two ways to stop a robot, s: together less than `RobotLink` waits before it
+tells the operator that the robot does not answer, and lets go of the connections."""
 SLOWEST = 0.2
 """Pace below which no more wall time is given for that."""
 
@@ -35,8 +35,8 @@ class UrClient:
 
     Args:
         host: Name or address.
-        lookahead_time: Of servoj, s, 0.03 to 0.2.
-        gain: Of servoj, 100 to 2000.
+        lookahead_time: Argument of servoj, s, 0.03 to 0.2.
+        gain: Argument of servoj, 100 to 2000.
         controls: Whether to take control; else it only reads, and `servo` refuses.
         pace: Controller seconds in a second; 1 for all robots.
 

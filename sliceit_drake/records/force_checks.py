@@ -46,8 +46,8 @@ def check_force(table: SliceTable, record: SliceRecord, findings: Findings) -> N
 
     Args:
         table: The files.
-        record: The same, as series in W.
-        findings: Where to report.
+        record: The table's record, as series in W.
+        findings: Collector of what is found.
     """
     magnitude = record.force_magnitude
     name = fmt.FORCE[0] if record.force is not None else fmt.FORCE_NORM
@@ -83,7 +83,7 @@ def check_force(table: SliceTable, record: SliceRecord, findings: Findings) -> N
 
 
 def _known_offset(record: SliceRecord, air: np.ndarray) -> np.ndarray | None:
-    """What to subtract from the force so that it is that of food and board alone [3].
+    """Force to subtract so that what is left is that of food and board alone [3].
 
     None if an offset may be there that cannot be told.
     """

@@ -32,8 +32,8 @@ def check_motion(table: SliceTable, record: SliceRecord, findings: Findings) -> 
 
     Args:
         table: The files.
-        record: The same, as series in W.
-        findings: Where to report.
+        record: The table's record, as series in W.
+        findings: Collector of what is found.
     """
     _check_units(record, findings)
     if record.joints is not None:

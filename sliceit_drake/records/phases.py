@@ -21,7 +21,7 @@ def phases_from_motion(
     Slicing begins when the edge is level with the food's top and ends when the knife stops.
 
     Args:
-        metadata: With `food.size` and `food.position`; without them nothing is labelled.
+        metadata: Facts of the slice; without `food.size` and `food.position` nothing is labelled.
         time: Increasing times [n], s.
         height: p_WK_z, height of the edge [n], m.
 

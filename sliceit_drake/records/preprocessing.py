@@ -30,7 +30,7 @@ __all__ = [
 
 GRAVITY = 9.81
 LEAST_AIR_ROWS = 10
-"""In the first air phase, for its mean to be a zero and its scatter the noise."""
+"""Fewest samples of the first air phase whose mean is a zero and whose scatter is the noise."""
 
 ANTI_ALIASING = 0.35
 """Cutoff of the filter before a resampling to fewer rows, of the new rate: at the new Nyquist
@@ -250,7 +250,7 @@ def as_measured(
     """What the record would show of a true series: the sensor's filter, then the record's steps.
 
     Args:
-        metadata: Of the measured record. `sensor.cutoff_frequency` is a causal filter of order 1.
+        metadata: The measured record's. `sensor.cutoff_frequency` is a causal filter of order 1.
         time: Increasing times [n], s, on the record's clock.
         values: The series [n] or [n, k].
 

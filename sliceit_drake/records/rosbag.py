@@ -36,7 +36,7 @@ JOINT_NAMES = (
     "wrist_2_joint",
     "wrist_3_joint",
 )
-"""Of Universal Robots' descriptions, from the base on; a prefix may stand before each."""
+"""Joints in Universal Robots' descriptions, from the base on; a prefix may stand before each."""
 
 FLANGE = "tool0"
 """The frame whose pose follows from the joints."""
@@ -158,8 +158,8 @@ class _Series:
 
     Attributes:
         kind: Type of the messages.
-        origin: Of the time, ns; for both topics that of the first wrench.
-        time: Increasing [n], s.
+        origin: Origin of the time, ns; for both topics that of the first wrench.
+        time: Increasing times [n], s.
         values: Force and torque [n, 6]; position and quaternion, w last [n, 7]; joints [n, 6].
         frame: header.frame_id of all.
         child: child_frame_id, or the flange for joints; None if there is none.

@@ -42,7 +42,7 @@ KEY_FACTS = (
     "motion.speed",
     "sensor.rate",
 )
-"""What the simulation of a slice needs: given, or listed as unknown."""
+"""Facts that the simulation of a slice needs: given, or listed as unknown."""
 
 
 def load_record(file: str | Path) -> SliceRecord:
@@ -89,7 +89,7 @@ def load_sessions(folders: Sequence[str | Path]) -> list[SliceRecord]:
     folder's before it.
 
     Args:
-        folders: In the order of the sessions.
+        folders: Folders in the order of the sessions.
 
     Raises:
         ConfigurationError: As `load_records`, or a folder is there twice.
@@ -135,15 +135,15 @@ def record_files(path: Path) -> list[Path]:
 
 
 def check_record(record: SliceRecord) -> list[RecordFinding]:
-    """What is wrong with a record in memory; see `check_table`."""
+    """Errors and warnings of a record in memory; see `check_table`."""
     return check_table(record.table())
 
 
 def check_table(table: SliceTable) -> list[RecordFinding]:
-    """What is wrong with a record as its files have it.
+    """Errors and warnings of a record as its files have it.
 
     Args:
-        table: From `read_table`, or of a record in memory.
+        table: What `read_table` returned, or a record's in memory.
 
     Returns:
         Errors and warnings. If the columns cannot be read as series, only the errors that say so.

@@ -100,7 +100,7 @@ class CurveCutter(KnifeForceSystem):
     Args:
         food: The food.
         X_WF: Pose of the food frame: the food stands at its origin, the edge is along Fx.
-        exchange_period: s.
+        exchange_period: Duration of an exchange, s.
     """
 
     def __init__(self, food: CurveFood, X_WF: RigidTransform, exchange_period: float) -> None:
@@ -121,7 +121,7 @@ class CurveCutter(KnifeForceSystem):
         Args:
             context: This system's.
             toughness, friction: Factors.
-            height: Of the food, metres.
+            height: Height of the food, metres.
         """
         values = [toughness, friction, height]
         context.get_mutable_numeric_parameter(self._slice).SetFromVector(values)

@@ -20,7 +20,7 @@ __all__ = ["CURVES", "CutState", "EllipticSection", "FoodCurve", "food_forces", 
 CURVES = {name: f"calibration/measured/sliceit_real_{name}_force.csv" for name in
           ("cucumber", "potato", "tomato")}  # fmt: skip
 CURVE_SPEED = 0.02
-"""At which the curves were recorded (calibration/measured/README.md), m/s."""
+"""Speed at which the curves were recorded (calibration/measured/README.md), m/s."""
 
 CONTACT = 0.3
 """Force at which a curve begins, N."""
@@ -35,7 +35,7 @@ FLANK_SHARE, WEDGE_SHARE = 0.15, 0.03
 """Friction and pressure of the flanks, fully buried, over the curve's largest force."""
 
 HOLD_FADE, HOLD_ONSET = 0.06, 0.03
-"""In a hold a force loses this share with each tenfold of the time over the onset, s."""
+"""Share that a force loses in a hold with each tenfold of the time over the onset; the onset, s."""
 
 RELOAD = 4e-4
 """Travel after which a force that faded, or was let go, is there again, metres."""
@@ -54,8 +54,8 @@ class FoodCurve:
     """Force of a press at `CURVE_SPEED` over depth.
 
     Attributes:
-        share: Of the food's height, from 0 to 1, increasing [n].
-        force: On the knife, up [n], N.
+        share: Depths as shares of the food's height, from 0 to 1, increasing [n].
+        force: Upward force on the knife [n], N.
     """
 
     share: np.ndarray
@@ -88,12 +88,12 @@ class EllipticSection:
     """An elliptic section, and how much of it lies above a depth.
 
     Args:
-        width, height: Of the food along the edge and vertically, metres.
+        width, height: Size of the food along the edge and vertically, metres.
 
     Attributes:
-        area: m^2.
-        depth: At which the section is tabulated, from its top [n], metres.
-        up: Height over the middle there, over half the section's height [n].
+        area: Area of the section, m^2.
+        depth: Depths at which the section is tabulated, from its top [n], metres.
+        up: Heights over the middle there, over half the section's height [n].
         half: Half the width there [n], metres.
     """
 
@@ -118,13 +118,13 @@ class CutState:
     """What a slice remembers along the knife's path. Lengths in metres, in F.
 
     Attributes:
-        place: Of the knife relative to the food [3].
+        place: Position of the knife relative to the food [3].
         heading: Direction of motion, as friction has turned to it [3].
         course: Motion along the edge and down, over the motion, as the edge has turned to it [2].
-        depth, deepest: Of the edge below the top of the food, now and ever; negative above it.
+        depth, deepest: Depth of the edge below the food's top, now and ever; negative above it.
         travel: Path of the edge in the food.
         swept: Area that the flanks have swept, m^2.
-        speed: Of the edge, m/s.
+        speed: Speed of the edge, m/s.
         ratio: Draw over press, xi.
         rest: Time for which the knife is held, s.
         faded: Share of the forces that a hold has left.
@@ -163,13 +163,13 @@ class CutState:
         still: float = STILL,
         turn: float = 0.0,
     ) -> None:
-        """To the end of a stretch of the path.
+        """Advances to the end of a stretch of the path.
 
         Args:
             period: Duration of the stretch, s.
             along: Direction of the edge in F [3].
-            place: Of the knife in F relative to the food [3], metres.
-            height: Of the food, metres.
+            place: Position of the knife in F relative to the food [3], metres.
+            height: Height of the food, metres.
             still: Move below which the knife is held, metres.
             turn: Travel over which the edge's ratio turns to that of the motion, metres; 0: at
                 once. A motion that a controller makes shakes; what it rises then does not count,
@@ -224,9 +224,9 @@ def food_forces(
     In F, for an edge along Fx.
 
     Args:
-        state: At the end of the stretch.
-        curve: Of this slice.
-        section: Of this slice.
+        state: The slice at the end of the stretch.
+        curve: Curve of this slice.
+        section: Section of this slice.
         toughness, friction: Factors on the edge's force and on the flanks'.
         more: What the edge meets beyond the curve at this depth, N.
     """

@@ -36,7 +36,7 @@ class CurveWorld:
     """Cuts slices by a measured curve.
 
     Args:
-        protocol: Its food's name chooses the curve.
+        protocol: The session, whose food's name chooses the curve.
 
     Raises:
         ConfigurationError: There is no curve of this food.
@@ -181,7 +181,7 @@ class CurveWorld:
 
 
 class _EdgeEffects:
-    """What effects do to the edge's force in a section."""
+    """The edge's force in a section, as effects change it."""
 
     def __init__(
         self, section: EllipticSection, facts: SliceTruth, effects: Sequence[Effect]
@@ -212,5 +212,5 @@ class _EdgeEffects:
         self._more = facts.toughness * 2.0 * half * (factor.mean(1) * stretch - 1.0)
 
     def at(self, depth: float) -> float:
-        """What they add to the force of the edge at a depth, N."""
+        """Force that effects add to the edge's at a depth, N."""
         return float(np.interp(depth, self._depth, self._more))

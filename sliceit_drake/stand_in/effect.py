@@ -1,4 +1,4 @@
-"""What an effect is: a small class that changes one thing in a world, and what it sees of a slice.
+"""Effects: small classes that change one thing in a world, and what they see of a slice.
 
 A user's own effect is a file with one subclass, given as `sliceit record ... --effect FILE:SIZE`:
 
@@ -25,15 +25,15 @@ __all__ = ["Effect", "Now", "Series", "SliceTruth", "Tissue"]
 
 @dc.dataclass(frozen=True)
 class SliceTruth:
-    """What is the same during one slice.
+    """What the world knows of one slice: what is the same while it is cut.
 
     Attributes:
         index: Order in the session, from 0.
         peeled: Whether the skin is off.
-        height: Of the food at the cut, metres; 0 without food.
-        width: Of the food along the edge, metres; 0 without food.
-        toughness: Of the food as the world has it, J/m^2.
-        reference_speed: At which it has that, m/s.
+        height: Height of the food at the cut, metres; 0 without food.
+        width: Width of the food along the edge, metres; 0 without food.
+        toughness: Toughness of the food as the world has it, J/m^2.
+        reference_speed: Speed at which it has that, m/s.
     """
 
     index: int = 0
@@ -49,10 +49,10 @@ class Tissue:
     """Places in the section or the food [M], metres.
 
     Attributes:
-        x: Along the edge, from the middle of the section.
-        height: Above the board.
-        depth: Below the outline, vertically.
-        distance: From the outline, inwards.
+        x: Coordinate along the edge, from the middle of the section.
+        height: Height above the board.
+        depth: Depth below the outline, vertically.
+        distance: Distance from the outline, inwards.
     """
 
     x: np.ndarray
@@ -67,12 +67,12 @@ class Now:
 
     Attributes:
         time, period: Begin and duration of the stretch, s.
-        position: Of Ko in F at its end, as commanded [3], metres.
+        position: Commanded position of Ko in F at its end [3], metres.
         press, draw: Speed of Ko into the food and along the edge, m/s.
-        depth: Of the edge below the top of the food at the end, metres; negative above it.
+        depth: Depth of the edge below the top of the food at the end, metres; negative above it.
         travel: Path of the edge in the food so far, metres.
         swept: Area that the flanks have swept so far, m^2.
-        force: Of food and board on the knife in the stretch before, in F [3], N.
+        force: Force of food and board on the knife in the stretch before, in F [3], N.
         toughness, friction: Factors on the world's own; effects multiply.
         knife_shift: Knife off its commanded position, in F [3], metres; effects add.
         food_shift: Food off its place, in F [3], metres; effects add.
@@ -94,7 +94,7 @@ class Now:
 
     @property
     def speed(self) -> float:
-        """Of the edge, m/s."""
+        """Speed of the edge, m/s."""
         return float(np.hypot(self.press, self.draw))
 
 
@@ -107,16 +107,16 @@ class Series:
         slice: What is the same during the slice.
         time: End of each exchange [N], s, equally spaced.
         R, p: Commanded pose of the knife in F [N, 3, 3] and [N, 3], metres.
-        p_true: Where Ko truly is [N, 3], metres.
+        p_true: True position of Ko [N, 3], metres.
         v: Velocity of Ko, in F [N, 3], m/s.
         phase: Label of the motion's segment at each time.
-        depth: Of the true edge below the top of the food [N], metres.
+        depth: Depth of the true edge below the top of the food [N], metres.
         flank: Area of both flanks in front of cut food [N], m^2.
-        flank_arm: From Ko to the middle of that area, in F [N, 3], metres.
+        flank_arm: Vector from Ko to the middle of that area, in F [N, 3], metres.
         cut: Share of the section that is cut [N].
-        edge, normal, friction: Of the food by mechanism.
-        board: Of the board.
-        other: Of anything else.
+        edge, normal, friction: Wrenches of the food by mechanism.
+        board: Wrench of the board.
+        other: Wrench of anything else.
     """
 
     slice: SliceTruth
@@ -138,7 +138,7 @@ class Series:
 
     @property
     def period(self) -> float:
-        """Between two rows, s."""
+        """Time between two rows, s."""
         return float(self.time[1] - self.time[0])
 
     @property
@@ -153,11 +153,11 @@ class Series:
 
     @property
     def force(self) -> np.ndarray:
-        """Of all on the knife, in F [N, 3], N."""
+        """Force of all on the knife, in F [N, 3], N."""
         return self.wrench()[:, 3:]
 
     def wrench(self) -> np.ndarray:
-        """Of all on the knife [N, 6]."""
+        """Wrench of all on the knife [N, 6]."""
         return self.edge + self.normal + self.friction + self.board + self.other
 
 
@@ -169,11 +169,11 @@ class Effect:
 
     Attributes:
         cause: What a diagnosis would have to call it; empty where it stands in no list of causes.
-        unit: Of the size.
+        unit: Unit of the size.
         typical: A size that matters and could be met in a kitchen.
         least: Least size that has a meaning.
         every_exchange: Whether `drive` must see every exchange, as where it feeds a force back.
-        size: How much of it.
+        size: How much of the effect there is.
     """
 
     cause = ""
@@ -197,11 +197,11 @@ class Effect:
             )
 
     def begin(self, facts: SliceTruth, rng: np.random.Generator) -> None:
-        """Before a slice.
+        """Prepares for a slice.
 
         Args:
-            facts: Of the slice.
-            rng: For what differs from slice to slice.
+            facts: What the world knows of the slice.
+            rng: Random numbers for what differs from slice to slice.
         """
         self.facts = facts
         self.rng = rng
@@ -225,11 +225,11 @@ class Effect:
         """Changes the forces of a slice when it is done, in place."""
 
     def measure(self, series: Series, wrench: np.ndarray) -> np.ndarray:
-        """What the sensor gets.
+        """The wrench that the sensor gets.
 
         Args:
             series: The slice.
-            wrench: On the knife, moment about Ko and force, in K [N, 6].
+            wrench: Wrench on the knife, moment about Ko and force, in K [N, 6].
 
         Returns:
             The same, changed.

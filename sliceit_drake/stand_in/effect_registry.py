@@ -22,7 +22,7 @@ UNLISTED: dict[str, type[Effect]] = {
     "serrated_edge": unlisted_effects.SerratedEdge,
     "warm_wrist": unlisted_effects.WarmWrist,
 }
-"""What stands in no list of causes."""
+"""Effects that stand in no list of causes."""
 
 EFFECTS: dict[str, type[Effect]] = {
     "bulk_relaxation": tissue_effects.BulkRelaxation,

@@ -59,7 +59,7 @@ class FiniteElementSettings:
 
 
 class _Section:
-    """What effects want to know of a cut's section, from its geometry."""
+    """A cut's section as effects see it, from its geometry."""
 
     def __init__(self, model: CuttingModel) -> None:
         self.model = model

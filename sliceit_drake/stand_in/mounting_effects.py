@@ -7,7 +7,7 @@ from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceTruth
 __all__ = ["ArmCompliance", "BoardHeight", "BoardLaw", "FoodSlip", "HolderCompliance"]
 
 STIFFEST = 3e6
-"""Of what arm and holder can meet, N/m."""
+"""Greatest stiffness that arm and holder can meet, N/m."""
 
 FORGET = 0.8
 """Share of the last estimate of that below which the next does not fall."""
@@ -60,9 +60,9 @@ class ArmCompliance(Effect):
         """How far it has given at the end of a stretch.
 
         Args:
-            force: On what gives, in the stretch before, N.
+            force: Force on what gives, in the stretch before, N.
             commanded: Place along the direction in which it gives, at the end, metres.
-            period: s.
+            period: Duration of the stretch, s.
         """
         # Force answers the place with a stiffness, estimated from the last two stretches. With it
         # taken into account a stiff contact does not chatter, and the balance is the same.

@@ -69,7 +69,9 @@ class Variation:
     stiffness: float = quantity(0.05, "", low=0.0, high=0.5, doc="Relative spread.")
     friction: float = quantity(0.05, "", low=0.0, high=0.5, doc="Relative spread.")
     height: float = quantity(3e-4, "m", low=0.0, high=0.01, doc="Spread of the food's height.")
-    correlation: float = quantity(0.3, "", low=0.0, high=0.99, doc="Of one slice with the next.")
+    correlation: float = quantity(
+        0.3, "", low=0.0, high=0.99, doc="Correlation of neighbouring slices."
+    )
 
 
 @dc.dataclass
@@ -134,7 +136,7 @@ class Specimen:
         index: Order in the session, from 0.
         condition: What is done.
         toughness, stiffness, friction: Factors.
-        height: By which the food is higher, metres.
+        height: Height by which the food is higher, metres.
     """
 
     index: int

@@ -38,9 +38,9 @@ def records_of_conditions(
     """All slices of a session.
 
     Args:
-        session: Of a protocol `without_noise`.
+        session: A session with a protocol `without_noise`.
         once: Whether each condition is cut once, and its record stands for all of its slices.
-        name: Of a record by its order.
+        name: Name of a record by its order.
 
     Raises:
         CuttingError: The cut broke down.

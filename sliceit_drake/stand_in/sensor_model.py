@@ -1,4 +1,4 @@
-"""What a wrench sensor makes of the true wrench, on a whole series at once."""
+"""Model of a wrench sensor, on a whole series of true wrenches at once."""
 
 import dataclasses as dc
 import math
@@ -60,9 +60,9 @@ def measured(
 
     Args:
         wrench: True moment and force in the sensor's axes, mean over each period [N, 6].
-        period: Between two rows, s.
+        period: Time between two rows, s.
         sensor: The sensor; its readings are a whole number of periods apart.
-        rng: For bias, drift and noise.
+        rng: Random numbers for bias, drift and noise.
 
     Returns:
         The rows at which there is a reading [M], and the readings [M, 6].

@@ -61,7 +61,7 @@ class Session:
         protocol: What is cut.
         effects: What is hidden.
         world: One of `WORLDS`.
-        seed: Of order, variation, noise and what effects draw.
+        seed: Seed of order, variation, noise and what effects draw.
         settings: How finely the finite elements are computed.
 
     Attributes:
@@ -145,7 +145,7 @@ def _food_pose(protocol: Protocol) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _metadata(protocol: Protocol, specimen: Specimen, series: Series) -> SliceMetadata:
-    """What the person at the bench knows."""
+    """The facts that the person at the bench knows."""
     condition, sensor = specimen.condition, protocol.sensor
     metadata = SliceMetadata(
         name=slice_name(specimen.index),
@@ -230,13 +230,13 @@ def record_session(
     Args:
         protocol: What is cut.
         output: Folder of the records.
-        effects: What is hidden, as `registry.make_effect` takes it.
+        effects: What is hidden, as `effect_registry.make_effect` takes it.
         world: One of `WORLDS`.
         seed: None for one that nobody knows; needed to go on.
-        workers: Processes.
+        workers: Number of processes.
         settings: How finely the finite elements are computed.
         progress: Called with the number of records that are there, and that of all.
-        client: Of a Dask cluster that cuts the slices, in place of processes; the files are
+        client: Client of a Dask cluster that cuts the slices, in place of processes; the files are
             written here, and are the same.
 
     Returns:

@@ -46,26 +46,26 @@ TOUGHNESS, MODULUS, FRICTION = 1.15, 1.1, 0.8
 """Means of the stand-in's parameters over the calibrated ones."""
 
 SPREAD = 0.1
-"""Of the logarithms of toughness, modulus and friction from slice to slice."""
+"""Spread of the logarithms of toughness, modulus and friction from slice to slice."""
 
 SIZE_SPREAD = 0.02
-"""Likewise of the food's diameter."""
+"""Spread of the logarithm of the food's diameter."""
 
 PLACE_SPREAD = 1e-3
-"""Of the food's place on the board, with the cut, and of the start along the edge and in height,
-metres. The cut stays on a layer of the mesh: off it, the tomato's thin elements invert in its tough
-middle, with or without hidden effects."""
+"""Spread of the food's place on the board, with the cut, and of the start along the edge and in
+height, metres. The cut stays on a layer of the mesh: off it, the tomato's thin elements invert in
+its tough middle, with or without hidden effects."""
 
 LARGEST = 2.5
 """Deviations go no further than this many spreads."""
 
 FORCE_NOISE, MOMENT_NOISE = 0.2, 0.02
 FORCE_BIAS, MOMENT_BIAS = 0.3, 0.02
-"""Of the wrench sensor, N and Nm: between an FT 300's resolution of 0.1 N and the 0.6 N by which
+"""The wrench sensor's, N and Nm: between an FT 300's resolution of 0.1 N and the 0.6 N by which
 its weighings spread (`WrenchSensorConfig`). Biases differ from slice to slice, by this spread."""
 
 DELAY = 4e-3
-"""Of the wrench sensor, s: two exchanges."""
+"""Delay of the wrench sensor, s: two exchanges."""
 
 
 @dc.dataclass(frozen=True)
@@ -115,7 +115,7 @@ class SlicingWorld(typing.Protocol):
 
         Args:
             food: One of `SLICING_FOODS`.
-            slice: Its index, from 0.
+            slice: Index of the slice, from 0.
             board_stiffness: N/m; None for the default board.
 
         Returns:
@@ -128,7 +128,7 @@ class SlicingWorld(typing.Protocol):
         ...
 
     def rng(self, food: str, slice: int) -> np.random.Generator:
-        """For what is random while a slice is cut, as the sensor's noise: give it to
+        """Seed of what is random while a slice is cut, as the sensor's noise: give it to
         `AgentStation.begin`."""
         ...
 
@@ -200,7 +200,7 @@ def _diameter(calibrated: CalibratedFood, rng: np.random.Generator) -> float:
 class StandInWorld:
     """Finite elements with hidden effects, finer than a training's; see `SlicingWorld`."""
 
-    seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Of all deviations.")
+    seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Seed of all deviations.")
     refinement: float = quantity(
         1.25, "", low=0.3, high=4.0, doc="Elements along an edge, relative to the food's mesh."
     )
@@ -247,7 +247,7 @@ class StandInWorld:
 class CurvesWorld:
     """Measured curves in place of the scenario's food; see `SlicingWorld` and `curve_cutter`."""
 
-    seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Of all deviations.")
+    seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Seed of all deviations.")
 
     def scenario(
         self, food: str, slice: int, board_stiffness: float | None = None

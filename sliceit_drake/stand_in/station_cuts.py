@@ -15,7 +15,7 @@ def scenario_of_cut(protocol: Protocol, specimen: Specimen, station: Scenario) -
     """One cut of a session as a scenario.
 
     Args:
-        protocol: Whose food, knife, board and placement are used.
+        protocol: The session whose food, knife, board and placement are used.
         specimen: The slice; its deviations from the mean slice go into the simulated material (a
             deviation of height does not). A real food brings its own, and they change nothing.
         station: What the protocol does not say: robot, controller, sensor, numerics.

@@ -1,4 +1,4 @@
-"""What a world is, and what all worlds share: the knife's path and the pieces it is cut into."""
+"""The interface of a world, and what all share: the knife's path and the pieces it is cut into."""
 
 import dataclasses as dc
 import typing
@@ -27,7 +27,7 @@ class World(typing.Protocol):
         Args:
             specimen: The slice.
             effects: What is hidden; fresh copies, which the world begins.
-            rng: For what differs from slice to slice.
+            rng: Random numbers for what differs from slice to slice.
         """
         ...
 
@@ -37,7 +37,7 @@ class Path:
     """A prescribed motion, sampled every exchange; row 0 is the start.
 
     Attributes:
-        period: s.
+        period: Time between two poses, s.
         time: [E + 1], s.
         R, p: Pose of the knife in F [E + 1, 3, 3] and [E + 1, 3], metres.
         phase: Label of the segment that leads to each row but the first [E].

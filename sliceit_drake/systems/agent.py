@@ -47,7 +47,7 @@ ACTIONS = ("stiffness_x", "stiffness_ry", "p_z", "p_ry", "draw", "press")
 """What the numbers of an action decide."""
 
 Decide = Callable[[np.ndarray], np.ndarray]
-"""From an observation to an action [6], each within [-1, 1]."""
+"""Function from an observation to an action [6], each within [-1, 1]."""
 
 ERROR = np.array([0.1, 0.06, 0.785])
 """Scales of the observed error, m, m, rad, as those below SliceIt!'s."""
@@ -58,7 +58,7 @@ NEAR = 2e-3
 """Scale of the height over the board where it is small, metres; ours."""
 
 ENVELOPE_SPEED = 0.05
-"""Of the way through all places where the knife may go, m/s."""
+"""Speed on the path through all places where the knife may go, m/s."""
 
 
 @dc.dataclass
@@ -70,7 +70,7 @@ class AgentConfig:
     descent: float = quantity(
         0.037, "m", low=1e-3, high=0.5, doc="Height of the edge over the board at the start."
     )
-    duration: float = quantity(8.0, "s", low=0.05, high=600.0, doc="Of the run.")
+    duration: float = quantity(8.0, "s", low=0.05, high=600.0, doc="Duration of the run.")
     period: float = quantity(0.05, "s", low=0.002, high=1.0, doc="Between two decisions.")
     history: int = quantity(12, "", low=1, high=100, doc="Force/torque readings that it sees.")
     reading_period: float = quantity(
@@ -121,7 +121,7 @@ class AgentConfig:
     )
     goal_decisions: int = quantity(10, "", low=0, high=1000, doc="That it stays there before.")
     lift_speed: float = quantity(
-        0.05, "m/s", low=1e-3, high=0.5, doc="Of the target, up, once the slice has ended."
+        0.05, "m/s", low=1e-3, high=0.5, doc="Speed of the target upwards once the slice has ended."
     )
 
     def check(self, where: str) -> None:
@@ -196,10 +196,10 @@ class AgentSystem(LeafSystem):
 
     Outputs:
         target_pose: RigidTransform X_WK.
-        target_offset: Of the target from the start, along Kx and Kz there [2], m.
-        stiffness, p_gains, error_scale: For the compliance controller [6], [6], [1].
+        target_offset: Offset of the target from the start, along Kx and Kz there [2], m.
+        stiffness, p_gains, error_scale: Settings of the compliance controller [6], [6], [1].
         observation: What a decision at this instant would be taken by, see `observation_names`.
-        error: To the final pose, along Kx and Kz and about Ky [3], m and rad.
+        error: Distance to the final pose, along Kx and Kz and about Ky [3], m and rad.
         wrench: Mean of the readings seen: force along Kx and Kz, moment about Ky at Ko [3].
         at_goal: Decisions in a row within the goal [1].
 
@@ -208,7 +208,7 @@ class AgentSystem(LeafSystem):
         X_WK: Pose of the knife at the start.
         X_KS: Pose of the sensor in the knife's frame.
         stiffness, p_gains: What it leaves alone of the controller's [6].
-        decide: From observation to action; None to read the port `action`.
+        decide: Function from observation to action; None to read the port `action`.
 
     Attributes:
         watch: Entered around each decision.

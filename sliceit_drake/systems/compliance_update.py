@@ -35,8 +35,8 @@ class ComplianceLaw:
         R_EC: Rotation of the compliance reference C in the end effector E [3, 3].
         mode: One of `MODES`.
         iterations: Virtual steps of an update.
-        time_step: Of a virtual step, s.
-        damping_factor: On the virtual velocity at each step.
+        time_step: Duration of a virtual step, s.
+        damping_factor: Factor on the virtual velocity at each step.
         threshold: A displacement shorter than this [m] counts as zero, and so does a rotation whose
             matrix differs from its transpose by less.
         hand_frame_control: Whether the target wrench is in the axes of E, not of B.

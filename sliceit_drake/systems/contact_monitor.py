@@ -13,7 +13,7 @@ from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig
 __all__ = ["UNSTABLE_GAINS", "ContactMonitor", "ContactMonitorConfig"]
 
 UNSTABLE_GAINS = "unstable gains"
-"""What the message of a run that the monitor ended begins with."""
+"""First words of the message of a run that the monitor ended."""
 
 _AXES = 6
 # Parts of the state; the first six are vectors of six, moment first.
@@ -36,7 +36,8 @@ class ContactMonitorConfig:
     """When a contact counts as unstable.
 
     A swing is what lies between a maximum and the next minimum of a component of the sensor's
-    wrench. Swings below `force_swing` and `moment_swing` do no harm and are not counted.
+    wrench. Swings below `force_swing` and `moment_swing` do no harm and are not counted, nor are
+    such as the sensor's noise alone makes.
     """
 
     enabled: bool = True
@@ -83,7 +84,7 @@ class ContactMonitor(LeafSystem):
 
     Args:
         config: Thresholds.
-        period: Of the wrench's readings, s.
+        period: Time between the wrench's readings, s.
         sensor: What measures the wrench; swings that its noise alone makes do not count.
     """
 

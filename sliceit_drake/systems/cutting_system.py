@@ -63,8 +63,8 @@ class CuttingSystem(KnifeForceSystem):
     Further output ports:
         force_components: Forces on the knife by edge, flank pressure, friction [9], N, in W.
         ledger: Cumulative work and dissipation [8], J, see `LEDGER_NAMES`.
-        food_index: Which of the prepared foods is cut [1].
-        energy: Of this food at the last check [5], see `ENERGY_NAMES`, J.
+        food_index: Index of the prepared food that is cut [1].
+        energy: Energies of this food at the last check [5], see `ENERGY_NAMES`, J.
         surface_vertices: Corners of the food's surface [3 V], metres, in W, padded with zeros.
         surface_damage: Share of the toughness that is spent there [V], padded with zeros.
 
@@ -240,7 +240,7 @@ class CuttingSystem(KnifeForceSystem):
 
     @property
     def solvers(self) -> tuple[CuttingSolver, ...]:
-        """Those of the prepared foods."""
+        """Solvers of the prepared foods."""
         return self._solvers
 
     @property
@@ -289,7 +289,7 @@ class CuttingSystem(KnifeForceSystem):
         """The food that the next exchange cuts: the one after this, if the knife is ready for it.
 
         Args:
-            context: Of this system.
+            context: This system's context.
             index: This food.
             X_WK: The knife's pose now [3, 4].
 

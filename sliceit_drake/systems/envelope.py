@@ -16,9 +16,9 @@ def envelope(corners: _Corners, speed: float, duration: float, label: str) -> Mo
 
     Args:
         corners: x and z in the knife frame at the start, m; the start before the first.
-        speed: m/s.
-        duration: Of the whole motion, s.
-        label: Of its segments.
+        speed: Speed between the corners, m/s.
+        duration: Duration of the whole motion, s.
+        label: Label of its segments.
     """
     way: list[Segment] = [
         ConstantSpeed(speed, [dx / distance, 0.0, dz / distance], distance, label=label)
@@ -29,7 +29,7 @@ def envelope(corners: _Corners, speed: float, duration: float, label: str) -> Mo
 
 
 def envelope_time(corners: _Corners, speed: float) -> float:
-    """How long the way through the corners takes, s; arguments as of `envelope`."""
+    """Duration of the path through the corners, s; arguments as for `envelope`."""
     return sum(distance for *_, distance in _legs(corners)) / speed
 
 

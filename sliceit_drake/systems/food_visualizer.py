@@ -53,16 +53,16 @@ class FoodVisualizer(LeafSystem):
     stays as it was last seen; not where the next food comes to its place.
 
     Input ports:
-        surface_vertices: Of the `CuttingSystem` [3 V], metres, in W.
-        surface_damage: Of the `CuttingSystem` [V].
-        food_index: Of the `CuttingSystem` [1].
+        surface_vertices: The port of the `CuttingSystem` [3 V], metres, in W.
+        surface_damage: The port of the `CuttingSystem` [V].
+        food_index: The port of the `CuttingSystem` [1].
 
     Args:
-        surfaces: Of the prepared foods.
+        surfaces: Surfaces of the prepared foods.
         slices_stay: Whether each food lies beside the one before it.
         meshcat: Viewer.
-        period: Between frames, s.
-        path: In Meshcat's tree.
+        period: Time between frames, s.
+        path: Path in Meshcat's tree.
     """
 
     def __init__(

@@ -41,9 +41,9 @@ class FrameVisualizer(LeafSystem):
         carried: Pose X_KP and length, of each frame that moves with the knife.
         X_WK: Pose of the knife at the start, where its letters face the viewer.
         towards_viewer: Horizontal direction in which letters face [3], in W.
-        period: Between frames, s.
+        period: Time between frames, s.
         visible: Whether they are shown at first; Meshcat's tree shows and hides them.
-        path: In Meshcat's tree; a frame is PATH/LETTER.
+        path: Path in Meshcat's tree; a frame is PATH/LETTER.
     """
 
     def __init__(

@@ -40,13 +40,13 @@ class KnifeForceSystem(ReportingSystem):
 
     Output ports:
         food_wrench: SpatialForce F_K_W of the food on the knife, at Ko, in W.
-        food_wrench_vector: The same as moment and force [6].
+        food_wrench_vector: `food_wrench` as moment and force [6].
         cut_progress: Share of the section that is cut [1].
         coupling_work_error: Work that the held wrench did on the knife minus work that the food did
             on it [1], J; it comes from the delay of one exchange.
 
     Args:
-        exchange_period: s.
+        exchange_period: Duration of an exchange, s.
     """
 
     def __init__(self, exchange_period: float) -> None:
@@ -84,8 +84,8 @@ class KnifeForceSystem(ReportingSystem):
         """Advances the food to the context's time.
 
         Args:
-            context: Before the update; `knife_velocity` of it is that of the knife now.
-            state: To write to.
+            context: Context before the update; its `knife_velocity` is that of the knife now.
+            state: State to write to.
             X_WK: Pose of the knife now.
 
         Returns:

@@ -62,15 +62,15 @@ class BoardContact(LeafSystem):
 
     Output ports:
         board_wrench: SpatialForce F_K_W of the board on the knife, at Ko, in W.
-        board_wrench_vector: The same as moment and force [6].
+        board_wrench_vector: `board_wrench` as moment and force [6].
 
     The plant computes contact results by solving its step once more, so they are asked for only
     when the edge is near the board.
 
     Args:
         knife_body: Index of the knife's body.
-        edge_length: Of the knife, metres.
-        board_height: In the world, metres.
+        edge_length: Length of the knife's edge, metres.
+        board_height: Height of the board in the world, metres.
     """
 
     def __init__(self, knife_body: BodyIndex, edge_length: float, board_height: float) -> None:

@@ -42,7 +42,7 @@ class PolicyObservation(NamedTuple):
 
     Attributes:
         time: Since the start, s.
-        offset: Of the target from the start, along Kx (draw) and Kz (press) there [2], m.
+        offset: Offset of the target from the start, along Kx (draw) and Kz (press) there [2], m.
         wrenches: Sensor wrench at this decision and those before, moment and force at So in S, the
             newest last [history, 6], Nm and N; zero before the first.
     """
@@ -57,8 +57,9 @@ class PolicyAction(NamedTuple):
 
     Attributes:
         draw, press: Speeds of the target along Kx and Kz of the start, m/s.
-        stiffness: Of the compliance controller [6], N/m and Nm/rad; None for the configured one.
-        p_gains: Likewise [6].
+        stiffness: Stiffness of the compliance controller [6], N/m and Nm/rad; None for the
+            configured one.
+        p_gains: Its proportional gains [6]; None for the configured ones.
     """
 
     draw: float
@@ -86,7 +87,7 @@ class PressByForce:
     force: float = quantity(30.0, "N", low=0.1, high=200.0, doc="Force at which it stands still.")
     draw_ratio: float = quantity(0.0, "", low=-10.0, high=10.0, doc="Draw over press.")
     cut_time: float = quantity(2.0, "s", low=0.05, high=600.0, doc="When it begins to lift.")
-    lift_speed: float = quantity(0.05, "m/s", low=1e-4, high=0.5, doc="Of lifting.")
+    lift_speed: float = quantity(0.05, "m/s", low=1e-4, high=0.5, doc="Speed of lifting.")
 
     def decide(self, observation: PolicyObservation) -> PolicyAction:
         """See `Policy`."""
@@ -103,16 +104,16 @@ class PolicyConfig:
 
     decide: PressByForce = dc.field(default_factory=PressByForce)
     """The policy, by its parameters; one that a network decides is an `AgentConfig`."""
-    period: float = quantity(0.05, "s", low=0.002, high=1.0, doc="Between two decisions.")
+    period: float = quantity(0.05, "s", low=0.002, high=1.0, doc="Time between two decisions.")
     history: int = quantity(3, "", low=1, high=100, doc="Wrenches that it sees, one a decision.")
-    duration: float = quantity(3.0, "s", low=0.05, high=600.0, doc="Of the run.")
+    duration: float = quantity(3.0, "s", low=0.05, high=600.0, doc="Duration of the run.")
     press: float = quantity(
         0.0372, "m", low=1e-3, high=0.5, doc="Farthest that the target goes down from the start."
     )
     draw: float = quantity(
         0.0, "m", low=0.0, high=0.2, doc="Farthest that it goes along the edge, either way."
     )
-    speed: float = quantity(0.05, "m/s", low=1e-4, high=0.5, doc="Greatest of the target.")
+    speed: float = quantity(0.05, "m/s", low=1e-4, high=0.5, doc="Greatest speed of the target.")
     acceleration: float = quantity(
         0.5, "m/s2", low=0.01, high=20.0, doc="With which the speed follows a decision."
     )
@@ -156,8 +157,8 @@ class PolicySystem(LeafSystem):
 
     Outputs:
         target_pose: RigidTransform X_WK.
-        target_offset: Of the target from the start, along Kx and Kz there [2], m.
-        stiffness, p_gains: For the compliance controller [6].
+        target_offset: Offset of the target from the start, along Kx and Kz there [2], m.
+        stiffness, p_gains: Settings of the compliance controller [6].
 
     Args:
         config: Policy and bounds.

@@ -27,13 +27,13 @@ class SpringCutter(KnifeForceSystem):
     `cut_progress` is the largest compression so far over the travel.
 
     Further output port:
-        compression: Of the button, m, and its rate, m/s [2].
+        compression: Compression of the button, m, and its rate, m/s [2].
 
     Args:
         food: The spring.
-        knife: Whose edge pushes.
+        knife: The knife whose edge pushes.
         X_WF: Pose of the food frame: the button's axis is Fz, the board is at its origin.
-        exchange_period: s.
+        exchange_period: Duration of an exchange, s.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class SpringCutter(KnifeForceSystem):
         """Depth of the edge below the button's released top, metres, and the arm from Ko to it.
 
         Args:
-            X_WK: As [3, 4].
+            X_WK: Pose of the knife as a matrix [3, 4].
 
         Returns:
             Depth, -inf where the edge passes beside the button, and the arm along Wx and Wy.

@@ -21,14 +21,14 @@ class SpringVisualizer(LeafSystem):
     An I/O system: what is drawn lies in the Meshcat instance.
 
     Input port:
-        compression: Of the `SpringCutter` [2], m and m/s.
+        compression: The port of the `SpringCutter` [2], m and m/s.
 
     Args:
         food: The spring.
         X_WF: Pose of the food frame.
         meshcat: Viewer.
-        period: Between frames, s.
-        path: In Meshcat's tree.
+        period: Time between frames, s.
+        path: Path in Meshcat's tree.
     """
 
     def __init__(

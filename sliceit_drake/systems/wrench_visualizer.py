@@ -58,7 +58,7 @@ class _Arrow:
 
     Args:
         meshcat: Viewer.
-        path: In Meshcat's tree.
+        path: Path in Meshcat's tree.
         colour: Red, green, blue.
         heads: 1, or 2 for a moment.
         order: Drawn over arrows of lower order.
@@ -125,9 +125,9 @@ class WrenchVisualizer(LeafSystem):
     Args:
         meshcat: Viewer.
         X_KS: Pose of the sensor's frame in the knife's.
-        period: Between frames, s.
+        period: Time between frames, s.
         scale: Lengths of the arrows.
-        path: In Meshcat's tree.
+        path: Path in Meshcat's tree.
     """
 
     def __init__(

@@ -22,19 +22,23 @@ class CalibratedFood:
     """A food with the parameters that a calibration found, and how sure it is of them.
 
     Attributes:
-        food: With the calibrated values; its shape is that of the records.
-        knife: That the records were taken with, as far as known.
-        distribution: Of the parameters; randomisation draws from it.
+        food: The food with the calibrated values; its shape is that of the records.
+        knife: The knife that the records were taken with, as far as known.
+        distribution: Joint distribution of the parameters; randomisation draws from it.
         spring: The spring-only baseline from the same records, or null.
-        records: That it was calibrated on, or the sources of a food without records.
-        date, command: When and how.
+        records: Records that it was calibrated on, or the sources of a food without records.
+        date, command: When and how it was calibrated.
         note: What it cannot be used for.
     """
 
     food: Food = dc.field(default_factory=Food)
     knife: Knife = dc.field(default_factory=Knife)
     flank_stiffness: float = quantity(
-        4.0, "E/h", low=0.01, high=1e3, doc="Of the numerics: a parameter of the food as well."
+        4.0,
+        "E/h",
+        low=0.01,
+        high=1e3,
+        doc="Flank stiffness of the numerics, a parameter of the food as well.",
     )
     distribution: ParameterDistribution = dc.field(default_factory=ParameterDistribution)
     spring: SpringFood | None = None

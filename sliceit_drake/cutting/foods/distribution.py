@@ -1,4 +1,4 @@
-"""What is known of parameters after a calibration: a normal distribution within their ranges."""
+"""Knowledge of parameters after a calibration: a normal distribution within their ranges."""
 
 import dataclasses as dc
 
@@ -10,7 +10,7 @@ from sliceit_drake.configuration import ConfigurationError
 __all__ = ["DETERMINED", "PRIOR_DEVIATION", "ParameterDistribution", "from_unit", "to_unit"]
 
 PRIOR_DEVIATION = float(np.sqrt(1.0 / 12.0))
-"""Of a place that is uniform in the unit range."""
+"""Standard deviation of a place that is uniform in the unit range."""
 DETERMINED = 0.5
 """Greatest standard deviation of what is determined, relative to that before the data."""
 BATCH, BATCHES = 20_000, 500
@@ -24,11 +24,11 @@ class ParameterDistribution:
     `log` is set.
 
     Attributes:
-        names: As `cutting.parameters.parameter_names`.
+        names: The parameters, as `cutting.parameters.parameter_names` gives them.
         low, high: Ranges, in the parameters' units.
         log: Whether the unit of a range is the logarithm.
-        mean: Places in the ranges.
-        covariance: Of the places, a row for each parameter.
+        mean: Mean places in the ranges.
+        covariance: Covariance of the places, a row for each parameter.
     """
 
     names: list[str] = dc.field(default_factory=list)

@@ -51,7 +51,7 @@ class Relaxation:
     """
 
     shares: list[float] = dc.field(default_factory=list)
-    """Of E, one a branch; empty for none."""
+    """Share of E that each branch relaxes; empty for none."""
     times: list[float] = dc.field(default_factory=list)
     """Relaxation times, s."""
 
@@ -140,7 +140,9 @@ class Bluntness:
         2e-3, "m", low=1e-4, high=0.05, doc="Depth over which the excess falls to 1/e."
     )
     dulling: float = quantity(0.0, "J/m2", low=0.0, high=1e5, doc="Growth of the excess, a slice.")
-    dulling_exponent: float = quantity(1.0, "", low=0.1, high=3.0, doc="Of the slice number.")
+    dulling_exponent: float = quantity(
+        1.0, "", low=0.1, high=3.0, doc="Exponent of the slice number."
+    )
     slices: int = quantity(0, "", low=0, high=100000, doc="Slices cut since sharpening.")
 
     @property
@@ -167,7 +169,9 @@ class Adhesion:
     viscosity: float = quantity(
         0.0, "Pa s/m", low=0.0, high=1e7, doc="Stress per sliding speed, at the reference."
     )
-    exponent: float = quantity(1.0, "", low=0.1, high=1.0, doc="Of the speed; 1 for linear.")
+    exponent: float = quantity(
+        1.0, "", low=0.1, high=1.0, doc="Exponent of the speed; 1 for linear."
+    )
     reference_speed: float = quantity(
         0.02, "m/s", low=1e-4, high=1.0, doc="Speed at which the viscosity is meant."
     )
@@ -189,8 +193,8 @@ class SlicePush:
 class Compliance:
     """Elasticity of what holds knife and food, on a prescribed motion without a robot."""
 
-    arm: float = quantity(0.0, "m/N", low=0.0, high=1e-3, doc="Of the knife's holder, vertical.")
-    holder: float = quantity(0.0, "m/N", low=0.0, high=1e-3, doc="Of the food's, along the edge.")
+    arm: float = quantity(0.0, "m/N", low=0.0, high=1e-3, doc="The knife's, vertically.")
+    holder: float = quantity(0.0, "m/N", low=0.0, high=1e-3, doc="The food's, along the edge.")
 
 
 @dc.dataclass
@@ -202,7 +206,9 @@ class Slip:
     """
 
     resistance: float | None = quantity(None, "N", low=0.0, high=1e4, doc="null: never slips.")
-    remaining: float = quantity(0.5, "", low=0.0, high=1.0, doc="Of the resistance, slipping.")
+    remaining: float = quantity(
+        0.5, "", low=0.0, high=1.0, doc="Share of the resistance while it slips."
+    )
 
 
 @dc.dataclass
@@ -213,7 +219,7 @@ class Edge:
     """
 
     share: float = quantity(
-        1.0, "", low=0.0, high=1.0, doc="Of toughness and bonds; 0 for opening alone."
+        1.0, "", low=0.0, high=1.0, doc="Share of toughness and bonds; 0 for opening alone."
     )
 
 

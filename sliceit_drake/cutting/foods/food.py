@@ -57,7 +57,8 @@ class Cylinder:
         "m",
         low=0.0,
         high=0.5,
-        doc="Distances of the element layers from y = 0, on both sides; the rest is one layer.",
+        doc="Distances of the element layers from y = 0, on both sides; the rest is one layer, "
+        "and layers beyond the food's end are left out.",
     )
 
     @property
@@ -103,7 +104,8 @@ class Box:
         "m",
         low=0.0,
         high=0.5,
-        doc="Distances of the element layers from y = 0, on both sides; the rest is one layer.",
+        doc="Distances of the element layers from y = 0, on both sides; the rest is one layer, "
+        "and layers beyond the food's end are left out.",
     )
 
     @property
@@ -205,7 +207,8 @@ class Tapered:
         "m",
         low=0.0,
         high=0.5,
-        doc="Distances of the element layers from y = 0, on both sides; the rest is one layer.",
+        doc="Distances of the element layers from y = 0, on both sides; the rest is one layer, "
+        "and layers beyond the food's end are left out.",
     )
 
     def check(self, where: str) -> None:
@@ -333,10 +336,14 @@ class Remainder:
 
     body: Cylinder | Box | Ellipsoid | Tapered = dc.field(default_factory=Cylinder)
     position: float = quantity(
-        0.0, "m", low=-0.5, high=0.5, doc="Of the next cut, y in the frame of the whole body."
+        0.0, "m", low=-0.5, high=0.5, doc="Place of the next cut, y in the frame of the whole body."
     )
     thickness: float = quantity(
-        5e-3, "m", low=5e-4, high=0.5, doc="Of the next slice, from the free end to the cut."
+        5e-3,
+        "m",
+        low=5e-4,
+        high=0.5,
+        doc="Thickness of the next slice, from the free end to the cut.",
     )
     slice_layers: int = quantity(2, "", low=1, high=20, doc="Layers of elements in the slice.")
     layers: list[float] = quantity(

@@ -87,7 +87,7 @@ def calibrate_spring(
 
     Args:
         force: Measured force over one slice [n], N.
-        height: Of the food, metres: the spring's travel.
+        height: Height of the food, metres: the spring's travel.
         erp: ODE's ERP at the food's `time_step`, which gives the damping.
         food: Other values; None for the defaults.
 

@@ -332,7 +332,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         ahead_next: wp.array2d(dtype=vec4),
         per_thread: wp.int32,
     ):
-        """What `move_nodes` does with the forces, into other arrays, so that it has an adjoint."""
+        """Steps the nodes as `move_nodes` does, into other arrays, so that it has an adjoint."""
         cut, chunk = wp.tid()
         for entry in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, moving.shape[0])):
             i = moving[entry]

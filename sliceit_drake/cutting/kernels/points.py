@@ -93,7 +93,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
     ):
         """Flank pressure and friction on one face of the cut.
 
-        Of the face's `whole` area a part is above the edge: `area` now, `old_area` before the
+        A part of the face's `whole` area is above the edge: `area` now, `old_area` before the
         sub-step. It goes by the depth of the edge below this face, not below the middle of both: a
         piece that is cut off leaves the other where it is. The mean of the flank's thickness over
         that part is that at its centroid, `rise` above the point, for the flank is straight.

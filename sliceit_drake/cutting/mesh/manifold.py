@@ -1,4 +1,4 @@
-"""What makes the surface of a mesh that of one solid body: where it pinches, and crosses itself."""
+"""Checks that a mesh is one solid body: where its surface pinches or crosses itself."""
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -30,7 +30,7 @@ def folded_faces(faces: np.ndarray) -> np.ndarray:
     """Faces [K, 3] that have both of their tetrahedra on one side.
 
     Args:
-        faces: Of all tetrahedra, outward oriented [F, 3]; each at most twice.
+        faces: Faces of all tetrahedra, outward oriented [F, 3]; each at most twice.
     """
     key, face, count = np.unique(
         np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True

@@ -19,7 +19,7 @@ class FoodCorners:
     Attributes:
         ends: Nodes of the split mesh at each corner [V, 2].
         weights: Their weights [V, 2].
-        side: Of the cut: 0 minus, 1 plus [V].
+        side: Side of the cut: 0 minus, 1 plus [V].
         cut_point: Cut point that each corner is, -1 elsewhere [V].
     """
 
@@ -77,7 +77,7 @@ class FoodSurface(FoodCorners):
 
     @functools.cached_property
     def halves(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-        """Of each side, its corners [V_s] and its triangles [M_s, 3], which index into those."""
+        """Corners [V_s] of each side and its triangles [M_s, 3], which index into those."""
         halves = []
         for side in (0, 1):
             corners = np.flatnonzero(self.side == side)

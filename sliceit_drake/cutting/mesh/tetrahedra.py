@@ -273,7 +273,7 @@ def tapered_mesh(radii: tuple[float, float], layers: np.ndarray, rings: int) -> 
     """A cone's frustum along y that lies on z = 0 along a line; each section y is a circle.
 
     Args:
-        radii: At the first and at the last layer, metres; linear between.
+        radii: Radii at the first and at the last layer, metres; linear between.
         layers: Increasing y coordinates of the mesh layers [L], metres.
         rings: Concentric rings of the section.
     """
