@@ -1,5 +1,6 @@
-"""Puts what a benchmark measured into a Markdown page, between two lines that mark the place."""
+"""Puts what a study measured into a hand-written page, between two lines that mark the place."""
 
+import argparse
 import dataclasses as dc
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,6 +29,16 @@ class Place:
     def end(self) -> str:
         """The line after it."""
         return f"<!-- end of {self.name} -->"
+
+    def add_argument(self, parser: argparse.ArgumentParser) -> None:
+        """Adds --output, the page that the table goes into."""
+        parser.add_argument(
+            "--output",
+            metavar="FILE",
+            type=Path,
+            help=f"Markdown file with the lines {self.begin} and {self.end}, between which the"
+            " table goes",
+        )
 
     def put(self, page: str, text: str, source: str) -> str:
         """A page with other text there.

@@ -1,28 +1,47 @@
-"""Writes what a benchmark measured as JSON, for docs/benchmarks.md."""
+"""What a study measured, as JSON with the command and the machine that measured it."""
 
+import argparse
 import json
 import os
 import platform
-import shlex
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-__all__ = ["write_results"]
+__all__ = ["add_json_argument", "describe_machine", "write_results"]
+
+QUIET = 0.5
+"""Load above which other work is in the numbers too."""
 
 
-def write_results(file: Path, values: Mapping[str, float]) -> None:
-    """Writes values with the command that measured them, the machine and its load.
+def add_json_argument(parser: argparse.ArgumentParser) -> None:
+    """Adds --json."""
+    parser.add_argument("--json", metavar="FILE", type=Path, help="also write the values there")
+
+
+def write_results(options: argparse.Namespace, values: Mapping[str, float]) -> None:
+    """Writes values where --json says, with the command, the machine and its load.
 
     Args:
-        file: Made, with its folder.
+        options: With `json`, None for nowhere, and `command`.
         values: By name, the unit at the end of it.
     """
+    if options.json is None:
+        return
     load = f"load {os.getloadavg()[0]:.1f} at the end"
     facts = {
-        "command": shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]]),
+        "command": options.command,
         "machine": f"{os.cpu_count()} cores ({platform.machine()}), {load}",
         "values": {name: float(f"{value:.4g}") for name, value in values.items()},
     }
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    options.json.parent.mkdir(parents=True, exist_ok=True)
+    options.json.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+
+
+def describe_machine() -> str:
+    """Cores and load before a measurement, for the line under a table; warns of other work."""
+    load = os.getloadavg()[0]
+    text = f"{os.cpu_count()} cores ({platform.machine()}), load {load:.2f} in the minute before"
+    if load <= QUIET:
+        return text
+    print(f"The machine is busy (load {load:.2f}): the numbers will be of that too.")
+    return f"{text}, so that other work is in the numbers"

@@ -14,7 +14,7 @@ from sliceit_drake.cutting.motion import (
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.protocol import Condition, Protocol, load_protocol
-from studies.commands.identifiability import nominal_records, protocol_setup
+from studies.diagnosis.identifiability import nominal_records, protocol_setup
 
 TURN, MASS = 0.5, 1.0
 

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from sliceit_drake.resources import load_module
+from studies.project import aims
 
 ROOT = Path(__file__).resolve().parent.parent
-report = load_module("report", ROOT / "studies/project/aims.py")
 SOURCES = ("speed.md", "calibration.md", "verification.json", "hidden_effects.json")
 
 
@@ -33,11 +32,11 @@ def line(text: str, begin: str) -> str:
 
 def test_the_page_is_what_its_command_makes():
     page = (ROOT / "docs/benchmarks.md").read_text(encoding="utf-8")
-    assert page == report.page(), "python studies/project/aims.py"
+    assert page == aims.page(), "python -m studies aims"
 
 
 def test_where_nothing_was_measured_the_page_says_so_and_names_the_command(tmp_path):
-    text = report.page(tmp_path)
+    text = aims.page(tmp_path)
     rows = [row for row in text.splitlines() if row.startswith("| ") and "`" in row]
     assert len(rows) > 12
     assert all("not measured | - | `" in row for row in rows)
@@ -75,7 +74,7 @@ def test_a_new_value_comes_onto_the_page_and_is_judged(docs, name, values, begin
     verdicts = []
     for factor in (0.99, 1.01):
         write(docs, name, **values, **{key: abs(bound) * factor})
-        row = line(report.page(docs), begin)
+        row = line(aims.page(docs), begin)
         assert f"[{name}.json](benchmarks/{name}.json)" in row
         verdicts.append("reached" if "| reached |" in row else "missed")
         assert ("**missed**" in row) == (verdicts[-1] == "missed")
@@ -88,12 +87,12 @@ def test_too_few_tetrahedra_or_records_do_not_count(docs):
     search = dict(search_slice_s=0.04, search_step_error=0.002, gradient_slices=3.0)
     for tetrahedra, verdict in ((1199.0, "**missed**"), (1200.0, "reached")):
         write(docs, "cutting_speed", tetrahedra=tetrahedra, **values, **search)
-        assert f"| {verdict} |" in line(report.page(docs), "27 mm of cucumber")
+        assert f"| {verdict} |" in line(aims.page(docs), "27 mm of cucumber")
     write(docs, "diagnosis_speed", records=17.0, cold_s=1.0, warm_s=1.0)
-    assert "**missed**" in line(report.page(docs), "diagnosis of 18")
+    assert "**missed**" in line(aims.page(docs), "diagnosis of 18")
 
 
 def test_numbers_of_pages_are_found_where_they_stand_now(docs):
-    text = report.page(docs)
+    text = aims.page(docs)
     for begin in ("27 mm", "a sub-step", "gradient", "station", "calibrating tomato", "200 random"):
         assert "not measured" not in line(text, begin), begin

@@ -21,6 +21,7 @@ from sliceit_drake.diagnosis.slices import Meshing
 from sliceit_drake.prediction.cluster import active, on_cluster
 from sliceit_drake.prediction.simulator import Runner
 from sliceit_drake.stand_in.protocol import Condition, Protocol
+from studies.__main__ import main as studies
 from studies.hidden_effects import runner
 from studies.hidden_effects.bench import model_food
 from studies.hidden_effects.cases import Case, Hidden
@@ -191,10 +192,17 @@ def test_workers_of_another_version_are_refused(local):
 
 
 @pytest.mark.parametrize(
-    "command", [["record"], ["study", "hidden"], ["diagnose", "records", "--model", "cucumber"]]
+    ("program", "command"),
+    [
+        (main, ["record"]),
+        (main, ["diagnose", "records", "--model", "cucumber"]),
+        (studies, ["hidden"]),
+    ],
 )
-def test_a_backend_without_its_scheduler_is_refused(command, tmp_path, monkeypatch, capsys):
+def test_a_backend_without_its_scheduler_is_refused(
+    program, command, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "records").mkdir()
-    assert main([*command, "--output", str(tmp_path), "--backend", "dask"]) == 2
+    assert program([*command, "--output", str(tmp_path), "--backend", "dask"]) == 2
     assert "--scheduler: is not given" in capsys.readouterr().err

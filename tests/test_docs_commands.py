@@ -18,7 +18,7 @@ from docs_commands import Command, commands_of
 
 from sliceit_drake.cli.main import main, make_parser
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError
-from sliceit_drake.resources import load_module
+from studies.registry import find_study, study_parser
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -48,7 +48,7 @@ TESTED = {
         "sliceit simulate radish.yaml",
     ],
     "tests/test_foods_page.py::test_tables_are_made_from_the_files_of_foods_and_knives": [
-        "python studies/physics/foods_page.py --output docs/foods.md",
+        "python -m studies foods_page --output docs/foods.md",
     ],
     "tests/test_paraview.py::test_the_series_of_a_run_has_its_body_its_knife_and_its_forces": [
         "sliceit simulate --paraview vtu",
@@ -166,9 +166,9 @@ TESTED = {
         "sliceit hardware SCENARIO --host ADDRESS --robot my.yaml --dry-run",
     ],
     "tests/test_hardware_pace.py::test_it_runs_emulator_and_client_and_prints_and_writes_the_"
-    "table": ["python studies/robot/hardware_pace.py --output docs/hardware.md"],
+    "table": ["python -m studies hardware_pace --output docs/hardware.md"],
     "tests/test_benchmarks_page.py::test_the_page_is_what_its_command_makes": [
-        "python studies/project/aims.py",
+        "python -m studies aims",
     ],
     "tests/test_rosbag.py::test_the_command_cuts_a_slice_out_of_a_bag": [
         "sliceit records import rosbag",
@@ -230,27 +230,27 @@ READ_ONLY = {
         python -m studies verification --output docs/verification.md
         """,  # noqa: E501
     "measures times or draws figures, whose results stand in docs": """
-        python studies/physics/batch_speed.py --output docs/speed.md
-        python studies/physics/condensed_scheme.py
-        python studies/physics/cutting_speed.py --json docs/benchmarks/cutting_speed.json
-        python studies/physics/cutting_speed.py --repeats 3 --output docs/figures/cutting_speed.png
-        python studies/diagnosis/diagnosis_speed.py --json docs/benchmarks/diagnosis_speed.json
-        python studies/physics/effects_figure.py
-        python studies/robot/endurance.py --minutes 60 --output docs/endurance.md
-        python studies/learning/faster_draws.py docs/slicing_evaluation.jsonl docs/faster_draws.jsonl --output docs/learning.md
-        python studies/project/first_run.py --json docs/benchmarks/first_run.json
-        python studies/physics/foods_page.py --cut --output docs/foods.md
-        python studies/learning/learning_speed.py --output docs/learning.md --json docs/benchmarks/learning_speed.json
-        python studies/learning/policy_and_motion.py models/policies/cutting_0 --output docs/learning.md
-        python studies/robot/safety_layer.py
-        python studies/scaling/scaling.py --output docs/scaling.md
-        python studies/scaling/scaling.py --trials 24 --slices 4 --tasks 500 --seconds 2 --output docs/scaling.md
-        python studies/learning/slicing_ablations.py --folder output/ablations --output docs/learning.md
-        python studies/physics/split_step_limit.py
-        python studies/diagnosis/stand_in_figure.py
-        python studies/robot/station_speed.py
-        python studies/robot/station_speed.py --json docs/benchmarks/station_speed.json
-        python studies/learning/unfinished_slices.py docs/slicing_evaluation.jsonl --output docs/learning.md
+        python -m studies batch_speed --output docs/speed.md
+        python -m studies condensed_scheme
+        python -m studies cutting_speed --json docs/benchmarks/cutting_speed.json
+        python -m studies cutting_speed --repeats 3 --output docs/figures/cutting_speed.png
+        python -m studies diagnosis_speed --json docs/benchmarks/diagnosis_speed.json
+        python -m studies effects_figure
+        python -m studies endurance --minutes 60 --output docs/endurance.md
+        python -m studies faster_draws docs/slicing_evaluation.jsonl docs/faster_draws.jsonl --output docs/learning.md
+        python -m studies first_run --json docs/benchmarks/first_run.json
+        python -m studies foods_page --cut --output docs/foods.md
+        python -m studies learning_speed --output docs/learning.md --json docs/benchmarks/learning_speed.json
+        python -m studies policy_and_motion models/policies/cutting_0 --output docs/learning.md
+        python -m studies safety_layer
+        python -m studies scaling --output docs/scaling.md
+        python -m studies scaling --trials 24 --slices 4 --tasks 500 --seconds 2 --output docs/scaling.md
+        python -m studies slicing_ablations --folder output/ablations --output docs/learning.md
+        python -m studies split_step_limit
+        python -m studies stand_in_figure
+        python -m studies station_speed
+        python -m studies station_speed --json docs/benchmarks/station_speed.json
+        python -m studies unfinished_slices docs/slicing_evaluation.jsonl --output docs/learning.md
         """,  # noqa: E501
 }
 
@@ -273,10 +273,6 @@ PLACEHOLDER = re.compile(r"[A-Z_]{3,}|.*/NAME\.\w+|\w+://.*")
 
 class Refused(Exception):
     """What a parser says of a command."""
-
-
-class ReadUpToHere(Exception):
-    """A program has read its command."""
 
 
 @pytest.fixture
@@ -324,9 +320,12 @@ def is_name(command: Command) -> bool:
         word.endswith(".py") for word in words
     ):
         return True
-    if words[0] != "sliceit":
+    if words[:3] == ["python", "-m", "studies"]:
+        rest = words[4:]
+    elif words[0] == "sliceit":
+        rest = nested_parser(words[1:])[1]
+    else:
         return False
-    rest = nested_parser(words[1:])[1]
     return rest == ["--help"] or not (command.typed or any(w[:2] != "--" for w in rest))
 
 
@@ -359,8 +358,8 @@ def test_commands_of_a_page_are_read_and_the_files_they_name_are_there(page, par
                 read_pip(words[1:])
             elif program == "pytest":
                 read_pytest(words[1:])
-            elif words[1].endswith(".py") and program == "python":
-                read_script(words[1:])
+            elif words[1:3] == ["-m", "studies"]:
+                read_study(words[3:], command.typed)
             else:
                 assert program in ("python", "python3", "dask", "sphinx-build"), where
         except Refused as error:
@@ -385,12 +384,32 @@ def is_file(word: str) -> bool:
 
 def read_sliceit(words: list[str], typed: bool) -> None:
     parser, rest = nested_parser(words)
+    read(parser, rest, whole_parser(), words, typed)
+
+
+def read_study(words: list[str], typed: bool) -> None:
+    if words:
+        study = find_study(words[0])
+        if study is None:
+            raise Refused(f"there is no study {words[0]}")
+        parser = study_parser(study)
+        read(parser, words[1:], parser, words[1:], typed)
+
+
+def read(
+    parser: argparse.ArgumentParser,
+    rest: list[str],
+    whole: argparse.ArgumentParser,
+    words: list[str],
+    typed: bool,
+) -> None:
+    """Reads `words` by the whole parser; `rest` are those that are left for the nested one."""
     options = parser._option_string_actions
     unknown = [w for w in rest if w.startswith("--") and w not in options]
     if unknown:
         raise Refused(f"{parser.prog} has no {unknown[0]}")
     try:
-        whole_parser().parse_args(words)
+        whole.parse_args(words)
     except SystemExit as end:
         assert end.code == 0  # --help.
     except Refused as error:
@@ -416,24 +435,6 @@ def read_pytest(words: list[str]) -> None:
     for part in wanted:
         if not any(part in name for name in names):
             raise Refused(f"no test has {part} in its name")
-
-
-def read_script(words: list[str]) -> None:
-    """Runs a script up to where it has read its arguments."""
-    file, parse = ROOT / words[0], argparse.ArgumentParser.parse_args
-    if "argparse" not in file.read_text():
-        assert words[1:] == [], f"{words[0]} takes no arguments"
-        return
-
-    def parse_and_stop(parser, arguments=None, namespace=None):
-        parse(parser, words[1:])
-        raise ReadUpToHere
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(file.parent))
-        patch.setattr(argparse.ArgumentParser, "parse_args", parse_and_stop)
-        with pytest.raises(ReadUpToHere):
-            load_module(f"script_{file.stem}", file).main()
 
 
 @pytest.mark.parametrize("text", lines(HERE))

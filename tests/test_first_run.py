@@ -18,6 +18,7 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.workers import worker_processes
 from sliceit_drake.diagrams import run
 from sliceit_drake.output_folder import check_output
+from studies.__main__ import main as studies
 
 ROOT = Path(__file__).resolve().parent.parent
 SMALL_FOOD = "{food: {shape: !Cylinder {rings: 3, layers: [0.0, 0.004, 0.012]}}}"
@@ -25,7 +26,7 @@ SMALL_FOOD = "{food: {shape: !Cylinder {rings: 3, layers: [0.0, 0.004, 0.012]}}}
 
 def test_all_files_are_text_in_utf8_whatever_the_locale():
     without = []
-    for file in [*ROOT.glob("sliceit_drake/**/*.py"), *ROOT.glob("benchmarks/*.py")]:
+    for file in [*ROOT.glob("sliceit_drake/**/*.py"), *ROOT.glob("studies/**/*.py")]:
         for call in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if not isinstance(call, ast.Call):
                 continue
@@ -38,12 +39,14 @@ def test_all_files_are_text_in_utf8_whatever_the_locale():
     assert without == []
 
 
-@pytest.mark.parametrize("command", [["simulate"], ["train"], ["study", "random"]])
+@pytest.mark.parametrize(
+    ("program", "command"), [(main, "simulate"), (main, "train"), (studies, "random")]
+)
 def test_a_place_that_cannot_be_written_is_refused_before_anything_is_computed(
-    command, tmp_path, capsys
+    program, command, tmp_path, capsys
 ):
     (tmp_path / "file").touch()
-    assert main([*command, "--output", str(tmp_path / "file" / "folder")]) == 2
+    assert program([command, "--output", str(tmp_path / "file" / "folder")]) == 2
     shown = capsys.readouterr()
     assert shown.out == ""
     assert "file: --output: cannot be written to (" in shown.err

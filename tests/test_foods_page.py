@@ -9,7 +9,8 @@ from sliceit_drake.calibration.setup import load_setup
 from sliceit_drake.cutting.foods.food import make_food_model
 from sliceit_drake.cutting.named_knife import load_knife
 from sliceit_drake.diagrams.scenario import load_scenario
-from sliceit_drake.resources import load_module
+from studies.marked_page import Place
+from studies.physics.foods_page import foods_table, knives_table
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = (ROOT / "docs/foods.md").read_text(encoding="utf-8")
@@ -17,10 +18,9 @@ PAGE = (ROOT / "docs/foods.md").read_text(encoding="utf-8")
 
 @pytest.mark.parametrize("name", ["foods", "knives"])
 def test_tables_are_made_from_the_files_of_foods_and_knives(name):
-    page = load_module("foods_page", ROOT / "studies/physics/foods_page.py")
-    table = {"foods": page.foods_table, "knives": page.knives_table}[name]()
-    command = "python studies/physics/foods_page.py --output docs/foods.md"
-    assert page.Place(name).put(PAGE, table, "docs/foods.md") == PAGE, command
+    table = {"foods": foods_table, "knives": knives_table}[name]()
+    command = "python -m studies foods_page --output docs/foods.md"
+    assert Place(name).put(PAGE, table, "docs/foods.md") == PAGE, command
 
 
 def test_what_the_page_says_to_write_is_a_food_a_knife_and_a_setup(tmp_path, monkeypatch):

@@ -1,8 +1,6 @@
 """Kernels on a GPU give what they give on the CPU; without one that is said, and nothing fails."""
 
 import dataclasses as dc
-import importlib.util
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +15,8 @@ from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.parameters import with_parameters
 from sliceit_drake.cutting.workspace import Workspace
+from studies.__main__ import main
+from studies.physics import batch_speed
 
 ROOT = Path(__file__).resolve().parent.parent
 PERIOD = 2e-3
@@ -55,16 +55,13 @@ def test_a_device_that_is_not_there_is_named_with_those_that_are():
 
 
 def test_the_benchmark_goes_on_without_a_gpu_and_says_why(monkeypatch, capsys, tmp_path):
-    spec = importlib.util.spec_from_file_location(
-        "batch_speed", ROOT / "studies/physics/batch_speed.py"
-    )
-    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    monkeypatch.setattr(module.wp, "is_cuda_available", lambda: False)
+    monkeypatch.setattr(batch_speed.wp, "is_cuda_available", lambda: False)
     page = tmp_path / "page.md"
-    page.write_text(f"before\n{module.PLACE.begin}\n{module.PLACE.end}\nafter\n", encoding="utf-8")
+    page.write_text(
+        f"before\n{batch_speed.PLACE.begin}\n{batch_speed.PLACE.end}\nafter\n", encoding="utf-8"
+    )
     options = ["--batches", "1", "2", "--refinement", "0.5", "--repeats", "1"]
-    assert module.main([*options, "--output", str(page)]) == 0
+    assert main(["batch_speed", *options, "--output", str(page)]) == 0
     assert "The GPU is skipped: there is no CUDA device" in capsys.readouterr().out
     text = page.read_text(encoding="utf-8")
     rows = [line.split("|")[1:5] for line in text.splitlines() if line.startswith("| cpu")]
@@ -72,4 +69,6 @@ def test_the_benchmark_goes_on_without_a_gpu_and_says_why(monkeypatch, capsys, t
     # The first cut of a batch is the same in all of them.
     assert [row[3].strip() for row in rows] == ["0.0000 %", "0.0000 %"]
     assert text.startswith("before\n") and text.endswith("after\n")
-    assert module.PLACE.put((ROOT / "docs/speed.md").read_text(encoding="utf-8"), "", "speed.md")
+    assert batch_speed.PLACE.put(
+        (ROOT / "docs/speed.md").read_text(encoding="utf-8"), "", "speed.md"
+    )

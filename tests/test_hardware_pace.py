@@ -1,8 +1,6 @@
 """How a run keeps up with the controller's clock: what the table counts, and where it goes."""
 
-import importlib.util
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +8,8 @@ import pytest
 from emulator_bench import free_address
 
 from sliceit_drake.configuration import ConfigurationError
+from studies.__main__ import main
+from studies.robot import hardware_pace as pace
 
 pytestmark = pytest.mark.second_tier
 
@@ -19,20 +19,11 @@ SHORT = """{start: {clearance: 0.005}, measurement: null, motion: {segments: [
 PATIENT = "{watchdog: 5.0, limits: {state_age: 0.1, command_age: 0.1, joint_step: 0.1}}"
 
 
-@pytest.fixture(scope="module")
-def pace():
-    file = ROOT / "studies/robot/hardware_pace.py"
-    spec = importlib.util.spec_from_file_location("hardware_pace", file)
-    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def cells_of(line):
     return [cell.strip() for cell in line.strip("|").split("|")]
 
 
-def test_cycles_count_from_the_first_target_to_the_last_and_gaps_are_missed(pace):
+def test_cycles_count_from_the_first_target_to_the_last_and_gaps_are_missed():
     time = np.array([1.000, 1.002, 1.004, 1.010, 1.012, 1.014])
     sent = np.array([np.nan, 0.1, 0.1, 0.1, 0.1, np.nan])
     late = np.array([9.0, 1e-3, 2e-3, 3e-3, 4e-3, 9.0])
@@ -43,19 +34,19 @@ def test_cycles_count_from_the_first_target_to_the_last_and_gaps_are_missed(pace
     assert pace.timing(log[:1])[0] == 0
 
 
-def test_runs_of_a_pace_make_a_row(pace):
+def test_runs_of_a_pace_make_a_row():
     late = np.linspace(0.0, 1e-3, 101)
     runs = [
         pace.PacedRun("", 1000, 3, late, 1, 0.02, 0.004),
         pace.PacedRun("", 1000, 0, late, 0, 0.04, 0.008),
         pace.PacedRun("state_age", 500, 2, np.array([0.012]), 4),
     ]
-    row = cells_of(pace.row(0.5, runs))
+    row = pace.row(0.5, runs)
     assert row[:4] == ["0.5", "2 of 3", "2500", "5 (0.20 %)"]
     assert row[4:8] == ["0.50 ms", "1.00 ms", "12.00 ms", "5"], "of all runs together"
     assert row[8:] == ["0.030 N, at most 0.040 (0.80 %)", "1 state_age"]
-    assert len(row) == len(cells_of(pace.HEADER.splitlines()[0]))
-    nothing = cells_of(pace.row(1.0, [pace.PacedRun("Not ready")] * 2))
+    assert len(row) == len(pace.HEAD.split(" | "))
+    nothing = pace.row(1.0, [pace.PacedRun("Not ready")] * 2)
     assert nothing == ["1", "0 of 2", "0", "-", "-", "-", "-", "0", "-", "2 Not ready"]
 
 
@@ -68,11 +59,11 @@ def test_runs_of_a_pace_make_a_row(pace):
         ("", "it said nothing"),
     ],
 )
-def test_stops_are_counted_by_their_reason(printed, stop, pace):
+def test_stops_are_counted_by_their_reason(printed, stop):
     assert pace.stop_of(printed) == stop
 
 
-def test_the_force_is_compared_at_the_times_of_the_run(pace):
+def test_the_force_is_compared_at_the_times_of_the_run():
     def record(time, force):
         parts = [np.array(time), *(np.array(force) * k for k in (0.0, 0.0, 1.0))]
         names = "time," + ",".join(f"sensor_wrench_f_{axis}" for axis in "xyz")
@@ -84,7 +75,7 @@ def test_the_force_is_compared_at_the_times_of_the_run(pace):
     assert share == pytest.approx(1.0 / np.sqrt(125.0))
 
 
-def test_a_table_replaces_what_is_between_the_marks_and_nothing_else(pace):
+def test_a_table_replaces_what_is_between_the_marks_and_nothing_else():
     text = f"a\n{pace.PLACE.begin}\nold\n{pace.PLACE.end}\nb\n"
     new = pace.PLACE.put(text, "new", "x.md")
     assert new == f"a\n{pace.PLACE.begin}\nnew\n{pace.PLACE.end}\nb\n"
@@ -95,15 +86,17 @@ def test_a_table_replaces_what_is_between_the_marks_and_nothing_else(pace):
     pace.PLACE.put((ROOT / "docs/hardware.md").read_text(), "new", "docs/hardware.md")
 
 
-def test_it_runs_emulator_and_client_and_prints_and_writes_the_table(pace, tmp_path, capsys):
+def test_it_runs_emulator_and_client_and_prints_and_writes_the_table(tmp_path, capsys):
     file = tmp_path / "pace.md"
     file.write_text(f"{pace.PLACE.begin}\n{pace.PLACE.end}\n")
     arguments = ["--set", SHORT, "--set-robot", PATIENT, "--pace", "0.1", "--repeats", "1"]
-    assert pace.main([*arguments, "--address", free_address(), "--output", str(file)]) == 0
+    assert (
+        main(["hardware_pace", *arguments, "--address", free_address(), "--output", str(file)]) == 0
+    )
     printed = capsys.readouterr().out
     row = cells_of(re.search(r"\| 0\.1 \|.*", printed)[0])
     # How the machine keeps up is its own affair; that targets went out is not.
     assert row[1] in ("1 of 1", "0 of 1")
     assert int(row[2]) > 20, printed
-    assert "python studies/robot/hardware_pace.py --set" in printed
+    assert "python -m studies hardware_pace --set" in printed
     assert re.search(r"\| 0\.1 \|.*", printed)[0] in file.read_text()

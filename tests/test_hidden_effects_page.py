@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from sliceit_drake.cli.main import main
+from studies.__main__ import main
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 RUNS = DOCS / "hidden_effects.jsonl"

@@ -19,9 +19,11 @@ from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.learning.ending import Limits
 from sliceit_drake.learning.evaluation import LIMITS, cut_slice
 from sliceit_drake.learning.metrics import bootstrap_ratio, slice_metrics
-from sliceit_drake.resources import load_module, resource_path
+from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.agent import AgentConfig
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
+from studies.__main__ import main as studies
+from studies.learning import faster_draws
 from studies.learning.comparison import claim, compare, comparison_page, plot_boxes
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -157,10 +159,10 @@ def test_policies_that_did_not_cut_the_same_slices_are_not_compared():
 def test_the_study_writes_its_page_and_says_what_it_lacks(tmp_path, capsys):
     file = tmp_path / "evaluation.jsonl"
     file.write_text("\n".join(map(json.dumps, rows())))
-    assert main(["study", "slicing", str(file), "--output", str(tmp_path)]) == 0
+    assert studies(["slicing", str(file), "--output", str(tmp_path)]) == 0
     assert "**0.6" in (tmp_path / "slicing_results.md").read_text()
     file.write_text("\n".join(map(json.dumps, rows()[: len(rows()) // 2])))
-    assert main(["study", "slicing", str(file), "--output", str(tmp_path)]) == 2
+    assert studies(["slicing", str(file), "--output", str(tmp_path)]) == 2
     assert "policies of both simulators" in capsys.readouterr().err
 
 
@@ -182,19 +184,18 @@ def test_an_evaluation_goes_on_over_batches_of_processes_and_runs(tmp_path, monk
 
 def test_the_page_is_that_of_the_slices(tmp_path, capsys):
     file = ROOT / "docs/slicing_evaluation.jsonl"
-    assert main(["study", "slicing", str(file), "--output", str(tmp_path)]) == 0
+    assert studies(["slicing", str(file), "--output", str(tmp_path)]) == 0
     for name in ("slicing_results.md", "slicing_results.json"):
         assert (tmp_path / name).read_text() == (ROOT / "docs" / name).read_text()
     capsys.readouterr()
 
 
 def test_the_table_of_faster_draws_is_that_of_the_slices():
-    page = load_module("faster_draws", ROOT / "studies/learning/faster_draws.py")
     text = (ROOT / "docs/learning.md").read_text(encoding="utf-8")
     files = ["docs/slicing_evaluation.jsonl", "docs/faster_draws.jsonl"]
-    command = f"python studies/learning/faster_draws.py {' '.join(files)} --output docs/learning.md"
-    table = page.table(*(ROOT / file for file in files), command)
-    assert page.PLACE.put(text, "\n".join(table), "docs/learning.md") == text, command
+    command = f"python -m studies faster_draws {' '.join(files)} --output docs/learning.md"
+    table = faster_draws.draws_table(*(ROOT / file for file in files), command)
+    assert faster_draws.PLACE.put(text, "\n".join(table), "docs/learning.md") == text, command
 
 
 def test_the_readme_says_what_the_policies_are_worth():

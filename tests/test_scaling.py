@@ -1,23 +1,15 @@
 """The cost model of many workers says what was measured with one, and where it ends."""
 
-import importlib.util
-import sys
 from pathlib import Path
 
 import pytest
 
+from studies.scaling import scaling
+
 ROOT = Path(__file__).resolve().parent.parent
 
 
-@pytest.fixture(scope="module")
-def scaling():
-    spec = importlib.util.spec_from_file_location("scaling", ROOT / "studies/scaling/scaling.py")
-    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_one_worker_is_as_fast_as_measured_and_many_as_fast_as_the_storage(scaling):
+def test_one_worker_is_as_fast_as_measured_and_many_as_fast_as_the_storage():
     run = scaling.SearchRun(1, 100, 50.0, simulation=0.4, storage=0.06, proposal=0.04)
     limits = scaling.StorageLimits({1: 150.0, 2: 200.0}, read=1e-4, reads=20_000.0)
     for shared in (False, True):
@@ -34,7 +26,7 @@ def test_one_worker_is_as_fast_as_measured_and_many_as_fast_as_the_storage(scali
     assert 90 < of_file < 120 and 20 < of_server < 60
 
 
-def test_a_session_is_as_fast_as_its_workers_the_scheduler_or_the_writer(scaling):
+def test_a_session_is_as_fast_as_its_workers_the_scheduler_or_the_writer():
     run = scaling.DaskRun({1: 20.0, 2: 11.0}, slices=10, tasks=300.0, write=0.01, size=10_000)
     assert scaling.dask_rate(1, run) == pytest.approx(0.5)
     assert scaling.dask_rate(100, run) == pytest.approx(50.0)
@@ -42,17 +34,17 @@ def test_a_session_is_as_fast_as_its_workers_the_scheduler_or_the_writer(scaling
     assert 180 < scaling.saturation(lambda n: scaling.dask_rate(n, run)) < 220
 
 
-def test_tables_say_what_was_measured_and_go_between_the_marks(scaling, tmp_path):
+def test_tables_say_what_was_measured_and_go_between_the_marks():
     runs = [
         scaling.SearchRun(1, 100, 50.0, 0.4, 0.06, 0.04),
         scaling.SearchRun(2, 104, 28.0, 0.42, 0.07, 0.05),
     ]
     limits = {"PostgreSQL": scaling.StorageLimits({1: 150.0, 2: 200.0}, 1e-4, 20_000.0)}
-    lines = scaling.search_tables({"PostgreSQL": runs}, limits)
+    lines = "\n".join(scaling.search_tables({"PostgreSQL": runs}, limits)).splitlines()
     assert "| PostgreSQL | 2 | 104 | 28.0 | 3.71 | 1.86 | 420.0 ms | 70.0 ms | 50.0 ms |" in lines
     assert "| PostgreSQL | 150 | 200 | 10000 | 20000 |" in lines
     model = scaling.model_table({"PostgreSQL": runs}, limits, None)
-    assert "| 1 | 2 (100 %) |" in model
+    assert "| 1 | 2 (100 %) |" in model[0].splitlines()
     page = f"before\n{scaling.PLACE.begin}\nold\n{scaling.PLACE.end}\nafter\n"
     text = scaling.PLACE.put(page, "\n".join(model), "page.md")
     assert "old" not in text and text.startswith("before\n") and text.endswith("\nafter\n")

@@ -27,7 +27,7 @@ from sliceit_drake.prediction.series import SliceFacts
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.protocol import Condition, Protocol, load_protocol
-from studies.commands.identifiability import study
+from studies.diagnosis.identifiability import study
 from studies.diagnosis.identifiability_page import Study, report
 
 Z = 2

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sliceit_drake.cli.main import main
 from sliceit_drake.cutting.foods.food import Cylinder, Food
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.knife import Knife
@@ -18,6 +17,7 @@ from sliceit_drake.cutting.simulate import check_energies
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.resources import resource_path
+from studies.__main__ import main
 from studies.physics.stepping import (
     STEPS,
     SteppingCase,
@@ -129,7 +129,7 @@ def test_a_scenario_held_half_way_goes_as_far_as_before():
 
 
 def test_quick_study_writes_the_kinds_of_tables_that_are_committed(tmp_path, capsys):
-    assert main(["study", "stepping", "--quick", "--output", str(tmp_path)]) == 0
+    assert main(["stepping", "--quick", "--output", str(tmp_path)]) == 0
     text = (tmp_path / "stepping.md").read_text(encoding="utf-8")
     assert text.strip() in capsys.readouterr().out
     quick = {t.split("|")[1].strip() for t in text.split("\n\n")}

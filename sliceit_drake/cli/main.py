@@ -114,13 +114,13 @@ def run_program(parser: argparse.ArgumentParser, arguments: Sequence[str] | None
         hint = (
             f". What is done is in {options.output}; the same command goes on." if goes_on else ""
         )
-        print(f"sliceit: interrupted{hint}", file=sys.stderr)
+        print(f"{parser.prog}: interrupted{hint}", file=sys.stderr)
         return INTERRUPTED
     except Exception as error:
         if isinstance(error, OSError) and error.errno in REFUSED:
-            print(f"sliceit: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
+            print(f"{parser.prog}: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
         elif _is_bad_input(error):
-            print(f"sliceit: {error}", file=sys.stderr)
+            print(f"{parser.prog}: {error}", file=sys.stderr)
         else:
             raise
         return BAD_INPUT

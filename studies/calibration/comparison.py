@@ -1,6 +1,14 @@
-"""The measured curves of the paper beside three simulators: its two, as published, and ours."""
+"""Calibrate the three foods that the paper measured, and compare with its two simulators.
 
+Runs `sliceit calibrate` on calibration/records for each food and writes to FOLDER the table
+(calibration.md), the figure (calibration.png), and a folder for each food with what `calibrate`
+leaves. A run that was killed goes on where it was. docs/calibration.md explains what comes out.
+"""
+
+import argparse
 import dataclasses as dc
+import os
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,15 +16,86 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.optimize import minimize_scalar
 
+from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate
 from sliceit_drake.calibration.result import Calibration
-from sliceit_drake.records.force_profile import ForceProfile
+from sliceit_drake.calibration.setup import load_setup
+from sliceit_drake.cli.calibrate import fit_points_shown
+from sliceit_drake.cli.progress import StageBars
+from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
+from sliceit_drake.records.validation import load_record
+from sliceit_drake.resources import resource_path
+from studies.pages import publish
 
-__all__ = ["FoodComparison", "Row", "compare", "plot_comparisons", "table"]
+__all__ = [
+    "FoodComparison",
+    "Row",
+    "add_arguments",
+    "compare",
+    "comparison_tables",
+    "plot_comparisons",
+    "run",
+]
 
+FOODS = ("cucumber", "tomato", "potato")
 LARGEST_SHIFT = 0.4
 """In time, that other simulators' curves get, s."""
 NAMES = {"DiSECt": "authors' calibrated DiSECt", "spring": "authors' spring"}
 COLOURS = {"DiSECt": "#2563eb", "spring": "#16a34a", "ours": "#c2410c"}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
+    parser.add_argument(
+        "--output", metavar="FOLDER", type=Path, required=True, help="where the results go"
+    )
+    parser.add_argument(
+        "--foods", nargs="+", choices=FOODS, default=list(FOODS), help="default: all"
+    )
+    parser.add_argument("--trials", type=int, default=500, help="of the search (default 500)")
+    parser.add_argument("--steps", type=int, default=100, help="of Adam (default 100)")
+    parser.add_argument(
+        "--point-steps",
+        type=int,
+        default=100,
+        help="of Adam on a toughness for each cut point (default 100; 0: none)",
+    )
+    parser.add_argument(
+        "--workers", type=int, default=os.cpu_count() or 1, help="default: all processors"
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
+    comparisons = []
+    for food in options.foods:
+        record = load_record(resource_path(f"calibration/records/{food}.csv"))
+        profile = load_force_profile(
+            resource_path(f"calibration/measured/sliceit_real_{food}_force.csv")
+        )
+        folder = options.output / food
+        begin = time.monotonic()
+        settings = CalibrationOptions(
+            trials=options.trials, steps=options.steps, workers=options.workers
+        )
+        with StageBars(f"{food}: ") as bars:
+            result = calibrate(
+                load_setup(food), [record], folder, settings, progress=bars.show_error
+            )
+        minutes = (time.monotonic() - begin) / 60.0
+        command = (
+            f"python -m studies calibration --foods {food} --trials {options.trials} --steps "
+            f"{options.steps}"
+        )
+        result.save(folder, command)
+        comparison = compare(result, profile, minutes)
+        if options.point_steps:
+            comparison.per_point_rms = fit_points_shown(result, options.point_steps).rms
+        comparisons.append(comparison)
+        for line in result.posterior.remarks():
+            print(f"{food}: {line}")
+    publish(comparison_tables(comparisons), options.output / "calibration.md")
+    plot_comparisons(comparisons, options.output / "calibration.png")
+    return 0
 
 
 @dc.dataclass
@@ -109,7 +188,7 @@ def _row(
     return Row(name, time, force, shift, rms, float(force.max()), work)
 
 
-def table(comparisons: Sequence[FoodComparison]) -> str:
+def comparison_tables(comparisons: Sequence[FoodComparison]) -> str:
     """The comparison as Markdown."""
     lines = [
         "| food | simulator | RMS error [N] | peak [N] | work [J] | time shift [ms] |"

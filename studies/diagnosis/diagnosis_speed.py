@@ -1,4 +1,4 @@
-"""What a diagnosis takes: python studies/diagnosis/diagnosis_speed.py [--json FILE].
+"""What a diagnosis takes.
 
 Records the 18 slices of the rich protocol, with nothing hidden, and has `sliceit diagnose` look at
 them with all causes, twice: first with nothing computed before, then with what it has kept.
@@ -12,7 +12,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from studies.results import write_results
+from studies.results import add_json_argument, write_results
+
+__all__ = ["add_arguments", "run"]
 
 
 def sliceit(*arguments: str) -> float:
@@ -22,11 +24,13 @@ def sliceit(*arguments: str) -> float:
     return time.perf_counter() - begin
 
 
-def main() -> None:
-    """Measures and prints."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--json", type=Path, help="also write the values there")
-    options = parser.parse_args()
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
+    add_json_argument(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
     with tempfile.TemporaryDirectory() as folder:
         records, output = f"{folder}/records", f"{folder}/diagnosis"
         sliceit("record", "calibration/protocols/rich.yaml", "--output", records, "--seed", "1")
@@ -37,9 +41,5 @@ def main() -> None:
             "warm_s": sliceit(*diagnose),
         }
     print(values)
-    if options.json is not None:
-        write_results(options.json, values)
-
-
-if __name__ == "__main__":
-    main()
+    write_results(options, values)
+    return 0

@@ -1,8 +1,6 @@
-"""Draws what each effect of the stand-in changes (docs/figures/stand_in.png).
+"""Draws what each effect of the stand-in changes (docs/figures/stand_in.png)."""
 
-python studies/diagnosis/stand_in_figure.py
-"""
-
+import argparse
 import dataclasses as dc
 from pathlib import Path
 
@@ -19,6 +17,8 @@ from sliceit_drake.stand_in.sensor_model import SensorModel
 from sliceit_drake.stand_in.session import Session
 
 matplotlib.use("Agg")
+
+__all__ = ["add_arguments", "run"]
 
 GREY, BLUE, ORANGE = "0.55", "#0072b2", "#d55e00"
 FIGURE = Path(__file__).resolve().parents[2] / "docs/figures/stand_in.png"
@@ -49,10 +49,22 @@ def cut(label: str, effects: list[Effect]) -> SliceRecord:
 
 def lateral(record: SliceRecord, axis: int) -> np.ndarray:
     """Force along the edge (0) or normal to the blade (1)."""
+    assert record.force is not None
     return np.einsum("nc,nc->n", record.force, record.rotation[:, :, axis])
 
 
-def main() -> None:
+def vertical(record: SliceRecord) -> np.ndarray:
+    """Force upwards."""
+    assert record.force is not None
+    return record.force[:, 2]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds nothing: the study has no arguments."""
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
     plain = {label: cut(label, []) for label in {"press", *CONDITIONS.values()}}
     rows = -(-len(EFFECTS) // COLUMNS)
     figure, axes = plt.subplots(rows, COLUMNS, figsize=(12, 1.75 * rows), layout="constrained")
@@ -60,9 +72,9 @@ def main() -> None:
         label = CONDITIONS.get(name, "press")
         record, without = cut(label, [kind()]), plain[label]
         side = int(name in NORMAL)
-        axis.plot(without.time, without.force[:, 2], color=GREY, lw=1.8)
+        axis.plot(without.time, vertical(without), color=GREY, lw=1.8)
         axis.plot(without.time, lateral(without, side), color=GREY, lw=1.8, ls=":")
-        axis.plot(record.time, record.force[:, 2], color=BLUE, lw=0.9)
+        axis.plot(record.time, vertical(record), color=BLUE, lw=0.9)
         axis.plot(record.time, lateral(record, side), color=ORANGE, lw=0.9, ls=":")
         size = f"{kind.typical:g} {kind.unit}".strip()
         normal = ", normal" if side else ""
@@ -78,8 +90,5 @@ def main() -> None:
         fontsize=10,
     )
     figure.savefig(FIGURE, dpi=90)
-    print(f"Wrote {FIGURE}")
-
-
-if __name__ == "__main__":
-    main()
+    print(f"wrote {FIGURE}")
+    return 0

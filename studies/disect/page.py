@@ -1,20 +1,32 @@
-"""The page and the figure of `disect_study`: docs/disect.md."""
+"""The simulator beside DiSECt, in both measures of the knife's force.
 
+Cuts DiSECt's reference case with the opening law alone, set to its parameters, and with the full
+model, puts its differences back one by one, and compares with its curves of the measured cuts.
+Writes to FOLDER disect.md and figures/disect.png. Takes some minutes.
+"""
+
+import argparse
 import dataclasses as dc
+import time
 import typing
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
 from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.resources import resource_path
 from studies.disect import case as disect
 from studies.disect.case import Case, CaseResult
 from studies.disect.settings import SETTINGS
-from studies.disect.study import Curve, DisectStudy, MeasuredCurves
+from studies.disect.study import STEPS, Curve, DisectStudy, MeasuredCurves, disect_study
+from studies.physics.measured_curves import load_measured_foods
 
-__all__ = ["disect_page", "field_unit", "plot_disect"]
+__all__ = ["add_arguments", "disect_page", "field_unit", "plot_disect", "run"]
+
+FOODS = "calibration/verification_foods.yaml"
 
 HEAD = """\
 # Side by side with DiSECt
@@ -88,6 +100,29 @@ are those of a `CuttingModel`. Functions are in `studies/disect/case.py`.
 
 {settings_table}
 """
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
+    parser.add_argument(
+        "--output", metavar="FOLDER", type=Path, required=True, help="where page and figure go"
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
+    foods = load_measured_foods(resource_path(FOODS)).foods
+    begin = time.monotonic()
+    with tqdm(total=STEPS + len(foods), desc="cuts") as bar:
+        study = disect_study(foods, bar.update)
+    minutes = max(1.0, (time.monotonic() - begin) / 60.0)
+    figure = options.output / "figures" / "disect.png"
+    plot_disect(study, figure)
+    file = options.output / "disect.md"
+    page = disect_page(study, "python -m studies disect --output docs", minutes)
+    file.write_text(page, encoding="utf-8")
+    print(f"{file} and {figure}")
+    return 0
 
 
 def disect_page(study: DisectStudy, command: str, minutes: float) -> str:

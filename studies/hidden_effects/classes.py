@@ -39,7 +39,7 @@ class ProtocolClasses:
 
 
 def protocol_classes(name: str, cache: Path | None = None) -> ProtocolClasses:
-    """Computes them from motions without any measurement, as `python -m studies identifiability` does.
+    """Computes them from motions without any measurement, as the study `identifiability` does.
 
     Args:
         name: Of a protocol.

@@ -1,6 +1,19 @@
-"""The report of the study: docs/hidden_effects.md, its numbers as JSON, and a figure."""
+"""Judge the diagnoses of `python -m studies hidden`: what was said against what was hidden.
 
+Prints rates with Wilson's bounds, what is asked for, rates by cause, detection curves and
+what was said where it was not right. With --output FOLDER it also writes hidden_effects.md,
+hidden_effects.json, hidden_effects.jsonl (the runs, from which the study can be judged again and
+gone on with) and figures/hidden_effects.png there. A study that is not done is judged by what there
+is. In place of its folder such a file of runs will do.
+
+  python -m studies score output/hidden --output docs
+  python -m studies score docs/hidden_effects.jsonl
+"""
+
+import argparse
+import json
 import math
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -8,11 +21,14 @@ from typing import Any
 
 import numpy as np
 
+from studies.hidden_effects.archive import pack, unpack
 from studies.hidden_effects.cases import KINDS
-from studies.hidden_effects.score import NAMING, Judgement, Rate, rate
+from studies.hidden_effects.score import NAMING, Judgement, Rate, judge_study, rate
+from studies.hidden_effects.study import read_facts
 from studies.hidden_effects.truth import BASE_OF
+from studies.pages import publish
 
-__all__ = ["numbers", "plot_curves", "report"]
+__all__ = ["add_arguments", "numbers", "plot_curves", "report", "run"]
 
 HEAD = """\
 # Hidden effects: how often the diagnosis is right
@@ -50,6 +66,34 @@ What counts as right:
   proposed experiment is cut on the same bench, and all records together must name the one cause.
 - A run that breaks down is a miss.
 """
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
+    parser.add_argument("study", metavar="DIR", type=Path, help="folder of the study, or its runs")
+    parser.add_argument("--output", metavar="FOLDER", type=Path, help="also write the report there")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
+    folder, found = options.output, {}
+    with tempfile.TemporaryDirectory() as unpacked:
+        study = options.study
+        if study.is_file():
+            unpack(study, Path(unpacked))
+            study = Path(unpacked)
+        judgements, facts = judge_study(study), read_facts(study / "study.json")
+        if folder is not None:
+            pack(study, folder / "hidden_effects.jsonl")
+    text = report(judgements, folder and "figures/hidden_effects.png", facts)
+    publish(text, folder and folder / "hidden_effects.md")
+    if folder is not None:
+        found = numbers(judgements)
+        file = folder / "hidden_effects.json"
+        file.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+        if found["curves"]:
+            plot_curves(judgements, folder / "figures" / "hidden_effects.png")
+    return 0
 
 
 def numbers(judgements: Sequence[Judgement]) -> dict[str, Any]:

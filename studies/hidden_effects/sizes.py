@@ -1,4 +1,4 @@
-"""At which size an effect has a wanted strength against the noise.
+"""At which size each effect has a wanted strength against the noise, protocol by protocol.
 
 The strength delta of an effect is the root mean square, over samples in contact and channels, of
 what is left of its noise-free change of the readings once base parameters and what is each slice's
@@ -8,6 +8,7 @@ In short:
     size_for("rich", "skin", 2.5)          # J/m, or None where no sensible size is that strong
 """
 
+import argparse
 import dataclasses as dc
 import functools
 import hashlib
@@ -18,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from tqdm import tqdm
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.solver import CuttingError
@@ -44,8 +46,17 @@ from studies.hidden_effects.bench import (
     model_food,
     protocol_named,
 )
+from studies.pages import publish
 
-__all__ = ["ProtocolSizes", "SizeCurve", "angles_for", "size_for", "sizes_as_markdown"]
+__all__ = [
+    "ProtocolSizes",
+    "SizeCurve",
+    "add_arguments",
+    "angles_for",
+    "run",
+    "size_for",
+    "sizes_as_markdown",
+]
 
 DELTAS = (0.5, 1.0, 2.0, 2.5, 3.0, 4.0)
 """Strengths that a table shows."""
@@ -79,6 +90,30 @@ ROUNDS = 3
 """In which sizes are tried nearer and nearer to the strengths that are wanted."""
 CLOSE = 0.08
 """Relative distance of a size that was computed from one that is wanted, to be good enough."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
+    parser.add_argument(
+        "--protocols",
+        nargs="+",
+        metavar="NAME",
+        default=["poor", "rich", "full"],
+        help="default: all",
+    )
+    parser.add_argument("--effects", nargs="+", metavar="NAME", help="default: all")
+    parser.add_argument("--cache", metavar="DIR", type=Path, help="keep what was computed there")
+    parser.add_argument("--output", metavar="FILE", type=Path, help="also write the table there")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
+    effects = options.effects or list(EFFECTS)
+    protocols = [ProtocolSizes(name, options.cache) for name in options.protocols]
+    with tqdm(total=len(effects) * len(protocols), desc="sizes") as bar:
+        text = sizes_as_markdown(protocols, effects, bar.update)
+    publish(text, options.output)
+    return 0
 
 
 @dc.dataclass(frozen=True)

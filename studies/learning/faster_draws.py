@@ -1,18 +1,12 @@
-"""What faster draws bring: python studies/learning/faster_draws.py EVALUATION FASTER [--output FILE].
+"""What faster draws bring.
 
 EVALUATION is what `sliceit evaluate` wrote for policies of both simulators, FASTER the same for
 policies that were trained alike but may move the target faster along the edge. Both have to hold
 the same slices; what only one of them holds is left out.
-
---output puts the table into a Markdown file, between the lines
-  <!-- faster_draws -->
-  <!-- end of faster_draws -->
 """
 
 import argparse
 import json
-import shlex
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +14,9 @@ import numpy as np
 from sliceit_drake.learning.metrics import bootstrap_ratio
 from studies.learning.comparison import PAPER, Comparison, compare, interval, share
 from studies.marked_page import Place
+from studies.pages import table
+
+__all__ = ["PLACE", "add_arguments", "draws_table", "run"]
 
 PLACE = Place("faster_draws")
 METRIC = "median_force"
@@ -31,7 +28,7 @@ def read(file: Path) -> dict[tuple[str, str, float], Comparison]:
     return {(e.world, e.food, e.board_stiffness): e for e in compare(rows)}
 
 
-def row(slow: Comparison, fast: Comparison) -> str:
+def row(slow: Comparison, fast: Comparison) -> list[str]:
     """A food's line of the table.
 
     Raises:
@@ -43,7 +40,7 @@ def row(slow: Comparison, fast: Comparison) -> str:
     gain = bootstrap_ratio(faster, ours, np.random.default_rng([*map(ord, slow.world + slow.food)]))
     boards = [each.ratios["board_peak"].value for each in (slow, fast)]
     forces = [each.values["spring"][METRIC].mean() for each in (slow, fast)]
-    cells = [
+    return [
         slow.world.replace("_", "-"),
         slow.food,
         f"{ours.mean():.1f} N, {faster.mean():.1f} N",
@@ -54,10 +51,9 @@ def row(slow: Comparison, fast: Comparison) -> str:
         f"{boards[0]:.2f}, {boards[1]:.2f}",
         share(fast.completed["cutting"]),
     ]
-    return "| " + " | ".join(cells) + " |"
 
 
-def table(evaluation: Path, faster: Path, command: str) -> list[str]:
+def draws_table(evaluation: Path, faster: Path, command: str) -> list[str]:
     """The table's lines.
 
     Args:
@@ -73,11 +69,12 @@ def table(evaluation: Path, faster: Path, command: str) -> list[str]:
         for found in (slow, fast)
     ]
     return [
-        "| world | food | ours: as it is, faster | ratio | baseline: as it is, faster "
-        "| ours over baseline: as it is, faster | paper's | board's peak likewise "
-        "| ours completed, faster |",
-        "|---|---|---|---|---|---|---|---|---|",
-        *(row(slow[key], each) for key, each in fast.items() if key in slow),
+        table(
+            "world | food | ours: as it is, faster | ratio | baseline: as it is, faster"
+            " | ours over baseline: as it is, faster | paper's | board's peak likewise"
+            " | ours completed, faster",
+            (row(slow[key], each) for key, each in fast.items() if key in slow),
+        ),
         "",
         f"Means of the slices' median force over {policies[0]['cutting']} and "
         f"{policies[0]['spring']} policies as they are, {policies[1]['cutting']} and "
@@ -86,19 +83,16 @@ def table(evaluation: Path, faster: Path, command: str) -> list[str]:
     ]
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
     parser.add_argument("evaluation", type=Path, help="of the policies as they are")
     parser.add_argument("faster", type=Path, help="of those with faster draws")
-    parser.add_argument("--output", type=Path, help="Markdown file with the two lines")
-    options = parser.parse_args()
+    PLACE.add_argument(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
     PLACE.check(options.output)
-    command = shlex.join(["python", "studies/learning/faster_draws.py", *sys.argv[1:]])
-    PLACE.show(options.output, table(options.evaluation, options.faster, command))
+    lines = draws_table(options.evaluation, options.faster, options.command)
+    PLACE.show(options.output, lines)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

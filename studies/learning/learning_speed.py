@@ -1,4 +1,4 @@
-"""Cost of a training and of a decision: python studies/learning/learning_speed.py [--output FILE].
+"""Cost of a training and of a decision.
 
 All in one process or one after the other on one machine: compare rows, not machines. In each of
 --rounds the steps of the environment and the updates are timed alone; then both overlap as in
@@ -6,16 +6,11 @@ All in one process or one after the other on one machine: compare rows, not mach
 with two side by side, and 80,000 steps are extrapolated from the rate after the warm-up. Medians of
 the rounds are shown, and of the rounds' ratios, since other work on a machine comes and goes. A
 decision is timed with the exported network, torch not imported.
-
---output puts the tables into a Markdown file, between the lines
-  <!-- learning_speed -->
-  <!-- end of learning_speed -->
 """
 
 import argparse
 import functools
 import os
-import shlex
 import subprocess
 import sys
 import tempfile
@@ -24,12 +19,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp
 
+from sliceit_drake.configuration import ConfigurationError
 from studies.marked_page import Place
-from studies.results import write_results
+from studies.pages import table
+from studies.results import add_json_argument, write_results
 
-warp.config.log_level = warp.LOG_ERROR
+__all__ = ["PLACE", "add_arguments", "run"]
+
 PLACE = Place("learning_speed")
 WARM_UP, STEPS = 300, 900
 ENVIRONMENTS = (1, 2)
@@ -174,27 +171,28 @@ def shares(rounds: int) -> list[str]:
     return [
         "Where the time of simulating goes, in shares of it:",
         "",
-        "| | " + " | ".join(SIMULATORS) + " |",
-        "|---|" + "---|" * len(SIMULATORS),
-        *(
-            f"| {part} | " + " | ".join(f"{100 * share:.0f} %" for share in both) + " |"
-            for part, both in sorted(rows, key=lambda row: -row[1][0])
+        table(
+            " | ".join(["part", *SIMULATORS]),
+            (
+                (part, *(f"{100 * share:.0f} %" for share in both))
+                for part, both in sorted(rows, key=lambda row: -row[1][0])
+            ),
         ),
     ]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--output", type=Path, help="Markdown file with the two lines")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
+    PLACE.add_argument(parser)
     parser.add_argument("--rounds", type=int, default=3, help="of everything; 3")
-    parser.add_argument("--json", type=Path, help="also write the values there")
-    options = parser.parse_args()
+    add_json_argument(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
     if options.rounds < 1:
-        parser.error("--rounds: at least 1")
+        raise ConfigurationError("is below 1", field="--rounds", fix="Give 1 or more.")
     PLACE.check(options.output)
-    command = shlex.join(["python", "studies/learning/learning_speed.py", *sys.argv[1:]])
     import torch
 
     torch.set_num_threads(1)
@@ -219,21 +217,17 @@ def main() -> None:
             text=True,
         ).stdout
     median, late = map(float, printed.split()[-2:])
-    lines = [
-        "| simulator | simulating a decision | an update | environments | training "
-        "| 80,000 decisions |",
-        "|---|---|---|---|---|---|",
-    ]
+    rows = []
     found: dict[str, float] = {}
     for (name, count), measured in rates.items():
         rate = float(np.median(measured))
         minutes = 80_000 / rate / 60
         found[f"{name}_{count}_decisions_a_second"] = rate
         found[f"{name}_{count}_80000_min"] = minutes
-        lines.append(
-            f"| {name} | {np.median(alone[name]):.1f} ms | {np.median(updates):.1f} ms | {count} "
-            f"| {rate:.1f} decisions/s ({min(measured):.1f} to {max(measured):.1f}) "
-            f"| {minutes:.0f} min |"
+        rows.append(
+            (name, f"{np.median(alone[name]):.1f} ms", f"{np.median(updates):.1f} ms", count)
+            + (f"{rate:.1f} decisions/s ({min(measured):.1f} to {max(measured):.1f})",)
+            + (f"{minutes:.0f} min",)
         )
     cutting, spring = SIMULATORS
     taken = []
@@ -243,9 +237,13 @@ def main() -> None:
         taken.append(
             f"{np.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f}) with {count}"
         )
-    if options.json is not None:
-        write_results(options.json, found)
-    lines += [
+    write_results(options, found)
+    lines = [
+        table(
+            "simulator | simulating a decision | an update | environments | training"
+            " | 80,000 decisions",
+            rows,
+        ),
         "",
         f"Medians of {options.rounds} rounds, least and greatest in brackets. The cutting "
         f"simulator takes {' and '.join(taken)} times as long as the spring. A decision of the "
@@ -253,10 +251,7 @@ def main() -> None:
         "",
         *shares(options.rounds),
         "",
-        f"`{command}`, {os.cpu_count()} cores.",
+        f"`{options.command}`, {os.cpu_count()} cores.",
     ]
     PLACE.show(options.output, lines)
-
-
-if __name__ == "__main__":
-    main()
+    return 0

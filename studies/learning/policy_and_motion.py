@@ -1,31 +1,22 @@
 """A trained policy beside a motion that was optimised without learning.
 
-    python studies/learning/policy_and_motion.py models/policies/cutting_0 --output docs/learning.md
-
 For each food a press and draw is optimised on the calibrated model (`sliceit optimize-motion`), in
 as much time as the policy took, and cut by a stiff position controller; the policy decides by what
 it feels. Both cut the same slices of the stand-in world, whose foods differ from the calibrated
 ones. Metrics are those of `sliceit evaluate`.
-
---output puts the table into a Markdown file, between the lines
-  <!-- policy_and_motion -->
-  <!-- end of policy_and_motion -->
 """
 
 import argparse
 import copy
 import dataclasses as dc
-import shlex
-import sys
 from pathlib import Path
 
 import numpy as np
-import warp
 from tqdm import tqdm
 
 from sliceit_drake.cli.evaluate import FOODS
 from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
-from sliceit_drake.cutting.foods.food import make_food_model
+from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model
 from sliceit_drake.cutting.motion import Hold, MotionPlan, PressAndDraw
 from sliceit_drake.cutting.motion_optimization import MotionLimits, optimize_motion
 from sliceit_drake.diagrams.run import prepare_run, simulate
@@ -37,8 +28,10 @@ from sliceit_drake.stand_in.slicing_worlds import StandInWorld
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
 from sliceit_drake.systems.exported_network import load_network
 from studies.marked_page import Place
+from studies.pages import table
 
-warp.config.log_level = warp.LOG_ERROR
+__all__ = ["PLACE", "add_arguments", "run"]
+
 PLACE = Place("policy_and_motion")
 STIFF = "scenarios/cucumber.yaml"
 """Whose controller tracks the motion."""
@@ -63,6 +56,7 @@ def cut_by_motion(
 ) -> SliceMetrics:
     """One slice by a motion from the start to the board."""
     scenario.controller = stiff
+    assert isinstance(scenario.food, Food) and isinstance(scenario.food.shape, Cylinder)
     height = scenario.food.shape.diameter + scenario.start.clearance
     down = dc.replace(motion, distance=height + BELOW)
     scenario.motion = MotionPlan([down, Hold(0.3)])
@@ -77,7 +71,7 @@ def cut_by_motion(
     return slice_metrics(record["time"], force("food"), force("board"), record["cut_progress"], end)
 
 
-def row(kind: str, found: list[SliceMetrics]) -> str:
+def row(kind: str, found: list[SliceMetrics]) -> list[str]:
     """Means over slices."""
     done = sum(each.completed for each in found)
     means = [
@@ -89,30 +83,26 @@ def row(kind: str, found: list[SliceMetrics]) -> str:
             ("duration", "s"),
         )
     ]
-    return f"{kind} | {done} of {len(found)} | {' | '.join(means)} |"
+    return [kind, f"{done} of {len(found)}", *means]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
     parser.add_argument("policy", type=Path, help="folder of a training")
-    parser.add_argument("--foods", nargs="+", choices=FOODS, default=list(FOODS))
+    parser.add_argument("--foods", nargs="+", choices=FOODS, default=list(FOODS), help="all")
     parser.add_argument("--slices", type=int, default=3, help="of each food; 3")
-    parser.add_argument("--output", type=Path, help="Markdown file with the two lines")
-    options = parser.parse_args()
+    PLACE.add_argument(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
     PLACE.check(options.output)
     from sliceit_drake.learning.training import POLICY, load_policy_folder
 
     config = load_policy_folder(options.policy)
     agent = dc.replace(config.task.agent, network=str(options.policy / POLICY))
     decide, stiff = load_network(agent), load_scenario(resource_path(STIFF)).controller
-    lines = [
-        "A policy and such a motion beside each other:",
-        "",
-        "| food | by | completed | median force | peak | board's peak | duration |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    rows = []
     for food in tqdm(options.foods, desc="foods"):
         scenarios = [StandInWorld().scenario(food, k)[0] for k in range(options.slices)]
         agents = [cut_slice(copy.deepcopy(each), agent, decide).metrics for each in scenarios]
@@ -124,11 +114,13 @@ def main() -> None:
             f"motion: {1e3 * motion.press_speed:.0f} mm/s down, {1e3 * motion.amplitude:.0f} mm at "
             f"{motion.frequency:.1f} Hz"
         )
-        lines += [f"| {food} | {row('policy', agents)}", f"| | {row(what, planned)}"]
-    command = shlex.join(["python", "studies/learning/policy_and_motion.py", *sys.argv[1:]])
-    lines += ["", f"`{command}`: means of {options.slices} slices of the stand-in world."]
+        rows += [[food, *row("policy", agents)], ["", *row(what, planned)]]
+    lines = [
+        "A policy and such a motion beside each other:",
+        "",
+        table("food | by | completed | median force | peak | board's peak | duration", rows),
+        "",
+        f"`{options.command}`: means of {options.slices} slices of the stand-in world.",
+    ]
     PLACE.show(options.output, lines)
-
-
-if __name__ == "__main__":
-    main()
+    return 0

@@ -1,28 +1,23 @@
 """What of the agent matters: trains variants and lets them cut.
 
-    python studies/learning/slicing_ablations.py --folder output/ablations --output docs/learning.md
-
 Each variant is `sliceit train` with one thing changed, on the same seed, then `sliceit evaluate` in
 the world of measured curves. Both go on where they were stopped; finished variants are not trained
 again, and a folder can hold a training that was made elsewhere. One seed: only great differences
 count.
-
---output puts the table into a Markdown file, between the lines
-  <!-- slicing_ablations -->
-  <!-- end of slicing_ablations -->
 """
 
 import argparse
 import collections
 import json
-import shlex
-import sys
 from pathlib import Path
 
 import numpy as np
 
 from sliceit_drake.cli.main import main as sliceit
 from studies.marked_page import Place
+from studies.pages import table
+
+__all__ = ["PLACE", "add_arguments", "run"]
 
 VARIANTS = {
     "as it is": "{}",
@@ -54,7 +49,7 @@ def returns(folder: Path) -> np.ndarray:
     return np.array([json.loads(line)["return"] for line in lines[-LAST:]])
 
 
-def row(variant: str, folder: Path, cuts: list[dict]) -> str:
+def row(variant: str, folder: Path, cuts: list[dict]) -> list[str]:
     """A variant's line of the table."""
     by_food = collections.defaultdict(list)
     for cut in cuts:
@@ -65,19 +60,20 @@ def row(variant: str, folder: Path, cuts: list[dict]) -> str:
         forces = [cut["median_force"] for cut in by_food[food]]
         cells.append(f"{np.mean(forces):.1f} N" if forces else "-")
     cells.append(f"{np.mean([cut['board_peak'] for cut in by_food['cucumber']]):.1f} N")
-    return "| " + " | ".join(cells) + " |"
+    return cells
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
     parser.add_argument("--folder", type=Path, required=True, help="where trainings are kept")
     parser.add_argument("--steps", type=int, default=15_000, help="of most trainings; 15000")
     parser.add_argument("--seed", type=int, default=0, help="of all of them; 0")
     parser.add_argument("--slices", type=int, default=5, help="of each food; 5")
-    parser.add_argument("--output", type=Path, help="Markdown file with the two lines")
-    options = parser.parse_args()
+    PLACE.add_argument(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
     PLACE.check(options.output)
     evaluation = options.folder / "evaluation.jsonl"
     folders = {variant: options.folder / slug(variant) for variant in VARIANTS}
@@ -99,21 +95,17 @@ def main() -> int:
         f"What of the agent matters, one thing changed at a time; {options.steps} decisions where "
         "no other number stands:",
         "",
-        "| variant | return of the last slices | completed | cucumber | tomato | potato | carrot "
-        "| board's peak, cucumber |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for variant, folder in folders.items():
-        lines.append(row(variant, folder, [c for c in cuts if c["policy"] == str(folder)]))
-    command = shlex.join(["python", "studies/learning/slicing_ablations.py", *sys.argv[1:]])
-    lines += [
+        table(
+            "variant | return of the last slices | completed | cucumber | tomato | potato | carrot"
+            " | board's peak, cucumber",
+            (
+                row(variant, folder, [c for c in cuts if c["policy"] == str(folder)])
+                for variant, folder in folders.items()
+            ),
+        ),
         "",
         f"Means of the median force, {options.slices} slices of each food in the world of measured "
-        f"curves, seed {options.seed}. `{command}`",
+        f"curves, seed {options.seed}. `{options.command}`",
     ]
     PLACE.show(options.output, lines)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,18 +1,12 @@
-"""Why slices stay unfinished: python studies/learning/unfinished_slices.py EVALUATION [--output FILE].
+"""Why slices stay unfinished.
 
 Cuts again each slice of `sliceit evaluate` that was not completed on one board, and says what the
 knife and the policy did in its last seconds.
-
---output puts the table into a Markdown file, between the lines
-  <!-- unfinished_slices -->
-  <!-- end of unfinished_slices -->
 """
 
 import argparse
 import dataclasses as dc
 import json
-import shlex
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -21,13 +15,16 @@ from tqdm import tqdm
 from sliceit_drake.cli.evaluate import Case, trace
 from sliceit_drake.systems.agent import ACTIONS, AgentConfig
 from studies.marked_page import Place
+from studies.pages import table
+
+__all__ = ["PLACE", "add_arguments", "run"]
 
 PLACE = Place("unfinished_slices")
 LAST = 5.0
 """How long before the end is looked at, s."""
 
 
-def row(case: Case) -> str:
+def row(case: Case) -> list[str]:
     """A slice's line of the table."""
     cut = trace(case)
     count = round(LAST / AgentConfig().period)
@@ -36,7 +33,7 @@ def row(case: Case) -> str:
     draw = actions[:, ACTIONS.index("draw")]
     force = (cut.food + cut.board)[cut.time > cut.time[-1] - LAST]
     along = np.hypot(force[:, 0], force[:, 1]).mean()
-    cells = [
+    return [
         Path(case.policy).name,
         case.world.replace("_", "-"),
         f"{case.food} {case.slice + 1}",
@@ -47,17 +44,17 @@ def row(case: Case) -> str:
         f"{press[0]:+.2f}, {press[1]:+.2f}",
         f"{along:.0f} N, {force[:, 2].mean():.0f} N",
     ]
-    return "| " + " | ".join(cells) + " |"
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
     parser.add_argument("evaluation", type=Path, help="what `sliceit evaluate` wrote")
     parser.add_argument("--board-stiffness", type=float, default=3e4, help="N/m; 3e4")
-    parser.add_argument("--output", type=Path, help="Markdown file with the two lines")
-    options = parser.parse_args()
+    PLACE.add_argument(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
     PLACE.check(options.output)
     names = [field.name for field in dc.fields(Case)]
     rows = [
@@ -70,17 +67,13 @@ def main() -> int:
         f"{options.board_stiffness / 1e3:g} kN/m are unfinished. What happened in their last "
         f"{LAST:g} s:",
         "",
-        "| policy | world | slice | ended by | cut | edge over the board | draw "
-        "| mean of press and p_z | mean force along the board, up |",
-        "|---|---|---|---|---|---|---|---|---|",
-        *(row(case) for case in tqdm(cases, desc="slices")),
+        table(
+            "policy | world | slice | ended by | cut | edge over the board | draw"
+            " | mean of press and p_z | mean force along the board, up",
+            map(row, tqdm(cases, desc="slices")),
+        ),
         "",
-        "Actions go from -1 to 1; p_z is the gain downwards. "
-        f"`{shlex.join(['python', 'studies/learning/unfinished_slices.py', *sys.argv[1:]])}`",
+        f"Actions go from -1 to 1; p_z is the gain downwards. `{options.command}`",
     ]
     PLACE.show(options.output, lines)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

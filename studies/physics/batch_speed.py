@@ -1,29 +1,17 @@
 """Slices a second against batch size, on the CPU and on a CUDA device where there is one.
 
-    python studies/physics/batch_speed.py [--output docs/speed.md]
-
 One kernel source for both: on the CPU a slice runs in one thread, on a GPU all cuts of a batch
 advance side by side. The forces of the devices are compared. Without a CUDA device the reason is
 printed, and the CPU is measured alone.
-
---output puts the table into a Markdown file, between the lines
-  <!-- batch_speed -->
-  <!-- end of batch_speed -->
 """
 
 import argparse
 import dataclasses as dc
-import os
-import shlex
-import sys
 import time
-from collections.abc import Sequence
-from pathlib import Path
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import warp as wp
+from tqdm import tqdm
 
 from sliceit_drake.cutting.batch import BatchSimulator
 from sliceit_drake.cutting.foods.food import make_food_model, start_pose
@@ -33,8 +21,11 @@ from sliceit_drake.cutting.parameters import with_parameters
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.resources import resource_path
 from studies.marked_page import Place
+from studies.pages import table
+from studies.results import describe_machine
 
-wp.config.log_level = wp.LOG_ERROR
+__all__ = ["add_arguments", "run"]
+
 PLACE = Place("batch_speed")
 PERIOD = 2e-3
 CPU_BATCHES, GPU_BATCHES = (1, 2, 4, 8, 16), (1, 4, 16, 64, 256, 1024)
@@ -72,43 +63,32 @@ def rate(device: str, count: int, refinement: float, repeats: int) -> tuple[floa
     return count / best, forces, models[0].element_count
 
 
-def measure(options: argparse.Namespace) -> list[str]:
-    """The table."""
-    lines, first, elements = [], None, 0
-    for device in devices():
-        batches = options.batches or (CPU_BATCHES if device == "cpu" else GPU_BATCHES)
-        for count in batches:
-            slices, forces, elements = rate(device, count, options.refinement, options.repeats)
-            first = forces if first is None else first
-            difference = np.sqrt(((forces - first) ** 2).mean() / (first**2).mean())
-            lines.append(f"| {device} | {count} | {slices:.2f} | {100 * difference:.4f} % |")
-            print(lines[-1], flush=True)
-    title = "| device | cuts in one call | slices a second | force against the CPU's, RMS |"
-    caption = f"{elements} tetrahedra, {os.cpu_count()} cores; least of {options.repeats} times."
-    return [title, "|---|---|---|---|", *lines, "", caption]
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Measures, prints and writes."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--output", type=Path, help="Markdown file with the two marks")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
+    PLACE.add_argument(parser)
     parser.add_argument("--batches", type=int, nargs="+", help="cuts in one call")
     parser.add_argument("--refinement", type=float, default=1.0, help="of the mesh (default 1)")
     parser.add_argument("--repeats", type=int, default=3, help="of each time (default 3)")
-    options = parser.parse_args(arguments)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
     PLACE.check(options.output)
-    load = os.getloadavg()[0]
-    lines = measure(options)
-    given = sys.argv[1:] if arguments is None else arguments
-    command = shlex.join(["python", "studies/physics/batch_speed.py", *given])
-    lines.append(f"`{command}`, load {load:.2f} in the minute before.")
+    machine = describe_machine()
+    rows, first, elements = [], None, 0
+    for device in devices():
+        batches = options.batches or (CPU_BATCHES if device == "cpu" else GPU_BATCHES)
+        for count in tqdm(batches, desc=device):
+            slices, forces, elements = rate(device, count, options.refinement, options.repeats)
+            first = forces if first is None else first
+            difference = np.sqrt(((forces - first) ** 2).mean() / (first**2).mean())
+            rows.append((device, count, f"{slices:.2f}", f"{100 * difference:.4f} %"))
+    lines = [
+        table("device | cuts in one call | slices a second | force against the CPU's, RMS", rows),
+        "",
+        f"{elements} tetrahedra; least of {options.repeats} times. `{options.command}`, {machine}.",
+    ]
     if not wp.is_cuda_available():
         lines.append("No CUDA device was at hand: the kernels have not been run on one.")
-    table = "\n".join(lines)
-    print(table)
-    PLACE.write(options.output, table)
+    PLACE.show(options.output, lines)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -6,14 +6,7 @@ kernels for bonds, edge, flanks, friction, board and bending blade, in backward 
 straight press; nothing has mass or viscosity. Times are processor time, the least of several runs.
 That in linear algebra is told apart: a compiled version would keep it, the rest is Python. The
 column "compiled" estimates such a version, see `compiled`.
-
-    python studies/physics/condensed_scheme.py
 """
-
-import os
-
-# As the explicit solver; threads of the linear algebra library count at import.
-os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import argparse
 import contextlib
@@ -38,7 +31,10 @@ from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.resources import resource_path
+from studies.pages import table
 from studies.physics.cutting_speed import CLEARANCE, PERIOD, least_times, sub_step_time, through
+
+__all__ = ["add_arguments", "run"]
 
 SPEED = 0.02
 DEPTH = 0.027
@@ -755,26 +751,30 @@ def compare(name: str, model: CuttingModel, repeats: int) -> None:
         f"explicit sub-step {1e6 * sub_step:.1f} us; points {1e6 * point:.1f} us, elements "
         f"{1e6 * element:.1f} us; a stored entry {1e9 * per_entry:.2f} ns"
     )
-    print(
-        "| scheme | step [ms] | slice [s] | of it linear algebra [s] | compiled (estimate) [s] "
-        "| iterations a step | factors | not converged | error to default | error to 5e-5 s |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|---|")
     step_error = relative(*forces)
-    print(
-        f"| explicit | {1e3 * model.numerics.time_step:g} | {wall:.3f} | | {wall:.3f} | | | | "
-        f"| {step_error:.2f} % |"
-    )
+    whole = f"{wall:.3f}"
+    rows: list[tuple[object, ...]] = [
+        ("explicit", f"{1e3 * model.numerics.time_step:g}", whole, "", whole)
+        + ("", "", "", "", f"{step_error:.2f} %")
+    ]
     for (scheme, step), cut in cuts.items():
         means = exchange_means(cut, len(explicit.time))
         bare = compiled(cut, point, 0.0 if schemes[scheme][0].linear else element, per_entry)
         clock = cut.clock
-        print(
-            f"| {scheme} | {1e3 * step:g} | {cut.wall:.3f} | {clock.seconds.total():.3f} "
-            f"| {bare:.3f} | {cut.iterations / (len(cut.times) - 1):.2f} "
-            f"| {clock.calls['factor'] + clock.calls['update']} | {cut.failures} "
-            f"| {relative(means, forces[0]):.2f} % | {relative(means, forces[1]):.2f} % |"
+        rows.append(
+            (scheme, f"{1e3 * step:g}", f"{cut.wall:.3f}", f"{clock.seconds.total():.3f}")
+            + (f"{bare:.3f}", f"{cut.iterations / (len(cut.times) - 1):.2f}")
+            + (clock.calls["factor"] + clock.calls["update"], cut.failures)
+            + tuple(f"{relative(means, force):.2f} %" for force in forces)
         )
+    print(
+        table(
+            "scheme | step [ms] | slice [s] | of it linear algebra [s] | compiled (estimate) [s]"
+            " | iterations a step | factors | not converged | error to default"
+            " | error to 5e-5 s",
+            rows,
+        )
+    )
     flops = len(condensed.weight) ** 3 / 3.0
     print("\nmean time of an operation [us] in steps of 2 ms:")
     for scheme in list(schemes)[:3]:
@@ -786,9 +786,7 @@ def compare(name: str, model: CuttingModel, repeats: int) -> None:
 
 def scaling(scenario: Scenario, repeats: int) -> None:
     """Prints cost and error against the mesh."""
-    print("\n| tetrahedra | condensed unknowns | condensation [s] | explicit [s] ", end="")
-    print("| condensed [s], 2 ms | compiled | 10 ms | compiled | error, 2 ms | 10 ms |")
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    rows = []
     per_entry = sparse_rate()
     for refinement in REFINEMENTS:
         model = make_food_model(scenario.food, scenario.knife, scenario.numerics, refinement)
@@ -811,18 +809,25 @@ def scaling(scenario: Scenario, repeats: int) -> None:
             c for cut in cuts.values() for c in (cut.wall, compiled(cut, point, 0.0, per_entry))
         ]
         errors = [relative(exchange_means(cut, len(force)), force) for cut in cuts.values()]
-        print(
-            f"| {model.element_count} | {len(bulk.weight)} | {condensing:.3f} | {wall:.3f} | ",
-            end="",
+        rows.append(
+            (model.element_count, len(bulk.weight), f"{condensing:.3f}", f"{wall:.3f}")
+            + tuple(f"{c:.3f}" for c in costs)
+            + tuple(f"{e:.2f} %" for e in errors)
         )
-        print(" | ".join([f"{c:.3f}" for c in costs] + [f"{e:.2f} %" for e in errors]) + " |")
+    head = (
+        "tetrahedra | condensed unknowns | condensation [s] | explicit [s] | condensed [s], 2 ms"
+        " | compiled | 10 ms | compiled | error, 2 ms | 10 ms"
+    )
+    print(f"\n{table(head, rows)}")
 
 
-def main() -> None:
-    """Measures and prints."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
     parser.add_argument("--repeats", type=int, default=3, help="runs, of which the least counts")
-    options = parser.parse_args()
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
     scenario: Scenario = load_scenario(resource_path("scenarios/cucumber.yaml"))
     model = make_food_model(scenario.food, scenario.knife, scenario.numerics)
     soft = dc.replace(model.material, youngs_modulus=SOFT)
@@ -834,7 +839,4 @@ def main() -> None:
     free = make_food_model(one_side, scenario.knife, scenario.numerics)
     compare("cucumber, held on one side", free, options.repeats)
     scaling(scenario, options.repeats)
-
-
-if __name__ == "__main__":
-    main()
+    return 0

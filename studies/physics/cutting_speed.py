@@ -1,10 +1,7 @@
 """Cost of a cut without a robot: slice, sub-step, gradient, against mesh and batch size.
 
 Prints a table and writes a figure; each cost stands beside the error of the same mesh. Times are
-the least of several repeats, taken in turns, since a shared machine only ever adds to them:
-
-    python studies/physics/cutting_speed.py --output docs/figures/cutting_speed.png \
-        --json docs/benchmarks/cutting_speed.json
+the least of several repeats, taken in turns, since a shared machine only ever adds to them.
 """
 
 import argparse
@@ -30,7 +27,10 @@ from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.resources import resource_path
-from studies.results import write_results
+from studies.pages import table
+from studies.results import add_json_argument, write_results
+
+__all__ = ["CLEARANCE", "PERIOD", "add_arguments", "least_times", "run", "sub_step_time", "through"]
 
 PERIOD = 2e-3
 CLEARANCE = 6e-4
@@ -86,13 +86,15 @@ def sub_step_time(solver: CuttingSolver, motion: Motion, repeats: int = 20) -> f
     return best / steps
 
 
-def main() -> None:
-    """Measures and prints."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--output", type=Path, help="figure (.png)")
-    parser.add_argument("--json", type=Path, help="also write the values there")
-    parser.add_argument("--repeats", type=int, default=5)
-    options = parser.parse_args()
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
+    parser.add_argument("--output", metavar="FILE", type=Path, help="figure (.png)")
+    add_json_argument(parser)
+    parser.add_argument("--repeats", type=int, default=5, help="of each time (default 5)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
     scenario: Scenario = load_scenario(resource_path("scenarios/cucumber.yaml"))
     diameter = scenario.food.shape.diameter
     models = {
@@ -147,46 +149,50 @@ def main() -> None:
         f"\nPress cut through {1e3 * diameter:g} mm of cucumber at 20 mm/s, {PERIOD:g} s exchange,"
     )
     print(f"sub-step {base.numerics.time_step:g} s, {base.numerics.precision}, one thread")
-    print("| tetrahedra | sub-step [us] | slice [s] | force error against the finest mesh |")
-    print("|---|---|---|---|")
-    for count, step, total, error in rows:
-        shown = "-" if np.isnan(error) else f"{100 * error:.2f} %"
-        print(f"| {count} | {step:.1f} | {total:.3f} | {shown} |")
+    shown = (
+        (n, f"{step:.1f}", f"{total:.3f}", "-" if np.isnan(error) else f"{100 * error:.2f} %")
+        for n, step, total, error in rows
+    )
+    head = "tetrahedra | sub-step [us] | slice [s] | force error against the finest mesh"
+    print(table(head, shown))
     step_error = difference(results[1.0], exact)
     print(f"\nforce error of the sub-step against 5e-5 s: {100 * step_error:.2f} % RMS")
-    print("\n| tetrahedra | sub-step [s] | slice [s] | force error of the sub-step |")
-    print("|---|---|---|---|")
-    reference_force, errors = reference, {}
+    errors, larger = {}, []
     for (r, step), solver in steppers.items():
         small = dc.replace(base.numerics, time_step=5e-5)
-        reference = simulate_slice(CuttingSolver(models[r].derive(numerics=small), PERIOD), motion)
-        error = errors[r, step] = difference(simulate_slice(solver, motion), reference)
+        stepped = simulate_slice(CuttingSolver(models[r].derive(numerics=small), PERIOD), motion)
+        error = errors[r, step] = difference(simulate_slice(solver, motion), stepped)
         total = times[f"stepped {(r, step)}"]
-        print(f"| {models[r].element_count} | {step:g} | {total:.3f} | {100 * error:.2f} % |")
+        larger.append(
+            (models[r].element_count, f"{step:g}", f"{total:.3f}", f"{100 * error:.2f} %")
+        )
+    head = "tetrahedra | sub-step [s] | slice [s] | force error of the sub-step"
+    print(f"\n{table(head, larger)}")
     ratio = times["gradient"] / times["slice 1.0"]
     print(f"gradient by all parameters and the path: {ratio:.2f} slices")
-    print("\n| cuts in one call | " + " | ".join(f"{w} threads" for w in sorted({1, cores})) + " |")
-    print("|---|" + "---|" * len({1, cores}))
-    for n in BATCHES:
-        shares = [times[f"batch {n} {w}"] / n for w in sorted({1, cores})]
-        print(f"| {n} | " + " | ".join(f"{s:.3f} s a cut" for s in shares) + " |")
-    if options.json is not None:
-        whole, searched = difference(results[1.0], reference_force), (1.0, 1e-3)
-        write_results(
-            options.json,
-            {
-                "tetrahedra": base.element_count,
-                "slice_s": times["slice 1.0"],
-                "sub_step_us": rows[REFINEMENTS.index(1.0)][1],
-                "mesh_error": whole,
-                "step_error": step_error,
-                "search_slice_s": times[f"stepped {searched}"],
-                "search_step_error": errors[searched],
-                "gradient_slices": ratio,
-            },
-        )
+    threads = sorted({1, cores})
+    batches = (
+        (n, *(f"{times[f'batch {n} {w}'] / n:.3f} s a cut" for w in threads)) for n in BATCHES
+    )
+    head = " | ".join(["cuts in one call", *(f"{w} threads" for w in threads)])
+    print(f"\n{table(head, batches)}")
+    searched = (1.0, 1e-3)
+    write_results(
+        options,
+        {
+            "tetrahedra": base.element_count,
+            "slice_s": times["slice 1.0"],
+            "sub_step_us": rows[REFINEMENTS.index(1.0)][1],
+            "mesh_error": difference(results[1.0], reference),
+            "step_error": step_error,
+            "search_slice_s": times[f"stepped {searched}"],
+            "search_step_error": errors[searched],
+            "gradient_slices": ratio,
+        },
+    )
     if options.output:
-        plot(rows, times, sorted({1, cores}), options.output)
+        plot(rows, times, threads, options.output)
+    return 0
 
 
 def plot(rows: list, times: dict[str, float], workers: list[int], file: Path) -> None:
@@ -209,7 +215,3 @@ def plot(rows: list, times: dict[str, float], workers: list[int], file: Path) ->
     for axes in (mesh, batch):
         axes.grid(alpha=0.25)
     figure.savefig(file, dpi=150)
-
-
-if __name__ == "__main__":
-    main()

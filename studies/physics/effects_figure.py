@@ -3,8 +3,6 @@
 A bar of 24 x 20 mm is pressed open 14 mm deep, the knife rests for half a second and is withdrawn.
 Each panel is the base model and the same cut with one effect of a plausible size, over the depth
 that is commanded; for what only a draw shows the knife is drawn as well, by twice its press.
-
-    python studies/physics/effects_figure.py
 """
 
 import argparse
@@ -12,6 +10,7 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+from tqdm import tqdm
 
 from sliceit_drake.cutting.batch import BatchSlice, simulate_batch
 from sliceit_drake.cutting.foods.effects import (
@@ -91,14 +90,19 @@ def draw(
     axes.plot(x, force, **style)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
     parser.add_argument(
-        "--output", type=Path, default=Path("docs/figures/effects.png"), help="figure"
+        "--output",
+        metavar="FILE",
+        type=Path,
+        default=Path("docs/figures/effects.png"),
+        help="figure; default docs/figures/effects.png",
     )
-    arguments = parser.parse_args()
-    from tqdm import tqdm
 
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
     food = Food(
         shape=Box(size=[WIDTH, 0.1, HEIGHT], divisions=[8, 8], layers=[0.0, 0.003, 0.006, 0.012]),
         material=Material(youngs_modulus=2e6, toughness=300.0, friction=0.05),
@@ -114,8 +118,9 @@ def main() -> None:
             PERIOD,
             progress=lambda done: bar.update(done - bar.n),
         )
-    figure_of(cuts, drawn, arguments.output)
-    print(f"wrote {arguments.output}")
+    figure_of(cuts, drawn, options.output)
+    print(f"wrote {options.output}")
+    return 0
 
 
 def figure_of(cuts: list[BatchSlice], drawn: list[bool], output: Path) -> None:
@@ -165,7 +170,3 @@ def figure_of(cuts: list[BatchSlice], drawn: list[bool], output: Path) -> None:
     )
     output.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(output, dpi=160)
-
-
-if __name__ == "__main__":
-    main()

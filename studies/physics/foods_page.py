@@ -1,4 +1,4 @@
-"""Tables of docs/foods.md: python studies/physics/foods_page.py [--cut] [--output docs/foods.md].
+"""Tables of foods and knives, for docs/foods.md.
 
 Foods and knives are read from calibration/foods and calibration/knives. --cut presses knives
 through foods as well, without a robot, which takes a minute. --output puts the tables into a
@@ -11,7 +11,6 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-import warp
 
 from sliceit_drake.cutting.foods.calibrated_food import calibrated_food_names, load_calibrated_food
 from sliceit_drake.cutting.foods.food import (
@@ -30,12 +29,30 @@ from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.resources import resource_path
 from studies.marked_page import Place
+from studies.pages import table
+
+__all__ = ["add_arguments", "cuts_table", "foods_table", "knives_table", "run"]
 
 PERIOD, SPEED, CLEARANCE = 2e-3, 0.02, 1e-3
 
 
-def row(*cells: object) -> str:
-    return "| " + " | ".join(str(cell) for cell in cells) + " |"
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
+    parser.add_argument("--cut", action="store_true", help="press knives through foods too")
+    parser.add_argument("--output", type=Path, metavar="FILE", help="page to write into")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
+    tables = {"foods": foods_table(), "knives": knives_table()}
+    if options.cut:
+        tables["cuts"] = cuts_table(options.command)
+    for name in tables:
+        Place(name).check(options.output)
+    print("\n\n".join(tables.values()))
+    for name, text in tables.items():
+        Place(name).write(options.output, text)
+    return 0
 
 
 def shape(food: Food) -> str:
@@ -52,18 +69,14 @@ def shape(food: Food) -> str:
 
 
 def foods_table() -> str:
-    lines = [
-        row("food", "shape [mm]", "E [MPa]", "nu", "kg/m3", "R [J/m2]", "mu", "from", "error"),
-        row(*["---"] * 9),
-    ]
-    notes = []
+    rows, notes = [], []
     for name in calibrated_food_names():
         entry = load_calibrated_food(name)
         material = entry.food.material
         recorded = entry.rms_error is not None
         error = f"{entry.rms_error:.2f} N, {entry.held_out_error:.2f} N" if recorded else "unknown"
-        lines.append(
-            row(
+        rows.append(
+            (
                 name,
                 shape(entry.food),
                 f"{1e-6 * material.youngs_modulus:.3g}",
@@ -79,21 +92,17 @@ def foods_table() -> str:
             sources = "".join(f"\n  - {source}" for source in entry.records)
             notes.append(f"- **{name}**: {entry.note} Sources:{sources}")
     legend = "R: toughness. mu: friction on the blade. Error: RMS on the record, and held out."
-    lines += ["", legend, "", *notes]
-    return "\n".join(lines)
+    head = "food | shape [mm] | E [MPa] | nu | kg/m3 | R [J/m2] | mu | from | error"
+    return "\n".join([table(head, rows), "", legend, "", *notes])
 
 
 def knives_table() -> str:
-    lines = [
-        row("knife", "spine [mm]", "edge [mm]", "height [mm]", "length [mm]", "degrees a side"),
-        row(*["---"] * 6),
-    ]
-    notes = []
+    rows, notes = [], []
     for name in knife_names():
         entry = load_knife(name)
         knife = entry.knife
-        lines.append(
-            row(
+        rows.append(
+            (
                 name,
                 f"{1e3 * knife.spine_thickness:.3g}",
                 f"{1e3 * knife.edge_thickness:.2g}",
@@ -108,7 +117,8 @@ def knives_table() -> str:
         sources = "".join(f"\n  - {', '.join(f)}: {text}" for text, f in by_text.items())
         notes.append(f"- **{name}**: {entry.note or 'one knife.'}{sources}")
     edge = "Edge: thickness where the bevel begins. Height: from the edge to the spine."
-    return "\n".join([*lines, "", edge, "", *notes])
+    head = "knife | spine [mm] | edge [mm] | height [mm] | length [mm] | degrees a side"
+    return "\n".join([table(head, rows), "", edge, "", *notes])
 
 
 def bevel(knife: Knife) -> float:
@@ -116,25 +126,23 @@ def bevel(knife: Knife) -> float:
     return float(np.degrees(np.arctan2(0.5 * knife.edge_thickness, knife.tip_height)))
 
 
-def cuts_table() -> str:
-    lines = [
-        row("food", "held", "knife", "peak [N]", "work [J/m2]", "of it friction"),
-        row(*["---"] * 6),
-    ]
+def cuts_table(command: str) -> str:
+    rows = []
     for scenario in ("cucumber", "cucumber_end_slice", "apple"):
         loaded = load_scenario(resource_path(f"scenarios/{scenario}.yaml"))
         for sides in (loaded.food.held_sides,) if scenario != "apple" else ("plus", "both"):
             loaded.food.held_sides = sides
-            lines += _cuts(loaded)
-    command = (
-        "`python studies/physics/foods_page.py --cut --output docs/foods.md`: pressed through at\n"
+            rows += _cuts(loaded)
+    how = (
+        f"`{command}`: pressed through at\n"
         f"{SPEED:g} m/s without a robot. A knife that is lower than the food is left out."
     )
-    return "\n".join([*lines, "", command])
+    head = "food | held | knife | peak [N] | work [J/m2] | of it friction"
+    return "\n".join([table(head, rows), "", how])
 
 
-def _cuts(scenario: Scenario) -> list[str]:
-    lines = []
+def _cuts(scenario: Scenario) -> list[tuple[str, ...]]:
+    rows = []
     for name in knife_names():
         knife = load_knife(name).knife
         model = make_food_model(scenario.food, knife, scenario.numerics)
@@ -148,27 +156,5 @@ def _cuts(scenario: Scenario) -> list[str]:
         held = "on both sides" if scenario.food.held_sides == "both" else "on one side"
         share = 100.0 * result.ledger.friction / work
         cells = (f"{force:.1f}", f"{work / model.section_area:.0f}", f"{share:.0f} %")
-        lines.append(row(scenario.food.name, held, name, *cells))
-    return lines
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--cut", action="store_true", help="press knives through foods too")
-    parser.add_argument("--output", type=Path, metavar="FILE", help="page to write into")
-    options = parser.parse_args()
-    warp.config.log_level = warp.LOG_ERROR
-    tables = {"foods": foods_table(), "knives": knives_table()}
-    if options.cut:
-        tables["cuts"] = cuts_table()
-    print("\n\n".join(tables.values()))
-    for name in tables:
-        Place(name).check(options.output)
-    for name, text in tables.items():
-        Place(name).write(options.output, text)
-
-
-if __name__ == "__main__":
-    main()
+        rows.append((scenario.food.name, held, name, *cells))
+    return rows

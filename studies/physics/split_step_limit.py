@@ -3,8 +3,6 @@
 Each plane through a box, a cylinder or an ellipsoid gives a cutting model; its limit with the true
 masses (`CuttingModel.critical_time_step`) is compared with that of the whole, uncut body. Terms are
 told apart by computing the limit with the bulk and one of them alone.
-
-    python studies/physics/split_step_limit.py --planes 1000
 """
 
 import argparse
@@ -83,13 +81,20 @@ def random_planes(mesh: TetrahedralMesh, count: int, seed: int) -> list[CutPlane
     return planes
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
     parser.add_argument("--planes", type=int, default=1000, help="random planes in total")
     parser.add_argument(
-        "--output", type=Path, default=Path("docs/figures/split_step_limit.png"), help="figure"
+        "--output",
+        metavar="FILE",
+        type=Path,
+        default=Path("docs/figures/split_step_limit.png"),
+        help="figure; default docs/figures/split_step_limit.png",
     )
-    arguments = parser.parse_args()
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
     material = Material()
 
     relative: dict[str, dict[str, np.ndarray]] = {}
@@ -99,7 +104,7 @@ def main() -> None:
         uncut = whole_body_limit(mesh, material, Numerics())
         middle = CutPlane(mesh.vertices.mean(0), np.array([0.0, 1.0, 0.0]), np.array([0, 0, 1.0]))
         aligned = limits(mesh, middle, material, ("all",))["all"]
-        count = (arguments.planes + len(BODIES) - 1 - index) // len(BODIES)
+        count = (options.planes + len(BODIES) - 1 - index) // len(BODIES)
         planes = random_planes(mesh, count, seed=index)
         rows = [limits(mesh, plane, material, ("all", "bulk")) for plane in planes]
         relative[name] = {key: np.array([row[key] for row in rows]) / uncut for key in rows[0]}
@@ -114,8 +119,9 @@ def main() -> None:
                 f"  plane {worst}: all {relative[name]['all'][worst]:.3f}; with one term: {shares}"
             )
 
-    draw(relative, arguments.output)
-    print(f"wrote {arguments.output}")
+    draw(relative, options.output)
+    print(f"wrote {options.output}")
+    return 0
 
 
 def draw(relative: dict[str, dict[str, np.ndarray]], output: Path) -> None:
@@ -137,7 +143,3 @@ def draw(relative: dict[str, dict[str, np.ndarray]], output: Path) -> None:
     axes.legend(loc="upper left")
     output.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(output, dpi=160)
-
-
-if __name__ == "__main__":
-    main()

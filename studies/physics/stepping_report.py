@@ -1,5 +1,12 @@
-"""The study of the sub-step in scenarios: their foods, a run in the station, figure and CSV."""
+"""How far the force depends on the food's sub-step, and what the step costs.
 
+Presses, draws and holds in three foods at two speeds with steps of 1e-5 to 1e-3 s: scaled masses
+against true ones where the cut is fast, against the finest step where it is slow; then the cucumber
+scenario in the station. Takes some minutes, --quick ten seconds. docs/stepping.md explains
+what comes out.
+"""
+
+import argparse
 import copy
 import csv
 import dataclasses as dc
@@ -7,6 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from tqdm import tqdm
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.food import Food
@@ -14,18 +22,97 @@ from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagrams.run import prepare_run, simulate
-from sliceit_drake.diagrams.scenario import Scenario
+from sliceit_drake.diagrams.scenario import Scenario, load_scenario
+from sliceit_drake.resources import resource_path
+from studies.physics import stepping as study
 from studies.physics.stepping import StepCost, StepResult
 
 __all__ = [
     "StationStep",
+    "add_arguments",
     "held_half_way",
     "plot_stepping",
+    "run",
     "sliced_food",
     "station_steps",
     "station_table",
     "write_stepping",
 ]
+
+
+FOODS = ("cucumber", "potato_sequence", "tomato_sequence")
+STATION_STEPS = (5e-5, 1e-4, 2.5e-4, 5e-4, 1e-3)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
+    parser.add_argument(
+        "--output",
+        metavar="FOLDER",
+        type=Path,
+        help="also write stepping.md, stepping.csv and stepping.png there",
+    )
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="cucumber at 100 mm/s against scaled masses at 1e-4 s, without the station",
+    )
+    parser.add_argument(
+        "--coarse",
+        action="store_true",
+        help="steps from 5e-5 s against scaled masses at that step, a sixth of the time",
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
+    scenarios = [
+        load_scenario(resource_path(f"scenarios/{name}.yaml"))
+        for name in (FOODS[:1] if options.quick else FOODS)
+    ]
+    foods = [sliced_food(scenario) for scenario in scenarios]
+    steps = study.STEPS[3 if options.quick else 2 if options.coarse else 0 :]
+    cases = study.stepping_cases(foods, (0.1,) if options.quick else (0.02, 0.1))
+    if options.quick or options.coarse:
+        cases = [dc.replace(case, true_masses=False) for case in cases]
+    with _bar("cuts") as bar:
+        results = study.stepping_study(cases, steps, progress=_mover(bar))
+    with _bar("costs") as bar:
+        costs = study.step_costs(foods, steps, progress=_mover(bar))
+    tables = [
+        study.error_table(results),
+        study.largest_table(results),
+        study.inertia_table(results),
+        study.hold_table(results),
+        study.mass_table(results),
+        study.cost_table(costs),
+    ]
+    if not options.quick:
+        cut = scenarios[0]
+        stations = []
+        for name, scenario in (
+            (cut.name, cut),
+            (f"{cut.name}, held half way", held_half_way(cut)),
+        ):
+            with _bar(f"station, {name}") as bar:
+                stations.append((name, station_steps(scenario, STATION_STEPS, _mover(bar))))
+        tables.append(station_table(stations))
+    text = "\n\n".join(tables) + "\n"
+    print(text)
+    if options.output is not None:
+        options.output.mkdir(parents=True, exist_ok=True)
+        (options.output / "stepping.md").write_text(text, encoding="utf-8")
+        write_stepping(results, costs, options.output / "stepping.csv")
+        plot_stepping(results, costs, options.output / "stepping.png")
+    return 0
+
+
+def _bar(name: str) -> "tqdm[None]":
+    return tqdm(total=100.0, desc=name, bar_format="{l_bar}{bar}| {elapsed}<{remaining}")
+
+
+def _mover(bar: "tqdm[None]") -> Callable[[float], None]:
+    return lambda share: (bar.update(100.0 * share - bar.n), None)[1]
 
 
 @dc.dataclass

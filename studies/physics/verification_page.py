@@ -1,17 +1,34 @@
-"""docs/verification.md: a page rendered from the results of the verification, and its figures."""
+"""The cutting physics against exact solutions, finer computations and the measured cuts.
 
+Prints the page that docs/verification.md holds; takes a few minutes. With --output it also writes
+the numbers beside it (.json) and the figures (figures/verification_*.png). Ends with status 1 if
+a number is beyond its limit.
+"""
+
+import argparse
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
+from sliceit_drake.resources import resource_path
+from studies.physics import measured_curves as curves
 from studies.physics.measured_curves import MeasuredCut
-from studies.physics.verification import limits
+from studies.physics.verification import CHECKS, limits, run_verification
 
-__all__ = ["plot_convergence", "plot_measured_cuts", "verification_page"]
+__all__ = [
+    "add_arguments",
+    "plot_convergence",
+    "plot_measured_cuts",
+    "run",
+    "verification_page",
+]
 
 COMMAND = "python -m studies verification --output docs/verification.md"
+FOODS = "calibration/verification_foods.yaml"
 CURVES = ("measured", "DiSECt", "spring", "ours")
 
 PAGE = """\
@@ -171,6 +188,52 @@ Published values for toughness itself: potato 1,230 and 1,350 J/m2 (two cultivar
 compression until tubers crack (Schoorl and Holt 1983, J. Texture Stud.), which is more than the
 whole work of the measured cut; we know of none for cucumber or tomato flesh.
 """
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
+    parser.add_argument(
+        "--output",
+        metavar="FILE",
+        type=Path,
+        help="write the page there, as docs/verification.md, with its numbers and figures",
+    )
+    parser.add_argument(
+        "--foods", metavar="FILE", type=Path, help=f"fitted foods; default: {FOODS}"
+    )
+    parser.add_argument(
+        "--fit",
+        action="store_true",
+        help="first fit the foods to the measured cuts, some minutes each, and write that file",
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
+    file = options.foods or resource_path(FOODS)
+    foods = curves.load_measured_foods(file)
+    if options.fit:
+        for k, case in enumerate(foods.foods):
+            with tqdm(total=len(curves.STARTS), desc=f"fit of {case.food.name}") as bar:
+                foods.foods[k] = curves.fit_measured_food(case, progress=bar.update)
+        curves.save_measured_foods(foods, file, "python -m studies verification --fit")
+    with tqdm(total=CHECKS + len(foods.foods), desc="checks") as bar:
+        results, cuts = run_verification(foods.foods, lambda: bar.update() and None)
+    page = verification_page(results)
+    print(page)
+    if options.output is not None:
+        output: Path = options.output
+        figures = output.parent / "figures"
+        named = [(case.food.name, cut) for case, cut in zip(foods.foods, cuts, strict=True)]
+        plot_measured_cuts(named, figures / "verification_curves.png")
+        plot_convergence(results, figures / "verification_convergence.png")
+        text = json.dumps(results, indent=1, allow_nan=True)
+        output.with_suffix(".json").write_text(text + "\n", encoding="utf-8")
+        output.write_text(page, encoding="utf-8")
+    missed = [limit.what for limit in limits(results) if not limit.holds]
+    for what in missed:
+        print(f"beyond its limit: {what}")
+    return 1 if missed else 0
 
 
 def verification_page(results: Mapping[str, Any]) -> str:

@@ -1,36 +1,24 @@
-"""Writes docs/benchmarks.md: python studies/project/aims.py. Measures nothing.
+"""Writes docs/benchmarks.md: each aim of the project with the value that was measured last.
 
-Each aim of the project with the value that its command last wrote, into a page or a JSON file of
-docs. A test fails where the page is not what this makes of them.
+It measures nothing: values are those that the studies wrote into a page or a JSON file of docs. A
+test fails where the page is not what this makes of them.
 """
 
+import argparse
 import dataclasses as dc
 import json
 import re
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from studies.learning.comparison import PAPER
+from studies.pages import render
 
-__all__ = ["Row", "page"]
+__all__ = ["Row", "add_arguments", "page", "run"]
 
 ROOT = Path(__file__).resolve().parents[2]
 NOT_MEASURED = "not measured"
-
-HEAD = """\
-# Aims and what is reached
-
-Written by
-
-    python studies/project/aims.py
-
-from what the commands in the tables wrote last; it measures nothing itself. "Not measured" means
-that no value of that command is kept in these pages. Times are of shared servers and hold for the
-machine of their command only; each speed stands beside the error and the number of tetrahedra of
-the same run. All is simulated.
-"""
 
 
 @dc.dataclass(frozen=True)
@@ -53,14 +41,14 @@ class Row:
     command: str
     source: str
 
-    def cells(self) -> str:
-        """A line of a table."""
+    def cells(self) -> tuple[str, ...]:
+        """A row of a table."""
         if self.value is None:
             verdict, value = "-", NOT_MEASURED
         else:
             verdict, value = ("reached" if self.met else "**missed**"), self.value
         name = f"[{Path(self.source).name}]({self.source})" if self.value else ""
-        return f"| {self.what} | {self.aim} | {value} | {verdict} | `{self.command}` | {name} |"
+        return (self.what, self.aim, value, verdict, f"`{self.command}`", name)
 
 
 class Docs:
@@ -153,7 +141,7 @@ def station(docs: Docs) -> tuple[Mapping[str, float], str]:
 
 def speed_rows(docs: Docs) -> Iterator[Row]:
     """Aims for the simulation's cost."""
-    command = "python studies/physics/cutting_speed.py --json docs/benchmarks/cutting_speed.json"
+    command = "python -m studies cutting_speed --json docs/benchmarks/cutting_speed.json"
     values, source = cutting(docs)
     yield measured(
         "27 mm of cucumber, no robot, one core, defaults",
@@ -192,7 +180,7 @@ def speed_rows(docs: Docs) -> Iterator[Row]:
     yield measured(
         "station with arm and control while it cuts, one core",
         ">= 4 times real time",
-        "python studies/robot/station_speed.py --json docs/benchmarks/station_speed.json",
+        "python -m studies station_speed --json docs/benchmarks/station_speed.json",
         source,
         values,
         lambda v: (
@@ -205,7 +193,7 @@ def speed_rows(docs: Docs) -> Iterator[Row]:
     yield measured(
         "from the installed wheel to the first picture, kernels compiled",
         "<= 60 s",
-        "python studies/project/first_run.py --json docs/benchmarks/first_run.json",
+        "python -m studies first_run --json docs/benchmarks/first_run.json",
         "benchmarks/first_run.json",
         values,
         lambda v: (
@@ -220,7 +208,7 @@ def learning_rows(docs: Docs) -> Iterator[Row]:
     """Aims for the cost of learning."""
     values, source = docs.values("learning_speed"), "benchmarks/learning_speed.json"
     command = (
-        "python studies/learning/learning_speed.py --output docs/learning.md "
+        "python -m studies learning_speed --output docs/learning.md "
         "--json docs/benchmarks/learning_speed.json"
     )
 
@@ -262,8 +250,8 @@ USUAL_BOARD = 3e4
 def slicing_rows(docs: Docs) -> Iterator[Row]:
     """Aims for what a policy of the cutting simulator is worth, on the usual board but for one."""
     command = (
-        "python -m studies slicing docs/slicing_evaluation.jsonl --policies models/policies/cutting_0 "
-        "models/policies/spring_0 --output docs"
+        "python -m studies slicing docs/slicing_evaluation.jsonl "
+        "--policies models/policies/cutting_0 models/policies/spring_0 --output docs"
     )
     source = "slicing_results.md"
     facts = docs.facts("slicing_results.json") or []
@@ -368,9 +356,7 @@ def accuracy_rows(docs: Docs) -> Iterator[Row]:
 
 def diagnosis_rows(docs: Docs) -> Iterator[Row]:
     """Aims for the diagnosis."""
-    command = (
-        "python studies/diagnosis/diagnosis_speed.py --json docs/benchmarks/diagnosis_speed.json"
-    )
+    command = "python -m studies diagnosis_speed --json docs/benchmarks/diagnosis_speed.json"
     for key, what, limit in (
         ("cold_s", "diagnosis of 18 records, all causes", 600.0),
         ("warm_s", "the same again, with what it has kept", 60.0),
@@ -411,36 +397,30 @@ SECTIONS = {
 
 def page(folder: Path = ROOT / "docs") -> str:
     """The page of what stands in a folder."""
-    docs, parts, all_rows = Docs(folder), [], []
-    for title, rows_of in SECTIONS.items():
-        rows = list(rows_of(docs))
-        all_rows += rows
-        parts += [
-            f"\n## {title}\n",
-            "| what | aim | value | | measured by | from |",
-            "|---|---|---|---|---|---|",
-            *(row.cells() for row in rows),
-        ]
-    known = [row for row in all_rows if row.value is not None]
+    docs = Docs(folder)
+    sections = {title: list(rows_of(docs)) for title, rows_of in SECTIONS.items()}
+    rows = [row for of_section in sections.values() for row in of_section]
+    known = [row for row in rows if row.value is not None]
     met = sum(bool(row.met) for row in known)
-    count = (
-        f"\nOf {len(all_rows)} aims {met} are reached, {len(known) - met} are missed, "
-        f"{len(all_rows) - len(known)} are not measured."
+    files = sorted((folder / "benchmarks").glob("*.json"))
+    return render(
+        "benchmarks",
+        sections={title: [row.cells() for row in rows] for title, rows in sections.items()},
+        aims=len(rows),
+        met=met,
+        missed=len(known) - met,
+        unknown=len(rows) - len(known),
+        machines={
+            file.name: json.loads(file.read_text(encoding="utf-8"))["machine"] for file in files
+        },
     )
-    machines = []
-    for file in sorted((folder / "benchmarks").glob("*.json")):
-        facts = json.loads(file.read_text(encoding="utf-8"))
-        machines.append(f"- {file.name}: {facts['machine']}")
-    if machines:
-        parts += ["\n## Machines\n", *machines]
-    return "\n".join([HEAD + count, *parts]) + "\n"
 
 
-def main() -> int:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds nothing: the study has no arguments."""
+
+
+def run(options: argparse.Namespace) -> int:
     """Writes the page."""
     (ROOT / "docs" / "benchmarks.md").write_text(page(), encoding="utf-8")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

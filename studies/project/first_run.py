@@ -1,4 +1,4 @@
-"""A newcomer's first run, and a release: python studies/project/first_run.py [--json FILE].
+"""A newcomer's first run, and a release.
 
 Builds source distribution and wheel, installs the wheel into an empty environment outside the
 checkout (from the index that pip is set to), and calls `sliceit` as a user would who has nothing:
@@ -16,7 +16,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from studies.results import write_results
+from studies.results import add_json_argument, write_results
+
+__all__ = ["add_arguments", "run"]
 
 ROOT = Path(__file__).resolve().parents[2]
 SHOW_RECORD = ["diagnose", "calibration/records/cucumber.csv", "--model", "cucumber"]
@@ -29,12 +31,14 @@ COMMANDS = (
     [*SHOW_RECORD, "--output", "diagnosis", "--replicates", "20"],
     ["record", "calibration/protocols/poor.yaml", "--world", "curves", "--output", "records"],
     ["simulate", "scenarios/apple.yaml", "--duration", "0.1", "--no-replay"],
-    *([command, "--help"] for command in ("emulate", "hardware", "train", "study")),
+    *([command, "--help"] for command in ("emulate", "hardware", "train")),
 )
 """What has to work with the wheel alone."""
 
 
-def call(arguments: list[str], **options: object) -> tuple[float, str]:
+def call(
+    arguments: list[str], cwd: Path | None = None, env: dict[str, str] | None = None
+) -> tuple[float, str]:
     """Runs a program; its time, s, and what it prints.
 
     Raises:
@@ -42,7 +46,7 @@ def call(arguments: list[str], **options: object) -> tuple[float, str]:
     """
     begin = time.perf_counter()
     done = subprocess.run(
-        arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options
+        arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=cwd, env=env
     )
     if done.returncode != 0:
         sys.exit(f"{' '.join(arguments)} ended with {done.returncode}:\n{done.stdout}")
@@ -89,19 +93,16 @@ def first_run(folder: Path) -> dict[str, float]:
     return values
 
 
-def main() -> int:
-    """Measures, prints and writes."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--json", type=Path, help="also write the values there")
-    options = parser.parse_args()
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
+    add_json_argument(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
     with tempfile.TemporaryDirectory() as folder:
         values = first_run(Path(folder))
     for name, value in values.items():
         print(f"{name}: {value:.4g}")
-    if options.json is not None:
-        write_results(options.json, values)
+    write_results(options, values)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

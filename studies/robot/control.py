@@ -1,7 +1,14 @@
-"""Stability of compliance control in contact: linear loop against station, and the agent's box."""
+"""How stiff a contact compliance control bears.
 
+Computes the linear loop's limit over error scale x gain and servo lag, simulates the station on
+both sides of it, and runs the station over the SliceIt! agent's whole box of gains on food and
+board. Takes a few minutes. docs/control.md explains what comes out.
+"""
+
+import argparse
 import copy
 import dataclasses as dc
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -11,6 +18,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 from pydrake.systems.framework import Context, DiagramBuilder, State
 from pydrake.systems.primitives import LogVectorOutput
+from tqdm import tqdm
 
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.diagrams.agent_gains import AgentGains, agent_box
@@ -23,17 +31,20 @@ from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 from sliceit_drake.systems.servo import ServoConfig
+from studies.pages import publish
 
 __all__ = [
     "BoxRun",
     "Check",
     "FactorRow",
+    "add_arguments",
     "box_table",
     "check_on_station",
     "check_table",
     "factor_row",
     "factor_table",
     "plot_stability_map",
+    "run",
     "run_in_contact",
     "stability_limits",
     "station_growth",
@@ -48,6 +59,51 @@ BOARD_STIFFNESS = (1e5, 1e6)
 # before torque limits shape it.
 KICK = 1e-6
 LINEAR = 30.0
+LAGS = (0.0, 0.005, 0.02, 0.03, 0.05)
+# Mode, servo lag [s] and error scale x gain of the station's runs.
+CHECKS = (
+    *(("compliance", 0.005, gain) for gain in (0.003, 0.025)),
+    *(("compliance", 0.02, gain) for gain in (0.025, 0.1)),
+    *(("compliance", 0.03, gain) for gain in (0.003, 0.1)),
+    ("compliance", 0.05, 0.1),
+    *(("parallel", 0.005, gain) for gain in (0.003, 0.02)),
+    *(("parallel", 0.02, gain) for gain in (0.03, 0.06)),
+    *(("parallel", 0.03, gain) for gain in (0.01, 0.1)),
+    ("motion", 0.03, 200.0),
+)
+FACTORS = (0.01, 0.03, 0.1, 0.3, 1.0)
+TRACKING = ((0.03, "ideal"), (0.005, "arm"), (0.03, "arm"), (0.03, "servo"))
+BOX_FACTORS, INTERIOR = (0.1, 1.0), 8
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
+    parser.add_argument(
+        "--output", metavar="FOLDER", type=Path, help="also write control.png and control.md there"
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
+    gains = np.geomspace(1e-4, 1.0, 33)
+    cases = [(mode, lag) for mode in ("compliance", "parallel") for lag in LAGS]
+    limits = {(mode, lag): stability_limits(mode, gains, lag) for mode, lag in tqdm(cases, "map")}
+    checks = list(tqdm(check_on_station(CHECKS), "station", total=2 * len(CHECKS)))
+    rows = [
+        factor_row(factor, lag, tracking)
+        for factor, (lag, tracking) in tqdm(list(itertools.product(FACTORS, TRACKING)), "factors")
+    ]
+    box = list(itertools.product(BOX_FACTORS, ("food", "board"), agent_box(INTERIOR)))
+    runs = [
+        run_in_contact(point, factor, contact)
+        for factor, contact, point in tqdm(box, "agent's box")
+    ]
+    text = "\n\n".join([check_table(checks), factor_table(rows), box_table(runs)])
+    folder = options.output
+    publish(text, folder and folder / "control.md")
+    if folder is not None:
+        plot_stability_map(gains, limits, checks, folder / "control.png")
+    return 0
 
 
 def with_lag(scenario: Scenario, lag: float) -> Scenario:

@@ -1,19 +1,52 @@
-"""How much the exchange between food and plant, and the plant's step, matter."""
+"""Error of a run against exchange period and plant step.
 
+Runs a scenario at several of both and prints the difference from the finest. Force and path errors
+are RMS while the food is cut; the path's is relative to the tracking error.
+"""
+
+import argparse
 import copy
 import dataclasses as dc
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
+from tqdm import tqdm
 
+from sliceit_drake.cli.scenario_argument import add_scenario_arguments, scenario_of
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.outputs.run_log import Record
 from sliceit_drake.diagrams.run import prepare_run, simulate
 from sliceit_drake.diagrams.scenario import Scenario
+from studies.pages import publish
 
-__all__ = ["CouplingCase", "coupling_study", "coupling_table"]
+__all__ = ["CouplingCase", "add_arguments", "coupling_study", "coupling_table", "run"]
 
 BIN = 4e-3
+COMBINATIONS = (
+    (4e-3, 1e-3),
+    (2e-3, 1e-3),
+    (2e-3, 2.5e-4),
+    (1e-3, 1e-3),
+    (5e-4, 5e-4),
+    (2.5e-4, 2.5e-4),
+)
+"""Exchange period and plant step, s; the last is the reference."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
+    add_scenario_arguments(parser)
+    parser.add_argument("--output", metavar="FILE", type=Path, help="also write the table there")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
+    scenario = scenario_of(options)
+    with tqdm(total=len(COMBINATIONS), desc="runs") as bar:
+        cases = coupling_study(scenario, COMBINATIONS, lambda done, _: bar.update(done - bar.n))
+    publish(coupling_table(cases), options.output)
+    return 0
 
 
 @dc.dataclass

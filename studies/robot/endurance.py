@@ -1,7 +1,5 @@
 """Memory over an hour of slices.
 
-    python studies/robot/endurance.py --minutes 60 --output docs/endurance.md
-
 One process cuts with one station of the cucumber, in a new context each time, and on a prescribed
 motion with one solver; what it holds of memory is read after each. Then it builds stations and
 drops them. It ends with status 1 if the memory of the last half of the slices grows by more than
@@ -10,9 +8,9 @@ drops them. It ends with status 1 if the memory of the last half of the slices g
 
 import argparse
 import gc
-import shlex
 import sys
 import time
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
@@ -20,13 +18,16 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from tqdm import tqdm
 
-from sliceit_drake.cutting.foods.food import make_food_model, start_pose
+from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.motion import Motion, MotionPlan, PressAndDraw
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
 from sliceit_drake.resources import resource_path
+from studies.pages import publish, render
+
+__all__ = ["add_arguments", "run"]
 
 GROWTH = 10.0
 """Allowed, MB an hour."""
@@ -51,7 +52,7 @@ def growth(hours: np.ndarray, held: np.ndarray) -> float:
     return float(np.polyfit(hours[late], held[late], 1)[0]) if late.sum() > 1 else 0.0
 
 
-def station_slices(scenario: Scenario):
+def station_slices(scenario: Scenario) -> Callable[[], None]:
     """Cuts into the food with one station, in a new context, whenever it is called."""
     diagram = MakeScenarioDiagram(scenario)
     simulator = Simulator(diagram)
@@ -66,8 +67,9 @@ def station_slices(scenario: Scenario):
     return cut
 
 
-def prescribed_slices(scenario: Scenario):
+def prescribed_slices(scenario: Scenario) -> Callable[[], object]:
     """Cuts on a prescribed motion with one solver, whenever it is called."""
+    assert isinstance(scenario.food, Food)
     model = make_food_model(scenario.food, scenario.knife, scenario.numerics, 0.5)
     start = start_pose(model, 2e-3)
     motion = Motion(MotionPlan([PressAndDraw(0.05, 2e-3 + model.top)]), start)
@@ -75,16 +77,21 @@ def prescribed_slices(scenario: Scenario):
     return lambda: simulate_slice(solver, motion)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Runs the benchmark; returns the status."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--output", type=Path, help="page to write")
-    parser.add_argument("--set", dest="overrides", help="fields of the scenario to replace")
-    options = parser.parse_args(arguments)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
+    parser.add_argument("--minutes", type=float, default=60.0, help="that it takes (default 60)")
+    parser.add_argument("--output", metavar="FILE", type=Path, help="page to write")
+    parser.add_argument(
+        "--set", metavar="YAML", dest="overrides", help="fields of the scenario to replace"
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
     scenario = load_scenario(resource_path("scenarios/cucumber.yaml"), options.overrides)
     cut, cut_with_arm = prescribed_slices(scenario), station_slices(scenario)
-    rows, count, slices = [], 0, 0
+    rows: list[tuple[float, float]] = []
+    count = slices = 0
     begin = time.monotonic()
     with tqdm(total=options.minutes, desc="minutes", bar_format="{l_bar}{bar}| {n:.1f}") as bar:
         while (minutes := (time.monotonic() - begin) / 60.0) < options.minutes or not rows:
@@ -102,31 +109,19 @@ def main(arguments: list[str] | None = None) -> int:
     for _ in range(BUILT):
         MakeScenarioDiagram(scenario)
     built = (memory() - before) / BUILT
-    command = shlex.join(["python", "studies/robot/endurance.py", *(arguments or sys.argv[1:])])
-    page = "\n".join(
-        [
-            "# Memory over an hour of slices",
-            "",
-            f"    {command}",
-            "",
-            f"{count} slices with one station and {slices} on a prescribed motion, in one process, "
-            f"in {60.0 * hours[-1]:.1f} minutes. It held {held[0]:.0f} MB after the first, "
-            f"{held[len(held) // 2]:.0f} MB half-way and {held[-1]:.0f} MB at the end: "
-            f"{slope:+.1f} MB an hour over the second half (allowed: {GROWTH:g}).",
-            "",
-            f"A station that is built and dropped leaves {built:.1f} MB behind (mean of {BUILT}; "
-            f"Python {sys.version_info.major}.{sys.version_info.minor}, pydrake "
-            f"{version('drake')}): pydrake does not free systems written in Python (issues 22515 "
-            "and 24162 of Drake). So build a station once and give it new contexts, as the "
-            "learning environment does, or let processes end, as `sliceit evaluate` does.",
-            "",
-        ]
+    page = render(
+        "endurance",
+        command=options.command,
+        station=count,
+        prescribed=slices,
+        minutes=60.0 * hours[-1],
+        held=(held[0], held[len(held) // 2], held[-1]),
+        slope=slope,
+        allowed=GROWTH,
+        left=built,
+        built=BUILT,
+        python=f"{sys.version_info.major}.{sys.version_info.minor}",
+        pydrake=version("drake"),
     )
-    print(page)
-    if options.output is not None:
-        options.output.write_text(page, encoding="utf-8")
+    publish(page, options.output)
     return 0 if slope <= GROWTH else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,7 +1,6 @@
 """How a run of `sliceit hardware` keeps up with the controller's clock: emulator and client, paced.
 
-    python studies/robot/hardware_pace.py
-    python studies/robot/hardware_pace.py scenarios/cucumber.yaml --pace 0.5 0.2 --repeats 5
+  python -m studies hardware_pace scenarios/cucumber.yaml --pace 0.5 0.2 --repeats 5
 
 For each pace and repeat it starts `sliceit emulate` and `sliceit hardware`, each in a process of
 its own, which talk over loopback TCP through ur_rtde, and reads what the run wrote. `sliceit
@@ -17,20 +16,13 @@ The table has a row for each pace:
   force           RMS difference of the sensor's force from `sliceit simulate`, mean and greatest of
                   the completed runs, and as a share of the simulated RMS
   stops           why runs ended early, as the operator reads it, each reason with its count
-
---output puts the table into a Markdown file, between the lines
-  <!-- hardware_pace -->
-  <!-- end of hardware_pace -->
-as docs/hardware.md has them, with the command and the machine.
 """
 
 import argparse
 import collections
 import dataclasses as dc
 import json
-import os
 import re
-import shlex
 import subprocess
 import sys
 import tempfile
@@ -43,16 +35,18 @@ from tqdm import tqdm
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.emulator.process import EmulatorError, EmulatorProcess
 from studies.marked_page import Place
+from studies.pages import table
+from studies.results import describe_machine
+
+__all__ = ["PLACE", "PacedRun", "add_arguments", "run"]
 
 PERIOD = 0.002
 PLACE = Place("hardware_pace")
 SCENARIO = "scenarios/cucumber_spring.yaml"
 ROBOT = "hardware/emulated.yaml"
-QUIET = 0.5
-"""Load of the machine above which its numbers are of other work too."""
-HEADER = """\
-| pace | completed | cycles | missed | late, median | 99 % | max | emulator late | force | stops |
-|---|---|---|---|---|---|---|---|---|---|"""
+HEAD = (
+    "pace | completed | cycles | missed | late, median | 99 % | max | emulator late | force | stops"
+)
 
 
 @dc.dataclass
@@ -151,7 +145,7 @@ def read(file: Path) -> np.ndarray:
     return np.genfromtxt(file, delimiter=",", names=True)
 
 
-def row(pace: float, runs: Sequence[PacedRun]) -> str:
+def row(pace: float, runs: Sequence[PacedRun]) -> list[str]:
     """A row of the table."""
     cycles, missed = sum(run.cycles for run in runs), sum(run.missed for run in runs)
     lateness = np.concatenate([run.lateness for run in runs])
@@ -164,7 +158,7 @@ def row(pace: float, runs: Sequence[PacedRun]) -> str:
         errors, share = [run.force_error for run in done], max(run.force_share for run in done)
         force = f"{np.mean(errors):.3f} N, at most {max(errors):.3f} ({100 * share:.2f} %)"
     stops = collections.Counter(run.stop for run in runs if run.stop)
-    cells = [
+    return [
         f"{pace:g}",
         f"{len(done)} of {len(runs)}",
         str(cycles),
@@ -174,10 +168,9 @@ def row(pace: float, runs: Sequence[PacedRun]) -> str:
         force,
         "; ".join(f"{count} {reason}" for reason, count in stops.items()) or "-",
     ]
-    return f"| {' | '.join(cells)} |"
 
 
-def measure(options: argparse.Namespace) -> list[str]:
+def measure(options: argparse.Namespace) -> list[list[str]]:
     """Rows of the table.
 
     Raises:
@@ -199,11 +192,8 @@ def measure(options: argparse.Namespace) -> list[str]:
     return [row(pace, made) for pace, made in runs.items()]
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Measures and prints."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
     parser.add_argument(
         "scenario", nargs="?", default=SCENARIO, help=f"as of sliceit simulate, default {SCENARIO}"
     )
@@ -216,29 +206,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--address", default="127.0.0.77", help="of the emulator (default 127.0.0.77)"
     )
-    parser.add_argument(
-        "--output", metavar="FILE", type=Path, help="Markdown file with the marking lines"
-    )
-    options = parser.parse_args(arguments)
+    PLACE.add_argument(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
     if options.repeats < 1:
-        parser.error("--repeats: give at least 1")
-    given = sys.argv[1:] if arguments is None else arguments
-    command = shlex.join(["python", "studies/robot/hardware_pace.py", *given])
-    load = os.getloadavg()[0]
-    if load > QUIET:
-        print(f"The machine is busy (load {load:.2f}): the numbers will be of that too.")
+        raise ConfigurationError("is below 1", field="--repeats", fix="Give 1 or more.")
+    PLACE.check(options.output)
+    machine = describe_machine()
     try:
-        PLACE.check(options.output)
         rows = measure(options)
-        machine = f"{os.cpu_count()} cores, load {load:.2f} in the minute before"
-        table = "\n".join([HEADER, *rows, "", f"`{command}`, {machine}."])
-        PLACE.write(options.output, table)
-    except (ConfigurationError, EmulatorError, OSError) as error:
-        print(error, file=sys.stderr)
-        return 2
-    print(table)
+    except EmulatorError as error:
+        raise ConfigurationError(str(error), field=options.scenario) from error
+    PLACE.show(options.output, [table(HEAD, rows), "", f"`{options.command}`, {machine}."])
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,24 +1,48 @@
-"""How the arm follows joint targets, against the two parameters of ``servoj``."""
+"""How the arm follows joint targets, against the two parameters of servoj.
 
+Moves the arm by a ramp and by a step for several of both and prints lag and overshoot.
+"""
+
+import argparse
 import dataclasses as dc
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial, Trajectory
+from tqdm import tqdm
 
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.diagrams.robot import RobotConfig, add_plant, add_robot, connect_arm_controller
 from sliceit_drake.systems.servo import JOINTS, ServoConfig
+from studies.pages import publish
 
-__all__ = ["ServoCase", "servo_study", "servo_table"]
+__all__ = ["ServoCase", "add_arguments", "run", "servo_study", "servo_table"]
 
+LOOKAHEAD_TIMES, GAINS = (0.03, 0.1, 0.2), (100.0, 300.0, 2000.0)
 SPEED = 0.1  # Of the ramp, rad/s.
 STEP = 0.01  # rad; larger ones meet the torque limits at high gains.
 DURATION = 6.0  # s; the least damped case needs most of it.
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
+    parser.add_argument("--output", metavar="FILE", type=Path, help="also write the table there")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
+    configs = [
+        ServoConfig(lookahead_time=time, gain=gain) for time in LOOKAHEAD_TIMES for gain in GAINS
+    ]
+    with tqdm(total=2 * len(configs), desc="runs") as bar:
+        cases = servo_study(configs, lambda done, _: bar.update(done - bar.n))
+    publish(servo_table(cases), options.output)
+    return 0
 
 
 @dc.dataclass

@@ -1,11 +1,12 @@
-"""Real-time factor of the station and where the time goes: python studies/robot/station_speed.py.
+"""Real-time factor of the station and where the time goes.
 
 All numbers come from one process on one core, so their ratios hold on any machine.
 """
 
 import argparse
 import time
-from pathlib import Path
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
@@ -18,7 +19,9 @@ from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.cutting_system import CuttingSystem
-from studies.results import write_results
+from studies.results import add_json_argument, write_results
+
+__all__ = ["add_arguments", "run"]
 
 WARM_UP = 0.7
 DURATION = 1.2
@@ -29,8 +32,8 @@ def station_times(scenario: Scenario) -> tuple[float, float, int]:
     in_food = 0.0
     calls = {name: getattr(CuttingSolver, name) for name in ("exchange", "energies")}
 
-    def timed(name):
-        def call(self, *arguments):
+    def timed(name: str) -> Callable[..., Any]:
+        def call(self: CuttingSolver, *arguments: Any) -> Any:
             nonlocal in_food
             begin = time.perf_counter()
             result = calls[name](self, *arguments)
@@ -75,11 +78,14 @@ def plant_time(scenario: Scenario) -> float:
     return time.perf_counter() - begin
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
     parser.add_argument("--repeat", type=int, default=3, help="runs, of which the fastest counts")
-    parser.add_argument("--json", type=Path, help="also write the values there")
-    options = parser.parse_args()
+    add_json_argument(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
     scenario = load_scenario(resource_path("scenarios/cucumber.yaml"))
     baseline = load_scenario(resource_path("scenarios/cucumber_spring.yaml"))
     # In turns, so that other work on the machine slows all alike.
@@ -106,16 +112,12 @@ def main() -> None:
         print(
             f"  {name:32s} {100 * part / total:5.1f} %  {1e6 * part / DURATION * 2e-3:7.0f} us/2 ms"
         )
-    if options.json is not None:
-        write_results(
-            options.json,
-            {
-                "tetrahedra": elements,
-                "real_time_factor": DURATION / total,
-                "spring_real_time_factor": DURATION / spring,
-            },
-        )
-
-
-if __name__ == "__main__":
-    main()
+    write_results(
+        options,
+        {
+            "tetrahedra": elements,
+            "real_time_factor": DURATION / total,
+            "spring_real_time_factor": DURATION / spring,
+        },
+    )
+    return 0

@@ -1,32 +1,22 @@
-"""What more workers bring: python studies/scaling/scaling.py [--output docs/scaling.md].
+"""What more workers bring.
 
 Runs a calibration's search on a journal file and on PostgreSQL, and records of the stand-in on
 Dask, with 1 and 2 workers of this machine; measures what storage and scheduler carry when nothing
 is simulated; and extrapolates to 1,000 workers by the model that the page states. What a part
 lacks (a PostgreSQL server, Dask) is printed, and the rest is measured.
-
---output puts the tables into a Markdown file, between the lines
-  <!-- scaling -->
-  <!-- end of scaling -->
 """
 
 import argparse
 import copy
 import dataclasses as dc
 import multiprocessing
-import os
 import pickle
-import platform
-import shlex
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import optuna
@@ -40,16 +30,17 @@ from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.protocol import Protocol, load_protocol
 from sliceit_drake.stand_in.session import keep_record, record_session
 from studies.marked_page import Place
+from studies.pages import table
+from studies.results import describe_machine
 from studies.scaling.local_database import NoServerError, local_database
 
-warp.config.log_level = warp.LOG_ERROR
+__all__ = ["PLACE", "DaskRun", "SearchRun", "StorageLimits", "add_arguments", "run"]
+
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 PLACE = Place("scaling")
 FOOD = "cucumber"
 WORKERS = (1, 2)
 MODELLED = (1, 2, 10, 30, 100, 300, 1000)
-QUIET = 0.5
-"""Load of the machine above which its numbers are of other work too."""
 
 
 @dc.dataclass
@@ -315,53 +306,49 @@ def measure_dask(slices: int, tasks: int, folder: Path) -> DaskRun:
 
 def search_tables(runs: dict[str, list[SearchRun]], limits: dict[str, StorageLimits]) -> list[str]:
     """What was measured of searches."""
-    lines = [
-        "| storage | workers | trials | wall [s] | trials a second | speed-up | simulation"
-        " | storage | proposals |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    rows = []
     for name, of_storage in runs.items():
         alone = of_storage[0].trials / of_storage[0].wall
         for run in of_storage:
             rate = run.trials / run.wall
-            parts = " | ".join(
-                f"{1e3 * part:.1f} ms" for part in (run.simulation, run.storage, run.proposal)
+            parts = (run.simulation, run.storage, run.proposal)
+            rows.append(
+                (name, run.workers, run.trials, f"{run.wall:.1f}", f"{rate:.2f}")
+                + (f"{rate / alone:.2f}", *(f"{1e3 * part:.1f} ms" for part in parts))
             )
-            lines.append(
-                f"| {name} | {run.workers} | {run.trials} | {run.wall:.1f} | {rate:.2f} | "
-                f"{rate / alone:.2f} | {parts} |"
-            )
-    lines += [
+    limit_rows = (
+        (name, f"{each.writes[1]:.0f}", f"{each.writes[2]:.0f}", f"{1.0 / each.read:.0f}")
+        + (f"{each.reads:.0f}",)
+        for name, each in limits.items()
+    )
+    return [
+        table(
+            "storage | workers | trials | wall [s] | trials a second | speed-up | simulation"
+            " | storage | proposals",
+            rows,
+        ),
         "",
-        "| storage | written a second, 1 process | 2 processes | read a second, 1 process | 2 |",
-        "|---|---|---|---|---|",
+        table(
+            "storage | written a second, 1 process | 2 processes | read a second, 1 process | 2",
+            limit_rows,
+        ),
     ]
-    for name, limit in limits.items():
-        lines.append(
-            f"| {name} | {limit.writes[1]:.0f} | {limit.writes[2]:.0f} | {1.0 / limit.read:.0f} | "
-            f"{limit.reads:.0f} |"
-        )
-    return lines
 
 
 def dask_table(run: DaskRun) -> list[str]:
     """What was measured of a cluster."""
-    lines = [
-        "| Dask workers | slices | wall [s] | slices a second | speed-up |",
-        "|---|---|---|---|---|",
-    ]
-    for workers, wall in run.walls.items():
-        lines.append(
-            f"| {workers} | {run.slices} | {wall:.1f} | {run.slices / wall:.3f} | "
-            f"{run.walls[1] / wall:.2f} |"
-        )
-    lines += [
+    rows = (
+        (workers, run.slices, f"{wall:.1f}", f"{run.slices / wall:.3f}")
+        + (f"{run.walls[1] / wall:.2f}",)
+        for workers, wall in run.walls.items()
+    )
+    return [
+        table("Dask workers | slices | wall [s] | slices a second | speed-up", rows),
         "",
         f"Scheduler: {run.tasks:.0f} empty tasks a second ({1e3 / run.tasks:.2f} ms a task). A"
         f" record is {run.size / 1e3:.0f} kB, and takes {1e3 * run.write:.1f} ms to write where the"
         " command runs.",
     ]
-    return lines
 
 
 def model_table(
@@ -379,19 +366,16 @@ def model_table(
         rates[f"{name}, trials a second"] = rate
     if dask is not None:
         rates["Dask, slices a second"] = lambda workers: dask_rate(workers, dask)
-    lines = [
-        "| workers | " + " | ".join(rates) + " |",
-        "|---|" + "---|" * len(rates),
+    rows = [
+        (
+            str(n),
+            *(f"{rate(n):.3g} ({100 * rate(n) / n / rate(1):.0f} %)" for rate in rates.values()),
+        )
+        for n in MODELLED
     ]
-    for workers in MODELLED:
-        cells = [
-            f"{rate(workers):.3g} ({100 * rate(workers) / workers / rate(1):.0f} %)"
-            for rate in rates.values()
-        ]
-        lines.append(f"| {workers} | " + " | ".join(cells) + " |")
-    full = [str(saturation(rate)) for rate in rates.values()]
-    lines.append("| **more bring little from** | " + " | ".join(full) + " |")
-    return lines
+    full = (str(saturation(rate)) for rate in rates.values())
+    rows.append(("**more bring little from**", *full))
+    return [table(" | ".join(["workers", *rates]), rows)]
 
 
 @contextmanager
@@ -438,31 +422,18 @@ def measure(options: argparse.Namespace) -> list[str]:
     return [*lines, "", *model_table(runs, limits, dask)]
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Measures, prints and writes."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--output", type=Path, help="Markdown file with the two marks")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
+    PLACE.add_argument(parser)
     parser.add_argument("--trials", type=int, default=100, help="of each search (default 100)")
     parser.add_argument("--slices", type=int, default=12, help="of each session (default 12)")
     parser.add_argument("--tasks", type=int, default=2000, help="empty ones (default 2000)")
     parser.add_argument("--seconds", type=float, default=5.0, help="of each limit (default 5)")
-    options = parser.parse_args(arguments)
-    given = sys.argv[1:] if arguments is None else arguments
-    command = shlex.join(["python", "studies/scaling/scaling.py", *given])
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
     PLACE.check(options.output)
-    load = os.getloadavg()[0]
-    if load > QUIET:
-        print(f"The machine is busy (load {load:.2f}): the numbers will be of that too.")
-    lines = measure(options)
-    machine = f"{os.cpu_count()} cores ({platform.machine()})"
-    busy = f"load {load:.2f} in the minute before"
-    if load > QUIET:
-        busy += ", so that other work is in the numbers and two workers had less than two cores"
-    table = "\n".join([*lines, "", f"`{command}`: {machine}, {busy}."])
-    print(table)
-    PLACE.write(options.output, table)
+    machine = describe_machine()
+    PLACE.show(options.output, [*measure(options), "", f"`{options.command}`: {machine}."])
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

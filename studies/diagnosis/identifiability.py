@@ -1,28 +1,33 @@
-"""`python -m studies identifiability`: which causes which protocol can tell apart."""
-
-import argparse
-import dataclasses as dc
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from sliceit_drake.calibration.setup import CalibrationSetup
-    from sliceit_drake.diagnosis.cause import Cause
-    from sliceit_drake.records.slice_record import SliceRecord
-    from sliceit_drake.stand_in.protocol import Protocol
-    from studies.diagnosis.identifiability_page import Study
-
-__all__ = ["add_identifiability", "nominal_records", "protocol_setup", "study"]
-
-DESCRIPTION = """\
-Compute which causes the slices of a protocol can tell apart, before anything is measured.
+"""Which causes the slices of a protocol can tell apart, before anything is measured.
 
 Takes the motions of the protocols poor, rich and full without noise, computes how each cause would
 change the forces, and the angles between causes after base parameters, differences from slice to
 slice and the discretisation have taken what they can. Takes a few minutes.
 docs/identifiability.md is what comes out.
 """
+
+import argparse
+import dataclasses as dc
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from tqdm import tqdm
+
+from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
+from sliceit_drake.diagnosis.cause import Cause
+from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
+from sliceit_drake.diagnosis.experiments.identifiability import Evidence, identifiability
+from sliceit_drake.diagnosis.registry import load_cause, open_causes
+from sliceit_drake.records.slice_record import SliceRecord
+from sliceit_drake.resources import resource_path
+from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
+from sliceit_drake.stand_in.protocol import Protocol, load_protocol
+from sliceit_drake.stand_in.quiet import records_of_conditions, without_noise
+from sliceit_drake.stand_in.session import Session
+from studies.diagnosis.identifiability_page import Study, plot_angles, report
+from studies.pages import publish
+
+__all__ = ["add_arguments", "nominal_records", "protocol_setup", "run", "study"]
 
 PROTOCOLS = ("poor", "rich", "full")
 BASE = (
@@ -34,14 +39,8 @@ BASE = (
 COARSE_STEP = 1e-3
 
 
-def add_identifiability(studies: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Adds the study."""
-    parser = studies.add_parser(
-        "identifiability",
-        help="which causes a protocol can tell apart",
-        description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
     parser.add_argument("--output", metavar="FILE", type=Path, help="also write the report there")
     parser.add_argument(
         "--figure", metavar="FILE", type=Path, help="draw the angles there, as .png"
@@ -60,13 +59,10 @@ def add_identifiability(studies: "argparse._SubParsersAction[argparse.ArgumentPa
         "--cause", metavar="FILE", action="append", default=[], help="also a cause of your own"
     )
     parser.add_argument("--workers", metavar="N", type=int, help="threads (default: all)")
-    parser.set_defaults(run=_run)
 
 
-def protocol_setup(protocol: "Protocol", refinement: float = 1.0) -> "CalibrationSetup":
+def protocol_setup(protocol: Protocol, refinement: float = 1.0) -> CalibrationSetup:
     """What a calibration on a protocol's slices would start from."""
-    from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
-
     return CalibrationSetup(
         food=protocol.food,
         knife=protocol.knife,
@@ -76,30 +72,26 @@ def protocol_setup(protocol: "Protocol", refinement: float = 1.0) -> "Calibratio
     )
 
 
-def nominal_records(protocol: "Protocol", prefix: str = "") -> "list[SliceRecord]":
+def nominal_records(protocol: Protocol, prefix: str = "") -> list[SliceRecord]:
     """The slices of a protocol without noise and differences, coarsely computed.
 
     Args:
         protocol: What is cut.
         prefix: Of the records' names.
     """
-    from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
-    from sliceit_drake.stand_in.quiet import records_of_conditions, without_noise
-    from sliceit_drake.stand_in.session import Session
-
     settings = FiniteElementSettings(refinement=0.5, time_step=COARSE_STEP, travel=2e-4)
     session = Session(without_noise(protocol, delay=0.0), seed=0, settings=settings)
     return records_of_conditions(session, name=lambda k: f"{prefix}{k:03d}")
 
 
 def study(
-    protocols: "Sequence[Protocol]",
-    causes: "Sequence[Cause]",
+    protocols: Sequence[Protocol],
+    causes: Sequence[Cause],
     refinement: float = 0.75,
     cache: Path | None = None,
     workers: int | None = None,
-    progress: "Callable[[int, int], None] | None" = None,
-) -> "Study":
+    progress: Callable[[int, int], None] | None = None,
+) -> Study:
     """What each of some protocols can tell.
 
     Args:
@@ -110,10 +102,6 @@ def study(
         workers: Threads.
         progress: Called with the number of simulated slices, and of those that must be.
     """
-    from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
-    from sliceit_drake.diagnosis.experiments.identifiability import Evidence, identifiability
-    from studies.diagnosis.identifiability_page import Study
-
     records: list[SliceRecord] = []
     ranges = []
     for protocol in protocols:
@@ -136,15 +124,8 @@ def study(
     return Study(results, causes, found)
 
 
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     """Runs the study."""
-    from tqdm import tqdm
-
-    from sliceit_drake.diagnosis.registry import load_cause, open_causes
-    from sliceit_drake.resources import resource_path
-    from sliceit_drake.stand_in.protocol import load_protocol
-    from studies.diagnosis.identifiability_page import plot_angles, report
-
     protocols = [
         load_protocol(str(resource_path(f"calibration/protocols/{name}.yaml")))
         for name in PROTOCOLS
@@ -160,11 +141,7 @@ def _run(options: argparse.Namespace) -> int:
         found = study(
             protocols, causes, options.refinement, options.cache, options.workers, progress
         )
-    text = report(found)
-    print(text)
-    if options.output is not None:
-        options.output.parent.mkdir(parents=True, exist_ok=True)
-        options.output.write_text(text, encoding="utf-8")
+    publish(report(found), options.output)
     if options.figure is not None:
         plot_angles(found, options.figure)
     return 0

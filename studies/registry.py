@@ -1,0 +1,215 @@
+"""All studies by topic: name, one line, how long it takes, and the module that runs it.
+
+A study's module has `add_arguments(parser)` and `run(options)`, which returns the exit status; its
+docstring is the text of `--help`. Beside its arguments a study finds the command line that was
+typed in `options.command`. This list imports none of the modules.
+"""
+
+import argparse
+import dataclasses as dc
+import importlib
+
+from sliceit_drake.cli.extras import needs_extra
+
+__all__ = ["TOPICS", "Study", "find_study", "study_parser"]
+
+
+@dc.dataclass(frozen=True)
+class Study:
+    """A study, not imported yet.
+
+    Attributes:
+        name: As it is typed.
+        module: Within `studies`.
+        line: What it measures, for the list.
+        duration: Rough wall time on two cores, for the list.
+        extra: Extra of pyproject.toml that it needs.
+    """
+
+    name: str
+    module: str
+    line: str
+    duration: str
+    extra: str = "studies"
+
+
+TOPICS: dict[str, tuple[Study, ...]] = {
+    "cutting physics": (
+        Study(
+            "verification",
+            "physics.verification_page",
+            "the physics against exact solutions and measured cuts",
+            "5 min",
+        ),
+        Study("disect", "disect.page", "side by side with DiSECt", "5 min"),
+        Study(
+            "random", "physics.random_slices", "random foods, planes, knives and motions", "7 min"
+        ),
+        Study(
+            "stepping",
+            "physics.stepping_report",
+            "error of the force against sub-step and cost",
+            "15 min",
+        ),
+        Study(
+            "split_step_limit",
+            "physics.split_step_limit",
+            "stable step of cuts by random planes",
+            "2 min",
+        ),
+        Study("effects_figure", "physics.effects_figure", "what each effect adds", "1 min"),
+        Study("foods_page", "physics.foods_page", "tables of foods and knives", "1 s"),
+        Study("cutting_speed", "physics.cutting_speed", "cost of a cut without a robot", "5 min"),
+        Study("batch_speed", "physics.batch_speed", "cuts a second, on CPU and GPU", "2 min"),
+        Study(
+            "condensed_scheme",
+            "physics.condensed_scheme",
+            "quasi-static schemes against the explicit solver",
+            "10 min",
+        ),
+    ),
+    "robot and station": (
+        Study(
+            "coupling",
+            "robot.coupling",
+            "error against exchange period and plant step",
+            "2 min",
+        ),
+        Study("servo", "robot.servo", "how the arm follows, by servoj's parameters", "20 s"),
+        Study(
+            "control",
+            "robot.control",
+            "stability of compliance control against contact stiffness",
+            "5 min",
+        ),
+        Study("station_speed", "robot.station_speed", "real-time factor of the station", "30 s"),
+        Study(
+            "safety_layer", "robot.safety_layer", "time of a decision of the safety layer", "5 s"
+        ),
+        Study(
+            "hardware_pace",
+            "robot.hardware_pace",
+            "how a run keeps up with the controller's clock",
+            "5 min",
+        ),
+        Study("endurance", "robot.endurance", "memory over an hour of slices", "1 h"),
+    ),
+    "calibration": (
+        Study(
+            "calibration",
+            "calibration.comparison",
+            "the paper's measured curves, calibrated and compared",
+            "1 h",
+        ),
+        Study(
+            "coverage",
+            "calibration.coverage",
+            "how often intervals of calibrations hold the truth",
+            "5 min",
+        ),
+    ),
+    "diagnosis": (
+        Study(
+            "identifiability",
+            "diagnosis.identifiability",
+            "which causes a protocol can tell apart",
+            "5 min",
+        ),
+        Study(
+            "real",
+            "diagnosis.real_slices",
+            "what the simulation gets wrong in the paper's slices",
+            "10 min",
+        ),
+        Study(
+            "hidden",
+            "hidden_effects.hide",
+            "hides effects in records and has them diagnosed",
+            "hours",
+        ),
+        Study("score", "hidden_effects.report", "judges the diagnoses of `hidden`", "5 s"),
+        Study(
+            "sizes",
+            "hidden_effects.sizes",
+            "sizes of effects by their strength against the noise",
+            "1 h",
+        ),
+        Study("diagnosis_speed", "diagnosis.diagnosis_speed", "time of a diagnosis", "3 min"),
+        Study(
+            "stand_in_figure",
+            "diagnosis.stand_in_figure",
+            "what each effect of the stand-in changes",
+            "1 min",
+        ),
+    ),
+    "learning": (
+        Study(
+            "slicing",
+            "learning.comparison",
+            "policies of both simulators in unseen worlds",
+            "5 s",
+            "learn",
+        ),
+        Study("faster_draws", "learning.faster_draws", "what faster draws bring", "5 s", "learn"),
+        Study(
+            "unfinished_slices",
+            "learning.unfinished_slices",
+            "why slices stay unfinished",
+            "5 min",
+            "learn",
+        ),
+        Study(
+            "policy_and_motion",
+            "learning.policy_and_motion",
+            "a trained policy beside an optimised motion",
+            "20 min",
+            "learn",
+        ),
+        Study(
+            "slicing_ablations",
+            "learning.slicing_ablations",
+            "which parts of the agent matter",
+            "hours",
+            "learn",
+        ),
+        Study(
+            "learning_speed",
+            "learning.learning_speed",
+            "cost of a training and of a decision",
+            "15 min",
+            "learn",
+        ),
+    ),
+    "many machines": (Study("scaling", "scaling.scaling", "what more workers bring", "10 min"),),
+    "the project": (
+        Study("aims", "project.aims", "writes docs/benchmarks.md from stored results", "1 s"),
+        Study("first_run", "project.first_run", "a newcomer's first run with the wheel", "2 min"),
+    ),
+}
+
+
+def find_study(name: str) -> Study | None:
+    """The study of a name; None where there is none."""
+    for studies in TOPICS.values():
+        for study in studies:
+            if study.name == name:
+                return study
+    return None
+
+
+def study_parser(study: Study) -> argparse.ArgumentParser:
+    """The parser of a study's arguments; imports its module.
+
+    Raises:
+        ConfigurationError: A package that it needs is not installed.
+    """
+    with needs_extra(study.extra):
+        module = importlib.import_module(f"studies.{study.module}")
+    parser = argparse.ArgumentParser(
+        prog=f"python -m studies {study.name}",
+        description=module.__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    module.add_arguments(parser)
+    parser.set_defaults(run=module.run)
+    return parser

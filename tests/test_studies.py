@@ -1,0 +1,85 @@
+"""One command lists and runs all studies; their tables and pages come from one place."""
+
+import ast
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from studies.__main__ import main, study_list
+from studies.pages import publish, render, table
+from studies.registry import TOPICS, study_parser
+from studies.results import write_results
+
+ROOT = Path(__file__).resolve().parent.parent
+STUDIES = [study for studies in TOPICS.values() for study in studies]
+
+
+def test_the_list_has_each_study_with_its_time_and_imports_none():
+    shown = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "studies"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    listed = re.findall(r"^  (\w+) +\S.* \[.+\]$", shown.stdout, re.M)
+    assert listed == [study.name for study in STUDIES]
+    assert len(set(listed)) == len(listed) > 30
+    for heavy in ("pydrake", "warp", "scipy", "matplotlib", "jinja2"):
+        assert f"| {heavy}" not in shown.stderr
+    assert all(len(line) <= 100 for line in study_list().splitlines())
+
+
+@pytest.mark.parametrize("study", STUDIES, ids=lambda study: study.name)
+def test_each_study_teaches(study):
+    parser = study_parser(study)
+    text = parser.format_help()
+    assert text.startswith(f"usage: python -m studies {study.name} ")
+    assert len(parser.description) > 60
+    assert all(len(line) <= 100 for line in parser.description.splitlines())
+    for action in parser._actions:
+        assert action.help, (study.name, action.option_strings or action.dest)
+    assert callable(parser.get_default("run"))
+
+
+def test_a_study_that_is_not_there_is_refused_with_the_one_that_is_meant(capsys):
+    assert main(["stepings"]) == 2
+    assert "Do you mean stepping?" in capsys.readouterr().err
+    assert main(["--help"]) == 0
+    assert "python -m studies NAME" in capsys.readouterr().out
+
+
+def test_an_argument_that_a_study_refuses_is_a_message_of_that_study(capsys):
+    assert main(["random", "--count", "0"]) == 2
+    assert capsys.readouterr().err.startswith("python -m studies random: --count or --workers: is")
+
+
+def test_nothing_in_the_package_imports_a_study():
+    for file in (ROOT / "sliceit_drake").rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert not [n for n in names if n.split(".")[0] == "studies"], file
+
+
+def test_a_table_has_a_cell_for_each_title():
+    assert table("a | b", [(1, "x"), ("", "y")]) == "| a | b |\n|---|---|\n| 1 | x |\n|  | y |"
+    assert table("a | b", [], "lr") == "| a | b |\n|---|---:|"
+
+
+def test_a_page_without_one_of_its_values_is_refused(tmp_path):
+    with pytest.raises(Exception, match="'command' is undefined"):
+        render("endurance")
+    publish("text", tmp_path / "a" / "page.md")
+    assert (tmp_path / "a" / "page.md").read_text(encoding="utf-8") == "text\n"
+
+
+def test_results_are_kept_with_the_command_that_was_typed(tmp_path):
+    options = type("Options", (), {"json": tmp_path / "x.json", "command": "python -m studies x"})
+    write_results(options, {"time_s": 1.23456})
+    facts = json.loads((tmp_path / "x.json").read_text(encoding="utf-8"))
+    assert facts["command"] == "python -m studies x" and facts["values"] == {"time_s": 1.235}
