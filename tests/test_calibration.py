@@ -14,7 +14,6 @@ from sliceit_drake.calibration.gauss_newton import residuals_at
 from sliceit_drake.calibration.oscillation import Oscillation, fit_oscillation
 from sliceit_drake.calibration.per_point import fit_points
 from sliceit_drake.calibration.prediction import Predictor
-from sliceit_drake.calibration.record_target import _turning
 from sliceit_drake.calibration.refine import refine
 from sliceit_drake.calibration.search import open_study, search
 from sliceit_drake.calibration.setup import (
@@ -35,6 +34,7 @@ from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagrams.scenario import load_scenario
+from sliceit_drake.prediction.record_target import turning
 from sliceit_drake.records.preprocessing import low_pass
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
@@ -178,7 +178,7 @@ def test_a_turn_is_one_in_the_food_and_ends_when_the_knife_is_back(way, left_out
     time = np.arange(0.0, knots[-1, 0], 2e-3)
     depth = 1e-3 * np.interp(time, *knots.T)
     depth += 4e-6 * np.random.default_rng(0).uniform(-1.0, 1.0, len(depth))
-    found = _turning(time, depth)
+    found = turning(time, depth)
     expected = np.zeros(len(time), bool)
     for begin, end in left_out:
         expected |= (time >= begin) & (time < end)

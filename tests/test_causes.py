@@ -21,7 +21,7 @@ from sliceit_drake.diagnosis.evidence.jumps import unlike_others
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.diagnosis.registry import all_causes, load_cause, open_causes
-from sliceit_drake.diagnosis.slices import Meshing
+from sliceit_drake.prediction.record_target import Meshing
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 GRAVITY = 9.81

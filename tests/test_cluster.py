@@ -17,8 +17,8 @@ from sliceit_drake.cutting.foods.food import Cylinder, Food
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagnosis.causes.material import SkinToughness
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
-from sliceit_drake.diagnosis.slices import Meshing
 from sliceit_drake.prediction.cluster import active, on_cluster
+from sliceit_drake.prediction.record_target import Meshing
 from sliceit_drake.prediction.simulator import Runner
 from sliceit_drake.stand_in.protocol import Condition, Protocol
 from studies.__main__ import main as studies

@@ -23,8 +23,8 @@ from sliceit_drake.diagnosis.one_slice.slice_fit import depth_blocks, fit_slice
 from sliceit_drake.diagnosis.one_slice.slice_problem import estimate_slice_noise
 from sliceit_drake.diagnosis.one_slice.slice_result import KIND
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
-from sliceit_drake.diagnosis.slices import Meshing
 from sliceit_drake.prediction.noise import MarkovCovariance
+from sliceit_drake.prediction.record_target import Meshing
 from sliceit_drake.records.slice_record import SliceRecord, write_record
 
 BROAD = Column("cause", "broad", "size", size=1.0)

@@ -21,8 +21,8 @@ from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.experiments.identifiability import ANGLE, Evidence, NoiseLevel
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.diagnosis.registry import load_cause
-from sliceit_drake.diagnosis.slices import Meshing
 from sliceit_drake.prediction.clock import BLOCK, Clock
+from sliceit_drake.prediction.record_target import Meshing
 from sliceit_drake.prediction.series import SliceFacts
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.resources import resource_path

@@ -6,7 +6,6 @@ from collections.abc import Callable
 import numpy as np
 from scipy.stats import qmc
 
-from sliceit_drake.calibration.record_target import EXCHANGE_PERIOD
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.batch import simulate_batch
@@ -16,6 +15,7 @@ from sliceit_drake.cutting.foods.food import make_food_model, start_pose
 from sliceit_drake.cutting.foods.spring_food import calibrate_spring
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.parameters import with_parameters
+from sliceit_drake.prediction.clock import EXCHANGE_PERIOD
 
 __all__ = ["food_from_literature"]
 

@@ -7,20 +7,20 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from sliceit_drake.calibration.oscillation import Oscillation, fit_oscillation
-from sliceit_drake.calibration.record_target import EXCHANGE_PERIOD, KnifeMotion, RecordTarget
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.batch import BatchSimulator, BatchSlice
 from sliceit_drake.cutting.board import board_wrenches
 from sliceit_drake.cutting.foods.distribution import from_unit, to_unit
-from sliceit_drake.cutting.foods.food import make_food_model
 from sliceit_drake.cutting.gradient import SliceAdjoint
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.knife_path import KnifePath
 from sliceit_drake.cutting.model import CuttingModel, TimeStepError
+from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.parameters import get_parameter, pull_back, with_parameters
 from sliceit_drake.cutting.solver import CuttingError
-from sliceit_drake.prediction.placement import food_of, knife_of
+from sliceit_drake.prediction.clock import EXCHANGE_PERIOD, Clock
+from sliceit_drake.prediction.record_target import Meshing, RecordTarget, make_targets
 from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = ["Parameter", "Prediction", "Predictor"]
@@ -31,6 +31,28 @@ STEP = 1e-3
 """Of these differences, in the unit range."""
 
 HEIGHT, SPEED = "height_offset", "speed_factor"
+
+
+@dc.dataclass
+class KnifeMotion:
+    """A recorded motion at the exchanges, as `cutting.batch.simulate_batch` takes it.
+
+    Attributes:
+        R, p: Pose X_FK at the ends of the exchanges [E + 1, 3, 3] and [E + 1, 3], metres.
+    """
+
+    R: np.ndarray
+    p: np.ndarray
+
+    @property
+    def duration(self) -> float:
+        """In s."""
+        return (len(self.p) - 1) * EXCHANGE_PERIOD
+
+    def pose(self, t: float) -> Pose:
+        """X_FK at the end of an exchange, s."""
+        k = round(t / EXCHANGE_PERIOD)
+        return Pose(self.R[k], self.p[k])
 
 
 @dc.dataclass(frozen=True)
@@ -110,15 +132,10 @@ class Predictor:
             raise ConfigurationError("no record is given", field="RECORD", fix="Name one.")
         self.setup = setup
         step = time_step or setup.numerics.time_step
-        numerics = dc.replace(setup.numerics, time_step=step, precision=precision)
-        models: dict[str, CuttingModel] = {}
-        self.targets = []
-        for record in records:
-            food, knife = food_of(setup.food, record), knife_of(setup.knife, record)
-            key = repr((food, knife))
-            if key not in models:
-                models[key] = make_food_model(food, knife, numerics, setup.refinement)
-            self.targets.append(RecordTarget(record, models[key], setup))
+        meshing = Meshing(1.0, step, precision, setup.numerics.device)
+        # Forces are fitted, and on an even clock the solver has an adjoint.
+        forces = [dc.replace(r, torque=None) for r in records]
+        self.targets = make_targets(setup, forces, [meshing], Clock(longest=1), near_food=True)
         self.board = dc.replace(setup.board, height=0.0)
         self.parameters = self._list_parameters()
         self.used = np.concatenate(
@@ -139,7 +156,7 @@ class Predictor:
         for target in self.targets:
             name = target.record.name
             out.append(Parameter(f"{HEIGHT}:{name}", low, high, False, 0.0))
-            if target.unknown_speed:
+            if target.speed_unknown:
                 out.append(Parameter(f"{SPEED}:{name}", slow, fast, False, 1.0))
         names = [p.name for p in out]
         if len(set(names)) < len(names):
@@ -212,7 +229,8 @@ class Predictor:
     def motion(self, target: RecordTarget, values: Mapping[str, float]) -> KnifeMotion:
         """The knife's motion of a record with these values."""
         name = target.record.name
-        return target.motion(values[f"{HEIGHT}:{name}"], values.get(f"{SPEED}:{name}", 1.0))
+        p = target.moved(values[f"{HEIGHT}:{name}"], values.get(f"{SPEED}:{name}", 1.0))
+        return KnifeMotion(target.R[target.exchanges], p[target.exchanges])
 
     def predict(
         self, units: Sequence[np.ndarray], progress: Callable[[int], None] | None = None
@@ -257,8 +275,7 @@ class Predictor:
         if failure is not None:
             nothing = np.full(target.measured.shape, np.nan)
             return Prediction(nothing, cut, Oscillation(), nothing, failure)
-        count = target.operator.shape[1]
-        smooth = target.compare(force[:count])
+        smooth = target.compare_forces(force)
         wave = self._oscillation(target, smooth)
         return Prediction(wave.factor(target.time)[:, None] * smooth, cut, wave, smooth, None)
 
@@ -333,14 +350,12 @@ class Predictor:
             run = adjoint.run(path.R_CK, path.p_CK, model)
             R_FC = model.X_FC_rotation
             board = self._board(path.R_FK, path.p_FK, model.knife)
-            E = target.operator.shape[1]
-            force = (run.wrenches[:, 3:] @ R_FC.T + board[:, 3:])[:E]
-            smooth = target.compare(force)
+            force = run.wrenches[:, 3:] @ R_FC.T + board[:, 3:]
+            smooth = target.compare_forces(force)
             factor = self._oscillation(target, smooth).factor(target.time)[:, None]
             residual = used * (factor * smooth - target.measured)
             total += float((residual**2).sum())
-            of_force = np.zeros((len(run.wrenches), 3))
-            of_force[:E] = target.adjoint(force, 2.0 * factor * residual / scale)
+            of_force = target.adjoint(force, 2.0 * factor * residual / scale)
             back = adjoint.gradient(run, np.column_stack([0.0 * of_force, of_force @ R_FC]))
             shared = [n for n in names if ":" not in n and n not in NO_ADJOINT]
             for name, slope in pull_back(model, back, shared).items():

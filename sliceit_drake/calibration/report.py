@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from sliceit_drake.calibration.prediction import Prediction
-from sliceit_drake.calibration.record_target import RecordTarget
 from sliceit_drake.cutting.foods.distribution import ParameterDistribution
+from sliceit_drake.prediction.record_target import RecordTarget
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,7 +48,7 @@ def force_figure(targets: Sequence[RecordTarget], predictions: Sequence[Predicti
     )
     for column, (target, prediction) in enumerate(zip(shown, predictions, strict=False)):
         upper, lower = axes[0, column], axes[1, column]
-        channels = ("force",) if target.by_norm else CHANNELS
+        channels = ("force",) if len(target.channels) == 1 else CHANNELS
         for c, name in enumerate(channels):
             # The press, which is nearly all of the force, stands out.
             style = (":", "--", "-")[c] if len(channels) > 1 else "-"

@@ -27,7 +27,7 @@ import numpy as np
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
-from sliceit_drake.prediction.series import ForceSeries, SliceFacts
+from sliceit_drake.prediction.series import ForceSeries, SharedFacts, SliceFacts
 
 __all__ = [
     "EXPERIMENTS",
@@ -158,6 +158,10 @@ class Cause:
         on wrenches alone.
         """
         return self
+
+    def visible(self, facts: SliceFacts) -> SliceFacts:
+        """Facts of a slice, without those that the cause does not go by."""
+        return facts if self.by_slice else SharedFacts.of(facts)
 
     def nulls(self) -> dict[str, float]:
         """Values at which it is absent."""

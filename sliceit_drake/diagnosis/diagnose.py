@@ -17,8 +17,8 @@ from sliceit_drake.diagnosis.input_checks import check_records, without_lone_tor
 from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import open_causes
 from sliceit_drake.diagnosis.result import Diagnosis
-from sliceit_drake.diagnosis.slices import Meshing
 from sliceit_drake.prediction.clock import Clock
+from sliceit_drake.prediction.record_target import Meshing
 from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = ["BASE", "Progress", "diagnose", "setup_of_food"]

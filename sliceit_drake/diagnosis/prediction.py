@@ -11,8 +11,8 @@ from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.parameters import with_parameters
 from sliceit_drake.diagnosis.cause import Cause
-from sliceit_drake.diagnosis.slices import Meshing, SliceTarget, make_targets
 from sliceit_drake.prediction.clock import Clock
+from sliceit_drake.prediction.record_target import Meshing, RecordTarget, make_targets
 from sliceit_drake.prediction.series import ForceSeries
 from sliceit_drake.prediction.simulator import Job, Run, Simulator
 from sliceit_drake.records.slice_record import SliceRecord
@@ -117,7 +117,7 @@ class SlicePredictor:
         self.simulator = Simulator(self.clock, self.board, cache, workers)
         self._boards: dict[bytes, np.ndarray] = {}
 
-    def record_effects(self, target: SliceTarget) -> tuple[RecordEffect, ...]:
+    def record_effects(self, target: RecordTarget) -> tuple[RecordEffect, ...]:
         """What may differ in a record from others like it."""
         if not target.facts.food:
             return ()
@@ -165,7 +165,7 @@ class SlicePredictor:
             plan.append(row)
         return plan, self.simulator.run(jobs, progress)
 
-    def model(self, point: Point, target: SliceTarget) -> CuttingModel:
+    def model(self, point: Point, target: RecordTarget) -> CuttingModel:
         """The cut of a record at a point."""
         model = target.models[point.meshing or self.meshings[0]]
         model = with_parameters(model, dict(point.values)) if point.values else model
@@ -177,7 +177,7 @@ class SlicePredictor:
         }
         model = with_parameters(model, factors) if factors else model
         for active in point.causes:
-            model = active.cause.model(model, active.values, target.seen_by(active.cause))
+            model = active.cause.model(model, active.values, active.cause.visible(target.facts))
         if target.facts.peeled and model.effects.skin.toughness > 0.0:
             model = with_parameters(model, {"effects.skin.toughness": 0.0})
         return model
@@ -188,11 +188,9 @@ class SlicePredictor:
         own = point.records.get(target.facts.name, {})
         R, p = target.R, target.p
         speed, height = own.get("speed", 0.0), own.get("height", 0.0)
-        if speed:
-            p = target.home + float(np.exp(speed)) * (p - target.home)
-        lower = np.array([0.0, 0.0, height])
-        if target.height_unknown:
-            p = p - lower
+        lower = height if target.height_unknown else 0.0
+        if speed or lower:
+            p = target.moved(lower, float(np.exp(speed)))
         for k, active in enumerate(point.causes):
             values, force = active.values, None
             if active.cause.uses_force:
@@ -201,11 +199,11 @@ class SlicePredictor:
                 assert series is not None
                 force = series.wrench[:, 3:]
             R, p = active.cause.motion(
-                R, p, target.grid, values, target.seen_by(active.cause), force
+                R, p, target.grid, values, active.cause.visible(target.facts), force
             )
         if target.stretches is None:
             return None, R, p
-        at_food = p if target.height_unknown else p - lower
+        at_food = p if target.height_unknown else p - np.array([0.0, 0.0, height])
         return (
             Job(
                 self.model(point, target),
@@ -218,7 +216,7 @@ class SlicePredictor:
         )
 
     def _series(
-        self, point: Point, target: SliceTarget, planned: "_Planned", runs: Sequence[Run]
+        self, point: Point, target: RecordTarget, planned: "_Planned", runs: Sequence[Run]
     ) -> ForceSeries:
         run = None if planned.job is None else runs[planned.job]
         p = planned.p
@@ -230,7 +228,7 @@ class SlicePredictor:
             self._boards[key] = target.board(self.board, planned.R, p)
         series = target.series(run, self._boards[key])
         for active in point.causes:
-            facts = target.seen_by(active.cause)
+            facts = active.cause.visible(target.facts)
             series.wrench = active.cause.wrench(series, active.values, facts)
         return series
 

@@ -9,7 +9,10 @@ import dataclasses as dc
 
 import numpy as np
 
-__all__ = ["BLOCK", "Clock", "Stretches"]
+__all__ = ["BLOCK", "EXCHANGE_PERIOD", "Clock", "Stretches"]
+
+EXCHANGE_PERIOD = 2e-3
+"""Between two forces of the food, s."""
 
 BLOCK = 8
 """Exchanges that are launched at once, all of one length."""
@@ -40,7 +43,7 @@ class Clock:
             step, so that what still swings when it grows would swing with more energy.
     """
 
-    period: float = 2e-3
+    period: float = EXCHANGE_PERIOD
     travel: float = 6e-5
     longest: int = 8
     settling: int = 3

@@ -43,9 +43,9 @@ from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.evidence.columns import MESH, Column, RecordSensitivity, Sensitivities
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
-from sliceit_drake.diagnosis.slices import Meshing, SliceTarget
 from sliceit_drake.prediction.clock import Clock
 from sliceit_drake.prediction.placement import poses_in_food
+from sliceit_drake.prediction.record_target import Meshing, RecordTarget
 from sliceit_drake.prediction.series import ForceSeries
 from sliceit_drake.prediction.simulator import cutting_source
 from sliceit_drake.records.preprocessing import as_measured
@@ -70,7 +70,7 @@ LINEAR_STEP = 0.02
 """Change of one on a linear scale, relative to its range."""
 
 
-SOURCES = (Cause, Clock, ForceSeries, Sensitivities, SlicePredictor, SliceTarget)
+SOURCES = (Cause, Clock, ForceSeries, Sensitivities, SlicePredictor, RecordTarget)
 SOURCES += (as_measured, poses_in_food)
 """Whose modules a result depends on, beside `cutting` and this one."""
 
@@ -284,7 +284,9 @@ class _Computation:
             if k in shown:
                 cause, *values = shown[k]
                 moved = [
-                    cause.wrench(base, v, target.seen_by(cause)) for v in values if v is not None
+                    cause.wrench(base, v, cause.visible(target.facts))
+                    for v in values
+                    if v is not None
                 ]
             else:
                 moved = [self._series(p, number).wrench for p in (up, down) if p is not None]
@@ -319,7 +321,7 @@ class _Computation:
 
 
 def _empty(
-    target: SliceTarget, in_contact: np.ndarray, predicted: np.ndarray, columns: int
+    target: RecordTarget, in_contact: np.ndarray, predicted: np.ndarray, columns: int
 ) -> RecordSensitivity:
     facts = target.facts
     moved = np.linalg.norm(np.diff(target.p, axis=0), axis=1)
@@ -361,7 +363,7 @@ class _Store:
         self._directory, self._common, self._point = directory, common, point
         self._by_slice = by_slice
 
-    def _file(self, target: SliceTarget) -> Path:
+    def _file(self, target: RecordTarget) -> Path:
         h = hashlib.sha256(self._common)
         metadata = dc.replace(target.record.metadata, name="", condition="")
         facts = dc.replace(target.facts, name="", condition="")
@@ -376,7 +378,9 @@ class _Store:
             h.update(np.ascontiguousarray(values).tobytes())
         return self._directory / f"{h.hexdigest()[:40]}.npz"
 
-    def load(self, target: SliceTarget, columns: int) -> tuple[RecordSensitivity, list[str]] | None:
+    def load(
+        self, target: RecordTarget, columns: int
+    ) -> tuple[RecordSensitivity, list[str]] | None:
         file = self._file(target)
         if not file.exists():
             return None
@@ -385,7 +389,7 @@ class _Store:
             record.columns, record.even = arrays["columns"], arrays["even"]
             return record, arrays["failed"].tolist()
 
-    def save(self, target: SliceTarget, record: RecordSensitivity, failed: list[str]) -> None:
+    def save(self, target: RecordTarget, record: RecordSensitivity, failed: list[str]) -> None:
         file = self._file(target)
         part = file.with_name(f"{file.stem}.{os.getpid()}.part")
         with open(part, "wb") as stream:

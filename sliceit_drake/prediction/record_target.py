@@ -1,66 +1,106 @@
-"""A slice record as a diagnosis compares it: all its rows, by component, with or without food."""
+"""A slice record as a prediction is compared with it: the knife's motion relative to the food, the
+force, and what the sensor would show of a predicted one."""
 
 import dataclasses as dc
+import functools
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.board import Board, board_wrenches
-from sliceit_drake.cutting.foods.food import make_food_model, start_pose
+from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import GRAVITY, CuttingModel, Numerics
-from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.prediction.clock import Clock, Stretches
 from sliceit_drake.prediction.placement import food_of, is_bare, knife_of, poses_in_food
-from sliceit_drake.prediction.series import ForceSeries, SharedFacts, SliceFacts
+from sliceit_drake.prediction.series import ForceSeries, SliceFacts
 from sliceit_drake.prediction.simulator import Run
 from sliceit_drake.records.preprocessing import as_measured
 from sliceit_drake.records.slice_record import SliceRecord
 
-__all__ = ["CHANNELS", "Meshing", "SliceTarget", "make_targets"]
+__all__ = ["CHANNELS", "Bench", "Meshing", "RecordTarget", "make_targets", "turning"]
 
 CHANNELS = ("force_x", "force_y", "force_z", "torque_y")
 """Compared components, in F: along the edge, normal to the blade, vertical, N; moment about Ko and
 Fy, which a draw and a turned sensor change, Nm."""
 WRENCH_ROWS = (3, 4, 5, 1)
+NORM = ("force_norm",)
 
 MARGIN = 2e-3
 """Height of the edge over the food from which on the food is computed, metres."""
+CLEARANCE = 5e-4
+"""Height of the edge over the food below which rows are compared, beside the range of the record's
+own height, metres."""
 CLEAR = 6e-4
 """Height of the edge over the food above which nothing moves fast, metres."""
+TURN_TRAVEL, TURN_TIME, STILL = 1e-3, 0.03, 2e-5
+"""Where the knife turns round in the food, the rows that are not compared: until it is as far back,
+metres, and for as long, s, counted from where it was last as deep but for `STILL`, metres. The
+force turns round over some tenths of a millimetre, in which scaled masses err by half of it
+(docs/stepping.md)."""
+
+
+class Bench(Protocol):
+    """What cuts what, as a `calibration.setup.CalibrationSetup` says it."""
+
+    food: Food
+    knife: Knife
+    board: Board
+    numerics: Numerics
+    refinement: float
+    height_offset: list[float]
 
 
 @dc.dataclass(frozen=True)
 class Meshing:
-    """How finely the food is computed.
+    """How finely the food is computed, and where.
 
     Attributes:
         refinement: Elements along an edge, relative to the food's mesh.
         time_step: Sub-step of the shortest exchange, s.
+        precision, device: As in `cutting.model.Numerics`.
     """
 
     refinement: float = 1.0
     time_step: float = 5e-4
+    precision: str = "float32"
+    device: str = "cpu"
 
 
-class SliceTarget:
+class RecordTarget:
     """One record: its motion relative to the food and what of it is compared.
 
-    Attributes:
+    The force is compared by component in F where the record has them, else by its norm. Prediction
+    and measurement went through the same filters: `records.preprocessing.as_measured`.
+
+    Args:
         record: The record.
-        facts: What causes see of it.
+        bench: Of which the knife is taken, but for what the record says of it.
         models: Its cut by meshing; empty without food.
+        frame: R_FW and p_WF of a record without food.
+        clock: How time is divided.
+        near_food: Whether rows are compared only from the first to the last in which the edge comes
+            near the food. A zero of the sensor shows in the air; a fit to food has nothing there.
+        margin: Height of the edge over the food below which it is near, metres.
+
+    Raises:
+        ConfigurationError: The knife starts in the food, or never comes near it and `near_food` is
+            set.
+
+    Attributes:
+        record, models, clock: As given.
+        facts: What causes see of it.
         knife: The knife.
-        clock: Of the grid.
         home: Ko where the edge first touches the food, in F [3], metres; 0 without food.
         channels: Names of the compared channels: `CHANNELS`, the first three without a torque, or
             "force_norm".
         time: Of the rows [m], s.
         measured: Channels at the rows [m, c].
         depth: Of the edge below the top of the food at the rows [m], metres.
+        compared: Whether a row counts in a fit [m]: not where the knife turns round in the food.
         phase: Label at the rows [m]; "" for none.
         grid: Even times of the exchanges [N + 1], s; row 0 is the first row of the record.
         R, p: Pose X_FK at `grid`.
@@ -72,48 +112,44 @@ class SliceTarget:
     def __init__(
         self,
         record: SliceRecord,
-        setup: CalibrationSetup,
+        bench: Bench,
         models: dict[Meshing, CuttingModel],
         frame: tuple[Rotation, np.ndarray],
         clock: Clock,
-        first: Meshing,
+        near_food: bool = False,
+        margin: float = MARGIN,
     ) -> None:
         self.record, self.models, self.clock = record, models, clock
-        self.knife: Knife = knife_of(setup.knife, record)
-        metadata = record.metadata
-        unknown = set(metadata.unknown)
+        self.near_food, self._margin = near_food, margin
+        self.knife = knife_of(bench.knife, record)
+        metadata, unknown = record.metadata, set(record.metadata.unknown)
         self.height_unknown = "p_WK_z" in unknown or "food.position" in unknown
         self.speed_unknown = "motion.speed" in unknown
         if models:
-            model = models[first]
+            model = self.model
             R_FW, rotation, p = poses_in_food(record, model)
             self.height_unknown = self.height_unknown or metadata.food.position is None
-            home = start_pose(model, 0.0).p
-            top, width = float(home[2]), float(np.ptp(model.span))
+            self.home = start_pose(model, 0.0).p
+            self._top, width = float(self.home[2]), float(np.ptp(model.span))
         else:
             R_FW, origin = frame
-            rotation, p = (
-                R_FW * Rotation.from_matrix(record.rotation),
-                R_FW.apply(record.position - origin),
-            )
-            home, top, width = np.zeros(3), 0.0, 0.0
-        self.home = home
-        T = clock.period
-        # Not beyond the last row: a knife that stopped there would show weight and speed that it
-        # never had.
-        count = max(2, int((record.time[-1] - record.time[0]) / T + 1e-6))
-        self.grid = record.time[0] + T * np.arange(count + 1)
+            rotation = R_FW * Rotation.from_matrix(record.rotation)
+            p = R_FW.apply(record.position - origin)
+            self.home, self._top, width = np.zeros(3), 0.0, 0.0
+        height = p[:, 2] - self._top
+        rows = self._near(height) if near_food else slice(None)
+        self.time, self.depth = record.time[rows], -height[rows]
+        self.compared = ~turning(self.time, self.depth)
+        self.grid = self._times()
         at = np.minimum(self.grid, record.time[-1])
         self.p = np.column_stack([np.interp(at, record.time, column) for column in p.T])
         self.R = Slerp(record.time, rotation)(at).as_matrix()
-        self.time = record.time
-        self.depth = top - p[:, 2]
-        self.phase = np.array([""] * len(record), dtype="<U16")
-        for phase in metadata.motion.phases:
-            self.phase[(record.time >= phase.start) & (record.time < phase.end)] = phase.label
+        phase = np.array([""] * len(record), dtype="<U16")
+        for label in metadata.motion.phases:
+            phase[(record.time >= label.start) & (record.time < label.end)] = label.label
         if len(metadata.motion.phases) and record.time[-1] >= metadata.motion.phases[-1].end:
-            self.phase[-1] = metadata.motion.phases[-1].label
-        self._top = top
+            phase[-1] = metadata.motion.phases[-1].label
+        self.phase = phase[rows]
         self.stretches = self._stretches() if models else None
         self.facts = SliceFacts(
             name=record.name,
@@ -124,29 +160,54 @@ class SliceTarget:
             ),
             peeled=bool(metadata.food.peeled),
             food=bool(models),
-            height=top,
+            height=self._top,
             width=width,
             speed=metadata.motion.speed or 0.0,
             draw_ratio=metadata.motion.draw_ratio or 0.0,
             tared=metadata.wrench.tared != "no",
         )
         if record.force is None:
-            self.channels: tuple[str, ...] = ("force_norm",)
-            self.measured = record.force_magnitude[:, None]
+            self.channels: tuple[str, ...] = NORM
+            measured = record.force_magnitude[:, None]
         else:
-            force = R_FW.apply(record.force)
-            self.channels, self.measured = CHANNELS[:3], force
+            self.channels, measured = CHANNELS[:3], R_FW.apply(record.force)
             if record.torque is not None:
                 self.channels = CHANNELS
-                self.measured = np.column_stack([force, R_FW.apply(record.torque)[:, 1]])
+                measured = np.column_stack([measured, R_FW.apply(record.torque)[:, 1]])
+        self.measured = measured[rows]
 
-    def seen_by(self, cause: Cause) -> SliceFacts:
-        """The facts, without those that a cause does not go by."""
-        return self.facts if cause.by_slice else SharedFacts.of(self.facts)
+    @property
+    def model(self) -> CuttingModel:
+        """The cut, in the first meshing; there is food."""
+        return next(iter(self.models.values()))
+
+    def _near(self, height: np.ndarray) -> slice:
+        """Rows from before the first to after the last near the food, of heights over it [n]."""
+        low = np.flatnonzero(height < self._margin)
+        if low.size == 0:
+            raise ConfigurationError(
+                f"the knife stays {1e3 * height.min():.3g} mm or more above the food",
+                source=self.record.file or self.record.name,
+                field="p_WK_z",
+                fix="Correct food.position or the heights; both are in the world frame, in metres.",
+            )
+        return slice(max(int(low[0]) - 1, 0), int(low[-1]) + 2)
+
+    def _times(self) -> np.ndarray:
+        """Of the grid [N + 1]. Not beyond the last row: a knife that stopped there would show
+        weight and speed that it never had."""
+        T = self.clock.period
+        if self.near_food:
+            # One more than there is time for: no sample lies beyond the last mean.
+            count = int(np.ceil((self.time[-1] - float(self.time[0])) / T)) + 1
+            return np.asarray(float(self.time[0]) + T * np.arange(count + 1))
+        first, last = self.record.time[0], self.record.time[-1]
+        count = max(2, int((last - first) / self.clock.period + 1e-6))
+        return np.asarray(first + self.clock.period * np.arange(count + 1))
 
     def _stretches(self) -> Stretches | None:
         height = self.p[:, 2] - self._top
-        low = np.flatnonzero(height < MARGIN)
+        low = np.flatnonzero(height < self._margin)
         if low.size == 0:
             return None
         if low[0] == 0 and height[0] < 0.0:
@@ -169,6 +230,11 @@ class SliceTarget:
         """Poses at the ends of exchanges; a knife whose record is over rests."""
         rows = np.minimum(stretches.ends, len(p) - 1)
         return R[rows], p[rows]
+
+    def moved(self, lower: float, faster: float) -> np.ndarray:
+        """Positions of Ko at the grid [N + 1, 3], metres, of a knife that stood lower, metres, and
+        moved faster by a factor."""
+        return self.home + faster * (self.p - self.home) - np.array([0.0, 0.0, lower])
 
     def series(self, run: Run | None, board_wrench: np.ndarray) -> ForceSeries:
         """The predicted slice on the even grid.
@@ -216,7 +282,7 @@ class SliceTarget:
         return np.interp(np.arange(len(self.grid)), ends[1:], run.rise)
 
     def board(self, board: Board, R: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """Wrench of a board, its height in F, with the knife at poses at the grid [N, 6], Nm, N.
+        """Wrench of a board, its height in F, with the knife at poses at even times [N, 6], Nm, N.
 
         Args:
             board: The board.
@@ -249,38 +315,108 @@ class SliceTarget:
         They go through the sensor's filter and the steps of the record, as the measurement did.
         """
         rest = wrench.shape[2:]
-        if self.channels == ("force_norm",):
+        if self.channels == NORM:
             picked = wrench[:, 3:]
         else:
             picked = wrench[:, list(WRENCH_ROWS[: len(self.channels)])]
-        columns = picked.reshape(len(picked), -1)
-        T = self.clock.period
+        seen = self._seen(picked.reshape(len(picked), -1))
+        seen = seen.reshape(len(self.time), -1, *rest)
+        if self.channels == NORM:
+            return np.linalg.norm(seen, axis=1, keepdims=True)
+        return seen
+
+    def _seen(self, columns: np.ndarray) -> np.ndarray:
+        """What would have been measured at the rows [m, k] of series on the grid [N, k].
+
+        A reading stands for the mean over the exchange that ends with it. Before the first and
+        after the last exchange a force is taken to stay as it is.
+        """
+        if self.near_food:
+            return self._seen_near(columns)
         before = np.zeros((2, columns.shape[1])) + columns[:1]
         after = np.zeros((2, columns.shape[1])) + columns[-1:]
-        ends = self.grid[0] + T * np.arange(-1, len(columns) + 3)
+        ends = self.grid[0] + self.clock.period * np.arange(-1, len(columns) + 3)
         time, rows = as_measured(
             self.record.metadata, ends, np.concatenate([before, columns, after])
         )
         at = np.clip(np.searchsorted(time, self.time, side="right"), 1, len(time) - 1)
         share = np.clip((self.time - time[at - 1]) / (time[at] - time[at - 1]), 0.0, 1.0)
-        seen = rows[at - 1] + share[:, None] * (rows[at] - rows[at - 1])
-        seen = seen.reshape(len(self.time), -1, *rest)
-        if self.channels == ("force_norm",):
-            return np.linalg.norm(seen, axis=1, keepdims=True)
-        return seen
+        return np.asarray(rows[at - 1] + share[:, None] * (rows[at] - rows[at - 1]))
+
+    def _seen_near(self, columns: np.ndarray) -> np.ndarray:
+        record, T, count, start = self.record, self.clock.period, len(columns), self.grid[0]
+        before = int((start - record.time[0]) / T) + 2
+        after = int(max(record.time[-1] - self.grid[-1], 0.0) / T) + 2
+        ends = start + T * np.arange(1 - before, count + after + 1)
+        series = np.zeros((len(ends), columns.shape[1]))
+        series[before : before + count] = columns
+        time, rows = as_measured(record.metadata, ends, series)
+        at = np.searchsorted(time, self.time, side="right")
+        low, high = np.clip(at - 1, 0, len(time) - 1), np.clip(at, 0, len(time) - 1)
+        span = np.where(high > low, time[high] - time[low], 1.0)
+        share = np.clip((self.time - time[low]) / span, 0.0, 1.0)[:, None]
+        return np.asarray((1.0 - share) * rows[low] + share * rows[high])
+
+    @property
+    def exchanges(self) -> np.ndarray:
+        """Rows of the grid at which the exchanges of an even clock end [E + 1]."""
+        return np.arange(len(self.grid))
+
+    @functools.cached_property
+    def operator(self) -> np.ndarray:
+        """From forces of `exchanges` to what would have been measured at the rows [m, E].
+
+        Filters are linear, so that their effect on each exchange's force is all there is to know.
+        """
+        return self._seen(np.eye(len(self.exchanges) - 1))
+
+    def compare_forces(self, force: np.ndarray) -> np.ndarray:
+        """Channels at the rows [m, c] from forces of the simulated exchanges [E, 3], N, in F."""
+        seen = self.operator @ force
+        return np.linalg.norm(seen, axis=1)[:, None] if self.channels == NORM else seen
+
+    def adjoint(self, force: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Adjoint of `compare_forces` at `force`: of the channels [m, c] to forces [E, 3]."""
+        if self.channels == NORM:
+            seen = self.operator @ force
+            norm = np.maximum(np.linalg.norm(seen, axis=1), 1e-9)[:, None]
+            weights = weights * seen / norm
+        return np.asarray(self.operator.T @ weights)
 
     def at_rows(self, mask: np.ndarray) -> np.ndarray:
         """A mask on the grid [N] at the rows [m]."""
         k = np.ceil((self.time - self.grid[0]) / self.clock.period - 1e-6).astype(int) - 1
         return np.asarray(mask[np.clip(k, 0, len(mask) - 1)])
 
+    def rms_error(self, predicted: np.ndarray) -> float:
+        """Root mean square over the compared rows of channels [m, c], N."""
+        rest = (predicted - self.measured)[self.compared]
+        return float(np.sqrt(np.mean(rest**2)))
+
+
+def turning(time: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Whether the knife has just turned back in the food, at samples [m] of its depth, metres."""
+    found, deepest, is_down = np.zeros(len(depth), bool), 0, True
+    for k in range(len(depth)):
+        if is_down == (depth[k] > depth[deepest]):
+            deepest = k
+        elif abs(depth[deepest] - depth[k]) > TURN_TRAVEL:
+            if is_down and depth[deepest] > 0.0:
+                bottom = np.flatnonzero(depth[deepest : k + 1] > depth[deepest] - STILL)
+                first = deepest + int(bottom[-1])
+                after = np.searchsorted(time, time[first] + TURN_TIME, side="right")
+                found[first : max(k, int(after))] = True
+            deepest, is_down = k, not is_down
+    return found
+
 
 def make_targets(
-    setup: CalibrationSetup,
+    bench: Bench,
     records: Sequence[SliceRecord],
     meshings: Sequence[Meshing],
     clock: Clock,
-) -> list[SliceTarget]:
+    near_food: bool = False,
+) -> list[RecordTarget]:
     """Prepares records; those of equal food and knife share their cuts.
 
     A record without food is placed by the yaw of the others and its own height of the board.
@@ -300,24 +436,23 @@ def make_targets(
             z = z if record.metadata.board_height is None else record.metadata.board_height
             frame = (Rotation.from_euler("z", -(facts.yaw or 0.0)), np.array([x, y, z]))
         else:
-            food, knife = food_of(setup.food, record), knife_of(setup.knife, record)
+            food, knife = food_of(bench.food, record), knife_of(bench.knife, record)
             if record.metadata.food.peeled:
                 food.effects.skin.toughness = 0.0
             key = repr((food, knife))
             if key not in cuts:
-                cuts[key] = {
-                    m: make_food_model(
-                        food,
-                        knife,
-                        _numerics(setup.numerics, m.time_step),
-                        setup.refinement * m.refinement,
-                    )
-                    for m in meshings
-                }
+                cuts[key] = {m: _cut(bench, food, knife, m) for m in meshings}
             models = cuts[key]
-        targets.append(SliceTarget(record, setup, models, frame, clock, meshings[0]))
+        margin = CLEARANCE + max(abs(v) for v in bench.height_offset) if near_food else MARGIN
+        targets.append(RecordTarget(record, bench, models, frame, clock, near_food, margin))
     return targets
 
 
-def _numerics(numerics: Numerics, time_step: float) -> Numerics:
-    return dc.replace(numerics, time_step=time_step, precision="float32", device="cpu")
+def _cut(bench: Bench, food: Food, knife: Knife, meshing: Meshing) -> CuttingModel:
+    numerics = dc.replace(
+        bench.numerics,
+        time_step=meshing.time_step,
+        precision=meshing.precision,
+        device=meshing.device,
+    )
+    return make_food_model(food, knife, numerics, bench.refinement * meshing.refinement)
