@@ -32,7 +32,7 @@ from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagnosis.diagnose import diagnose, setup_of_food
 from sliceit_drake.diagnosis.one_slice.diagnose_slice import diagnose_slice, setup_of_slice
-from sliceit_drake.diagrams.run import prepare_run, simulate
+from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.learning.environment import SlicingEnv
 from sliceit_drake.learning.reward import TERMS
@@ -96,7 +96,7 @@ def scenario(name: str) -> Facts:
     """The record of a scenario."""
     loaded = load_scenario(resource_path(f"scenarios/{name}.yaml"))
     run = prepare_run(loaded)
-    simulate(run, min(SCENARIOS[name], run.motion.duration))
+    run.advance(min(SCENARIOS[name], run.motion.duration))
     assert run.stopped is None, run.stopped
     record = run.record()
     force = record.vector("food_wrench_f")

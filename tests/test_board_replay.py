@@ -13,7 +13,7 @@ from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan
 from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.outputs.run_log import Record
-from sliceit_drake.diagrams.run import prepare_run, simulate
+from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.resources import resource_path
@@ -64,7 +64,7 @@ def test_a_replayed_station_record_has_the_stations_board_force(
 ):
     scenario = analytic(stiffness, time_step, speed)
     run = prepare_run(scenario)
-    simulate(run)
+    run.advance()
     record = run.record()
     scenario.numerics.time_step = 1e-4
     food = Food(shape=Cylinder(diameter=DIAMETER, rings=2, layers=[0.0, 0.004, 0.012]))
@@ -86,7 +86,7 @@ def test_a_replayed_station_record_has_the_foods_force_as_well(tmp_path):
     scenario.start.clearance = 0.002
     scenario.motion = MotionPlan([ConstantSpeed(distance=0.030, speed=0.05, acceleration=2.0)])
     run = prepare_run(scenario)
-    simulate(run)
+    run.advance()
     record = run.record()
     result = replay(scenario, record, scenario.food, tmp_path / "knife.csv")
     # The station holds the mean over an exchange through the next, and logs before it updates.

@@ -15,7 +15,7 @@ from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagrams.agent_gains import ERROR_FACTOR, AgentGains, agent_box
 from sliceit_drake.diagrams.contact_loop import ContactLoop, directional_stiffness
 from sliceit_drake.diagrams.contact_margin import check_contact_margin
-from sliceit_drake.diagrams.run import prepare_run, simulate
+from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.resources import resource_path
@@ -124,7 +124,7 @@ def test_that_blade_would_shake_and_the_run_ends_by_name(monkeypatch):
     monkeypatch.setattr("sliceit_drake.diagrams.contact_margin.LEAST_MARGIN", 0.0)
     run = prepare_run(scenario)
     assert run.contact_margin.food < 1.0
-    simulate(run)
+    run.advance()
     assert run.stopped is not None
     assert UNSTABLE_GAINS in run.stopped
     assert run.simulator.get_context().get_time() < run.motion.duration
@@ -145,7 +145,7 @@ def test_landing_on_the_board_and_resting_on_food_raise_no_alarm():
         ]
     )
     run = prepare_run(scenario)
-    simulate(run)
+    run.advance()
     assert run.stopped is None
     assert run.record()["board_wrench_f_z"].max() > 10.0
 

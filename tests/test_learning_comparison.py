@@ -14,7 +14,7 @@ pytest.importorskip("gymnasium")
 from sliceit_drake.cli import evaluate
 from sliceit_drake.cli.main import main
 from sliceit_drake.diagrams.agent_gains import AgentGains
-from sliceit_drake.diagrams.run import prepare_run, simulate
+from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.learning.ending import Limits
 from sliceit_drake.learning.evaluation import LIMITS, cut_slice
@@ -208,7 +208,7 @@ def test_the_readme_says_what_the_policies_are_worth():
 
 def test_a_trained_policy_runs_in_a_scenario():
     run = prepare_run(load_scenario(resource_path("scenarios/cucumber_agent.yaml")))
-    simulate(run, 2.4)
+    run.advance(2.4)
     record = run.record()
     assert not run.stopped and record["cut_progress"][-1] > 0.999
     assert 5.0 < np.abs(record["food_wrench_f_z"]).max() < 30.0

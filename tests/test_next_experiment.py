@@ -29,7 +29,7 @@ from sliceit_drake.diagnosis.experiments.proposal import NEEDED, NextExperiment
 from sliceit_drake.diagnosis.registry import open_causes
 from sliceit_drake.diagnosis.result import Diagnosis
 from sliceit_drake.diagrams.planned_scenario import scenario_of_slice
-from sliceit_drake.diagrams.run import prepare_run, simulate
+from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.records.validation import load_sessions
@@ -127,7 +127,7 @@ def test_station_and_stand_in_run_what_was_written(bench):
         text = file.read_text()
         assert f"# Slices: {step.slices}." in text and step.experiment.by_hand in text
     run = prepare_run(load_scenario(bench.files[0], COARSE))
-    simulate(run, 1.2)
+    run.advance(1.2)
     assert run.stopped is None
     # 300 ms in the air, then 3 mm at 6 mm/s.
     assert np.linalg.norm(run.record().vector("food_wrench_f"), axis=1).max() > 1.0

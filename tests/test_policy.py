@@ -9,7 +9,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.motion import Motion, Pose
-from sliceit_drake.diagrams.run import prepare_run, simulate, write_outputs
+from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.policy import (
@@ -134,7 +134,7 @@ def test_a_scenario_runs_by_a_policy_and_its_record_has_the_target_of_the_run():
     overrides = """{food: !AnalyticFood {stiffness: 3.0e+3}, start: {clearance: 0.002},
       policy: {duration: 1.4, draw: 0.0, decide: {draw_ratio: 0.0, cut_time: 0.8}}}"""
     run = prepare_run(load_scenario(POLICY, overrides))
-    simulate(run)
+    run.advance()
     record = run.record()
     depth = record["target_pose_p_z"][0] - record["target_pose_p_z"]
     assert depth[0] == 0.0 and 0.01 < depth.max() < 0.03 * 0.8
@@ -150,8 +150,8 @@ def test_the_summary_of_a_policys_run_estimates_no_error_on_a_motion_that_was_no
     overrides = """{food: {shape: !Cylinder {rings: 2, layers: [0.0, 0.006, 0.0125]}},
       policy: {press: 0.001, draw: 0.0, duration: 0.05}}"""
     run = prepare_run(load_scenario(POLICY, overrides))
-    simulate(run)
+    run.advance()
     assert run.stopped is None
-    summary = write_outputs(run, tmp_path, None)
+    summary = run.save(tmp_path)
     assert summary["elements"] > 0 and summary["discretization_error"] is None
     assert summary["warnings"] == []

@@ -10,7 +10,7 @@ from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.foods.food import Ellipsoid, Remainder
 from sliceit_drake.diagrams.holder_arm import FINGERTIPS, HoldingArm
 from sliceit_drake.diagrams.outputs.sequence_report import slice_reports
-from sliceit_drake.diagrams.run import prepare_run, simulate
+from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
 from sliceit_drake.diagrams.sequence import SliceSequence
@@ -34,7 +34,7 @@ def scenario(**sequence) -> Scenario:
 
 def run_of(indexing: str):
     run = prepare_run(scenario(indexing=indexing))
-    simulate(run)
+    run.advance()
     assert run.stopped is None
     return run, run.record()
 
@@ -152,7 +152,7 @@ def test_a_slice_that_is_not_cut_off_stops_the_run():
     shallow = scenario()
     shallow.sequence = Shallow(**vars(shallow.sequence))
     run = prepare_run(shallow)
-    simulate(run)
+    run.advance()
     assert re.search(r"the cut of slice 1 has parted \d\d\.\d\d % of its section", run.stopped)
     assert run.record()["food_index"].max() == 0
 

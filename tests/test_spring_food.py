@@ -15,7 +15,7 @@ from sliceit_drake.cutting.foods.spring_food import SpringFood, calibrate_spring
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagrams.ports import check_station_ports
-from sliceit_drake.diagrams.run import prepare_run, simulate
+from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.records.force_profile import load_force_profile
@@ -242,7 +242,7 @@ def test_stations_without_elements_keep_the_port_contract_and_complete_a_slice(f
         scenario.food, scenario.measurement = AnalyticFood(), None
     check_station_ports(MakeStation(scenario))
     run = prepare_run(scenario)
-    simulate(run)
+    run.advance()
     record = run.record()
     assert run.stopped is None
     assert record["cut_progress"][-1] > 0.98
@@ -253,7 +253,7 @@ def test_the_food_sees_the_plant_at_the_instants_of_the_exchange():
     scenario = spring_scenario()
     scenario.motion = MotionPlan([ConstantSpeed(distance=0.0368, speed=0.02, acceleration=1.0)])
     run = prepare_run(scenario)
-    simulate(run, duration=1.2)
+    run.advance(duration=1.2)
     record = run.record()
     # Row k's force was computed from the knife's pose one exchange before it.
     depth = (scenario.board.height + scenario.food.height - record["knife_pose_p_z"])[:-1]

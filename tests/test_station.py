@@ -10,7 +10,7 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan, Retract
 from sliceit_drake.diagrams.outputs.run_log import Record
 from sliceit_drake.diagrams.ports import STATION_PORTS, check_station_ports, ports_as_markdown
-from sliceit_drake.diagrams.run import Run, prepare_run, simulate
+from sliceit_drake.diagrams.run import Run, prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.resources import resource_path
@@ -30,7 +30,7 @@ def cucumber(overrides: str = SMALL_FOOD) -> Scenario:
 @pytest.fixture(scope="module")
 def cut() -> tuple[Run, Record]:
     run = prepare_run(cucumber())
-    simulate(run)
+    run.advance()
     assert run.stopped is None
     return run, run.record()
 
@@ -109,7 +109,7 @@ def test_two_runs_of_one_scenario_agree_bit_for_bit():
     values = []
     for _ in range(2):
         run = prepare_run(cucumber())
-        simulate(run, duration=0.75)
+        run.advance(duration=0.75)
         values.append(run.record().values)
     assert values[0][:, 1:].any()
     np.testing.assert_array_equal(values[0], values[1])
@@ -121,7 +121,7 @@ def test_analytic_food_gives_toughness_times_width():
     scenario.measurement = None
     scenario.motion = MotionPlan([ConstantSpeed(distance=0.03, speed=0.05, acceleration=1.0)])
     run = prepare_run(scenario)
-    simulate(run)
+    run.advance()
     record = run.record()
     height = record["knife_pose_p_z"] - scenario.board.height
     inside = (height > 0.003) & (height < 0.024)
@@ -178,7 +178,7 @@ def test_knife_that_presses_on_the_bare_board_feels_the_boards_stiffness():
         ]
     )
     run = prepare_run(scenario)
-    simulate(run, duration=1.5)
+    run.advance(duration=1.5)
     record = run.record()
     penetration = scenario.board.height - record["knife_pose_p_z"][-1]
     assert penetration > 1e-5

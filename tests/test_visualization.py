@@ -18,10 +18,11 @@ from sliceit_drake.diagrams.live_view import (
     SPEED,
     STOP,
     LiveControls,
+    make_meshcat,
     viewing_instructions,
     wait_for_browser,
 )
-from sliceit_drake.diagrams.run import Run, make_meshcat, prepare_run, simulate
+from sliceit_drake.diagrams.run import Run, prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.simulated_station import FRAMES_PER_SECOND, REPLAY_SIZE
 from sliceit_drake.diagrams.station import MakeStation
@@ -84,7 +85,7 @@ def watched() -> tuple[Run, Meshcat]:
     run = prepare_run(fast_slice(), meshcat)
     run.controls = LiveControls(meshcat)
     meshcat.SetSliderValue(SPEED, FASTEST)
-    simulate(run)
+    run.advance()
     assert run.stopped is None
     return run, meshcat
 
@@ -180,7 +181,7 @@ def test_cut_faces_show_where_the_edge_has_been_and_the_skin_stays_as_it_is():
     run = prepare_run(fast_slice())
     cutting = run.station.cutting
     assert isinstance(cutting, CuttingSystem)
-    simulate(run, 0.22)
+    run.advance(0.22)
     context = cutting.GetMyContextFromRoot(run.simulator.get_context())
     surface, model = cutting.surfaces[0], cutting.solver(context).model
     damage = cutting.GetOutputPort("surface_damage").Eval(context)
@@ -217,7 +218,7 @@ def test_each_half_is_drawn_with_its_damage_and_skin_colours():
     visualizer = run.station.food_visualizer
     assert visualizer is not None
     visualizer._meshcat = fake
-    simulate(run, 0.2)
+    run.advance(0.2)
     colours = fake.meshes["/drake/food/minus/frame_0006"]
     corners, _ = run.station.cutting.surfaces[0].halves[0]
     is_cut = run.station.cutting.surfaces[0].is_cut_face[corners]
@@ -272,7 +273,7 @@ def test_a_run_with_a_viewer_gives_the_same_record_to_the_bit(watched):
     run, _ = watched
     with_viewer = run.record()
     without = prepare_run(fast_slice())
-    simulate(without)
+    without.advance()
     record = without.record()
     assert list(record.columns) == list(with_viewer.columns)
     for name in record.columns:
@@ -310,7 +311,7 @@ def test_stop_in_the_viewer_ends_a_run_and_says_so():
 
     run = prepare_run(fast_slice())
     run.controls = Stopped()
-    simulate(run)
+    run.advance()
     assert run.stopped == "stopped in the viewer"
     assert run.record()["time"][-1] == pytest.approx(0.04)
 

@@ -14,7 +14,7 @@ from sliceit_drake.cli.hardware import (
     run_confirmed,
     touch_confirmed,
 )
-from sliceit_drake.cli.scenario_argument import add_protocol_argument, find_file, protocol_file
+from sliceit_drake.cli.scenario_argument import add_protocol_argument, protocol_file
 from sliceit_drake.output_folder import check_folder
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ def _run(options: argparse.Namespace) -> int:
 
     config = _checked_config(options)
     protocol = load_protocol(str(protocol_file(options)))
-    station = load_scenario(find_file(options.station, "scenario", STATION))
+    station = load_scenario(options.station)
     options.output = directory = options.output or Path("output") / protocol.name
     check_folder(directory, "--output")
     specimens = schedule(protocol, np.random.default_rng([options.seed, 0]))[: options.first]
@@ -133,10 +133,10 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _cut_simulated(scenario: "Scenario") -> "Run":
-    from sliceit_drake.diagrams.run import prepare_run, simulate
+    from sliceit_drake.diagrams.run import prepare_run
 
     made = prepare_run(scenario)
-    simulate(made)
+    made.advance()
     return made
 
 

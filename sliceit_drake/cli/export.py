@@ -59,7 +59,7 @@ def _run(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from sliceit_drake.diagrams.outputs.paraview import FoodFrames, write_series
-    from sliceit_drake.diagrams.run import prepare_run, simulate
+    from sliceit_drake.diagrams.run import prepare_run
     from sliceit_drake.diagrams.scenario import load_scenario
     from sliceit_drake.tables import read_columns
 
@@ -70,7 +70,7 @@ def _run(options: argparse.Namespace) -> int:
     duration = float(kept["time"][-1])
     shown = "{desc}: {percentage:3.0f}%|{bar}| {n:.2f}/{total:.2f} s"
     with tqdm(total=duration, desc=prepared.scenario.name, bar_format=shown) as bar:
-        simulate(prepared, duration, lambda time, _: (bar.update(time - bar.n), None)[1])
+        prepared.advance(duration, lambda time, _: (bar.update(time - bar.n), None)[1])
     force = prepared.record()["food_wrench_f_z"]
     count = min(len(force), len(kept["time"]))
     difference = float(np.abs(force[:count] - kept["food_wrench_f_z"][:count]).max())

@@ -146,7 +146,7 @@ def run_confirmed(
     Returns:
         The run; None if the robot was not ready or the operator did not confirm.
     """
-    from sliceit_drake.diagrams.run import make_meshcat
+    from sliceit_drake.diagrams.live_view import make_meshcat
     from sliceit_drake.robot_run.hardware_run import prepare_hardware_run
 
     if options.move_to_start and not options.dry_run:

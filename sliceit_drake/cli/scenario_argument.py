@@ -49,7 +49,7 @@ def scenario_of(options: argparse.Namespace) -> "Scenario":
     """
     from sliceit_drake.diagrams.scenario import load_scenario
 
-    return load_scenario(find_file(options.scenario, "scenario", DEFAULT), options.set)
+    return load_scenario(options.scenario, options.set)
 
 
 def add_protocol_argument(parser: argparse.ArgumentParser, kind: str = "a protocol") -> None:

@@ -81,11 +81,12 @@ def _run(options: argparse.Namespace) -> int:
     from sliceit_drake.diagrams.live_view import (
         FASTEST,
         LiveControls,
+        make_meshcat,
         viewing_instructions,
         wait_for_browser,
     )
     from sliceit_drake.diagrams.outputs.paraview import FoodFrames, write_series
-    from sliceit_drake.diagrams.run import make_meshcat, prepare_run, simulate, write_outputs
+    from sliceit_drake.diagrams.run import prepare_run
 
     if options.duration is not None and not options.duration > 0.0:
         from sliceit_drake.configuration import ConfigurationError
@@ -120,8 +121,8 @@ def _run(options: argparse.Namespace) -> int:
             bar.set_postfix_str(f"{time / wall:.2f} x real time", refresh=False)
             bar.update(time - bar.n)
 
-        simulate(prepared, duration, show)
-    summary = write_outputs(prepared, directory, None if options.no_replay else meshcat)
+        prepared.advance(duration, show)
+    summary = prepared.save(directory, replay=not options.no_replay)
     if frames is not None:
         write_series(frames, directory / "paraview", options.paraview)
     _report(summary, directory)

@@ -1,15 +1,16 @@
 """What a person does with a run in a browser: find it, wait for it, change its speed, stop it."""
 
 import getpass
+import logging
 import os
 import sys
 import time
 from collections.abc import Mapping
 
-from pydrake.geometry import Meshcat
+from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import Simulator
 
-__all__ = ["FASTEST", "LiveControls", "viewing_instructions", "wait_for_browser"]
+__all__ = ["FASTEST", "LiveControls", "make_meshcat", "viewing_instructions", "wait_for_browser"]
 
 SPEED = "speed"
 STOP = "stop"
@@ -40,6 +41,18 @@ class LiveControls:
             # Or else the new rate would count from the start of the run and be made up for.
             simulator.ResetStatistics()
         return self._meshcat.GetButtonClicks(STOP) == 0
+
+
+def make_meshcat() -> Meshcat:
+    """A viewer on the loopback interface; `viewing_instructions` says how to see it."""
+    log = logging.getLogger("drake")
+    level = log.level
+    # Drake would say where every viewer listens, those too that only record a replay.
+    log.setLevel(logging.WARNING)
+    try:
+        return Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
+    finally:
+        log.setLevel(level)
 
 
 def wait_for_browser(meshcat: Meshcat, timeout: float) -> bool:

@@ -1,4 +1,4 @@
-"""Runs a scenario and writes what a user wants of it: record, summary, figure, replay."""
+"""A run of a scenario, and what a user wants of it: record, summary, figure, replay."""
 
 import dataclasses as dc
 import gc
@@ -6,21 +6,21 @@ import importlib.metadata
 import json
 import platform
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 
-from sliceit_drake.configuration import ConfigurationError, dump_yaml
+from sliceit_drake.configuration import ConfigurationError, dump_yaml, validate
 from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError
-from sliceit_drake.cutting.motion import Motion
+from sliceit_drake.cutting.motion import Motion, MotionPlan
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.contact_margin import ContactMargin, check_contact_margin
-from sliceit_drake.diagrams.live_view import LiveControls
+from sliceit_drake.diagrams.live_view import LiveControls, make_meshcat
 from sliceit_drake.diagrams.outputs.figures import CONTACT_THRESHOLD, plot_force
 from sliceit_drake.diagrams.outputs.measurement_comparison import (
     Comparison,
@@ -30,17 +30,24 @@ from sliceit_drake.diagrams.outputs.measurement_comparison import (
 from sliceit_drake.diagrams.outputs.run_log import Record
 from sliceit_drake.diagrams.outputs.sequence_report import plot_sequence, slice_reports
 from sliceit_drake.diagrams.outputs.snapshot import Snapshot, take_snapshot
-from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram, ScenarioDiagram
-from sliceit_drake.diagrams.simulated_station import SimulatedStation
-from sliceit_drake.diagrams.station_interface import Station
+from sliceit_drake.diagrams.scenario import Scenario, load_scenario
+from sliceit_drake.diagrams.scenario_diagram import (
+    MakeScenarioDiagram,
+    OwnPolicy,
+    ScenarioDiagram,
+)
+from sliceit_drake.diagrams.simulated_station import OwnCutting
+from sliceit_drake.diagrams.station import MakeStation
+from sliceit_drake.diagrams.station_interface import OwnController, Station
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.resources import file_or_resource
+from sliceit_drake.systems.agent import AgentConfig
+from sliceit_drake.systems.policy import PolicyConfig
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Run", "make_meshcat", "measured_profile", "prepare_run", "simulate", "write_outputs"]
+__all__ = ["Run", "measured_profile", "prepare_run", "simulate"]
 
 CHUNK = 0.02
 SNAPSHOT_PROGRESS = 0.5
@@ -48,14 +55,17 @@ SNAPSHOT_PROGRESS = 0.5
 
 @dc.dataclass
 class Run:
-    """A scenario ready to simulate, and what came of it.
+    """A simulated slice, from its start to what came of it; plots and saves itself.
 
     Attributes:
         scenario: What is simulated.
         diagram: Station, motion and record.
         simulator: Initialized.
         profile: The measured force to compare with, or None.
-        contact_margin: How far the contact is from instability.
+        contact_margin: How far the contact is from instability; None with a controller of the
+            user's own, of which that is not known.
+        meshcat: The viewer that records the replay, or None.
+        own: Class of each system of the user's own, by what it is put in for.
         wall_time: Seconds spent in the simulator.
         stopped: Why the run ended early, or None.
         snapshot: Knife and food when half of the section was cut, or None.
@@ -66,14 +76,53 @@ class Run:
     diagram: ScenarioDiagram
     simulator: Simulator
     profile: ForceProfile | None
-    contact_margin: ContactMargin
+    contact_margin: ContactMargin | None
+    meshcat: Meshcat | None = None
+    own: dict[str, str] = dc.field(default_factory=dict)
     wall_time: float = 0.0
     stopped: str | None = None
     snapshot: Snapshot | None = None
     controls: LiveControls | None = None
 
+    def advance(
+        self,
+        duration: float | None = None,
+        progress: Callable[[float, float], None] | None = None,
+    ) -> None:
+        """Simulates to the end; an error or Ctrl-C ends it early and is noted in `stopped`.
+
+        Args:
+            duration: Simulated time at the end, s; None for the motion's.
+            progress: Called with simulated time and wall time, s, after each part.
+        """
+        end = self.motion.duration if duration is None else duration
+        # The run makes no cycles worth collecting, but walking through all imported modules costs.
+        gc.collect()
+        gc.freeze()
+        begin = clock.perf_counter()
+        try:
+            while (now := self.simulator.get_context().get_time()) < end - 1e-9:
+                if self.controls is not None and not self.controls.apply(self.simulator):
+                    self.stopped = "stopped in the viewer"
+                    break
+                status = self.simulator.AdvanceTo(min(now + CHUNK, end))
+                if self.snapshot is None and _cut_progress(self) > SNAPSHOT_PROGRESS:
+                    self.snapshot = take_snapshot(self.station, self.simulator.get_context())
+                self.wall_time = clock.perf_counter() - begin
+                if progress is not None:
+                    progress(self.simulator.get_context().get_time(), self.wall_time)
+                if status.reason() == SimulatorStatus.ReturnReason.kReachedTerminationCondition:
+                    self.stopped = status.message()
+                    break
+        except CuttingError as error:
+            self.stopped = str(error)
+        except KeyboardInterrupt:
+            self.stopped = "interrupted by the user"
+        finally:
+            gc.unfreeze()
+
     def record(self) -> Record:
-        """The record so far."""
+        """The table of the run so far: joints, poses, wrenches, energies at every exchange."""
         return self.diagram.record(self.simulator.get_context())
 
     @property
@@ -91,18 +140,116 @@ class Run:
         record = self.record()
         return _figure(self, record, _comparison(self, record))
 
+    def summary(self) -> dict:
+        """Forces, work, times, margins and versions, as summary.json has them.
 
-def prepare_run(scenario: Scenario, meshcat: Meshcat | None = None) -> Run:
-    """Builds the diagram of a scenario and puts it at its start.
+        It simulates the cut again on other meshes, for the discretisation error.
+        """
+        record = self.record()
+        return _summary(self, record, _comparison(self, record))
+
+    def save(self, folder: str | Path, *, replay: bool = True, extra: dict | None = None) -> dict:
+        """Writes record.csv, replay.html, force.png, summary.json and scenario.yaml.
+
+        Args:
+            folder: Made if absent.
+            replay: False leaves replay.html out, as a run without a viewer does.
+            extra: What else the summary shall say.
+
+        Returns:
+            The summary.
+        """
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        record = self.record()
+        record.write_csv(folder / "record.csv")
+        dump_yaml(self.scenario, folder / "scenario.yaml")
+        comparison = _comparison(self, record)
+        summary = _summary(self, record, comparison) | (extra or {})
+        text = json.dumps(summary, indent=2) + "\n"
+        (folder / "summary.json").write_text(text, encoding="utf-8")
+        _figure(self, record, comparison).savefig(folder / "force.png", dpi=150)
+        if replay and self.meshcat is not None:
+            if self.station.food_visualizer is not None:
+                self.station.food_visualizer.PublishRecording()
+            self.meshcat.StopRecording()
+            self.meshcat.PublishRecording()
+            (folder / "replay.html").write_text(self.meshcat.StaticHtml(), encoding="utf-8")
+        return summary
+
+
+def simulate(
+    scenario: str | Path | Scenario,
+    overrides: str | Mapping[str, Any] | None = None,
+    *,
+    policy: PolicyConfig | AgentConfig | OwnPolicy | None = None,
+    cutting: OwnCutting | None = None,
+    controller: OwnController | None = None,
+    duration: float | None = None,
+    meshcat: Meshcat | None = None,
+    replay: bool = True,
+    progress: Callable[[float, float], None] | None = None,
+) -> Run:
+    """A scenario simulated in the station, with systems of your own where you give them.
+
+    Args:
+        scenario: Name of one that ships, such as "cucumber"; a YAML file; or a `Scenario`.
+        overrides: Fields that replace those of the scenario, see `load_scenario`.
+        policy: What moves the knife in place of the scenario's motion or policy, see `prepare_run`.
+        cutting: What gives the food's force in place of the scenario's food, see `MakeStation`.
+        controller: What commands the joints in place of the compliance controller, likewise.
+        duration: Simulated time, s; None for the motion's.
+        meshcat: Viewer to draw in; None for one that only records the replay.
+        replay: False draws nothing where no viewer is given; `Run.save` then leaves the replay out.
+        progress: Called with simulated time and wall time, s, after each part.
+
+    Returns:
+        The run, at its end or where it stopped: see `Run.stopped`.
 
     Raises:
         ConfigurationError, MeshError, TimeStepError, CuttingError: The scenario cannot start.
     """
+    if meshcat is None and replay:
+        meshcat = make_meshcat()
+    run = prepare_run(
+        load_scenario(scenario, overrides),
+        meshcat,
+        policy=policy,
+        cutting=cutting,
+        controller=controller,
+    )
+    run.advance(duration, progress)
+    return run
+
+
+def prepare_run(
+    scenario: Scenario,
+    meshcat: Meshcat | None = None,
+    *,
+    policy: PolicyConfig | AgentConfig | OwnPolicy | None = None,
+    cutting: OwnCutting | None = None,
+    controller: OwnController | None = None,
+) -> Run:
+    """A run at its start.
+
+    Args:
+        scenario: What to simulate.
+        meshcat: Viewer to draw and to record in, or None.
+        policy: A configuration, which takes the place of the scenario's motion; or a policy of your
+            own, see `MakeScenarioDiagram`.
+        cutting, controller: See `MakeStation`.
+
+    Raises:
+        ConfigurationError, MeshError, TimeStepError, CuttingError: The scenario cannot start.
+    """
+    if isinstance(policy, PolicyConfig | AgentConfig):
+        scenario = dc.replace(scenario, policy=policy, motion=MotionPlan(), sequence=None)
+        validate(scenario, "scenario")
+        policy = None
     profile = measured_profile(scenario)
-    diagram = MakeScenarioDiagram(scenario, meshcat)
-    station = diagram.station
-    assert isinstance(station, SimulatedStation)
-    margin = check_contact_margin(station)
+    station = MakeStation(scenario, meshcat, cutting=cutting, controller=controller)
+    diagram = MakeScenarioDiagram(scenario, station=station, policy=policy)
+    margin = check_contact_margin(station) if controller is None else None
     simulator = Simulator(diagram)
     diagram.SetStart(simulator.get_mutable_context())
     if meshcat is not None:
@@ -110,76 +257,14 @@ def prepare_run(scenario: Scenario, meshcat: Meshcat | None = None) -> Run:
         if station.food_visualizer is not None:
             station.food_visualizer.StartRecording()
     simulator.Initialize()
-    return Run(scenario, diagram, simulator, profile, margin)
-
-
-def simulate(
-    run: Run, duration: float | None = None, progress: Callable[[float, float], None] | None = None
-) -> None:
-    """Advances a run to its end; an error or Ctrl-C ends it early and is noted in `run.stopped`.
-
-    Args:
-        run: Prepared.
-        duration: Simulated time, s; None for the motion's.
-        progress: Called with simulated time and wall time, s, after each part.
-    """
-    end = run.motion.duration if duration is None else duration
-    # The run makes no cycles worth collecting, but walking through all imported modules costs it.
-    gc.collect()
-    gc.freeze()
-    begin = clock.perf_counter()
-    try:
-        while (now := run.simulator.get_context().get_time()) < end - 1e-9:
-            if run.controls is not None and not run.controls.apply(run.simulator):
-                run.stopped = "stopped in the viewer"
-                break
-            status = run.simulator.AdvanceTo(min(now + CHUNK, end))
-            if run.snapshot is None and _cut_progress(run) > SNAPSHOT_PROGRESS:
-                run.snapshot = take_snapshot(run.station, run.simulator.get_context())
-            run.wall_time = clock.perf_counter() - begin
-            if progress is not None:
-                progress(run.simulator.get_context().get_time(), run.wall_time)
-            if status.reason() == SimulatorStatus.ReturnReason.kReachedTerminationCondition:
-                run.stopped = status.message()
-                break
-    except CuttingError as error:
-        run.stopped = str(error)
-    except KeyboardInterrupt:
-        run.stopped = "interrupted by the user"
-    finally:
-        gc.unfreeze()
-
-
-def write_outputs(
-    run: Run, directory: Path, meshcat: Meshcat | None, extra: dict | None = None
-) -> dict:
-    """Writes record.csv, summary.json, force.png, scenario.yaml and, with a viewer, replay.html.
-
-    Args:
-        run: After `simulate`.
-        directory: Made if absent.
-        meshcat: The viewer that recorded the run, or None.
-        extra: What else the summary shall say.
-
-    Returns:
-        The summary.
-    """
-    directory.mkdir(parents=True, exist_ok=True)
-    record = run.record()
-    record.write_csv(directory / "record.csv")
-    dump_yaml(run.scenario, directory / "scenario.yaml")
-    comparison = _comparison(run, record)
-    summary = _summary(run, record, comparison) | (extra or {})
-    text = json.dumps(summary, indent=2) + "\n"
-    (directory / "summary.json").write_text(text, encoding="utf-8")
-    _figure(run, record, comparison).savefig(directory / "force.png", dpi=150)
-    if meshcat is not None:
-        if run.station.food_visualizer is not None:
-            run.station.food_visualizer.PublishRecording()
-        meshcat.StopRecording()
-        meshcat.PublishRecording()
-        (directory / "replay.html").write_text(meshcat.StaticHtml(), encoding="utf-8")
-    return summary
+    own = {}
+    if policy is not None:
+        own["policy"] = type(diagram.policy if callable(policy) else policy).__name__
+    if cutting is not None:
+        own["cutting"] = type(station.cutting).__name__
+    if controller is not None:
+        own["controller"] = type(station.controller).__name__
+    return Run(scenario, diagram, simulator, profile, margin, meshcat, own)
 
 
 def _figure(run: Run, record: Record, comparison: Comparison | None) -> "Figure":
@@ -188,11 +273,6 @@ def _figure(run: Run, record: Record, comparison: Comparison | None) -> "Figure"
         board = run.scenario.board.height
         return plot_sequence(record, areas, title, board, caption, run.snapshot)
     return plot_force(record, title, _top_height(run), comparison, caption, run.snapshot)
-
-
-def make_meshcat() -> Meshcat:
-    """A viewer on the loopback interface."""
-    return Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
 
 
 def _cut_progress(run: Run) -> float:
@@ -247,7 +327,7 @@ def _title(run: Run) -> str:
     scenario, segments = run.scenario, run.station.motion_plan.segments
     speeds = [getattr(s, "speed", None) for s in segments]
     speed = next((s for s in speeds if s), None)
-    at = f" at {1e3 * speed:.3g} mm/s" if speed and scenario.policy is None else ""
+    at = f" at {1e3 * speed:.3g} mm/s" if speed and run.diagram.policy is None else ""
     if scenario.sequence is not None:
         name = scenario.food.name if isinstance(scenario.food, Food) else scenario.name
         count, thickness = scenario.sequence.count, 1e3 * scenario.sequence.thickness
@@ -261,6 +341,9 @@ def _caption(run: Run, comparison: Comparison | None) -> str:
         named = run.scenario.calibration
         source = "Parameters set by hand" if named is None else f"Calibrated food {named}"
         lines.append(f"{source}: {described}")
+    if run.own:
+        put_in = ", ".join(f"{name} {kind}" for kind, name in run.own.items())
+        lines.append(f"Put in by the user: {put_in}.")
     if comparison is not None:
         lines.append(
             "Measured curve digitised from the SliceIt! paper's project page; first contact fitted "
@@ -288,7 +371,7 @@ def _summary(run: Run, record: Record, comparison: Comparison | None) -> dict:
     summary: dict = {
         "scenario": scenario.name,
         "stopped": run.stopped,
-        "contact_margin": dc.asdict(run.contact_margin),
+        "contact_margin": run.contact_margin and dc.asdict(run.contact_margin),
         "simulated_time_s": float(time[-1]),
         "wall_time_s": run.wall_time,
         "real_time_factor": float(time[-1] / run.wall_time) if run.wall_time else None,
@@ -313,6 +396,8 @@ def _summary(run: Run, record: Record, comparison: Comparison | None) -> dict:
         }
         | {"python": platform.python_version()},
     }
+    if run.own:
+        summary["own"] = run.own
     summary |= station.cutting.summary(record)
     if areas := _slice_areas(run):
         summary["slices"] = [dc.asdict(report) for report in slice_reports(record, areas)]
@@ -346,8 +431,10 @@ def _slice_areas(run: Run) -> list[float]:
 
 
 def _discretization_error(run: Run) -> dict | None:
-    """What `PreparedFood.estimate_error` says; None where the run ended early."""
-    if run.stopped is not None or run.station.estimate_error is None:
+    """What `PreparedFood.estimate_error` says; None where the run ended early or a policy led."""
+    # Of a policy the prescribed motion is not known.
+    unknown = run.stopped is not None or run.diagram.policy is not None
+    if unknown or run.station.estimate_error is None:
         return None
     try:
         error = run.station.estimate_error()

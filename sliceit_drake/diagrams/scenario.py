@@ -1,9 +1,12 @@
 """A scenario: everything about one simulated or real slice, and the YAML that holds it."""
 
 import dataclasses as dc
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 from pydrake.math import RigidTransform, RotationMatrix
 
 from sliceit_drake.configuration import ConfigurationError, choice, load_yaml, quantity, validate
@@ -18,6 +21,7 @@ from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.cutting.named_knife import load_knife
 from sliceit_drake.diagrams.robot import RobotConfig
 from sliceit_drake.diagrams.sequence import SliceSequence
+from sliceit_drake.resources import file_or_resource, named_yaml, resource_path
 from sliceit_drake.systems.agent import AgentConfig
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
@@ -171,28 +175,65 @@ class Scenario:
         return RigidTransform(RotationMatrix.MakeZRotation(self.placement.yaw), p_WF)
 
 
-def load_scenario(file: str | Path, overrides: str | None = None) -> Scenario:
-    """Reads and validates a scenario.
+def load_scenario(
+    scenario: str | Path | Scenario, overrides: str | Mapping[str, Any] | None = None
+) -> Scenario:
+    """A validated scenario: one that ships, one of a file, or a copy of another.
 
     Args:
-        file: YAML with one document of `Scenario` fields.
-        overrides: YAML text whose fields replace those of the file.
+        scenario: Name of one that ships, such as "cucumber"; a YAML file with one document of
+            `Scenario` fields; or a `Scenario`, which stays as it is.
+        overrides: Fields that replace those of the scenario: YAML text such as
+            `{food: {material: {toughness: 400}}}`, or a dictionary. A key of a dictionary may be
+            a path, such as `food.material.toughness` or `motion.segments.0.speed`.
 
     Raises:
         ConfigurationError: Naming file, field and fix.
     """
-    scenario = load_yaml(Scenario, file, defaults=Scenario(), overrides_text=overrides)
-    assert isinstance(scenario, Scenario)
-    if isinstance(scenario.food, Food):
-        scenario.food.look_beside(file)
-    if scenario.knife_name is not None:
-        scenario.knife = _named_knife(scenario.knife_name, scenario.knife, str(file))
-    if scenario.calibration is not None:
+    paths: dict[str, Any] = {}
+    if isinstance(overrides, Mapping):
+        paths = {key: value for key, value in overrides.items() if "." in key}
+        plain = {key: value for key, value in overrides.items() if key not in paths}
+        overrides = yaml.safe_dump(plain) if plain else None
+    if isinstance(scenario, Scenario):
+        file, given, source = None, scenario, "scenario"
+    else:
+        file, given = _scenario_file(scenario), Scenario()
+        source = str(file)
+    loaded = load_yaml(Scenario, file, defaults=given, overrides_text=overrides)
+    assert isinstance(loaded, Scenario)
+    if file is not None and isinstance(loaded.food, Food):
+        loaded.food.look_beside(file)
+    _put_in_named(loaded, given, source)
+    for path, value in paths.items():
+        _set_field(loaded, path, value)
+    validate(loaded, "scenario")
+    return loaded
+
+
+def _scenario_file(name: str | Path) -> Path:
+    file = file_or_resource(str(name)) or named_yaml(name, "scenarios")
+    if file is None or not file.is_file():
+        shipped = ", ".join(sorted(each.stem for each in resource_path("scenarios").glob("*.yaml")))
+        raise ConfigurationError(
+            "there is no such scenario, neither here nor in the package",
+            source=str(name),
+            fix=f"Give a YAML file, or one of {shipped}.",
+        )
+    return file
+
+
+def _put_in_named(scenario: Scenario, given: Scenario, source: str) -> None:
+    """Puts the named knife and the calibrated food in, where `given` does not have them yet."""
+    if scenario.knife_name not in (None, given.knife_name):
+        beside = Knife() if scenario.knife == given.knife else scenario.knife
+        scenario.knife = _named_knife(scenario.knife_name, beside, source)
+    if scenario.calibration not in (None, given.calibration):
         if not isinstance(scenario.food, Food):
             raise ConfigurationError(
                 "is of a food of finite elements",
                 field="scenario.calibration",
-                source=str(file),
+                source=source,
                 fix="Leave it out, or give a food with a shape and a material.",
             )
         calibrated = load_calibrated_food(scenario.calibration)
@@ -201,8 +242,28 @@ def load_scenario(file: str | Path, overrides: str | None = None) -> Scenario:
     if scenario.preparation is not None and scenario.preparation.peeled:
         if isinstance(scenario.food, Food):
             scenario.food.effects.skin.toughness = 0.0
-    validate(scenario, "scenario")
-    return scenario
+
+
+def _set_field(scenario: Scenario, path: str, value: Any) -> None:
+    """Sets the field at a path of names, and of numbers of elements of lists."""
+    *parents, last = path.split(".")
+    at: Any = scenario
+    try:
+        for part in parents:
+            at = at[int(part)] if isinstance(at, list) else getattr(at, part)
+        value = value.item() if isinstance(value, np.generic) else value
+        if isinstance(at, list):
+            at[int(last)] = value
+        elif last in {field.name for field in dc.fields(at)}:
+            setattr(at, last, value)
+        else:
+            raise AttributeError(last)
+    except (AttributeError, IndexError, TypeError, ValueError) as error:
+        raise ConfigurationError(
+            "there is no such field",
+            field=f"scenario.{path}",
+            fix="Give a path such as food.material.toughness or motion.segments.0.speed.",
+        ) from error
 
 
 def _named_knife(name: str, given: Knife, source: str) -> Knife:

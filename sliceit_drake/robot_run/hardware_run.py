@@ -19,7 +19,7 @@ from sliceit_drake.diagrams.hardware_station import (
     HardwareStation,
     RobotConnection,
 )
-from sliceit_drake.diagrams.run import Run, measured_profile, write_outputs
+from sliceit_drake.diagrams.run import Run, measured_profile
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
 from sliceit_drake.diagrams.simulated_station import FRAMES_PER_SECOND, SimulatedStation
@@ -37,7 +37,9 @@ from sliceit_drake.hardware.interruption import raise_if_interrupted
 from sliceit_drake.hardware.robot_state import RobotState
 from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.robot_run.plan_check import JointPlan, check_plan, plan_joints
+from sliceit_drake.systems.agent import AgentSystem
 from sliceit_drake.systems.motion_sources import placed_motion
+from sliceit_drake.systems.policy import PolicySystem
 
 __all__ = ["HardwareRun", "prepare_hardware_run", "steady_python", "write_hardware_outputs"]
 
@@ -153,7 +155,8 @@ class HardwareRun:
         rehearsal = Simulator(diagram, simulator.get_context().Clone())
         rehearsal.Initialize()
         rehearsal.AdvanceTo(WARM_UP)
-        return Run(self.scenario, diagram, simulator, measured_profile(self.scenario), margin)
+        profile, meshcat = measured_profile(self.scenario), self.twin.meshcat
+        return Run(self.scenario, diagram, simulator, profile, margin, meshcat)
 
     def _follow(
         self,
@@ -166,6 +169,7 @@ class HardwareRun:
         link, simulator, policy = station.link, run.simulator, run.diagram.policy
         if policy is not None:
             assert self.scenario.policy is not None
+            assert isinstance(policy, PolicySystem | AgentSystem)
             period = self.scenario.policy.period
             policy.watch = lambda: link.deadline("policy", period)
         context = simulator.get_mutable_context()
@@ -249,7 +253,7 @@ def prepare_hardware_run(
 
 
 def write_hardware_outputs(hardware: HardwareRun, directory: Path) -> dict:
-    """Writes the files of `run.write_outputs` from what the robot measured.
+    """Writes the files of `Run.save` from what the robot measured.
 
     And robot.csv: what came and what went out in every cycle, braking included; `robot` in the
     summary has the timing. The replay shows the measured motion; the food in it is not cut.
@@ -262,7 +266,7 @@ def write_hardware_outputs(hardware: HardwareRun, directory: Path) -> dict:
     meshcat = hardware.twin.meshcat
     if meshcat is not None:
         _draw(hardware, meshcat)
-    summary = write_outputs(run, directory, meshcat, {"robot": link.timing()})
+    summary = run.save(directory, extra={"robot": link.timing()})
     link.write_log(directory / "robot.csv")
     return summary
 

@@ -19,7 +19,7 @@ from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
 from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model
 from sliceit_drake.cutting.motion import Hold, MotionPlan, PressAndDraw
 from sliceit_drake.cutting.motion_optimization import MotionLimits, optimize_motion
-from sliceit_drake.diagrams.run import prepare_run, simulate
+from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.learning.evaluation import cut_slice
 from sliceit_drake.learning.metrics import SliceMetrics, slice_metrics
@@ -61,7 +61,7 @@ def cut_by_motion(
     down = dc.replace(motion, distance=height + BELOW)
     scenario.motion = MotionPlan([down, Hold(0.3)])
     run = prepare_run(scenario)
-    simulate(run)
+    run.advance()
     record = run.record()
 
     def force(name: str) -> np.ndarray:

@@ -21,7 +21,7 @@ from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
-from sliceit_drake.diagrams.run import prepare_run, simulate
+from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.resources import resource_path
 from studies.physics import stepping as study
@@ -193,7 +193,7 @@ def station_steps(
         case.measurement = None
         case.numerics.time_step = step
         run = prepare_run(case)
-        simulate(run)
+        run.advance()
         if run.stopped and not results:
             raise ConfigurationError(
                 f"the run with a step of {step:g} s, the reference, broke off: {run.stopped}",

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from sliceit_drake.cli.scenario_argument import add_scenario_arguments, scenario_of
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.outputs.run_log import Record
-from sliceit_drake.diagrams.run import prepare_run, simulate
+from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario
 from studies.pages import publish
 
@@ -99,7 +99,7 @@ def coupling_study(
         case.robot.plant_time_step = step
         case.numerics.time_step = sub_step
         run = prepare_run(case)
-        simulate(run)
+        run.advance()
         if run.stopped:
             raise ConfigurationError(
                 f"the run with an exchange of {exchange:g} s broke off: {run.stopped}",

@@ -1,7 +1,7 @@
 """A run as a time series for ParaView: the deformed food, the knife, and the force on it.
 
 frames = FoodFrames(run, 30.0)
-simulate(run)
+run.advance()
 write_series(frames, Path("output/cucumber/paraview"))
 """
 

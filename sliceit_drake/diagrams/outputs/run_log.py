@@ -9,7 +9,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem, OutputPort
 from pydrake.systems.primitives import (
     ConstantVectorSource,
     LogVectorOutput,
@@ -96,11 +98,12 @@ class Recorder:
             ("commanded_pose", raw.vector("q_command", "123456")),
         ):
             add(_pose_columns(name), self._knife_poses(q))
-        R, p, _, _ = self.motion.sample(time)
-        if "_target_x" in self.columns:
-            R = np.repeat(R[:1], len(time), axis=0)
-            p = p[0] + raw.vector("_target", "xz") @ R[0][:, [0, 2]].T
-        add(_pose_columns("target_pose"), np.column_stack([p, _quaternions(R)]))
+        if _pose_columns("target_pose")[0] not in self.columns:
+            R, p, _, _ = self.motion.sample(time)
+            if "_target_x" in self.columns:
+                R = np.repeat(R[:1], len(time), axis=0)
+                p = p[0] + raw.vector("_target", "xz") @ R[0][:, [0, 2]].T
+            add(_pose_columns("target_pose"), np.column_stack([p, _quaternions(R)]))
         names = [f"knife_velocity_{part}_{a}" for part in ("v", "w") for a in _AXES]
         add(names, self._knife_velocities(joints, raw.vector("qd", "123456")))
         for name in ("food_wrench", "board_wrench", "sensor_wrench"):
@@ -141,6 +144,20 @@ def _wrench_columns(name: str) -> list[str]:
     return [f"_{name}_{part}_{a}" for part in ("m", "f") for a in _AXES]
 
 
+class _PoseRow(LeafSystem):
+    """A pose as a vector: position and quaternion [7]."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._pose = self.DeclareAbstractInputPort("pose", Value(RigidTransform()))
+        self.DeclareVectorOutputPort("row", 7, self._calc)
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        X = self._pose.Eval(context)
+        q = _quaternions(X.rotation().matrix()[None])[0]
+        output.SetFromVector(np.concatenate([X.translation(), q]))
+
+
 def add_recorder(
     builder: DiagramBuilder,
     station: Station,
@@ -154,9 +171,10 @@ def add_recorder(
         station: The station.
         motion: What drives its target pose.
         sources: Output ports that drive the station's vector inputs, by input name; for the others
-            the configured constants are recorded. And "target_offset", the target's place along Kx
-            and Kz of the start, where a policy moves it.
+            the configured constants are recorded. And where a policy moves the target either
+            "target_offset", its place along Kx and Kz of the start, or its "target_pose".
     """
+    sources = dict(sources)
     vectors = {
         "joint_positions": [f"q_{i}" for i in range(1, 7)],
         "joint_velocities": [f"qd_{i}" for i in range(1, 7)],
@@ -169,6 +187,11 @@ def add_recorder(
     }
     if "target_offset" in sources:
         vectors["target_offset"] = ["_target_x", "_target_z"]
+    elif "target_pose" in sources:
+        target = builder.AddNamedSystem("target_pose_row", _PoseRow())
+        builder.Connect(sources["target_pose"], target.get_input_port())
+        sources["target_pose_row"] = target.get_output_port()
+        vectors["target_pose_row"] = _pose_columns("target_pose")
     vectors |= {name: list(columns) for name, columns in station.cutting.recorded().items()}
     row = builder.AddNamedSystem(
         "record_row", Multiplexer([len(columns) for columns in vectors.values()])
