@@ -21,7 +21,15 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["ConfigurationError", "choice", "dump_yaml", "load_yaml", "quantity", "validate"]
+__all__ = [
+    "ConfigurationError",
+    "choice",
+    "dump_yaml",
+    "load_yaml",
+    "quantity",
+    "unit_of",
+    "validate",
+]
 
 _METADATA_KEY = "sliceit_drake"
 
@@ -144,6 +152,18 @@ def choice(default: str, options: collections.abc.Sequence[str], *, doc: str) ->
     if default not in options:
         raise ValueError(f"choice(...) declared for {doc!r}: {default!r} is not in {options}")
     return dc.field(default=default, metadata={_METADATA_KEY: _Choice(tuple(options), doc)})
+
+
+def unit_of(config: Any, path: str) -> str:
+    """Unit of the quantity at a dotted path in a configuration; "" where it has none."""
+    *parents, last = path.split(".")
+    for part in parents:
+        config = config[int(part)] if isinstance(config, list) else getattr(config, part)
+    if not dc.is_dataclass(config):
+        return ""
+    rules = {field.name: field.metadata.get(_METADATA_KEY) for field in dc.fields(config)}
+    rule = rules.get(last)
+    return rule.unit if isinstance(rule, _Quantity) else ""
 
 
 def validate(config: Any, where: str) -> None:
