@@ -189,8 +189,8 @@ def sweep(
         parameters: Values by field, as `{"food.material.toughness": [200.0, 400.0]}`. Fields are
             paths as for `load_scenario`.
         overrides: What all slices have in common, see `load_scenario`.
-        robot: True cuts each slice in the station, as `simulate` does. False moves the knife exactly
-            on the scenario's motion, over a rigid mount: some ten times as fast.
+        robot: True cuts each slice in the station, as `simulate` does. False moves the knife on
+            the scenario's motion exactly, without a robot: several times as fast.
         workers: Processes of the station (a script that asks for several needs Python's
             `if __name__ == "__main__":`), threads without a robot.
         client: Of a Dask cluster that simulates the stations, in place of processes.
