@@ -309,12 +309,12 @@ def test_the_counts_are_those_of_the_paper():
 @pytest.mark.parametrize("world", WORLDS, ids=["stand_in", "curves"])
 def test_a_slice_follows_from_seed_food_and_index(world):
     for food in SLICING_FOODS:
-        first, again = (world.scenario(food, 2)[0] for _ in range(2))
+        first, again = (world.scenario(food, 2) for _ in range(2))
         assert first == again
-        validate(first, "scenario")
-        assert first.food != world.scenario(food, 3)[0].food
-        assert first.sensor != world.scenario(food, 3)[0].sensor
-        assert first.food != dc.replace(world, seed=1).scenario(food, 2)[0].food
+        validate(first.scenario, "scenario")
+        assert first.food != world.scenario(food, 3).food
+        assert first.scenario.sensor != world.scenario(food, 3).scenario.sensor
+        assert first.food != dc.replace(world, seed=1).scenario(food, 2).food
     draws = [world.rng("tomato", k).random() for k in (0, 0, 1)]
     assert draws[0] == draws[1] != draws[2]
     with pytest.raises(ConfigurationError, match="slice"):

@@ -224,7 +224,7 @@ class HardwareStation(Station):
         )
         builder = DiagramBuilder()
         self.rtde = builder.AddNamedSystem("robot", RtdeSystem(self.link, robot.pace))
-        controller = builder.AddNamedSystem("controller", make_controller(scenario, controller))
+        commander = builder.AddNamedSystem("controller", make_controller(scenario, controller))
         top = float(twin.start_pose.translation()[2]) - scenario.start.clearance
         estimate = builder.AddNamedSystem(
             "knife_estimate",
@@ -236,10 +236,10 @@ class HardwareStation(Station):
         )
         rtde = self.rtde
         for source, targets in (
-            (rtde.GetOutputPort("joint_positions"), (controller, estimate)),
+            (rtde.GetOutputPort("joint_positions"), (commander, estimate)),
             (rtde.GetOutputPort("joint_velocities"), (estimate,)),
-            (rtde.GetOutputPort("sensor_wrench"), (controller, estimate, monitor)),
-            (controller.GetOutputPort("joint_positions_command"), (rtde,)),
+            (rtde.GetOutputPort("sensor_wrench"), (commander, estimate, monitor)),
+            (commander.GetOutputPort("joint_positions_command"), (rtde,)),
         ):
             for target in targets:
                 builder.Connect(source, target.GetInputPort(source.get_name()))
@@ -247,12 +247,12 @@ class HardwareStation(Station):
             "joint_positions": rtde,
             "joint_velocities": rtde,
             "sensor_wrench": rtde,
-            "joint_positions_command": controller,
-            "commanded_pose": controller,
+            "joint_positions_command": commander,
+            "commanded_pose": commander,
         }
         for port in STATION_PORTS:
             if port.direction == "input":
-                builder.ExportInput(controller.GetInputPort(port.name), port.name)
+                builder.ExportInput(commander.GetInputPort(port.name), port.name)
             else:
                 home = homes.get(port.name, estimate)
                 builder.ExportOutput(home.GetOutputPort(port.name), port.name)

@@ -6,7 +6,7 @@ A food of a user's own is any object with the members of `CuttableFood`.
 import dataclasses as dc
 import functools
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
@@ -39,7 +39,7 @@ class CuttableFood(Protocol):
         ...
 
 
-OwnCutting = KnifeForceSystem | Callable[[Scenario], KnifeForceSystem] | CuttableFood
+OwnCutting: TypeAlias = KnifeForceSystem | Callable[[Scenario], KnifeForceSystem] | CuttableFood
 """A cutting system of a user's own, what makes it, or a food that does."""
 
 
@@ -107,11 +107,11 @@ def _own_system(
 
 
 @functools.singledispatch
-def prepare_food(food: CuttableFood, scenario: Scenario) -> PreparedFood:
+def prepare_food(food: Any, scenario: Scenario) -> PreparedFood:
     """Prepares a food for the station of a scenario.
 
     Args:
-        food: The scenario's, or one in its place.
+        food: The scenario's, or a `CuttableFood` in its place.
         scenario: Where and how it is cut.
 
     Raises:

@@ -1,6 +1,7 @@
 """What all that surrounds a station may ask of it besides its ports, simulated or hardware."""
 
 from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer
@@ -18,7 +19,7 @@ from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
 
 __all__ = ["OwnController", "Station", "make_controller"]
 
-OwnController = LeafSystem | Callable[[Scenario], LeafSystem]
+OwnController: TypeAlias = LeafSystem | Callable[[Scenario], LeafSystem]
 """What commands the joints in place of the compliance controller, or what makes it."""
 
 

@@ -36,6 +36,7 @@ __all__ = [
     "CurvesWorld",
     "SlicingWorld",
     "StandInWorld",
+    "WorldSlice",
     "paper_slices",
 ]
 
@@ -105,22 +106,33 @@ def paper_slices(food: str) -> int:
     return PAPER_SLICES[food]
 
 
+class WorldSlice(typing.NamedTuple):
+    """A slice of a world.
+
+    Attributes:
+        scenario: With the controller that the agent needs.
+        cutting: What `MakeStation` shall cut in place of the scenario's food, or None.
+    """
+
+    scenario: Scenario
+    cutting: CurveFood | None
+
+    @property
+    def food(self) -> object:
+        """What is cut."""
+        return self.cutting or self.scenario.food
+
+
 class SlicingWorld(typing.Protocol):
     """Gives slices to be cut."""
 
-    def scenario(
-        self, food: str, slice: int, board_stiffness: float | None = None
-    ) -> tuple[Scenario, CurveFood | None]:
+    def scenario(self, food: str, slice: int, board_stiffness: float | None = None) -> WorldSlice:
         """One slice; the same for the same food and index.
 
         Args:
             food: One of `SLICING_FOODS`.
             slice: Index of the slice, from 0.
             board_stiffness: N/m; None for the default board.
-
-        Returns:
-            The scenario, with the controller that the agent needs, and what `MakeStation` shall cut
-            in place of the scenario's food, or None.
 
         Raises:
             ConfigurationError: The food or the index is none.
@@ -206,9 +218,7 @@ class StandInWorld:
     )
     time_step: float = quantity(1e-4, "s", low=1e-6, high=2e-3, doc="Sub-step of the food.")
 
-    def scenario(
-        self, food: str, slice: int, board_stiffness: float | None = None
-    ) -> tuple[Scenario, CurveFood | None]:
+    def scenario(self, food: str, slice: int, board_stiffness: float | None = None) -> WorldSlice:
         """One slice; see `SlicingWorld`."""
         rng = _rng("stand_in", self.seed, food, slice, SLICE)
         calibrated = load_calibrated_food(food)
@@ -217,7 +227,7 @@ class StandInWorld:
             flank_stiffness=calibrated.flank_stiffness, time_step=self.time_step
         )
         scenario.food = self._food(calibrated, rng)
-        return scenario, None
+        return WorldSlice(scenario, None)
 
     def rng(self, food: str, slice: int) -> np.random.Generator:
         """See `SlicingWorld`."""
@@ -249,9 +259,7 @@ class CurvesWorld:
 
     seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Seed of all deviations.")
 
-    def scenario(
-        self, food: str, slice: int, board_stiffness: float | None = None
-    ) -> tuple[Scenario, CurveFood | None]:
+    def scenario(self, food: str, slice: int, board_stiffness: float | None = None) -> WorldSlice:
         """One slice; see `SlicingWorld`."""
         rng = _rng("curves", self.seed, food, slice, SLICE)
         calibrated = load_calibrated_food(food)
@@ -260,7 +268,7 @@ class CurvesWorld:
         tough, rub = np.exp(SPREAD * _deviations(rng, 2)).tolist()
         cut = CurveFood(food, diameter, diameter, tough, rub)
 
-        return scenario, cut
+        return WorldSlice(scenario, cut)
 
     def rng(self, food: str, slice: int) -> np.random.Generator:
         """See `SlicingWorld`."""
