@@ -13,13 +13,14 @@ from sliceit_drake import cluster
 from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
+from sliceit_drake.cutting.driver import Driver
 from sliceit_drake.cutting.foods.food import Cylinder, Food
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagnosis.causes.material import SkinToughness
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
-from sliceit_drake.prediction.cluster import active, on_cluster
+from sliceit_drake.prediction.cluster import on_cluster
 from sliceit_drake.prediction.record_target import Meshing
-from sliceit_drake.prediction.simulator import Runner
+from sliceit_drake.prediction.simulator import Workers
 from sliceit_drake.stand_in.protocol import Condition, Protocol
 from studies.__main__ import main as studies
 from studies.hidden_effects import runner
@@ -55,24 +56,22 @@ def points() -> list[Point]:
     ]
 
 
-def predictor() -> SlicePredictor:
+def predictor(workers: Workers = 1) -> SlicePredictor:
     setup = CalibrationSetup(
         food=Food(shape=Cylinder(HEIGHT, 0.06, 3, [0.0, 0.004, 0.012]), hold_distance=0.0119),
         parameters=[ParameterRange("material.toughness", 50.0, 1000.0)],
     )
-    return SlicePredictor(setup, [short_press()], (Meshing(0.5), Meshing(1.0)), workers=1)
+    return SlicePredictor(setup, [short_press()], (Meshing(0.5), Meshing(1.0)), workers=workers)
 
 
 def test_slices_on_a_cluster_are_those_of_one_process(local, monkeypatch):
     alone = [row[0].wrench for row in predictor().predict(points())]
-    with on_cluster(local.scheduler_address):
-        assert active()
+    with on_cluster(local.scheduler_address) as workers:
         # Of this process alone: the workers are others.
-        monkeypatch.setattr(Runner, "run", None)
-        spread = predictor()
+        monkeypatch.setattr(Driver, "run", None)
+        spread = predictor(workers)
         seen: list[tuple[int, int]] = []
         rows = spread.predict(points(), lambda done, of: seen.append((done, of)))
-    assert not active()
     assert seen[-1] == (5, 5) and spread.simulator.simulated == 5
     for one, (other,) in zip(alone, rows, strict=True):
         assert np.abs(one).max() > 0.1

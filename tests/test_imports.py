@@ -10,7 +10,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "sliceit_drake"
 
 # Modules at the top of the package, on which everything may stand.
-BASE = {"cluster", "configuration", "output_folder", "resources", "tables"}
+BASE = {"cluster", "configuration", "content_store", "output_folder", "resources", "tables"}
 
 # Which of our packages each may import, besides itself and BASE.
 LAYERS: dict[str, set[str]] = {

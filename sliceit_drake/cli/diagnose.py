@@ -120,8 +120,9 @@ def _run(options: argparse.Namespace) -> int:
     check_folder(options.cache, "--cache")
     if options.next_experiment is not None:
         check_folder(options.next_experiment.parent, "--next-experiment")
-    place = on_cluster(options.scheduler) if options.backend == "dask" else nullcontext()
-    with place:
+    there = options.backend == "dask"
+    with on_cluster(options.scheduler) if there else nullcontext(options.workers) as workers:
+        options.workers = workers
         if len(records) == 1:
             return _one_slice(options, food, records[0], extra)
         return _diagnose(options, food, records, extra)

@@ -19,6 +19,7 @@ from sliceit_drake.diagnosis.registry import open_causes
 from sliceit_drake.diagnosis.result import Diagnosis
 from sliceit_drake.prediction.clock import Clock
 from sliceit_drake.prediction.record_target import Meshing
+from sliceit_drake.prediction.simulator import Workers
 from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = ["BASE", "Progress", "diagnose", "setup_of_food"]
@@ -52,7 +53,7 @@ def diagnose(
     cache: Path | None = None,
     replicates: int = 200,
     seed: int = 0,
-    workers: int | None = None,
+    workers: Workers = None,
     progress: Progress | None = None,
     other_food: bool = False,
 ) -> Diagnosis:
@@ -65,7 +66,7 @@ def diagnose(
         cache: Folder for sensitivities.
         replicates: Of the bootstrap.
         seed: Of the bootstrap.
-        workers: Threads.
+        workers: What simulates.
         progress: See `Progress`.
         other_food: Whether records of a food of another name than the model's are meant.
 

@@ -12,9 +12,10 @@ from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.parameters import with_parameters
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.prediction.clock import Clock
+from sliceit_drake.prediction.jobs import Job, Run
 from sliceit_drake.prediction.record_target import Meshing, RecordTarget, make_targets
 from sliceit_drake.prediction.series import ForceSeries
-from sliceit_drake.prediction.simulator import Job, Run, Simulator
+from sliceit_drake.prediction.simulator import Simulator, Workers
 from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = ["RECORD_EFFECTS", "ActiveCause", "Point", "RecordEffect", "SlicePredictor"]
@@ -95,7 +96,7 @@ class SlicePredictor:
         meshings: How finely; the first is the default of a point.
         clock: How time is divided.
         cache: Folder of finished simulations.
-        workers: Threads.
+        workers: What simulates.
 
     Raises:
         ConfigurationError: A record cannot be compared, naming file and field.
@@ -108,7 +109,7 @@ class SlicePredictor:
         meshings: Sequence[Meshing] = (Meshing(),),
         clock: Clock | None = None,
         cache: Path | None = None,
-        workers: int | None = None,
+        workers: Workers = None,
     ) -> None:
         self.setup, self.clock = setup, clock or Clock()
         self.meshings = tuple(meshings)

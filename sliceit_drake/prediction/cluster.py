@@ -1,18 +1,16 @@
 """Spreads simulations over a cluster, through joblib's Dask back end.
 
-    with on_cluster("tcp://192.168.0.5:8786"):
-        result = diagnose(...)
+    with on_cluster("tcp://192.168.0.5:8786") as cluster:
+        result = diagnose(..., workers=cluster)
 
-Every simulator that runs within the block sends its missing slices to the scheduler's workers. The
-workers need this package, in the same version. What is found in memory or on disk is not sent, and
-what comes back is kept here, so that results are those of one process.
+The workers need this package, in the same version. What is found in memory or on disk is not sent,
+and what comes back is kept here, so that results are those of one process.
 """
 
 import contextlib
 import dataclasses as dc
 import threading
 from collections.abc import Iterator, Sequence
-from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,30 +18,28 @@ import numpy as np
 from sliceit_drake.cluster import CONNECT, connected
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.board import Board
+from sliceit_drake.cutting.driver import Driver
 from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.prediction.clock import Stretches
+from sliceit_drake.prediction.jobs import Executor, Job, Run, run_job
 
 if TYPE_CHECKING:
-    from sliceit_drake.prediction.simulator import Job, Run
+    from distributed import Client
 
-__all__ = ["active", "on_cluster", "run_jobs"]
-
-_CLIENT: ContextVar[Any] = ContextVar("client", default=None)
-
-
-def active() -> bool:
-    """Whether simulations go to a cluster here."""
-    return _CLIENT.get() is not None
+__all__ = ["on_cluster"]
 
 
 @contextlib.contextmanager
-def on_cluster(scheduler: str, patience: float = CONNECT) -> Iterator[None]:
-    """Sends simulations to a Dask scheduler.
+def on_cluster(scheduler: str, patience: float = CONNECT) -> Iterator[Executor]:
+    """Connects to a Dask scheduler, for simulations.
 
     Args:
         scheduler: Its address, as tcp://HOST:8786.
         patience: For it and for its first worker, s.
+
+    Yields:
+        What runs jobs on the scheduler's workers.
 
     Raises:
         ConfigurationError: The package is not installed, or see `cluster.connected`.
@@ -57,30 +53,17 @@ def on_cluster(scheduler: str, patience: float = CONNECT) -> Iterator[None]:
             fix="pip install 'sliceit_drake[cluster]'",
         ) from error
     with connected(scheduler, patience) as client:
-        token = _CLIENT.set(client)
-        try:
-            yield
-        finally:
-            _CLIENT.reset(token)
+        yield lambda jobs, period, board: _run_jobs(client, jobs, period, board)
 
 
-def run_jobs(
-    items: "Sequence[tuple[str, Job]]", period: float, board: Board
-) -> "Iterator[tuple[str, Run]]":
-    """Runs jobs on the cluster, in any order.
-
-    Args:
-        items: Keys and jobs, those of one mesh in a row.
-        period: Of the shortest exchange, s.
-        board: Under the knife.
-    """
+def _run_jobs(
+    client: "Client", jobs: Sequence[Job], period: float, board: Board
+) -> Iterator[tuple[int, Run]]:
     import joblib
 
-    if not items:
-        return
     work: list[Any] = []
     meshes: list[CuttingModel] = []
-    for key, job in items:
+    for number, job in enumerate(jobs):
         model = job.model
         if not meshes or meshes[-1].split is not model.split:
             meshes.append(model)
@@ -91,9 +74,9 @@ def run_jobs(
             if getattr(model, f.name) is not getattr(shared, f.name)
         }
         rest = (job.R, job.p, job.stretches, job.name)
-        work.append(joblib.delayed(_run_there)(key, shared, own, rest, period, board))
+        work.append(joblib.delayed(_run_there)(number, shared, own, rest, period, board))
     # What is scattered travels to a worker once, however many calls name it.
-    with joblib.parallel_config(backend="dask", client=_CLIENT.get(), scatter=meshes):
+    with joblib.parallel_config(backend="dask", client=client, scatter=meshes):
         # One slice takes longer than to send it; larger batches would leave workers idle.
         parallel = joblib.Parallel(n_jobs=-1, batch_size=1, return_as="generator_unordered")
         yield from parallel(work)
@@ -112,18 +95,16 @@ _THREAD = threading.local()
 
 
 def _run_there(
-    key: str,
+    number: int,
     shared: CuttingModel,
     own: dict[str, Any],
     rest: tuple[np.ndarray, np.ndarray, Stretches, str],
     period: float,
     board: Board,
-) -> "tuple[str, Run]":
+) -> tuple[int, Run]:
     """Runs a job on a worker, which keeps what it needs from one to the next."""
-    from sliceit_drake.prediction.simulator import Job, Runner
-
-    runners: dict[tuple[float, str], Runner] = _THREAD.__dict__.setdefault("runners", {})
+    drivers: dict[tuple[float, str], Driver] = _THREAD.__dict__.setdefault("drivers", {})
     place = (period, repr(board))
-    if place not in runners:
-        runners[place] = Runner(period, board)
-    return key, runners[place].run(Job(_rebuilt(shared, own), *rest))
+    if place not in drivers:
+        drivers[place] = Driver(period, board)
+    return number, run_job(drivers[place], Job(_rebuilt(shared, own), *rest))

@@ -15,9 +15,9 @@ from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import GRAVITY, CuttingModel, Numerics
 from sliceit_drake.prediction.clock import Clock, Stretches
+from sliceit_drake.prediction.jobs import Run
 from sliceit_drake.prediction.placement import food_of, is_bare, knife_of, poses_in_food
 from sliceit_drake.prediction.series import ForceSeries, SliceFacts
-from sliceit_drake.prediction.simulator import Run
 from sliceit_drake.records.preprocessing import as_measured
 from sliceit_drake.records.slice_record import SliceRecord
 

@@ -1,10 +1,10 @@
 """Which causes the slices of a protocol cannot tell apart: what a run may be judged by."""
 
 import dataclasses as dc
-import hashlib
 import json
 from pathlib import Path
 
+from sliceit_drake.content_store import content_key, source_key
 from sliceit_drake.diagnosis.diagnose import BASE, setup_of_food
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.experiments import identifiability as identifiability_module
@@ -52,9 +52,9 @@ def protocol_classes(name: str, cache: Path | None = None) -> ProtocolClasses:
     causes = open_causes([p.name for p in BASE])
     file = None
     if cache is not None:
-        h = hashlib.sha256(Path(identifiability_module.__file__).read_bytes())
-        h.update(repr((protocol, [(c.name, c.parameters, c.scan) for c in causes])).encode())
-        file = cache / "classes" / f"{name}_{h.hexdigest()[:12]}.json"
+        code = source_key(identifiability_module.__file__)
+        key = content_key(code, protocol, [(c.name, c.parameters, c.scan) for c in causes])
+        file = cache / "classes" / f"{name}_{key[:12]}.json"
         if file.exists():
             return ProtocolClasses(**json.loads(file.read_text(encoding="utf-8")))
     records = QuietBench(protocol, SEED).records()

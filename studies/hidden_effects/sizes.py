@@ -11,7 +11,6 @@ In short:
 import argparse
 import dataclasses as dc
 import functools
-import hashlib
 import inspect
 import json
 from collections.abc import Callable, Sequence
@@ -22,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.content_store import content_key, source_key
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.diagnose import BASE, setup_of_food
@@ -31,7 +31,6 @@ from sliceit_drake.diagnosis.evidence.linear import USUAL, LinearProblem
 from sliceit_drake.diagnosis.evidence.screen import screen
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.registry import all_causes, open_causes
-from sliceit_drake.prediction.simulator import cutting_source
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.stand_in import effect as effect_module
 from sliceit_drake.stand_in import finite_element_world, quiet, sensor_model, session, world
@@ -195,21 +194,14 @@ class ProtocolSizes:
     def _file(self, effect: str) -> Path | None:
         if self.cache is None:
             return None
-        h = hashlib.sha256(cutting_source())
         modules = (bench, effect_module, finite_element_world, quiet, sensor_model, session, world)
-        sources = [inspect.getfile(m) for m in modules]
-        for source in [*sources, inspect.getfile(EFFECTS[effect])]:
-            h.update(Path(source).read_bytes())
-        h.update(inspect.getsource(ProtocolSizes.strengths).encode())
-        h.update(
-            repr(
-                (
-                    *(self.protocol, self.settings, DIAGNOSIS_REFINEMENT),
-                    *(effect, EFFECTS[effect].typical, LIMITS.get(effect)),
-                )
-            ).encode()
+        key = content_key(
+            source_key(*map(inspect.getfile, (*modules, EFFECTS[effect]))),
+            inspect.getsource(ProtocolSizes.strengths),
+            *(self.protocol, self.settings, DIAGNOSIS_REFINEMENT),
+            *(effect, EFFECTS[effect].typical, LIMITS.get(effect)),
         )
-        return self.cache / "sizes" / f"{self.name}_{effect}_{h.hexdigest()[:12]}.json"
+        return self.cache / "sizes" / f"{self.name}_{effect}_{key[:12]}.json"
 
     @functools.cached_property
     def _null(self) -> tuple[Sensitivities, LinearProblem]:
@@ -279,8 +271,8 @@ class ProtocolSizes:
         file = self._file(effect)
         if file is not None:
             causes = open_causes([p.name for p in BASE])
-            key = hashlib.sha256(repr([(c.name, c.parameters, c.scan) for c in causes]).encode())
-            file = file.with_name(f"angles_{file.stem}_{key.hexdigest()[:8]}.json")
+            key = content_key([(c.name, c.parameters, c.scan) for c in causes])
+            file = file.with_name(f"angles_{file.stem}_{key[:8]}.json")
             if file.exists():
                 known: dict[str, float] = json.loads(file.read_text(encoding="utf-8"))
                 return known

@@ -29,26 +29,23 @@ change by plus `size` alone. A coefficient of 1 is a parameter of `size`.
 """
 
 import dataclasses as dc
-import hashlib
 import inspect
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
+from sliceit_drake.content_store import ContentStore, content_key, source_key
 from sliceit_drake.cutting.parameters import get_parameter
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.evidence.columns import MESH, Column, RecordSensitivity, Sensitivities
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.prediction.clock import Clock
-from sliceit_drake.prediction.placement import poses_in_food
 from sliceit_drake.prediction.record_target import Meshing, RecordTarget
 from sliceit_drake.prediction.series import ForceSeries
-from sliceit_drake.prediction.simulator import cutting_source
-from sliceit_drake.records.preprocessing import as_measured
+from sliceit_drake.prediction.simulator import Workers
 from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = [
@@ -68,12 +65,6 @@ LOG_STEP = 0.05
 """Change of the logarithm of a base parameter."""
 LINEAR_STEP = 0.02
 """Change of one on a linear scale, relative to its range."""
-
-
-SOURCES = (Cause, Clock, ForceSeries, Sensitivities, SlicePredictor, RecordTarget)
-SOURCES += (as_measured, poses_in_food)
-"""Whose modules a result depends on, beside `cutting` and this one."""
-
 
 STORED = ("in_contact", "predicted", "columns", "even")
 """Arrays of a record that take simulations."""
@@ -114,7 +105,7 @@ def sensitivities(
     finer: float | None = FINER,
     clock: Clock | None = None,
     cache: Path | None = None,
-    workers: int | None = None,
+    workers: Workers = None,
     progress: Progress | None = None,
 ) -> Sensitivities:
     """Computes sensitivities at a point.
@@ -131,7 +122,7 @@ def sensitivities(
         clock: How time is divided.
         cache: Folder for finished simulations and sensitivities, found again by their content;
             some 6 MB a record.
-        workers: Threads.
+        workers: What simulates.
         progress: Called with the number of simulated slices, and of those that must be.
 
     Raises:
@@ -144,16 +135,16 @@ def sensitivities(
         meshings.append(dc.replace(meshing, refinement=finer * meshing.refinement))
     runs = None if cache is None else cache / "slices"
     predictor = SlicePredictor(setup, records, meshings, clock, runs, workers)
-    options = (meshing, finer, clock)
+    store = None if cache is None else ContentStore(cache / "sensitivities")
 
     def computed(some: Sequence[Cause], alone: bool, show: Progress | None) -> Sensitivities:
-        store = None
-        if cache is not None and not any(cause.adapts for cause in some):
-            common = _content_hash(setup, some, point, (alone, *options))
+        kept = None
+        if store is not None and not any(cause.adapts for cause in some):
+            common = _common_key(setup, some, point, alone, meshing, finer, clock)
             if common is not None:
                 by_slice = any(c.by_slice for c in (*some, *(a.cause for a in point.causes)))
-                store = _Store(cache / "sensitivities", common, point, by_slice)
-        return _Computation(predictor, point, some, alone).result(store, show)
+                kept = _RecordStore(store, common, point, by_slice)
+        return _Computation(predictor, point, some, alone).result(kept, show)
 
     # What replicates share is computed once for all of them.
     found = computed([c for c in causes if not (c.by_slice or c.adapts)], False, progress)
@@ -245,8 +236,8 @@ class _Computation:
     def _cause_point(self, cause: Cause, values: dict[str, float]) -> Point:
         return dc.replace(self.point, causes=(*self.point.causes, ActiveCause(cause, values)))
 
-    def result(self, store: "_Store | None", progress: Progress | None) -> Sensitivities:
-        """All columns of all records; those that the store holds are taken from there."""
+    def result(self, store: "_RecordStore | None", progress: Progress | None) -> Sensitivities:
+        """All columns of all records; those that are known are not computed again."""
         predictor = self.predictor
         targets = predictor.targets
         warnings: list[str] = []
@@ -346,80 +337,58 @@ def _empty(
     )
 
 
-class _Store:
-    """Predictions of records and their changes in a folder, found again by what goes into them.
+class _RecordStore:
+    """Predictions of records and their changes that were computed before.
 
-    What was measured does not: another cut along the same path is found at once.
+    What was measured does not matter: another cut along the same path is found at once.
 
     Args:
-        directory: The folder.
-        common: Hash of all that does not differ between records.
+        store: Where they are.
+        common: Key of all that does not differ between records.
         point: Where records are predicted.
         by_slice: Whether it matters which slice of the session a record is.
     """
 
-    def __init__(self, directory: Path, common: bytes, point: Point, by_slice: bool) -> None:
-        directory.mkdir(parents=True, exist_ok=True)
-        self._directory, self._common, self._point = directory, common, point
+    def __init__(self, store: ContentStore, common: str, point: Point, by_slice: bool) -> None:
+        self._store, self._common, self._point = store, common, point
         self._by_slice = by_slice
 
-    def _file(self, target: RecordTarget) -> Path:
-        h = hashlib.sha256(self._common)
+    def _key(self, target: RecordTarget) -> str:
         metadata = dc.replace(target.record.metadata, name="", condition="")
         facts = dc.replace(target.facts, name="", condition="")
         if not self._by_slice:
             metadata = dc.replace(metadata, slice_index=0, knife_slices=None)
             facts = dc.replace(facts, slice_index=0, knife_slices=0)
-        h.update(repr((metadata, facts, target.channels)).encode())
-        name = target.facts.name
         own = [dict(a.values) for a in self._point.causes]
-        h.update(repr((self._point.records.get(name), own)).encode())
-        for values in (target.time, target.grid, target.R, target.p):
-            h.update(np.ascontiguousarray(values).tobytes())
-        return self._directory / f"{h.hexdigest()[:40]}.npz"
+        at = (self._point.records.get(target.facts.name), own)
+        path = (target.time, target.grid, target.R, target.p)
+        return content_key(self._common, metadata, facts, target.channels, at, *path)
 
     def load(
         self, target: RecordTarget, columns: int
     ) -> tuple[RecordSensitivity, list[str]] | None:
-        file = self._file(target)
-        if not file.exists():
+        arrays = self._store.load(self._key(target))
+        if arrays is None:
             return None
-        with np.load(file) as arrays:
-            record = _empty(target, arrays["in_contact"], arrays["predicted"], columns)
-            record.columns, record.even = arrays["columns"], arrays["even"]
-            return record, arrays["failed"].tolist()
+        record = _empty(target, arrays["in_contact"], arrays["predicted"], columns)
+        record.columns, record.even = arrays["columns"], arrays["even"]
+        return record, arrays["failed"].tolist()
 
     def save(self, target: RecordTarget, record: RecordSensitivity, failed: list[str]) -> None:
-        file = self._file(target)
-        part = file.with_name(f"{file.stem}.{os.getpid()}.part")
-        with open(part, "wb") as stream:
-            np.savez(
-                stream,
-                allow_pickle=False,
-                failed=np.array(failed, np.str_),
-                **{name: getattr(record, name) for name in STORED},
-            )
-        os.replace(part, file)
+        arrays = {name: getattr(record, name) for name in STORED}
+        self._store.save(self._key(target), arrays | {"failed": np.array(failed, np.str_)})
 
 
-def _content_hash(
-    setup: CalibrationSetup, causes: Sequence[Cause], point: Point, options: tuple[object, ...]
-) -> bytes | None:
-    """Hash of all that results depend on beside the record; None where the source of a cause
-    cannot be read."""
-    h = hashlib.sha256(cutting_source())
-    for source in SOURCES:
-        h.update(Path(inspect.getfile(source)).read_bytes())
-    h.update(Path(__file__).read_bytes())
+def _common_key(
+    setup: CalibrationSetup, causes: Sequence[Cause], point: Point, *options: object
+) -> str | None:
+    """Key of all that results depend on beside the record; None where the source of a cause cannot
+    be read."""
     everything = [*causes, *(active.cause for active in point.causes)]
-    for cause in everything:
-        try:
-            text = Path(inspect.getfile(type(cause))).read_bytes()
-        except (TypeError, OSError):
-            return None
-        facts = (cause.name, cause.parameters, cause.scan, cause.per_record, vars(cause))
-        h.update(text + repr(facts).encode())
+    try:
+        code = source_key(__file__, *(inspect.getfile(type(cause)) for cause in everything))
+    except (TypeError, OSError):
+        return None
+    facts = [(c.name, c.parameters, c.scan, c.per_record, vars(c)) for c in everything]
     active = [a.cause.name for a in point.causes]
-    h.update(repr((setup, point.values, active, point.meshing)).encode())
-    h.update(repr(options).encode())
-    return h.digest()
+    return content_key(code, facts, setup, point.values, active, point.meshing, options)

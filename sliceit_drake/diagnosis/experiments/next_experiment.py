@@ -35,6 +35,7 @@ from sliceit_drake.diagnosis.experiments.proposal import MARGIN, NEEDED, NextExp
 from sliceit_drake.diagnosis.experiments.search import CauseClass, ExperimentSearch
 from sliceit_drake.diagnosis.result import Diagnosis
 from sliceit_drake.prediction.placement import is_bare
+from sliceit_drake.prediction.simulator import Workers
 from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = ["next_experiment"]
@@ -50,7 +51,7 @@ def next_experiment(
     diagnosis: Diagnosis,
     records: Sequence[SliceRecord],
     cache: Path | None = None,
-    workers: int | None = None,
+    workers: Workers = None,
     progress: Progress | None = None,
 ) -> NextExperiment:
     """What to cut next.
@@ -59,7 +60,7 @@ def next_experiment(
         diagnosis: Of the records.
         records: The records at hand.
         cache: Folder for finished simulations.
-        workers: Threads.
+        workers: What simulates.
         progress: See `sensitivity.Progress`.
     """
     verdict = diagnosis.verdict

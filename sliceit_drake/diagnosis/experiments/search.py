@@ -21,6 +21,7 @@ from sliceit_drake.diagnosis.experiments.planned_record import (
 )
 from sliceit_drake.diagnosis.experiments.proposal import NextExperiment, Pair, Step
 from sliceit_drake.diagnosis.result import Diagnosis
+from sliceit_drake.prediction.simulator import Workers
 from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = ["CauseClass", "ExperimentSearch"]
@@ -73,7 +74,7 @@ class ExperimentSearch:
         classes: To be told apart.
         records: The records at hand.
         cache: Folder for finished simulations; None for none.
-        workers: Threads.
+        workers: What simulates.
         progress: See `sensitivity.Progress`.
     """
 
@@ -84,7 +85,7 @@ class ExperimentSearch:
         classes: list[CauseClass],
         records: Sequence[SliceRecord],
         cache: Path | None,
-        workers: int | None,
+        workers: Workers,
         progress: Progress | None,
     ) -> None:
         self.experiments, self.classes = experiments, classes

@@ -40,6 +40,7 @@ from sliceit_drake.diagnosis.one_slice.slice_fit import (
 from sliceit_drake.diagnosis.one_slice.slice_result import OneSlice
 from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import open_causes
+from sliceit_drake.prediction.simulator import Workers
 from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = ["diagnose_slice", "setup_of_slice"]
@@ -94,7 +95,7 @@ def diagnose_slice(
     cache: Path | None = None,
     replicates: int = 200,
     seed: int = 0,
-    workers: int | None = None,
+    workers: Workers = None,
     progress: Progress | None = None,
     remarks: Sequence[str] = (),
 ) -> OneSlice:
@@ -107,7 +108,7 @@ def diagnose_slice(
         cache: Folder for simulations.
         replicates: Of the bootstrap.
         seed: Of the bootstrap.
-        workers: Threads.
+        workers: What simulates.
         progress: See `diagnose.Progress`.
         remarks: What is known already that a reader must know.
 

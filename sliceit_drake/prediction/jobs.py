@@ -1,0 +1,87 @@
+"""Slices to be simulated on an uneven clock."""
+
+import dataclasses as dc
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+
+from sliceit_drake.cutting.board import Board
+from sliceit_drake.cutting.driver import Driver, Launch
+from sliceit_drake.cutting.knife_path import KnifePath
+from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.cutting.motion import Pose
+from sliceit_drake.prediction.clock import BLOCK, Stretches
+
+__all__ = ["Executor", "Job", "Run", "run_job"]
+
+
+@dc.dataclass
+class Job:
+    """A slice to be simulated.
+
+    Attributes:
+        model: The cut; its numerics hold the sub-step of exchanges of one period.
+        R, p: Poses X_FK of the knife relative to the food at the ends of the exchanges
+            [E + 1, 3, 3] and [E + 1, 3], metres.
+        stretches: Which exchanges these are.
+        name: For messages.
+    """
+
+    model: CuttingModel
+    R: np.ndarray
+    p: np.ndarray
+    stretches: Stretches
+    name: str = ""
+
+
+@dc.dataclass
+class Run:
+    """What a job gives; nothing is finite where the slice broke down.
+
+    Attributes:
+        parts: Mean wrenches on the knife by edge, flank pressure, friction, moment about Ko and
+            force, in F [E, 3, 6], single precision.
+        rise: By which an arm that gives stood higher than its command, at the ends [E], metres.
+    """
+
+    parts: np.ndarray
+    rise: np.ndarray
+
+
+Executor = Callable[[Sequence[Job], float, Board], Iterable[tuple[int, Run]]]
+"""Runs jobs, given the period of the shortest exchange, s, and the board under the knife; gives
+their numbers and runs, in any order. Jobs of one mesh come in a row."""
+
+
+@dc.dataclass(frozen=True)
+class _Poses:
+    """Poses by number, as `KnifePath` asks for them with a period of 1."""
+
+    R: np.ndarray
+    p: np.ndarray
+
+    @property
+    def duration(self) -> float:
+        return float(len(self.p) - 1)
+
+    def pose(self, t: float) -> Pose:
+        k = round(t)
+        return Pose(self.R[k], self.p[k])
+
+
+def run_job(driver: Driver, job: Job) -> Run:
+    """Simulates a slice."""
+    path = KnifePath(job.model, _Poses(job.R, job.p), 1.0)
+    together, multiples = BLOCK if path.rigid else 1, job.stretches.multiples.tolist()
+    starts = range(0, path.exchanges, together)
+    launches = [Launch(k, together, multiples[k // BLOCK]) for k in starts]
+    wrenches = np.zeros((path.exchanges, 3, 6))
+    rise = np.zeros(path.exchanges)
+    for (k, count, _), (step,) in driver.run([path], launches):
+        wrenches[k : k + count] = step.wrenches
+        if not step.finite:
+            wrenches[:] = np.nan
+    if np.isfinite(wrenches).all():
+        rise = path.p_FK[1:, 2] - job.p[1:, 2]
+    parts = (wrenches.reshape(-1, 3, 2, 3) @ job.model.X_FC_rotation.T).reshape(-1, 3, 6)
+    return Run(parts.astype(np.float32), rise.astype(np.float32))
