@@ -1,13 +1,11 @@
 """The guarded touch: what its readings mean, and the word that starts it."""
 
-import argparse
 import io
 
 import numpy as np
 import pytest
 from fake_robot import FakeRobot
 
-from sliceit_drake.cli import hardware as command
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.diagrams.station import MakeStation
@@ -15,6 +13,7 @@ from sliceit_drake.hardware.guarded_touch import Touch, TouchError, contact_of
 from sliceit_drake.hardware.hardware_config import HardwareConfig, TouchConfig
 from sliceit_drake.resources import resource_path
 from sliceit_drake.robot_run.board_touch import check_height
+from sliceit_drake.robot_run.operated_robot import OperatedRobot
 
 BOARD, STIFFNESS, CYCLE = 0.05, 3e4, 0.002
 
@@ -81,10 +80,9 @@ def test_only_its_own_word_starts_the_touch(typed, monkeypatch, capsys):
     scenario = load_scenario(resource_path("scenarios/cucumber_spring.yaml"))
     robot = FakeRobot(MakeStation(scenario).start_joints.tolist())
     monkeypatch.setattr("sys.stdin", io.StringIO(typed))
-    options = argparse.Namespace(dry_run=False, move_to_start=False, pace=0.2)
     config = HardwareConfig(payload=1.2, payload_cog=[0.0, 0.0, 0.06])
     try:
-        assert not command.touch_board(options, scenario, config, robot)
+        assert not OperatedRobot("127.0.0.1", config, pace=0.2).touch_board(scenario, robot)
     finally:
         robot.close()
     assert "Nothing was moved" in capsys.readouterr().out

@@ -13,7 +13,7 @@ import pytest
 from fake_robot import FakeRobot
 from fake_station import CONFIG, PACE, spring_scenario
 
-from sliceit_drake.cli import hardware as command
+from sliceit_drake.cli.hardware import robot_of
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.hardware_station import RobotConnection
@@ -28,9 +28,11 @@ from sliceit_drake.hardware.hardware_config import (
 )
 from sliceit_drake.resources import resource_path
 from sliceit_drake.robot_run.hardware_run import prepare_hardware_run, write_hardware_outputs
+from sliceit_drake.robot_run.operated_robot import OperatedRobot
+from sliceit_drake.robot_run.operator import ask, plan_text
 from sliceit_drake.robot_run.plan_check import check_plan, plan_joints
 
-OPTIONS = argparse.Namespace(duration=0.1, dry_run=False, host="127.0.0.1")
+EMULATED = "127.0.0.1"
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +51,11 @@ def hardware_run(robot, **changes):
     return prepare_hardware_run(
         spring_scenario(), HardwareConfig(**(CONFIG | changes)), robot, PACE
     )
+
+
+def checked_run(robot, directory, duration=0.1, host=EMULATED):
+    hardware = hardware_run(robot)
+    return OperatedRobot(host, hardware.config, PACE).checked_run(hardware, directory, duration)
 
 
 def failed(checks):
@@ -185,18 +192,17 @@ def test_a_plan_out_of_limits_is_refused_before_the_word(twin, robot):
 @pytest.mark.parametrize("typed", ["", "\n", "y\n", "yes\n", "Slice\n"])
 def test_only_the_word_itself_moves_the_robot(typed, robot, monkeypatch, capsys, tmp_path):
     monkeypatch.setattr("sys.stdin", io.StringIO(typed))
-    assert command.checked_run(OPTIONS, hardware_run(robot), tmp_path) is None
+    assert checked_run(robot, tmp_path) is None
     assert "Nothing was moved" in capsys.readouterr().out
     assert robot.sent == [] and robot.watchdog is None
 
 
 def test_a_pipe_moves_an_emulated_robot_but_no_other(robot, monkeypatch, capsys, tmp_path):
-    real = argparse.Namespace(**vars(OPTIONS) | {"host": "192.168.1.10"})
     monkeypatch.setattr("sys.stdin", io.StringIO("slice\n"))
-    assert command.checked_run(real, hardware_run(robot), tmp_path) is None
+    assert checked_run(robot, tmp_path, host="192.168.1.10") is None
     assert "must be typed at a terminal" in capsys.readouterr().out
     assert robot.sent == []
-    run = command.checked_run(OPTIONS, hardware_run(robot), tmp_path)
+    run = checked_run(robot, tmp_path)
     assert run.stopped is None
     assert len(robot.sent) > 20
 
@@ -208,10 +214,10 @@ def test_a_word_typed_before_the_question_does_not_answer_it(monkeypatch):
         os.write(ours, b"slice\n")
         timer = threading.Timer(0.5, lambda: os.write(ours, b"no\n"))
         timer.start()
-        assert not command.ask("slice", OPTIONS)
+        assert not ask("slice", is_emulated=True)
         timer = threading.Timer(0.5, lambda: os.write(ours, b"slice\n"))
         timer.start()
-        assert command.ask("slice", OPTIONS)
+        assert ask("slice", is_emulated=True)
         timer.join()
     os.close(ours)
 
@@ -242,16 +248,15 @@ def test_what_changes_while_the_plan_is_read_is_found_before_it_moves(
 
     monkeypatch.setattr("builtins.input", typed)
     monkeypatch.setattr("sys.stdin", io.StringIO())
-    made = command.checked_run(OPTIONS, hardware_run(robot), tmp_path)
+    made = checked_run(robot, tmp_path)
     assert said in made.stopped
     assert robot.sent == [] and robot.watchdog is None
 
 
 @pytest.mark.parametrize("duration", [0.0, -1.0, float("nan"), float("inf"), 100.0])
 def test_a_run_lasts_as_long_as_its_motion_at_most(duration, robot, tmp_path):
-    options = argparse.Namespace(**vars(OPTIONS) | {"duration": duration})
     with pytest.raises(ConfigurationError, match="--duration"):
-        command.checked_run(options, hardware_run(robot), tmp_path)
+        checked_run(robot, tmp_path, duration)
     assert robot.log == []
 
 
@@ -265,7 +270,7 @@ def test_the_plan_names_each_setting_that_is_not_the_default(robot):
         assert f"{name}: {value}" in differing(dc.replace(config, **{name: value}))
     config.touch.force_limit = 50.0
     config.limits = dc.replace(config.limits, force=200.0)
-    text = command.plan_text(hardware_run(robot, limits=config.limits, touch=config.touch), 1.0)
+    text = plan_text(hardware_run(robot, limits=config.limits, touch=config.touch), 1.0)
     assert "touch.force_limit: 50.0" in text and "force: 200.0" in text
 
 
@@ -297,8 +302,7 @@ def test_a_robot_that_does_not_confirm_its_stop_is_named(robot, monkeypatch, cap
     monkeypatch.setattr("sys.stdin", io.StringIO("slice\n"))
     robot.wrench = [0.0, 0.0, 2.9, 0.0, 0.0, 0.0]
     robot.later(0.3, lambda: setattr(robot, "bits", 1 << 2))
-    options = argparse.Namespace(**vars(OPTIONS) | {"duration": 2.0})
-    assert command.checked_run(options, hardware_run(robot), tmp_path).stopped
+    assert checked_run(robot, tmp_path, 2.0).stopped
     assert "DID NOT CONFIRM THAT ITS PROGRAM IS STOPPED (no answer)" in capsys.readouterr().out
 
 
@@ -308,4 +312,4 @@ def test_the_files_for_users_are_read_and_an_absent_robot_is_named(capsys):
     assert main(["hardware"]) == 2
     assert "--host" in capsys.readouterr().err
     with pytest.raises(ConfigurationError, match="pace 1"):
-        command.robot_config(argparse.Namespace(host="10.0.0.5", pace=0.2, board_height=None))
+        robot_of(argparse.Namespace(host="10.0.0.5", pace=0.2, board_height=None))

@@ -1,27 +1,19 @@
 """`sliceit collect`: cut the slices of a protocol on a station, and write their records."""
 
 import argparse
-import copy
 import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sliceit_drake.cli.hardware import (
-    add_robot_arguments,
-    is_loopback,
-    move_confirmed,
-    robot_config,
-    run_confirmed,
-    touch_confirmed,
-)
+from sliceit_drake.cli.hardware import add_robot_arguments, robot_of
 from sliceit_drake.cli.scenario_argument import add_protocol_argument, protocol_file
+from sliceit_drake.hardware.client import is_loopback
 from sliceit_drake.output_folder import check_folder
 
 if TYPE_CHECKING:
-    from sliceit_drake.diagrams.run import Run
+    from collections.abc import Callable
+
     from sliceit_drake.diagrams.scenario import Scenario
-    from sliceit_drake.hardware.hardware_config import HardwareConfig
-    from sliceit_drake.stand_in.protocol import Specimen
 
 __all__ = ["add_parser"]
 
@@ -93,58 +85,36 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 def _run(options: argparse.Namespace) -> int:
     """Runs the command."""
-    import numpy as np
-
     logging.getLogger("drake").setLevel(logging.WARNING)
+    _check(options)
+    robot = robot_of(options) if options.host else None
 
     from sliceit_drake.diagrams.scenario import load_scenario
-    from sliceit_drake.stand_in.protocol import load_protocol, schedule
-    from sliceit_drake.stand_in.session import is_recorded
-    from sliceit_drake.stand_in.station_cuts import scenario_of_cut
+    from sliceit_drake.robot_run.collection import Collection
+    from sliceit_drake.stand_in.protocol import load_protocol
 
-    config = _checked_config(options)
     protocol = load_protocol(str(protocol_file(options)))
     station = load_scenario(options.station)
     options.output = directory = options.output or Path("output") / protocol.name
     check_folder(directory, "--output")
-    specimens = schedule(protocol, np.random.default_rng([options.seed, 0]))[: options.first]
-    left = [specimen for specimen in specimens if not is_recorded(specimen, directory)]
-    if config is not None and options.touch and left and not options.dry_run:
-        scenario = scenario_of_cut(protocol, left[0], station)
-        if not _touch(options, scenario, config):
-            return 1
-    for specimen in left:
-        scenario = scenario_of_cut(protocol, specimen, station)
-        print(f"Slice {specimen.index + 1} of {len(specimens)}: {specimen.condition.label}")
-        if config is not None:
-            made = _cut_on_robot(options, scenario, config, specimen, directory)
-        else:
-            made = _cut_simulated(scenario)
-        if made is None:
-            return 1
-        if options.dry_run:
-            return 0
-        _write(made, specimen, directory, config is not None)
-        if made.stopped:
-            print(f"Stopped: {made.stopped}. Its record is kept. Start again to go on.")
-            return 1
-    print(f"{len(specimens)} records in {directory}/")
-    return 0
+    collection = Collection(
+        protocol,
+        station,
+        directory,
+        options.seed,
+        robot,
+        move_to_start=options.move_to_start,
+        touch=options.touch,
+        put_fresh_food=_fresh_food(options),
+    )
+    return 0 if collection.cut(options.first) else 1
 
 
-def _cut_simulated(scenario: "Scenario") -> "Run":
-    from sliceit_drake.diagrams.run import prepare_run
-
-    made = prepare_run(scenario)
-    made.advance()
-    return made
-
-
-def _checked_config(options: argparse.Namespace) -> "HardwareConfig | None":
-    """The robot's file; None without a robot.
+def _check(options: argparse.Namespace) -> None:
+    """Refuses options that do not fit together.
 
     Raises:
-        ConfigurationError: It is missing or wrong, or an option does not fit.
+        ConfigurationError: Naming option and fix.
     """
     from sliceit_drake.configuration import ConfigurationError
 
@@ -154,92 +124,39 @@ def _checked_config(options: argparse.Namespace) -> "HardwareConfig | None":
             field="--emulator-pendant",
             fix="Give its address with --host; with a robot leave this out.",
         )
-    if options.host:
-        return robot_config(options)
     for name in ("touch", "move_to_start", "dry_run"):
-        if getattr(options, name):
+        if getattr(options, name) and not options.host:
             raise ConfigurationError(
                 "is for a robot",
                 field=f"--{name.replace('_', '-')}",
                 fix="Give its address with --host, or leave this out.",
             )
-    return None
 
 
-def _touch(options: argparse.Namespace, scenario: "Scenario", config: "HardwareConfig") -> bool:
-    """Finds the board's height on the bare board; `config` then has it."""
-    from sliceit_drake.systems.analytic_cutter import AnalyticFood
+def _fresh_food(options: argparse.Namespace) -> "Callable[[Scenario], None] | None":
+    """Renews the food under the knife of an emulated robot; None where somebody does that by hand.
 
-    if options.move_to_start and not move_confirmed(options, copy.deepcopy(scenario), config):
-        return False
-    print("First the knife looks for the board. Take everything off it. Stand back.")
-    if options.emulator_pendant is not None:
-        bare = copy.deepcopy(scenario)
-        bare.food = AnalyticFood(toughness=0.0)
-        _put_fresh_food(options, bare)
-    return touch_confirmed(options, scenario, config)
-
-
-def _cut_on_robot(
-    options: argparse.Namespace,
-    scenario: "Scenario",
-    config: "HardwareConfig",
-    specimen: "Specimen",
-    directory: Path,
-) -> "Run | None":
-    """The run; None if the robot was not ready or the operator did not confirm."""
-    from sliceit_drake.records.metadata import slice_name
-
-    # Away from the last slice, before somebody reaches there.
-    if options.move_to_start and not options.dry_run:
-        if not move_confirmed(options, copy.deepcopy(scenario), config):
-            return None
-    condition = specimen.condition
-    what = "nothing, the bare board" if condition.without_food else "a fresh piece of food"
-    extra = [" peeled"] * condition.peeled
-    extra += [f" scaled by {condition.width_scale:g} in width"] * (condition.width_scale != 1.0)
-    extra += [f" with {condition.weight:g} kg hung on the knife"] * (condition.weight > 0.0)
-    print(f"Put under the knife: {what}{','.join(extra)}. Stand back.")
-    if options.emulator_pendant is not None and not options.dry_run:
-        _put_fresh_food(options, scenario)
-    there = argparse.Namespace(**vars(options) | {"move_to_start": False, "touch": False})
-    return run_confirmed(there, scenario, config, directory / slice_name(specimen.index))
-
-
-def _put_fresh_food(options: argparse.Namespace, scenario: "Scenario") -> None:
-    """Renews the food under the knife of an emulated robot.
-
-    Raises:
-        ConfigurationError: No emulator answers there, or it refuses.
+    What it returns raises a ConfigurationError where no emulator answers, or it refuses.
     """
+    port = options.emulator_pendant
+    if port is None:
+        return None
     from sliceit_drake.configuration import ConfigurationError, dump_yaml
     from sliceit_drake.emulator.process import EmulatorError, PendantClient
 
-    port = options.emulator_pendant
-    try:
-        pendant = PendantClient(options.host, PREPARATION, port)
+    def put_fresh_food(scenario: "Scenario") -> None:
         try:
-            pendant.put_fresh_food(dump_yaml(scenario))
-        finally:
-            pendant.close()
-    except (OSError, EmulatorError) as error:
-        raise ConfigurationError(
-            f"{options.host}:{port} puts no fresh food there: {error}",
-            field="--emulator-pendant",
-            fix="Give the own port of a running `sliceit emulate`, 30099.",
-        ) from error
-    print("The emulator has put it there.")
+            pendant = PendantClient(options.host, PREPARATION, port)
+            try:
+                pendant.put_fresh_food(dump_yaml(scenario))
+            finally:
+                pendant.close()
+        except (OSError, EmulatorError) as error:
+            raise ConfigurationError(
+                f"{options.host}:{port} puts no fresh food there: {error}",
+                field="--emulator-pendant",
+                fix="Give the own port of a running `sliceit emulate`, 30099.",
+            ) from error
+        print("The emulator has put it there.")
 
-
-def _write(made: "Run", specimen: "Specimen", directory: Path, is_real: bool) -> None:
-    from sliceit_drake.diagrams.outputs.slice_record_of_run import slice_record_of
-    from sliceit_drake.records.metadata import slice_name
-    from sliceit_drake.records.slice_record import write_record
-
-    provenance = "UR5e through RTDE." if is_real else "Simulated station, sliceit collect."
-    record = slice_record_of(
-        made, provenance, index=specimen.index, condition=specimen.condition.label
-    )
-    # A slice that ended early does not count as cut.
-    name = slice_name(specimen.index) + ("_stopped" if made.stopped else "")
-    write_record(record, directory / name)
+    return put_fresh_food

@@ -5,7 +5,7 @@ from typing import Protocol
 
 from sliceit_drake.hardware.robot_state import RobotState
 
-__all__ = ["RobotClient", "RobotFacts", "RobotUnavailableError"]
+__all__ = ["RobotClient", "RobotFacts", "RobotUnavailableError", "is_loopback"]
 
 
 class RobotUnavailableError(RuntimeError):
@@ -86,3 +86,8 @@ class RobotClient(Protocol):
 
     def close(self) -> None:
         """Stops the program on the robot, if it was not stopped, and disconnects."""
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address is of this machine, as an emulated controller's is."""
+    return host == "localhost" or host.startswith("127.")

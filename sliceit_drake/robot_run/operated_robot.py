@@ -1,0 +1,243 @@
+"""A robot whose motions an operator confirms: connect, check, show, ask for the word, move."""
+
+import dataclasses as dc
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.diagrams.live_view import make_meshcat
+from sliceit_drake.diagrams.run import Run
+from sliceit_drake.diagrams.scenario import Scenario
+from sliceit_drake.hardware.client import RobotClient, is_loopback
+from sliceit_drake.hardware.guarded_touch import TouchError
+from sliceit_drake.hardware.hardware_config import HardwareConfig
+from sliceit_drake.hardware.interruption import catch_signals
+from sliceit_drake.robot_run.board_touch import BoardTouch, check_height
+from sliceit_drake.robot_run.hardware_run import (
+    HardwareRun,
+    prepare_hardware_run,
+    write_hardware_outputs,
+)
+from sliceit_drake.robot_run.move_to_start import MoveToStart
+from sliceit_drake.robot_run.operator import ask, plan_text, report, stopped_text
+
+__all__ = ["OperatedRobot"]
+
+WORD = "slice"
+MOVE_WORD = "move"
+TOUCH_WORD = "touch"
+WATCHED = 1.0
+"""Longest time that a dry run follows the robot's data, s."""
+
+
+@dc.dataclass
+class OperatedRobot:
+    """A robot at an address, and an operator at the terminal who types a word before each motion.
+
+    Attributes:
+        host: Address of the robot.
+        config: The robot's file; a touch writes the board's height into it.
+        pace: Controller seconds in a second; 1 for all robots.
+        dry_run: Whether to do all but move.
+    """
+
+    host: str
+    config: HardwareConfig
+    pace: float = 1.0
+    dry_run: bool = False
+
+    def run(
+        self,
+        scenario: Scenario,
+        directory: Path,
+        *,
+        move_to_start: bool = False,
+        touch: bool = False,
+        duration: float | None = None,
+        draws: bool = False,
+    ) -> Run | None:
+        """Connects, checks, asks for the word, runs, and writes the outputs.
+
+        Args:
+            scenario: What to run.
+            directory: Where the outputs go.
+            move_to_start: Whether to move the joints to the start first.
+            touch: Whether to find the board's height then.
+            duration: s; None for the motion's.
+            draws: Whether to write a replay.
+
+        Returns:
+            The run; None if the robot was not ready or the operator did not confirm.
+        """
+        if move_to_start and not self.dry_run:
+            if not self.move_to_start(scenario):
+                return None
+        if touch and not self.dry_run:
+            if not self.find_board(scenario):
+                return None
+        with self._connected() as client:
+            meshcat = make_meshcat() if draws and not self.dry_run else None
+            hardware = prepare_hardware_run(scenario, self.config, client, self.pace, meshcat)
+            return self.checked_run(hardware, directory, duration)
+
+    def move_to_start(self, scenario: Scenario) -> bool:
+        """Connects, checks the robot, and moves it to the start after the operator's word.
+
+        Returns:
+            False if the robot was not ready or did not move, or the operator did not confirm.
+        """
+        with self._connected() as client:
+            hardware = prepare_hardware_run(scenario, self.config, client, self.pace)
+            if not report("Robot", hardware.check_facts()):
+                return False
+            move = MoveToStart(hardware)
+            if not report("Move to the start", move.checks()):
+                return False
+            print(
+                "\nMOVE: the joints turn straight to "
+                f"{hardware.twin.start_joints.round(4).tolist()}; the knife moves at up to "
+                f"{1e3 * move.knife_speed:.0f} mm/s, and nothing looks for obstacles but the "
+                "board. Stand back.\n"
+            )
+            if not self._asks(MOVE_WORD):
+                return False
+            problem = move.execute()
+            if problem is not None:
+                print(f"STOPPED on the way to the start: {problem}")
+            return problem is None
+
+    def find_board(self, scenario: Scenario) -> bool:
+        """Connects and finds the board, see `touch_board`; the program on the robot is stopped."""
+        with self._connected() as client:
+            return self.touch_board(scenario, client)
+
+    def touch_board(self, scenario: Scenario, client: RobotClient) -> bool:
+        """Finds the board after checks and the word; `config` then has the height found.
+
+        Returns:
+            False if the robot was not ready, the operator did not confirm, or there was no board.
+
+        Raises:
+            ConfigurationError: The board is not where it is expected.
+        """
+        config = self.config
+        field = "scenario.board.height" if config.board_height is None else "board_height"
+        if config.board_height is None:
+            config.board_height = scenario.board.height
+        hardware = prepare_hardware_run(scenario, config, client, self.pace)
+        touch = BoardTouch(hardware)
+        if not report("Robot and touch", [*hardware.check_facts(), *touch.checks()]):
+            return False
+        if not report("Start", hardware.check_at_start()):
+            return False
+        print(
+            f"\nTOUCH: the knife goes straight down by up to {1e3 * touch.depth:.1f} mm at "
+            f"{1e3 * config.touch.speed:g} mm/s, until it meets {config.touch.force:g} N, and back "
+            f"up. It looks for the board between the start and "
+            f"{touch.expected - config.touch.below:.4f} m. Take the food away: the knife would "
+            "take it for the board.\n"
+        )
+        if not self._asks(TOUCH_WORD):
+            return False
+        try:
+            found = touch.execute()
+        except TouchError as error:
+            print(f"STOPPED: {error}")
+            print(stopped_text(touch.link))
+            return False
+        print(
+            f"The board is at {found.height:.4f} m (+- {1e3 * found.uncertainty:.2f} mm), expected "
+            f"at {touch.expected:.4f}. It is as stiff as {1e-3 * found.stiffness:.0f} N/mm, with "
+            f"the arm; the force rose to {found.peak_force:.1f} N."
+        )
+        check_height(found, touch.expected, config.touch.tolerance, field)
+        config.board_height = found.height
+        print("This run takes the height that was found.\n")
+        return True
+
+    def checked_run(
+        self, hardware: HardwareRun, directory: Path, duration: float | None = None
+    ) -> Run | None:
+        """The same as `run` with a robot that is connected already, and at the start."""
+        if not report("Robot and plan", hardware.check_before()):
+            return None
+        duration = _run_duration(hardware, duration)
+        if not report("Start", hardware.check_at_start()):
+            return None
+        print(plan_text(hardware, duration))
+        if self.dry_run:
+            made = hardware.execute(min(WATCHED, duration), moves=False)
+            assert hardware.link is not None
+            timing = ", ".join(f"{k} {v:.4g}" for k, v in hardware.link.timing().items())
+            print(f"Dry run: nothing was sent to the joints. {timing}")
+            return made
+        return _slice(hardware, duration, directory) if self._asks(WORD) else None
+
+    def _asks(self, word: str) -> bool:
+        return ask(word, is_loopback(self.host))
+
+    @contextmanager
+    def _connected(self) -> Iterator[RobotClient]:
+        """A client in control of the robot; at its end, however it ends, the program is stopped.
+
+        SIGTERM and SIGHUP, which a terminal that is closed sends, end it as Ctrl-C does.
+
+        Raises:
+            RobotUnavailableError: It does not answer, or refuses.
+        """
+        from sliceit_drake.hardware.ur_client import UrClient
+
+        with catch_signals():
+            print(f"Connecting to {self.host}", flush=True)
+            config = self.config
+            client = UrClient(self.host, config.lookahead_time, config.gain, pace=self.pace)
+            try:
+                yield client
+            finally:
+                client.close()
+
+
+def _run_duration(hardware: HardwareRun, duration: float | None) -> float:
+    """How long to run, s.
+
+    Raises:
+        ConfigurationError: It is no part of the motion: the knife would stay where it is.
+    """
+    longest = hardware.motion.duration
+    if duration is None:
+        return longest
+    if not 0.0 < duration <= longest + 1e-9:
+        raise ConfigurationError(
+            f"{duration:g} s is not within the motion",
+            field="--duration",
+            fix=f"Give up to {longest:g}, or leave it out.",
+        )
+    return duration
+
+
+def _slice(hardware: HardwareRun, duration: float, directory: Path) -> Run:
+    """Runs, writes and reports."""
+    from tqdm import tqdm
+
+    with tqdm(
+        total=duration,
+        desc=hardware.scenario.name,
+        bar_format="{desc}: {percentage:3.0f}%|{bar}| {n:.2f}/{total:.2f} s",
+    ) as bar:
+
+        def show(time: float, wall: float) -> None:
+            bar.update(time - bar.n)
+
+        made = hardware.execute(duration, show)
+    summary = write_hardware_outputs(hardware, directory)
+    if made.stopped:
+        print(f"STOPPED: {made.stopped}")
+        print(stopped_text(hardware.link))
+    robot = summary["robot"]
+    print(
+        f"Peak force {summary['peak_force_N']:.1f} N; {robot['cycles']:.0f} cycles, "
+        f"{robot['missed_cycles']:.0f} missed, lateness {1e3 * robot['lateness_99_s']:.2f} ms "
+        f"(99 %), {1e3 * robot['lateness_max_s']:.2f} ms at most"
+    )
+    return made
