@@ -1,1 +1,1 @@
-"""Running a robot: plan, board touch, move to the start, run and what it leaves."""
+"""Runs a robot: checks, plan, the operator's word, run, and what it leaves."""
