@@ -16,8 +16,8 @@ from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Placement
 from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
 from sliceit_drake.stand_in.protocol import Condition, Protocol
-from sliceit_drake.stand_in.quiet import without_noise
 from sliceit_drake.stand_in.session import Session
+from studies.hidden_effects.quiet import without_noise
 
 
 @pytest.fixture(scope="module")

@@ -5,13 +5,14 @@ import pytest
 from scipy.optimize import brentq, curve_fit
 from scipy.spatial.transform import Rotation
 
-from sliceit_drake.cutting.foods.material import Material, energy_density, first_piola_stress
+from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.mesh.split import CutPlane
 from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh, box_mesh
 from sliceit_drake.cutting.model import CuttingModel, Numerics, make_cutting_model
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.solver import CuttingSolver
+from studies.physics.neo_hookean import energy_density, first_piola_stress
 
 FAR = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.5]))
 SOFT = Material(youngs_modulus=2e5, poisson_ratio=0.35, density=1000.0, damping_time=0.0)

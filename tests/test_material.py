@@ -5,12 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import ConfigurationError, validate
-from sliceit_drake.cutting.foods.material import (
-    Material,
-    energy_density,
-    first_piola_stress,
-    small_strain_stiffness,
-)
+from sliceit_drake.cutting.foods.material import Material
+from studies.physics.neo_hookean import energy_density, first_piola_stress, small_strain_stiffness
 
 POISSON_RATIOS = [0.0, 0.1, 0.37, 0.49]
 

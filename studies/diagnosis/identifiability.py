@@ -22,9 +22,9 @@ from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
 from sliceit_drake.stand_in.protocol import Protocol, load_protocol
-from sliceit_drake.stand_in.quiet import records_of_conditions, without_noise
 from sliceit_drake.stand_in.session import Session
 from studies.diagnosis.identifiability_page import Study, plot_angles, report
+from studies.hidden_effects.quiet import records_of_conditions, without_noise
 from studies.pages import publish
 
 __all__ = ["add_arguments", "nominal_records", "protocol_setup", "run", "study"]

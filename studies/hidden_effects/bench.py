@@ -12,9 +12,9 @@ from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.effect import Effect, Series
 from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
 from sliceit_drake.stand_in.protocol import Protocol, Specimen, load_protocol
-from sliceit_drake.stand_in.quiet import records_of_conditions, without_noise
 from sliceit_drake.stand_in.session import Session
 from sliceit_drake.stand_in.world import World
+from studies.hidden_effects.quiet import records_of_conditions, without_noise
 
 __all__ = [
     "DIAGNOSIS_REFINEMENT",

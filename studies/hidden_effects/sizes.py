@@ -33,11 +33,11 @@ from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.registry import all_causes, open_causes
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.stand_in import effect as effect_module
-from sliceit_drake.stand_in import finite_element_world, quiet, sensor_model, session, world
+from sliceit_drake.stand_in import finite_element_world, sensor_model, session, world
 from sliceit_drake.stand_in.effect_registry import EFFECTS, make_effect
 from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
 from sliceit_drake.stand_in.session import Session
-from studies.hidden_effects import bench
+from studies.hidden_effects import bench, quiet
 from studies.hidden_effects.bench import (
     DIAGNOSIS_REFINEMENT,
     WORLD,

@@ -9,17 +9,14 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import LinearOperator, cg, splu
 from scipy.spatial.transform import Rotation
 
-from sliceit_drake.cutting.foods.material import (
-    Material,
-    first_piola_stress,
-    small_strain_stiffness,
-)
+from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.mesh.split import CutPlane
 from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh, box_mesh
 from sliceit_drake.cutting.model import GRAVITY, Numerics, make_cutting_model
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.solver import CuttingSolver
+from studies.physics.neo_hookean import first_piola_stress, small_strain_stiffness
 
 __all__ = ["BeamCheck", "PatchCheck", "check_beam", "check_patch"]
 

@@ -25,7 +25,6 @@ from scipy.sparse.linalg import splu
 from tqdm import tqdm
 
 from sliceit_drake.cutting.foods.food import make_food_model
-from sliceit_drake.cutting.foods.material import first_piola_stress, small_strain_stiffness
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
@@ -33,6 +32,7 @@ from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.resources import resource_path
 from studies.pages import table
 from studies.physics.cutting_speed import CLEARANCE, PERIOD, least_times, sub_step_time, through
+from studies.physics.neo_hookean import first_piola_stress, small_strain_stiffness
 
 __all__ = ["add_arguments", "run"]
 

@@ -13,11 +13,12 @@ import matplotlib
 import numpy as np
 
 from sliceit_drake.cutting.foods.food import Box, Cylinder, Ellipsoid
-from sliceit_drake.cutting.foods.material import Material, small_strain_stiffness
+from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.mesh.split import CutPlane
 from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh
 from sliceit_drake.cutting.model import Numerics, make_cutting_model
+from studies.physics.neo_hookean import small_strain_stiffness
 
 matplotlib.use("Agg")
 
