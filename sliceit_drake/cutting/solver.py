@@ -6,7 +6,6 @@ import typing
 
 import numpy as np
 
-from sliceit_drake.cutting.kernels.types import LANES
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose, small_turn
 from sliceit_drake.cutting.workspace import Workspace, parameter_row
@@ -364,20 +363,3 @@ class CuttingSolver:
             least_volume_ratio=float(ratio[least]),
             least_element=least,
         )
-
-    def held_reaction(self, state: np.ndarray, pose: Pose) -> np.ndarray:
-        """Force of what holds the food on the food [3], N, in C, with the knife at `pose`."""
-        m = self.model
-        with self._lock:
-            self._place(state, pose)
-            forces, point_forces = self._workspace.present_forces()
-        held = np.ones(len(m.nodes), bool)
-        held[m.moving] = False
-        at_held = held[m.blocks]
-        on_held = (forces.reshape(-1, 4, 3, LANES) * at_held[:, :, None, :]).sum((0, 1, 3))
-        # Forces of the bulk sum to zero, so that those on held nodes relax as those on the others.
-        lag = self.field(state, "lag").reshape(len(m.relaxing), len(m.nodes), 3)[:, m.moving]
-        on_held += m.relaxing @ lag.sum(1, dtype=float)
-        share = (held[m.point_nodes].reshape(-1, 2, 2) * m.point_weights[:, None, :]).sum(2)
-        on_held += (point_forces * share[:, :, None]).sum((0, 1)) + m.weight[held].sum(0)
-        return -on_held

@@ -520,17 +520,6 @@ class Workspace:
             self.launch(self.kernels.point_energy, P, points)
         return capture.graph
 
-    def present_forces(self) -> tuple[np.ndarray, np.ndarray]:
-        """Forces of elements [B, 12, LANES] and cut points [P, 2, 3] of the first cut, N."""
-        look_ahead = self.kernels.look_ahead
-        with DIRECT:
-            self.launch(look_ahead, len(self.model.nodes), self.look_ahead_arguments())
-            self.launch_elements(0)
-            point_forces = self.point_forces()
-        B = len(self.model.blocks)
-        forces = self.force.numpy()[0, : B * 12 * LANES].astype(np.float64)
-        return forces.reshape(B, 12, LANES), point_forces
-
     def point_forces(self) -> np.ndarray:
         """Forces on both faces at the cut points of the first cut [P, 2, 3], N."""
         # A step of no duration changes no history that another call reads.

@@ -13,7 +13,7 @@ from sliceit_drake.systems.servo import JOINTS, ServoConfig, ServoLaw
 if TYPE_CHECKING:
     from sliceit_drake.diagrams.scenario import Scenario
 
-__all__ = ["CYCLE", "START", "KinematicRobot", "RobotModel", "ArmState", "SimulationStopped"]
+__all__ = ["CYCLE", "START", "ArmState", "KinematicRobot", "RobotModel", "SimulationStopped"]
 
 CYCLE = 0.002
 """Controller time of one cycle of an e-Series controller, s."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from sliceit_drake.records.slice_record import SliceTable
 
-__all__ = ["RecordFinding", "Findings", "runs"]
+__all__ = ["Findings", "RecordFinding", "runs"]
 
 
 @dc.dataclass(frozen=True)
