@@ -11,6 +11,7 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagrams.hardware_station import RobotConnection
 from sliceit_drake.diagrams.outputs.paraview import FoodFrames
+from sliceit_drake.diagrams.outputs.slice_record_of_run import slice_record_of
 from sliceit_drake.diagrams.run import prepare_run, simulate
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.station import MakeStation
@@ -137,3 +138,9 @@ def test_what_does_not_fit_the_scenario_is_refused():
     robot = RobotConnection(client=None, config=HardwareConfig())
     with pytest.raises(ConfigurationError, match="what lies on its board"):
         MakeStation(scenario(), hardware=robot, cutting=Dough)
+
+
+def test_a_slice_record_does_not_say_that_the_replaced_food_was_cut():
+    run = prepare_run(Scenario(), cutting=Dough)
+    run.advance(0.02)
+    assert slice_record_of(run, "a test").metadata.food.name == "Dough"

@@ -9,7 +9,7 @@ import numpy as np
 from sliceit_drake.cutting.foods.effects import Compliance, Slip
 from sliceit_drake.cutting.planned_slice import PlannedSlice
 from sliceit_drake.diagrams.scenario import Placement, Preparation, Scenario, Start
-from sliceit_drake.systems.analytic_cutter import AnalyticFood
+from sliceit_drake.systems.analytic_cutter import no_food
 
 __all__ = ["scenario_of_slice"]
 
@@ -35,7 +35,7 @@ def scenario_of_slice(plan: PlannedSlice) -> Scenario:
     scenario.numerics.flank_stiffness = plan.flank_stiffness
     if plan.food is None:
         # Of no toughness, it is a height to start from and no force.
-        scenario.food = AnalyticFood(diameter=plan.height, toughness=0.0)
+        scenario.food = no_food(plan.height)
     else:
         scenario.food = copy.deepcopy(plan.food)
         # An arm and a holder that give belong to the station, not to the food.

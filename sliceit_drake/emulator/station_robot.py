@@ -18,7 +18,7 @@ from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.emulator.joint_targets import JointTargets
 from sliceit_drake.emulator.kinematics import forward
 from sliceit_drake.emulator.robot_model import CYCLE, ArmState, SimulationStopped
-from sliceit_drake.systems.analytic_cutter import AnalyticFood
+from sliceit_drake.systems.analytic_cutter import is_no_food
 from sliceit_drake.systems.servo import ServoConfig
 
 __all__ = ["StationRobot"]
@@ -129,7 +129,7 @@ class StationRobot:
     def _check_room(self, station: SimulatedStation) -> None:
         """Whether the knife is over the food of a station."""
         food, start = station.scenario.food, station.scenario.start
-        if isinstance(food, AnalyticFood) and food.toughness == 0.0:
+        if is_no_food(food):
             return
         top = float(station.start_pose.translation()[2]) - start.clearance
         robot = self._scenario.robot

@@ -156,11 +156,10 @@ def make_agent_station(task: TaskConfig, food: str, rng: np.random.Generator) ->
     calibrated = load_calibrated_food(food)
     scenario = station_scenario(task, calibrated, food)
     cutting = None
-    if isinstance(scenario.food, Food):
+    if task.simulator == "cutting":
         models = _variants(task, calibrated, scenario, rng)
-        X_WF, period = scenario.X_WF(), scenario.exchange_period
-
-        cutting = CuttingSystem([CuttingSolver(model, period) for model in models], X_WF)
+        solvers = [CuttingSolver(model, scenario.exchange_period) for model in models]
+        cutting = CuttingSystem(solvers, scenario.X_WF())
 
     station = MakeStation(scenario, cutting=cutting)
     return AgentStation(station, dc.replace(task.agent, descent=station.descent()))

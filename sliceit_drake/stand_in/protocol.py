@@ -12,7 +12,7 @@ from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.diagrams.scenario import Placement, Preparation, Scenario
 from sliceit_drake.stand_in.sensor_model import SensorModel
-from sliceit_drake.systems.analytic_cutter import AnalyticFood
+from sliceit_drake.systems.analytic_cutter import is_no_food
 
 __all__ = [
     "Condition",
@@ -215,8 +215,8 @@ def protocol_of_scenario(scenario: Scenario, replicates: int = 1) -> Protocol:
         ConfigurationError: The scenario has no food to cut, or is a sequence.
     """
     food, prepared = scenario.food, scenario.preparation or Preparation()
-    without_food = isinstance(food, AnalyticFood) and food.toughness == 0.0
-    if isinstance(food, AnalyticFood) and without_food:
+    without_food = is_no_food(food)
+    if is_no_food(food):
         food = Food(name="none", shape=Cylinder(diameter=food.diameter))
     if not isinstance(food, Food) or scenario.sequence is not None:
         raise ConfigurationError(

@@ -6,7 +6,7 @@ import dataclasses as dc
 from sliceit_drake.configuration import validate
 from sliceit_drake.diagrams.scenario import Preparation, Scenario, Start
 from sliceit_drake.stand_in.protocol import Protocol, Specimen, scaled_food, section_size
-from sliceit_drake.systems.analytic_cutter import AnalyticFood
+from sliceit_drake.systems.analytic_cutter import no_food
 
 __all__ = ["scenario_of_cut"]
 
@@ -43,7 +43,7 @@ def scenario_of_cut(protocol: Protocol, specimen: Specimen, station: Scenario) -
         placement=protocol.placement,
         exchange_period=protocol.exchange_period,
         # What offers no resistance stands for no food: the start is over where its top would be.
-        food=AnalyticFood(diameter=height, toughness=0.0) if condition.without_food else food,
+        food=no_food(height) if condition.without_food else food,
         calibration=None,
         start=Start(clearance=condition.clearance, offset=condition.offset),
         motion=condition.motion,

@@ -1,6 +1,7 @@
 """A cutting system in twenty lines: force against depth. The example for writing one's own."""
 
 import dataclasses as dc
+from typing import TypeGuard
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -9,7 +10,7 @@ from pydrake.systems.framework import Context, State
 from sliceit_drake.configuration import quantity
 from sliceit_drake.systems.knife_force import CuttingSetup, KnifeForceSystem
 
-__all__ = ["AnalyticCutter", "AnalyticFood"]
+__all__ = ["AnalyticCutter", "AnalyticFood", "is_no_food", "no_food"]
 
 
 @dc.dataclass
@@ -33,6 +34,16 @@ class AnalyticFood:
     def make_cutting(self, setup: CuttingSetup) -> "AnalyticCutter":
         """The system that this food is in a station."""
         return AnalyticCutter(self, setup.X_WF().translation()[2], setup.exchange_period)
+
+
+def no_food(height: float) -> AnalyticFood:
+    """What stands for no food: it has a top at `height`, m, and offers no resistance."""
+    return AnalyticFood(diameter=height, toughness=0.0)
+
+
+def is_no_food(food: object) -> TypeGuard[AnalyticFood]:
+    """Whether a food is one that offers no resistance."""
+    return isinstance(food, AnalyticFood) and food.toughness == 0.0
 
 
 class AnalyticCutter(KnifeForceSystem):

@@ -99,6 +99,8 @@ def slice_record_of(
 
 def _food_facts(run: Run) -> FoodFacts:
     scenario, food = run.scenario, run.scenario.food
+    if own := run.own.get("cutting"):
+        return FoodFacts(name=own)
     if not isinstance(food, Food):
         return FoodFacts(name="none")
     shape, size = shape_facts(food)
