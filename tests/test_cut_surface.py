@@ -4,13 +4,9 @@ import numpy as np
 import pytest
 
 from sliceit_drake.cutting.mesh.cut_surface import EdgeTables, edge_tables
+from sliceit_drake.cutting.mesh.generators import box_mesh, cylinder_mesh, ellipsoid_mesh
 from sliceit_drake.cutting.mesh.split import CutPlane, SplitMesh, split_mesh
-from sliceit_drake.cutting.mesh.tetrahedra import (
-    TetrahedralMesh,
-    box_mesh,
-    cylinder_mesh,
-    ellipsoid_mesh,
-)
+from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh
 
 MESHES = {
     "box": box_mesh(

@@ -7,7 +7,8 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.food import Box, Food, MeshFile, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.mesh.tetrahedra import MeshError, TetrahedralMesh, box_mesh
+from sliceit_drake.cutting.mesh.generators import box_mesh
+from sliceit_drake.cutting.mesh.tetrahedra import MeshError, TetrahedralMesh
 from sliceit_drake.cutting.model import Numerics, TimeStepError
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan, Pose, Waypoints
 from sliceit_drake.cutting.simulate import check_clear, check_in_plane, simulate_slice

@@ -19,13 +19,9 @@ from sliceit_drake.cutting.foods.food import (
     make_food_model,
 )
 from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.mesh.generators import box_mesh
 from sliceit_drake.cutting.mesh.manifold import surface_crossings
-from sliceit_drake.cutting.mesh.tetrahedra import (
-    MeshError,
-    TetrahedralMesh,
-    boundary_faces,
-    box_mesh,
-)
+from sliceit_drake.cutting.mesh.tetrahedra import MeshError, TetrahedralMesh, boundary_faces
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 

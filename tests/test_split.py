@@ -8,15 +8,10 @@ from scipy.spatial import ConvexHull
 
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.mesh.generators import box_mesh, cylinder_mesh, ellipsoid_mesh
 from sliceit_drake.cutting.mesh.manifold import bodies
 from sliceit_drake.cutting.mesh.split import CutPlane, split_mesh
-from sliceit_drake.cutting.mesh.tetrahedra import (
-    MeshError,
-    TetrahedralMesh,
-    box_mesh,
-    cylinder_mesh,
-    ellipsoid_mesh,
-)
+from sliceit_drake.cutting.mesh.tetrahedra import MeshError, TetrahedralMesh
 from sliceit_drake.cutting.model import Numerics, make_cutting_model
 
 BODIES = ("box", "cylinder", "ellipsoid")

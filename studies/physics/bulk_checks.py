@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.mesh.generators import box_mesh
 from sliceit_drake.cutting.mesh.split import CutPlane
-from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh, box_mesh
+from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh
 from sliceit_drake.cutting.model import GRAVITY, Numerics, make_cutting_model
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.solver import CuttingSolver

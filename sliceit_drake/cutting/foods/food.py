@@ -9,16 +9,15 @@ from sliceit_drake.configuration import ConfigurationError, choice, quantity
 from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.mesh.split import CutPlane
-from sliceit_drake.cutting.mesh.tetrahedra import (
-    MeshError,
-    TetrahedralMesh,
+from sliceit_drake.cutting.mesh.generators import (
     box_mesh,
     cylinder_mesh,
     ellipsoid_mesh,
     halved_mesh,
     tapered_mesh,
 )
+from sliceit_drake.cutting.mesh.split import CutPlane
+from sliceit_drake.cutting.mesh.tetrahedra import MeshError, TetrahedralMesh
 from sliceit_drake.cutting.model import CuttingModel, Numerics, make_cutting_model
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.resources import file_or_resource
