@@ -21,8 +21,9 @@ from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.cutting.batch import simulate_batch
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood, load_calibrated_food
 from sliceit_drake.cutting.foods.effects import Adhesion, Effects, Relaxation, Skin, ToughnessRate
-from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
+from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.gradient import SliceAdjoint
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics

@@ -9,8 +9,9 @@ from sliceit_drake.cutting.batch import BatchSlice, cut_together, simulate_batch
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.driver import Driver, Launch
 from sliceit_drake.cutting.foods.effects import Compliance, Effects, Relaxation
-from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
+from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan, PressAndDraw

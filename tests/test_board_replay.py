@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import ConfigurationError, validate
 from sliceit_drake.cutting.board import Board, impact_peak_loss
-from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model
+from sliceit_drake.cutting.foods.food import Food, make_food_model
+from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan, Recorded, Retract
 from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver

@@ -29,8 +29,9 @@ from sliceit_drake.cutting.foods.calibrated_food import (
     load_calibrated_food,
 )
 from sliceit_drake.cutting.foods.distribution import ParameterDistribution
-from sliceit_drake.cutting.foods.food import Cylinder, Food
+from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.foods.material import Material
+from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagrams.scenario import load_scenario

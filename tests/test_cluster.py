@@ -14,7 +14,8 @@ from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.driver import Driver
-from sliceit_drake.cutting.foods.food import Cylinder, Food
+from sliceit_drake.cutting.foods.food import Food
+from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagnosis.causes.material import SkinToughness
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor

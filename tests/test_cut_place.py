@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
-from sliceit_drake.cutting.foods.food import Box, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.shapes import Box
 from sliceit_drake.cutting.motion import ConstantSpeed, MotionPlan
 from sliceit_drake.diagnosis.diagnose import setup_of_food
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.foods.food import Box, Food, MeshFile, make_food_model, start_pose
+from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
+from sliceit_drake.cutting.foods.shapes import Box, MeshFile
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.mesh.generators import box_mesh
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError, TetrahedralMesh

@@ -16,7 +16,8 @@ from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.calibration.storage import keeps_answering, without_password
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.foods.food import Cylinder, Food
+from sliceit_drake.cutting.foods.food import Food
+from sliceit_drake.cutting.foods.shapes import Cylinder
 from studies.scaling.local_database import NoServerError, find_server, local_database
 
 

@@ -5,17 +5,9 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from sliceit_drake.configuration import ConfigurationError, validate
-from sliceit_drake.cutting.foods.food import (
-    Box,
-    Cylinder,
-    Ellipsoid,
-    Food,
-    Remainder,
-    Tapered,
-    make_food_model,
-    start_pose,
-)
+from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
+from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid, Remainder, Tapered
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.mesh.manifold import bodies
 from sliceit_drake.cutting.mesh.split import CutPlane, split_mesh

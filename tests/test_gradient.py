@@ -18,8 +18,9 @@ from sliceit_drake.cutting.foods.effects import (
     Slip,
     ToughnessRate,
 )
-from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model
+from sliceit_drake.cutting.foods.food import Food, make_food_model
 from sliceit_drake.cutting.foods.material import Material
+from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.gradient import SliceAdjoint, SliceGradient, SliceRun
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel, Numerics

@@ -10,14 +10,8 @@ import pytest
 
 from sliceit_drake.calibration.setup import CalibrationSetup, load_setup
 from sliceit_drake.configuration import dump_yaml
-from sliceit_drake.cutting.foods.food import (
-    Box,
-    Cylinder,
-    Ellipsoid,
-    Food,
-    MeshFile,
-    make_food_model,
-)
+from sliceit_drake.cutting.foods.food import Food, make_food_model
+from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid, MeshFile
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.mesh.generators import box_mesh
 from sliceit_drake.cutting.mesh.manifold import surface_crossings

@@ -10,7 +10,7 @@ import pytest
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
 from sliceit_drake.cutting.foods.effects import Effects
-from sliceit_drake.cutting.foods.food import Cylinder
+from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.diagnosis.diagnose import setup_of_food
 from sliceit_drake.diagnosis.evidence.columns import Sensitivities
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem

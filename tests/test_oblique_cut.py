@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
+from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.mesh.split import CutPlane
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError, TetrahedralMesh

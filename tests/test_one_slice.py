@@ -14,7 +14,8 @@ from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import dump_yaml
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
-from sliceit_drake.cutting.foods.food import Cylinder, Food
+from sliceit_drake.cutting.foods.food import Food
+from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.causes.material import SkinToughness
 from sliceit_drake.diagnosis.evidence.columns import Column, Sensitivities

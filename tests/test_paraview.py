@@ -10,7 +10,8 @@ import pytest
 
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model
+from sliceit_drake.cutting.foods.food import Food, make_food_model
+from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.mesh.body import food_body
 from sliceit_drake.cutting.model import Numerics

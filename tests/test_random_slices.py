@@ -5,7 +5,7 @@ import dataclasses as dc
 import numpy as np
 import pytest
 
-from sliceit_drake.cutting.foods.food import Box
+from sliceit_drake.cutting.foods.shapes import Box
 from studies.physics import random_slices
 from studies.physics.random_slices import (
     Outcome,

@@ -7,7 +7,7 @@ import pytest
 from pydrake.systems.analysis import InitializeParams, Simulator
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
-from sliceit_drake.cutting.foods.food import Ellipsoid, Remainder
+from sliceit_drake.cutting.foods.shapes import Ellipsoid, Remainder
 from sliceit_drake.diagrams.holder_arm import FINGERTIPS, HoldingArm
 from sliceit_drake.diagrams.outputs.sequence_report import slice_reports
 from sliceit_drake.diagrams.run import prepare_run

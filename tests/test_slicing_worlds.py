@@ -14,7 +14,8 @@ from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 
 from sliceit_drake.configuration import ConfigurationError, validate
 from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
-from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan, Pose, Retract
 from sliceit_drake.cutting.simulate import simulate_slice

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sliceit_drake.cutting.foods.food import Cylinder, Food
+from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.foods.material import Material
+from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan

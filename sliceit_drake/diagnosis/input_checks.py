@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.foods.food import Box, Cylinder, Ellipsoid, Food
+from sliceit_drake.cutting.foods.food import Food
+from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid
 from sliceit_drake.prediction.placement import is_bare
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.records.validation import check_record

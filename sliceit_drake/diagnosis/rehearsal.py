@@ -3,7 +3,8 @@
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model
+from sliceit_drake.cutting.foods.food import Food, make_food_model
+from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.diagnosis.cause import Cause

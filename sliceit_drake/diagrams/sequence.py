@@ -5,7 +5,8 @@ import dataclasses as dc
 from pydrake.math import RigidTransform
 
 from sliceit_drake.configuration import ConfigurationError, choice, quantity
-from sliceit_drake.cutting.foods.food import Ellipsoid, Food, MeshFile, Remainder
+from sliceit_drake.cutting.foods.food import Food
+from sliceit_drake.cutting.foods.shapes import Ellipsoid, MeshFile, Remainder
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan, Retract, Segment
 
 __all__ = ["SliceSequence"]

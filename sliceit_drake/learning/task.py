@@ -9,7 +9,8 @@ import numpy as np
 from sliceit_drake.configuration import ConfigurationError, choice, quantity
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood, load_calibrated_food
-from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model
+from sliceit_drake.cutting.foods.food import Food, make_food_model
+from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.parameters import with_parameters
 from sliceit_drake.cutting.solver import CuttingSolver

@@ -7,7 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.foods.food import Box, Cylinder, Ellipsoid, Food, start_pose
+from sliceit_drake.cutting.foods.food import Food, start_pose
+from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.records.slice_record import SliceRecord

@@ -16,7 +16,8 @@ import numpy as np
 
 from sliceit_drake.configuration import quantity
 from sliceit_drake.cutting.board import board_wrench, board_wrenches
-from sliceit_drake.cutting.foods.food import Box, Cylinder, Food, start_pose
+from sliceit_drake.cutting.foods.food import Food, start_pose
+from sliceit_drake.cutting.foods.shapes import Box, Cylinder
 from sliceit_drake.cutting.mesh.cut_surface import depth_below, distance_inside
 from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh
 from sliceit_drake.cutting.model import CuttingModel, Numerics, PointScales, make_cutting_model

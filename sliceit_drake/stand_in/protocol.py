@@ -7,7 +7,8 @@ import numpy as np
 from sliceit_drake.configuration import ConfigurationError, load_yaml, quantity, validate
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.foods.effects import Effects
-from sliceit_drake.cutting.foods.food import Box, Cylinder, Ellipsoid, Food
+from sliceit_drake.cutting.foods.food import Food
+from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.diagrams.scenario import Placement, Preparation, Scenario

@@ -24,7 +24,8 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError, quantity
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood, load_calibrated_food
-from sliceit_drake.cutting.foods.food import Cylinder, Food
+from sliceit_drake.cutting.foods.food import Food
+from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.diagrams.agent_gains import AgentGains
 from sliceit_drake.diagrams.scenario import Placement, Scenario, Start

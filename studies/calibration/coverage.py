@@ -23,7 +23,7 @@ from sliceit_drake.calibration.prediction import Predictor
 from sliceit_drake.calibration.setup import CalibrationSetup, load_setup
 from sliceit_drake.calibration.uncertainty import estimate
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.foods.food import Cylinder
+from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.workers import worker_processes
 from sliceit_drake.prediction.noise import NoiseModel, group_series
 from sliceit_drake.records.metadata import FoodFacts, NominalMotion, SliceMetadata

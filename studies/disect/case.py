@@ -10,7 +10,8 @@ import math
 import numpy as np
 
 from sliceit_drake.configuration import load_yaml, quantity
-from sliceit_drake.cutting.foods.food import Box, Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.shapes import Box
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan

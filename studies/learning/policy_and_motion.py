@@ -16,7 +16,8 @@ from tqdm import tqdm
 
 from sliceit_drake.cli.evaluate import FOODS
 from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
-from sliceit_drake.cutting.foods.food import Cylinder, Food, make_food_model
+from sliceit_drake.cutting.foods.food import Food, make_food_model
+from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.motion import Hold, MotionPlan, PressAndDraw
 from sliceit_drake.cutting.motion_optimization import MotionLimits, optimize_motion
 from sliceit_drake.diagrams.run import prepare_run

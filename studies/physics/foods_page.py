@@ -13,14 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from sliceit_drake.cutting.foods.calibrated_food import calibrated_food_names, load_calibrated_food
-from sliceit_drake.cutting.foods.food import (
-    Box,
-    Cylinder,
-    Ellipsoid,
-    Food,
-    make_food_model,
-    start_pose,
-)
+from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.named_knife import knife_names, load_knife

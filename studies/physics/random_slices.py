@@ -17,16 +17,9 @@ from tqdm import tqdm
 
 from sliceit_drake.configuration import ConfigurationError, validate
 from sliceit_drake.cutting.board import Board
-from sliceit_drake.cutting.foods.food import (
-    Box,
-    Cylinder,
-    Ellipsoid,
-    Food,
-    Tapered,
-    make_food_model,
-    start_pose,
-)
+from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
+from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid, Tapered
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError
 from sliceit_drake.cutting.model import CuttingModel, Numerics, TimeStepError

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sliceit_drake.cutting.foods.food import MeshFile, Remainder, Tapered
+from sliceit_drake.cutting.foods.shapes import MeshFile, Remainder, Tapered
 from sliceit_drake.diagnosis.evidence.screen import CauseEvidence
 from sliceit_drake.diagnosis.evidence.sensitivity import Progress
 from sliceit_drake.diagnosis.evidence.verdict import CLASS_ANGLE, LEAST_REPLICATES

@@ -13,15 +13,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sliceit_drake.calibration.setup import CalibrationSetup
-from sliceit_drake.cutting.foods.food import (
-    Box,
-    Cylinder,
-    Ellipsoid,
-    Food,
-    make_food_model,
-    shape_facts,
-    start_pose,
-)
+from sliceit_drake.cutting.foods.food import Food, make_food_model, shape_facts, start_pose
+from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid
 from sliceit_drake.cutting.motion import Motion, MotionPlan, Pose, Segment, Waypoints
 from sliceit_drake.cutting.planned_slice import PlannedSlice
 from sliceit_drake.diagnosis.experiments.designs import Experiment, Scale
