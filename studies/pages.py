@@ -5,7 +5,7 @@ from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-__all__ = ["publish", "render", "table"]
+__all__ = ["percent", "publish", "render", "table"]
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -28,8 +28,13 @@ def _row(cells: Iterable[object]) -> str:
     return f"| {' | '.join(map(str, cells))} |"
 
 
+def percent(share: float) -> str:
+    """A share in percent, to two digits."""
+    return f"{100.0 * share:.2g} %" if abs(share) < 0.1 else f"{100.0 * share:.0f} %"
+
+
 def _environment() -> Environment:
-    """What templates know besides their values: `table`, and `| f(".2f")` to format a number."""
+    """Where templates are; they know `table`, `| percent`, and `| f(".2f")` for other numbers."""
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
         undefined=StrictUndefined,
@@ -38,7 +43,7 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
     )
     environment.globals["table"] = table
-    environment.filters["f"] = format
+    environment.filters |= {"f": format, "percent": percent}
     return environment
 
 

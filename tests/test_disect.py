@@ -184,7 +184,7 @@ def settings_rows(text):
     table = text.split("## Everything that DiSECt sets")[1]
     rows = re.findall(r"^\| (.*?) \| (.*?) \| (.*?) \|$", table, re.M)
     assert rows[0][0] == "DiSECt"
-    return rows[2:]
+    return rows[1:]
 
 
 def test_every_field_that_the_page_names_exists():

@@ -71,6 +71,12 @@ def test_a_table_has_a_cell_for_each_title():
     assert table("a | b", [], "lr") == "| a | b |\n|---|---:|"
 
 
+def test_tables_stand_in_no_other_module():
+    separator = re.compile(r"\|-{3}:?\|")
+    files = [*(ROOT / "studies").rglob("*.py"), *(ROOT / "studies/templates").glob("*.md")]
+    assert [file for file in files if separator.search(file.read_text(encoding="utf-8"))] == []
+
+
 def test_a_page_without_one_of_its_values_is_refused(tmp_path):
     with pytest.raises(Exception, match="'command' is undefined"):
         render("endurance")

@@ -24,7 +24,7 @@ from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.records.validation import load_record
 from sliceit_drake.resources import resource_path
-from studies.pages import publish
+from studies.pages import publish, table
 
 __all__ = [
     "FoodComparison",
@@ -190,46 +190,41 @@ def _row(
 
 def comparison_tables(comparisons: Sequence[FoodComparison]) -> str:
     """The comparison as Markdown."""
-    lines = [
-        "| food | simulator | RMS error [N] | peak [N] | work [J] | time shift [ms] |"
-        " free parameters | held-out RMS [N] |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    rows, costs = [], []
     for c in comparisons:
-        speed = c.calibration.predictor.targets[0].record.metadata.motion.speed or 0.0
-        work = float(np.trapezoid(c.measured, c.time)) * speed
-        lines.append(f"| {c.food} | measured | | {c.measured.max():.1f} | {work:.3f} | | | |")
-        for row in c.rows:
-            own = row.name == "ours"
-            count = ""
-            held = ""
-            if own:
-                k = c.calibration
-                waves = 3 * (k.setup.oscillation is not None)
-                count = str(len(k.unit) + waves)
-                held = f"{k.held_out_rms:.2f}" if k.held_out_rms is not None else ""
-            shift = "fitted" if own else f"{1e3 * row.shift:.0f}"
-            name = "**ours**" if own else NAMES.get(row.name, row.name)
-            lines.append(
-                f"| {c.food} | {name} | {row.rms:.2f} | {row.peak:.1f} | {row.work:.3f} | {shift} "
-                f"| {count} | {held} |"
-            )
-    lines += [
-        "",
-        "| food | ours / half of DiSECt's | search [N] | after Adam [N] | polished [N] | minutes |"
-        " a toughness for each cut point [N] | cut points |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for c in comparisons:
-        half = 0.5 * next(r.rms for r in c.rows if r.name == "DiSECt")
         k = c.calibration
+        target = k.predictor.targets[0]
+        speed = target.record.metadata.motion.speed or 0.0
+        work = float(np.trapezoid(c.measured, c.time)) * speed
+        rows.append((c.food, "measured", "", f"{c.measured.max():.1f}", f"{work:.3f}", "", "", ""))
+        for row in c.rows:
+            name, shift = NAMES.get(row.name, row.name), f"{1e3 * row.shift:.0f}"
+            count = held = ""
+            if row.name == "ours":
+                name, shift = "**ours**", "fitted"
+                count = str(len(k.unit) + 3 * (k.setup.oscillation is not None))
+                held = f"{k.held_out_rms:.2f}" if k.held_out_rms is not None else ""
+            rows.append(
+                (c.food, name, f"{row.rms:.2f}", f"{row.peak:.1f}", f"{row.work:.3f}", shift)
+                + (count, held)
+            )
+        half = 0.5 * next(r.rms for r in c.rows if r.name == "DiSECt")
         points = "" if c.per_point_rms is None else f"{c.per_point_rms:.2f}"
-        number = len(k.predictor.targets[0].model.point_nodes)
-        lines.append(
-            f"| {c.food} | {k.rms / half:.2f} | {k.search_rms:.3f} | {k.refined_rms:.3f} "
-            f"| {k.rms:.3f} | {c.minutes:.1f} | {points} | {number} |"
+        costs.append(
+            (c.food, f"{k.rms / half:.2f}", f"{k.search_rms:.3f}", f"{k.refined_rms:.3f}")
+            + (f"{k.rms:.3f}", f"{c.minutes:.1f}", points, str(len(target.model.point_nodes)))
         )
-    return "\n".join(lines)
+    curves = table(
+        "food | simulator | RMS error [N] | peak [N] | work [J] | time shift [ms]"
+        " | free parameters | held-out RMS [N]",
+        rows,
+    )
+    cost = table(
+        "food | ours / half of DiSECt's | search [N] | after Adam [N] | polished [N] | minutes"
+        " | a toughness for each cut point [N] | cut points",
+        costs,
+    )
+    return f"{curves}\n\n{cost}"
 
 
 def plot_comparisons(comparisons: Sequence[FoodComparison], file: Path) -> None:

@@ -28,7 +28,7 @@ from sliceit_drake.cutting.workers import worker_processes
 from sliceit_drake.prediction.noise import NoiseModel, group_series
 from sliceit_drake.records.metadata import FoodFacts, NominalMotion, SliceMetadata
 from sliceit_drake.records.slice_record import SliceRecord, velocities
-from studies.pages import publish
+from studies.pages import publish, render
 
 __all__ = [
     "Problem",
@@ -45,13 +45,6 @@ __all__ = [
 LEVEL = 0.9
 LEAST, MOST = 0.80, 0.98
 """Between which the share of 90 % intervals that hold the truth must be."""
-LIMITS = """\
-The records come from the model itself, so that this tests the statistics and not the model: on real
-food the model lacks something, and that error is in no interval. Held-out errors show it. Where a
-height may be off by more than a part of the force's waves over the elements (some millimetres), or
-may bring the knife to the board, there are several fits that noise does not tell apart, and no
-normal distribution covers them.
-"""
 LEAST_SQUARES_STEPS = 5
 """Before the weighted fit."""
 CLEARANCE, REST = 2.5e-3, 6e-3
@@ -315,50 +308,28 @@ def coverage_page(problem: Problem, replicates: Sequence[Replicate], command: st
         errors = np.array([r.mean[k] - r.truth[k] for r in replicates for k in members])
         sd = np.array([r.deviation[k] for r in replicates for k in members])
         rows.append(
-            f"| {kind} | {sum(inside)} of {len(inside)} | {100.0 * np.mean(inside):.0f} % "
-            f"| {np.sqrt(np.mean(errors**2)):.4f} | {np.sqrt(np.mean(sd**2)):.4f} "
-            f"| {errors.mean():+.4f} |"
+            (kind, f"{sum(inside)} of {len(inside)}", f"{100.0 * np.mean(inside):.0f} %")
+            + (f"{np.sqrt(np.mean(errors**2)):.4f}", f"{np.sqrt(np.mean(sd**2)):.4f}")
+            + (f"{errors.mean():+.4f}",)
         )
     share = coverage_share(replicates)
-    verdict = "within" if LEAST <= share <= MOST else "outside"
     n = len(replicates)
-    # Of a share of n independent replicates.
-    error = np.sqrt(LEVEL * (1.0 - LEVEL) / n)
-    scale = np.array([r.record_scale for r in replicates])
-    tau = np.array([r.tau for r in replicates])
-    speeds = " and ".join(f"{1e3 * s:g} mm/s" for s in problem.speeds)
-    method = f"""How often the 90 % interval of a calibrated parameter holds the true value. Each of
-        {n}
-        replicates draws true values from the middle {100.0 * problem.middle:.0f} % of the ranges
-        and presses through a coarse cucumber with them, {problem.records} times at each of
-        {speeds}. It adds noise: first-order autoregressive ({problem.ar:g} N,
-        {1e3 * problem.tau:g} ms) and white ({problem.white:g} N) in each channel, and a scale of
-        each record's force ({100.0 * problem.record_scale:g} %). A record's height may be up to
-        {1e3 * problem.height_offset:g} mm off. Then it calibrates from a start
-        {problem.start_error:g} of the range away, without knowing the noise: least squares, then
-        the fit weighted with the noise that it estimates. `studies/calibration/coverage.py`
-        has the details."""
-    result = f"""All parameters together: **{100.0 * share:.1f} %**, {verdict}
-        {100.0 * LEAST:.0f} to {100.0 * MOST:.0f} %. With {n} replicates the share of a parameter
-        that all records share has a standard error of {100.0 * error:.0f} %. Errors and standard
-        deviations are in parts of the range."""
-    noise = f"""The noise as it was estimated (median, and 10 and 90 % quantiles of the replicates):
-        scale between records {_quantiles(100.0 * scale)} % of {100.0 * problem.record_scale:g} %,
-        correlation time {_quantiles(1e3 * tau)} ms of {1e3 * problem.tau:g} ms."""
-    header = (
-        "| parameter | inside | coverage | RMS error | stated standard deviation | mean error |",
-        "|---|---|---|---|---|---|",
+    page = render(
+        "coverage",
+        command=command,
+        problem=problem,
+        replicates=n,
+        speeds=" and ".join(f"{1e3 * s:g} mm/s" for s in problem.speeds),
+        rows=rows,
+        share=100.0 * share,
+        verdict="within" if LEAST <= share <= MOST else "outside",
+        bounds=(100.0 * LEAST, 100.0 * MOST),
+        # Of a share of n independent replicates.
+        error=100.0 * np.sqrt(LEVEL * (1.0 - LEVEL) / n),
+        scale=_quantiles(np.array([100.0 * r.record_scale for r in replicates])),
+        tau=_quantiles(np.array([1e3 * r.tau for r in replicates])),
     )
-    parts = [
-        "# Coverage of calibration intervals",
-        _paragraph(method),
-        f"    {command}",
-        _paragraph(result),
-        "\n".join((*header, *rows)),
-        _paragraph(noise),
-        _paragraph(LIMITS),
-    ]
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join(map(_wrapped, page.strip().split("\n\n"))) + "\n"
 
 
 def coverage_share(replicates: Sequence[Replicate]) -> float:
@@ -366,8 +337,9 @@ def coverage_share(replicates: Sequence[Replicate]) -> float:
     return float(np.mean([inside for r in replicates for inside in r.inside]))
 
 
-def _paragraph(text: str) -> str:
-    return textwrap.fill(" ".join(text.split()), 100)
+def _wrapped(paragraph: str) -> str:
+    """A paragraph of a page in lines of 100; titles, commands and tables as they are."""
+    return paragraph if paragraph.startswith(("#", " ", "|")) else textwrap.fill(paragraph, 100)
 
 
 def _quantiles(values: np.ndarray) -> str:

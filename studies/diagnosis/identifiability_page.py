@@ -16,6 +16,7 @@ from sliceit_drake.diagnosis.experiments.identifiability import (
     classes,
     short,
 )
+from studies.pages import render
 
 __all__ = ["Study", "plot_angles", "report"]
 
@@ -35,12 +36,9 @@ class Study:
     found: Sensitivities
 
 
-def _table(result: Identifiability) -> str:
-    """One line a cause: what shows, with what it can be confused, what would part it."""
-    lines = [
-        "| cause | shows [sd] | delta | class | nearest other | parted by |",
-        "|---|---|---|---|---|---|",
-    ]
+def _rows(result: Identifiability) -> list[tuple[str, ...]]:
+    """A row a cause: what shows, with what it can be confused, what would part it."""
+    rows = []
     for a, name in enumerate(result.names):
         others = [f"`{short(b)}`" for b in result.equivalence_class(name)[1:]]
         nearest = result.nearest(name)
@@ -60,11 +58,9 @@ def _table(result: Identifiability) -> str:
             parted = f"{split[0]}: shows {split[1]:.0f} sd"
         elif a >= result.shifts:
             parted = "no condition"
-        lines.append(
-            f"| {short(name) if a < result.shifts else f'`{name}`'} | {result.shows[a]:.0f} "
-            f"| {result.delta[a]:.2f} | {what} | {near} | {parted} |"
-        )
-    return "\n".join(lines)
+        shown = short(name) if a < result.shifts else f"`{name}`"
+        rows.append((shown, f"{result.shows[a]:.0f}", f"{result.delta[a]:.2f}", what, near, parted))
+    return rows
 
 
 def _nonlinearity(found: Sensitivities) -> dict[str, float]:
@@ -103,93 +99,44 @@ def _scan_angles(found: Sensitivities) -> dict[str, float]:
     return {name: float(np.median(values)) for name, values in out.items()}
 
 
-HEAD = """\
-# What slices can tell
-
-Which causes of a misfit a set of slices can tell apart, computed before anything is measured:
-
-    python -m studies identifiability --output docs/identifiability.md --figure {figure}
-
-For each cause the change of the predicted forces at a plausible size; less what free base
-parameters can take up ({base}), and differences from slice to slice (5 % in
-toughness, modulus and friction, 0.3 mm in height), the sensor's zero (0.05 N, differing) and the
-discretisation (half the step, a finer mesh); in units of noise (0.09 N in a row, most of it
-correlated over 0.1 s). The motions are the protocols' own, without noise; {elements} tetrahedra.
-What the causes are: [causes.md](causes.md).
-
-- **shows**: standard deviations that are left of the cause at its plausible size, all rows
-  together. Below {shows:g} it does not show: slices of this protocol say nothing of it, and a
-  calibration takes it for a shift of the parameters that are named.
-- **delta**: what is left of it, RMS over the rows in contact, in the channel that has most of it,
-  in standard deviations of a row's noise.
-- **class**: what cannot be told from it: one explains the other to within {angle:g} degrees. A
-  cause with several numbers explains more and is explained less, so each direction counts.
-- **nearest other**: what explains most of it, or is explained best by it.
-- **parted by**: the condition of `full.yaml` that, added with its replicates, gives the largest
-  angle to the nearest other; for a cause that does not show, with which it shows most.
-
-A shift of a base parameter, by {shift:.0f} %, is compared with it left out of what is taken up.
-"""
-
-WHY = """\
-## Why {angle:g} degrees
-
-By noise alone a cause of n standard deviations leaves n sin(a) of them if another at the angle a is
-blamed: at 20 degrees a third, so 3 of 9. Most causes show with tens, and less would do. What sets
-the bound is that no real cause has quite the form that is assumed here. How far apart forms of one
-cause are, before anything is taken up: neighbouring values of its scan, and its change at full size
-against its linear part. In the middle {middle:.0f} degrees, in three cases out of four less than
-{most:.0f}. Causes that are nearer to each other than that cannot be told apart by their form.
-
-| cause | neighbours of its scan [deg] | full size off linear [deg] |
-|---|---|---|
-{rows}
-"""
-
-
 def report(study: Study, figure: str = "docs/figures/identifiability.png") -> str:
     """The report as Markdown."""
     found = study.found
     base = ", ".join(c.name.rsplit(".", 1)[-1] for c in found.columns if c.kind == "base")
-    parts = [
-        HEAD.format(
-            figure=figure,
-            base=base.replace("youngs_", ""),
-            elements=found.elements,
-            shows=SHOWS,
-            angle=ANGLE,
-            shift=100.0 * SHIFT,
-        )
-    ]
-    for result in study.results:
-        seen = int(result.visible[result.shifts :].sum())
-        total = len(result.names) - result.shifts
-        alone = sum(
-            len(result.equivalence_class(n)) == 1
-            for n, v in zip(result.names, result.visible, strict=True)
-            if v and n not in result.names[: result.shifts]
-        )
-        parts.append(
-            f"## {result.protocol}\n\nOf {total} causes {seen} show, {alone} of them apart from "
-            "all others."
-        )
-        groups = classes(result)
-        if groups:
-            listed = "; ".join("{" + ", ".join(map(short, g)) + "}" for g in groups)
-            parts.append(f"Not told apart: {listed}.")
-        parts.append(_table(result))
-    parts.append(f"![Angles between causes]({figure.removeprefix('docs/')})")
     bent, scanned = _nonlinearity(found), _scan_angles(found)
-    rows = "\n".join(
-        f"| `{name}` | {f'{scanned[name]:.0f}' if name in scanned else ''} "
-        f"| {f'{bent[name]:.0f}' if name in bent else ''} |"
-        for name in found.causes
-        if name in bent or name in scanned
-    )
     own = [v for v in (*scanned.values(), *bent.values()) if v > 1.0]
     middle, most = np.percentile(own, [50.0, 75.0]) if own else (0.0, 0.0)
-    parts.append(WHY.format(angle=ANGLE, rows=rows, middle=middle, most=most))
-    return "\n\n".join(part.strip() for part in parts) + "\n"
+    return render(
+        "identifiability",
+        figure=figure,
+        base=base.replace("youngs_", ""),
+        elements=found.elements,
+        shows=SHOWS,
+        angle=ANGLE,
+        shift=100.0 * SHIFT,
+        protocols=[_protocol(result) for result in study.results],
+        forms=[
+            (f"`{name}`", *(f"{by[name]:.0f}" if name in by else "" for by in (scanned, bent)))
+            for name in found.causes
+            if name in bent or name in scanned
+        ],
+        middle=middle,
+        most=most,
+    )
+
+
+def _protocol(result: Identifiability) -> dict[str, object]:
+    """What the template tells of a protocol."""
+    named = zip(result.names, result.visible, strict=True)
+    visible = [n for n, v in list(named)[result.shifts :] if v]
+    return {
+        "name": result.protocol,
+        "total": len(result.names) - result.shifts,
+        "seen": len(visible),
+        "alone": sum(len(result.equivalence_class(name)) == 1 for name in visible),
+        "groups": "; ".join("{" + ", ".join(map(short, g)) + "}" for g in classes(result)),
+        "rows": _rows(result),
+    }
 
 
 def plot_angles(study: Study, file: Path) -> None:

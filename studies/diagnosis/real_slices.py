@@ -10,6 +10,7 @@ import dataclasses as dc
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from sliceit_drake.diagnosis.one_slice.slice_result import OneSlice
 from sliceit_drake.output_folder import check_folder
 from sliceit_drake.records.validation import load_record
 from sliceit_drake.resources import resource_path
+from studies.pages import publish, render
 
 __all__ = ["SIMULATIONS", "MeasuredSlice", "add_arguments", "draw", "page", "run"]
 
@@ -66,35 +68,6 @@ CLAIMS = (
     ),
 )
 """What a list of causes, made beforehand, says of one push cut at one speed."""
-
-HEAD = """\
-# What the simulation gets wrong
-
-In the paper's cucumber, tomato and potato: one recording each, one speed, a push, the norm of the
-force, read off a figure (calibration/measured/README.md). Written by
-
-    {command}
-
-**What such a recording can carry.** The unit of replication is the slice. There is one of each
-food, so that nothing here says how slices vary, and no cause is named: what is found holds *in this
-slice*, and another may show otherwise. `sliceit diagnose` gives such a record the verdict
-`one_slice`, whatever it shows, and extends no food by it.
-
-**How.** The simulation is fitted to the slice: all parameters that its calibration fitted, and
-height and speed of the knife within the ranges of the calibration. *Left out*: five contiguous
-blocks of depth, each predicted from a fit to the other four; where the knife was stays as fitted.
-*Gain*: twice the log-likelihood that a cause adds by generalised least squares, where all that the
-fit leaves is taken for an autocorrelated process within the slice (restricted maximum likelihood).
-*p*: that of a gain as large, relative to its spread, by any cause of the list where nothing is
-wrong, from {replicates} draws of that process. A cause is **supported in this slice** if p is at
-most {level:g}, and a fit by simulation with it takes {least:.0f} % or more off the error on
-left-out depth, also without the block where it gains most. *Linear* errors come from the
-derivatives at the fit; by these and by p the causes are chosen that are fitted by simulation. No
-interval stands beside the errors: blocks of one slice are no replicates. {elements}
-
-Two simulations: {simulations}. The first was calibrated on these very records; the second shows
-what its layers are worth.
-"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -147,8 +120,7 @@ def run(options: argparse.Namespace) -> int:
         command += f" --refinement {options.refinement:g}"
     if options.foods != list(FOODS):
         command += f" --foods {' '.join(options.foods)}"
-    file.write_text(page(items, REPLICATES, command), encoding="utf-8")
-    print(f"{file} and {options.output}/figures/one_slice_FOOD.png")
+    publish(page(items, REPLICATES, command), file)
     return 0
 
 
@@ -183,78 +155,78 @@ def page(items: Sequence[MeasuredSlice], replicates: int, command: str) -> str:
         replicates: Of the bootstrap.
         command: That wrote it.
     """
-    simulations = " and ".join(f"*{k}* ({v})" for k, v in SIMULATIONS.items())
-    counts = ", ".join(f"{i.food} {i.results['plain'].elements}" for i in items)
-    parts = [
-        HEAD.format(
-            command=command,
-            replicates=replicates,
-            level=LEVEL,
-            least=100 * LEAST_GAIN,
-            elements=f"Tetrahedra: {counts}.",
-            simulations=simulations,
-        ),
-        "## In short",
-        _summary(items),
-        *(_food(item) for item in items),
-        "## Against what was expected",
-        _claims(items),
-        "## What to record next",
-        _next(items),
-    ]
-    return "\n\n".join(part.strip() for part in parts) + "\n"
-
-
-def _summary(items: Sequence[MeasuredSlice]) -> str:
-    lines = [
-        "| food | simulation | RMS of the fit [N] | left out [N] | supported in this slice "
-        "| left out with it [N] |",
-        "|---|---|---|---|---|---|",
-    ]
-    for item in items:
-        for name, result in item.results.items():
-            found = result.supported
-            causes = "; ".join(" or ".join(map(short, g)) for g in result.supported_classes)
-            errors = "; ".join(f"{c.name} {c.confirmed:.2f}" for c in found)
-            lines.append(
-                f"| {item.food} | {name} | {result.error(result.fit.predicted):.2f} "
-                f"| {result.error(result.fit.held_out):.2f} | {causes or 'none'} | {errors} |"
+    return render(
+        "what_the_simulation_gets_wrong",
+        command=command,
+        replicates=replicates,
+        level=LEVEL,
+        least=100 * LEAST_GAIN,
+        tetrahedra=", ".join(f"{i.food} {i.results['plain'].elements}" for i in items),
+        simulations=" and ".join(f"*{k}* ({v})" for k, v in SIMULATIONS.items()),
+        fits=[_fit_row(i.food, *named) for i in items for named in i.results.items()],
+        layers="; ".join(map(_layers, items)),
+        foods=[_food(item) for item in items],
+        names=[item.food for item in items],
+        angle=ANGLE,
+        claims=[
+            [text, *(_cell(item.results["plain"], expected, pairs) for item in items)]
+            for text, expected, pairs in CLAIMS
+        ],
+        slices=LEAST_REPLICATES,
+        experiments={
+            item.food: ", then ".join(
+                f"{EXPERIMENTS[e]} (`{e}`)" for e in item.results["plain"].experiments()[:5]
             )
-    layers = []
-    for item in items:
-        given, plain = (item.results[k] for k in ("calibrated", "plain"))
-        with_them, without = given.error(given.fit.held_out), plain.error(plain.fit.held_out)
-        if abs(without - with_them) > LEAST_GAIN * without:
-            how = "better" if with_them < without else "worse"
-            layers.append(
-                f"the {item.food}'s predict left-out depth {how} ({with_them:.2f} N with them, "
-                f"{without:.2f} N without)"
-            )
-        else:
-            layers.append(
-                f"the {item.food}'s make no difference there ({with_them:.2f} N and"
-                f" {without:.2f} N)"
-            )
-    return "\n".join(lines) + f"\n\nLayers from the calibration: {'; '.join(layers)}."
+            for item in items
+        },
+    )
 
 
-def _food(item: MeasuredSlice) -> str:
-    parts = [f"## {item.food.capitalize()}"]
-    parts.append(f"![{item.food}](figures/one_slice_{item.food}.png)")
-    for name, result in item.results.items():
-        parts.append(f"**{SIMULATIONS[name].capitalize()}**: {result.verdict}. {_worst(result)}")
-        parts.append(_by_depth(result))
-        parts.append(_evidence_table(result))
-        parts.append(_fitted(result))
+def _fit_row(food: str, simulation: str, result: OneSlice) -> tuple[str, ...]:
+    """Errors of a fit, and what was found in it."""
+    causes = "; ".join(" or ".join(map(short, g)) for g in result.supported_classes)
+    errors = "; ".join(f"{c.name} {c.confirmed:.2f}" for c in result.supported)
+    fit, held_out = (result.error(f) for f in (result.fit.predicted, result.fit.held_out))
+    return (food, simulation, f"{fit:.2f}", f"{held_out:.2f}", causes or "none", errors)
+
+
+def _layers(item: MeasuredSlice) -> str:
+    """What the layers of a calibrated food are worth, in a sentence."""
+    given, plain = (item.results[k] for k in ("calibrated", "plain"))
+    with_them, without = given.error(given.fit.held_out), plain.error(plain.fit.held_out)
+    if abs(without - with_them) > LEAST_GAIN * without:
+        how = "better" if with_them < without else "worse"
+        return (
+            f"the {item.food}'s predict left-out depth {how} ({with_them:.2f} N with them, "
+            f"{without:.2f} N without)"
+        )
+    return f"the {item.food}'s make no difference there ({with_them:.2f} N and {without:.2f} N)"
+
+
+def _food(item: MeasuredSlice) -> dict[str, Any]:
+    """What the template tells of a food."""
     plain = item.results["plain"]
     groups = "; ".join("{" + ", ".join(map(short, g)) + "}" for g in plain.classes)
-    lines = [
-        f"Not told apart by such a recording: {groups or 'nothing that shows'}.",
-        f"It cannot show at a plausible size, were all else right: {_list(plain.hidden)}.",
-        f"Not above what this simulation gets wrong anyway: {_list(plain.drowned)}.",
-    ]
-    parts.append("\n".join(f"- {line}" for line in lines))
-    return "\n\n".join(parts)
+    return {
+        "name": item.food,
+        "results": [
+            {
+                "simulation": SIMULATIONS[name],
+                "verdict": result.verdict,
+                "worst": _worst(result),
+                "depths": [
+                    (depth, rows, f"{mean:+.2f}", f"{rms:.2f}", f"{out:.2f}")
+                    for depth, rows, mean, rms, out in result.by_depth()
+                ],
+                "evidence": _evidence_rows(result),
+                "fitted": _fitted(result),
+            }
+            for name, result in item.results.items()
+        ],
+        "groups": groups or "nothing that shows",
+        "hidden": _list(plain.hidden),
+        "drowned": _list(plain.drowned),
+    }
 
 
 def _list(names: Sequence[str]) -> str:
@@ -280,14 +252,6 @@ def _worst(result: OneSlice) -> str:
             " its own, and p is not to be trusted here."
         )
     return text
-
-
-def _by_depth(result: OneSlice) -> str:
-    lines = ["| depth | rows | mean left [N] | RMS left [N] | RMS left out [N] |"]
-    lines.append("|---|---|---|---|---|")
-    for name, rows, mean, rms, out in result.by_depth():
-        lines.append(f"| {name} | {rows} | {mean:+.2f} | {rms:.2f} | {out:.2f} |")
-    return "\n".join(lines)
 
 
 def _fitted(result: OneSlice) -> str:
@@ -316,32 +280,6 @@ def _fitted(result: OneSlice) -> str:
     return text + (f". With a cause: {'; '.join(shown)}." if shown else ".")
 
 
-def _claims(items: Sequence[MeasuredSlice]) -> str:
-    lines = [
-        "A list of causes, made before anything was computed, says of one push cut at one speed",
-        "what can be told apart. Here two are one class where the angle between their projected",
-        f"sensitivities is below {ANGLE:g} degrees; a cause that does not show at its plausible",
-        "size is part of what takes it up. Simulation: plain; noise as in docs/identifiability.md.",
-        "",
-        "| expected | " + " | ".join(i.food for i in items) + " |",
-        "|---|" + "---|" * len(items),
-    ]
-    for text, expected, pairs in CLAIMS:
-        cells = [_cell(item.results["plain"], expected, pairs) for item in items]
-        lines.append(f"| {text} | " + " | ".join(cells) + " |")
-    lines += ["", WHY_OTHER]
-    return "\n".join(lines)
-
-
-WHY_OTHER = """\
-Where it says no: the list speaks of the form of a residual in any simulation. These angles come
-from one simulation, after base parameters, height and speed were refitted, and trust that the
-section is round and that the pressure on the flank is that of the finite elements. What the fits
-above leave shows that the simulation is not right to that level. So where the two differ, the list
-is the safer reading, and more slices decide. What does not show is taken up by the refit entirely:
-that is the extreme of not being told apart."""
-
-
 def _cell(result: OneSlice, expected: str, pairs: Sequence[tuple[str, str]]) -> str:
     """Whether it is as expected, with the angle of each pair."""
     angles, names = result.angles, result.angles.names
@@ -361,45 +299,19 @@ def _cell(result: OneSlice, expected: str, pairs: Sequence[tuple[str, str]]) -> 
     return f"{'yes' if all(verdicts) else 'no'}: {'; '.join(dict.fromkeys(out))}"
 
 
-def _next(items: Sequence[MeasuredSlice]) -> str:
-    lines = [
-        f"At least {LEAST_REPLICATES} slices of each condition, in random order: without them no"
-        " difference can be told from a slice. Then what reveals the causes that these recordings"
-        " cannot show or part, those first that serve most of them:",
-        "",
-    ]
-    for item in items:
-        plain = item.results["plain"]
-        names = ", then ".join(f"{EXPERIMENTS[e]} (`{e}`)" for e in plain.experiments()[:5])
-        lines.append(f"- {item.food}: {names}.")
-    lines += [
-        "",
-        "All channels of the wrench, the commanded and the measured height, half a second of air"
-        " before contact, and the size of the section at the cut belong to it. With two records or"
-        " more `sliceit diagnose --next-experiment FILE` writes the motion.",
-    ]
-    return "\n".join(lines)
-
-
-def _evidence_table(result: OneSlice, most: int = 8) -> str:
-    """Evidence of the causes that come nearest, in Markdown."""
-    lines = [
-        "| cause | gain | p | left out, linear [N] | by simulation [N] | blocks better "
-        "| ratio without its best block |",
-        "|---|---|---|---|---|---|---|",
-    ]
+def _evidence_rows(result: OneSlice, most: int = 8) -> list[tuple[str, ...]]:
+    """Evidence of the causes that come nearest."""
     before = result.error(result.fit.held_out)
     blocks = len(np.unique(result.block))
-    lines.append(f"| none | | | {result.evidence.held_out:.2f} | {before:.2f} | | |")
-    shown = [c for k, c in enumerate(result.evidence.causes) if k < most or c.confirmed is not None]
+    rows = [("none", "", "", f"{result.evidence.held_out:.2f}", f"{before:.2f}", "", "")]
     names = {c.name for c in result.supported}
-    for c in shown:
-        own = "" if c.confirmed is None else f"{c.confirmed:.2f}"
-        better = "" if c.confirmed is None else f"{c.blocks_better} of {blocks}"
-        ratio = "" if c.confirmed is None else f"{c.without_best:.2f}"
+    for k, c in enumerate(result.evidence.causes):
+        if k >= most and c.confirmed is None:
+            continue
+        confirmed = ("", "", "")
+        if c.confirmed is not None:
+            better = f"{c.blocks_better} of {blocks}"
+            confirmed = (f"{c.confirmed:.2f}", better, f"{c.without_best:.2f}")
         name = f"**`{c.name}`**" if c.name in names else f"`{c.name}`"
-        lines.append(
-            f"| {name} | {c.gain:.1f} | {c.p_value:.3f} | {c.held_out:.2f} | {own} | {better} "
-            f"| {ratio} |"
-        )
-    return "\n".join(lines)
+        rows.append((name, f"{c.gain:.1f}", f"{c.p_value:.3f}", f"{c.held_out:.2f}", *confirmed))
+    return rows

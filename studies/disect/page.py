@@ -22,84 +22,12 @@ from studies.disect import case as disect
 from studies.disect.case import Case, CaseResult
 from studies.disect.settings import SETTINGS
 from studies.disect.study import STEPS, Curve, DisectStudy, MeasuredCurves, disect_study
+from studies.pages import publish, render
 from studies.physics.measured_curves import load_measured_foods
 
 __all__ = ["add_arguments", "disect_page", "field_unit", "plot_disect", "run"]
 
 FOODS = "calibration/verification_foods.yaml"
-
-HEAD = """\
-# Side by side with DiSECt
-
-The cutting simulator that SliceIt! uses (Heiden et al., RSS 2021; Autonomous Robots 2023), on its
-reference case and on the paper's measured cuts. Written by
-
-    {command}
-
-Numbers of DiSECt are from [calibration/disect](../calibration/disect/README.md) and
-[calibration/measured](../calibration/measured/README.md), with their sources; all others are
-computed by that command, in {minutes:.1f} minutes on a machine that had other work beside.
-
-Two measures: the **sum of norms** adds up the lengths of all contact forces at one instant, and is
-what DiSECt records as the knife's force. The **resultant** is what a sensor feels: the flanks' two
-pressures cancel in it but for the wedge. Here both come from one run (`simulate_slice` with
-`contact_sum`, `CuttingSolver.contact_forces`).
-
-![Both measures in the reference case and in the measured cuts](figures/disect.png)
-
-## The reference case
-
-A block of 54 x 36 x 30 mm, cells of 6 mm, cut through at 50 mm/s. *Opening law alone*
-(`calibration/disect/opening_alone.yaml`) has DiSECt's parameters and an edge that cuts nothing;
-*full model* (`calibration/disect/full_model.yaml`) is the same block with the cucumber of
-`scenarios/cucumber.yaml`.
-
-{case_table}
-
-DiSECt's peak is at the end. Its mean and work were not noted.
-
-### Does the opening law alone do what DiSECt does?
-
-Two numbers are fitted to the nominal run. Its contact stiffness was not noted: {contact:.0f} N/m a
-spring gives its last sum of norms ({given:.0f} is set). Its softness was not noted either: a spring
-breaks {delay:.0f} ms after the knife touches it, and how that goes with step, speed and stiffness
-follows from its law (`break_opening`). All else in the table is predicted. To compare like with
-like, both copies of a cut element have all of its volume here, as there.
-
-{runs_table}
-
-So DiSECt's forces follow from its parameters and laws as they are understood here, to {worst:.0f} %
-at worst. What is left of the bonds at the end agrees less well; ours soften bilinearly. The nominal
-springs hold {strength:.1f} kPa and take {toughness:.2f} J/m2; [calibration.md](calibration.md)
-searches 30 kPa to 3 MPa and 50 to 1500 J/m2. That is why the force hardly changes with their
-stiffness, and rests on the contact's.
-
-## The measured cuts
-
-20 mm/s through cucumber, potato and tomato. DiSECt's curves are its authors' calibrated ones, so
-sums of norms. Ours are the foods of [verification.md](verification.md) (five numbers fitted to
-the measured curve, in sample). *Opening law alone*: the same shapes with DiSECt's moduli and
-friction and the reference's springs; one contact stiffness is fitted to *DiSECt's* curve, and
-with it the time of first contact.
-
-{measured_table}
-
-{measured_text}
-
-## Differences
-
-Effects are those on the sum of norms of the opening law alone at the end of the reference case,
-{last:.1f} N, where nothing else is said.
-
-{difference_table}
-
-## Everything that DiSECt sets, and where it is set here
-
-Fields are those of `calibration/disect/*.yaml`; `food` is that of scenarios as well. `point_scales`
-are those of a `CuttingModel`. Functions are in `studies/disect/case.py`.
-
-{settings_table}
-"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -118,10 +46,8 @@ def run(options: argparse.Namespace) -> int:
     minutes = max(1.0, (time.monotonic() - begin) / 60.0)
     figure = options.output / "figures" / "disect.png"
     plot_disect(study, figure)
-    file = options.output / "disect.md"
     page = disect_page(study, "python -m studies disect --output docs", minutes)
-    file.write_text(page, encoding="utf-8")
-    print(f"{file} and {figure}")
+    publish(page, options.output / "disect.md")
     return 0
 
 
@@ -136,38 +62,32 @@ def disect_page(study: DisectStudy, command: str, minutes: float) -> str:
     toughness, strength = study.laws[0]
     nominal = study.reference.runs[0]
     assert nominal.break_delay is not None
-    return HEAD.format(
+    return render(
+        "disect",
         command=command,
         minutes=minutes,
-        case_table=_case_table(study),
+        case=_case_rows(study),
         contact=study.contact_stiffness,
         given=study.reference.springs.contact_stiffness,
         delay=1e3 * nominal.break_delay,
-        runs_table=_runs_table(study),
+        runs=_run_rows(study),
         strength=strength / 1e3,
         worst=_worst(study),
         toughness=toughness,
-        measured_table=_measured_table(study.measured),
-        measured_text=_measured_text(study.measured),
+        measured=_measured_rows(study.measured),
+        sums=_peaks(study.measured, "full model", "sum of norms", 0),
+        left=_peaks(study.measured, "opening law alone", "resultant", 2),
         last=study.opening.norms[-1],
-        difference_table=_table(
-            ("difference", "DiSECt", "here", "reason", "effect"),
-            [dc.astuple(d) for d in study.differences],
-        ),
-        settings_table=_settings_table(),
+        differences=[dc.astuple(d) for d in study.differences],
+        settings=[(name, value, _with_units(here)) for name, value, here in SETTINGS],
     )
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(str(cell) for cell in row) + " |" for row in lines)
 
 
 def _number(value: float | None, digits: int = 1) -> str:
     return "not noted" if value is None else f"{value:.{digits}f}"
 
 
-def _case_table(study: DisectStudy) -> str:
+def _case_rows(study: DisectStudy) -> list[Sequence[object]]:
     nominal = study.reference.runs[0]
     rows: list[Sequence[object]] = [
         (
@@ -206,16 +126,7 @@ def _case_table(study: DisectStudy) -> str:
                     _number(result.work(values), 3),
                 )
             )
-    head = (
-        "simulator",
-        "measure",
-        "peak [N]",
-        "half way [N]",
-        "end [N]",
-        "mean in the food [N]",
-        "work [J]",
-    )
-    return _table(head, rows)
+    return rows
 
 
 def _mean(result: CaseResult, values: np.ndarray) -> float:
@@ -223,7 +134,7 @@ def _mean(result: CaseResult, values: np.ndarray) -> float:
     return float(values[inside].mean())
 
 
-def _runs_table(study: DisectStudy) -> str:
+def _run_rows(study: DisectStudy) -> list[tuple[str, ...]]:
     count = study.reference.springs.count
     stiffness = study.reference.springs.stiffness
     rows = []
@@ -241,16 +152,7 @@ def _runs_table(study: DisectStudy) -> str:
                 "" if run.break_delay is None else _pair(1e3 * run.break_delay, 1e3 * delay, 0),
             )
         )
-    head = (
-        "run (DiSECt / here)",
-        "sum of norms, peak [N]",
-        "half way [N]",
-        "vertical, peak [N]",
-        "broken at the end",
-        "mean stiffness left",
-        "contact to break [ms]",
-    )
-    return _table(head, rows)
+    return rows
 
 
 def _worst(study: DisectStudy) -> float:
@@ -273,7 +175,7 @@ def _rms(curve: Curve, other: np.ndarray) -> str:
     return "-" if rms == 0.0 else f"{rms:.2f}"
 
 
-def _measured_table(measured: Sequence[MeasuredCurves]) -> str:
+def _measured_rows(measured: Sequence[MeasuredCurves]) -> list[tuple[str, ...]]:
     rows = []
     for item in measured:
         theirs = item.profile.references["DiSECt"]
@@ -291,48 +193,18 @@ def _measured_table(measured: Sequence[MeasuredCurves]) -> str:
                     _rms(curve, theirs),
                 )
             )
-    head = (
-        "food",
-        "curve",
-        "measure",
-        "peak [N]",
-        "mean [N]",
-        "work [J]",
-        "RMS to measured [N]",
-        "RMS to DiSECt's [N]",
-    )
-    return _table(head, rows)
+    return rows
 
 
-def _measured_text(measured: Sequence[MeasuredCurves]) -> str:
-    def peak(item: MeasuredCurves, name: str, measure: str) -> float:
-        curve = next(c for c in item.curves if (c.name, c.measure) == (name, measure))
-        return float(curve.force.max())
-
-    sums = ", ".join(
-        f"{item.food} {peak(item, 'full model', 'sum of norms'):.0f} N" for item in measured
+def _peaks(measured: Sequence[MeasuredCurves], name: str, measure: str, digits: int) -> str:
+    """Greatest force of a curve, food by food."""
+    peaks = (
+        (item.food, float(curve.force.max()))
+        for item in measured
+        for curve in item.curves
+        if (curve.name, curve.measure) == (name, measure)
     )
-    left = ", ".join(
-        f"{item.food} {peak(item, 'opening law alone', 'resultant'):.2f} N" for item in measured
-    )
-    return (
-        "A model that meets the measured resultant has quite another sum of norms (peaks: "
-        f"{sums}), because the flanks press on it from both sides.\n\n"
-        "The other way round, the opening law with one contact stiffness grows with the square of "
-        "the depth and does not follow DiSECt's curves, the soft tomato's least. Where it is as "
-        f"near as it comes, the knife feels a peak of {left}. DiSECt's own calibration has contact "
-        "parameters for each spring, and frees friction; what it found is not published. With a "
-        "friction between 0 and 1 its resultant may be anything from a thirtieth of the sum of "
-        "norms to most of it, so its curves say little about the force on a sensor, and its "
-        "parameters do not carry over."
-    )
-
-
-def _settings_table() -> str:
-    return _table(
-        ("DiSECt", "reference case", "here"),
-        [(name, value, _with_units(here)) for name, value, here in SETTINGS],
-    )
+    return ", ".join(f"{food} {peak:.{digits}f} N" for food, peak in peaks)
 
 
 def _with_units(text: str) -> str:

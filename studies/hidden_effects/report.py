@@ -26,46 +26,9 @@ from studies.hidden_effects.cases import KINDS
 from studies.hidden_effects.score import NAMING, Judgement, Rate, judge_study, rate
 from studies.hidden_effects.study import read_facts
 from studies.hidden_effects.truth import BASE_OF
-from studies.pages import publish
+from studies.pages import publish, render
 
 __all__ = ["add_arguments", "numbers", "plot_curves", "report", "run"]
-
-HEAD = """\
-# Hidden effects: how often the diagnosis is right
-
-Does the diagnosis name the right cause, and does it keep silent where there is none? Effects are
-hidden in records of the stand-in ([stand_in.md](stand_in.md)), which cuts on another mesh and with
-another step than the diagnosis, by laws that are written otherwise. `sliceit diagnose` runs as a
-process of its own and is given the folder of records and the food without any effect, nothing else.
-Then its diagnosis.json is compared with what was hidden. Everything here is simulated.
-
-    {command}
-    python -m studies score output/hidden --output docs
-
-Many runs take hours; the study can be stopped, and goes on. `hidden_effects.jsonl` beside this page
-has what was said in each run: `python -m studies score docs/hidden_effects.jsonl --output docs` judges it
-again and writes this page, the first command with `--runs-from docs/hidden_effects.jsonl` goes on
-from there.
-
-An effect has the size at which its strength delta is a number drawn from 2 to 3: the root mean
-square, over samples in contact, of what is left of its noise-free change of the forces once the
-base parameters and what is each slice's own are refitted, over the noise in contact
-(`python -m studies sizes`).
-
-What counts as right:
-
-- **one cause**: the verdict is one cause; its class holds the one that was hidden, and nothing that
-  these slices could tell from it: all others must mimic what was hidden to within 20 degrees, or
-  to within 3 degrees of what the cause itself can do as it is modelled here, computed from the
-  effect's noise-free change of the forces. A second finding is a miss, and so is a class
-  that is too large.
-- **nothing hidden**: any other verdict than "nothing" is an alarm.
-- **unknown**: the effect stands in no list of causes; "unknown" is right, a name is wrong.
-- **two causes**: two findings, one of each.
-- **poor**: as one cause, for effects that the poor protocol cannot tell from others; then the
-  proposed experiment is cut on the same bench, and all records together must name the one cause.
-- A run that breaks down is a miss.
-"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -254,97 +217,68 @@ def report(
         figure: Of the detection curves, relative to the report; None for none.
         options: Seed and replicates of the study, as its study.json has them.
     """
-    head = HEAD.format(command=_command(judgements, options or {}))
-    lines = [head, f"{len(judgements)} runs.", ""]
-    lines += [
-        "| what | asked for | reached | share | one-sided bound, 95 % | met |",
-        "|---|---|---|---|---|---|",
-    ]
-    for row in _requirements(judgements):
-        shown = f"{row['hits']} of {row['runs']}" + (f" ({row['shown']})" if row["shown"] else "")
-        met = ("yes" if row["met"] else "no") if row["runs"] else "not run"
-        sign, side = ("<=", "upper_bound") if row["few"] else (">=", "lower_bound")
-        bound = f"{sign} {_percent(row[side])}"
-        lines.append(
-            f"| {row['what']} | {row['asked']} | {shown} | {_percent(row['share'])} "
-            f"| {bound if row['runs'] else _percent(None)} | {met} |"
-        )
-    lines.append("")
     sizes = [len(c) for j in _of(judgements, "single") for c in j.classes]
     seconds = [j.seconds for j in judgements if not math.isnan(j.seconds)]
-    if sizes:
-        lines += [
-            f"Causes in a class that was named for one cause: {np.mean(sizes):.2f} in the mean."
-        ]
-    if seconds:
-        lines += [f"A diagnosis took {np.median(seconds):.0f} s in the middle."]
-    versions = len({j.code for j in judgements})
-    if versions > 1:
-        lines += [f"The runs are of {versions} versions of the package."]
-    lines += ["", *_effect_table(judgements), *_base_table(judgements), *_curve_table(judgements)]
-    if figure is not None and _of(judgements, "curve"):
-        lines += [f"![Detection curves]({figure})", ""]
-    confusion = _confusion(judgements)
-    if confusion:
-        lines += [
-            "## What was said where it was not right",
-            "",
-            "| run | said | times |",
-            "|---|---|---|",
-        ]
-        for name, counts in confusion.items():
-            lines += [f"| {name} | {said} | {n} |" for said, n in counts.most_common()]
-        lines.append("")
-    return "\n".join(lines)
+    curves = _curves(judgements, lambda j: j.right)
+    return render(
+        "hidden_effects",
+        command=_command(judgements, options or {}),
+        runs=len(judgements),
+        requirements=[_requirement_row(row) for row in _requirements(judgements)],
+        class_size=np.mean(sizes) if sizes else None,
+        seconds=np.median(seconds) if seconds else None,
+        versions=len({j.code for j in judgements}),
+        kinds={
+            title: rows
+            for kind, title in TITLES.items()
+            if (rows := _effect_rows(judgements, kind))
+        },
+        shifts=_base_rows(judgements),
+        deltas=[f"delta {delta:g}" for delta in _deltas(curves)],
+        curves=_curve_rows(judgements, curves),
+        figure=figure,
+        confusion=[
+            (name, said, n)
+            for name, counts in _confusion(judgements).items()
+            for said, n in counts.most_common()
+        ],
+    )
 
 
-def _effect_table(judgements: Sequence[Judgement]) -> list[str]:
-    lines = []
-    titles = {
-        "single": "One cause",
-        "nothing": "Nothing hidden",
-        "unknown": "Unknown effects",
-        "pairs": "Two causes",
-        "poor": "The poor protocol",
-    }
-    for kind, title in titles.items():
-        of_kind = _of(judgements, kind)
-        if not of_kind:
-            continue
-        lines += [
-            f"## {title}",
-            "",
-            "| hidden | protocol | right | verdicts |",
-            "|---|---|---|---|",
-        ]
-        groups: dict[tuple[str, str], list[Judgement]] = {}
-        for j in of_kind:
-            groups.setdefault((j.effects, j.case.protocol), []).append(j)
-        for (effects, protocol), js in sorted(groups.items()):
-            verdicts = Counter(j.verdict for j in js).most_common()
-            said = ", ".join(f"{v.replace('_', ' ')} {n}" for v, n in verdicts)
-            lines.append(f"| {effects} | {protocol} | {_shown(rate(js))} | {said} |")
-        lines.append("")
-    return lines
+TITLES = {
+    "single": "One cause",
+    "nothing": "Nothing hidden",
+    "unknown": "Unknown effects",
+    "pairs": "Two causes",
+    "poor": "The poor protocol",
+}
 
 
-def _base_table(judgements: Sequence[Judgement]) -> list[str]:
+def _requirement_row(row: Mapping[str, Any]) -> tuple[str, ...]:
+    shown = f"{row['hits']} of {row['runs']}" + (f" ({row['shown']})" if row["shown"] else "")
+    met = ("yes" if row["met"] else "no") if row["runs"] else "not run"
+    sign, side = ("<=", "upper_bound") if row["few"] else (">=", "lower_bound")
+    bound = f"{sign} {_percent(row[side])}" if row["runs"] else ""
+    return (row["what"], row["asked"], shown, _percent(row["share"]), bound, met)
+
+
+def _effect_rows(judgements: Sequence[Judgement], kind: str) -> list[tuple[str, ...]]:
+    groups: dict[tuple[str, str], list[Judgement]] = {}
+    for j in _of(judgements, kind):
+        groups.setdefault((j.effects, j.case.protocol), []).append(j)
+    rows = []
+    for (effects, protocol), js in sorted(groups.items()):
+        verdicts = Counter(j.verdict for j in js).most_common()
+        said = ", ".join(f"{v.replace('_', ' ')} {n}" for v, n in verdicts)
+        rows.append((effects, protocol, _shown(rate(js)), said))
+    return rows
+
+
+def _base_rows(judgements: Sequence[Judgement]) -> list[tuple[str, ...]]:
     """Shifts of base parameters against those of runs with nothing hidden: what the mesh shifts is
     in both."""
-    groups = _by_effect(judgements, "base")
-    if not groups:
-        return []
-    lines = [
-        "## Shifts of base parameters",
-        "",
-        "These are no causes: nothing else may be named, and the shift is reported. A coarse mesh",
-        "shifts the parameters as well, so the shift is compared with that of runs with nothing",
-        "hidden.",
-        "",
-        "| hidden | nothing else named | hidden shift | found, less that without | +- |",
-        "|---|---|---|---|---|",
-    ]
-    for name, js in groups.items():
+    rows = []
+    for name, js in _by_effect(judgements, "base").items():
         parameter = BASE_OF[name]
         null = [
             math.log(j.shifts[parameter][0])
@@ -356,38 +290,33 @@ def _base_table(judgements: Sequence[Judgement]) -> list[str]:
         sign = -1.0 if name == "stiffness" else 1.0
         true = [math.log1p(sign * j.case.hidden[0].size) for j in js]
         if found:
-            lines.append(
-                f"| {name} | {_shown(rate(js))} | {_change(float(np.mean(true)))} "
-                f"| {_change(float(np.mean(found)))} | {100 * np.std(found):.0f} % |"
+            rows.append(
+                (name, _shown(rate(js)), _change(float(np.mean(true))))
+                + (_change(float(np.mean(found))), f"{100 * np.std(found):.0f} %")
             )
-    return [*lines, ""]
+    return rows
 
 
 def _change(log_factor: float) -> str:
     return f"{100 * math.expm1(log_factor):+.0f} %"
 
 
-def _curve_table(judgements: Sequence[Judgement]) -> list[str]:
-    named = _curves(judgements, lambda j: j.right)
+def _deltas(curves: Mapping[str, Mapping[float, Rate]]) -> list[float]:
+    return sorted({delta for points in curves.values() for delta in points})
+
+
+def _curve_rows(
+    judgements: Sequence[Judgement], named: Mapping[str, Mapping[float, Rate]]
+) -> list[list[str]]:
     alarms = _curves(judgements, lambda j: j.verdict != "nothing")
-    if not named:
-        return []
-    deltas = sorted({delta for points in named.values() for delta in points})
-    head = " | ".join(f"delta {delta:g}" for delta in deltas)
-    lines = [
-        "## Detection curves",
-        "",
-        'Rich protocol: named rightly (in brackets: anything but "nothing" said).',
-        "",
-        f"| hidden | {head} |",
-        "|---" * (1 + len(deltas)) + "|",
-    ]
-    for effect, points in named.items():
-        cells = [
-            f"{_shown(points[d])} ({alarms[effect][d].hits})" if d in points else "" for d in deltas
+    return [
+        [effect]
+        + [
+            f"{_shown(points[d])} ({alarms[effect][d].hits})" if d in points else ""
+            for d in _deltas(named)
         ]
-        lines.append(f"| {effect} | {' | '.join(cells)} |")
-    return [*lines, ""]
+        for effect, points in named.items()
+    ]
 
 
 def plot_curves(judgements: Sequence[Judgement], file: Path) -> None:

@@ -45,7 +45,7 @@ from studies.hidden_effects.bench import (
     model_food,
     protocol_named,
 )
-from studies.pages import publish
+from studies.pages import publish, table
 
 __all__ = [
     "ProtocolSizes",
@@ -390,18 +390,20 @@ def sizes_as_markdown(
     progress: Callable[[], object] | None = None,
 ) -> str:
     """A table of the sizes of effects for `DELTAS`, protocol by protocol."""
-    head = " | ".join(f"delta {delta:g}" for delta in DELTAS)
-    lines = []
+    deltas = (f"delta {delta:g}" for delta in DELTAS)
+    head = " | ".join(["effect", "unit", "typical", "at typical", *deltas])
+    parts = []
     for sizes in protocols:
-        lines += [f"### {sizes.name}", "", f"| effect | unit | typical | at typical | {head} |"]
-        lines.append("|---" * (4 + len(DELTAS)) + "|")
+        rows = []
         for effect in effects:
             curve, kind = sizes.curve(effect), EFFECTS[effect]
-            cells = [curve.size(delta) for delta in DELTAS]
-            shown = " | ".join("not visible" if c is None else f"{c:.3g}" for c in cells)
+            found = (curve.size(delta) for delta in DELTAS)
             at = np.interp(kind.typical, curve.sizes, curve.deltas) if curve.sizes else np.nan
-            lines.append(f"| `{effect}` | {kind.unit} | {kind.typical:g} | {at:.2f} | {shown} |")
+            rows.append(
+                (f"`{effect}`", kind.unit, f"{kind.typical:g}", f"{at:.2f}")
+                + tuple("not visible" if size is None else f"{size:.3g}" for size in found)
+            )
             if progress is not None:
                 progress()
-        lines.append("")
-    return "\n".join(lines)
+        parts.append(f"### {sizes.name}\n\n{table(head, rows)}\n")
+    return "\n".join(parts)

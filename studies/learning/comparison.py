@@ -21,7 +21,7 @@ from sliceit_drake.cli.evaluate import Case, trace
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.learning.evaluation import SliceTrace
 from sliceit_drake.learning.metrics import Ratio, bootstrap_ratio
-from studies.pages import publish
+from studies.pages import publish, render
 
 __all__ = [
     "PAPER",
@@ -80,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
         )
     figures = options.output / "figures"
     figures.mkdir(parents=True, exist_ok=True)
-    publish(_page(found), options.output / "slicing_results.md")
+    publish(comparison_page(found), options.output / "slicing_results.md")
     facts = json.dumps([_facts(each) for each in found], indent=1) + "\n"
     (options.output / "slicing_results.json").write_text(facts, encoding="utf-8")
     boards = sorted({each.board_stiffness for each in found})
@@ -222,37 +222,9 @@ def _two_slices(policies: Sequence[str]) -> dict[str, list[SliceTrace]]:
     }
 
 
-def _page(found: Sequence[Comparison]) -> str:
-    return "\n".join(
-        [
-            "# Slicing with policies of both simulators",
-            "",
-            "Everything here is simulated, in worlds that no training has seen"
-            " ([learning.md](learning.md) says what they are). Written by `python -m studies slicing`.",
-            "",
-            *claim(found),
-            "",
-            comparison_page(found),
-            "",
-            "Means over policies and slices; in brackets the 95 % interval of the ratio, cutting"
-            " simulator over spring. The strict ratio counts each slice that a policy of ours left"
-            " unfinished as if it had met as much as the worst of the baseline's. The paper's ratio"
-            " is that of its box plot, on a robot.",
-            "",
-            "![Median contact force of slices by food and world](figures/slicing_forces.png)",
-            "",
-        ]
-    )
-
-
 def comparison_page(found: Sequence[Comparison]) -> str:
-    """A table of all comparisons; the paper's ratio stands beside the foods that it cut."""
-    lines = [
-        "| world | board [N/m] | food | policies, slices | completed: ours, baseline | "
-        + " | ".join(f"{title}: ours, baseline | ratio" for title in TITLES)
-        + " | strict ratio of the median force | paper's ratio |",
-        "|" + "---|" * (7 + 2 * len(TITLES)),
-    ]
+    """The page; the paper's ratio stands beside the foods that it cut."""
+    rows = []
     for each in found:
         ours, baseline = each.values[OURS], each.values[BASELINE]
         shape = ours[METRICS[0]].shape
@@ -267,10 +239,9 @@ def comparison_page(found: Sequence[Comparison]) -> str:
             unit = "s" if metric == "duration" else "N"
             means = f"{ours[metric].mean():.1f} {unit}, {baseline[metric].mean():.1f} {unit}"
             cells += [means, interval(each.ratios[metric])]
-        cells.append(interval(each.strict))
         paper = f"{PAPER[each.food]:.2f}" if each.food in PAPER else ""
-        lines.append("| " + " | ".join([*cells, paper]) + " |")
-    return "\n".join(lines)
+        rows.append([*cells, interval(each.strict), paper])
+    return render("slicing_results", claim=claim(found), titles=TITLES, rows=rows)
 
 
 def interval(ratio: Ratio) -> str:

@@ -27,6 +27,7 @@ from sliceit_drake.cutting.motion import Hold, Motion, MotionPlan, PressAndDraw,
 from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
 from sliceit_drake.cutting.workers import worker_processes
+from studies.pages import publish, render
 
 __all__ = [
     "Outcome",
@@ -43,6 +44,7 @@ EXCHANGE_PERIOD = 2e-3
 CLEARANCE = 2e-3
 OVERTRAVEL = 5e-4
 """Of the edge into the board, metres: under the blade a soft food sinks into it."""
+KINDS = ("cut", "refused", "stopped", "unexplained")
 IMBALANCE = 0.02
 """Greatest work that the books may lack, over the work of the knife."""
 LEFT = 0.01
@@ -78,10 +80,8 @@ def run(options: argparse.Namespace) -> int:
             raise
         interrupted = True  # What was asked for has no page then.
     page = random_slices_page(outcomes, options.seed, options.command)
-    print(page)
-    if options.output is not None and not interrupted:
-        options.output.mkdir(parents=True, exist_ok=True)
-        (options.output / "random_slices.md").write_text(page, encoding="utf-8")
+    folder = None if interrupted else options.output
+    publish(page, folder and folder / "random_slices.md")
     if interrupted:
         print(f"Interrupted: this is of the first {len(outcomes)} of {options.count} slices.")
         return 130
@@ -242,50 +242,28 @@ def _wrong(result: SliceResult, model: CuttingModel) -> str:
 def random_slices_page(outcomes: list[Outcome], seed: int, command: str) -> str:
     """The page of a study."""
     shapes = sorted({outcome.shape for outcome in outcomes})
-    kinds = ("cut", "refused", "stopped", "unexplained")
     counts = collections.Counter((o.shape, o.kind) for o in outcomes)
-    lines = [
-        "# Random slices",
-        "",
-        f"    {command}",
-        "",
-        f"{len(outcomes)} slices from seed {seed}: modulus 50 kPa to 10 MPa, toughness 20 to 800 "
-        "J/m2, friction 0 to 0.6, speed 5 to 100 mm/s, draw up to twice the press, half of the "
-        "planes oblique, knives 0.8 to 4 mm thick; many of these pairs no food has. A slice is "
-        "cut, is refused or stopped with a reason, or is unexplained: an error that nobody "
-        "foresaw, a force that is not finite, a cut that closes, or of which more is left at the "
-        "board than 1 % or twice toughness over modulus, the way that a food gives before it "
-        f"parts, or books of energy that lack more than {100 * IMBALANCE:g} % of the knife's work.",
-        "",
-        "| food | " + " | ".join(kinds) + " |",
-        "|---|" + "---:|" * len(kinds),
-        *(
-            f"| {shape} | " + " | ".join(str(counts[shape, kind]) for kind in kinds) + " |"
-            for shape in shapes
-        ),
-        "| all | " + " | ".join(str(sum(counts[s, kind] for s in shapes)) for kind in kinds) + " |",
-        "",
-    ]
     peaks = [o.peak for o in outcomes if o.kind == "cut"]
-    if peaks:
-        low, middle, high = np.quantile(peaks, [0.05, 0.5, 0.95])
-        lines += [
-            f"Peak force of the food in those cut: median {middle:.1f} N, 5 to 95 % {low:.2g} to "
-            f"{high:.0f} N.",
-            "",
-        ]
-    for kind in kinds[1:]:
-        found = [o for o in outcomes if o.kind == kind]
-        if found:
-            lines += [f"## {kind.capitalize()}", "", "| slices | the first of them says |"]
-            lines += ["|---:|---|"]
-            groups: dict[str, list[Outcome]] = {}
-            for outcome in found:
-                groups.setdefault(_gist(outcome.reason), []).append(outcome)
-            for group in sorted(groups.values(), key=len, reverse=True):
-                lines.append(f"| {len(group)} | {group[0].reason.replace('|', '/')} |")
-            lines.append("")
-    return "\n".join(lines).rstrip() + "\n"
+    reasons = {}
+    for kind in KINDS[1:]:
+        groups: dict[str, list[str]] = {}
+        for outcome in outcomes:
+            if outcome.kind == kind:
+                groups.setdefault(_gist(outcome.reason), []).append(outcome.reason)
+        most = sorted(groups.values(), key=len, reverse=True)
+        reasons[kind] = [(len(group), group[0].replace("|", "/")) for group in most]
+    return render(
+        "random_slices",
+        command=command,
+        slices=len(outcomes),
+        seed=seed,
+        imbalance=100 * IMBALANCE,
+        kinds=KINDS,
+        rows=[(shape, *(counts[shape, kind] for kind in KINDS)) for shape in shapes]
+        + [("all", *(sum(counts[shape, kind] for shape in shapes) for kind in KINDS))],
+        peaks=np.quantile(peaks, [0.05, 0.5, 0.95]) if peaks else None,
+        reasons={kind: found for kind, found in reasons.items() if found},
+    )
 
 
 def _gist(reason: str) -> str:

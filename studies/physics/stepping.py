@@ -15,6 +15,7 @@ from sliceit_drake.cutting.model import CuttingModel, Numerics, TimeStepError
 from sliceit_drake.cutting.motion import Hold, Motion, MotionPlan, PressAndDraw, Retract, Segment
 from sliceit_drake.cutting.simulate import ENERGY_RATIO_LIMIT, energy_ratio
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
+from studies.pages import table
 
 __all__ = [
     "STEPS",
@@ -350,9 +351,7 @@ def step_costs(
 
 
 def _table(first: str, steps: Sequence[float], rows: Sequence[Sequence[str]]) -> str:
-    names = " | ".join(f"{step:g} s" for step in steps)
-    lines = [f"| {first} | {names} |", "|---|" + "---|" * len(steps)]
-    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+    return table(" | ".join([first, *(f"{step:g} s" for step in steps)]), rows)
 
 
 def _by_case(

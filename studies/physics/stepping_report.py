@@ -24,6 +24,7 @@ from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.resources import resource_path
+from studies.pages import publish, table
 from studies.physics import stepping as study
 from studies.physics.stepping import StepCost, StepResult
 
@@ -97,13 +98,11 @@ def run(options: argparse.Namespace) -> int:
             with _bar(f"station, {name}") as bar:
                 stations.append((name, station_steps(scenario, STATION_STEPS, _mover(bar))))
         tables.append(station_table(stations))
-    text = "\n\n".join(tables) + "\n"
-    print(text)
-    if options.output is not None:
-        options.output.mkdir(parents=True, exist_ok=True)
-        (options.output / "stepping.md").write_text(text, encoding="utf-8")
-        write_stepping(results, costs, options.output / "stepping.csv")
-        plot_stepping(results, costs, options.output / "stepping.png")
+    folder = options.output
+    publish("\n\n".join(tables), folder and folder / "stepping.md")
+    if folder is not None:
+        write_stepping(results, costs, folder / "stepping.csv")
+        plot_stepping(results, costs, folder / "stepping.png")
     return 0
 
 
@@ -226,19 +225,17 @@ def station_steps(
 
 def station_table(cases: Sequence[tuple[str, Sequence[StationStep]]]) -> str:
     """Results of `station_steps` by name as a table for people."""
-    lines = [
-        "| in the station | step [s] | RMS error [%] | largest difference [% of peak] "
-        "| path error [um] | largest kinetic/internal energy [%] | x real time | ran to the end |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for name, steps in cases:
-        for s in steps:
-            lines.append(
-                f"| {name} | {s.time_step:g} | {100 * s.force_error:.2f} | "
-                f"{100 * s.largest_difference:.1f} | {1e6 * s.path_error:.1f} | "
-                f"{100 * s.energy_ratio:.3f} | {s.real_time_factor:.2f} | {s.stopped or 'yes'} |"
-            )
-    return "\n".join(lines)
+    return table(
+        "in the station | step [s] | RMS error [%] | largest difference [% of peak]"
+        " | path error [um] | largest kinetic/internal energy [%] | x real time | ran to the end",
+        (
+            (name, f"{s.time_step:g}", f"{100 * s.force_error:.2f}")
+            + (f"{100 * s.largest_difference:.1f}", f"{1e6 * s.path_error:.1f}")
+            + (f"{100 * s.energy_ratio:.3f}", f"{s.real_time_factor:.2f}", s.stopped or "yes")
+            for name, steps in cases
+            for s in steps
+        ),
+    )
 
 
 def write_stepping(results: Sequence[StepResult], costs: Sequence[StepCost], file: Path) -> None:

@@ -31,7 +31,7 @@ from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 from sliceit_drake.systems.servo import ServoConfig
-from studies.pages import publish
+from studies.pages import publish, table
 
 __all__ = [
     "BoxRun",
@@ -405,46 +405,36 @@ _TRACKING = {"arm": "arm", "servo": "rigid arm", "ideal": "rigid arm, no servo"}
 
 def factor_table(rows: Sequence[FactorRow]) -> str:
     """The rows as a table for people."""
-    lines = [
-        "| factor | servo lag [ms] | tracking | unstable corners: air | food | board "
-        "| least limit [kN/m] | approach [s] |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    cells = []
     for r in rows:
         lag = "-" if r.tracking == "ideal" else f"{1e3 * r.lag:g}"
-        air, food, board = r.unstable
         limit = f"{1e-3 * r.least_limit:.3g}" if np.isfinite(r.least_limit) else "-"
         times = ", ".join(f"{t:.2g}" if np.isfinite(t) else "never" for t in r.approach)
-        lines.append(
-            f"| {r.factor:g} | {lag} | {_TRACKING[r.tracking]} | {air} | {food} | {board} | "
-            f"{limit} | {times} |"
-        )
-    return "\n".join(lines)
+        cells.append((f"{r.factor:g}", lag, _TRACKING[r.tracking], *r.unstable, limit, times))
+    return table(
+        "factor | servo lag [ms] | tracking | unstable corners: air | food | board"
+        " | least limit [kN/m] | approach [s]",
+        cells,
+    )
 
 
 def check_table(checks: Sequence[Check]) -> str:
     """The station's runs beside the linear loop's limits."""
-    lines = [
-        "| mode | servo lag [ms] | error scale x p | limit [kN/m] | spring / limit "
-        "| growth per s on the station | agrees |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for c in checks:
-        lines.append(
-            f"| {c.mode} | {1e3 * c.lag:g} | {c.gain:g} | {1e-3 * c.limit:.3g} | "
-            f"{c.stiffness / c.limit:.3g} | {np.log(c.growth) / 2e-3:+.3g} | "
-            f"{'yes' if c.agrees else 'NO'} |"
-        )
-    return "\n".join(lines)
+    return table(
+        "mode | servo lag [ms] | error scale x p | limit [kN/m] | spring / limit"
+        " | growth per s on the station | agrees",
+        (
+            (c.mode, f"{1e3 * c.lag:g}", f"{c.gain:g}", f"{1e-3 * c.limit:.3g}")
+            + (f"{c.stiffness / c.limit:.3g}", f"{np.log(c.growth) / 2e-3:+.3g}")
+            + ("yes" if c.agrees else "NO",)
+            for c in checks
+        ),
+    )
 
 
 def box_table(runs: Sequence[BoxRun]) -> str:
     """Runs over the agent's box, summed up by factor and contact."""
-    lines = [
-        "| factor | contact | runs | ended as unstable gains | greatest force, others [N] "
-        "| greatest force, ended [N] |",
-        "|---|---|---|---|---|---|",
-    ]
+    rows = []
     groups: dict[tuple[float, str], list[BoxRun]] = {}
     for run in runs:
         groups.setdefault((run.factor, run.contact), []).append(run)
@@ -456,10 +446,12 @@ def box_table(runs: Sequence[BoxRun]) -> str:
             for ended in (False, True)
         ]
         ended = sum(run.stopped is not None for run in group)
-        lines.append(
-            f"| {factor:g} | {contact} | {len(group)} | {ended} | {peaks[0]} | {peaks[1]} |"
-        )
-    return "\n".join(lines)
+        rows.append((f"{factor:g}", contact, len(group), ended, *peaks))
+    return table(
+        "factor | contact | runs | ended as unstable gains | greatest force, others [N]"
+        " | greatest force, ended [N]",
+        rows,
+    )
 
 
 def plot_stability_map(

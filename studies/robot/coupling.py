@@ -18,7 +18,7 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.outputs.run_log import Record
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario
-from studies.pages import publish
+from studies.pages import publish, table
 
 __all__ = ["CouplingCase", "add_arguments", "coupling_study", "coupling_table", "run"]
 
@@ -152,15 +152,13 @@ def _compare(
 
 def coupling_table(cases: Sequence[CouplingCase]) -> str:
     """The cases as a table for people."""
-    lines = [
-        "| exchange [ms] | plant step [ms] | force error | path error | work error "
-        "| board peak [N] | x real time |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for c in cases:
-        lines.append(
-            f"| {1e3 * c.exchange_period:g} | {1e3 * c.plant_time_step:g} | "
-            f"{100 * c.force_error:.2f} % | {100 * c.motion_error:.2f} % | "
-            f"{100 * c.work_error:.2f} % | {c.board_peak:.2f} | {c.real_time_factor:.2f} |"
-        )
-    return "\n".join(lines)
+    return table(
+        "exchange [ms] | plant step [ms] | force error | path error | work error"
+        " | board peak [N] | x real time",
+        (
+            (f"{1e3 * c.exchange_period:g}", f"{1e3 * c.plant_time_step:g}")
+            + (f"{100 * c.force_error:.2f} %", f"{100 * c.motion_error:.2f} %")
+            + (f"{100 * c.work_error:.2f} %", f"{c.board_peak:.2f}", f"{c.real_time_factor:.2f}")
+            for c in cases
+        ),
+    )

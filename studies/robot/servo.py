@@ -19,7 +19,7 @@ from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.diagrams.robot import RobotConfig, add_plant, add_robot, connect_arm_controller
 from sliceit_drake.systems.servo import JOINTS, ServoConfig
-from studies.pages import publish
+from studies.pages import publish, table
 
 __all__ = ["ServoCase", "add_arguments", "run", "servo_study", "servo_table"]
 
@@ -110,19 +110,17 @@ def servo_study(
 
 def servo_table(cases: Sequence[ServoCase]) -> str:
     """The cases as a Markdown table."""
-    lines = [
-        "| lookahead [s] | gain [1/s2] | damping ratio | lag behind a ramp [ms] "
-        "| of it the arm's [ms] | step: 90 % after [ms] | overshoot [%] | within 2 % after [ms] |",
-        "|" + "---|" * 8,
-    ]
-    lines += [
-        f"| {case.config.lookahead_time:g} | {case.config.gain:g} "
-        f"| {case.config.damping_ratio:.2f} | {1e3 * case.ramp_lag:.1f} "
-        f"| {1e3 * case.arm_lag:.1f} | {1e3 * case.rise_time:.0f} "
-        f"| {1e2 * case.overshoot:.1f} | {1e3 * case.settling_time:.0f} |"
-        for case in cases
-    ]
-    return "\n".join(lines)
+    return table(
+        "lookahead [s] | gain [1/s2] | damping ratio | lag behind a ramp [ms]"
+        " | of it the arm's [ms] | step: 90 % after [ms] | overshoot [%] | within 2 % after [ms]",
+        (
+            (f"{case.config.lookahead_time:g}", f"{case.config.gain:g}")
+            + (f"{case.config.damping_ratio:.2f}", f"{1e3 * case.ramp_lag:.1f}")
+            + (f"{1e3 * case.arm_lag:.1f}", f"{1e3 * case.rise_time:.0f}")
+            + (f"{1e2 * case.overshoot:.1f}", f"{1e3 * case.settling_time:.0f}")
+            for case in cases
+        ),
+    )
 
 
 def _respond(config: ServoConfig, targets: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
