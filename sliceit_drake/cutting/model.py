@@ -262,7 +262,8 @@ def _derived(
     element_volume = g.stiff_volume * (1.0 + (core.stiffness_ratio - 1.0) * inside)
 
     scale = material.youngs_modulus / g.element_size
-    # Never flatter than the rise of the force on the way in: a retreat must not gain anything.
+    # Never flatter than the rise of the force on the way in: a retreat must not return more energy
+    # than the advance took.
     outline = tables.skin(effects.skin.thickness)
     force = _edge_forces(g, effects, toughness, outline)
     steepest = (np.diff(force, axis=1) / tables.spacing).max(1)

@@ -21,7 +21,7 @@ class Mounting:
     the spring makes any scheme unstable that takes the force of the exchange before; a cut does, by
     friction on its flanks up to 1e6 N/m. So each exchange is computed until its force and the
     springs' agree: a quasi-Newton search for the displacements (rise of the knife, displacement of
-    the food along Cx); one alone is held between what is known to be too small and too large.
+    the food along Cx); where only one gives, it is bracketed.
 
     Attributes:
         arm, holder: Compliances of knife (vertical) and food (along the edge), m/N.

@@ -70,7 +70,7 @@ class EnergyLedger:
         return -self.internal - energies.elastic
 
     def imbalance(self, energies: Energies) -> float:
-        """Work put in minus everything that it went into; 0 if the books close."""
+        """Work put in minus everything that it went into; 0 if energy is conserved."""
         stored = energies.elastic + energies.interface + energies.kinetic
         spent = self.edge + self.opening + self.friction + self.board_friction + self.blade
         return self.work + self.gravity - stored - spent - self.damping(energies)

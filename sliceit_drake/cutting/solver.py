@@ -206,7 +206,7 @@ class CuttingSolver:
         ws, row = self._workspace, parameter_row(self.model)
         row[ws.parameter_layout["toughness"]] *= factors.toughness
         row[ws.parameter_layout["friction_scale"]] *= factors.friction
-        # A retreat of a tougher edge must not gain anything.
+        # The retreat of a tougher edge must not return more energy than its advance took.
         row[ws.parameter_layout["unloading"]] *= max(1.0, factors.toughness)
         ws.write(ws.parameters, row[None])
         self._held_factors = factors

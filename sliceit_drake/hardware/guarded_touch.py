@@ -45,8 +45,8 @@ class Touch(NamedTuple):
 
     Attributes:
         height: Height of its surface under the edge's lowest point, in the world, m.
-        uncertainty: Half width, m: way in a cycle, half of what the ways down and up differ by, and
-            what the force's noise makes of the height.
+        uncertainty: Half width, m: the distance of a cycle, half the difference between down and
+            up, and what the force's noise makes of the height.
         stiffness: Stiffness of board, knife and arm together, N/m.
         peak_force: Greatest force, N.
     """
@@ -62,8 +62,8 @@ class GuardedTouch:
 
     Args:
         link: A started link, not armed; its safety layer has the limits of the touch.
-        path: Joint positions [6], rad, by the way down from the start, m.
-        depth: Farthest way down, m.
+        path: Joint positions [6], rad, as a function of the distance below the start, m.
+        depth: Greatest distance below the start, m.
         kinematics: Where the knife's edge is.
         config: Speeds and threshold.
         pace: Controller seconds in a second.
@@ -118,7 +118,7 @@ class GuardedTouch:
         return contact_of(np.array(self._rows), noise, self._config)
 
     def _move(self, is_up: bool, is_clear: bool, dt: float) -> None:
-        """Advances way and speed by a time step, s."""
+        """Advances distance and speed by a time step, s."""
         config = self._config
         wanted = config.speed
         if is_up:

@@ -18,7 +18,7 @@ _asked = threading.Event()
 
 @contextmanager
 def catch_signals() -> Iterator[None]:
-    """Lets Ctrl-C, a terminal that is closed and a polite kill interrupt what is inside.
+    """Lets Ctrl-C, a closed terminal and SIGTERM interrupt what is inside.
 
     Each raises a KeyboardInterrupt, which `raise_if_interrupted` repeats. Signals belong to the
     process: in another thread than the main one this changes nothing.

@@ -38,7 +38,7 @@ class _Command(NamedTuple):
 
 
 class _Task(NamedTuple):
-    """What the diagram waits for: name, since when (controller time, s), and how long it may."""
+    """Wait of the diagram: its name, since when (controller time, s), and how long it may last."""
 
     limit: str
     begin: float

@@ -22,7 +22,7 @@ _SIZE = 24
 
 
 class RtdeSystem(LeafSystem):
-    """What takes the place of plant and wrench sensor in a hardware station.
+    """System in the place of plant and wrench sensor in a hardware station.
 
     Inputs and outputs beyond the diagram happen where the run loop says so and nowhere else:
     `receive` puts the newest measurement into the Context, `send` hands the newest target to the

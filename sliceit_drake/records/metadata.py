@@ -128,7 +128,7 @@ class Phase:
 
 @dc.dataclass
 class NominalMotion:
-    """What the knife was told to do."""
+    """The motion that the knife was told to make."""
 
     speed: float | None = quantity(
         None, "m/s", low=1e-5, high=2.0, doc="Speed of the press while slicing."
@@ -141,7 +141,7 @@ class NominalMotion:
 
 @dc.dataclass
 class WrenchFacts:
-    """What the force and torque columns mean.
+    """Meaning of the force and torque columns.
 
     Attributes:
         includes: Parts of the wrench, of food, board, gravity (the tool's weight) and inertia (of

@@ -247,7 +247,7 @@ def apply_filters(
 def as_measured(
     metadata: SliceMetadata, time: np.ndarray, values: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What the record would show of a true series: the sensor's filter, then the record's steps.
+    """A true series as the record would show it: the sensor's filter, then the record's steps.
 
     Args:
         metadata: The measured record's. `sensor.cutoff_frequency` is a causal filter of order 1.

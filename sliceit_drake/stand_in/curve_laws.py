@@ -115,7 +115,7 @@ class EllipticSection:
 
 @dc.dataclass
 class CutState:
-    """What a slice remembers along the knife's path. Lengths in metres, in F.
+    """State of a slice along the knife's path. Lengths in metres, in F.
 
     Attributes:
         place: Position of the knife relative to the food [3].

@@ -234,7 +234,7 @@ def _with_tissue(section: _Section, specimen: Specimen, effects: Sequence[Effect
 
 
 class _Run:
-    """One slice on its way."""
+    """One slice while it is cut."""
 
     def __init__(
         self,

@@ -141,7 +141,7 @@ class SlicingWorld(typing.Protocol):
         ...
 
     def rng(self, food: str, slice: int) -> np.random.Generator:
-        """Seed of what is random while a slice is cut, as the sensor's noise: give it to
+        """Random numbers of a slice while it is cut, as of the sensor's noise: give them to
         `AgentStation.begin`."""
         ...
 

@@ -26,7 +26,7 @@ def load_kernels() -> None:
 
 @dc.dataclass(frozen=True)
 class ComplianceLaw:
-    """What all updates of a controller have in common.
+    """Constants that all updates of a controller share.
 
     Attributes:
         chain: The arm of n joints, n > 0.

@@ -197,7 +197,7 @@ class CuttingSystem(KnifeForceSystem):
         return found
 
     def contact_responses(self, offset: float) -> list[np.ndarray]:
-        """Those of the food with the largest section; see `ReportingSystem`."""
+        """Responses of the food with the largest section; see `ReportingSystem`."""
         solver = max(self._solvers, key=lambda each: each.model.section_area)
         return contact_responses(solver, offset)
 

@@ -38,7 +38,7 @@ _STIFFNESS, _GAINS, _HISTORY = slice(7, 13), slice(13, 19), 19
 
 
 class PolicyObservation(NamedTuple):
-    """What a policy sees.
+    """Observation of a policy.
 
     Attributes:
         time: Since the start, s.
@@ -53,7 +53,7 @@ class PolicyObservation(NamedTuple):
 
 
 class PolicyAction(NamedTuple):
-    """What a policy decides.
+    """Decision of a policy.
 
     Attributes:
         draw, press: Speeds of the target along Kx and Kz of the start, m/s.

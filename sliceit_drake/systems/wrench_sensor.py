@@ -37,7 +37,7 @@ _READOUT, _WALK = 0, 1  # Independent streams of random numbers.
 
 @dc.dataclass
 class WrenchSensorConfig:
-    """What the sensor adds to the true wrench. The defaults are an ideal sensor.
+    """Imperfections that the sensor adds to the true wrench. The defaults are an ideal sensor.
 
     What makers publish gives sizes, not spectra, so there are no named sensors here:
 
