@@ -186,16 +186,55 @@ def test_a_turn_is_one_in_the_food_and_ends_when_the_knife_is_back(way, left_out
     assert np.count_nonzero(found ^ expected) <= 3 * len(left_out)
 
 
-def test_the_filters_of_a_record_are_repeated_on_its_prediction(records):
+@pytest.mark.parametrize(("part", "off"), [(1.0, 0.05), (0.55, 0.08)])
+def test_the_filters_of_a_record_are_repeated_on_its_prediction(part, off):
+    """At the end of a record that ends in the cut, too."""
     (record,) = bench_records(1, noise=1e-6)
+    record = record.between(0.0, part * record.time[-1])
     filtered = low_pass(record, 8.0)
     ends = []
     for r in (record, filtered):
         predictor = Predictor(coarse_setup(), [r])
         ends += residuals_at(predictor, [truth(predictor)])
-    change = np.std(filtered.force - record.force)
-    assert change > 0.3
-    assert np.std(ends[1]) < 0.05 * change
+    change = filtered.force - record.force
+    assert np.std(change) > 0.3
+    assert np.std(ends[1]) < off * np.std(change)
+
+
+def test_a_weight_that_was_measured_is_predicted(records):
+    heavy = copy.deepcopy(records[0])
+    heavy.metadata.tool.mass, heavy.metadata.tool.center_of_mass = 0.3, [0.0, 0.0, 0.0]
+    heavy.metadata.wrench.includes.append("gravity")
+    heavy.metadata.wrench.tared = "no"
+    heavy.force[:, 2] -= 9.81 * 0.3
+    rests = []
+    for record in (records[0], heavy):
+        predictor = Predictor(coarse_setup(), [record])
+        rests += residuals_at(predictor, [truth(predictor)])
+    np.testing.assert_allclose(rests[1], rests[0], atol=1e-9)
+
+
+def test_a_peeled_record_is_cut_without_skin(records):
+    setup = coarse_setup()
+    setup.food.effects.skin.toughness = 0.5
+    setup.parameters.append(ParameterRange("effects.skin.toughness", 0.1, 2.0))
+    peeled = copy.deepcopy(records[0])
+    peeled.metadata.food.peeled = True
+    predictor = Predictor(setup, [peeled])
+    names = [p.name for p in predictor.parameters]
+    _, gradient = predictor.mean_square_and_gradient(predictor.start)
+    assert gradient[names.index("effects.skin.toughness")] == 0.0
+    (rest,) = residuals_at(predictor, [truth(predictor)])
+    without = Predictor(coarse_setup(), records[:1])
+    (bare,) = residuals_at(without, [truth(without)])
+    np.testing.assert_allclose(rest, bare, atol=1e-3)
+
+
+def test_a_record_without_food_is_refused(records):
+    bare = copy.deepcopy(records[0])
+    bare.metadata.food.name = "none"
+    with pytest.raises(ConfigurationError, match="no food under the knife"):
+        Predictor(coarse_setup(), [bare])
 
 
 def test_a_search_that_was_killed_ends_where_it_would_have_ended(records, tmp_path, monkeypatch):

@@ -20,6 +20,7 @@ from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.parameters import get_parameter, pull_back, with_parameters
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.prediction.clock import EXCHANGE_PERIOD, Clock
+from sliceit_drake.prediction.placement import is_bare
 from sliceit_drake.prediction.record_target import Meshing, RecordTarget, make_targets
 from sliceit_drake.records.slice_record import SliceRecord
 
@@ -133,6 +134,14 @@ class Predictor:
         self.setup = setup
         step = time_step or setup.numerics.time_step
         meshing = Meshing(1.0, step, precision, setup.numerics.device)
+        for record in records:
+            if is_bare(record):
+                raise ConfigurationError(
+                    "says that there is no food under the knife",
+                    source=record.file or record.name,
+                    field="food.name",
+                    fix="Leave the record out of the calibration.",
+                )
         # Forces are fitted, and on an even clock the solver has an adjoint.
         forces = [dc.replace(r, torque=None) for r in records]
         self.targets = make_targets(setup, forces, [meshing], Clock(longest=1), near_food=True)
@@ -146,9 +155,9 @@ class Predictor:
         self._adjoints: dict[int, SliceAdjoint] = {}
 
     def _list_parameters(self) -> list[Parameter]:
-        model = self.targets[0].model
+        model = next((t.model for t in self.targets if not t.facts.peeled), self.targets[0].model)
         out = [
-            Parameter(p.name, p.low, p.high, p.scale == "log", _start(model, p.name))
+            Parameter(p.name, p.low, p.high, p.scale == "log", max(p.low, _start(model, p.name)))
             for p in self.setup.parameters
         ]
         low, high = self.setup.height_offset
@@ -208,7 +217,7 @@ class Predictor:
         shared: dict[str, float | np.ndarray] = {
             name: value for name, value in values.items() if ":" not in name
         }
-        return with_parameters(target.model, shared | self.point_factors)
+        return target.as_cut(with_parameters(target.model, shared | self.point_factors))
 
     def with_point_factors(self, factors: Mapping[str, np.ndarray]) -> "Predictor":
         """The same predictor with factors of each cut point, by name as `POINT_PARAMETERS`.
@@ -358,6 +367,8 @@ class Predictor:
             of_force = target.adjoint(force, 2.0 * factor * residual / scale)
             back = adjoint.gradient(run, np.column_stack([0.0 * of_force, of_force @ R_FC]))
             shared = [n for n in names if ":" not in n and n not in NO_ADJOINT]
+            if target.facts.peeled:
+                shared = [n for n in shared if not n.startswith("effects.skin.")]
             for name, slope in pull_back(model, back, shared).items():
                 gradient[name] = gradient[name] + slope
             for key in (f"{kind}:{target.record.name}" for kind in (HEIGHT, SPEED)):

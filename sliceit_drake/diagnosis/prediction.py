@@ -179,9 +179,7 @@ class SlicePredictor:
         model = with_parameters(model, factors) if factors else model
         for active in point.causes:
             model = active.cause.model(model, active.values, active.cause.visible(target.facts))
-        if target.facts.peeled and model.effects.skin.toughness > 0.0:
-            model = with_parameters(model, {"effects.skin.toughness": 0.0})
-        return model
+        return target.as_cut(model)
 
     def _job(self, point: Point, number: int) -> tuple[Job | None, np.ndarray, np.ndarray]:
         """What must be simulated, and the poses of the knife over the board at the grid."""

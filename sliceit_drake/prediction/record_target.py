@@ -14,6 +14,7 @@ from sliceit_drake.cutting.board import Board, board_wrenches
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import GRAVITY, CuttingModel, Numerics
+from sliceit_drake.cutting.parameters import with_parameters
 from sliceit_drake.prediction.clock import Clock, Stretches
 from sliceit_drake.prediction.jobs import Run
 from sliceit_drake.prediction.placement import food_of, is_bare, knife_of, poses_in_food
@@ -29,11 +30,9 @@ Fy, which a draw and a turned sensor change, Nm."""
 WRENCH_ROWS = (3, 4, 5, 1)
 NORM = ("force_norm",)
 
-MARGIN = 2e-3
-"""Height of the edge over the food from which on the food is computed, metres."""
 CLEARANCE = 5e-4
-"""Height of the edge over the food below which rows are compared, beside the range of the record's
-own height, metres."""
+"""Height of the edge over the food from which on the food is computed, beside the range of the
+record's own height, metres."""
 CLEAR = 6e-4
 """Height of the edge over the food above which nothing moves fast, metres."""
 TURN_TRAVEL, TURN_TIME, STILL = 1e-3, 0.03, 2e-5
@@ -78,13 +77,13 @@ class RecordTarget:
 
     Args:
         record: The record.
-        bench: Of which the knife is taken, but for what the record says of it.
+        bench: Of which the knife is taken, but for what the record says of it, and the range of the
+            record's height: the food is computed wherever a knife within it may touch.
         models: Its cut by meshing; empty without food.
         frame: R_FW and p_WF of a record without food.
         clock: How time is divided.
         near_food: Whether rows are compared only from the first to the last in which the edge comes
             near the food. A zero of the sensor shows in the air; a fit to food has nothing there.
-        margin: Height of the edge over the food below which it is near, metres.
 
     Raises:
         ConfigurationError: The knife starts in the food, or never comes near it and `near_food` is
@@ -117,10 +116,11 @@ class RecordTarget:
         frame: tuple[Rotation, np.ndarray],
         clock: Clock,
         near_food: bool = False,
-        margin: float = MARGIN,
     ) -> None:
         self.record, self.models, self.clock = record, models, clock
-        self.near_food, self._margin = near_food, margin
+        self._margin = 2e-3
+        if near_food:
+            self._margin = CLEARANCE + max(abs(v) for v in bench.height_offset)
         self.knife = knife_of(bench.knife, record)
         metadata, unknown = record.metadata, set(record.metadata.unknown)
         self.height_unknown = "p_WK_z" in unknown or "food.position" in unknown
@@ -196,11 +196,6 @@ class RecordTarget:
     def _times(self) -> np.ndarray:
         """Of the grid [N + 1]. Not beyond the last row: a knife that stopped there would show
         weight and speed that it never had."""
-        T = self.clock.period
-        if self.near_food:
-            # One more than there is time for: no sample lies beyond the last mean.
-            count = int(np.ceil((self.time[-1] - float(self.time[0])) / T)) + 1
-            return np.asarray(float(self.time[0]) + T * np.arange(count + 1))
         first, last = self.record.time[0], self.record.time[-1]
         count = max(2, int((last - first) / self.clock.period + 1e-6))
         return np.asarray(first + self.clock.period * np.arange(count + 1))
@@ -230,6 +225,12 @@ class RecordTarget:
         """Poses at the ends of exchanges; a knife whose record is over rests."""
         rows = np.minimum(stretches.ends, len(p) - 1)
         return R[rows], p[rows]
+
+    def as_cut(self, model: CuttingModel) -> CuttingModel:
+        """A cut of the record's food, without its skin where it was peeled."""
+        if self.facts.peeled and model.effects.skin.toughness > 0.0:
+            return with_parameters(model, {"effects.skin.toughness": 0.0})
+        return model
 
     def moved(self, lower: float, faster: float) -> np.ndarray:
         """Positions of Ko at the grid [N + 1, 3], metres, of a knife that stood lower, metres, and
@@ -331,8 +332,6 @@ class RecordTarget:
         A reading stands for the mean over the exchange that ends with it. Before the first and
         after the last exchange a force is taken to stay as it is.
         """
-        if self.near_food:
-            return self._seen_near(columns)
         before = np.zeros((2, columns.shape[1])) + columns[:1]
         after = np.zeros((2, columns.shape[1])) + columns[-1:]
         ends = self.grid[0] + self.clock.period * np.arange(-1, len(columns) + 3)
@@ -343,24 +342,11 @@ class RecordTarget:
         share = np.clip((self.time - time[at - 1]) / (time[at] - time[at - 1]), 0.0, 1.0)
         return np.asarray(rows[at - 1] + share[:, None] * (rows[at] - rows[at - 1]))
 
-    def _seen_near(self, columns: np.ndarray) -> np.ndarray:
-        record, T, count, start = self.record, self.clock.period, len(columns), self.grid[0]
-        before = int((start - record.time[0]) / T) + 2
-        after = int(max(record.time[-1] - self.grid[-1], 0.0) / T) + 2
-        ends = start + T * np.arange(1 - before, count + after + 1)
-        series = np.zeros((len(ends), columns.shape[1]))
-        series[before : before + count] = columns
-        time, rows = as_measured(record.metadata, ends, series)
-        at = np.searchsorted(time, self.time, side="right")
-        low, high = np.clip(at - 1, 0, len(time) - 1), np.clip(at, 0, len(time) - 1)
-        span = np.where(high > low, time[high] - time[low], 1.0)
-        share = np.clip((self.time - time[low]) / span, 0.0, 1.0)[:, None]
-        return np.asarray((1.0 - share) * rows[low] + share * rows[high])
-
     @property
     def exchanges(self) -> np.ndarray:
         """Rows of the grid at which the exchanges of an even clock end [E + 1]."""
-        return np.arange(len(self.grid))
+        assert self.stretches is not None
+        return self.stretches.ends[self.stretches.ends < len(self.grid)]
 
     @functools.cached_property
     def operator(self) -> np.ndarray:
@@ -368,17 +354,25 @@ class RecordTarget:
 
         Filters are linear, so that their effect on each exchange's force is all there is to know.
         """
-        return self._seen(np.eye(len(self.exchanges) - 1))
+        rows = self.exchanges[1:] - 1
+        series = np.zeros((len(self.grid) - 1, len(rows)))
+        series[rows, np.arange(len(rows))] = 1.0
+        return self._seen(series)
+
+    @functools.cached_property
+    def _weight_seen(self) -> np.ndarray:
+        """Force at the rows [m, 3], N, of what hangs on the knife."""
+        return self._seen(self._weight()[:, 3:])
 
     def compare_forces(self, force: np.ndarray) -> np.ndarray:
         """Channels at the rows [m, c] from forces of the simulated exchanges [E, 3], N, in F."""
-        seen = self.operator @ force
+        seen = self.operator @ force + self._weight_seen
         return np.linalg.norm(seen, axis=1)[:, None] if self.channels == NORM else seen
 
     def adjoint(self, force: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Adjoint of `compare_forces` at `force`: of the channels [m, c] to forces [E, 3]."""
         if self.channels == NORM:
-            seen = self.operator @ force
+            seen = self.operator @ force + self._weight_seen
             norm = np.maximum(np.linalg.norm(seen, axis=1), 1e-9)[:, None]
             weights = weights * seen / norm
         return np.asarray(self.operator.T @ weights)
@@ -443,8 +437,7 @@ def make_targets(
             if key not in cuts:
                 cuts[key] = {m: _cut(bench, food, knife, m) for m in meshings}
             models = cuts[key]
-        margin = CLEARANCE + max(abs(v) for v in bench.height_offset) if near_food else MARGIN
-        targets.append(RecordTarget(record, bench, models, frame, clock, near_food, margin))
+        targets.append(RecordTarget(record, bench, models, frame, clock, near_food))
     return targets
 
 
