@@ -78,14 +78,16 @@ def content_key(*parts: object) -> str:
     return h.hexdigest()[:40]
 
 
-def source_key(*files: str) -> str:
-    """Hash of the code that runs through modules, given by their files: `source_key(__file__)`."""
-    sources = [path.read_bytes() for path in source_files(*files)]
+def source_key(*files: str | Path, package: Path = PACKAGE) -> str:
+    """Hash of `source_files` and of the versions of the libraries, as `source_key(__file__)`."""
+    sources = [file.read_bytes() for file in source_files(*files, package=package)]
     return content_key(*sources, *map(importlib.metadata.version, LIBRARIES))
 
 
 def source_files(*files: str | Path, package: Path = PACKAGE) -> list[Path]:
     """Files of modules and of all modules of ours that they import, directly or not.
+
+    What a package's `__init__.py` holds does not count.
 
     Args:
         files: Of the modules.

@@ -341,3 +341,74 @@ def test_coupling_work_error_is_what_the_delay_costs():
     assert spring.GetOutputPort("coupling_work_error").Eval(context)[0] == pytest.approx(expected)
     assert spring.wrench(context)[5] == pytest.approx(Spring.STIFFNESS * 0.05 * 0.1)
     assert spring.GetOutputPort("cut_progress").Eval(context)[0] == pytest.approx(0.005)
+
+
+class Torsion(KnifeForceSystem):
+    """A food that turns a knife back about the vertical, in proportion to its angle."""
+
+    STIFFNESS = 3.0
+
+    def advance(self, context, state, X_WK):
+        angle = np.arctan2(X_WK.rotation().matrix()[1, 0], X_WK.rotation().matrix()[0, 0])
+        return np.array([0.0, 0.0, -self.STIFFNESS * angle, 0.0, 0.0, 0.0]), 0.0
+
+
+def test_coupling_work_error_counts_the_work_of_moments_on_a_knife_that_turns():
+    rate, torsion = 0.5, Torsion(PERIOD)
+
+    class Turning(KnifePath):
+        def _pose(self, context, output):
+            turned = RotationMatrix.MakeZRotation(rate * context.get_time())
+            output.set_value(RigidTransform(turned @ DOWN, self._start))
+
+    builder = DiagramBuilder()
+    path = builder.AddNamedSystem("path", Turning(np.zeros(3)))
+    builder.AddNamedSystem("cutting", torsion)
+    for name in ("knife_pose", "knife_velocity"):
+        builder.Connect(path.GetOutputPort(name), torsion.GetInputPort(name))
+    simulator = Simulator(builder.Build())
+    simulator.AdvanceTo(0.1 + 0.5 * PERIOD)
+    context = torsion.GetMyContextFromRoot(simulator.get_context())
+    expected = 50 * Torsion.STIFFNESS * (rate * PERIOD) ** 2
+    error = torsion.GetOutputPort("coupling_work_error").Eval(context)[0]
+    assert error == pytest.approx(expected, rel=1e-5)
+
+
+def test_each_slice_of_a_sequence_is_judged_by_its_own_energies():
+    food = Food(shape=Cylinder(diameter=0.016, rings=2, layers=[0.0, 0.004, 0.012]))
+    model = make_food_model(food, Knife(), Numerics())
+    speed, down = 0.1, 0.018
+    turns = np.cumsum([0.0, down, down, down]) / speed
+
+    class TwiceThrough(KnifePath):
+        def _pose(self, context, output):
+            depth = speed * np.interp(context.get_time(), turns, [0.0, 1.0, 0.0, 1.0]) * turns[1]
+            output.set_value(RigidTransform(DOWN, self._start - [0.0, 0.0, depth]))
+
+    solvers = [CuttingSolver(model, PERIOD) for _ in range(2)]
+    cutting = CuttingSystem(solvers, RigidTransform(), check_period=PERIOD, in_sequence=True)
+    builder = DiagramBuilder()
+    path = builder.AddNamedSystem("path", TwiceThrough(start_pose(model, 1.2e-3).p))
+    builder.AddNamedSystem("cutting", cutting)
+    for name in ("knife_pose", "knife_velocity"):
+        builder.Connect(path.GetOutputPort(name), cutting.GetInputPort(name))
+    run = Slice(builder.Build())
+    energies, ledgers, slices = [], [], []
+    for _ in range(round(turns[-1] / PERIOD)):
+        run.advance(1)
+        energies.append(cutting.GetOutputPort("energy").Eval(run.context))
+        ledgers.append(cutting.GetOutputPort("ledger").Eval(run.context))
+        slices.append(cutting.food_index(run.context))
+    energies, ledgers, second = np.array(energies), np.array(ledgers), np.array(slices) == 1
+    ratio, least = energies[:, 3], energies[:, 4]
+    passes = round(turns[1] / PERIOD)
+    # Two equal slices: what the first dissipated is no energy of the second.
+    assert ratio[passes] > 1e-5
+    assert ratio[-1] == pytest.approx(ratio[passes], rel=0.05)
+    assert (np.diff(ledgers[:, 2:4], axis=0) >= 0.0).all()
+    assert ledgers[-1, 2] == pytest.approx(2.0 * ledgers[passes, 2], rel=0.02)
+    # The smallest volume ratio of a slice only falls, and begins anew with the next.
+    for rows in (~second, second):
+        assert (np.diff(least[rows]) <= 0.0).all()
+    assert least[second][0] > 0.999 and least[passes] < 0.98
+    assert least[-1] == pytest.approx(least[passes], rel=1e-3)

@@ -341,3 +341,16 @@ def test_damping_makes_an_oscillation_decay_at_the_kelvin_voigt_rate():
     damped, _ = oscillation(tau)
     assert abs(undamped) < 0.02 * damped
     assert damped == pytest.approx(0.5 * tau * omega**2, rel=0.03)
+
+
+def test_the_least_volume_ratio_is_that_of_the_element_that_is_pressed_most():
+    solver = prepare(random_box())
+    model = solver.model
+    x = model.nodes + np.random.default_rng(3).uniform(-3e-4, 3e-4, model.nodes.shape)
+    corners = model.tetrahedra
+    volumes = [np.linalg.det(at[corners[:, 1:]] - at[corners[:, :1]]) for at in (x, model.nodes)]
+    ratio = volumes[0] / volumes[1]
+    assert ratio.min() < 0.95 and ratio.max() > 1.05
+    energies = solver.energies(placed(solver, x), FAR)
+    assert energies.least_volume_ratio == pytest.approx(ratio.min(), rel=1e-9)
+    assert energies.least_element == ratio.argmin()
