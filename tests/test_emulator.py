@@ -11,7 +11,7 @@ from emulator_bench import Bench, RawClient, ScriptBench, free_address
 from pydrake.systems.analysis import Simulator
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.diagrams.robot import RobotConfig
+from sliceit_drake.diagrams.plant.robot_plant import RobotConfig
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
 from sliceit_drake.emulator.control_script import COMMAND_NAMES, ControlScript

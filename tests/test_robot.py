@@ -24,8 +24,8 @@ from sliceit_drake.cutting.board import (
     impact_peak_loss,
 )
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.diagrams.knife_body import blade_surface, effective_mass
-from sliceit_drake.diagrams.robot import (
+from sliceit_drake.diagrams.plant.knife_body import blade_surface, effective_mass
+from sliceit_drake.diagrams.plant.robot_plant import (
     JOINT_NAMES,
     ArmController,
     JointControlConfig,
@@ -36,7 +36,7 @@ from sliceit_drake.diagrams.robot import (
     connect_arm_controller,
     set_joint_positions,
 )
-from sliceit_drake.diagrams.workspace import add_board, add_holder, add_table
+from sliceit_drake.diagrams.plant.surroundings import add_board, add_holder, add_table
 from sliceit_drake.systems.servo import ServoConfig
 
 

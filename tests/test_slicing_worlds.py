@@ -21,7 +21,7 @@ from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.agent_station import AgentStation
-from sliceit_drake.diagrams.start import solve_start_joints
+from sliceit_drake.diagrams.plant.start_joints import solve_start_joints
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.stand_in import slicing_worlds
 from sliceit_drake.stand_in.curve_cutter import CurveCutter, CurveFood, food_curve

@@ -22,7 +22,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from sliceit_drake.configuration import ConfigurationError, validate
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.diagrams.robot import (
+from sliceit_drake.diagrams.plant.robot_plant import (
     Robot,
     RobotConfig,
     add_plant,

@@ -1,1 +1,1 @@
-"""Stations as diagrams: scenarios, the port contract, the simulated and the hardware station."""
+"""Stations as diagrams: scenario, port contract, simulated and hardware station, and their runs."""

@@ -6,9 +6,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.diagrams.plant.start_joints import solve_start_joints
 from sliceit_drake.diagrams.randomize import randomize
 from sliceit_drake.diagrams.simulated_station import SimulatedStation
-from sliceit_drake.diagrams.start import solve_start_joints
 from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.systems.agent import AgentConfig, AgentSystem, Decide
 

@@ -19,7 +19,6 @@ from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError
 from sliceit_drake.cutting.motion import Motion, MotionPlan
 from sliceit_drake.cutting.solver import CuttingError
-from sliceit_drake.diagrams.contact_margin import ContactMargin, check_contact_margin
 from sliceit_drake.diagrams.live_view import LiveControls, make_meshcat
 from sliceit_drake.diagrams.outputs.figures import CONTACT_THRESHOLD, plot_force
 from sliceit_drake.diagrams.outputs.measurement_comparison import (
@@ -37,6 +36,7 @@ from sliceit_drake.diagrams.scenario_diagram import (
     ScenarioDiagram,
 )
 from sliceit_drake.diagrams.simulated_station import OwnCutting
+from sliceit_drake.diagrams.stability.contact_margin import ContactMargin, check_contact_margin
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.diagrams.station_interface import OwnController, Station
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile

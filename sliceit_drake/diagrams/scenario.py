@@ -19,7 +19,7 @@ from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.cutting.named_knife import load_knife
-from sliceit_drake.diagrams.robot import RobotConfig
+from sliceit_drake.diagrams.plant.robot_plant import RobotConfig
 from sliceit_drake.diagrams.sequence import SliceSequence
 from sliceit_drake.resources import file_or_resource, named_yaml, resource_path
 from sliceit_drake.systems.agent import AgentConfig

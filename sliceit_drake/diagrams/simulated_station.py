@@ -10,11 +10,9 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer
 
-from sliceit_drake.diagrams.holder_arm import add_holding_arm
-from sliceit_drake.diagrams.knife_body import check_plant_step, effective_mass
-from sliceit_drake.diagrams.ports import STATION_PORTS
-from sliceit_drake.diagrams.prepared_food import HeldFood, OwnCutting, food_to_cut
-from sliceit_drake.diagrams.robot import (
+from sliceit_drake.diagrams.plant.holder_arm import add_holding_arm
+from sliceit_drake.diagrams.plant.knife_body import check_plant_step, effective_mass
+from sliceit_drake.diagrams.plant.robot_plant import (
     ArmController,
     Robot,
     add_plant,
@@ -22,10 +20,12 @@ from sliceit_drake.diagrams.robot import (
     connect_arm_controller,
     set_joint_positions,
 )
+from sliceit_drake.diagrams.plant.start_joints import solve_start_joints
+from sliceit_drake.diagrams.plant.surroundings import add_board, add_holder, add_table
+from sliceit_drake.diagrams.ports import STATION_PORTS
+from sliceit_drake.diagrams.prepared_food import HeldFood, OwnCutting, food_to_cut
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.diagrams.start import solve_start_joints
 from sliceit_drake.diagrams.station_interface import OwnController, Station, make_controller
-from sliceit_drake.diagrams.workspace import add_board, add_holder, add_table
 from sliceit_drake.systems.contact_monitor import ContactMonitor
 from sliceit_drake.systems.cut_report import FrameRecorder
 from sliceit_drake.systems.frame_visualizer import FrameVisualizer

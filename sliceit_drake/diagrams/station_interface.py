@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context, Diagram, LeafSystem
 
 from sliceit_drake.cutting.discretization import DiscretizationError
 from sliceit_drake.cutting.motion import MotionPlan
-from sliceit_drake.diagrams.robot import Robot
+from sliceit_drake.diagrams.plant.robot_plant import Robot
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.systems.compliance_controller import ComplianceController
 from sliceit_drake.systems.cut_report import FrameRecorder, ReportingSystem

@@ -7,8 +7,8 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from sliceit_drake.diagrams.plant.robot_plant import RobotConfig
 from sliceit_drake.diagrams.ports import STATION_PORTS
-from sliceit_drake.diagrams.robot import RobotConfig
 from sliceit_drake.emulator.kinematics import forward
 from sliceit_drake.emulator.robot_model import CYCLE
 from sliceit_drake.systems.servo import JOINTS

@@ -13,7 +13,6 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 
 from sliceit_drake.cutting.motion import Motion
-from sliceit_drake.diagrams.contact_margin import check_contact_margin
 from sliceit_drake.diagrams.hardware_station import (
     PERIOD,
     HardwareStation,
@@ -23,6 +22,7 @@ from sliceit_drake.diagrams.run import Run, measured_profile
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
 from sliceit_drake.diagrams.simulated_station import FRAMES_PER_SECOND, SimulatedStation
+from sliceit_drake.diagrams.stability.contact_margin import check_contact_margin
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.hardware.checks import (
     Check,

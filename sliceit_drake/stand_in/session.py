@@ -17,7 +17,7 @@ import numpy as np
 from sliceit_drake.configuration import ConfigurationError, load_yaml
 from sliceit_drake.cutting.foods.food import shape_facts
 from sliceit_drake.cutting.workers import worker_processes
-from sliceit_drake.diagrams.record_facts import food_support, knife_facts
+from sliceit_drake.diagrams.outputs.record_facts import food_support, knife_facts
 from sliceit_drake.records.metadata import (
     PHASE_LABELS,
     FoodFacts,

@@ -173,7 +173,8 @@ class WrenchSensor(LeafSystem):
         if plant.has_sampled_output_ports():
             raise ConfigurationError(
                 "the plant's output ports are sampled: their reaction forces are a step old",
-                fix="Set use_sampled_output_ports to false, as diagrams.robot.add_plant does.",
+                fix="Set use_sampled_output_ports to false, as add_plant does "
+                "(diagrams.plant.robot_plant).",
             )
         self._index = int(weld.index())
         self._steps = steps

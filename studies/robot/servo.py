@@ -17,7 +17,12 @@ from tqdm import tqdm
 
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.diagrams.robot import RobotConfig, add_plant, add_robot, connect_arm_controller
+from sliceit_drake.diagrams.plant.robot_plant import (
+    RobotConfig,
+    add_plant,
+    add_robot,
+    connect_arm_controller,
+)
 from sliceit_drake.systems.servo import JOINTS, ServoConfig
 from studies.pages import publish, table
 

@@ -14,7 +14,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 from sliceit_drake.cutting.solver import CuttingSolver
-from sliceit_drake.diagrams.robot import add_plant, add_robot, connect_arm_controller
+from sliceit_drake.diagrams.plant.robot_plant import add_plant, add_robot, connect_arm_controller
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
 from sliceit_drake.resources import resource_path

@@ -17,8 +17,8 @@ from pydrake.systems.framework import Context, EventStatus
 from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.diagrams.knife_body import blade_surface
 from sliceit_drake.diagrams.outputs.run_log import Record
+from sliceit_drake.diagrams.plant.knife_body import blade_surface
 from sliceit_drake.diagrams.run import Run
 from sliceit_drake.systems.cut_report import FoodBodyFrame
 

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sliceit_drake.cutting.foods.food import Food, shape_facts
-from sliceit_drake.diagrams.record_facts import food_support, knife_facts
+from sliceit_drake.diagrams.outputs.record_facts import food_support, knife_facts
 from sliceit_drake.diagrams.run import Run
 from sliceit_drake.records.metadata import (
     PHASE_LABELS,

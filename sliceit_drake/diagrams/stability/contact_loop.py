@@ -27,7 +27,7 @@ import numpy as np
 from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable
 from scipy.linalg import block_diag, expm
 
-from sliceit_drake.diagrams.robot import Robot
+from sliceit_drake.diagrams.plant.robot_plant import Robot
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.simulated_station import SimulatedStation
 from sliceit_drake.systems.compliance_controller import (

@@ -6,7 +6,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 
 from sliceit_drake.cutting.board import EDGE_CONTACTS, Board
-from sliceit_drake.diagrams.knife_body import contact_properties
+from sliceit_drake.diagrams.plant.knife_body import contact_properties
 
 __all__ = ["add_board", "add_holder", "add_table"]
 

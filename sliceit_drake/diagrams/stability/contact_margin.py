@@ -12,8 +12,8 @@ import numpy as np
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.board import Board, edge_contact_positions
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.diagrams.contact_loop import ContactLoop
 from sliceit_drake.diagrams.simulated_station import SimulatedStation
+from sliceit_drake.diagrams.stability.contact_loop import ContactLoop
 
 __all__ = [
     "LEAST_MARGIN",

@@ -16,7 +16,7 @@ from pydrake.systems.primitives import LinearSystem, Multiplexer
 from sliceit_drake.configuration import ConfigurationError, quantity
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.diagrams.knife_body import add_knife
+from sliceit_drake.diagrams.plant.knife_body import add_knife
 from sliceit_drake.resources import add_package_map
 from sliceit_drake.systems.servo import JOINTS, Servo, ServoConfig
 

@@ -7,7 +7,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.diagrams.start import solve_start_joints
+from sliceit_drake.diagrams.plant.start_joints import solve_start_joints
 from sliceit_drake.resources import add_package_map
 
 __all__ = ["FINGERTIPS", "HoldingArm", "add_holding_arm"]
