@@ -28,7 +28,8 @@ from sliceit_drake.learning.replay import PrioritizedReplayBuffer  # noqa: E402
 from sliceit_drake.learning.reward import RewardConfig, reward_potential  # noqa: E402
 from sliceit_drake.learning.sac import OverlapVecEnv, PrioritizedSAC  # noqa: E402
 from sliceit_drake.learning.task import RandomizationConfig, TaskConfig  # noqa: E402
-from sliceit_drake.learning.training import TrainingConfig, train  # noqa: E402
+from sliceit_drake.learning.training import train  # noqa: E402
+from sliceit_drake.learning.training_config import TrainingConfig  # noqa: E402
 from sliceit_drake.systems.agent import AgentConfig, observation_names  # noqa: E402
 from sliceit_drake.systems.exported_network import load_network  # noqa: E402
 

@@ -11,11 +11,11 @@ import pytest
 
 pytest.importorskip("gymnasium")
 
-from sliceit_drake.cli import evaluate
 from sliceit_drake.cli.main import main
 from sliceit_drake.diagrams.agent_gains import AgentGains
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
+from sliceit_drake.learning import unseen_worlds
 from sliceit_drake.learning.ending import Limits
 from sliceit_drake.learning.evaluation import LIMITS, cut_slice
 from sliceit_drake.learning.metrics import bootstrap_ratio, slice_metrics
@@ -169,8 +169,7 @@ def test_the_study_writes_its_page_and_says_what_it_lacks(tmp_path, capsys):
 
 
 def test_an_evaluation_goes_on_over_batches_of_processes_and_runs(tmp_path, monkeypatch, capsys):
-    pytest.importorskip("torch", reason="the settings of a training name torch's")
-    monkeypatch.setattr(evaluate, "SLICES", 1)
+    monkeypatch.setattr(unseen_worlds, "SLICES", 1)
     file, policy = tmp_path / "evaluation.jsonl", resource_path("models/policies/cutting_0")
     given = ["evaluate", str(policy), "--world", "curves", "--foods", "cucumber"]
     given += ["--workers", "1", "--output", str(file)]

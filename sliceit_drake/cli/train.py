@@ -85,7 +85,8 @@ def _run(options: argparse.Namespace) -> int:
     from sliceit_drake.cli.extras import needs_extra
 
     with needs_extra("learn"):
-        from sliceit_drake.learning.training import load_training, train
+        from sliceit_drake.learning.training import train
+        from sliceit_drake.learning.training_config import load_training
 
     config = load_training(options.config, options.set)
     if options.simulator is not None:

@@ -1,4 +1,4 @@
-"""A training: its configuration, its run with checkpoints, and what it leaves."""
+"""A training: its run with checkpoints, and what it leaves."""
 
 import contextlib
 import copy
@@ -21,7 +21,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from sliceit_drake.configuration import ConfigurationError, dump_yaml, load_yaml, quantity
+from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.workers import deaf_children, start_worker
 from sliceit_drake.learning.environment import SlicingEnv
 from sliceit_drake.learning.export import export_policy
@@ -29,96 +29,16 @@ from sliceit_drake.learning.network import HistoryExtractor
 from sliceit_drake.learning.reward import HEIGHT, RewardConfig
 from sliceit_drake.learning.sac import OverlapVecEnv, PrioritizedSAC
 from sliceit_drake.learning.task import TaskConfig, check_task
+from sliceit_drake.learning.training_config import CONFIGURATION, POLICY, TrainingConfig
 from sliceit_drake.systems.agent import ERROR, observation_names
 
-__all__ = [
-    "CHECKPOINT",
-    "POLICY",
-    "Outcome",
-    "TrainingConfig",
-    "load_policy_folder",
-    "load_training",
-    "make_model",
-    "train",
-    "value_limit",
-]
+__all__ = ["CHECKPOINT", "Outcome", "make_model", "train", "value_limit"]
 
-CHECKPOINT, CONFIGURATION, POLICY, EPISODES = (
-    "checkpoint.pt",
-    "training.yaml",
-    "policy.onnx",
-    "episodes.jsonl",
-)
+CHECKPOINT, EPISODES = "checkpoint.pt", "episodes.jsonl"
 SELECTION = 20
 """Slices in a row by whose mean return the policy is chosen that is exported."""
 GUARD_SHARE = 1e-3
 """Of episodes that guards of the simulation may end."""
-
-
-@dc.dataclass
-class TrainingConfig:
-    """How an agent is trained, and on what."""
-
-    task: TaskConfig = dc.field(default_factory=TaskConfig)
-    steps: int = quantity(15_000, "", low=1, high=10**9, doc="Decisions.")
-    seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Of everything random.")
-    learning_rate: float = quantity(3e-4, "", low=1e-7, high=1.0, doc="Of all networks.")
-    batch: int = quantity(256, "", low=1, high=10**6, doc="Transitions in an update.")
-    warm_up: int = quantity(1000, "", low=1, high=10**9, doc="Random decisions at the start.")
-    entropy: float = quantity(
-        0.03,
-        "",
-        low=1e-6,
-        high=10.0,
-        doc="Weight of the entropy at the start, from which it adapts. At Stable-Baselines3's 1 "
-        "lingering is worth more than the goal at first, and is long after believed to be.",
-    )
-    tau: float = quantity(0.01, "", low=0.0, high=1.0, doc="Of the targets' moving average.")
-    layers: list[int] = dc.field(default_factory=lambda: [128, 128])
-    """Widths of the fully connected layers behind the joined features."""
-    priority: float = quantity(
-        0.6, "", low=0.0, high=1.0, doc="Power of the priorities; 0 replays uniformly."
-    )
-    history: bool = True
-    """Whether the network sees the force/torque history."""
-    environments: int = quantity(
-        1,
-        "",
-        low=1,
-        high=64,
-        doc="That simulate side by side, each a process; there is an update for each decision. "
-        "Another number gives another policy.",
-    )
-    checkpoint_interval: int = quantity(
-        5000, "", low=1, high=10**9, doc="Decisions between checkpoints."
-    )
-
-
-def load_training(file: str | Path | None, overrides: str | None = None) -> TrainingConfig:
-    """Reads and validates a training; None for the defaults.
-
-    Raises:
-        ConfigurationError: Naming file, field and fix.
-    """
-    config = load_yaml(TrainingConfig, file, overrides_text=overrides)
-    assert isinstance(config, TrainingConfig)
-    return config
-
-
-def load_policy_folder(folder: Path) -> TrainingConfig:
-    """The training of a folder that has a policy.
-
-    Raises:
-        ConfigurationError: There is no training, or it has not come to a policy.
-    """
-    if not (folder / POLICY).is_file():
-        raise ConfigurationError(
-            f"there is no {POLICY}",
-            field="POLICY",
-            source=str(folder),
-            fix="Give the --output of a `sliceit train` that came to its end.",
-        )
-    return load_training(folder / CONFIGURATION)
 
 
 @dc.dataclass

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from sliceit_drake.cli.evaluate import Case, trace
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.learning.evaluation import SliceTrace
 from sliceit_drake.learning.metrics import Ratio, bootstrap_ratio
+from sliceit_drake.learning.unseen_worlds import Case, trace
 from studies.pages import publish, render
 
 __all__ = [

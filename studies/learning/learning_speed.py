@@ -66,7 +66,8 @@ def environment_step(simulator: str, count: int = 400) -> float:
 def training_rate(simulator: str, environments: int, output: Path) -> float:
     """Decisions in a second, learning included."""
     from sliceit_drake.learning.task import TaskConfig
-    from sliceit_drake.learning.training import TrainingConfig, train
+    from sliceit_drake.learning.training import train
+    from sliceit_drake.learning.training_config import TrainingConfig
 
     config = TrainingConfig(
         task=TaskConfig(simulator=simulator),
@@ -90,7 +91,8 @@ def update_time(count: int = 200) -> float:
     from sliceit_drake.learning.environment import SlicingEnv
     from sliceit_drake.learning.sac import OverlapVecEnv
     from sliceit_drake.learning.task import TaskConfig
-    from sliceit_drake.learning.training import TrainingConfig, make_model
+    from sliceit_drake.learning.training import make_model
+    from sliceit_drake.learning.training_config import TrainingConfig
 
     config = TrainingConfig(task=TaskConfig(simulator="spring", foods=["cucumber"]))
     model = make_model(config, OverlapVecEnv(DummyVecEnv([lambda: SlicingEnv(config.task)])))

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from sliceit_drake.cli.evaluate import FOODS
 from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
 from sliceit_drake.cutting.foods.food import Food, make_food_model
 from sliceit_drake.cutting.foods.shapes import Cylinder
@@ -25,7 +24,7 @@ from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.learning.evaluation import cut_slice
 from sliceit_drake.learning.metrics import SliceMetrics, slice_metrics
 from sliceit_drake.resources import resource_path
-from sliceit_drake.stand_in.slicing_worlds import StandInWorld
+from sliceit_drake.stand_in.slicing_worlds import SLICING_FOODS, StandInWorld
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
 from sliceit_drake.systems.exported_network import load_network
 from studies.marked_page import Place
@@ -90,7 +89,9 @@ def row(kind: str, found: list[SliceMetrics]) -> list[str]:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of the study."""
     parser.add_argument("policy", type=Path, help="folder of a training")
-    parser.add_argument("--foods", nargs="+", choices=FOODS, default=list(FOODS), help="all")
+    parser.add_argument(
+        "--foods", nargs="+", choices=SLICING_FOODS, default=list(SLICING_FOODS), help="all"
+    )
     parser.add_argument("--slices", type=int, default=3, help="of each food; 3")
     PLACE.add_argument(parser)
 
@@ -98,7 +99,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
     PLACE.check(options.output)
-    from sliceit_drake.learning.training import POLICY, load_policy_folder
+    from sliceit_drake.learning.training_config import POLICY, load_policy_folder
 
     config = load_policy_folder(options.policy)
     agent = dc.replace(config.task.agent, network=str(options.policy / POLICY))

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from sliceit_drake.cli.evaluate import Case, trace
+from sliceit_drake.learning.unseen_worlds import Case, trace
 from sliceit_drake.systems.agent import ACTIONS, AgentConfig
 from studies.marked_page import Place
 from studies.pages import table

@@ -1,0 +1,77 @@
+"""The settings of a training, and the folder that it leaves; without what trains."""
+
+import dataclasses as dc
+from pathlib import Path
+
+from sliceit_drake.configuration import ConfigurationError, load_yaml, quantity
+from sliceit_drake.learning.task import TaskConfig
+
+__all__ = ["CONFIGURATION", "POLICY", "TrainingConfig", "load_policy_folder", "load_training"]
+
+CONFIGURATION, POLICY = "training.yaml", "policy.onnx"
+
+
+@dc.dataclass
+class TrainingConfig:
+    """How an agent is trained, and on what."""
+
+    task: TaskConfig = dc.field(default_factory=TaskConfig)
+    steps: int = quantity(15_000, "", low=1, high=10**9, doc="Decisions.")
+    seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Of everything random.")
+    learning_rate: float = quantity(3e-4, "", low=1e-7, high=1.0, doc="Of all networks.")
+    batch: int = quantity(256, "", low=1, high=10**6, doc="Transitions in an update.")
+    warm_up: int = quantity(1000, "", low=1, high=10**9, doc="Random decisions at the start.")
+    entropy: float = quantity(
+        0.03,
+        "",
+        low=1e-6,
+        high=10.0,
+        doc="Weight of the entropy at the start, from which it adapts. At Stable-Baselines3's 1 "
+        "lingering is worth more than the goal at first, and is long after believed to be.",
+    )
+    tau: float = quantity(0.01, "", low=0.0, high=1.0, doc="Of the targets' moving average.")
+    layers: list[int] = dc.field(default_factory=lambda: [128, 128])
+    """Widths of the fully connected layers behind the joined features."""
+    priority: float = quantity(
+        0.6, "", low=0.0, high=1.0, doc="Power of the priorities; 0 replays uniformly."
+    )
+    history: bool = True
+    """Whether the network sees the force/torque history."""
+    environments: int = quantity(
+        1,
+        "",
+        low=1,
+        high=64,
+        doc="That simulate side by side, each a process; there is an update for each decision. "
+        "Another number gives another policy.",
+    )
+    checkpoint_interval: int = quantity(
+        5000, "", low=1, high=10**9, doc="Decisions between checkpoints."
+    )
+
+
+def load_training(file: str | Path | None, overrides: str | None = None) -> TrainingConfig:
+    """Reads and validates a training; None for the defaults.
+
+    Raises:
+        ConfigurationError: Naming file, field and fix.
+    """
+    config = load_yaml(TrainingConfig, file, overrides_text=overrides)
+    assert isinstance(config, TrainingConfig)
+    return config
+
+
+def load_policy_folder(folder: Path) -> TrainingConfig:
+    """The training of a folder that has a policy.
+
+    Raises:
+        ConfigurationError: There is no training, or it has not come to a policy.
+    """
+    if not (folder / POLICY).is_file():
+        raise ConfigurationError(
+            f"there is no {POLICY}",
+            field="POLICY",
+            source=str(folder),
+            fix="Give the --output of a `sliceit train` that came to its end.",
+        )
+    return load_training(folder / CONFIGURATION)
