@@ -36,7 +36,7 @@ class Study:
     found: Sensitivities
 
 
-def _rows(result: Identifiability) -> list[tuple[str, ...]]:
+def _rows(result: Identifiability) -> Sequence[tuple[str, ...]]:
     """A row a cause: what shows, with what it can be confused, what would part it."""
     rows = []
     for a, name in enumerate(result.names):

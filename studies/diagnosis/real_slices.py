@@ -299,7 +299,7 @@ def _cell(result: OneSlice, expected: str, pairs: Sequence[tuple[str, str]]) -> 
     return f"{'yes' if all(verdicts) else 'no'}: {'; '.join(dict.fromkeys(out))}"
 
 
-def _evidence_rows(result: OneSlice, most: int = 8) -> list[tuple[str, ...]]:
+def _evidence_rows(result: OneSlice, most: int = 8) -> Sequence[tuple[str, ...]]:
     """Evidence of the causes that come nearest."""
     before = result.error(result.fit.held_out)
     blocks = len(np.unique(result.block))

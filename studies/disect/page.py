@@ -134,7 +134,7 @@ def _mean(result: CaseResult, values: np.ndarray) -> float:
     return float(values[inside].mean())
 
 
-def _run_rows(study: DisectStudy) -> list[tuple[str, ...]]:
+def _run_rows(study: DisectStudy) -> Sequence[tuple[str, ...]]:
     count = study.reference.springs.count
     stiffness = study.reference.springs.stiffness
     rows = []
@@ -175,7 +175,7 @@ def _rms(curve: Curve, other: np.ndarray) -> str:
     return "-" if rms == 0.0 else f"{rms:.2f}"
 
 
-def _measured_rows(measured: Sequence[MeasuredCurves]) -> list[tuple[str, ...]]:
+def _measured_rows(measured: Sequence[MeasuredCurves]) -> Sequence[tuple[str, ...]]:
     rows = []
     for item in measured:
         theirs = item.profile.references["DiSECt"]

@@ -262,7 +262,7 @@ def _requirement_row(row: Mapping[str, Any]) -> tuple[str, ...]:
     return (row["what"], row["asked"], shown, _percent(row["share"]), bound, met)
 
 
-def _effect_rows(judgements: Sequence[Judgement], kind: str) -> list[tuple[str, ...]]:
+def _effect_rows(judgements: Sequence[Judgement], kind: str) -> Sequence[tuple[str, ...]]:
     groups: dict[tuple[str, str], list[Judgement]] = {}
     for j in _of(judgements, kind):
         groups.setdefault((j.effects, j.case.protocol), []).append(j)
@@ -274,7 +274,7 @@ def _effect_rows(judgements: Sequence[Judgement], kind: str) -> list[tuple[str, 
     return rows
 
 
-def _base_rows(judgements: Sequence[Judgement]) -> list[tuple[str, ...]]:
+def _base_rows(judgements: Sequence[Judgement]) -> Sequence[tuple[str, ...]]:
     """Shifts of base parameters against those of runs with nothing hidden: what the mesh shifts is
     in both."""
     rows = []

@@ -196,7 +196,7 @@ class ProtocolSizes:
             return None
         modules = (bench, effect_module, finite_element_world, quiet, sensor_model, session, world)
         key = content_key(
-            source_key(*map(inspect.getfile, (*modules, EFFECTS[effect]))),
+            source_key(*map(inspect.getfile, modules), inspect.getfile(EFFECTS[effect])),
             inspect.getsource(ProtocolSizes.strengths),
             *(self.protocol, self.settings, DIAGNOSIS_REFINEMENT),
             *(effect, EFFECTS[effect].typical, LIMITS.get(effect)),

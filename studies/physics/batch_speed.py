@@ -14,7 +14,7 @@ import warp as wp
 from tqdm import tqdm
 
 from sliceit_drake.cutting.batch import BatchSimulator
-from sliceit_drake.cutting.foods.food import make_food_model, start_pose
+from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.parameters import with_parameters
@@ -43,6 +43,7 @@ def variants(device: str, count: int, refinement: float) -> tuple[list[CuttingMo
     """Cuts of one cucumber with toughnesses of their own, and a press to the board at 20 mm/s."""
     scenario = load_scenario(resource_path("scenarios/cucumber.yaml"))
     numerics = dc.replace(scenario.numerics, device=device)
+    assert isinstance(scenario.food, Food)
     base = make_food_model(scenario.food, scenario.knife, numerics, refinement)
     plan = MotionPlan([ConstantSpeed(distance=base.top + 6e-4, speed=0.02)])
     motion = Motion(plan, start_pose(base, 6e-4))

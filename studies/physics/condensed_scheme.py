@@ -12,8 +12,9 @@ import argparse
 import contextlib
 import dataclasses as dc
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -24,7 +25,7 @@ from scipy.sparse import block_diag, coo_matrix, csc_matrix, csr_matrix, diags_a
 from scipy.sparse.linalg import splu
 from tqdm import tqdm
 
-from sliceit_drake.cutting.foods.food import make_food_model
+from sliceit_drake.cutting.foods.food import Food, make_food_model
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
@@ -75,9 +76,13 @@ class Clock:
     """Seconds and calls of linear algebra by operation."""
 
     def __init__(self) -> None:
-        self.seconds: Counter[str] = Counter()
+        self.seconds: dict[str, float] = defaultdict(float)
         self.calls: Counter[str] = Counter()
         self.entries = 0
+
+    def total(self) -> float:
+        """All of it, s."""
+        return sum(self.seconds.values())
 
     @contextlib.contextmanager
     def of(self, name: str, entries: int = 0) -> Iterator[None]:
@@ -134,9 +139,9 @@ class Contacts:
         p, end, axis = p[used], end[used], axis[used]
         rows = [6 * p + 3 * (end // 2) + axis]
         columns, values = [3 * nodes[p, end] + axis], [weights[p, end]]
-        j, axis = np.meshgrid(np.arange(len(self.board_nodes)), np.arange(3), indexing="ij")
-        rows.append((6 * P + 1 + 3 * j + axis).ravel())
-        columns.append((3 * number[self.board_nodes][j] + axis).ravel())
+        j, side = np.meshgrid(np.arange(len(self.board_nodes)), np.arange(3), indexing="ij")
+        rows.append((6 * P + 1 + 3 * j + side).ravel())
+        columns.append((3 * number[self.board_nodes][j] + side).ravel())
         values.append(np.ones(j.size))
         self.faces = 6 * P
         size = 6 * P + 1 + j.size
@@ -377,6 +382,11 @@ class Bulk:
     contacts: Contacts
     clock: Clock
     linear = True
+    S: Any
+
+    def force(self, u: np.ndarray) -> np.ndarray:
+        """Forces of the bulk at displacements `u` [n], N."""
+        raise NotImplementedError
 
 
 class Condensed(Bulk):
@@ -453,7 +463,10 @@ class Newton:
 
     dtype: type = np.float64
 
-    def __init__(self, bulk: Condensed) -> None:
+    factor: Any = None
+    values: np.ndarray
+
+    def __init__(self, bulk: Bulk) -> None:
         self.bulk = bulk
 
     def prepare(self, blocks: np.ndarray, slow: bool, stuck: bool) -> bool:
@@ -474,7 +487,7 @@ class Newton:
     def factored(self) -> None:
         bulk = self.bulk
         with bulk.clock.of("tangent"):
-            T = bulk.S.astype(self.dtype)
+            T: np.ndarray = bulk.S.astype(self.dtype)
             T.ravel()[bulk.contacts.places] += self.values
         with bulk.clock.of("factor"):
             # It is symmetric, so its transpose is it in LAPACK's order.
@@ -497,20 +510,12 @@ class Reused(Newton):
 
     dtype = np.float32
 
-    def __init__(self, bulk: Condensed) -> None:
-        super().__init__(bulk)
-        self.factor: tuple | None = None
-
     def prepare(self, blocks: np.ndarray, slow: bool, stuck: bool) -> bool:
         return (slow or self.factor is None) and super().prepare(blocks, slow, stuck)
 
 
 class Sparse(Newton):
     """Modified Newton with a sparse factor."""
-
-    def __init__(self, bulk: Whole) -> None:
-        super().__init__(bulk)
-        self.factor = None
 
     def prepare(self, blocks: np.ndarray, slow: bool, stuck: bool) -> bool:
         return (slow or self.factor is None) and super().prepare(blocks, slow, stuck)
@@ -531,10 +536,9 @@ class Woodbury(Newton):
     """Modified Newton: inverse of one tangent, corrected where contacts have changed since."""
 
     dtype = np.float32
-
-    def __init__(self, bulk: Condensed) -> None:
-        super().__init__(bulk)
-        self.inverse: np.ndarray | None = None
+    inverse: np.ndarray | None = None
+    base: np.ndarray
+    stiffness: np.ndarray
 
     def prepare(self, blocks: np.ndarray, slow: bool, stuck: bool) -> bool:
         if self.inverse is not None and not slow:
@@ -559,6 +563,7 @@ class Woodbury(Newton):
 
     def correct(self, at: np.ndarray, change: np.ndarray) -> None:
         """Takes the change of the tangent at the unknowns `at` into account."""
+        assert self.inverse is not None
         self.at, m, c = at, len(at), self.bulk.contacts
         place = np.full(len(self.stiffness), -1)
         place[at] = np.arange(m)
@@ -572,6 +577,7 @@ class Woodbury(Newton):
         self.small = lu_factor(small, overwrite_a=True, check_finite=False)
 
     def solve(self, r: np.ndarray) -> np.ndarray:
+        assert self.inverse is not None
         with self.bulk.clock.of("solve"):
             du = self.inverse @ r.astype(self.dtype)
             if len(self.at):
@@ -702,7 +708,7 @@ def compiled(cut: Cut, point: float, element: float, per_entry: float) -> float:
     Dense and factored linear algebra as measured; products with small sparse matrices by their
     entries; each evaluation of the contacts as `POINT_COST` calls of the solver's kernel.
     """
-    calls = cut.clock.seconds.total() - cut.clock.seconds["sparse"]
+    calls = cut.clock.total() - cut.clock.seconds["sparse"]
     return calls + cut.clock.entries * per_entry + cut.iterations * (POINT_COST * point + element)
 
 
@@ -762,7 +768,7 @@ def compare(name: str, model: CuttingModel, repeats: int) -> None:
         bare = compiled(cut, point, 0.0 if schemes[scheme][0].linear else element, per_entry)
         clock = cut.clock
         rows.append(
-            (scheme, f"{1e3 * step:g}", f"{cut.wall:.3f}", f"{clock.seconds.total():.3f}")
+            (scheme, f"{1e3 * step:g}", f"{cut.wall:.3f}", f"{clock.total():.3f}")
             + (f"{bare:.3f}", f"{cut.iterations / (len(cut.times) - 1):.2f}")
             + (clock.calls["factor"] + clock.calls["update"], cut.failures)
             + tuple(f"{relative(means, force):.2f} %" for force in forces)
@@ -784,12 +790,12 @@ def compare(name: str, model: CuttingModel, repeats: int) -> None:
         print(f"  {scheme}: " + ", ".join(parts) + f" (factor at {rate:.0f} GFLOP/s)")
 
 
-def scaling(scenario: Scenario, repeats: int) -> None:
+def scaling(food: Food, scenario: Scenario, repeats: int) -> None:
     """Prints cost and error against the mesh."""
     rows = []
     per_entry = sparse_rate()
     for refinement in REFINEMENTS:
-        model = make_food_model(scenario.food, scenario.knife, scenario.numerics, refinement)
+        model = make_food_model(food, scenario.knife, scenario.numerics, refinement)
         solver, motion = CuttingSolver(model, PERIOD), through(model, DEPTH)
         bulk = Condensed(model)
         point = point_time(solver)
@@ -828,15 +834,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
-    scenario: Scenario = load_scenario(resource_path("scenarios/cucumber.yaml"))
-    model = make_food_model(scenario.food, scenario.knife, scenario.numerics)
+    scenario = load_scenario(resource_path("scenarios/cucumber.yaml"))
+    food = scenario.food
+    assert isinstance(food, Food)
+    model = make_food_model(food, scenario.knife, scenario.numerics)
     soft = dc.replace(model.material, youngs_modulus=SOFT)
     compare("cucumber", model, options.repeats)
     compare("soft food", model.derive(material=soft), options.repeats)
     softer = dc.replace(model.material, youngs_modulus=SOFTER)
     compare("softer food", model.derive(material=softer), options.repeats)
-    one_side = dc.replace(scenario.food, held_sides="minus")
+    one_side = dc.replace(food, held_sides="minus")
     free = make_food_model(one_side, scenario.knife, scenario.numerics)
     compare("cucumber, held on one side", free, options.repeats)
-    scaling(scenario, options.repeats)
+    scaling(food, scenario, options.repeats)
     return 0

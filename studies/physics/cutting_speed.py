@@ -6,6 +6,7 @@ the least of several repeats, taken in turns, since a shared machine only ever a
 
 import argparse
 import dataclasses as dc
+import functools
 import os
 import time
 from collections.abc import Callable
@@ -17,7 +18,8 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from sliceit_drake.cutting.batch import simulate_batch
-from sliceit_drake.cutting.foods.food import make_food_model, start_pose
+from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.gradient import SliceAdjoint
 from sliceit_drake.cutting.knife_path import KnifePath
 from sliceit_drake.cutting.model import CuttingModel
@@ -25,7 +27,7 @@ from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.parameters import with_parameters
 from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
-from sliceit_drake.diagrams.scenario import Scenario, load_scenario
+from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.resources import resource_path
 from studies.pages import table
 from studies.results import add_json_argument, write_results
@@ -95,10 +97,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
-    scenario: Scenario = load_scenario(resource_path("scenarios/cucumber.yaml"))
-    diameter = scenario.food.shape.diameter
+    scenario = load_scenario(resource_path("scenarios/cucumber.yaml"))
+    food = scenario.food
+    assert isinstance(food, Food) and isinstance(food.shape, Cylinder)
+    diameter = food.shape.diameter
     models = {
-        r: make_food_model(scenario.food, scenario.knife, scenario.numerics, r)
+        r: make_food_model(food, scenario.knife, scenario.numerics, r)
         for r in {*REFINEMENTS, *(r for r, _ in LARGER_STEPS)}
     }
     base = models[1.0]
@@ -123,15 +127,15 @@ def run(options: argparse.Namespace) -> int:
     weights = np.ones((path.exchanges, 6))
     cores = os.cpu_count() or 1
     calls: dict[str, Callable[[], object]] = {
-        f"slice {r}": lambda r=r: simulate_slice(solvers[r], motion) for r in REFINEMENTS
+        f"slice {r}": functools.partial(simulate_slice, solvers[r], motion) for r in REFINEMENTS
     }
     for key, solver in steppers.items():
-        calls[f"stepped {key}"] = lambda solver=solver: simulate_slice(solver, motion)
+        calls[f"stepped {key}"] = functools.partial(simulate_slice, solver, motion)
     calls["gradient"] = lambda: adjoint.gradient(adjoint.run(path.R_CK, path.p_CK), weights)
     for workers in {1, cores}:
         for n in BATCHES:
-            calls[f"batch {n} {workers}"] = lambda n=n, w=workers: simulate_batch(
-                variants[:n], [motion], PERIOD, workers=w
+            calls[f"batch {n} {workers}"] = functools.partial(
+                simulate_batch, variants[:n], [motion], PERIOD, workers=workers
             )
     times = least_times(calls, options.repeats)
     rows = []

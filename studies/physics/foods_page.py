@@ -8,6 +8,8 @@ Markdown file, between lines such as
 """
 
 import argparse
+import dataclasses as dc
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +18,12 @@ from sliceit_drake.cutting.foods.calibrated_food import calibrated_food_names, l
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid
 from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.named_knife import knife_names, load_knife
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
-from sliceit_drake.diagrams.scenario import Scenario, load_scenario
+from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.resources import resource_path
 from studies.marked_page import Place
 from studies.pages import table
@@ -122,11 +125,12 @@ def bevel(knife: Knife) -> float:
 
 def cuts_table(command: str) -> str:
     rows = []
-    for scenario in ("cucumber", "cucumber_end_slice", "apple"):
-        loaded = load_scenario(resource_path(f"scenarios/{scenario}.yaml"))
-        for sides in (loaded.food.held_sides,) if scenario != "apple" else ("plus", "both"):
-            loaded.food.held_sides = sides
-            rows += _cuts(loaded)
+    for name in ("cucumber", "cucumber_end_slice", "apple"):
+        scenario = load_scenario(resource_path(f"scenarios/{name}.yaml"))
+        food = scenario.food
+        assert isinstance(food, Food)
+        for sides in (food.held_sides,) if name != "apple" else ("plus", "both"):
+            rows += _cuts(dc.replace(food, held_sides=sides), scenario.numerics)
     how = (
         f"`{command}`: pressed through at\n"
         f"{SPEED:g} m/s without a robot. A knife that is lower than the food is left out."
@@ -135,11 +139,11 @@ def cuts_table(command: str) -> str:
     return "\n".join([table(head, rows), "", how])
 
 
-def _cuts(scenario: Scenario) -> list[tuple[str, ...]]:
+def _cuts(food: Food, numerics: Numerics) -> Sequence[tuple[str, ...]]:
     rows = []
     for name in knife_names():
         knife = load_knife(name).knife
-        model = make_food_model(scenario.food, knife, scenario.numerics)
+        model = make_food_model(food, knife, numerics)
         if knife.height < model.top - model.bottom:
             continue
         plan = MotionPlan([ConstantSpeed(distance=model.top + CLEARANCE, speed=SPEED)])
@@ -147,8 +151,8 @@ def _cuts(scenario: Scenario) -> list[tuple[str, ...]]:
         result = simulate_slice(CuttingSolver(model, PERIOD), motion)
         force = np.linalg.norm(result.food_wrench[:, 3:], axis=1).max()
         work = result.ledger.work
-        held = "on both sides" if scenario.food.held_sides == "both" else "on one side"
+        held = "on both sides" if food.held_sides == "both" else "on one side"
         share = 100.0 * result.ledger.friction / work
         cells = (f"{force:.1f}", f"{work / model.section_area:.0f}", f"{share:.0f} %")
-        rows.append((scenario.food.name, held, name, *cells))
+        rows.append((food.name, held, name, *cells))
     return rows

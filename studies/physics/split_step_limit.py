@@ -22,7 +22,7 @@ from studies.physics.neo_hookean import small_strain_stiffness
 
 matplotlib.use("Agg")
 
-BODIES = {
+BODIES: dict[str, Box | Cylinder | Ellipsoid] = {
     "box": Box(divisions=[4, 4]),
     "cylinder": Cylinder(rings=2),
     "ellipsoid": Ellipsoid(refinements=2),
@@ -130,7 +130,7 @@ def draw(relative: dict[str, dict[str, np.ndarray]], output: Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
-    bins = np.linspace(0.3, 1.1, 41)
+    bins = np.linspace(0.3, 1.1, 41).tolist()
     styles = {"all": ("0.35", "all terms"), "bulk": ("#e69f00", "bulk alone")}
     for key, (colour, label) in styles.items():
         values = np.concatenate([body[key] for body in relative.values()])
