@@ -124,7 +124,7 @@ def bevel(knife: Knife) -> float:
 
 
 def cuts_table(command: str) -> str:
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for name in ("cucumber", "cucumber_end_slice", "apple"):
         scenario = load_scenario(resource_path(f"scenarios/{name}.yaml"))
         food = scenario.food
