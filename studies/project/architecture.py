@@ -1,12 +1,16 @@
-"""The picture of docs/architecture.md: folders of the package, and which imports which."""
+"""The picture of docs/architecture.md: the folders of the project, and which imports which.
 
+Reads the layers from the import rules in pyproject.toml and the imports from the code.
+"""
+
+import argparse
 import tomllib
 from pathlib import Path
 
 import grimp
 import matplotlib.pyplot as plt
 
-__all__ = ["FIGURE", "draw", "layers", "needless", "uses"]
+__all__ = ["FIGURE", "add_arguments", "draw", "layers", "needless", "run", "uses"]
 
 ROOT = Path(__file__).resolve().parents[2]
 FIGURE = ROOT / "docs" / "figures" / "architecture.png"
@@ -121,3 +125,17 @@ def draw(file: Path = FIGURE) -> None:
     figure.tight_layout()
     figure.savefig(file, dpi=130)
     plt.close(figure)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
+    parser.add_argument(
+        "--output", metavar="FILE", type=Path, default=FIGURE, help="default: the page's figure"
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Draws the picture."""
+    draw(options.output)
+    print(f"Drawn: {options.output}")
+    return 0
