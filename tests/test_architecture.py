@@ -24,7 +24,7 @@ def test_the_modules_that_the_walks_pass_are_there():
         assert 10 < len(re.findall(r"^\d+\. ", walk, re.M)) <= 20
 
 
-def test_the_picture_leaves_out_only_what_a_longer_way_of_arrows_says(tmp_path):
+def test_the_picture_leaves_out_what_longer_paths_of_arrows_say(tmp_path):
     found = {("a", "b"): 1, ("b", "c"): 2, ("a", "c"): 3, ("b", "d"): 1}
     assert needless(found) == {("a", "c")}
     assert ("calibration", "prediction") in uses(layers())

@@ -167,7 +167,7 @@ TESTED = {
     ],
     "tests/test_hardware_pace.py::test_it_runs_emulator_and_client_and_prints_and_writes_the_"
     "table": ["python -m studies hardware_pace --output docs/hardware.md"],
-    "tests/test_architecture.py::test_the_picture_leaves_out_only_what_a_longer_way_of_arrows_says": [
+    "tests/test_architecture.py::test_the_picture_leaves_out_what_longer_paths_of_arrows_say": [
         "python -m studies architecture",
     ],
     "tests/test_benchmarks_page.py::test_the_page_is_what_its_command_makes": [

@@ -67,7 +67,7 @@ def folder_of(module: str) -> str:
 
 
 def needless(found: dict[tuple[str, str], int]) -> set[tuple[str, str]]:
-    """Arrows that a longer way of arrows says as well; without them the picture is readable."""
+    """Arrows that a longer path of arrows says as well; without them the picture is readable."""
     below: dict[str, set[str]] = {}
 
     def reach(folder: str) -> set[str]:
