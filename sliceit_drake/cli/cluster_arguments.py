@@ -16,7 +16,7 @@ def add_cluster_arguments(parser: argparse.ArgumentParser, here: str, work: str)
     """Adds --backend and --scheduler.
 
     Args:
-        parser: Of the command.
+        parser: Parser of the command.
         here: What the work is done by without a cluster: "threads" or "processes".
         work: What is spread, as "slices are simulated".
     """

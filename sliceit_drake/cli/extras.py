@@ -11,7 +11,7 @@ def needs_extra(extra: str) -> Iterator[None]:
     """Turns the failed import of another's package into a message for the user.
 
     Args:
-        extra: Of pyproject.toml.
+        extra: Name of the extra in pyproject.toml.
 
     Raises:
         ConfigurationError: A package is not installed.

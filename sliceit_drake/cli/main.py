@@ -91,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         0 on success, 1 if a run stopped early, 2 for bad input, 130 for Ctrl-C outside a run (and
-        for a polite kill, or a terminal that is closed).
+        for SIGTERM or SIGHUP).
     """
     return run_program(make_parser(), arguments)
 
@@ -128,7 +128,7 @@ def run_program(parser: argparse.ArgumentParser, arguments: Sequence[str] | None
 
 @contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """Lets what ends a program politely interrupt it as Ctrl-C does."""
+    """Lets SIGTERM and SIGHUP interrupt the program as Ctrl-C does."""
     before = {}
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGTERM, signal.SIGHUP):

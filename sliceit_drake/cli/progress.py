@@ -10,7 +10,7 @@ class StageBars:
     """One bar for each stage, made when the stage begins.
 
     Args:
-        prefix: Before the stages' names.
+        prefix: Text before the stages' names.
     """
 
     def __init__(self, prefix: str = "") -> None:

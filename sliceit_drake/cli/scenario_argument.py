@@ -56,7 +56,7 @@ def add_protocol_argument(parser: argparse.ArgumentParser, kind: str = "a protoc
     """Adds PROTOCOL.
 
     Args:
-        parser: Of the command.
+        parser: Parser of the command.
         kind: What it may be, for the help.
     """
     parser.add_argument(

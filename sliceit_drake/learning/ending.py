@@ -12,9 +12,9 @@ class Limits:
     """What ends a slice before its goal.
 
     Attributes:
-        force: Of each component at the sensor, N.
-        torque: Likewise, Nm.
-        workspace: Errors to the final pose [3], m, m, rad.
+        force: Greatest force of each component at the sensor, N.
+        torque: Greatest torque of each component there, Nm.
+        workspace: Greatest errors to the final pose [3], m, m, rad.
     """
 
     force: float
@@ -31,11 +31,11 @@ class Limits:
 
         Args:
             at_goal: Whether the goal was held for long enough.
-            time: Of the simulation, s; before `until` where the station's monitor ended a run that
-                shakes.
-            until: To which it was to advance, s.
+            time: Time of the simulation, s; before `until` where the station's monitor ended a run
+                that shakes.
+            until: Time to which it was to advance, s.
             wrench: Moment and force at the sensor [6].
-            error: To the final pose [3], m, m, rad.
+            error: Error to the final pose [3], m, m, rad.
         """
         if at_goal:
             return "goal"

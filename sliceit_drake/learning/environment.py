@@ -85,7 +85,7 @@ class SlicingEnv(gymnasium.Env):
         """Begins a slice.
 
         Args:
-            seed: Of all random numbers from here on.
+            seed: Seed of all random numbers from here on.
             options: "food": one of the task's foods, instead of a random one.
 
         Raises:

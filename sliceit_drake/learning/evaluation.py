@@ -20,7 +20,7 @@ __all__ = ["LIMITS", "SliceTrace", "cut_slice"]
 
 
 LONGEST = 25.0
-"""Of a slice, s: as many decisions as in training."""
+"""Longest slice, s: as many decisions as in training."""
 LIMITS = Limits(force=150.0, torque=30.0, workspace=(0.05, 0.1, 0.1745))
 """Greater than in training: what a policy does over its sensor's limit is measured too."""
 
@@ -33,9 +33,9 @@ class SliceTrace:
         time: [n], s.
         food, board: Forces on the knife in W [n, 3], N.
         cut: Share of the section [n].
-        height: Of the edge over the board at the decisions [m], metres.
-        actions: Decided [m, 6].
-        metrics: Of the slice.
+        height: Height of the edge over the board at the decisions [m], metres.
+        actions: Actions decided [m, 6].
+        metrics: Metrics of the slice.
     """
 
     time: np.ndarray
@@ -63,7 +63,7 @@ def cut_slice(
         decide: The policy.
         cutting: A cutting system in place of the scenario's food.
         limits: What ends the slice before its goal.
-        longest: After which it ends, s.
+        longest: Time after which it ends, s.
 
     Raises:
         ConfigurationError: The scenario cannot be built, or is not for an agent.

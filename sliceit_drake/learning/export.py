@@ -14,7 +14,7 @@ __all__ = ["export_policy"]
 
 
 class _Deterministic(nn.Module):
-    """The middle of the actor's distribution."""
+    """The actor's decision without its randomness: the middle of the distribution."""
 
     def __init__(self, actor: Actor) -> None:
         super().__init__()
@@ -28,9 +28,9 @@ def export_policy(actor: Actor, config: AgentConfig, file: Path) -> None:
     """Writes the actor's decisions, without its randomness, as ONNX with the layout it needs.
 
     Args:
-        actor: Of a Stable-Baselines3 SAC.
-        config: The agent's.
-        file: To write.
+        actor: Actor of a Stable-Baselines3 SAC.
+        config: The agent's configuration.
+        file: File to write.
     """
     network = _Deterministic(actor).eval()
     example = torch.zeros(1, config.observation_size())

@@ -23,7 +23,7 @@ class SliceMetrics:
     """One slice.
 
     Attributes:
-        median_force: Of |F| over contact samples, N.
+        median_force: Median of |F| over contact samples, N.
         peak_force: Greatest |F|, N.
         board_peak: Greatest force of the board, N.
         duration: From the start to the end of the slice, s.
@@ -69,11 +69,11 @@ def slice_metrics(
 
 @dc.dataclass(frozen=True)
 class Ratio:
-    """Of two means, with a 95 % interval.
+    """A ratio of two means, with a 95 % interval.
 
     Attributes:
-        value: Of the means.
-        low, high: Of the interval.
+        value: Ratio of the means.
+        low, high: Ends of the interval.
     """
 
     value: float
@@ -90,7 +90,7 @@ def bootstrap_ratio(
         ours: A number for each policy and slice [policies, slices].
         baseline: Likewise, of other policies on the same slices.
         rng: Draws policies of each kind, and slices, the same for both.
-        draws: Of the bootstrap; a ratio is infinite where the baseline drawn is zero.
+        draws: Draws of the bootstrap; a ratio is infinite where the baseline drawn is zero.
     """
     slices = rng.integers(ours.shape[1], size=(draws, ours.shape[1]))
 

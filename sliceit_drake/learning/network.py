@@ -54,7 +54,7 @@ class HistoryExtractor(BaseFeaturesExtractor):
     Args:
         observation_space: The environment's.
         history: Readings at the end of an observation.
-        features: Of each of the two branches.
+        features: Numbers that each of the two branches gives.
         blind: Whether the history is left out, and with it its branch.
     """
 

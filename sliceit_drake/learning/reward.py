@@ -18,7 +18,8 @@ TERMS = ("distance", "force", "jerk", "step")
 HEIGHT = 0.06
 """Scale of the height over the board, metres."""
 WIDTH, FLOOR = 0.25, 0.1
-"""Of the Gaussians by which a schedule moves weight, as shares of the training, and their least."""
+"""Width of the Gaussians by which a schedule moves weight, as a fraction of the training, and their
+least value."""
 
 
 @dc.dataclass
@@ -30,7 +31,8 @@ class RewardConfig:
         "",
         low=0.0,
         size=4,
-        doc="Of distance, force, jerk and step; only their ratios count. SliceIt! has all equal.",
+        doc="Weights of distance, force, jerk and step; only their ratios count. SliceIt! has all "
+        "equal.",
     )
     schedule: str = choice(
         "constant",
@@ -40,30 +42,40 @@ class RewardConfig:
     force_shape: str = choice(
         "square",
         ("square", "sigmoid"),
-        doc="Of the force term: the square of force over scale, at most 1, or SliceIt!'s.",
+        doc="Shape of the force term: the square of force over scale, at most 1, or SliceIt!'s.",
     )
     force_scale: float = quantity(
         40.0,
         "N",
         low=0.01,
         high=1e3,
-        doc="Of the force term. A sigmoid's is half at three times as much; 2 in SliceIt!.",
+        doc="Scale of the force term. A sigmoid is half at three times as much; 2 in SliceIt!.",
     )
-    goal: float = quantity(15.0, "", low=0.0, doc="For a slice that is done; 100 in SliceIt!.")
+    goal: float = quantity(
+        15.0, "", low=0.0, doc="Reward for a slice that is done; 100 in SliceIt!."
+    )
     way: float = quantity(
-        15.0, "", low=0.0, doc="Of `reward_potential`, for 60 mm of way down; not in SliceIt!."
+        15.0,
+        "",
+        low=0.0,
+        doc="Part of `reward_potential` for 60 mm of way down; not in SliceIt!.",
     )
     hold: float = quantity(
-        5.0, "", low=0.0, doc="Likewise, for the decisions at the goal that end a slice."
+        5.0, "", low=0.0, doc="Part of `reward_potential` for the decisions at the goal."
     )
     discount: float = quantity(
-        0.99, "", low=0.0, high=1.0, doc="Of a decision; of the potential too, so that it is free."
+        0.99,
+        "",
+        low=0.0,
+        high=1.0,
+        doc="Discount of a decision; of the potential too, so that it changes no policy's worth.",
     )
     collision: float = quantity(
         -15.0,
         "",
         high=0.0,
-        doc="For a force over the limit, leaving the workspace, or a failure; -100 in SliceIt!.",
+        doc="Reward for a force over the limit, leaving the workspace, or a failure; -100 in "
+        "SliceIt!.",
     )
 
     def check(self, where: str) -> None:
@@ -80,7 +92,7 @@ def reward_terms(
 
     Args:
         config: Shape and scale of the force term.
-        height: Of the edge over its final pose, metres.
+        height: Height of the edge over its final pose, metres.
         force: Mean of the readings seen, along Kx and Kz [2], N.
         jerk: Scaled as it is observed [3].
     """
@@ -97,18 +109,18 @@ def reward_terms(
 
 
 def reward_potential(config: RewardConfig, height: float, at_goal: float) -> float:
-    """What a slice has still to make good, below zero; zero when it is done.
+    """The potential of a slice: the reward still to be earned, below zero; zero when it is done.
 
     A decision's reward has ``discount * potential after - potential before`` added to it. No policy
     becomes better by that than another (Ng, Harada and Russell, "Policy invariance under reward
     transformations", 1999), but each decision sees at once what it brings: where only the end
     pays, and time costs little, agents learned to put the end off. That theorem wants a potential
     of zero at every end; it is kept where a limit or a failure ends a slice, which therefore costs
-    what was left to make good besides `RewardConfig.collision`.
+    what was still to be earned besides `RewardConfig.collision`.
 
     Args:
         config: Its `way` and `hold`.
-        height: Of the edge over the board, metres.
+        height: Height of the edge over the board, metres.
         at_goal: Share of the decisions at the goal that end a slice.
     """
     return -config.way * max(height, 0.0) / HEIGHT - config.hold * (1.0 - min(at_goal, 1.0))
@@ -119,7 +131,7 @@ def reward_weights(config: RewardConfig, progress: float = 0.0) -> np.ndarray:
 
     Args:
         config: Weights and schedule.
-        progress: Share of the training that is done.
+        progress: Fraction of the training that is done.
     """
     weights = np.array(config.weights)
     if config.schedule == "gaussian":

@@ -20,7 +20,7 @@ from sliceit_drake.learning.replay import PrioritizedReplayBuffer
 __all__ = ["OverlapVecEnv", "PrioritizedSAC"]
 
 TRACE = 0.01
-"""Share of the newest update in the running means that are logged."""
+"""Weight of the newest update in the running means that are logged."""
 
 
 class OverlapVecEnv(VecEnvWrapper):
@@ -65,9 +65,9 @@ class PrioritizedSAC(SAC):
         beta_end: Power of the importance weights after `beta_steps`; it grows linearly from that
             of the replay buffer.
         beta_steps: Steps in which it grows; None to leave it as it is.
-        value_limit: From observations [batch, n] to the most that can still be got from there
-            [batch, 1]; None for no limit. Where an episode can linger, an overestimated value feeds
-            on itself, and fades only with the discount.
+        value_limit: Bound on values, from observations [batch, n] to [batch, 1]; None for none.
+            Where an episode can linger, an overestimated value feeds on itself, and fades only with
+            the discount.
     """
 
     replay_buffer: PrioritizedReplayBuffer

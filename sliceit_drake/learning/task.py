@@ -101,8 +101,10 @@ class TaskConfig:
     workspace: list[float] = quantity(
         [0.05, 0.1, 0.1745], "m, m, rad", low=0.0, size=3, doc="Errors that end an episode."
     )
-    force_limit: float = quantity(50.0, "N", low=0.1, doc="Of each component; ends an episode.")
-    torque_limit: float = quantity(10.0, "Nm", low=0.1, doc="Likewise.")
+    force_limit: float = quantity(
+        50.0, "N", low=0.1, doc="Greatest force of each component; more ends an episode."
+    )
+    torque_limit: float = quantity(10.0, "Nm", low=0.1, doc="Greatest torque, likewise.")
 
     def limits(self) -> Limits:
         """What ends an episode before its goal."""
@@ -147,8 +149,8 @@ def make_agent_station(task: TaskConfig, food: str, rng: np.random.Generator) ->
     """A food's station with all its prepared variants, and the agent on it.
 
     Args:
-        task: What is trained.
-        food: Of its foods.
+        task: Task of the training.
+        food: One of its foods.
         rng: Draws the variants.
 
     Raises:

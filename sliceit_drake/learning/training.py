@@ -38,7 +38,7 @@ CHECKPOINT, EPISODES = "checkpoint.pt", "episodes.jsonl"
 SELECTION = 20
 """Slices in a row by whose mean return the policy is chosen that is exported."""
 GUARD_SHARE = 1e-3
-"""Of episodes that guards of the simulation may end."""
+"""Fraction of the episodes that guards of the simulation may end."""
 
 
 @dc.dataclass
@@ -47,8 +47,8 @@ class Outcome:
 
     Attributes:
         steps: Decisions taken, those before a resumption included.
-        episodes: Likewise.
-        wall_time: Of this run, s.
+        episodes: Slices begun and ended, likewise.
+        wall_time: Wall time of this run, s.
         guard_errors: Episodes that guards ended, by kind.
         ends: Episodes by how they ended.
         best_return: Greatest mean return of `SELECTION` slices in a row, after which the policy is
@@ -174,9 +174,9 @@ def make_model(config: TrainingConfig, environments: OverlapVecEnv) -> Prioritiz
 
 
 def value_limit(reward: RewardConfig) -> Callable[[torch.Tensor], torch.Tensor]:
-    """From observations [batch, n] to the most that can still be got from there [batch, 1].
+    """A bound on values: from observations [batch, n] to the most still to be earned [batch, 1].
 
-    It is the goal and what is left to make good of the potential: all terms cost.
+    It is the reward of the goal and what is left of the potential: all other terms only cost.
     """
     names = observation_names(1)
     height, at_goal = names.index("error_z"), names.index("at_goal")

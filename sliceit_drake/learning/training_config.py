@@ -16,9 +16,11 @@ class TrainingConfig:
     """How an agent is trained, and on what."""
 
     task: TaskConfig = dc.field(default_factory=TaskConfig)
-    steps: int = quantity(15_000, "", low=1, high=10**9, doc="Decisions.")
-    seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Of everything random.")
-    learning_rate: float = quantity(3e-4, "", low=1e-7, high=1.0, doc="Of all networks.")
+    steps: int = quantity(15_000, "", low=1, high=10**9, doc="Decisions of the training.")
+    seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Seed of everything random.")
+    learning_rate: float = quantity(
+        3e-4, "", low=1e-7, high=1.0, doc="Learning rate of all networks."
+    )
     batch: int = quantity(256, "", low=1, high=10**6, doc="Transitions in an update.")
     warm_up: int = quantity(1000, "", low=1, high=10**9, doc="Random decisions at the start.")
     entropy: float = quantity(
@@ -27,9 +29,11 @@ class TrainingConfig:
         low=1e-6,
         high=10.0,
         doc="Weight of the entropy at the start, from which it adapts. At Stable-Baselines3's 1 "
-        "lingering is worth more than the goal at first, and is long after believed to be.",
+        "lingering is worth more than the goal at first, and is overestimated long after.",
     )
-    tau: float = quantity(0.01, "", low=0.0, high=1.0, doc="Of the targets' moving average.")
+    tau: float = quantity(
+        0.01, "", low=0.0, high=1.0, doc="Weight of the newest in the targets' moving average."
+    )
     layers: list[int] = dc.field(default_factory=lambda: [128, 128])
     """Widths of the fully connected layers behind the joined features."""
     priority: float = quantity(
@@ -42,7 +46,7 @@ class TrainingConfig:
         "",
         low=1,
         high=64,
-        doc="That simulate side by side, each a process; there is an update for each decision. "
+        doc="Environments side by side, each a process; there is an update for each decision. "
         "Another number gives another policy.",
     )
     checkpoint_interval: int = quantity(
@@ -65,7 +69,7 @@ def load_policy_folder(folder: Path) -> TrainingConfig:
     """The training of a folder that has a policy.
 
     Raises:
-        ConfigurationError: There is no training, or it has not come to a policy.
+        ConfigurationError: There is no training, or it has not written a policy.
     """
     if not (folder / POLICY).is_file():
         raise ConfigurationError(

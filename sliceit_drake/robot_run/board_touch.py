@@ -17,7 +17,7 @@ from sliceit_drake.systems.motion_sources import placed_motion
 __all__ = ["BoardTouch", "check_height"]
 
 SAMPLE = 1e-3
-"""Between the postures that the path is made of, m."""
+"""Distance between the postures that the path is made of, m."""
 
 
 @dc.dataclass
@@ -29,7 +29,7 @@ class BoardTouch:
             one that is expected.
         depth: Farthest way down, m.
         plan: The way down to there in joint space.
-        link: To the robot, once it ran.
+        link: Link to the robot, once it ran.
     """
 
     hardware: HardwareRun

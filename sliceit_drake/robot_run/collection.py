@@ -29,7 +29,7 @@ class Collection:
         protocol: What is cut.
         station: Whose robot, controller, sensor and numerics are used.
         directory: Folder of the records, and on a robot of each slice's outputs.
-        seed: Of the order and of the simulated variation.
+        seed: Seed of the order and of the simulated variation.
         robot: The robot; None for the simulated station.
         move_to_start: Whether the knife goes to the slice's start before each slice.
         touch: Whether the bare knife finds the board before the first slice.

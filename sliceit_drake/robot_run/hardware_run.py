@@ -62,7 +62,7 @@ class HardwareRun:
         plan: The motion in joint space.
         pace: Controller seconds in a second.
         run: Diagram and results, once it ran.
-        link: Likewise.
+        link: Link to the robot, once it ran.
     """
 
     scenario: Scenario
@@ -76,7 +76,7 @@ class HardwareRun:
 
     @property
     def motion(self) -> Motion:
-        """What the knife shall do."""
+        """The motion of the knife."""
         return placed_motion(self.twin.motion_plan, self.twin.start_pose)
 
     def check_facts(self) -> list[Check]:
@@ -118,7 +118,7 @@ class HardwareRun:
         """Runs the scenario to its end, or to the first fault; always stops the robot's program.
 
         Args:
-            duration: s; None for the motion's.
+            duration: Duration, s; None for the motion's.
             progress: Called with run time and wall time, s, now and then.
             moves: False to let the diagram follow the robot's data without sending anything.
 
@@ -241,7 +241,7 @@ def prepare_hardware_run(
         config: The robot's file.
         client: Connected.
         pace: Controller seconds in a second; 1 for all robots.
-        meshcat: To draw the replay in, or None.
+        meshcat: Viewer to draw the replay in, or None.
 
     Raises:
         ConfigurationError, MeshError, TimeStepError, CuttingError: The scenario cannot start.

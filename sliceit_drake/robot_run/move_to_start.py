@@ -16,9 +16,9 @@ from sliceit_drake.robot_run.hardware_run import HardwareRun
 __all__ = ["MoveToStart"]
 
 SPEED = 0.3
-"""Of the fastest joint at most, rad/s."""
+"""Greatest speed of the fastest joint, rad/s."""
 ACCELERATION = 0.5
-"""Likewise, rad/s2."""
+"""Acceleration of the fastest joint, rad/s2."""
 SAMPLES = 200
 WATCHDOG = 10.0
 """Inputs a second below which the controller stops the motion, Hz."""
@@ -41,8 +41,8 @@ class MoveToStart:
     Attributes:
         hardware: Whose robot, start and limits are used.
         begin: Where the arm is.
-        speed: Of the fastest joint, rad/s.
-        knife_speed: Of the faster end of the edge then, m/s.
+        speed: Speed of the fastest joint, rad/s.
+        knife_speed: Speed of the faster end of the edge then, m/s.
         lowest: Least height of the edge on the way, m.
         floor: Least height that is allowed, m.
     """

@@ -64,7 +64,7 @@ class OperatedRobot:
             directory: Where the outputs go.
             move_to_start: Whether to move the joints to the start first.
             touch: Whether to find the board's height then.
-            duration: s; None for the motion's.
+            duration: Duration, s; None for the motion's.
             draws: Whether to write a replay.
 
         Returns:

@@ -107,7 +107,7 @@ def check_plan(
     """Compares a plan with the limits, and asks the robot for its own.
 
     Args:
-        plan: Of `plan_joints`.
+        plan: Plan from `plan_joints`.
         station: Whose plan it is.
         config: The robot's file.
         client: In control of the robot; None to ask nothing.

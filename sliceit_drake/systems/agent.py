@@ -71,16 +71,16 @@ class AgentConfig:
         0.037, "m", low=1e-3, high=0.5, doc="Height of the edge over the board at the start."
     )
     duration: float = quantity(8.0, "s", low=0.05, high=600.0, doc="Duration of the run.")
-    period: float = quantity(0.05, "s", low=0.002, high=1.0, doc="Between two decisions.")
+    period: float = quantity(0.05, "s", low=0.002, high=1.0, doc="Time between two decisions.")
     history: int = quantity(12, "", low=1, high=100, doc="Force/torque readings that it sees.")
     reading_period: float = quantity(
-        0.01, "s", low=0.002, high=1.0, doc="Between two of these readings."
+        0.01, "s", low=0.002, high=1.0, doc="Time between two of these readings."
     )
     mapping: str = choice(
         "whole",
         ("whole", "upper"),
-        doc="What of [-1, 1] spans the ranges of stiffness and gains; upper: [0, 1], as the code "
-        "of SliceIt! has it.",
+        doc="Part of [-1, 1] that spans the ranges of stiffness and gains; upper: [0, 1], as in "
+        "SliceIt!'s code.",
     )
     stiffness_x: list[float] = quantity(
         [1000.0, 10000.0], "N/m", low=0.0, high=1e5, size=2, doc="Range, along the edge."
@@ -95,7 +95,7 @@ class AgentConfig:
         "",
         low=0.0,
         size=2,
-        doc="Far from the final pose, and at it; with the factor of docs/control.md.",
+        doc="Error scale far from the final pose, and at it; with the factor of docs/control.md.",
     )
     draw_increment: float = quantity(
         2e-3, "m", low=0.0, high=0.05, doc="Greatest move of the target along Kx in a decision."
@@ -119,7 +119,13 @@ class AgentConfig:
         size=3,
         doc="Error along Kx, height over the board and error about Ky within which the slice ends.",
     )
-    goal_decisions: int = quantity(10, "", low=0, high=1000, doc="That it stays there before.")
+    goal_decisions: int = quantity(
+        10,
+        "",
+        low=0,
+        high=1000,
+        doc="Decisions in a row within the goal, after which the slice ends.",
+    )
     lift_speed: float = quantity(
         0.05, "m/s", low=1e-3, high=0.5, doc="Speed of the target upwards once the slice has ended."
     )
