@@ -31,7 +31,7 @@ Progress = Callable[[str, int, int, float], None]
 
 @dc.dataclass
 class CalibrationOptions:
-    """How a calibration is run.
+    """Options of a calibration: how much is searched, from how many starts, with which seed.
 
     Attributes:
         trials: Of the search.

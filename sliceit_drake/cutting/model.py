@@ -37,7 +37,7 @@ class TimeStepError(ValueError):
 
 @dc.dataclass
 class Numerics:
-    """How the cut is computed. Contacts and bonds scale with E over the edge length h."""
+    """Numerical settings of a cut. Contacts and bonds scale with E over the edge length h."""
 
     time_step: float = quantity(
         2.5e-4, "s", low=1e-7, high=5e-3, doc="Sub-step; must divide the exchange period."

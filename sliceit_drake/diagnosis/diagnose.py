@@ -38,7 +38,7 @@ LEAST_RECORDS = 2
 
 
 def setup_of_food(food: CalibratedFood, refinement: float = 1.0) -> CalibrationSetup:
-    """What is tested of a calibrated food: its values, with `BASE` free."""
+    """The setup in which a calibrated food is diagnosed: its values, with `BASE` free."""
     setup = CalibrationSetup(
         food=food.food, knife=food.knife, parameters=list(BASE), refinement=refinement
     )

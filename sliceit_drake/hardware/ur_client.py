@@ -31,7 +31,7 @@ SLOWEST = 0.2
 
 
 class UrClient:
-    """Connects to a UR e-Series robot; implements `RobotClient`.
+    """A connection to a UR e-Series robot; implements `RobotClient`.
 
     Args:
         host: Name or address.

@@ -25,7 +25,7 @@ VARIANT_SEED = 1
 
 
 class SlicingEnv(gymnasium.Env):
-    """One slice an episode; observation and action as `systems.agent.AgentSystem`.
+    """A Gymnasium environment, one slice an episode; observation and action as `systems.agent.AgentSystem`.
 
     `step` returns in `info`: `reward_terms` (before their weights), `shaping` (the reward that the
     potential gives), `cut_progress`, `height` of the edge over the board, m, `force`: the norm of

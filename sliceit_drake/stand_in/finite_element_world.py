@@ -48,7 +48,7 @@ SAMPLES = 5
 
 @dc.dataclass
 class FiniteElementSettings:
-    """How finely the world is computed; other than what looks at its records."""
+    """Mesh and step of the world, other than what looks at its records."""
 
     refinement: float = quantity(
         0.85, "", low=0.3, high=3.0, doc="Elements along an edge, relative to the food's mesh."

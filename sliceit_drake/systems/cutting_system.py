@@ -49,7 +49,7 @@ INDEXED = 5e-4
 
 
 class CuttingSystem(KnifeForceSystem):
-    """Advances a finite-element food by its own sub-steps once per exchange.
+    """A finite-element food as a cutting system, with sub-steps of its own in each exchange.
 
     All state is in the Context: the food's nodes and history as one discrete vector, the food that
     is cut as an index into the prepared foods. The solvers hold only workspaces that each update

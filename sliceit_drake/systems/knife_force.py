@@ -27,7 +27,7 @@ class CuttingSetup(Protocol):
 
 
 class KnifeForceSystem(ReportingSystem):
-    """Exchanges pose for force with a knife, once per `exchange_period`.
+    """A cutting system: exchanges pose for force with a knife, once per `exchange_period`.
 
     At t_k the update takes the knife's pose and velocity and holds the wrench that `advance`
     returns over [t_k, t_{k+1}). It is an unrestricted update, so it runs before the discrete

@@ -16,7 +16,7 @@ def placed_motion(plan: MotionPlan, X_WK: RigidTransform) -> Motion:
 
 
 class MotionSource(LeafSystem):
-    """Gives the target pose and velocity of the knife as functions of the context's time.
+    """A prescribed motion as a source of targets: pose and velocity of the knife over time.
 
     It has no inputs and no state.
 

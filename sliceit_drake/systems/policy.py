@@ -53,7 +53,7 @@ class PolicyObservation(NamedTuple):
 
 
 class PolicyAction(NamedTuple):
-    """Decision of a policy.
+    """A decision of a policy, which holds until the next.
 
     Attributes:
         draw, press: Speeds of the target along Kx and Kz of the start, m/s.

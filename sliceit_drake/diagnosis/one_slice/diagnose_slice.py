@@ -99,7 +99,7 @@ def diagnose_slice(
     progress: Progress | None = None,
     remarks: Sequence[str] = (),
 ) -> OneSlice:
-    """Describes one slice.
+    """Describes what one slice shows of the differences between food and simulation.
 
     Args:
         setup: Food, knife and board; its parameters are fitted to the slice.
