@@ -1,4 +1,4 @@
-"""What a person does with a run in a browser: find it, wait for it, change its speed, stop it."""
+"""Live view of a run in a browser: how to find it, wait for it, change its speed, stop it."""
 
 import getpass
 import logging

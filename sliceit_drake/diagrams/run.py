@@ -332,7 +332,8 @@ def _title(run: Run) -> str:
         name = scenario.food.name if isinstance(scenario.food, Food) else scenario.name
         count, thickness = scenario.sequence.count, 1e3 * scenario.sequence.thickness
         return f"A UR5e cuts {count} slices of {thickness:.3g} mm of {name}{at}"
-    return f"A UR5e slices {scenario.name.replace('_', ' ')}{at}"
+    name = run.own.get("cutting", scenario.name.replace("_", " "))
+    return f"A UR5e slices {name}{at}"
 
 
 def _caption(run: Run, comparison: Comparison | None) -> str:
@@ -342,7 +343,7 @@ def _caption(run: Run, comparison: Comparison | None) -> str:
         source = "Parameters set by hand" if named is None else f"Calibrated food {named}"
         lines.append(f"{source}: {described}")
     if run.own:
-        put_in = ", ".join(f"{name} {kind}" for kind, name in run.own.items())
+        put_in = ", ".join(f"{kind} {name}" for kind, name in run.own.items())
         lines.append(f"Put in by the user: {put_in}.")
     if comparison is not None:
         lines.append(

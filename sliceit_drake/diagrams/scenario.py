@@ -193,7 +193,7 @@ def load_scenario(
     paths: dict[str, Any] = {}
     if isinstance(overrides, Mapping):
         paths = {key: value for key, value in overrides.items() if "." in key}
-        plain = {key: value for key, value in overrides.items() if key not in paths}
+        plain = {k: _plain(value) for k, value in overrides.items() if k not in paths}
         overrides = yaml.safe_dump(plain) if plain else None
     if isinstance(scenario, Scenario):
         file, given, source = None, scenario, "scenario"
@@ -221,6 +221,15 @@ def _scenario_file(name: str | Path) -> Path:
             fix=f"Give a YAML file, or one of {shipped}.",
         )
     return file
+
+
+def _plain(value: Any) -> Any:
+    """What YAML has a form for, of arrays and numbers of NumPy."""
+    if isinstance(value, Mapping):
+        return {key: _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(each) for each in value]
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def _put_in_named(scenario: Scenario, given: Scenario, source: str) -> None:
@@ -251,11 +260,10 @@ def _set_field(scenario: Scenario, path: str, value: Any) -> None:
     try:
         for part in parents:
             at = at[int(part)] if isinstance(at, list) else getattr(at, part)
-        value = value.item() if isinstance(value, np.generic) else value
         if isinstance(at, list):
-            at[int(last)] = value
+            at[int(last)] = _plain(value)
         elif last in {field.name for field in dc.fields(at)}:
-            setattr(at, last, value)
+            setattr(at, last, _plain(value))
         else:
             raise AttributeError(last)
     except (AttributeError, IndexError, TypeError, ValueError) as error:

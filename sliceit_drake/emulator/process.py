@@ -101,7 +101,7 @@ class PendantClient:
 
 
 class EmulatorProcess:
-    """``sliceit emulate`` as a child process; a context manager.
+    """An emulated controller: ``sliceit emulate`` as a child process; a context manager.
 
     The child ends with this process, however that ends.
 

@@ -25,7 +25,9 @@ VARIANT_SEED = 1
 
 
 class SlicingEnv(gymnasium.Env):
-    """A Gymnasium environment, one slice an episode; observation and action as `systems.agent.AgentSystem`.
+    """A Gymnasium environment: one slice an episode.
+
+    Observation and action are those of `systems.agent.AgentSystem`.
 
     `step` returns in `info`: `reward_terms` (before their weights), `shaping` (the reward that the
     potential gives), `cut_progress`, `height` of the edge over the board, m, `force`: the norm of

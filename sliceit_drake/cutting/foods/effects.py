@@ -225,7 +225,7 @@ class Edge:
 
 @dc.dataclass
 class Effects:
-    """Effects that extend the base model of a food, a group each; the defaults are the base model."""
+    """Extensions of the base model, a group each; the defaults are the base model."""
 
     edge: Edge = dc.field(default_factory=Edge)
     toughness_rate: ToughnessRate = dc.field(default_factory=ToughnessRate)
