@@ -49,7 +49,8 @@ if TYPE_CHECKING:
     from sliceit_drake.learning.environment import SlicingEnv
     from sliceit_drake.learning.evaluation import cut_slice
     from sliceit_drake.learning.task import TaskConfig, station_scenario
-    from sliceit_drake.learning.training import TrainingConfig, train
+    from sliceit_drake.learning.training import train
+    from sliceit_drake.learning.training_config import TrainingConfig
     from sliceit_drake.records.slice_record import SliceRecord, write_record
     from sliceit_drake.records.validation import load_record, load_records
     from sliceit_drake.resources import resource_path
@@ -167,7 +168,8 @@ _HOME = {
     "learning.environment": ("SlicingEnv",),
     "learning.evaluation": ("cut_slice",),
     "learning.task": ("TaskConfig", "station_scenario"),
-    "learning.training": ("TrainingConfig", "train"),
+    "learning.training": ("train",),
+    "learning.training_config": ("TrainingConfig",),
     "records.slice_record": ("SliceRecord", "write_record"),
     "records.validation": ("load_record", "load_records"),
     "resources": ("resource_path",),
