@@ -19,8 +19,8 @@ class BatchSlice:
     """One slice of a batch. Row k holds the mean over the exchange that ends at time[k].
 
     Attributes:
-        time: s [n].
-        position: Of Ko in F [n, 3], metres.
+        time: End of each exchange [n], s.
+        position: Position of Ko in F [n, 3], metres.
         food_wrench, board_wrench: On the knife, moment about Ko and force, in F [n, 6]; not finite
             from where the slice failed.
         cut: Share of the section that is cut [n].

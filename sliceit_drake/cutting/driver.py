@@ -60,7 +60,7 @@ def drive(
     no cut finite is the last.
 
     Args:
-        paths: Of the knives, one a cut [C].
+        paths: Paths of the knives, one a cut [C].
         launches: Each is taken once the one before it was yielded.
         states: The foods before the first launch [C, state_size].
         advance: Advances all cuts, given a launch, states [C, state_size], rotations
@@ -99,7 +99,7 @@ class Driver:
     Not to be used by several threads at once.
 
     Args:
-        exchange_period: Of the shortest exchange, s.
+        exchange_period: Duration of the shortest exchange, s.
         board: Board under the knife, its height in F; None for none.
     """
 
@@ -126,7 +126,7 @@ class Driver:
         """Drives uncut foods side by side; see `drive`.
 
         Args:
-            paths: Of the knives; their cuts are all derived from one model.
+            paths: Paths of the knives; their cuts are all derived from one model.
             launches: `even_launches` by default.
         """
         launches = list(even_launches(paths) if launches is None else launches)

@@ -12,7 +12,7 @@ from sliceit_drake.cutting.mounting import Mounting
 __all__ = ["CHECK_TRAVEL", "KnifePath", "PosedMotion"]
 
 CHECK_TRAVEL = 1e-3
-"""Of the knife between two looks at the energies, metres."""
+"""Travel of the knife between two checks of the energies, metres."""
 BLOCK = 10
 """Exchanges that are advanced at once where nothing stands against it."""
 

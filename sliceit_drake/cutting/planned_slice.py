@@ -15,9 +15,9 @@ class PlannedSlice:
     """A slice that is yet to be cut.
 
     Attributes:
-        name: Of the slice.
+        name: Name of the slice.
         food: What is cut; None for the bare board.
-        height: Of the food's section, metres; of the bare board where its top would be.
+        height: Height of the food's section, metres; of the bare board where its top would be.
         knife: The knife.
         board: What the food lies on; the top is its height in the world.
         flank_stiffness: See `Numerics`.
@@ -25,7 +25,7 @@ class PlannedSlice:
         yaw: Direction of Fx in the world, rad.
         clearance: Height of the edge above the food at the start, metres.
         offset: Shift of the edge's middle along the edge at the start, metres.
-        motion: Of the knife.
+        motion: Motion of the knife.
         peeled: Whether the skin is taken off before.
         weight: Mass hung on the knife in segments "weight", kg.
         knife_slices: Slices that the knife has cut since it was sharpened.

@@ -27,9 +27,9 @@ __all__ = [
 ENERGY_RATIO_LIMIT = 0.05
 """Kinetic over internal energy above which scaled masses are not quasi-static."""
 LATERAL_LIMIT = 3e-3
-"""Of the blade off the cut plane, metres."""
+"""Greatest distance of the blade from the cut plane, metres."""
 TILT_LIMIT = 0.15
-"""Of the blade out of the cut plane, rad."""
+"""Greatest angle between the blade and the cut plane, rad."""
 LEAST_VOLUME_RATIO = 0.0
 
 
@@ -38,10 +38,10 @@ class EnergyLedger:
     """Work and dissipation since the start of a slice, J.
 
     Attributes:
-        work: Done by the knife on the food.
-        gravity: Done by the food's weight.
-        edge, opening, friction, board_friction, blade: Dissipated.
-        internal: Done by the bulk's forces on the nodes.
+        work: Work of the knife on the food.
+        gravity: Work of the food's weight.
+        edge, opening, friction, board_friction, blade: Energy dissipated.
+        internal: Work of the bulk's forces on the nodes.
     """
 
     work: float = 0.0
@@ -81,15 +81,15 @@ class SliceResult:
     """A slice on a prescribed motion. Row k holds the mean over the exchange that ends at time[k].
 
     Attributes:
-        time: s [n].
-        position: Of Ko in F [n, 3], metres.
-        food_wrench, board_wrench: On the knife, moment about Ko and force, in F [n, 6].
+        time: End of each exchange [n], s.
+        position: Position of Ko in F [n, 3], metres.
+        food_wrench, board_wrench: Wrenches on the knife, moment about Ko and force, in F [n, 6].
         edge, normal, friction: Force of the food by mechanism, in F [n, 3].
         cut: Share of the section that is cut [n].
         state: The food at the end.
         pose: The knife in C at the end.
         ledger: Work and dissipation.
-        energies: At the end.
+        energies: Energies at the end.
         energy_ratio: Largest kinetic over internal energy.
         contact_sum: Sum of the norms of all contact forces of the food on the knife at time[k] [n],
             N, by cut point and face; None if not asked for.
@@ -175,7 +175,7 @@ def energy_ratio(energies: Energies, dissipated: float, model: CuttingModel) -> 
     """Kinetic energy over internal energy, at least 1 % of that needed to cut through.
 
     Args:
-        energies: Of the state.
+        energies: Energies of the state.
         dissipated: Since the start, J.
         model: The cut.
     """
@@ -190,7 +190,7 @@ def check_energies(
     """Refuses inverted elements and too much kinetic energy.
 
     Args:
-        energies: Of the state.
+        energies: Energies of the state.
         dissipated: Since the start, J.
         model: The cut.
         time: For the message, s.

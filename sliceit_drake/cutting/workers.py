@@ -26,9 +26,9 @@ def worker_processes(
 
     Args:
         count: How many.
-        method: By which they start, "spawn" or "forkserver".
+        method: How they start, "spawn" or "forkserver".
         initializer: Called in each at its start.
-        arguments: Of `initializer`.
+        arguments: Arguments of `initializer`.
     """
     pool = _Pool(
         count,

@@ -28,7 +28,7 @@ class AnalyticFood:
 
     @property
     def height(self) -> float:
-        """Of the top over the board, metres."""
+        """Height of the top over the board, metres."""
         return self.diameter
 
     def make_cutting(self, setup: CuttingSetup) -> "AnalyticCutter":

@@ -56,7 +56,7 @@ class FoodBodyFrame:
         points, rest: Corners now and before anything touched them, in W [V, 3], metres.
         tetrahedra: Their corners [M, 4].
         damage: Share of the toughness that is spent at each corner [V]: 0 intact, 1 cut.
-        side: Of the cut on which each corner is [V], 0 or 1.
+        side: Side of the cut on which each corner is [V], 0 or 1.
     """
 
     food: int
@@ -126,7 +126,7 @@ class ReportingSystem(LeafSystem):
         """Adds what draws the food to the diagram that holds this system, and connects it.
 
         Args:
-            builder: Of the diagram.
+            builder: Builder of the diagram.
             meshcat: Viewer.
             period: Between frames, s.
 
