@@ -120,11 +120,12 @@ def test_a_food_of_ones_own_says_where_the_knife_starts_and_what_is_cut():
     np.testing.assert_allclose(higher, [0.0, 0.0, 0.05 - HEIGHT], atol=1e-12)
 
 
-def test_a_scenarios_food_that_is_replaced_prepares_no_solver(monkeypatch):
+def test_of_a_scenarios_food_that_is_replaced_only_the_geometry_is_made(monkeypatch):
     def fail(*arguments):
-        raise AssertionError("a solver was made")
+        raise AssertionError("what is not cut was prepared")
 
-    monkeypatch.setattr("sliceit_drake.diagrams.prepared_food.CuttingSolver", fail)
+    for name in ("prepare_cut", "CuttingSolver"):
+        monkeypatch.setattr(f"sliceit_drake.diagrams.prepared_food.{name}", fail)
     station = MakeStation(Scenario(), cutting=Dough)
     assert isinstance(station.cutting, Dough) and station.estimate_error is None
     assert RigidTransform.IsExactlyEqualTo(station.cutting.X_WF, Scenario().X_WF())

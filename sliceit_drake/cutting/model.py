@@ -22,6 +22,7 @@ __all__ = [
     "PointScales",
     "TimeStepError",
     "make_cutting_model",
+    "prepare_cut",
 ]
 
 GRAVITY = 9.81
@@ -226,6 +227,21 @@ def make_cutting_model(
         ConfigurationError: Nothing can move.
     """
     geometry = make_cut_geometry(mesh, plane, held, up, board_height)
+    return prepare_cut(geometry, material, knife, numerics, effects)
+
+
+def prepare_cut(
+    geometry: CutGeometry,
+    material: Material,
+    knife: Knife,
+    numerics: Numerics,
+    effects: Effects | None = None,
+) -> CuttingModel:
+    """A cut of a known geometry; see `make_cutting_model`.
+
+    Raises:
+        TimeStepError: The step is beyond the limit and masses are not scaled.
+    """
     ones = np.ones(len(geometry.point_nodes))
     given: dict[str, Any] = {
         "material": material,

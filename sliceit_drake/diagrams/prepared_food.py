@@ -13,9 +13,10 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.discretization import DiscretizationError, estimate_discretization_error
-from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.food import Food, make_food_geometry, start_pose
 from sliceit_drake.cutting.foods.spring_food import SpringFood
-from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry
+from sliceit_drake.cutting.model import prepare_cut
 from sliceit_drake.cutting.motion import Motion, MotionPlan
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.scenario import Scenario
@@ -142,18 +143,22 @@ def _on_the_board(
 def _(food: Food, scenario: Scenario) -> PreparedFood:
     sequence, start, numerics = scenario.sequence, scenario.start, scenario.numerics
     foods = sequence.foods(food) if sequence else [food]
-    models = [make_food_model(each, scenario.knife, numerics) for each in foods]
-    _check_blade(models, scenario)
+    cuts = [make_food_geometry(each) for each in foods]
+    _check_blade(cuts, scenario)
     poses = sequence.poses(food, scenario.X_WF()) if sequence else [scenario.X_WF()]
-    pose = start_pose(models[0], start.clearance, start.offset)
+    pose = start_pose(cuts[0], start.clearance, start.offset)
     if scenario.policy is not None:
         plan = scenario.policy.envelope()
     elif sequence is not None:
-        plan = sequence.motion([model.top for model in models], start.clearance)
+        plan = sequence.motion([cut.top for cut in cuts], start.clearance)
     else:
         plan = scenario.motion
 
     def make_cutting() -> KnifeForceSystem:
+        models = [
+            prepare_cut(cut, each.material, scenario.knife, numerics, each.effects)
+            for cut, each in zip(cuts, foods, strict=True)
+        ]
         solvers = [CuttingSolver(model, scenario.exchange_period) for model in models]
         return CuttingSystem(solvers, poses, in_sequence=sequence is not None)
 
@@ -162,11 +167,11 @@ def _(food: Food, scenario: Scenario) -> PreparedFood:
         if scenario.policy is not None:  # It would decide otherwise on another mesh.
             return None
         middle = len(foods) // 2
-        model = models[middle]
+        cut = cuts[middle]
         one = scenario.motion
         if sequence is not None:
-            one = sequence.motion([model.top], start.clearance)
-        motion = Motion(one, start_pose(model, start.clearance, start.offset))
+            one = sequence.motion([cut.top], start.clearance)
+        motion = Motion(one, start_pose(cut, start.clearance, start.offset))
         return estimate_discretization_error(
             foods[middle], scenario.knife, numerics, scenario.exchange_period, motion, None
         )
@@ -175,15 +180,15 @@ def _(food: Food, scenario: Scenario) -> PreparedFood:
         poses[0] @ RigidTransform(RotationMatrix(pose.R), pose.p),
         plan,
         make_cutting,
-        _held(food, scenario, models[0]),
+        _held(food, scenario, cuts[0]),
         estimate_error,
     )
 
 
-def _check_blade(models: list[CuttingModel], scenario: Scenario) -> None:
+def _check_blade(cuts: list[CutGeometry], scenario: Scenario) -> None:
     """Refuses a blade that is not as high as the food."""
     blade = scenario.knife.tip_height + scenario.knife.height
-    highest = max(model.top - model.bottom for model in models)
+    highest = max(cut.top - cut.bottom for cut in cuts)
     if highest > blade:
         raise ConfigurationError(
             f"the blade is {1e3 * blade:.3g} mm high and the food {1e3 * highest:.3g} mm: spine "
@@ -194,12 +199,12 @@ def _check_blade(models: list[CuttingModel], scenario: Scenario) -> None:
         )
 
 
-def _held(food: Food, scenario: Scenario, model: CuttingModel) -> HeldFood | None:
+def _held(food: Food, scenario: Scenario, cut: CutGeometry) -> HeldFood | None:
     """Where the food is held, in a sequence behind the last cut."""
     if food.held_sides not in ("both", "plus"):
         return None
     distance = food.hold_distance + 0.005
     if scenario.sequence is not None:
         distance += scenario.sequence.positions(food)[-1]
-    size = np.ptp(model.split.vertex_position @ model.X_FC_rotation.T, axis=0)
+    size = np.ptp(cut.split.vertex_position @ cut.X_FC_rotation.T, axis=0)
     return HeldFood(float(size[0]), float(size[2]), distance)

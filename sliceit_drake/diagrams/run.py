@@ -29,13 +29,13 @@ from sliceit_drake.diagrams.outputs.measurement_comparison import (
 from sliceit_drake.diagrams.outputs.run_log import Record
 from sliceit_drake.diagrams.outputs.sequence_report import plot_sequence, slice_reports
 from sliceit_drake.diagrams.outputs.snapshot import Snapshot, take_snapshot
+from sliceit_drake.diagrams.prepared_food import OwnCutting
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.scenario_diagram import (
     MakeScenarioDiagram,
     OwnPolicy,
     ScenarioDiagram,
 )
-from sliceit_drake.diagrams.simulated_station import OwnCutting
 from sliceit_drake.diagrams.stability.contact_margin import ContactMargin, check_contact_margin
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.diagrams.station_interface import OwnController, Station

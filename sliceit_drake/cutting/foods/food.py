@@ -17,12 +17,13 @@ from sliceit_drake.cutting.foods.shapes import (
     Tapered,
 )
 from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry, make_cut_geometry
 from sliceit_drake.cutting.mesh.split import CutPlane
 from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh
-from sliceit_drake.cutting.model import CuttingModel, Numerics, make_cutting_model
+from sliceit_drake.cutting.model import CuttingModel, Numerics, prepare_cut
 from sliceit_drake.cutting.motion import Pose
 
-__all__ = ["Food", "make_food_model", "start_pose"]
+__all__ = ["Food", "make_food_geometry", "make_food_model", "shape_facts", "start_pose"]
 
 
 @dc.dataclass
@@ -90,6 +91,20 @@ def make_food_model(
     Raises:
         MeshError, TimeStepError, ConfigurationError: As `make_cutting_model`.
     """
+    geometry = make_food_geometry(food, refinement)
+    return prepare_cut(geometry, food.material, knife, numerics, food.effects)
+
+
+def make_food_geometry(food: Food, refinement: float = 1.0) -> CutGeometry:
+    """The geometry of that cut.
+
+    Args:
+        food: The food.
+        refinement: Elements along an edge, relative to the food's mesh.
+
+    Raises:
+        MeshError, ConfigurationError: As `make_cutting_model`.
+    """
     mesh = food.shape.mesh(refinement)
     where = f"food.shape of {food.name}"
     if isinstance(food.shape, MeshFile):
@@ -97,16 +112,7 @@ def make_food_model(
     mesh.check(where)
     if isinstance(food.shape, MeshFile):
         mesh.check_solid(where)
-    return make_cutting_model(
-        mesh,
-        food.plane(),
-        food.held(mesh),
-        food.material,
-        knife,
-        numerics,
-        food.effects,
-        board_height=0.0,
-    )
+    return make_cut_geometry(mesh, food.plane(), food.held(mesh), board_height=0.0)
 
 
 def shape_facts(food: Food) -> tuple[str, list[float] | None]:
@@ -122,16 +128,16 @@ def shape_facts(food: Food) -> tuple[str, list[float] | None]:
     return "unknown", None
 
 
-def start_pose(model: CuttingModel, clearance: float, offset: float = 0.0) -> Pose:
+def start_pose(cut: CutGeometry, clearance: float, offset: float = 0.0) -> Pose:
     """Pose X_FK of the knife above the middle of the section, edge down, blade in the cut plane.
 
     Args:
-        model: The cut.
+        cut: The cut.
         clearance: Height of the edge above the section, metres.
         offset: Shift along the edge, metres.
     """
-    points = model.split.points
+    points = cut.split.points
     middle = 0.5 * (points[:, 0].min() + points[:, 0].max()) + offset
-    p_C = np.array([middle, 0.0, model.top + clearance])
-    R = model.X_FC_rotation
-    return Pose(R @ np.diag([1.0, -1.0, -1.0]), model.X_FC_position + R @ p_C)
+    p_C = np.array([middle, 0.0, cut.top + clearance])
+    R = cut.X_FC_rotation
+    return Pose(R @ np.diag([1.0, -1.0, -1.0]), cut.X_FC_position + R @ p_C)
