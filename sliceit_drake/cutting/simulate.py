@@ -246,8 +246,8 @@ def simulate_slice(
     every = max(1, round(check_period / T))
     check_clear(model, path.pose(0))
     ledger = EnergyLedger()
-    rows = np.zeros((count, 26))
-    norms = np.zeros(count)
+    food_wrench, mechanisms = np.zeros((count, 6)), np.zeros((count, 3, 3))
+    cut, norms = np.zeros(count), np.zeros(count)
     ratio = travel = 0.0
     last_check = 0
 
@@ -271,9 +271,9 @@ def simulate_slice(
         at, state = slice(k, k + block), step.state
         ledger.add(step)
         parts = step.wrenches.reshape(block, 3, 2, 3) @ R_FC.T
-        rows[at, 4:10] = parts.sum(1).reshape(block, 6)
-        rows[at, 16:25] = parts[:, :, 1].reshape(block, 9)
-        rows[at, 25] = step.cut
+        food_wrench[at] = parts.sum(1).reshape(block, 6)
+        mechanisms[at] = parts[:, :, 1]
+        cut[at] = step.cut
         if contact_sum:
             forces = solver.contact_forces(state, path.pose(k), path.pose(k + 1))
             norms[k] = np.linalg.norm(forces, axis=-1).sum()
@@ -285,19 +285,18 @@ def simulate_slice(
             energies = solver.energies(state, path.pose(end))
             spent = ledger.edge + ledger.opening + ledger.friction
             ratio = max(ratio, check_energies(energies, spent, model, end * T))
-    rows[:, 0] = np.arange(1, count + 1) * T
-    rows[:, 1:4] = path.p_FK[1:]
+    on_board = np.zeros((count, 6))
     if board is not None:
-        rows[:, 10:16] = board_wrenches(board, model.knife, path.R_FK, path.p_FK, T)
+        on_board = board_wrenches(board, model.knife, path.R_FK, path.p_FK, T)
     return SliceResult(
-        time=rows[:, 0],
-        position=rows[:, 1:4],
-        food_wrench=rows[:, 4:10],
-        board_wrench=rows[:, 10:16],
-        edge=rows[:, 16:19],
-        normal=rows[:, 19:22],
-        friction=rows[:, 22:25],
-        cut=rows[:, 25],
+        time=np.arange(1, count + 1) * T,
+        position=path.p_FK[1:],
+        food_wrench=food_wrench,
+        board_wrench=on_board,
+        edge=mechanisms[:, 0],
+        normal=mechanisms[:, 1],
+        friction=mechanisms[:, 2],
+        cut=cut,
         state=state,
         pose=path.pose(count),
         ledger=ledger,
