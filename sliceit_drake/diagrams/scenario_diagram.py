@@ -2,6 +2,7 @@
 
 import dataclasses as dc
 from collections.abc import Callable
+from typing import TypeAlias
 
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import (
@@ -29,7 +30,7 @@ from sliceit_drake.systems.policy import Policy, PolicyConfig, PolicySystem
 
 __all__ = ["MakeScenarioDiagram", "OwnPolicy", "ScenarioDiagram"]
 
-OwnPolicy = LeafSystem | Callable[[Station], LeafSystem] | Policy
+OwnPolicy: TypeAlias = LeafSystem | Callable[[Station], LeafSystem] | Policy
 """A user's own source of targets: a system, what makes one for a station, or what decides."""
 
 CLEAR_OF_BOARD = 2e-4
