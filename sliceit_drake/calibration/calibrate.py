@@ -19,11 +19,15 @@ from sliceit_drake.calibration.search import SearchResult, error_of, open_study,
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.calibration.uncertainty import estimate_posterior
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
+from sliceit_drake.cutting.foods.food import make_food_model
+from sliceit_drake.cutting.model import Numerics
+from sliceit_drake.cutting.parameters import get_parameter
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.cutting.workers import worker_processes
 from sliceit_drake.records.slice_record import SliceRecord
 
-__all__ = ["CalibrationOptions", "Progress", "calibrate"]
+__all__ = ["CalibrationOptions", "Progress", "calibrate", "values_of"]
 
 Progress = Callable[[str, int, int, float], None]
 """Called with what is done, steps done, steps in all, best error so far in N."""
@@ -131,6 +135,14 @@ def calibrate(
         {} if others is None else _held_out(others, predictor, unit),
         found.failures,
     )
+
+
+def values_of(food: CalibratedFood) -> dict[str, float]:
+    """The values of a calibrated food's parameters, for `CalibrationOptions.start`."""
+    numerics = Numerics(flank_stiffness=food.flank_stiffness)
+    model = make_food_model(food.food, food.knife, numerics)
+    values = {n: get_parameter(model, n) for n in food.distribution.names}
+    return {n: float(v) for n, v in values.items() if isinstance(v, int | float)}
 
 
 def _given(predictor: Predictor, start: Mapping[str, float]) -> SearchResult:

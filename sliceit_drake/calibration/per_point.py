@@ -2,6 +2,7 @@
 
 import dataclasses as dc
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -33,6 +34,17 @@ class PointFit:
     factors: np.ndarray
     positions: np.ndarray
     rms: float
+
+    def save(self, file: Path) -> None:
+        """Writes a table of points and factors (CSV)."""
+        np.savetxt(
+            file,
+            np.column_stack([self.positions, self.factors]),
+            fmt="%.6g",
+            delimiter=",",
+            header="x,z,toughness_factor",
+            comments="",
+        )
 
 
 def fit_points(

@@ -9,10 +9,9 @@ from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.cli.scenario_argument import here_or_shipped
 
 if TYPE_CHECKING:
-    from sliceit_drake.calibration.per_point import PointFit
     from sliceit_drake.calibration.result import Calibration
 
-__all__ = ["add_parser", "fit_points_shown"]
+__all__ = ["add_parser"]
 
 DESCRIPTION = """\
 Calibrate a food from slice records (NAME.csv and NAME.yaml, see docs/records.md).
@@ -164,10 +163,11 @@ def _calibrate(options: argparse.Namespace) -> int:
     import shlex
     import sys
 
-    from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate
+    from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate, values_of
     from sliceit_drake.calibration.setup import load_setup
     from sliceit_drake.calibration.storage import without_password
     from sliceit_drake.configuration import ConfigurationError
+    from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
     from sliceit_drake.records.validation import check_record, load_record, record_files
 
     setup = load_setup(options.food)
@@ -198,7 +198,7 @@ def _calibrate(options: argparse.Namespace) -> int:
                 workers=options.workers,
                 storage=options.storage,
                 blocks=options.blocks,
-                start=_start(options.start) if options.start else None,
+                start=values_of(load_calibrated_food(options.start)) if options.start else None,
             ),
             [r for r in records if r.name in options.hold_out],
             bars.show_error,
@@ -213,45 +213,19 @@ def _calibrate(options: argparse.Namespace) -> int:
     return 0
 
 
-def _start(name: str) -> "dict[str, float]":
-    """Values of a calibrated food's parameters."""
-    from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
-    from sliceit_drake.cutting.foods.food import make_food_model
-    from sliceit_drake.cutting.model import Numerics
-    from sliceit_drake.cutting.parameters import get_parameter
-
-    given = load_calibrated_food(name)
-    numerics = Numerics(flank_stiffness=given.flank_stiffness)
-    model = make_food_model(given.food, given.knife, numerics)
-    values = {n: get_parameter(model, n) for n in given.distribution.names}
-    return {n: float(v) for n, v in values.items() if isinstance(v, int | float)}
-
-
-def fit_points_shown(result: "Calibration", steps: int) -> "PointFit":
-    """Fits a toughness for each cut point, behind a progress bar."""
+def _fit_points(options: argparse.Namespace, result: "Calibration") -> None:
+    """Fits a toughness for each cut point and writes it."""
     from sliceit_drake.calibration.per_point import fit_points
 
+    steps = options.per_point
     with StageBars() as bars:
-        return fit_points(
+        points = fit_points(
             result.predictor,
             result.unit,
             steps,
             lambda done, error: bars.show_error("each point", done, steps, error),
         )
-
-
-def _fit_points(options: argparse.Namespace, result: "Calibration") -> None:
-    import numpy as np
-
-    points = fit_points_shown(result, options.per_point)
-    np.savetxt(
-        options.output / "points.csv",
-        np.column_stack([points.positions, points.factors]),
-        fmt="%.6g",
-        delimiter=",",
-        header="x,z,toughness_factor",
-        comments="",
-    )
+    points.save(options.output / "points.csv")
     print(
         f"With a toughness for each of {len(points.factors)} cut points: RMS {points.rms:.3f} N, "
         "on the records that they were fitted to"

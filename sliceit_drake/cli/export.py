@@ -6,10 +6,6 @@ from pathlib import Path
 
 __all__ = ["add_parser"]
 
-AGREES = 1e-6
-"""Difference of the force from the record's, N, up to which the run is the same: it is printed with
-eight digits."""
-
 DESCRIPTION = """\
 Write a run that `sliceit simulate` left in FOLDER as a time series for ParaView.
 
@@ -45,40 +41,26 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 def _run(options: argparse.Namespace) -> int:
     """Runs the command."""
-    from sliceit_drake.configuration import ConfigurationError
-
-    for name in ("scenario.yaml", "record.csv"):
-        if not (options.folder / name).is_file():
-            raise ConfigurationError(
-                f"there is no {name}",
-                source=str(options.folder),
-                fix="Give the folder that `sliceit simulate --output FOLDER` wrote.",
-            )
-
-    import numpy as np
     from tqdm import tqdm
 
-    from sliceit_drake.diagrams.outputs.paraview import FoodFrames, write_series
-    from sliceit_drake.diagrams.run import prepare_run
-    from sliceit_drake.diagrams.scenario import load_scenario
-    from sliceit_drake.tables import read_columns
+    from sliceit_drake.diagrams.outputs.paraview import write_series
+    from sliceit_drake.diagrams.outputs.run_again import run_again
 
     logging.getLogger("drake").setLevel(logging.WARNING)
-    kept = read_columns(options.folder / "record.csv", ["time", "food_wrench_f_z"])
-    prepared = prepare_run(load_scenario(options.folder / "scenario.yaml"))
-    frames = FoodFrames(prepared, options.fps)
-    duration = float(kept["time"][-1])
     shown = "{desc}: {percentage:3.0f}%|{bar}| {n:.2f}/{total:.2f} s"
-    with tqdm(total=duration, desc=prepared.scenario.name, bar_format=shown) as bar:
-        prepared.advance(duration, lambda time, _: (bar.update(time - bar.n), None)[1])
-    force = prepared.record()["food_wrench_f_z"]
-    count = min(len(force), len(kept["time"]))
-    difference = float(np.abs(force[:count] - kept["food_wrench_f_z"][:count]).max())
-    if difference > AGREES * max(1.0, float(np.abs(force).max())):
+    with tqdm(desc=options.folder.name, bar_format=shown, total=0.0) as bar:
+
+        def show(time: float, duration: float) -> None:
+            bar.total = duration
+            bar.update(time - bar.n)
+
+        again = run_again(options.folder, options.fps, show)
+    if not again.agrees:
         print(
-            f"This run differs from the record by up to {difference:.3g} N: it was made by another"
-            " version or on another machine. The series is of this run."
+            f"This run differs from the record by up to {again.difference:.3g} N: it was made by"
+            " another version or on another machine. The series is of this run."
         )
-    files = write_series(frames, options.output or options.folder / "paraview", options.format)
-    print(f"{len(frames)} frames. Open in ParaView: {', '.join(map(str, files))}")
+    output = options.output or options.folder / "paraview"
+    files = write_series(again.frames, output, options.format)
+    print(f"{len(again.frames)} frames. Open in ParaView: {', '.join(map(str, files))}")
     return 0

@@ -55,46 +55,25 @@ def _run(options: argparse.Namespace) -> int:
 
     from tqdm import tqdm
 
-    from sliceit_drake.configuration import ConfigurationError, dump_yaml, validate
-    from sliceit_drake.cutting.foods.food import Food, make_food_model
-    from sliceit_drake.cutting.motion import Hold, MotionPlan, PressAndDraw, Retract
-    from sliceit_drake.cutting.motion_optimization import MotionLimits, optimize_motion
+    from sliceit_drake.configuration import dump_yaml
+    from sliceit_drake.cutting.motion import PressAndDraw
+    from sliceit_drake.cutting.motion_optimization import MotionLimits
+    from sliceit_drake.diagrams.optimized_scenario import optimize_scenario
 
-    scenario = scenario_of(options)
-    if not isinstance(scenario.food, Food) or scenario.sequence is not None:
-        raise ConfigurationError(
-            "has no single cut of finite elements",
-            field="scenario.food",
-            fix="Give a scenario such as scenarios/cucumber.yaml.",
-        )
     limits = MotionLimits(
         duration=options.duration,
         draw_speed=options.draw_speed,
         draw_acceleration=options.draw_acceleration,
         margin=options.margin,
     )
-    validate(limits, "limits")
-    model = make_food_model(scenario.food, scenario.knife, scenario.numerics)
     with tqdm(desc="slices", unit="slice") as bar:
 
         def show(count: int, force: float, motion: PressAndDraw) -> None:
             bar.set_postfix_str(f"{force:.2f} N", refresh=False)
             bar.update(count - bar.n)
 
-        found = optimize_motion(
-            model,
-            limits,
-            period=scenario.exchange_period,
-            iterations=options.iterations,
-            progress=show,
-        )
+        scenario, found = optimize_scenario(scenario_of(options), limits, options.iterations, show)
     motion = found.motion
-    # A robot starts and stops; and the edge starts above the food.
-    down = scenario.start.clearance + model.top - model.bottom
-    slicing = dc.replace(motion, distance=down + 2e-4, acceleration=limits.draw_acceleration)
-    retract = Retract(down + 0.01, 0.05, 0.5, label="retract")
-    scenario.policy = None
-    scenario.motion = MotionPlan([slicing, Hold(0.1, label="hold"), retract])
     options.output.mkdir(parents=True, exist_ok=True)
     dump_yaml(scenario, options.output / "scenario.yaml")
     summary = dc.asdict(found)

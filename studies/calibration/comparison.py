@@ -17,9 +17,9 @@ from matplotlib.figure import Figure
 from scipy.optimize import minimize_scalar
 
 from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate
+from sliceit_drake.calibration.per_point import fit_points
 from sliceit_drake.calibration.result import Calibration
 from sliceit_drake.calibration.setup import load_setup
-from sliceit_drake.cli.calibrate import fit_points_shown
 from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.records.validation import load_record
@@ -64,6 +64,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _points_rms(result: Calibration, steps: int) -> float:
+    """Error with a toughness for each cut point, N."""
+    with StageBars() as bars:
+        points = fit_points(
+            result.predictor,
+            result.unit,
+            steps,
+            lambda done, error: bars.show_error("each point", done, steps, error),
+        )
+    return points.rms
+
+
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
     comparisons = []
@@ -89,7 +101,7 @@ def run(options: argparse.Namespace) -> int:
         result.save(folder, command)
         comparison = compare(result, profile, minutes)
         if options.point_steps:
-            comparison.per_point_rms = fit_points_shown(result, options.point_steps).rms
+            comparison.per_point_rms = _points_rms(result, options.point_steps)
         comparisons.append(comparison)
         for line in result.posterior.remarks():
             print(f"{food}: {line}")
