@@ -5,6 +5,8 @@ from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from studies.results import write_json
+
 __all__ = ["percent", "publish", "render", "table"]
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -59,9 +61,17 @@ def render(name: str, **values: object) -> str:
     return ENVIRONMENT.get_template(f"{name}.md").render(values)
 
 
-def publish(text: str, file: Path | None) -> None:
-    """Prints a text and writes it to a file, whose folder is made; None is no file."""
+def publish(text: str, file: Path | None, results: object = None) -> None:
+    """Prints a page and writes it, with its results as JSON beside it.
+
+    Args:
+        text: The page.
+        file: To write; its folder is made. None for none.
+        results: What the page shows, see `results.plain`; None for nothing beside it.
+    """
     print(text)
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text.rstrip("\n") + "\n", encoding="utf-8")
+        if results is not None:
+            write_json(file.with_suffix(".json"), results)

@@ -1,13 +1,17 @@
-"""What a study measured, as JSON with the command and the machine that measured it."""
+"""What a study measured, as JSON."""
 
 import argparse
+import dataclasses as dc
 import json
 import os
 import platform
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-__all__ = ["add_json_argument", "describe_machine", "write_results"]
+import numpy as np
+
+__all__ = ["add_json_argument", "describe_machine", "plain", "write_json", "write_results"]
 
 QUIET = 0.5
 """Load above which other work is in the numbers too."""
@@ -33,8 +37,30 @@ def write_results(options: argparse.Namespace, values: Mapping[str, float]) -> N
         "machine": f"{os.cpu_count()} cores ({platform.machine()}), {load}",
         "values": {name: float(f"{value:.4g}") for name, value in values.items()},
     }
-    options.json.parent.mkdir(parents=True, exist_ok=True)
-    options.json.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    write_json(options.json, facts)
+
+
+def write_json(file: Path, results: object) -> None:
+    """Writes results, made `plain`; the folder is made."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(plain(results), indent=1) + "\n", encoding="utf-8")
+
+
+def plain(value: Any) -> Any:
+    """Results as dictionaries, lists, strings and numbers to six digits.
+
+    Args:
+        value: Of these, or of dataclasses, tuples and arrays.
+    """
+    if dc.is_dataclass(value):
+        return {field.name: plain(getattr(value, field.name)) for field in dc.fields(value)}
+    if isinstance(value, dict):
+        return {name: plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 def describe_machine() -> str:

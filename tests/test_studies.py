@@ -7,12 +7,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from studies.__main__ import main, study_list
 from studies.pages import publish, render, table
 from studies.registry import TOPICS, study_parser
-from studies.results import write_results
+from studies.results import plain, write_results
 
 ROOT = Path(__file__).resolve().parent.parent
 STUDIES = [study for studies in TOPICS.values() for study in studies]
@@ -80,7 +81,9 @@ def test_tables_stand_in_no_other_module():
 def test_a_page_without_one_of_its_values_is_refused(tmp_path):
     with pytest.raises(Exception, match="'command' is undefined"):
         render("endurance")
-    publish("text", tmp_path / "a" / "page.md")
+    publish("text", tmp_path / "a" / "page.md", {"values": np.array([1.0, 2.0 / 3.0])})
+    results = json.loads((tmp_path / "a" / "page.json").read_text(encoding="utf-8"))
+    assert results == {"values": [1.0, 0.666667]} and plain((1, "x", None)) == [1, "x", None]
     assert (tmp_path / "a" / "page.md").read_text(encoding="utf-8") == "text\n"
 
 

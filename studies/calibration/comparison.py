@@ -105,7 +105,11 @@ def run(options: argparse.Namespace) -> int:
         comparisons.append(comparison)
         for line in result.posterior.remarks():
             print(f"{food}: {line}")
-    publish(comparison_tables(comparisons), options.output / "calibration.md")
+    results = [
+        {"food": c.food, "minutes": c.minutes, "per_point_rms": c.per_point_rms, "rows": c.rows}
+        for c in comparisons
+    ]
+    publish(comparison_tables(comparisons), options.output / "calibration.md", results)
     plot_comparisons(comparisons, options.output / "calibration.png")
     return 0
 

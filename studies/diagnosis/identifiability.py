@@ -141,7 +141,7 @@ def run(options: argparse.Namespace) -> int:
         found = study(
             protocols, causes, options.refinement, options.cache, options.workers, progress
         )
-    publish(report(found), options.output)
+    publish(report(found), options.output, found.results)
     if options.figure is not None:
         plot_angles(found, options.figure)
     return 0

@@ -120,7 +120,8 @@ def run(options: argparse.Namespace) -> int:
         command += f" --refinement {options.refinement:g}"
     if options.foods != list(FOODS):
         command += f" --foods {' '.join(options.foods)}"
-    publish(page(items, REPLICATES, command), file)
+    results = {i.food: {name: each.facts() for name, each in i.results.items()} for i in items}
+    publish(page(items, REPLICATES, command), file, results)
     return 0
 
 

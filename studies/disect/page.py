@@ -47,8 +47,27 @@ def run(options: argparse.Namespace) -> int:
     figure = options.output / "figures" / "disect.png"
     plot_disect(study, figure)
     page = disect_page(study, "python -m studies disect --output docs", minutes)
-    publish(page, options.output / "disect.md")
+    publish(page, options.output / "disect.md", _numbers(study))
     return 0
+
+
+def _numbers(study: DisectStudy) -> dict[str, Any]:
+    """The results without models and states."""
+    kept = ("height", "norms", "resultant", "vertical", "broken", "intact", "opening_energy")
+
+    def curves(result: CaseResult) -> dict[str, Any]:
+        return {name: getattr(result, name) for name in kept}
+
+    return {
+        "contact_stiffness": study.contact_stiffness,
+        "runs": [(run.name, curves(result)) for run, result in study.runs],
+        "delays": study.delays,
+        "laws": study.laws,
+        "opening": curves(study.opening),
+        "full": curves(study.full),
+        "differences": study.differences,
+        "measured": [(item.food, item.flank_stiffness, item.curves) for item in study.measured],
+    }
 
 
 def disect_page(study: DisectStudy, command: str, minutes: float) -> str:

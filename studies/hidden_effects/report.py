@@ -11,7 +11,6 @@ is. In place of its folder such a file of runs will do.
 """
 
 import argparse
-import json
 import math
 import tempfile
 from collections import Counter
@@ -39,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
-    folder, found = options.output, {}
+    folder = options.output
     with tempfile.TemporaryDirectory() as unpacked:
         study = options.study
         if study.is_file():
@@ -49,13 +48,10 @@ def run(options: argparse.Namespace) -> int:
         if folder is not None:
             pack(study, folder / "hidden_effects.jsonl")
     text = report(judgements, folder and "figures/hidden_effects.png", facts)
-    publish(text, folder and folder / "hidden_effects.md")
-    if folder is not None:
-        found = numbers(judgements)
-        file = folder / "hidden_effects.json"
-        file.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
-        if found["curves"]:
-            plot_curves(judgements, folder / "figures" / "hidden_effects.png")
+    found = numbers(judgements)
+    publish(text, folder and folder / "hidden_effects.md", found)
+    if folder is not None and found["curves"]:
+        plot_curves(judgements, folder / "figures" / "hidden_effects.png")
     return 0
 
 

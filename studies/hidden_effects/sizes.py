@@ -111,7 +111,8 @@ def run(options: argparse.Namespace) -> int:
     protocols = [ProtocolSizes(name, options.cache) for name in options.protocols]
     with tqdm(total=len(effects) * len(protocols), desc="sizes") as bar:
         text = sizes_as_markdown(protocols, effects, bar.update)
-    publish(text, options.output)
+    curves = {sizes.name: [sizes.curve(effect) for effect in effects] for sizes in protocols}
+    publish(text, options.output, curves)
     return 0
 
 

@@ -80,9 +80,8 @@ def run(options: argparse.Namespace) -> int:
         )
     figures = options.output / "figures"
     figures.mkdir(parents=True, exist_ok=True)
-    publish(comparison_page(found), options.output / "slicing_results.md")
-    facts = json.dumps([_facts(each) for each in found], indent=1) + "\n"
-    (options.output / "slicing_results.json").write_text(facts, encoding="utf-8")
+    page = options.output / "slicing_results.md"
+    publish(comparison_page(found), page, [_facts(each) for each in found])
     boards = sorted({each.board_stiffness for each in found})
     usual = boards[len(boards) // 2]
     plot_boxes(

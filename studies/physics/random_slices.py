@@ -73,15 +73,16 @@ def run(options: argparse.Namespace) -> int:
     try:
         with worker_processes(options.workers, "forkserver") as pool:
             seeds = [options.seed] * options.count
-            results = pool.map(cut_drawn, seeds, range(options.count))
-            outcomes.extend(tqdm(results, total=options.count, desc="slices"))
+            cuts = pool.map(cut_drawn, seeds, range(options.count))
+            outcomes.extend(tqdm(cuts, total=options.count, desc="slices"))
     except KeyboardInterrupt:
         if not outcomes:
             raise
         interrupted = True  # What was asked for has no page then.
     page = random_slices_page(outcomes, options.seed, options.command)
     folder = None if interrupted else options.output
-    publish(page, folder and folder / "random_slices.md")
+    results = {"command": options.command, "seed": options.seed, "slices": outcomes}
+    publish(page, folder and folder / "random_slices.md", results)
     if interrupted:
         print(f"Interrupted: this is of the first {len(outcomes)} of {options.count} slices.")
         return 130

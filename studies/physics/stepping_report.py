@@ -88,9 +88,9 @@ def run(options: argparse.Namespace) -> int:
         study.mass_table(results),
         study.cost_table(costs),
     ]
+    stations: list[tuple[str, list[StationStep]]] = []
     if not options.quick:
         cut = scenarios[0]
-        stations = []
         for name, scenario in (
             (cut.name, cut),
             (f"{cut.name}, held half way", held_half_way(cut)),
@@ -99,7 +99,8 @@ def run(options: argparse.Namespace) -> int:
                 stations.append((name, station_steps(scenario, STATION_STEPS, _mover(bar))))
         tables.append(station_table(stations))
     folder = options.output
-    publish("\n\n".join(tables), folder and folder / "stepping.md")
+    measured = {"costs": costs, "stations": dict(stations)}
+    publish("\n\n".join(tables), folder and folder / "stepping.md", measured)
     if folder is not None:
         write_stepping(results, costs, folder / "stepping.csv")
         plot_stepping(results, costs, folder / "stepping.png")

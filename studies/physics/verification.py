@@ -11,6 +11,7 @@ from sliceit_drake.cutting.foods.material import Material
 from studies.physics import bulk_checks as bulk
 from studies.physics import contact_checks, convergence
 from studies.physics.measured_curves import MeasuredCut, MeasuredFood, cut_measured_food
+from studies.results import plain
 
 __all__ = [
     "CHECKS",
@@ -92,9 +93,8 @@ def _check_physics(progress: Callable[[], None]) -> dict[str, Any]:
         "mesh": dc.asdict(convergence.refine_mesh(cucumber(), DEPTH, REFINEMENTS, progress)),
         "step": dc.asdict(convergence.refine_step(cucumber(), DEPTH, DIVISORS, progress)),
     }
-    rounded = _rounded(results)
-    assert isinstance(rounded, dict)
-    return rounded
+    numbers: dict[str, Any] = plain(results)
+    return numbers
 
 
 def food_numbers(case: MeasuredFood, cut: MeasuredCut) -> dict[str, Any]:
@@ -130,19 +130,8 @@ def food_numbers(case: MeasuredFood, cut: MeasuredCut) -> dict[str, Any]:
         },
         "budget": dc.asdict(budget),
     }
-    rounded = _rounded(numbers)
-    assert isinstance(rounded, dict)
+    rounded: dict[str, Any] = plain(numbers)
     return rounded
-
-
-def _rounded(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _rounded(item) for name, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_rounded(item) for item in value]
-    if isinstance(value, float):
-        return float(f"{value:.6g}")
-    return value
 
 
 @dc.dataclass

@@ -6,7 +6,6 @@ a number is beyond its limit.
 """
 
 import argparse
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -62,15 +61,12 @@ def run(options: argparse.Namespace) -> int:
         curves.save_measured_foods(foods, file, "python -m studies verification --fit")
     with tqdm(total=CHECKS + len(foods.foods), desc="checks") as bar:
         results, cuts = run_verification(foods.foods, lambda: bar.update() and None)
-    publish(verification_page(results), options.output)
+    publish(verification_page(results), options.output, results)
     if options.output is not None:
-        output: Path = options.output
-        figures = output.parent / "figures"
+        figures = options.output.parent / "figures"
         named = [(case.food.name, cut) for case, cut in zip(foods.foods, cuts, strict=True)]
         plot_measured_cuts(named, figures / "verification_curves.png")
         plot_convergence(results, figures / "verification_convergence.png")
-        text = json.dumps(results, indent=1, allow_nan=True)
-        output.with_suffix(".json").write_text(text + "\n", encoding="utf-8")
     missed = [limit.what for limit in limits(results) if not limit.holds]
     for what in missed:
         print(f"beyond its limit: {what}")

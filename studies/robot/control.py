@@ -100,7 +100,8 @@ def run(options: argparse.Namespace) -> int:
     ]
     text = "\n\n".join([check_table(checks), factor_table(rows), box_table(runs)])
     folder = options.output
-    publish(text, folder and folder / "control.md")
+    results = {"checks": checks, "factors": rows, "runs": runs}
+    publish(text, folder and folder / "control.md", results)
     if folder is not None:
         plot_stability_map(gains, limits, checks, folder / "control.png")
     return 0

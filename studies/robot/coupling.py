@@ -45,7 +45,7 @@ def run(options: argparse.Namespace) -> int:
     scenario = scenario_of(options)
     with tqdm(total=len(COMBINATIONS), desc="runs") as bar:
         cases = coupling_study(scenario, COMBINATIONS, lambda done, _: bar.update(done - bar.n))
-    publish(coupling_table(cases), options.output)
+    publish(coupling_table(cases), options.output, cases)
     return 0
 
 

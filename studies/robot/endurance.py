@@ -123,5 +123,6 @@ def run(options: argparse.Namespace) -> int:
         python=f"{sys.version_info.major}.{sys.version_info.minor}",
         pydrake=version("drake"),
     )
-    publish(page, options.output)
+    results = {"hours": hours, "held_MB": held, "growth_MB_an_hour": slope, "left_MB": built}
+    publish(page, options.output, results)
     return 0 if slope <= GROWTH else 1

@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> int:
     ]
     with tqdm(total=2 * len(configs), desc="runs") as bar:
         cases = servo_study(configs, lambda done, _: bar.update(done - bar.n))
-    publish(servo_table(cases), options.output)
+    publish(servo_table(cases), options.output, cases)
     return 0
 
 
