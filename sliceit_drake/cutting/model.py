@@ -76,7 +76,11 @@ class Numerics:
         5e-3, "s", low=0.0, high=1.0, doc="Damping over stiffness of the food on the board."
     )
     unloading_length: float = quantity(
-        1e-4, "m", low=1e-6, high=1e-2, doc="Retreat of the edge over which its force vanishes."
+        1e-4,
+        "m",
+        low=1e-6,
+        high=1e-2,
+        doc="Retreat of the edge over which its force vanishes; less where it rises more steeply.",
     )
     direction_length: float = quantity(
         2e-4, "m", low=1e-7, high=1e-2, doc="Travel over which the edge's direction follows."

@@ -108,7 +108,13 @@ def _acceleration_field() -> typing.Any:
 class ConstantSpeed:
     """Straight motion at constant speed, over a distance or for a duration (give one of them)."""
 
-    speed: float = quantity(0.02, "m/s", low=1e-6, high=2.0, doc="Speed between the ramps.")
+    speed: float = quantity(
+        0.02,
+        "m/s",
+        low=1e-6,
+        high=2.0,
+        doc="Speed between the ramps; not reached on a path too short for them.",
+    )
     direction: list[float] = quantity(
         [0.0, 0.0, 1.0], "", size=3, doc="Direction in K at the start; its length does not matter."
     )
@@ -208,7 +214,13 @@ class Retract:
     """Straight withdrawal against the cutting direction."""
 
     distance: float = quantity(0.05, "m", low=1e-6, high=1.0, doc="Distance to travel along -z.")
-    speed: float = quantity(0.05, "m/s", low=1e-6, high=2.0, doc="Speed between the ramps.")
+    speed: float = quantity(
+        0.05,
+        "m/s",
+        low=1e-6,
+        high=2.0,
+        doc="Speed between the ramps; not reached on a path too short for them.",
+    )
     acceleration: float | None = _acceleration_field()
     label: str = "retract"
 
