@@ -21,6 +21,7 @@ from sphinx.application import Sphinx
 from sphinx.ext.autodoc.mock import mock
 from sphinx.util import logging
 
+import sliceit_drake
 from sliceit_drake.cli.main import make_parser
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -98,9 +99,56 @@ def modules(package: str) -> list[str]:
     return [f"{package}.{file.stem}" for file in files if file.stem != "__init__"]
 
 
+EXTENSION_POINTS = (
+    "KnifeForceSystem",
+    "PolicyAction",
+    "PolicySystem",
+    "MotionSource",
+    "Cause",
+    "CauseParameter",
+    "Scan",
+    "Effect",
+)
+"""What a user subclasses, or gives and connects in place of ours."""
+GROUPS = {
+    "Simulate a slice": ("diagrams", "configuration", "resources"),
+    "Foods, knives, cuts without a robot": ("cutting",),
+    "Systems and policies": ("systems",),
+    "Records": ("records",),
+    "Calibration": ("calibration",),
+    "Diagnosis": ("diagnosis",),
+    "Simulated bench": ("stand_in",),
+    "Learning": ("learning",),
+    "Robot": ("hardware", "robot_run", "emulator"),
+}
+"""Names of the front door by the folder that they come from."""
+
+
+def front_door() -> list[str]:
+    """The names of `import sliceit_drake as sliceit`, by what they are for."""
+    groups: dict[str, list[str]] = {title: [] for title in [*GROUPS, "Extension points"]}
+    for home, names in sliceit_drake._HOME.items():
+        (title,) = (t for t, folders in GROUPS.items() if home.partition(".")[0] in folders)
+        for name in names:
+            groups["Extension points" if name in EXTENSION_POINTS else title].append(name)
+    lines = []
+    for title, names in groups.items():
+        lines += [title, "-" * len(title), ""]
+        for name in names:
+            is_class = name[0].isupper() and name != "MakeStation"
+            kind = "autoclass" if is_class else "autofunction"
+            lines += [f".. {kind}:: {project}.{name}", ""]
+    title = "Modules"
+    lines += [title, "-" * len(title), ""]
+    for name, home in sliceit_drake._MODULES.items():
+        lines += [f"- ``{name}``: :py:mod:`{project}.{home}`"]
+    return [*lines, ""]
+
+
 def package_page(package: str) -> str:
     """The docstring of a package, then each of its modules with the names of its `__all__`."""
     lines = [package, "=" * len(package), "", f".. automodule:: {package}", "   :no-members:", ""]
+    lines += front_door() if package == project else []
     for module in modules(package):
         title = module.removeprefix(f"{package}.")
         lines += [title, "-" * len(title), "", f".. automodule:: {module}", ""]
@@ -167,11 +215,16 @@ def write_api(app: Sphinx) -> None:
             file.write_text(text, encoding="utf-8")
 
 
+def api_pages() -> list[Path]:
+    """The front door first, then the packages."""
+    return sorted(API.iterdir(), key=lambda file: (file.stem != project, file.name))
+
+
 def order_pages(app: Sphinx, docname: str, content: list[str]) -> None:
     """Gives each section of the index a table of contents, of what it links to."""
     if docname != root_doc:
         return
-    api = "".join(f"- [{file.stem}](api/{file.name})\n" for file in sorted(API.iterdir()))
+    api = "".join(f"- [{file.stem}](api/{file.name})\n" for file in api_pages())
     text = f"{content[0]}\n## Commands and API\n\n{api}"
     first, *sections = re.split(r"^(?=## )", text, flags=re.M)
     for k, section in enumerate(sections):
@@ -192,6 +245,10 @@ def open_at_the_index(app: Sphinx, exception: Exception | None) -> None:
 def check_names(app: Sphinx, env) -> None:
     """Warns of a public name that no page has."""
     shown = env.get_domain("py").objects
+    for names in sliceit_drake._HOME.values():
+        for name in names:
+            if f"{project}.{name}" not in shown:
+                logging.getLogger(__name__).warning("%s is on no page", name)
     for package in packages():
         for module in modules(package):
             with mock(autodoc_mock_imports):

@@ -6,8 +6,8 @@ first used, so that importing the package stays light.
     run = sliceit.simulate("cucumber", {"food.material.toughness": 300.0})
     run.save("output/softer")
 
-Five of the names are modules: `motions` (knife motions), `shapes` (shapes of foods), `parameters`
-(named values of a prepared cut), `ports` (the port contract of a station), `viewer` (Meshcat).
+Six of the names are modules: `motions` (of the knife), `shapes` (of foods), `parameters` (of a
+prepared cut), `ports` (of a station), `preprocessing` (of records), `viewer` (Meshcat).
 """
 
 import importlib
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from sliceit_drake.cutting import motion as motions
     from sliceit_drake.cutting import parameters as parameters
     from sliceit_drake.cutting.batch import simulate_batch
-    from sliceit_drake.cutting.foods import food as shapes
+    from sliceit_drake.cutting.foods import shapes as shapes
     from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood, load_calibrated_food
     from sliceit_drake.cutting.foods.effects import Effects
     from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from sliceit_drake.cutting.model import Numerics
     from sliceit_drake.cutting.motion_optimization import optimize_motion
     from sliceit_drake.cutting.named_knife import load_knife
-    from sliceit_drake.diagnosis.cause import Cause, CauseParameter
+    from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan
     from sliceit_drake.diagnosis.diagnose import diagnose, setup_of_food
     from sliceit_drake.diagnosis.one_slice.diagnose_slice import diagnose_slice
     from sliceit_drake.diagnosis.registry import load_cause
@@ -51,8 +51,9 @@ if TYPE_CHECKING:
     from sliceit_drake.learning.task import TaskConfig, station_scenario
     from sliceit_drake.learning.training import train
     from sliceit_drake.learning.training_config import TrainingConfig
+    from sliceit_drake.records import preprocessing as preprocessing
     from sliceit_drake.records.slice_record import SliceRecord, write_record
-    from sliceit_drake.records.validation import load_record, load_records
+    from sliceit_drake.records.validation import check_record, load_record, load_records
     from sliceit_drake.resources import resource_path
     from sliceit_drake.robot_run.hardware_run import prepare_hardware_run
     from sliceit_drake.stand_in.effect import Effect
@@ -94,6 +95,7 @@ __all__ = [
     "PolicySystem",
     "Protocol",
     "Run",
+    "Scan",
     "Scenario",
     "SliceAdjoint",
     "SliceRecord",
@@ -104,6 +106,7 @@ __all__ = [
     "UrClient",
     "add_recorder",
     "calibrate",
+    "check_record",
     "cut_slice",
     "diagnose",
     "diagnose_slice",
@@ -122,6 +125,7 @@ __all__ = [
     "parameters",
     "ports",
     "prepare_hardware_run",
+    "preprocessing",
     "randomize",
     "record_session",
     "resource_path",
@@ -152,7 +156,7 @@ _HOME = {
     "cutting.model": ("Numerics",),
     "cutting.motion_optimization": ("optimize_motion",),
     "cutting.named_knife": ("load_knife",),
-    "diagnosis.cause": ("Cause", "CauseParameter"),
+    "diagnosis.cause": ("Cause", "CauseParameter", "Scan"),
     "diagnosis.diagnose": ("diagnose", "setup_of_food"),
     "diagnosis.one_slice.diagnose_slice": ("diagnose_slice",),
     "diagnosis.registry": ("load_cause",),
@@ -171,7 +175,7 @@ _HOME = {
     "learning.training": ("train",),
     "learning.training_config": ("TrainingConfig",),
     "records.slice_record": ("SliceRecord", "write_record"),
-    "records.validation": ("load_record", "load_records"),
+    "records.validation": ("check_record", "load_record", "load_records"),
     "resources": ("resource_path",),
     "robot_run.hardware_run": ("prepare_hardware_run",),
     "stand_in.effect": ("Effect",),
@@ -190,7 +194,8 @@ _MODULES = {
     "motions": "cutting.motion",
     "parameters": "cutting.parameters",
     "ports": "diagrams.ports",
-    "shapes": "cutting.foods.food",
+    "preprocessing": "records.preprocessing",
+    "shapes": "cutting.foods.shapes",
     "viewer": "diagrams.live_view",
 }
 """Modules under the names that they have here."""

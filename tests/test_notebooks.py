@@ -106,6 +106,13 @@ def test_a_stored_notebook_has_no_outputs_and_says_what_its_cells_are(path):
     )
 
 
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_uses_nothing_of_ours_but_the_front_door(path):
+    code = [cell.source for cell in nbformat.read(path, as_version=4).cells]
+    imports = re.findall(r"^ *(?:from|import) sliceit_drake.*$", "\n".join(code), re.M)
+    assert set(imports) == {"import sliceit_drake as sliceit"}
+
+
 # --- As they run.
 
 

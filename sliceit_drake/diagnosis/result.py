@@ -269,8 +269,9 @@ class Diagnosis:
             "remarks": self.remarks,
         }
 
-    def save(self, directory: Path, report: bool = True) -> None:
+    def save(self, directory: str | Path, report: bool = True) -> None:
         """Writes diagnosis.json, extended.yaml and, if wanted, report.html."""
+        directory = Path(directory)
         directory.mkdir(parents=True, exist_ok=True)
         text = json.dumps(self.facts(), indent=2) + "\n"
         (directory / "diagnosis.json").write_text(text, encoding="utf-8")
