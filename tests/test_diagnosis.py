@@ -57,6 +57,23 @@ def test_variation_between_slices_is_that_of_replicates():
     assert found.variation[0] == pytest.approx(VARIATION / 0.05, rel=0.3)
 
 
+def test_rows_that_do_not_count_say_nothing():
+    whole = problem(3)
+    rows = slice(100, 110)
+    grams = []
+    for spoiled in (0.0, 50.0):
+        records = [dc.replace(r, compared=r.compared.copy()) for r in whole.found.records]
+        for r in records:
+            r.compared[rows] = False
+            r.measured = r.measured.copy()
+            r.measured[rows] += spoiled
+        found = Sensitivities(whole.found.columns, records)
+        same = LinearProblem(found, whole.noise, whole.variation)
+        grams.append(same.moments.gram[0])
+    np.testing.assert_allclose(grams[1], grams[0], atol=2e-3 * np.abs(grams[0]).max())
+    assert grams[0][-1, -1] > 0.0
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_nothing_is_named_where_nothing_is_hidden(seed):
     assert reach_verdict(problem(10 + seed), 60, seed).kind == "nothing"

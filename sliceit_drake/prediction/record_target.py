@@ -118,9 +118,7 @@ class RecordTarget:
         near_food: bool = False,
     ) -> None:
         self.record, self.models, self.clock = record, models, clock
-        self._margin = 2e-3
-        if near_food:
-            self._margin = CLEARANCE + max(abs(v) for v in bench.height_offset)
+        self._margin = CLEARANCE + max(abs(v) for v in bench.height_offset)
         self.knife = knife_of(bench.knife, record)
         metadata, unknown = record.metadata, set(record.metadata.unknown)
         self.height_unknown = "p_WK_z" in unknown or "food.position" in unknown

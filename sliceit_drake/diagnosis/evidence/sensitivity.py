@@ -330,6 +330,7 @@ def _empty(
         depth=target.depth,
         path=np.interp(target.time, target.grid, way),
         in_contact=in_contact,
+        compared=target.compared,
         measured=target.measured,
         predicted=predicted,
         columns=np.zeros((*predicted.shape, columns), np.float32),

@@ -140,7 +140,7 @@ def diagnose_slice(
         progress=lambda done, total: show("simulations", done, total),
     )
     whole = found.records[0]
-    kept = whole.time < whole.time[-1] - END
+    kept = whole.compared & (whole.time < whole.time[-1] - END)
     found = _rows(found, kept)
     evidence = slice_evidence(
         found, fit.jacobian[kept], _priors(fit), block[kept], replicates, seed, _own_columns(fit)

@@ -55,7 +55,8 @@ class FittedSlice:
         """RMS error of the forces of a prediction, N."""
         keep = [k for k, c in enumerate(self.record.channels) if c.startswith("force")]
         rest = (self.record.measured - predicted)[:, keep]
-        rest = rest if rows is None else rest[rows]
+        compared = self.record.compared
+        rest = rest[compared if rows is None else compared & rows]
         return float(np.sqrt((rest**2).sum(1).mean())) if len(rest) else 0.0
 
     def by_depth(self) -> list[tuple[str, int, float, float, float]]:

@@ -244,7 +244,7 @@ class _Work:
 
     def fit(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         (predicted,) = self.predict([theta])
-        everything = np.ones(len(predicted), bool)
+        everything = self.target.compared
         cost = self.cost(theta, predicted, everything)
         if not np.isfinite(cost):
             raise CuttingError(
@@ -275,10 +275,11 @@ class _Work:
         predicts. The first step is taken even where it makes the rest a little worse: as good a
         fit to the rest as it can tell, and one without the rows.
         """
-        cost = AS_GOOD * self.cost(theta, predicted, ~rows)
+        others = ~rows & self.target.compared
+        cost = AS_GOOD * self.cost(theta, predicted, others)
         for _ in range(HELD_OUT_STEPS):
-            aim = self.refit(theta, predicted, jacobian, ~rows, free)
-            tries, seen, costs = self.search(theta, aim, ~rows)
+            aim = self.refit(theta, predicted, jacobian, others, free)
+            tries, seen, costs = self.search(theta, aim, others)
             # The longest step that is nearly as good as the best one.
             best = int(np.argmax(np.array(costs) <= AS_GOOD * min(costs)))
             if not costs[best] < (1.0 - ENOUGH) * cost:
