@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 from scipy.optimize import minimize_scalar
 
 from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate
@@ -24,6 +23,7 @@ from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.records.validation import load_record
 from sliceit_drake.resources import resource_path
+from studies.figures import new_figure, save_figure
 from studies.pages import publish, table
 
 __all__ = [
@@ -245,7 +245,7 @@ def comparison_tables(comparisons: Sequence[FoodComparison]) -> str:
 
 def plot_comparisons(comparisons: Sequence[FoodComparison], file: Path) -> None:
     """Measured and simulated curves of all foods, with what ours leaves."""
-    figure = Figure(figsize=(4.6 * len(comparisons), 4.6), layout="constrained")
+    figure = new_figure(4.6 * len(comparisons), 4.6)
     axes = figure.subplots(
         2,
         len(comparisons),
@@ -272,4 +272,4 @@ def plot_comparisons(comparisons: Sequence[FoodComparison], file: Path) -> None:
             axis.grid(alpha=0.25)
     axes[0, 0].set_ylabel("force [N]")
     axes[1, 0].set_ylabel("error [N]")
-    figure.savefig(file, dpi=150)
+    save_figure(figure, file, 150)

@@ -16,6 +16,7 @@ from sliceit_drake.diagnosis.experiments.identifiability import (
     classes,
     short,
 )
+from studies.figures import new_figure, save_figure
 from studies.pages import render
 
 __all__ = ["Study", "plot_angles", "report"]
@@ -141,14 +142,10 @@ def _protocol(result: Identifiability) -> dict[str, object]:
 
 def plot_angles(study: Study, file: Path) -> None:
     """Draws the angles of all protocols."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     count = len(study.results)
     # One below the other, so that the names can be read.
-    figure, axes = plt.subplots(count, 1, figsize=(8.0, 7.6 * count), layout="constrained")
+    figure = new_figure(8.0, 7.6 * count)
+    axes = figure.subplots(count, 1)
     image = None
     for axis, result in zip(np.atleast_1d(axes), study.results, strict=True):
         show = np.flatnonzero(result.visible)
@@ -176,6 +173,4 @@ def plot_angles(study: Study, file: Path) -> None:
         )
     if image is not None:
         figure.colorbar(image, ax=axes, shrink=0.5, aspect=40, location="top", label="angle [deg]")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=110)
-    plt.close(figure)
+    save_figure(figure, file, 110)

@@ -28,6 +28,7 @@ from sliceit_drake.diagnosis.one_slice.slice_result import OneSlice
 from sliceit_drake.output_folder import check_folder
 from sliceit_drake.records.validation import load_record
 from sliceit_drake.resources import resource_path
+from studies.figures import save_figure
 from studies.pages import publish, render
 
 __all__ = ["SIMULATIONS", "MeasuredSlice", "add_arguments", "draw", "page", "run"]
@@ -143,8 +144,7 @@ def draw(item: MeasuredSlice, folder: Path) -> Path:
     titles = [f"{item.food}: {SIMULATIONS[name]}" for name in item.results]
     figure = slice_figure(list(item.results.values()), titles)
     file = folder / f"one_slice_{item.food}.png"
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=110)
+    save_figure(figure, file, 110)
     return file
 
 

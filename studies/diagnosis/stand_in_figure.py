@@ -4,8 +4,6 @@ import argparse
 import dataclasses as dc
 from pathlib import Path
 
-import matplotlib
-import matplotlib.pyplot as plt
 import numpy as np
 
 from sliceit_drake.records.slice_record import SliceRecord
@@ -15,12 +13,11 @@ from sliceit_drake.stand_in.effect_registry import EFFECTS
 from sliceit_drake.stand_in.protocol import Protocol, Variation, load_protocol
 from sliceit_drake.stand_in.sensor_model import SensorModel
 from sliceit_drake.stand_in.session import Session
-
-matplotlib.use("Agg")
+from studies.figures import BLUE, RED, new_figure, save_figure
 
 __all__ = ["add_arguments", "run"]
 
-GREY, BLUE, ORANGE = "0.55", "#0072b2", "#d55e00"
+GREY = "0.55"
 FIGURE = Path(__file__).resolve().parents[2] / "docs/figures/stand_in.png"
 CONDITIONS = {"slice_push_law": "draw_1", "holder_compliance": "draw_1", "serrated_edge": "draw_1"}
 CONDITIONS |= {"board_law": "board", "tool_weight": "air"}
@@ -67,7 +64,8 @@ def run(options: argparse.Namespace) -> int:
     """Runs the study."""
     plain = {label: cut(label, []) for label in {"press", *CONDITIONS.values()}}
     rows = -(-len(EFFECTS) // COLUMNS)
-    figure, axes = plt.subplots(rows, COLUMNS, figsize=(12, 1.75 * rows), layout="constrained")
+    figure = new_figure(12, 1.75 * rows)
+    axes = figure.subplots(rows, COLUMNS)
     for axis, (name, kind) in zip(axes.flat, EFFECTS.items(), strict=False):
         label = CONDITIONS.get(name, "press")
         record, without = cut(label, [kind()]), plain[label]
@@ -75,7 +73,7 @@ def run(options: argparse.Namespace) -> int:
         axis.plot(without.time, vertical(without), color=GREY, lw=1.8)
         axis.plot(without.time, lateral(without, side), color=GREY, lw=1.8, ls=":")
         axis.plot(record.time, vertical(record), color=BLUE, lw=0.9)
-        axis.plot(record.time, lateral(record, side), color=ORANGE, lw=0.9, ls=":")
+        axis.plot(record.time, lateral(record, side), color=RED, lw=0.9, ls=":")
         size = f"{kind.typical:g} {kind.unit}".strip()
         normal = ", normal" if side else ""
         axis.set_title(f"{name} {size} ({label}{normal})", fontsize=8)
@@ -89,6 +87,5 @@ def run(options: argparse.Namespace) -> int:
         "blade (dotted):\nwithout an effect (grey) and with one (colour)",
         fontsize=10,
     )
-    figure.savefig(FIGURE, dpi=90)
-    print(f"wrote {FIGURE}")
+    save_figure(figure, FIGURE, 90)
     return 0

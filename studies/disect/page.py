@@ -22,6 +22,7 @@ from studies.disect import case as disect
 from studies.disect.case import Case, CaseResult
 from studies.disect.settings import SETTINGS
 from studies.disect.study import STEPS, Curve, DisectStudy, MeasuredCurves, disect_study
+from studies.figures import BLUE, ORANGE, PURPLE, new_figure, save_figure, tidy
 from studies.pages import publish, render
 from studies.physics.measured_curves import load_measured_foods
 
@@ -269,7 +270,7 @@ def _classes(types: Iterable[object]) -> list[type]:
     return out
 
 
-COLOURS = {"sum of norms": "#E69F00", "resultant": "#0072B2"}
+COLOURS = {"sum of norms": ORANGE, "resultant": BLUE}
 STYLES = {"opening law alone": "--", "full model": "-"}
 
 
@@ -280,11 +281,7 @@ def plot_disect(study: DisectStudy, file: Path) -> None:
         study: The results.
         file: PNG to write.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.0, 7.6), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(10.0, 7.6)
     panels = figure.subplots(2, 2, sharey=True).ravel()
     nominal = study.reference.runs[0]
     axes = panels[0]
@@ -326,7 +323,7 @@ def plot_disect(study: DisectStudy, file: Path) -> None:
                 style = dict(color="black", lw=2.4, label="measured")
             elif curve.name.startswith("DiSECt"):
                 label = "DiSECt, calibrated: sum of norms"
-                style = dict(color="#CC79A7", lw=2.4, ls=":", label=label)
+                style = dict(color=PURPLE, lw=2.4, ls=":", label=label)
             else:
                 style = dict(color=COLOURS[curve.measure], ls=STYLES[curve.name], lw=1.5)
             axes.plot(item.profile.time, np.where(curve.force > 0.0, curve.force, np.nan), **style)
@@ -336,8 +333,7 @@ def plot_disect(study: DisectStudy, file: Path) -> None:
     for axes in panels:
         axes.set_yscale("log")
         axes.set_ylim(0.03, 400.0)
-        axes.grid(alpha=0.25)
-        axes.spines[["top", "right"]].set_visible(False)
+        tidy(axes)
     for axes in panels[::2]:
         axes.set_ylabel("force on the knife [N]")
     handles: dict[str, Any] = {}
@@ -351,5 +347,4 @@ def plot_disect(study: DisectStudy, file: Path) -> None:
         frameon=False,
         fontsize=9,
     )
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=130)
+    save_figure(figure, file)

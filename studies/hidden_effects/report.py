@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from studies.figures import new_figure, save_figure
 from studies.hidden_effects.archive import pack, unpack
 from studies.hidden_effects.cases import KINDS
 from studies.hidden_effects.score import NAMING, Judgement, Rate, judge_study, rate
@@ -317,12 +318,8 @@ def _curve_rows(
 
 def plot_curves(judgements: Sequence[Judgement], file: Path) -> None:
     """Draws how often each effect is named rightly against its strength."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     named = _curves(judgements, lambda j: j.right)
-    figure = Figure(figsize=(6.4, 4.0), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(6.4, 4.0)
     axes = figure.add_subplot()
     for k, (effect, points) in enumerate(named.items()):
         deltas = list(points)
@@ -338,5 +335,4 @@ def plot_curves(judgements: Sequence[Judgement], file: Path) -> None:
     axes.set_ylim(-0.05, 1.05)
     axes.set_title("One hidden cause in the rich protocol")
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=130)
+    save_figure(figure, file)

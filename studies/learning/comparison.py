@@ -21,6 +21,7 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.learning.evaluation import SliceTrace
 from sliceit_drake.learning.metrics import Ratio, bootstrap_ratio
 from sliceit_drake.learning.unseen_worlds import Case, trace
+from studies.figures import new_figure, save_figure
 from studies.pages import publish, render
 
 __all__ = [
@@ -260,10 +261,8 @@ def plot_boxes(found: Sequence[Comparison], file: Path) -> None:
         found: Of one board stiffness.
         file: .png.
     """
-    from matplotlib.figure import Figure
-
     worlds = list(dict.fromkeys(each.world for each in found))
-    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    figure = new_figure(9.0, 3.6)
     axes = figure.subplots(1, len(worlds), sharey=True, squeeze=False)[0]
     for axis, world in zip(axes, worlds, strict=True):
         here = [each for each in found if each.world == world]
@@ -286,7 +285,7 @@ def plot_boxes(found: Sequence[Comparison], file: Path) -> None:
     axes[0].set_ylabel("median contact force of a slice [N]")
     axes[0].set_ylim(bottom=0.0)
     axes[0].legend(loc="upper left", fontsize=8)
-    figure.savefig(file, dpi=110)
+    save_figure(figure, file, 110)
 
 
 def plot_two_slices(traces: Mapping[str, Sequence[SliceTrace]], file: Path) -> None:
@@ -296,10 +295,8 @@ def plot_two_slices(traces: Mapping[str, Sequence[SliceTrace]], file: Path) -> N
         traces: By simulator: slices.
         file: .png.
     """
-    from matplotlib.figure import Figure
-
     count = max(len(slices) for slices in traces.values())
-    figure = Figure(figsize=(9.0, 3.4), layout="constrained")
+    figure = new_figure(9.0, 3.4)
     axes = figure.subplots(1, count, sharey=True, squeeze=False)[0]
     for kind, slices in traces.items():
         for axis, cut in zip(axes, slices, strict=False):
@@ -323,4 +320,4 @@ def plot_two_slices(traces: Mapping[str, Sequence[SliceTrace]], file: Path) -> N
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("normal force on the knife [N]")
     axes[0].legend(fontsize=8, title="trained with (shaded: on the board)", title_fontsize=8)
-    figure.savefig(file, dpi=110)
+    save_figure(figure, file, 110)

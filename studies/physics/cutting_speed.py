@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import warp as wp
-from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from sliceit_drake.cutting.batch import simulate_batch
@@ -29,6 +28,7 @@ from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.resources import resource_path
+from studies.figures import new_figure, save_figure
 from studies.pages import table
 from studies.results import add_json_argument, write_results
 
@@ -201,7 +201,7 @@ def run(options: argparse.Namespace) -> int:
 
 def plot(rows: list, times: dict[str, float], workers: list[int], file: Path) -> None:
     """Cost against mesh and against batch size."""
-    figure = Figure(figsize=(8.0, 3.2), layout="constrained")
+    figure = new_figure(8.0, 3.2)
     mesh, batch = figure.subplots(1, 2)
     counts = [row[0] for row in rows]
     mesh.loglog(counts, [row[2] for row in rows], "o-", color="#c2410c")
@@ -218,4 +218,4 @@ def plot(rows: list, times: dict[str, float], workers: list[int], file: Path) ->
     batch.legend(frameon=False)
     for axes in (mesh, batch):
         axes.grid(alpha=0.25)
-    figure.savefig(file, dpi=150)
+    save_figure(figure, file, 150)

@@ -8,8 +8,8 @@ that is commanded; for what only a draw shows the knife is drawn as well, by twi
 import argparse
 from pathlib import Path
 
-import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from tqdm import tqdm
 
 from sliceit_drake.cutting.batch import BatchSlice, simulate_batch
@@ -31,11 +31,10 @@ from sliceit_drake.cutting.foods.shapes import Box
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan, Retract
-
-matplotlib.use("Agg")
+from studies.figures import BLUE, new_figure, save_figure
 
 WIDTH, HEIGHT, DEPTH, CLEARANCE, PERIOD, HOLD, SPEED = 0.024, 0.02, 0.014, 1e-3, 2e-3, 0.5, 0.02
-BASE, CHANGED, DRAW = "0.55", "#0072b2", 2.0
+BASE, CHANGED, DRAW = "0.55", BLUE, 2.0
 
 # Title, size, group; the last shows the force along the edge.
 PANELS = [
@@ -78,9 +77,7 @@ def motions(model: CuttingModel) -> dict[bool, Motion]:
     return out
 
 
-def draw(
-    axes: "matplotlib.axes.Axes", command: np.ndarray, cut: BatchSlice, axis: int, style: dict
-) -> None:
+def draw(axes: Axes, command: np.ndarray, cut: BatchSlice, axis: int, style: dict) -> None:
     """Force over the commanded depth on the way in and out, and in between over time, at rest."""
     stop = round((DEPTH + CLEARANCE) / SPEED / PERIOD)
     held = round(HOLD / PERIOD)
@@ -120,16 +117,13 @@ def run(options: argparse.Namespace) -> int:
             progress=lambda done: bar.update(done - bar.n),
         )
     figure_of(cuts, drawn, options.output)
-    print(f"wrote {options.output}")
     return 0
 
 
 def figure_of(cuts: list[BatchSlice], drawn: list[bool], output: Path) -> None:
     """Panels of three, with the phases of the motion marked."""
-    import matplotlib.pyplot as plt
-
-    plt.rcParams.update({"font.size": 9, "axes.titlesize": 10})
-    figure, grid = plt.subplots(3, 3, figsize=(10.0, 7.4), sharex=True, layout="constrained")
+    figure = new_figure(10.0, 7.4)
+    grid = figure.subplots(3, 3, sharex=True)
     for k, (axes, (title, size, group)) in enumerate(zip(grid.flat, PANELS, strict=True)):
         axis = 0 if isinstance(group, Slip) else 2
         base = cuts[int(drawn[2 + k])]
@@ -143,7 +137,7 @@ def figure_of(cuts: list[BatchSlice], drawn: list[bool], output: Path) -> None:
             axis,
             {"color": CHANGED, "lw": 1.4, "label": "with the effect"},
         )
-        axes.set_title(f"{title}", loc="left", fontweight="bold", pad=16)
+        axes.set_title(title, loc="left", fontsize=10, fontweight="bold", pad=16)
         axes.text(0.0, 1.03, size, transform=axes.transAxes, color="0.35", fontsize=8.5)
         low, high = axes.get_ylim()
         axes.set_ylim(low, high + 0.16 * (high - low))
@@ -169,5 +163,4 @@ def figure_of(cuts: list[BatchSlice], drawn: list[bool], output: Path) -> None:
     figure.suptitle(
         "What each effect changes in the force of the food on the knife", x=0.01, ha="left"
     )
-    output.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(output, dpi=160)
+    save_figure(figure, output, 160)

@@ -9,7 +9,6 @@ import argparse
 import dataclasses as dc
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 
 from sliceit_drake.cutting.foods.material import Material
@@ -18,9 +17,8 @@ from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.mesh.split import CutPlane
 from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh
 from sliceit_drake.cutting.model import Numerics, make_cutting_model
+from studies.figures import ORANGE, new_figure, save_figure
 from studies.physics.neo_hookean import small_strain_stiffness
-
-matplotlib.use("Agg")
 
 BODIES: dict[str, Box | Cylinder | Ellipsoid] = {
     "box": Box(divisions=[4, 4]),
@@ -121,17 +119,15 @@ def run(options: argparse.Namespace) -> int:
             )
 
     draw(relative, options.output)
-    print(f"wrote {options.output}")
     return 0
 
 
 def draw(relative: dict[str, dict[str, np.ndarray]], output: Path) -> None:
     """Histogram of the limits: all terms and bulk alone."""
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
+    figure = new_figure(6.4, 3.8)
+    axes = figure.subplots()
     bins = np.linspace(0.3, 1.1, 41).tolist()
-    styles = {"all": ("0.35", "all terms"), "bulk": ("#e69f00", "bulk alone")}
+    styles = {"all": ("0.35", "all terms"), "bulk": (ORANGE, "bulk alone")}
     for key, (colour, label) in styles.items():
         values = np.concatenate([body[key] for body in relative.values()])
         axes.hist(
@@ -142,5 +138,4 @@ def draw(relative: dict[str, dict[str, np.ndarray]], output: Path) -> None:
     count = sum(len(body["all"]) for body in relative.values())
     axes.set_title(f"Step limit of {count} random cuts, relative to the uncut body")
     axes.legend(loc="upper left")
-    output.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(output, dpi=160)
+    save_figure(figure, output, 160)

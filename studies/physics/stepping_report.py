@@ -24,6 +24,7 @@ from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.resources import resource_path
+from studies.figures import BLUE, GREEN, ORANGE, PURPLE, RED, new_figure, save_figure
 from studies.pages import publish, table
 from studies.physics import stepping as study
 from studies.physics.stepping import StepCost, StepResult
@@ -263,19 +264,16 @@ def write_stepping(results: Sequence[StepResult], costs: Sequence[StepCost], fil
 
 def plot_stepping(results: Sequence[StepResult], costs: Sequence[StepCost], file: Path) -> None:
     """Draws the error over the cost of a simulated second, a panel for each food, scaled masses."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
     from matplotlib.ticker import NullFormatter
 
     cost = {(c.food, c.time_step): c.seconds for c in costs}
     foods = list(dict.fromkeys(r.case.food.name for r in results))
     speeds = sorted({r.case.press_speed for r in results})
     # Okabe and Ito's palette by motion, marker and line by speed.
-    colours = {"press": "#0072B2", "press and retract": "#E69F00", "draw": "#009E73"}
-    colours |= {"hold after a sudden stop": "#D55E00", "hold after a ramp": "#CC79A7"}
+    colours = {"press": BLUE, "press and retract": ORANGE, "draw": GREEN}
+    colours |= {"hold after a sudden stop": RED, "hold after a ramp": PURPLE}
     styles = dict(zip(speeds, (("--", "o"), ("-", "s")), strict=False))
-    figure = Figure(figsize=(4.0 * len(foods), 4.6), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(4.0 * len(foods), 4.6)
     panels = figure.subplots(1, len(foods), sharey=True, squeeze=False)[0]
     for axes, food in zip(panels, foods, strict=True):
         of_food = [r for r in results if r.case.food.name == food and r.scaled]
@@ -318,4 +316,4 @@ def plot_stepping(results: Sequence[StepResult], costs: Sequence[StepCost], file
     )
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
-    figure.savefig(file, dpi=150)
+    save_figure(figure, file, 150)

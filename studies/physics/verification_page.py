@@ -14,6 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from sliceit_drake.resources import resource_path
+from studies.figures import BLUE, RED, new_figure, save_figure, tidy
 from studies.pages import percent, publish, render
 from studies.physics import measured_curves as curves
 from studies.physics.measured_curves import MeasuredCut
@@ -186,32 +187,25 @@ def plot_measured_cuts(cuts: Sequence[tuple[str, MeasuredCut]], file: Path) -> N
         cuts: By the food's name.
         file: PNG to write.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12.0, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(12.0, 4.2)
     for axes, (name, cut) in zip(figure.subplots(1, len(cuts)), cuts, strict=True):
         profile, comparison = cut.profile, cut.comparison
         axes.plot(profile.time, profile.force, color="#000000", lw=2.0, label="measured")
-        for reference, colour, style in (("DiSECt", "#D55E00", "--"), ("spring", "0.6", ":")):
+        for reference, colour, style in (("DiSECt", RED, "--"), ("spring", "0.6", ":")):
             force = profile.references[reference]
             rms = float(np.sqrt(np.mean((force - profile.force) ** 2)))
             label = f"{'calibrated DiSECt' if reference == 'DiSECt' else reference}: {rms:.2f} N"
             axes.plot(profile.time, force, style, color=colour, lw=1.5, label=label)
         label = f"ours: {comparison.rms:.2f} N"
-        axes.plot(profile.time, comparison.simulated, color="#0072B2", lw=1.5, label=label)
-        axes.set_title(name, loc="left", fontsize=11)
+        axes.plot(profile.time, comparison.simulated, color=BLUE, lw=1.5, label=label)
         axes.set_xlabel("time [s]")
         axes.set_ylim(0.0, 1.45 * max(profile.force.max(), comparison.simulated_peak))
-        axes.grid(alpha=0.25)
-        axes.spines[["top", "right"]].set_visible(False)
+        tidy(axes, name)
         axes.legend(
             frameon=False, fontsize=8, loc="upper left", title="RMS error", title_fontsize=8
         )
     figure.axes[0].set_ylabel("force on the knife [N]")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=130)
+    save_figure(figure, file)
 
 
 def plot_convergence(results: Mapping[str, Any], file: Path) -> None:
@@ -221,11 +215,7 @@ def plot_convergence(results: Mapping[str, Any], file: Path) -> None:
         results: Of `run_verification`.
         file: PNG to write.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.4, 3.8), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(8.4, 3.8)
     panels = figure.subplots(1, 2)
     mesh, step = results["mesh"], results["step"]
     parts = (
@@ -235,17 +225,15 @@ def plot_convergence(results: Mapping[str, Any], file: Path) -> None:
     for axes, (part, scale, label, slope, title) in zip(panels, parts, strict=True):
         size = scale * np.array(part["size"][:-1])
         error = 100.0 * np.array(part["error"])
-        axes.loglog(size, error, "o-", color="#0072B2", label="against the finest")
+        axes.loglog(size, error, "o-", color=BLUE, label="against the finest")
         guide = error[0] * (size / size[0]) ** slope
         axes.loglog(size, guide, "--", color="0.5", label=f"order {slope:g}")
         axes.set_xticks(size, [f"{x:.3g}" for x in size])
         axes.set_yticks(error, [f"{e:.2g}" for e in error])
         axes.minorticks_off()
         axes.set_xlabel(label)
-        axes.set_title(title, loc="left", fontsize=11)
+        tidy(axes, title)
         axes.grid(alpha=0.25, which="both")
-        axes.spines[["top", "right"]].set_visible(False)
         axes.legend(frameon=False, fontsize=8)
     panels[0].set_ylabel("RMS error of the force [%]")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=130)
+    save_figure(figure, file)

@@ -31,6 +31,7 @@ from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 from sliceit_drake.systems.servo import ServoConfig
+from studies.figures import BLUE, GREEN, ORANGE, PURPLE, RED, new_figure, save_figure
 from studies.pages import publish, table
 
 __all__ = [
@@ -469,19 +470,15 @@ def plot_stability_map(
         checks: Of the station.
         file: PNG to write.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.0, 4.6), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(10.0, 4.6)
     modes = list(dict.fromkeys(mode for mode, _ in limits))
     lags = list(dict.fromkeys(lag for _, lag in limits))
-    colours = ["#000000", "#0072B2", "#D55E00", "#009E73", "#CC79A7"]
+    colours = ["#000000", BLUE, RED, GREEN, PURPLE]
     styles = [":", "-", "--", "-.", "-"]
     panels = figure.subplots(1, len(modes), sharey=True)
     for axes, mode in zip(np.atleast_1d(panels), modes, strict=True):
-        axes.axhspan(*FOOD_STIFFNESS, color="#009E73", alpha=0.25, lw=0)
-        axes.axhspan(*BOARD_STIFFNESS, color="#E69F00", alpha=0.18, lw=0)
+        axes.axhspan(*FOOD_STIFFNESS, color=GREEN, alpha=0.25, lw=0)
+        axes.axhspan(*BOARD_STIFFNESS, color=ORANGE, alpha=0.18, lw=0)
         axes.text(gains[0], 4.5e3, " vegetables", va="center", fontsize=8)
         axes.text(gains[0], 3.2e5, " boards", va="center", fontsize=8)
         for lag, colour, style in zip(lags, colours, styles, strict=False):
@@ -509,5 +506,4 @@ def plot_stability_map(
     first.plot([], [], "o", mfc="white", color="0.3", label="station: dies out")
     first.plot([], [], "x", color="0.3", label="station: grows")
     first.legend(frameon=False, fontsize=7.5, labelspacing=0.25, loc="lower left")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=150)
+    save_figure(figure, file, 150)
