@@ -1,4 +1,25 @@
-"""Which causes the residuals support: likelihood ratios, calibrated by a bootstrap of records."""
+"""Which causes the residuals support: likelihood ratios, calibrated by a bootstrap of records.
+
+Let X_r be the columns of record r, y_r its residual, N_r the covariance of its noise. All that is
+needed of a record is its Gram matrix
+
+    G_r = [X_r y_r]' N_r^-1 [X_r y_r],
+
+of a measurement its *products* with the columns, X_r' N_r^-1 y_r: n measurements are given by their
+products [n, R, K], those at hand by the last column of G_r. Two steps lead to a gain:
+
+1. Coefficients that are each record's own (columns E, normal, of variance V) are integrated out:
+   *reduced* A_r = G_r - G_r[:, E] (G_r[E, E] + V^-1)^-1 G_r[E, :], and so the products.
+2. The *baseline*, what all records share and what is fitted in any case (columns F, of precision P
+   before the data), is projected out of A, the sum of A_r over the records:
+   *projected* A - A[:, F] (A[F, F] + P)^-1 A[F, :], and so the products.
+
+The *gain* of a cause with columns C is the likelihood-ratio statistic, twice the gain in
+log-likelihood by its coefficients: b' A[C, C]^-1 b, with b the projected products at C. What it is
+*by chance* is seen from measurements that are drawn where nothing is wrong.
+
+The *null* of a parameter is the value at which its cause is absent.
+"""
 
 import dataclasses as dc
 from collections.abc import Callable, Sequence
@@ -16,8 +37,8 @@ CORRECTION_VARIANCE = 1e4
 UNUSUAL = 0.98
 """Quantile of the gain beyond the usual from which on what a sensor has a little of is a cause."""
 LEAST_DEVIATION = 0.5
-"""Least standard deviation of a gain where nothing is wrong: one that is always nought there is no
-proof of anything by being a little more."""
+"""Least standard deviation of a gain by chance: a cause that never gains by chance is not proved by
+a gain of next to nothing."""
 PRESENT = 5.0
 """Gain for each number of a cause from which on it shows in a record."""
 JITTER = 1e-9
@@ -71,7 +92,7 @@ class CauseEvidence:
 
     @property
     def deviations(self) -> float:
-        """Gain beyond its mean under the null, in its standard deviations there."""
+        """Gain beyond its mean by chance, in its standard deviations there."""
         return (self.gain - self.expected) / max(self.deviation, LEAST_DEVIATION)
 
 
@@ -81,7 +102,7 @@ class Screening:
 
     Attributes:
         causes: By decreasing score.
-        p_value: Of the largest gain over all causes, in standard deviations, under the null.
+        p_value: Of the largest gain over all causes, in standard deviations by chance.
         misfit: Gain by the nonparametric correction of each condition: all that could be gained.
         expected_misfit: Its mean where nothing is wrong.
         misfit_p_value: Of `misfit`.
@@ -128,22 +149,29 @@ class _Statistics:
     """Gains of all causes, given what is assumed already.
 
     The columns are the same whatever was measured, so that all that is solved is solved once and
-    many measurements [n] are tested in one go. A measurement is given by its products with the
-    columns of each record [n, R, K]. Gains are differences, so that its square is not needed.
+    many measurements [n] are tested in one go. Gains are differences, so that a measurement's
+    square is not needed, only its products.
+
+    Attributes:
+        baseline, own: Numbers of the columns F and E of the module's formulas.
+        own_extra: Those of E that belong to causes that are assumed.
+        options: Of each cause and value of its scan the numbers of its columns.
+        reduced: A_r of each record [K, K].
+        projected: A beside the baseline [K, K].
     """
 
     def __init__(self, problem: LinearProblem, assumed: Sequence[tuple[str, float | None]]) -> None:
         self.problem = problem
         found = problem.found
         self.prior = problem.prior()
-        self.null = [*problem.base, *problem.numerical, *problem.spline, *problem.usual]
+        self.baseline = [*problem.base, *problem.numerical, *problem.spline, *problem.usual]
         self.own_extra: list[int] = []
         for name, scan in assumed:
             columns = found.index("cause", name, scan)
             if found.columns[columns[0]].per_record:
                 self.own_extra += columns
             else:
-                self.null += columns
+                self.baseline += columns
         # At another value of its scan an assumed cause may still add something.
         self.options: list[tuple[str, float | None, list[int]]] = [
             (name, scan, found.index("cause", name, scan))
@@ -159,16 +187,16 @@ class _Statistics:
         own, variance = problem.own_prior()
         variance = np.concatenate([variance, np.full(len(self.own_extra), FLAT)])
         self.own = [*own, *self.own_extra]
-        y = problem.size
+        K = problem.size
         self.reduced, self.own_weights = [], []
         for G in problem.moments.gram:
-            A, weights, _ = _integrated(G[:y, :y], self.own, variance)
+            A, weights, _ = _integrated(G[:K, :K], self.own, variance)
             self.reduced.append(A)
             self.own_weights.append(weights)
         total = np.sum(self.reduced, axis=0)
-        self.null_covariance = self._null_covariance(total)
-        self.null_weights = total[:, self.null] @ self.null_covariance
-        self.projected = total - self.null_weights @ total[self.null]
+        self.baseline_covariance = self._baseline_covariance(total)
+        self.baseline_weights = total[:, self.baseline] @ self.baseline_covariance
+        self.projected = total - self.baseline_weights @ total[self.baseline]
         self._eliminated = {
             columns[0]: self._eliminate([[r] for r in range(len(self.reduced))], columns, FLAT)
             for name, _, columns in self.options
@@ -178,9 +206,10 @@ class _Statistics:
             list(problem.conditions.values()), problem.correction, CORRECTION_VARIANCE
         )
 
-    def _null_covariance(self, total: np.ndarray) -> np.ndarray:
-        null = self.null
-        return scaled_inverse(total[np.ix_(null, null)] + np.diag(self.prior[null]))
+    def _baseline_covariance(self, total: np.ndarray) -> np.ndarray:
+        """(A[F, F] + P)^-1 of a summed Gram matrix [F, F]."""
+        F = self.baseline
+        return scaled_inverse(total[np.ix_(F, F)] + np.diag(self.prior[F]))
 
     def _eliminate(
         self, groups: Sequence[Sequence[int]], columns: list[int], variance: float
@@ -192,33 +221,33 @@ class _Statistics:
             total += A
             weights.append(weight)
             inverses.append(inverse)
-        return _Eliminated(groups, columns, weights, inverses, self._null_covariance(total))
+        return _Eliminated(groups, columns, weights, inverses, self._baseline_covariance(total))
 
-    def products(self, b: np.ndarray) -> np.ndarray:
-        """Without what is each record's own [n, R, K]."""
-        own = b[:, :, self.own]
-        out = b.copy()
+    def reduce(self, products: np.ndarray) -> np.ndarray:
+        """Products with what is each record's own integrated out [n, R, K]."""
+        own = products[:, :, self.own]
+        out = products.copy()
         for r, weights in enumerate(self.own_weights):
             out[:, r] -= own[:, r] @ weights.T
         return out
 
     def project(self, reduced: np.ndarray) -> np.ndarray:
-        """Products with all columns beside the null's [n, K]."""
+        """Sum over the records of reduced products with the baseline projected out [n, K]."""
         total = reduced.sum(1)
-        return np.asarray(total - total[:, self.null] @ self.null_weights.T)
+        return np.asarray(total - total[:, self.baseline] @ self.baseline_weights.T)
 
     def gains(
-        self, b: np.ndarray
+        self, products: np.ndarray
     ) -> tuple[dict[str, tuple[np.ndarray, list[float | None]]], np.ndarray, np.ndarray]:
         """Of each cause the largest gains [n] and their scans; gains by a correction of each
-        condition [n]; and the products beside the null's columns [n, K]."""
-        reduced = self.products(b)
+        condition [n]; and the products beside the baseline [n, K]."""
+        reduced = self.reduce(products)
         projected = self.project(reduced)
-        of_null = _squares(reduced.sum(1)[:, self.null], self.null_covariance)
+        of_baseline = _squares(reduced.sum(1)[:, self.baseline], self.baseline_covariance)
         out: dict[str, tuple[np.ndarray, list[float | None]]] = {}
         for name, scan, columns in self.options:
             if self.per_record[name]:
-                gain = self._eliminated[columns[0]].gain(reduced, self.null) - of_null
+                gain = self._eliminated[columns[0]].gain(reduced, self.baseline) - of_baseline
             else:
                 gain = self._bounded(projected, columns)[0]
             if name not in out:
@@ -228,7 +257,7 @@ class _Statistics:
             better = gain > before
             scans = [scan if new else old for new, old in zip(better, scans, strict=True)]
             out[name] = np.where(better, gain, before), scans
-        return out, self._corrected.gain(reduced, self.null) - of_null, projected
+        return out, self._corrected.gain(reduced, self.baseline) - of_baseline, projected
 
     def _bounded(
         self, projected: np.ndarray, columns: list[int]
@@ -257,7 +286,7 @@ class _Statistics:
             values[better], errors[better] = value[better], error[better]
         return best, values, errors
 
-    def gain_with_usual(self, b: np.ndarray, columns: list[int]) -> float:
+    def gain_with_usual(self, products: np.ndarray, columns: list[int]) -> float:
         """Gain of a cause for one measurement [1, R, K] against a model without what is usual of
         it; 0 for one of which nothing is usual."""
         problem = self.problem
@@ -267,46 +296,48 @@ class _Statistics:
         own, variance = problem.own_prior(without=columns)
         variance = np.concatenate([variance, np.full(len(self.own_extra), FLAT)])
         own = [*own, *self.own_extra]
-        null = [k for k in self.null if k not in mine]
+        baseline = [k for k in self.baseline if k not in mine]
         prior = self.prior.copy()
         prior[columns] = 0.0
-        y = problem.size
-        total, products = np.zeros((y, y)), np.zeros(y)
-        for G, measured in zip(problem.moments.gram, b[0], strict=True):
-            A, weights, _ = _integrated(G[:y, :y], own, variance)
+        K = problem.size
+        total, left = np.zeros((K, K)), np.zeros(K)
+        for G, measured in zip(problem.moments.gram, products[0], strict=True):
+            A, weights, _ = _integrated(G[:K, :K], own, variance)
             total = total + A
-            products = products + measured - weights @ measured[own]
+            left = left + measured - weights @ measured[own]
         gains = []
-        for chosen in (null, [*null, *columns]):
+        for chosen in (baseline, [*baseline, *columns]):
             inner = total[np.ix_(chosen, chosen)] + np.diag(prior[chosen])
-            seen = products[chosen]
+            seen = left[chosen]
             gains.append(float(seen @ scaled_inverse(inner) @ seen))
         return gains[1] - gains[0]
 
-    def coefficients(self, b: np.ndarray, columns: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    def coefficients(
+        self, products: np.ndarray, columns: list[int]
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Of a cause's columns for one measurement [1, R, K]; where each record has its own their
         mean and its standard error."""
-        reduced = self.products(b)
+        reduced = self.reduce(products)
         kinds = self.problem.found.columns
         if not kinds[columns[0]].per_record:
             _, value, error = self._bounded(self.project(reduced), columns)
             return value[0], error[0]
-        own = self.own_fits(b, columns)[0]
+        own = self.own_fits(products, columns)[0]
         own = own[np.abs(own).max(1) > 0.0]
         if not len(own):
             return np.zeros(len(columns)), np.full(len(columns), np.inf)
         spread = np.std(own, axis=0, ddof=1) if len(own) > 1 else np.full(len(columns), np.inf)
         return np.mean(own, axis=0), spread / np.sqrt(len(own))
 
-    def own_fits(self, b: np.ndarray, columns: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    def own_fits(self, products: np.ndarray, columns: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """Coefficients of columns for each record by itself [R, n], and what they gain there [R];
         0 where a record knows nothing of them."""
-        out, gains = np.zeros((b.shape[1], len(columns))), np.zeros(b.shape[1])
-        for r, (A, y) in enumerate(zip(self.reduced, self.products(b)[0], strict=True)):
+        out, gains = np.zeros((products.shape[1], len(columns))), np.zeros(products.shape[1])
+        for r, (A, b) in enumerate(zip(self.reduced, self.reduce(products)[0], strict=True)):
             inner = A[np.ix_(columns, columns)]
             if np.diag(inner).min() > 1e-9:
-                out[r] = np.linalg.lstsq(inner, y[columns], rcond=1e-9)[0]
-                gains[r] = float(out[r] @ y[columns])
+                out[r] = np.linalg.lstsq(inner, b[columns], rcond=1e-9)[0]
+                gains[r] = float(out[r] @ b[columns])
         return out, gains
 
 
@@ -319,7 +350,7 @@ class _Eliminated:
         columns: Numbers of the columns.
         weights: Of each group [K, c].
         inverses: Of each group [c, c].
-        covariance: Of the null's columns with these integrated out.
+        covariance: Of the baseline's coefficients with these integrated out [F, F].
     """
 
     groups: Sequence[Sequence[int]]
@@ -328,14 +359,14 @@ class _Eliminated:
     inverses: list[np.ndarray]
     covariance: np.ndarray
 
-    def gain(self, reduced: np.ndarray, null: list[int]) -> np.ndarray:
-        """By these columns and the null's together [n]."""
+    def gain(self, reduced: np.ndarray, baseline: list[int]) -> np.ndarray:
+        """By these columns and the baseline together [n]."""
         gain, total = np.zeros(len(reduced)), np.zeros((len(reduced), reduced.shape[2]))
         for members, weight, inverse in zip(self.groups, self.weights, self.inverses, strict=True):
             b = reduced[:, members].sum(1)
             gain += _squares(b[:, self.columns], inverse)
             total += b - b[:, self.columns] @ weight.T
-        return gain + _squares(total[:, null], self.covariance)
+        return gain + _squares(total[:, baseline], self.covariance)
 
 
 def _squares(b: np.ndarray, inverse: np.ndarray) -> np.ndarray:
@@ -375,18 +406,18 @@ def screen(
         progress: Called with a number of replicates each time that these are done.
     """
     statistics = _Statistics(problem, assumed)
-    y = problem.size
-    measured = problem.moments.gram[None, :, :y, y]
+    K = problem.size
+    measured = problem.moments.gram[None, :, :K, K]
     gains, misfit, _ = statistics.gains(measured)
     draw = _Bootstrap(problem, np.random.default_rng(seed))
-    null_gains: dict[str, list[float]] = {name: [] for name in statistics.names}
-    null_misfits: list[float] = []
-    while len(null_misfits) < replicates:
-        count = min(BATCH, replicates - len(null_misfits))
+    chance_gains: dict[str, list[float]] = {name: [] for name in statistics.names}
+    chance_misfits: list[float] = []
+    while len(chance_misfits) < replicates:
+        count = min(BATCH, replicates - len(chance_misfits))
         own, of_correction, _ = statistics.gains(draw(count))
         for name, (gain, _) in own.items():
-            null_gains[name] += gain.tolist()
-        null_misfits += of_correction.tolist()
+            chance_gains[name] += gain.tolist()
+        chance_misfits += of_correction.tolist()
         if progress is not None:
             progress(count)
     evidence = []
@@ -401,15 +432,15 @@ def screen(
             shown = own_gains > kinds[0].searched + PRESENT * len(columns)
             presence = float(shown.sum() / max((own_gains > 0.0).sum(), 1))
         searched = _searched(problem, columns)
-        null_gains[name] = [g + searched for g in null_gains[name]]
-        null = np.array(null_gains[name])
+        chance_gains[name] = [g + searched for g in chance_gains[name]]
+        by_chance = np.array(chance_gains[name])
         evidence.append(
             CauseEvidence(
                 name=name,
                 gain=float(gain[0]),
-                expected=float(null.mean()),
-                deviation=float(null.std()),
-                limit=float(np.quantile(null, 0.95)),
+                expected=float(by_chance.mean()),
+                deviation=float(by_chance.std()),
+                limit=float(np.quantile(by_chance, 0.95)),
                 scan=scan,
                 parameters=[c.parameter for c in kinds],
                 coefficients=value.tolist(),
@@ -423,20 +454,20 @@ def screen(
         )
     means = np.array([[e.expected] for e in evidence])
     spreads = np.array([[max(e.deviation, LEAST_DEVIATION)] for e in evidence])
-    null = (np.array([null_gains[e.name] for e in evidence]) - means) / spreads
+    by_chance = (np.array([chance_gains[e.name] for e in evidence]) - means) / spreads
     largest = max(e.deviations for e in evidence)
-    p = (1.0 + (null.max(0) >= largest).sum()) / (replicates + 1.0)
+    p = (1.0 + (by_chance.max(0) >= largest).sum()) / (replicates + 1.0)
     for e in evidence:
-        if e.gain > float(np.quantile(null_gains[e.name], UNUSUAL)):
+        if e.gain > float(np.quantile(chance_gains[e.name], UNUSUAL)):
             columns = problem.found.index("cause", e.name, e.scan)
             e.gain = max(e.gain, statistics.gain_with_usual(measured, columns))
-    p_misfit = (1.0 + (np.array(null_misfits) >= misfit[0]).sum()) / (replicates + 1.0)
+    p_misfit = (1.0 + (np.array(chance_misfits) >= misfit[0]).sum()) / (replicates + 1.0)
     angles, visible = _angles(statistics)
     return Screening(
         causes=sorted(evidence, key=lambda e: -e.score),
         p_value=float(p),
         misfit=float(misfit[0]),
-        expected_misfit=float(np.mean(null_misfits)),
+        expected_misfit=float(np.mean(chance_misfits)),
         misfit_p_value=float(p_misfit),
         angles=angles,
         visible=visible,
@@ -456,20 +487,20 @@ class _Bootstrap:
 
     def __init__(self, problem: LinearProblem, rng: np.random.Generator) -> None:
         self.problem, self.rng = problem, rng
-        y = problem.size
-        self.gram = problem.moments.gram[:, :y, :y]
+        K = problem.size
+        self.gram = problem.moments.gram[:, :K, :K]
         scale = np.sqrt(np.maximum(np.diagonal(self.gram, axis1=1, axis2=2), 1e-30))
-        unit = self.gram / scale[:, :, None] / scale[:, None, :] + JITTER * np.eye(y)
+        unit = self.gram / scale[:, :, None] / scale[:, None, :] + JITTER * np.eye(K)
         self.roots = scale[:, :, None] * np.linalg.cholesky(unit)
 
     def __call__(self, number: int) -> np.ndarray:
         """Draws some [number, R, K]."""
         problem, rng = self.problem, self.rng
-        count, y = len(self.gram), problem.size
+        count, K = len(self.gram), problem.size
         samples = max(problem.variation_samples, 1)
         chi = rng.chisquare(samples, (number, 1, len(problem.own)))
         spread = problem.variation * np.sqrt(samples / np.maximum(chi, 0.1 * samples))
-        shared = np.zeros((number, 1, y))
+        shared = np.zeros((number, 1, K))
         for columns, deviation in (
             (problem.numerical, 1.0),
             (problem.spline, problem.discretisation),
@@ -482,8 +513,8 @@ class _Bootstrap:
         )
         for k, deviation in problem.usual_own.items():
             coefficients[:, :, k] += deviation * rng.normal(size=(number, count))
-        noise = rng.normal(size=(number, count, y))
-        out = np.empty((number, count, y))
+        noise = rng.normal(size=(number, count, K))
+        out = np.empty((number, count, K))
         for r in range(count):
             out[:, r] = coefficients[:, r] @ self.gram[r] + noise[:, r] @ self.roots[r].T
         return out
@@ -497,7 +528,7 @@ def _angles(statistics: _Statistics) -> tuple[np.ndarray, np.ndarray]:
     }
     norm = np.sqrt(np.maximum(np.diag(projected), 1e-12))
     cosine = np.abs(projected) / np.outer(norm, norm)
-    # What the null's columns take away entirely has no direction.
+    # What the baseline takes away entirely has no direction.
     seen = np.diag(projected) > 1e-6
     angles = np.full((len(names), len(names)), 90.0)
     visible = np.zeros(len(names))

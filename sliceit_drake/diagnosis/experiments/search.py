@@ -120,12 +120,14 @@ class ExperimentSearch:
     ) -> np.ndarray:
         """What is left of a summed Gram matrix beside what is fitted in any case."""
         problem = self.problem
-        null = [*problem.base, *problem.numerical, *problem.spline, *problem.usual]
+        baseline = [*problem.base, *problem.numerical, *problem.spline, *problem.usual]
         for name, scan in assumed:
-            null += problem.found.index("cause", name, scan)
-        null = list(dict.fromkeys(null))
-        inverse = scaled_inverse(total[np.ix_(null, null)] + np.diag(problem.prior()[null]))
-        return np.asarray(total - total[:, null] @ inverse @ total[null])
+            baseline += problem.found.index("cause", name, scan)
+        baseline = list(dict.fromkeys(baseline))
+        inverse = scaled_inverse(
+            total[np.ix_(baseline, baseline)] + np.diag(problem.prior()[baseline])
+        )
+        return np.asarray(total - total[:, baseline] @ inverse @ total[baseline])
 
     def _angles(self, total: np.ndarray) -> list[tuple[str, str, float, float]]:
         """Of each ordered pair the angle, degrees, and the expected gain."""

@@ -107,11 +107,11 @@ def slice_evidence(
     options = [(n, s, found.index("cause", n, s)) for n in found.causes for s in found.scans(n)]
     rng = np.random.default_rng(seed)
     best = _best_gains(problem, options, record.residual)
-    null = []
+    by_chance = []
     for _ in range(replicates):
         gains = _best_gains(problem, options, problem.sample(rng))
-        null.append([gains[name][0] for name in found.causes])
-    draws = np.array(null)
+        by_chance.append([gains[name][0] for name in found.causes])
+    draws = np.array(by_chance)
     mean, spread = draws.mean(0), np.maximum(draws.std(0), LEAST_SPREAD)
     largest = ((draws - mean) / spread).max(1)
     held_out = HeldOutDepth(problem, block, own)
