@@ -24,7 +24,7 @@ from sliceit_drake.prediction.placement import is_bare
 from sliceit_drake.prediction.record_target import Meshing, RecordTarget, make_targets
 from sliceit_drake.records.slice_record import SliceRecord
 
-__all__ = ["Parameter", "Prediction", "Predictor"]
+__all__ = ["KnifeMotion", "Parameter", "Prediction", "Predictor"]
 
 NO_ADJOINT = ("effects.skin.thickness",)
 """Parameters whose derivative is taken by differences."""

@@ -11,7 +11,7 @@ from sliceit_drake.cutting.knife_path import KnifePath, PosedMotion
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.solver import NOT_FINITE
 
-__all__ = ["BatchSimulator", "BatchSlice", "simulate_batch"]
+__all__ = ["BatchSimulator", "BatchSlice", "cut_together", "simulate_batch"]
 
 
 @dc.dataclass
