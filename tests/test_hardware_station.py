@@ -70,6 +70,17 @@ def test_it_keeps_the_port_contract_of_the_simulated_station(twin, robot):
         assert station.HasOutputPort(name)
 
 
+def test_without_a_twin_it_is_made_on_the_measured_board(robot):
+    scenario = spring_scenario()
+    usual = scenario.board.height
+    connection = RobotConnection(robot, HardwareConfig(board_height=usual + 0.01), PACE)
+    station = MakeStation(scenario, hardware=connection)
+    check_station_ports(station)
+    assert station.scenario.board.height == usual + 0.01 and scenario.board.height == usual
+    higher = station.start_pose.translation() - MakeStation(scenario).start_pose.translation()
+    np.testing.assert_allclose(higher, [0.0, 0.0, 0.01], atol=1e-12)
+
+
 def test_a_scenario_runs_and_leaves_the_outputs_of_simulate(robot, tmp_path):
     hardware = hardware_run(robot)
     assert failed(hardware.check_before()) == []

@@ -136,6 +136,9 @@ def test_what_does_not_fit_the_scenario_is_refused():
     other.exchange_period = 0.001
     with pytest.raises(ConfigurationError, match="period of the scenario"):
         MakeStation(scenario(), cutting=Dough(other))
+    for cutting in (42, lambda _: None):
+        with pytest.raises(ConfigurationError, match="Give a subclass of KnifeForceSystem"):
+            MakeStation(scenario(), cutting=cutting)
     robot = RobotConnection(client=None, config=HardwareConfig())
     with pytest.raises(ConfigurationError, match="what lies on its board"):
         MakeStation(scenario(), hardware=robot, cutting=Dough)

@@ -97,6 +97,8 @@ def _own_system(
     cutting: KnifeForceSystem | Callable[[Scenario], KnifeForceSystem], scenario: Scenario
 ) -> KnifeForceSystem:
     system = cutting(scenario) if callable(cutting) else cutting
+    if not isinstance(system, KnifeForceSystem):
+        raise _not_to_be_cut(system)
     if abs(system.exchange_period - scenario.exchange_period) > 1e-12:
         raise ConfigurationError(
             f"is {scenario.exchange_period:g} s, and that of the cutting system that was put in "
@@ -118,7 +120,18 @@ def prepare_food(food: Any, scenario: Scenario) -> PreparedFood:
     Raises:
         ConfigurationError, MeshError, TimeStepError: The food cannot be cut so.
     """
+    if not (hasattr(food, "height") and hasattr(food, "make_cutting")):
+        raise _not_to_be_cut(food)
     return _on_the_board(food.height, lambda: food.make_cutting(scenario), scenario)
+
+
+def _not_to_be_cut(given: object) -> ConfigurationError:
+    return ConfigurationError(
+        f"is {type(given).__name__}, which a station cannot cut",
+        field="cutting",
+        fix="Give a subclass of KnifeForceSystem, a function that makes one of a scenario, or a "
+        "food with height and make_cutting.",
+    )
 
 
 @prepare_food.register

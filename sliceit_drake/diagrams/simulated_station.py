@@ -64,7 +64,7 @@ class SimulatedStation(Station):
     Attributes:
         scenario: What it was made from.
         plant: The arm with gripper and knife, and the board.
-        cutting: The food: finite elements, analytic, or the spring of the baseline.
+        cutting: The food, or what was put in its place.
         controller: The compliance controller, or what was given in its place.
         sensor: The wrench sensor.
         motion_plan: The scenario's segments, those of its sequence, or the bounds of its policy.

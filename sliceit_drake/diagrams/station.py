@@ -52,7 +52,8 @@ def MakeStation(
         meshcat: Viewer to draw in, or None. Of a hardware station, its twin draws.
         hardware: The robot; None for the simulated station.
         cutting: A cutting system of your own in place of that of the scenario's food, or a function
-            that makes one of the scenario. The scenario's food still says where the knife starts.
+            that makes one of the scenario; the scenario's food still says where the knife starts.
+            Or a food of your own, see `CuttableFood`.
         controller: What commands the joints in place of the compliance controller, with the same
             ports, or a function that makes it of the scenario.
 
