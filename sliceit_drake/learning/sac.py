@@ -175,7 +175,7 @@ class PrioritizedSAC(SAC):
 
         It holds tensors and plain values only, for `torch.load(..., weights_only=True)`.
         """
-        name, keys, *rest = np.random.get_state()
+        numpy = np.random.get_state(legacy=False)
         return {
             "parameters": self.get_parameters(),
             "log_ent_coef": None if self.ent_coef_optimizer is None else self.log_ent_coef.detach(),
@@ -183,7 +183,8 @@ class PrioritizedSAC(SAC):
             "num_timesteps": self.num_timesteps,
             "running": dict(self.running),
             "torch": torch.get_rng_state(),
-            "numpy": (name, keys.tolist(), *rest),
+            "numpy": numpy
+            | {"state": {k: np.asarray(v).tolist() for k, v in numpy["state"].items()}},
             "actions": self.action_space.np_random.bit_generator.state,
         }
 
