@@ -6,12 +6,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from sliceit_drake.cutting.board import Board, board_wrenches
-from sliceit_drake.cutting.driver import Launch, drive, even_launches
+from sliceit_drake.cutting.driver import Exchanges, Launch, drive, even_launches
 from sliceit_drake.cutting.knife import signed_distance
 from sliceit_drake.cutting.knife_path import CHECK_TRAVEL, KnifePath
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Motion, Pose
-from sliceit_drake.cutting.solver import CuttingError, CuttingSolver, Energies, Exchanges
+from sliceit_drake.cutting.solver import CuttingError, CuttingSolver, Energies
 
 __all__ = [
     "ENERGY_RATIO_LIMIT",

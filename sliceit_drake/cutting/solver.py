@@ -6,6 +6,7 @@ import typing
 
 import numpy as np
 
+from sliceit_drake.cutting.driver import Exchanges, run_exchanges
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose, small_turn
 from sliceit_drake.cutting.workspace import Workspace, parameter_row
@@ -16,9 +17,7 @@ __all__ = [
     "CuttingSolver",
     "Energies",
     "Exchange",
-    "Exchanges",
     "SurfaceFactors",
-    "run_exchanges",
 ]
 
 
@@ -72,33 +71,6 @@ class Exchange:
 
 
 @dc.dataclass
-class Exchanges:
-    """Result of E exchanges in a row; see `Exchange`.
-
-    Attributes:
-        state: The food's new state.
-        wrenches: Wrenches by mechanism (edge, flank pressure, friction) [E, 3, 6].
-        work: Work of each exchange [E], J.
-        dissipation: Energy lost by edge, opening, friction, blade, board over all exchanges [5], J.
-        internal_work, gravity_work: Work over all exchanges, J.
-        cut: Share of the section that the edge has passed [E].
-    """
-
-    state: np.ndarray
-    wrenches: np.ndarray
-    work: np.ndarray
-    dissipation: np.ndarray
-    internal_work: float
-    gravity_work: float
-    cut: np.ndarray
-
-    @property
-    def finite(self) -> bool:
-        """Whether the cut has not broken down; limits on forces can hide a state that has."""
-        return bool(np.isfinite(self.wrenches).all() and np.isfinite(self.state).all())
-
-
-@dc.dataclass
 class Energies:
     """Energies of a state, J.
 
@@ -120,52 +92,11 @@ class Energies:
 
 UNCHANGED = SurfaceFactors()
 
-LOSSES = ("edge_loss", "opening_loss", "friction_loss")
-"""Energies dissipated at the cut points, in the order of `Exchanges.dissipation`."""
-
 NOT_FINITE = (
     "the knife's force is not finite: elements inverted or the step became unstable. "
     "Use a smaller numerics.time_step or a finer mesh near the cut."
 )
 """Message of a cut that broke down."""
-
-
-def run_exchanges(
-    ws: Workspace, states: np.ndarray, R: np.ndarray, p: np.ndarray
-) -> list[Exchanges]:
-    """Advances all cuts of a workspace by its exchanges.
-
-    Args:
-        ws: Workspace of C cuts and E exchanges.
-        states: [C, state_size].
-        R: Rotations of the knives in C at the ends of the exchanges [C, E + 1, 3, 3].
-        p: Positions of Ko there [C, E + 1, 3], metres.
-
-    Returns:
-        One result a cut; what is not finite is left so.
-    """
-    ws.advance(states, R, p)
-    new = ws.read(ws.states[0]).copy()
-    results = ws.results()
-    x = ws.layout["x"]
-    return [
-        Exchanges(
-            state=new[c],
-            wrenches=row["wrenches"],
-            work=row["work"],
-            dissipation=np.array(
-                [
-                    *np.stack([row["point_sums"][name] for name in LOSSES], axis=1).sum(0),
-                    row["blade"]["loss"].sum(),
-                    row["node_sums"]["board_loss"],
-                ]
-            ),
-            internal_work=float(row["node_sums"]["internal_work"]),
-            gravity_work=float(model.weight.ravel() @ (new[c, x] - states[c, x])),
-            cut=row["point_sums"]["cut_area"] / model.section_area,
-        )
-        for c, (model, row) in enumerate(zip(ws.models, results, strict=True))
-    ]
 
 
 class CuttingSolver:
