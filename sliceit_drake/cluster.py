@@ -47,6 +47,7 @@ def connected(scheduler: str, patience: float = CONNECT) -> "Iterator[Client]":
             lack this package or have another version of it.
     """
     try:
+        import joblib  # noqa: F401
         from distributed import Client
     except ImportError as error:
         raise ConfigurationError(

@@ -69,7 +69,7 @@ def test_each_slice_of_a_batch_is_the_slice_alone(models, motions, one_by_one, w
 
 def test_cuts_side_by_side_are_the_cuts_alone(models, motions, one_by_one):
     # As on a GPU; the second motion is shorter.
-    results = cut_together(Driver(PERIOD, BOARD), models[:2], motions[:2])
+    results = cut_together(Driver(PERIOD), models[:2], motions[:2], BOARD)
     for result, alone in zip(results, one_by_one, strict=False):
         np.testing.assert_array_equal(table(result), alone)
 
@@ -82,7 +82,7 @@ def test_a_slice_that_breaks_down_is_reported_and_disturbs_no_other(models, moti
     assert "not finite" in results[0].failure
     assert np.isnan(results[0].food_wrench[-1]).all()
     np.testing.assert_array_equal(table(results[1]), one_by_one[0])
-    together = cut_together(Driver(PERIOD, BOARD), [broken, models[0]], [motions[0]] * 2)
+    together = cut_together(Driver(PERIOD), [broken, models[0]], [motions[0]] * 2, BOARD)
     assert together[0].failure == results[0].failure
     np.testing.assert_array_equal(table(together[1]), one_by_one[0])
 

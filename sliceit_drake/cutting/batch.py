@@ -69,7 +69,7 @@ class BatchSimulator:
     def __init__(
         self, exchange_period: float, board: Board | None = None, workers: int | None = None
     ) -> None:
-        self._pool = DriverPool(exchange_period, board, workers)
+        self._pool, self._board = DriverPool(exchange_period, workers), board
 
     def run(
         self,
@@ -108,7 +108,8 @@ class BatchSimulator:
         results: dict[int, BatchSlice] = {}
 
         def run(driver: Driver, members: list[int]) -> list[BatchSlice]:
-            return cut_together(driver, [models[c] for c in members], [motions[c] for c in members])
+            some = [models[c] for c in members]
+            return cut_together(driver, some, [motions[c] for c in members], self._board)
 
         jobs = list(groups.values())
         for members, slices in zip(jobs, self._pool.map(run, jobs, threads), strict=True):
@@ -119,7 +120,10 @@ class BatchSimulator:
 
 
 def cut_together(
-    driver: Driver, models: Sequence[CuttingModel], motions: Sequence[PosedMotion]
+    driver: Driver,
+    models: Sequence[CuttingModel],
+    motions: Sequence[PosedMotion],
+    board: Board | None = None,
 ) -> list[BatchSlice]:
     """Simulates slices that advance side by side; their cuts are all derived from one model."""
     T = driver.exchange_period
@@ -127,26 +131,28 @@ def cut_together(
     count = max(path.exchanges for path in paths)
     wrenches = np.full((len(models), count, 6), np.nan)
     cut = np.full((len(models), count), np.nan)
-    for launch, steps in driver.run(paths):
+    for launch, steps in driver.run(paths, board=board):
         at = slice(launch.first, launch.first + launch.exchanges)
         for c, step in enumerate(steps):
             wrenches[c, at] = step.wrenches.sum(1) if step.finite else np.nan
             cut[c, at] = step.cut
     return [
-        _slice(driver, path, wrench, share)
+        _slice(path, wrench, share, T, board)
         for path, wrench, share in zip(paths, wrenches, cut, strict=True)
     ]
 
 
-def _slice(driver: Driver, path: KnifePath, wrench: np.ndarray, cut: np.ndarray) -> BatchSlice:
-    n, T = path.exchanges, driver.exchange_period
+def _slice(
+    path: KnifePath, wrench: np.ndarray, cut: np.ndarray, T: float, board: Board | None
+) -> BatchSlice:
+    n = path.exchanges
     food = (wrench[:n].reshape(n, 2, 3) @ path.model.X_FC_rotation.T).reshape(n, 6)
-    board = np.zeros((n, 6))
-    if driver.board is not None:
-        board = board_wrenches(driver.board, path.model.knife, path.R_FK, path.p_FK, T)
+    on_board = np.zeros((n, 6))
+    if board is not None:
+        on_board = board_wrenches(board, path.model.knife, path.R_FK, path.p_FK, T)
     finite = np.isfinite(food).all(1)
     failure = None
     if not finite.all():
         failure = f"at {(int(finite.argmin()) + 1) * T:.4g} s {NOT_FINITE}"
     time = np.arange(1, n + 1) * T
-    return BatchSlice(time, path.p_FK[1:], food, board, cut[:n], failure)
+    return BatchSlice(time, path.p_FK[1:], food, on_board, cut[:n], failure)

@@ -14,7 +14,7 @@ from sliceit_drake.cutting.knife_path import KnifePath
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.workspace import Workspace
 
-__all__ = ["Driver", "DriverPool", "Exchanges", "Launch", "drive", "even_launches", "run_exchanges"]
+__all__ = ["Driver", "DriverPool", "Exchanges", "Launch", "even_launches", "run_exchanges"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -103,9 +103,6 @@ class Launch(NamedTuple):
     multiple: int = 1
 
 
-Advance = Callable[[Launch, np.ndarray, np.ndarray, np.ndarray], list[Exchanges]]
-
-
 def even_launches(paths: Sequence[KnifePath]) -> Iterator[Launch]:
     """Launches of exchanges of one duration, as many at once as all paths allow."""
     k, count = 0, max(path.exchanges for path in paths)
@@ -115,52 +112,6 @@ def even_launches(paths: Sequence[KnifePath]) -> Iterator[Launch]:
         k += launch.exchanges
 
 
-def drive(
-    paths: Sequence[KnifePath],
-    launches: Iterable[Launch],
-    states: np.ndarray,
-    advance: Advance,
-    board: Board | None = None,
-) -> Iterator[tuple[Launch, list[Exchanges]]]:
-    """Advances cuts along the paths of their knives, launch by launch.
-
-    Where arm or holder give, a launch is repeated until they hold its force. A launch that leaves
-    no cut finite is the last.
-
-    Args:
-        paths: Paths of the knives, one a cut [C].
-        launches: Each is taken once the one before it was yielded.
-        states: The foods before the first launch [C, state_size].
-        advance: Advances all cuts, given a launch, states [C, state_size], rotations
-            [C, E + 1, 3, 3] and positions [C, E + 1, 3] of the knives in C, metres.
-        board: Board under the knives, its height in F; None for none.
-
-    Yields:
-        Each launch and what it gives, one a cut.
-    """
-    for launch in launches:
-        last = launch.first + launch.exchanges
-        # A knife whose motion is over rests at its end.
-        ends = [np.minimum(np.arange(launch.first, last + 1), path.exchanges) for path in paths]
-        R = np.array([path.R_CK[rows] for path, rows in zip(paths, ends, strict=True)])
-        found: dict[int, Exchanges] = {}
-        unbalanced = list(range(len(paths)))
-        while unbalanced:
-            p = np.array([path.p_CK[rows] for path, rows in zip(paths, ends, strict=True)])
-            tried = advance(launch, states, R, p)
-            found |= {c: tried[c] for c in unbalanced}
-            unbalanced = [
-                c
-                for c in unbalanced
-                if not paths[c].balanced(last, tried[c].wrenches[-1].sum(0)[3:], board)
-            ]
-        steps = [found[c] for c in range(len(paths))]
-        yield launch, steps
-        if not any(step.finite for step in steps):
-            return
-        states = np.array([step.state for step in steps])
-
-
 class Driver:
     """Drives cuts, keeping the device arrays of each mesh for the cuts that come after.
 
@@ -168,11 +119,10 @@ class Driver:
 
     Args:
         exchange_period: Duration of the shortest exchange, s.
-        board: Board under the knife, its height in F; None for none.
     """
 
-    def __init__(self, exchange_period: float, board: Board | None = None) -> None:
-        self.exchange_period, self.board = exchange_period, board
+    def __init__(self, exchange_period: float) -> None:
+        self.exchange_period = exchange_period
         self._workspaces: dict[tuple, Workspace] = {}
 
     def workspace(self, models: Sequence[CuttingModel], launch: Launch) -> Workspace:
@@ -189,29 +139,50 @@ class Driver:
         return ws
 
     def run(
-        self, paths: Sequence[KnifePath], launches: Iterable[Launch] | None = None
+        self,
+        paths: Sequence[KnifePath],
+        launches: Iterable[Launch] | None = None,
+        board: Board | None = None,
     ) -> Iterator[tuple[Launch, list[Exchanges]]]:
-        """Drives uncut foods side by side; see `drive`.
+        """Drives uncut foods side by side.
+
+        Where arm or holder give, a launch is repeated until they hold its force. A launch that
+        leaves no cut finite is the last.
 
         Args:
-            paths: Paths of the knives; their cuts are all derived from one model.
-            launches: `even_launches` by default.
+            paths: Of the knives, one a cut; the cuts are all derived from one model.
+            launches: Each is taken once the one before it was yielded; `even_launches` by default.
+            board: Board under the knives, its height in F; None for none.
+
+        Yields:
+            Each launch and what it gives, one a cut.
         """
-        launches = list(even_launches(paths) if launches is None else launches)
         models = {1: [path.model for path in paths]}
-        for m in {launch.multiple for launch in launches} - {1}:
-            models[m] = [_with_longer_steps(model, m) for model in models[1]]
-
-        def advance(
-            launch: Launch, states: np.ndarray, R: np.ndarray, p: np.ndarray
-        ) -> list[Exchanges]:
-            ws = self.workspace(models[launch.multiple], launch)
-            return run_exchanges(ws, states, R, p)
-
-        ws = self.workspace(models[launches[0].multiple], launches[0])
-        return drive(
-            paths, launches, np.tile(ws.initial_state(), (len(paths), 1)), advance, self.board
-        )
+        states = None
+        for launch in even_launches(paths) if launches is None else launches:
+            m, last = launch.multiple, launch.first + launch.exchanges
+            if m not in models:
+                models[m] = [_with_longer_steps(model, m) for model in models[1]]
+            ws = self.workspace(models[m], launch)
+            if states is None:
+                states = np.tile(ws.initial_state(), (len(paths), 1))
+            # A knife whose motion is over rests at its end.
+            ends = [np.minimum(np.arange(launch.first, last + 1), path.exchanges) for path in paths]
+            R = np.array([path.R_CK[rows] for path, rows in zip(paths, ends, strict=True)])
+            steps: list[Exchanges] = []
+            unbalanced = list(range(len(paths)))
+            while unbalanced:
+                p = np.array([path.p_CK[rows] for path, rows in zip(paths, ends, strict=True)])
+                tried = run_exchanges(ws, states, R, p)
+                steps = [tried[c] if c in unbalanced else steps[c] for c in range(len(paths))]
+                forces = [step.wrenches[-1].sum(0)[3:] for step in steps]
+                unbalanced = [
+                    c for c in unbalanced if not paths[c].balanced(last, forces[c], board)
+                ]
+            yield launch, steps
+            if not any(step.finite for step in steps):
+                return
+            states = np.array([step.state for step in steps])
 
 
 def _with_longer_steps(model: CuttingModel, multiple: int) -> CuttingModel:
@@ -223,14 +194,12 @@ class DriverPool:
     """Threads that drive cuts, each with a `Driver` that it keeps from one call to the next.
 
     Args:
-        exchange_period, board: As `Driver`.
+        exchange_period: As `Driver`.
         threads: The number of processors by default.
     """
 
-    def __init__(
-        self, exchange_period: float, board: Board | None = None, threads: int | None = None
-    ) -> None:
-        self.exchange_period, self.board = exchange_period, board
+    def __init__(self, exchange_period: float, threads: int | None = None) -> None:
+        self.exchange_period = exchange_period
         self.threads = threads or os.cpu_count() or 1
         self._drivers: list[Driver] = []
 
@@ -243,7 +212,7 @@ class DriverPool:
         """Does work on items, in their order, at most as many at once as there are threads."""
         threads = max(1, min(threads or self.threads, len(items)))
         while len(self._drivers) < threads:
-            self._drivers.append(Driver(self.exchange_period, self.board))
+            self._drivers.append(Driver(self.exchange_period))
         # The first come first, as their arrays are those most likely to be there.
         spare: queue.LifoQueue[Driver] = queue.LifoQueue()
         for driver in reversed(self._drivers):

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from sliceit_drake.cutting.board import Board, board_wrenches
-from sliceit_drake.cutting.driver import Exchanges, Launch, drive, even_launches
+from sliceit_drake.cutting.driver import Exchanges, Launch, even_launches
 from sliceit_drake.cutting.knife import signed_distance
 from sliceit_drake.cutting.knife_path import CHECK_TRAVEL, KnifePath
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Motion, Pose
-from sliceit_drake.cutting.solver import CuttingError, CuttingSolver, Energies
+from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError, CuttingSolver, Energies
 
 __all__ = [
     "ENERGY_RATIO_LIMIT",
@@ -258,16 +258,9 @@ def simulate_slice(
                 check_in_plane(model, path.pose(m), m * T)
             yield launch
 
-    def advance(
-        launch: Launch, states: np.ndarray, R: np.ndarray, p: np.ndarray
-    ) -> list[Exchanges]:
-        try:
-            return [solver.exchanges(states[0], R[0], p[0])]
-        except CuttingError as error:
-            raise CuttingError(f"at {(launch.first + 1) * T:.4g} s {error}") from error
-
-    uncut = solver.initial_state()[None]
-    for (k, block, _), (step,) in drive([path], launches(), uncut, advance, board):
+    for (k, block, _), (step,) in solver.driver.run([path], launches(), board):
+        if not step.finite:
+            raise CuttingError(f"at {(k + 1) * T:.4g} s {NOT_FINITE}")
         at, state = slice(k, k + block), step.state
         ledger.add(step)
         parts = step.wrenches.reshape(block, 3, 2, 3) @ R_FC.T

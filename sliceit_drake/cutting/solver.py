@@ -6,7 +6,7 @@ import typing
 
 import numpy as np
 
-from sliceit_drake.cutting.driver import Exchanges, run_exchanges
+from sliceit_drake.cutting.driver import Driver, Exchanges, Launch, run_exchanges
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose, small_turn
 from sliceit_drake.cutting.workspace import Workspace, parameter_row
@@ -122,7 +122,7 @@ class CuttingSolver:
         self.state_size = self._workspace.state_size
         self.dtype = self._workspace.dtype
         self._lock = threading.Lock()
-        self._long: Workspace | None = None
+        self.driver = Driver(exchange_period)
         # What the workspace holds, to write it only where it changes; each call says what it wants.
         self._held_factors = UNCHANGED
 
@@ -220,19 +220,11 @@ class CuttingSolver:
             CuttingError: A force is not finite.
         """
         with self._lock:
-            self._take_factors(UNCHANGED)
-            ws = self._workspace_for(len(p) - 1)
-            result = run_exchanges(ws, state[None], R[None], p[None])
-        if not result[0].finite:
+            ws = self.driver.workspace([self.model], Launch(0, len(p) - 1))
+            (result,) = run_exchanges(ws, state[None], R[None], p[None])
+        if not result.finite:
             raise CuttingError(NOT_FINITE)
-        return result[0]
-
-    def _workspace_for(self, exchanges: int) -> Workspace:
-        if exchanges == 1:
-            return self._workspace
-        if self._long is None or self._long.exchanges != exchanges:
-            self._long = Workspace([self.model], self.exchange_period, exchanges)
-        return self._long
+        return result
 
     def _place(self, state: np.ndarray, pose: Pose, factors: SurfaceFactors = UNCHANGED) -> None:
         """Puts food and knife, at rest at `pose`, into the workspace for launches with k = 0."""

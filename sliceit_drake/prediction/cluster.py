@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sliceit_drake.cluster import CONNECT, connected
-from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.driver import Driver
 from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry
@@ -42,16 +41,8 @@ def on_cluster(scheduler: str, patience: float = CONNECT) -> Iterator[Executor]:
         What runs jobs on the scheduler's workers.
 
     Raises:
-        ConfigurationError: The package is not installed, or see `cluster.connected`.
+        ConfigurationError: See `cluster.connected`.
     """
-    try:
-        import joblib  # noqa: F401
-    except ImportError as error:
-        raise ConfigurationError(
-            f"needs the packages of the extra `cluster` ({error.name} is missing)",
-            field="--backend",
-            fix="pip install 'sliceit_drake[cluster]'",
-        ) from error
     with connected(scheduler, patience) as client:
         yield lambda jobs, period, board: _run_jobs(client, jobs, period, board)
 
@@ -103,8 +94,6 @@ def _run_there(
     board: Board,
 ) -> tuple[int, Run]:
     """Runs a job on a worker, which keeps what it needs from one to the next."""
-    drivers: dict[tuple[float, str], Driver] = _THREAD.__dict__.setdefault("drivers", {})
-    place = (period, repr(board))
-    if place not in drivers:
-        drivers[place] = Driver(period, board)
-    return number, run_job(drivers[place], Job(_rebuilt(shared, own), *rest))
+    drivers: dict[float, Driver] = _THREAD.__dict__.setdefault("drivers", {})
+    driver = drivers.setdefault(period, Driver(period))
+    return number, run_job(driver, Job(_rebuilt(shared, own), *rest), board)

@@ -33,6 +33,15 @@ class Job:
     stretches: Stretches
     name: str = ""
 
+    @property
+    def duration(self) -> float:
+        """Number of exchanges, the unit of time in which a job is a motion of the knife."""
+        return float(len(self.p) - 1)
+
+    def pose(self, t: float) -> Pose:
+        """X_FK after `t` exchanges."""
+        return Pose(self.R[round(t)], self.p[round(t)])
+
 
 @dc.dataclass
 class Run:
@@ -53,31 +62,15 @@ Executor = Callable[[Sequence[Job], float, Board], Iterable[tuple[int, Run]]]
 their numbers and runs, in any order. Jobs of one mesh come in a row."""
 
 
-@dc.dataclass(frozen=True)
-class _Poses:
-    """Poses by number, as `KnifePath` asks for them with a period of 1."""
-
-    R: np.ndarray
-    p: np.ndarray
-
-    @property
-    def duration(self) -> float:
-        return float(len(self.p) - 1)
-
-    def pose(self, t: float) -> Pose:
-        k = round(t)
-        return Pose(self.R[k], self.p[k])
-
-
-def run_job(driver: Driver, job: Job) -> Run:
+def run_job(driver: Driver, job: Job, board: Board) -> Run:
     """Simulates a slice."""
-    path = KnifePath(job.model, _Poses(job.R, job.p), 1.0)
+    path = KnifePath(job.model, job, 1.0)
     together, multiples = BLOCK if path.rigid else 1, job.stretches.multiples.tolist()
     starts = range(0, path.exchanges, together)
     launches = [Launch(k, together, multiples[k // BLOCK]) for k in starts]
     wrenches = np.zeros((path.exchanges, 3, 6))
     rise = np.zeros(path.exchanges)
-    for (k, count, _), (step,) in driver.run([path], launches):
+    for (k, count, _), (step,) in driver.run([path], launches, board):
         wrenches[k : k + count] = step.wrenches
         if not step.finite:
             wrenches[:] = np.nan

@@ -46,8 +46,10 @@ class Simulator:
         if callable(workers):
             self._executor: Executor = workers
         else:
-            pool = DriverPool(clock.period, board, workers)
-            self._executor = lambda some, *_: enumerate(pool.map(run_job, some))
+            pool = DriverPool(clock.period, workers)
+            self._executor = lambda some, _, board: enumerate(
+                pool.map(lambda driver, job: run_job(driver, job, board), some)
+            )
 
     def run(
         self, jobs: Sequence[Job], progress: Callable[[int, int], None] | None = None
