@@ -13,7 +13,7 @@ CONFIGURATION, POLICY = "training.yaml", "policy.onnx"
 
 @dc.dataclass
 class TrainingConfig:
-    """How an agent is trained, and on what."""
+    """A training: its task, its algorithm and its length."""
 
     task: TaskConfig = dc.field(default_factory=TaskConfig)
     steps: int = quantity(15_000, "", low=1, high=10**9, doc="Decisions of the training.")
