@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from multiprocessing import get_context, resource_tracker
 from typing import Any
 
-__all__ = ["deaf_children", "start_worker", "worker_processes"]
+__all__ = ["children_without_interrupts", "start_worker", "worker_processes"]
 
 
 @contextmanager
@@ -47,7 +47,7 @@ def worker_processes(
 
 
 @contextmanager
-def deaf_children() -> Iterator[None]:
+def children_without_interrupts() -> Iterator[None]:
     """Processes that are started in this context do not hear Ctrl-C, from their first moment on."""
     # Its start would end the blocking.
     resource_tracker.ensure_running()

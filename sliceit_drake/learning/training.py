@@ -22,7 +22,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
-from sliceit_drake.cutting.workers import deaf_children, start_worker
+from sliceit_drake.cutting.workers import children_without_interrupts, start_worker
 from sliceit_drake.learning.environment import SlicingEnv
 from sliceit_drake.learning.export import export_policy
 from sliceit_drake.learning.network import HistoryExtractor
@@ -96,7 +96,7 @@ def train(
     # An error in the environment's process would come out as a broken pipe.
     check_task(config.task)
     torch.set_num_threads(1)
-    with deaf_children():
+    with children_without_interrupts():
         make = functools.partial(_environment, config.task)
         processes = SubprocVecEnv([make] * config.environments, "forkserver")
     environments = OverlapVecEnv(processes, None if saved is None else saved["environments"])
