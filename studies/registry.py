@@ -144,13 +144,9 @@ TOPICS: dict[str, tuple[Study, ...]] = {
     ),
     "learning": (
         Study(
-            "slicing",
-            "learning.comparison",
-            "policies of both simulators in unseen worlds",
-            "5 s",
-            "learn",
+            "slicing", "learning.comparison", "policies of both simulators in unseen worlds", "5 s"
         ),
-        Study("faster_draws", "learning.faster_draws", "what faster draws bring", "5 s", "learn"),
+        Study("faster_draws", "learning.faster_draws", "what faster draws bring", "5 s"),
         Study(
             "unfinished_slices",
             "learning.unfinished_slices",
@@ -204,6 +200,8 @@ def study_parser(study: Study) -> argparse.ArgumentParser:
     Raises:
         ConfigurationError: A package that it needs is not installed.
     """
+    with needs_extra("studies"):
+        importlib.import_module("studies.pages")
     with needs_extra(study.extra):
         module = importlib.import_module(f"studies.{study.module}")
     parser = argparse.ArgumentParser(
