@@ -30,8 +30,8 @@ def add_scenario_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         default=DEFAULT,
         metavar="SCENARIO",
-        help=f"YAML file, or one that ships with the package, as {DEFAULT} (the default); there "
-        f"are {shipped}",
+        help=f"YAML file, or the name of one that ships with the package: {shipped}; default "
+        f"{DEFAULT}",
     )
     parser.add_argument(
         "--set",
