@@ -1,4 +1,9 @@
-"""A part of the study of hidden effects, of every kind of run, with nothing computed before."""
+"""A part of the study of hidden effects: a fresh draw of single effects, pairs, unknowns and nulls.
+
+Each diagnosis is a process of its own that sees a folder of records and a food, as
+docs/hidden_effects.md says, which also gives how often it is right of 633 runs. What is cut next
+(`poor` runs of that study) is protected by tests/test_next_experiment.py.
+"""
 
 import dataclasses as dc
 import json
@@ -8,20 +13,22 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from sliceit_drake.configuration import dump_yaml
 from studies.hidden_effects.bench import model_food, protocol_named
 from studies.hidden_effects.cases import Case, Hidden
-from studies.hidden_effects.runner import food_file, run_case
-from studies.hidden_effects.score import judge_study
+from studies.hidden_effects.runner import food_file
+from studies.hidden_effects.score import Judgement, judge_study
 from studies.hidden_effects.sizes import ProtocolSizes
 from studies.hidden_effects.study import run_study
 from studies.hidden_effects.truth import CAUSE_OF
 
+pytestmark = pytest.mark.second_tier
+
 REPLICATES = 100
-SHARES = {"single": 0.95, "nothing": 0.92, "unknown": 0.90, "pairs": 0.80, "poor": 0.90}
-"""Shares of right runs by kind that docs/hidden_effects.md has to show."""
-FALSE_FAILURE = 1e-3
+LEAST_RIGHT = 10
+"""Of the twelve runs."""
 SINGLE = (
     "skin",
     "bulk_relaxation",
@@ -33,16 +40,10 @@ SINGLE = (
     "blunt_edge",
     "drive_vibration",
 )
+OF_ONE_PRESS = ("core", "section_shape", "sensor_drift", "drive_vibration")
+"""Effects that presses of one speed show."""
 PAIRS = (("skin", "sensor_tilt"), ("rate_toughness", "sensor_tilt"))
 UNKNOWN = ("magnetic_board", "warm_wrist")
-
-
-def most_wrong(kinds: list[str]) -> int:
-    """So many wrong runs that more are seen less often than `FALSE_FAILURE` with `SHARES`."""
-    chance = np.ones(1)
-    for kind in kinds:
-        chance = np.convolve(chance, [SHARES[kind], 1.0 - SHARES[kind]])
-    return int(np.argmax(np.cumsum(chance) >= 1.0 - FALSE_FAILURE))
 
 
 def drawn(rng: np.random.Generator) -> list[Case]:
@@ -54,11 +55,12 @@ def drawn(rng: np.random.Generator) -> list[Case]:
         return Case(name, kind, protocol, hidden, int(rng.integers(1, 2**31)))
 
     return [
-        case("poor", "poor", "skin"),
-        case("single", "rich", str(rng.choice(SINGLE))),
-        case("nothing", ("rich", "poor")[rng.integers(2)]),
+        *(case("single", "rich", str(e)) for e in rng.choice(SINGLE, 5, replace=False)),
+        *(case("single", "poor", str(e)) for e in rng.choice(OF_ONE_PRESS, 2, replace=False)),
         case("pairs", "rich", *PAIRS[rng.integers(len(PAIRS))]),
-        case("unknown", "rich", UNKNOWN[rng.integers(len(UNKNOWN))]),
+        *(case("unknown", "rich", effect) for effect in UNKNOWN),
+        case("nothing", "rich"),
+        case("nothing", "poor"),
     ]
 
 
@@ -77,42 +79,42 @@ def sized(cases: list[Case], protocol: str, output: Path) -> tuple[list[Case], d
     return found, near
 
 
-def poor_runs(cases: list[Case], output: Path) -> tuple[list[Case], dict]:
-    """`sized`, and runs them."""
-    found, near = sized(cases, "poor", output)
-    for case in found:
-        run_case(case, output, REPLICATES)
-    return found, near
+def is_wrong_name(judgement: Judgement) -> bool:
+    """Whether something is named that was not hidden, nor mimics it; a class that is too large is
+    a miss, but no wrong name."""
+    return any(set(names) <= set(judgement.wrong) for names in judgement.classes)
 
 
-def test_runs_of_every_kind_are_diagnosed_rightly(tmp_path):
-    """Effects, strengths and seeds are drawn; each diagnosis is a process that sees a folder of
-    records."""
+def test_a_fresh_draw_of_effects_is_diagnosed_rightly(tmp_path):
     seed = secrets.randbits(31)
+    print(f"seed {seed}")
     cases = drawn(np.random.default_rng(seed))
+    assert len(cases) >= 12
     for name in ("rich", "poor"):
         food_file(tmp_path, name).parent.mkdir(exist_ok=True)
         dump_yaml(model_food(protocol_named(name)), food_file(tmp_path, name))
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
-        rich = pool.submit(sized, cases, "rich", tmp_path)
-        poor = pool.submit(poor_runs, cases, tmp_path)
-        (of_rich, near_rich), (of_poor, near_poor) = rich.result(), poor.result()
+        jobs = {n: pool.submit(sized, cases, n, tmp_path) for n in ("rich", "poor")}
+        made = {name: job.result() for name, job in jobs.items()}
     (tmp_path / "truth").mkdir()
-    for case in (*of_rich, *of_poor):
+    cases = [case for found, _ in made.values() for case in found]
+    for case in cases:
         file = tmp_path / "truth" / f"{case.name}.json"
         file.write_text(json.dumps(dc.asdict(case)), encoding="utf-8")
     for name, facts in (
-        ("near", {"rich": near_rich, "poor": near_poor}),
-        ("classes", {"rich": {"classes": {}}, "poor": {"classes": {}}}),
+        ("near", {name: near for name, (_, near) in made.items()}),
+        ("classes", {name: {"classes": {}} for name in made}),
     ):
         (tmp_path / f"{name}.json").write_text(json.dumps(facts), encoding="utf-8")
-    run_study(of_rich, tmp_path, REPLICATES, workers=2)
+    run_study(cases, tmp_path, REPLICATES, workers=2)
 
     judgements = judge_study(tmp_path)
+    said = "\n".join(
+        f"{'right' if j.right else 'WRONG'} {j.case.protocol} {j.effects}: {j.verdict} {j.classes}"
+        for j in judgements
+    )
+    print(said)
     assert len(judgements) == len(cases)
-    wrong = [j for j in judgements if not j.right or j.resolved is False]
-    said = "\n".join(f"{j.case}: {j.verdict} {j.classes}" for j in wrong)
-    assert len(wrong) <= most_wrong([c.kind for c in cases]), f"seed {seed}\n{said}"
+    assert sum(j.right for j in judgements) >= LEAST_RIGHT, f"seed {seed}\n{said}"
     # A confident wrong name is worse than a miss.
-    named = [j for j in wrong if j.verdict in ("cause", "causes") and j.wrong]
-    assert len(named) <= 1, f"seed {seed}\n{said}"
+    assert not any(map(is_wrong_name, judgements)), f"seed {seed}\n{said}"
