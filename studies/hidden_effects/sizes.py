@@ -13,6 +13,7 @@ import dataclasses as dc
 import functools
 import inspect
 import json
+import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -31,7 +32,8 @@ from sliceit_drake.diagnosis.evidence.linear import USUAL, LinearProblem
 from sliceit_drake.diagnosis.evidence.screen import screen
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.registry import all_causes, open_causes
-from sliceit_drake.records.slice_record import SliceRecord
+from sliceit_drake.records.slice_record import SliceRecord, write_record
+from sliceit_drake.records.validation import load_record, record_files
 from sliceit_drake.stand_in import effect as effect_module
 from sliceit_drake.stand_in import finite_element_world, sensor_model, session, world
 from sliceit_drake.stand_in.effect_registry import EFFECTS, make_effect
@@ -250,9 +252,13 @@ class ProtocolSizes:
 
     @functools.cached_property
     def _noisy(self) -> list[SliceRecord]:
-        """The slices of a session with nothing hidden."""
+        """The slices of a session with nothing hidden, as files hold them: a diagnosis of other
+        slices then finds what was simulated here."""
         real = Session(self.protocol, seed=SEED, settings=self.settings)
-        return [real.record(k) for k in range(len(real))]
+        with tempfile.TemporaryDirectory() as folder:
+            for k in range(len(real)):
+                write_record(real.record(k), Path(folder) / f"{k:04d}")
+            return [load_record(file) for file in record_files(Path(folder))]
 
     def _problem(self, causes: Sequence[Cause]) -> tuple[Sensitivities, LinearProblem]:
         setup = setup_of_food(model_food(self.protocol), DIAGNOSIS_REFINEMENT)
