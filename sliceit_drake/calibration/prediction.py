@@ -5,6 +5,7 @@ import dataclasses as dc
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from sliceit_drake.calibration.oscillation import Oscillation, fit_oscillation
 from sliceit_drake.calibration.setup import CalibrationSetup
@@ -24,7 +25,7 @@ from sliceit_drake.prediction.placement import is_bare
 from sliceit_drake.prediction.record_target import Meshing, RecordTarget, make_targets
 from sliceit_drake.records.slice_record import SliceRecord
 
-__all__ = ["KnifeMotion", "Parameter", "Prediction", "Predictor"]
+__all__ = ["Parameter", "Poses", "Prediction", "Predictor"]
 
 NO_ADJOINT = ("effects.skin.thickness",)
 """Parameters whose derivative is taken by differences."""
@@ -35,11 +36,11 @@ HEIGHT, SPEED = "height_offset", "speed_factor"
 
 
 @dc.dataclass
-class KnifeMotion:
-    """A recorded motion at the exchanges, as `cutting.batch.simulate_batch` takes it.
+class Poses:
+    """The knife's poses X_FK at the ends of even exchanges, as a motion of `cutting`.
 
     Attributes:
-        R, p: Pose X_FK at the ends of the exchanges [E + 1, 3, 3] and [E + 1, 3], metres.
+        R, p: [E + 1, 3, 3] and [E + 1, 3], metres.
     """
 
     R: np.ndarray
@@ -147,9 +148,7 @@ class Predictor:
         self.targets = make_targets(setup, forces, [meshing], Clock(longest=1), near_food=True)
         self.board = dc.replace(setup.board, height=0.0)
         self.parameters = self._list_parameters()
-        self.used = np.concatenate(
-            [np.repeat(t.compared, t.measured.shape[1]) for t in self.targets]
-        )
+        self.used = self._by_entry("compared")
         self.point_factors: dict[str, np.ndarray] = {}
         self._simulator = BatchSimulator(EXCHANGE_PERIOD, self.board, workers)
         self._adjoints: dict[int, SliceAdjoint] = {}
@@ -192,12 +191,17 @@ class Predictor:
     @property
     def depth(self) -> np.ndarray:
         """Depth of the edge at each entry of `measured` [M], metres."""
-        return np.concatenate([np.repeat(t.depth, t.measured.shape[1]) for t in self.targets])
+        return self._by_entry("depth")
 
     @property
     def time(self) -> np.ndarray:
         """Time in its record of each entry of `measured` [M], s."""
-        return np.concatenate([np.repeat(t.time, t.measured.shape[1]) for t in self.targets])
+        return self._by_entry("time")
+
+    def _by_entry(self, name: str) -> np.ndarray:
+        return np.concatenate(
+            [np.repeat(getattr(t, name), t.measured.shape[1]) for t in self.targets]
+        )
 
     @property
     def conditions(self) -> list[str]:
@@ -235,11 +239,11 @@ class Predictor:
         other.point_factors = dict(factors)
         return other
 
-    def motion(self, target: RecordTarget, values: Mapping[str, float]) -> KnifeMotion:
+    def motion(self, target: RecordTarget, values: Mapping[str, float]) -> Poses:
         """The knife's motion of a record with these values."""
         name = target.record.name
         p = target.moved(values[f"{HEIGHT}:{name}"], values.get(f"{SPEED}:{name}", 1.0))
-        return KnifeMotion(target.R[target.exchanges], p[target.exchanges])
+        return Poses(target.R[target.exchanges], p[target.exchanges])
 
     def predict(
         self, units: Sequence[np.ndarray], progress: Callable[[int], None] | None = None
@@ -264,15 +268,14 @@ class Predictor:
                     models.append(target.model)
                 motions.append(self.motion(target, values))
         slices = self._simulator.run(models, motions, progress)
-        out = []
         n = len(self.targets)
-        for s in range(len(units)):
-            row = [
+        return [
+            [
                 self._prediction(target, slices[s * n + r], failed.get((s, r)))
                 for r, target in enumerate(self.targets)
             ]
-            out.append(row)
-        return out
+            for s in range(len(units))
+        ]
 
     def _prediction(
         self, target: RecordTarget, result: BatchSlice, failure: str | None
@@ -470,17 +473,9 @@ class Predictor:
         if self.setup.oscillation is None:
             return np.zeros((self.measured.size, 0))
         (row,) = self.predict([unit])
-        blocks = []
-        for p, target in zip(row, self.targets, strict=True):
-            slopes = p.oscillation.derivatives(target.time)
-            by = p.smooth[:, :, None] * slopes[:, None, :]
-            blocks.append(by.reshape(-1, 3))
-        out = np.zeros((self.measured.size, 3 * len(blocks)))
-        start = 0
-        for k, block in enumerate(blocks):
-            out[start : start + len(block), 3 * k : 3 * k + 3] = block
-            start += len(block)
-        return out
+        slopes = [p.oscillation.derivatives(t.time) for p, t in zip(row, self.targets, strict=True)]
+        by = [p.smooth[:, :, None] * d[:, None] for p, d in zip(row, slopes, strict=True)]
+        return np.asarray(block_diag(*(x.reshape(-1, 3) for x in by)))
 
 
 def _start(model: CuttingModel, name: str) -> float:

@@ -47,7 +47,6 @@ class Bench(Protocol):
 
     food: Food
     knife: Knife
-    board: Board
     numerics: Numerics
     refinement: float
     height_offset: list[float]
