@@ -1,1 +1,1 @@
-"""The program `sliceit`."""
+"""The program `sliceit`: each command parses its arguments, calls its package, and prints."""

@@ -1,1 +1,1 @@
-"""A real UR5e: limits, safety layer, the link through RTDE, and its Drake system."""
+"""A real UR5e: limits, safety layer, checks, the link through RTDE and the system that reads it."""

@@ -4,19 +4,19 @@ The same system serves training, where the action is an input port, and deployme
 decides inside it. Facts of the original: Beltran-Hernandez et al., SliceIt! (2024), and its code.
 What differs, and why:
 
-- The authors double stiffness and gains before they send them; the ranges here are the doubled.
+- The authors double stiffness and gains before they send them. The ranges here are doubled, too.
 - They map [0, 1], not [-1, 1], to a range, so that half of each action does nothing. Here the whole
   range is used (`mapping: whole`); `upper` is theirs.
 - Their increments of the rotation about y are off in the cutting configuration (greatest rate 0).
-  That action moves the target's depth here: with a fixed target at the board the vertical spring
-  (2,000 N/m) pulls with less than a food resists over the last millimetres, in the spring-only
-  simulator as in the other, and no policy could end a slice in either.
-- The error is to the final pose, the edge on the board; how far the target has been moved from it
-  is observed as well. Without it the agent could not know what it has accumulated.
-- A slice of which 2 mm hold is not cut: the goal asks for 0.2 mm, and no lower bound, for a
-  board gives. On the scale of the error that is 0.003, and how long the edge has been there decides
-  when the slice ends: two numbers more are observed, the height within 2 mm, and the share of the
-  decisions at the goal that it takes.
+  Here that action moves the target's depth. With a fixed target at the board the vertical spring
+  (2,000 N/m) pulls with less than a food resists over the last millimetres, so that no policy could
+  end a slice in either simulator.
+- The error is to the final pose, with the edge on the board. The agent also observes how far its
+  actions have moved the target from there.
+- A slice that still holds at 2 mm is not cut. The goal asks for 0.2 mm over the board, and sets no
+  lower bound, because a board gives. On the scale of the observed error 0.2 mm is 0.003, and the
+  slice ends when the edge has been there for long enough. Two more numbers are observed: the height
+  within 2 mm, and the fraction of the decisions at the goal that end a slice.
 """
 
 import dataclasses as dc
