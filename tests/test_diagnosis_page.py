@@ -13,32 +13,35 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 @pytest.mark.parametrize(
     ("page", "words"),
     [
-        ("diagnosis", f"the alarm of {100 * verdict.ALARM:g} %"),
-        ("diagnosis", f"refitted to it, {verdict.LEAST_SIZE:g} of the noise in contact"),
-        ("diagnosis", f"must show in {100 * verdict.PRESENCE:g} % of those"),
-        ("diagnosis", f"can do what was found to within {verdict.CLASS_ANGLE:g} degrees"),
-        ("diagnosis", f"falls short of it by less than {100 * verdict.CLASS_GAIN:g} %"),
+        ("diagnosis", f"The alarm of {100 * verdict.ALARM:g} %"),
+        ("diagnosis", f"its effect must be {verdict.LEAST_SIZE:g} of the noise in contact"),
+        ("diagnosis", f"must show in {100 * verdict.PRESENCE:g} % of the records"),
+        ("diagnosis", f"the effect that was found to within {verdict.CLASS_ANGLE:g} degrees"),
+        ("diagnosis", f"their gain is less than {100 * verdict.CLASS_GAIN:g} % below the largest"),
         (
             "diagnosis",
-            f"of one condition it is {verdict.ONE_CONDITION_ANGLE:g} degrees "
+            f"of one condition, the limits are {verdict.ONE_CONDITION_ANGLE:g} degrees "
             f"and {100 * verdict.ONE_CONDITION_GAIN:g} %",
         ),
-        ("diagnosis", f"nothing is wrong ({verdict.TOLERATED:g} of the noise) is taken off"),
-        ("diagnosis", f"Less than {100 * verdict.EXPLAINED:g} % is unknown"),
-        ("diagnosis", f"at least {100 * verdict.SECOND_SHARE:g} % of the squares"),
+        (
+            "diagnosis",
+            f"It subtracts what remains where nothing is wrong ({verdict.TOLERATED:g} of the noise)",
+        ),
+        ("diagnosis", f"less than {100 * verdict.EXPLAINED:g} %, the verdict is unknown"),
+        ("diagnosis", f"at least {100 * verdict.SECOND_SHARE:g} % of the sum of squares"),
         ("diagnosis", f"at least {100 * verdict.OF_THE_REST:g} % of what the first leaves"),
         ("diagnosis", f"at least {100 * verdict.SECOND_GAIN:g} % of all that can be gained"),
-        ("diagnosis", f"an effect of {verdict.LEAST_MISFIT:g} of the noise or more"),
+        ("diagnosis", f"its effect is {verdict.LEAST_MISFIT:g} of the noise or more"),
         ("diagnosis", f"at least {verdict.MISFIT_FACTOR:g} times what it gains where nothing"),
         (
             "diagnosis",
-            f"of one condition: {verdict.ONE_CONDITION_MISFIT:g} of the noise, "
-            f"{verdict.ONE_CONDITION_FACTOR:g} times",
+            f"of one condition, the last two limits are {verdict.ONE_CONDITION_MISFIT:g} of the noise "
+            f"and {verdict.ONE_CONDITION_FACTOR:g} times",
         ),
-        ("diagnosis", f"Where it ends below {100 * verdict.LEAST_REMOVED:g} %, and"),
+        ("diagnosis", f"if the interval ends below {100 * verdict.LEAST_REMOVED:g} % and"),
         (
             "next_experiment",
-            f"least {100 * (1.0 - next_experiment.ALIKE_GAIN):g} % as much and are within "
+            f"at least {100 * (1.0 - next_experiment.ALIKE_GAIN):g} % as much and lie within "
             f"{verdict.CLASS_ANGLE + proposal.MARGIN:g} degrees",
         ),
     ],
