@@ -25,7 +25,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
         ),
         (
             "diagnosis",
-            f"It subtracts what remains where nothing is wrong ({verdict.TOLERATED:g} of the noise)",
+            f"subtracts what remains where nothing is wrong ({verdict.TOLERATED:g} of the noise)",
         ),
         ("diagnosis", f"less than {100 * verdict.EXPLAINED:g} %, the verdict is unknown"),
         ("diagnosis", f"at least {100 * verdict.SECOND_SHARE:g} % of the sum of squares"),
@@ -35,7 +35,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
         ("diagnosis", f"at least {verdict.MISFIT_FACTOR:g} times what it gains where nothing"),
         (
             "diagnosis",
-            f"of one condition, the last two limits are {verdict.ONE_CONDITION_MISFIT:g} of the noise "
+            f"condition, the last two limits are {verdict.ONE_CONDITION_MISFIT:g} of the noise "
             f"and {verdict.ONE_CONDITION_FACTOR:g} times",
         ),
         ("diagnosis", f"if the interval ends below {100 * verdict.LEAST_REMOVED:g} % and"),
