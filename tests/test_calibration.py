@@ -34,7 +34,7 @@ from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
-from sliceit_drake.diagrams.scenario import load_scenario
+from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.prediction.record_target import turning
 from sliceit_drake.records.preprocessing import low_pass
 from sliceit_drake.records.slice_record import SliceRecord
@@ -446,7 +446,7 @@ def test_draws_from_a_calibrated_food_stay_in_its_ranges_and_have_its_covariance
 @pytest.mark.parametrize("name", calibrated_food_names())
 def test_a_scenario_loads_a_calibrated_food_by_name(name):
     calibrated = load_calibrated_food(name)
-    scenario = load_scenario(None, f"{{calibration: {name}}}")
+    scenario = load_scenario(Scenario(), f"{{calibration: {name}}}")
     assert scenario.food.material == calibrated.food.material
     assert scenario.food.effects.skin == calibrated.food.effects.skin
     assert scenario.numerics.flank_stiffness == calibrated.flank_stiffness
@@ -456,7 +456,7 @@ def test_a_scenario_loads_a_calibrated_food_by_name(name):
 
 def test_an_unknown_calibration_is_refused_with_the_names_there_are():
     with pytest.raises(ConfigurationError, match="pear.*not calibrated"):
-        load_scenario(None, "{calibration: pear}")
+        load_scenario(Scenario(), "{calibration: pear}")
 
 
 def test_a_distribution_that_is_none_is_refused():
