@@ -35,12 +35,12 @@ class Oscillation:
     sine: float = 0.0
 
     def factor(self, time: np.ndarray) -> np.ndarray:
-        """Of the force at times [m], s."""
+        """Factor on the force at times [m], s."""
         phase = 2.0 * np.pi * self.frequency * time
         return 1.0 + self.cosine * np.cos(phase) + self.sine * np.sin(phase)
 
     def derivatives(self, time: np.ndarray) -> np.ndarray:
-        """Of `factor` by frequency, cosine and sine [m, 3]."""
+        """Derivatives of `factor` by frequency, cosine and sine [m, 3]."""
         phase = 2.0 * np.pi * self.frequency * time
         c, s = np.cos(phase), np.sin(phase)
         by_frequency = 2.0 * np.pi * time * (self.sine * c - self.cosine * s)

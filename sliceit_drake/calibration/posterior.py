@@ -48,7 +48,7 @@ class Posterior(ParameterDistribution):
         )
 
     def correlation(self) -> np.ndarray:
-        """Of the places [d, d]."""
+        """Correlation of the parameters, in their unit ranges [d, d]."""
         sd = self.deviation
         return np.asarray(np.array(self.covariance) / np.outer(sd, sd))
 

@@ -30,7 +30,7 @@ __all__ = ["Parameter", "Poses", "Prediction", "Predictor"]
 NO_ADJOINT = ("effects.skin.thickness",)
 """Parameters whose derivative is taken by differences."""
 STEP = 1e-3
-"""Of these differences, in the unit range."""
+"""Step of these differences, in the unit range."""
 
 HEIGHT, SPEED = "height_offset", "speed_factor"
 
@@ -205,7 +205,7 @@ class Predictor:
 
     @property
     def conditions(self) -> list[str]:
-        """Of each record; those with the same one are replicates, "" is none."""
+        """Condition of each record. Records of one condition are replicates; "" is none."""
         return [t.record.metadata.condition for t in self.targets]
 
     def values(self, unit: np.ndarray) -> dict[str, float]:

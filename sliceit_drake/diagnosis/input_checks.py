@@ -224,7 +224,7 @@ def _check_contact(record: SliceRecord, food: Food) -> None:
 
 
 def _height(record: SliceRecord, food: Food) -> float | None:
-    """Of the food over its origin, metres, as far as it is known without computing it."""
+    """Height of the food over its origin, metres, where it is known without a mesh."""
     size = record.metadata.food.size
     if size is not None:
         return size[2]

@@ -45,7 +45,7 @@ __all__ = [
 ]
 
 PERIOD = 0.002
-"""Of an e-Series controller, s."""
+"""Cycle of an e-Series controller, s."""
 
 
 class KnifeEstimate(ReportingSystem):

@@ -16,7 +16,7 @@ __all__ = ["scenario_of_slice"]
 REACH = (0.3, 0.7)
 """Distances from the base at which the arm cuts, metres."""
 GAINS = 200.0
-"""Of the controller in motion mode, as scenarios/cucumber.yaml has it."""
+"""Gains of the controller in motion mode, as in scenarios/cucumber.yaml."""
 
 
 def scenario_of_slice(plan: PlannedSlice) -> Scenario:

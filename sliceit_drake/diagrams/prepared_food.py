@@ -32,7 +32,7 @@ class CuttableFood(Protocol):
 
     @property
     def height(self) -> float:
-        """Of the top over the board, metres."""
+        """Height of the top over the board, metres."""
         ...
 
     def make_cutting(self, scenario: Scenario, /) -> KnifeForceSystem:

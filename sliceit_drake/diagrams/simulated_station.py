@@ -39,7 +39,7 @@ from sliceit_drake.systems.wrench_visualizer import WrenchVisualizer
 __all__ = ["FRAMES_PER_SECOND", "SimulatedStation"]
 
 FRAMES_PER_SECOND = 32
-"""Of what is drawn and of replays; fewer where a replay would be too large."""
+"""Frame rate of the live view and of replays; lower where a replay would be too large."""
 # A browser opens no more than 20 MB with ease: 3 MB are the arm, the rest is for frames. What is
 # drawn beside the food takes this much a frame.
 REPLAY_SIZE = 16e6

@@ -218,9 +218,9 @@ class NoiseFit:
     _numbers: np.ndarray
 
     def averaged_covariance(self) -> np.ndarray:
-        """Of the estimate, averaged over what is not known of the noise model [d, d].
+        """Covariance of the estimate [d, d], averaged over the uncertainty of the noise model.
 
-        Over samples of a normal approximation in the logarithms of its numbers.
+        The average is over samples of a normal approximation in the logarithms of its numbers.
         """
         return self._problem.averaged(self._numbers)
 

@@ -191,8 +191,8 @@ class RecordTarget:
         return slice(max(int(low[0]) - 1, 0), int(low[-1]) + 2)
 
     def _times(self) -> np.ndarray:
-        """Of the grid [N + 1]. Not beyond the last row: a knife that stopped there would show
-        weight and speed that it never had."""
+        """Times of the grid [N + 1], s. It ends with the last row: a knife that stopped there would
+        show weight and speed that it never had."""
         first, last = self.record.time[0], self.record.time[-1]
         count = max(2, int((last - first) / self.clock.period + 1e-6))
         return np.asarray(first + self.clock.period * np.arange(count + 1))

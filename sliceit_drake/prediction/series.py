@@ -90,7 +90,7 @@ class ForceSeries:
 
     @property
     def speed(self) -> np.ndarray:
-        """Of Ko [N], m/s."""
+        """Speed of Ko [N], m/s."""
         return np.asarray(np.linalg.norm(self.v, axis=1))
 
     def in_knife(self, vectors: np.ndarray) -> np.ndarray:

@@ -77,7 +77,7 @@ def held_out_gain(
 
 
 def held_out_share(problem: LinearProblem, causes: Sequence[tuple[str, float | None]]) -> float:
-    """Of what is above the floor in the held-out mean square, what causes remove."""
+    """Fraction of the held-out mean square above the noise floor that causes remove."""
     total = max(int(problem.moments.force_rows.sum()), 1)
     return _share(_both(problem, causes).sum(1) / total, _noise(problem))
 

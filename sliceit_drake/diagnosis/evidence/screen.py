@@ -33,7 +33,7 @@ __all__ = ["CauseEvidence", "Screening", "screen"]
 FLAT = 1e8
 """Variance of a coefficient of which nothing is known, in the column's size."""
 CORRECTION_VARIANCE = 1e4
-"""Of the nonparametric correction, N^2."""
+"""Prior variance of the nonparametric correction, N^2."""
 UNUSUAL = 0.98
 """Quantile of the gain beyond the usual from which on what a sensor has a little of is a cause."""
 LEAST_DEVIATION = 0.5
@@ -124,7 +124,7 @@ class Screening:
     projected: np.ndarray
 
     def evidence(self, name: str) -> CauseEvidence:
-        """Of one cause."""
+        """Evidence of one cause."""
         return next(c for c in self.causes if c.name == name)
 
     def angle_to(self, problem: LinearProblem, effect: CauseEvidence, other: str) -> float:
@@ -239,8 +239,8 @@ class _Statistics:
     def gains(
         self, products: np.ndarray
     ) -> tuple[dict[str, tuple[np.ndarray, list[float | None]]], np.ndarray, np.ndarray]:
-        """Of each cause the largest gains [n] and their scans; gains by a correction of each
-        condition [n]; and the products beside the baseline [n, K]."""
+        """Largest gains of each cause [n] with their scans, gains by a correction of each condition
+        [n], and the products beside the baseline [n, K]."""
         reduced = self.reduce(products)
         projected = self.project(reduced)
         of_baseline = _squares(reduced.sum(1)[:, self.baseline], self.baseline_covariance)
@@ -315,8 +315,8 @@ class _Statistics:
     def coefficients(
         self, products: np.ndarray, columns: list[int]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Of a cause's columns for one measurement [1, R, K]; where each record has its own their
-        mean and its standard error."""
+        """Coefficients of a cause's columns for one measurement [1, R, K], and their errors. Where
+        each record has its own, their mean and its standard error."""
         reduced = self.reduce(products)
         kinds = self.problem.found.columns
         if not kinds[columns[0]].per_record:

@@ -177,7 +177,7 @@ class _Computation:
         self.predictor, self.point = predictor, point
         self.columns: list[Column] = []
         self.ends: list[tuple[Point, Point | None, float]] = []
-        """Of each column the point at plus its size, that at minus, and a factor on the change."""
+        """Points at plus and minus the size of each column, and a factor on the change."""
         self.shown: list[tuple[int, Cause, dict[str, float], dict[str, float] | None]] = []
         """Columns that follow from the prediction without a simulation."""
         if not alone:

@@ -56,7 +56,7 @@ class NoiseLevel:
     drift: float = 0.01
 
     def scale(self, channel: str) -> float:
-        """Of a channel's noise over that of a force."""
+        """Ratio of a channel's noise to that of a force."""
         return self.torque if channel.startswith("torque") else 1.0
 
     @property

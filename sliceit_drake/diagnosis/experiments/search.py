@@ -130,7 +130,7 @@ class ExperimentSearch:
         return np.asarray(total - total[:, baseline] @ inverse @ total[baseline])
 
     def _angles(self, total: np.ndarray) -> list[tuple[str, str, float, float]]:
-        """Of each ordered pair the angle, degrees, and the expected gain."""
+        """Angle, degrees, and expected gain of each ordered pair of causes."""
         out = []
         for members in self.classes:
             screening = dc.replace(

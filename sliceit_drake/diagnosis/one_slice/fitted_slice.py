@@ -60,8 +60,8 @@ class FittedSlice:
         return float(np.sqrt((rest**2).sum(1).mean())) if len(rest) else 0.0
 
     def by_depth(self) -> list[tuple[str, int, float, float, float]]:
-        """Of the air and each block of depth: name, rows, mean and RMS of what the fit leaves, RMS
-        where it was left out, N."""
+        """Rows of a table, for the air and each block of depth: name, number of rows, mean and RMS
+        residual of the fit, RMS residual where the block was left out, N."""
         record, out = self.record, []
         depth = record.depth
         parts = [("before contact", ~record.in_contact & (depth <= 0.0))]

@@ -21,8 +21,8 @@ __all__ = ["LEVEL", "CauseInSlice", "SliceEvidence", "slice_evidence"]
 LEVEL = 0.05
 """Greatest p-value, over all causes, of one that the slice supports."""
 LEAST_SPREAD = 0.5
-"""Of a gain where nothing is wrong: that of a cause that hardly shows is next to none, and must not
-turn what is small into many standard deviations."""
+"""Least standard deviation of a gain where nothing is wrong. A cause that hardly shows has next to
+none, which would turn a small gain into many standard deviations."""
 
 
 @dc.dataclass
@@ -145,7 +145,7 @@ def _known(found: Sensitivities) -> tuple[list[int], np.ndarray]:
 def _best_gains(
     problem: SliceProblem, options: Sequence[tuple[str, float | None, list[int]]], y: np.ndarray
 ) -> dict[str, tuple[float, float | None]]:
-    """Of each cause its largest gain, and the value of its scan."""
+    """Largest gain of each cause, and the value of its scan."""
     b, kinds = problem.with_y(y), problem.found.columns
     out: dict[str, tuple[float, float | None]] = {}
     for name, scan, columns in options:

@@ -64,7 +64,7 @@ class Unknown:
 
 
 OWN = {"height": (1e-4, 2e-3), "speed": (0.01, 0.15)}
-"""Of what a record does not say of its motion: step, and plausible standard deviation; m, log."""
+"""Step and plausible standard deviation of what a record does not say of its motion; m, log."""
 
 
 def _unknowns(

@@ -83,12 +83,12 @@ class FoodFrames:
 
     @property
     def times(self) -> np.ndarray:
-        """Of the frames [n], s."""
+        """Times of the frames [n], s."""
         return np.array(self._times)
 
     @property
     def bodies(self) -> list[FoodBodyFrame]:
-        """Of the frames."""
+        """Bodies of the food, one a frame."""
         return self._bodies
 
 
