@@ -72,7 +72,7 @@ TOPICS: dict[str, tuple[Study, ...]] = {
         Study(
             "coupling",
             "robot.coupling",
-            "error against exchange period and plant step",
+            "error against coupling period and plant step",
             "2 min",
         ),
         Study("servo", "robot.servo", "how the arm follows, by servoj's parameters", "20 s"),

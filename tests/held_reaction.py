@@ -5,14 +5,14 @@ import numpy as np
 from sliceit_drake.cutting.kernels.types import LANES
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.solver import CuttingSolver
-from sliceit_drake.cutting.workspace import DIRECT
+from sliceit_drake.cutting.workspace import LAUNCH_LOCK
 
 
 def held_reaction(solver: CuttingSolver, state: np.ndarray, pose: Pose) -> np.ndarray:
     """Force of what holds the food on the food [3], N, in C, with the knife at `pose`."""
     m, ws, blocks = solver.model, solver._workspace, len(solver.model.blocks)
     solver._place(state, pose)
-    with DIRECT:
+    with LAUNCH_LOCK:
         ws.launch(ws.kernels.look_ahead, len(m.nodes), ws.look_ahead_arguments())
         ws.launch_elements(0)
         point_forces = ws.point_forces()
@@ -22,7 +22,7 @@ def held_reaction(solver: CuttingSolver, state: np.ndarray, pose: Pose) -> np.nd
     at_held = held[m.blocks]
     on_held = (forces.reshape(-1, 4, 3, LANES) * at_held[:, :, None, :]).sum((0, 1, 3))
     # Forces of the bulk sum to zero, so that those on held nodes relax as those on the others.
-    lag = solver.field(state, "lag").reshape(len(m.relaxing), len(m.nodes), 3)[:, m.moving]
+    lag = solver.field(state, "overstress").reshape(len(m.relaxing), len(m.nodes), 3)[:, m.moving]
     on_held += m.relaxing @ lag.sum(1, dtype=float)
     share = (held[m.point_nodes].reshape(-1, 2, 2) * m.point_weights[:, None, :]).sum(2)
     on_held += (point_forces * share[:, :, None]).sum((0, 1)) + m.weight[held].sum(0)

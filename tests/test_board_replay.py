@@ -70,7 +70,7 @@ def test_a_replayed_station_record_has_the_stations_board_force(
     scenario.numerics.time_step = 1e-4
     food = Food(shape=Cylinder(diameter=DIAMETER, rings=2, layers=[0.0, 0.004, 0.012]))
     result = replay(scenario, record, food, tmp_path / "knife.csv")
-    # Result k is at the end of exchange k, record row k at its begin.
+    # Result k is at the end of coupling step k, record row k at its begin.
     np.testing.assert_allclose(result.time, record["time"][1:], atol=1e-9)
     station, replayed = record["board_wrench_f_z"][1:], result.board_wrench[:, 5]
     peak = station.max()
@@ -90,7 +90,7 @@ def test_a_replayed_station_record_has_the_foods_force_as_well(tmp_path):
     run.advance()
     record = run.record()
     result = replay(scenario, record, scenario.food, tmp_path / "knife.csv")
-    # The station holds the mean over an exchange through the next, and logs before it updates.
+    # The station holds the mean over a coupling step through the next, and logs before it updates.
     station, replayed = record["food_wrench_f_z"][2:], result.food_wrench[:-1, 5]
     assert station.max() > 10.0
     np.testing.assert_allclose(replayed, station, atol=0.01)

@@ -58,7 +58,7 @@ def rms(values: np.ndarray) -> float:
 
 
 def within(condition: str, low: float, high: float, phase: str = "slice") -> np.ndarray:
-    """Rows of a phase between two shares of the food's height."""
+    """Rows of a phase between two fractions of the food's height."""
     r = record(condition)
     share = r.depth / 0.027
     return (r.phase == phase) & (share > low) & (share < high)

@@ -89,7 +89,7 @@ def test_rigid_arm_without_lag_has_the_limit_of_one_axis_by_hand():
     h, damping = 0.02, 0.9
 
     def growth(stiffness: float) -> float:
-        # Position, virtual velocity, position an exchange ago, whose force the sensor reports.
+        # Position, virtual velocity, position a coupling step ago, whose force the sensor reports.
         push = -damping * h * g * 0.025
         A = [[1.0, h, 0.0], [push * spring, damping, push * stiffness], [1.0, 0.0, 0.0]]
         return float(np.abs(np.linalg.eigvals(A)).max())

@@ -1,4 +1,4 @@
-"""Energy books of a cut: what the knife puts in is stored or goes somewhere."""
+"""Energy balance of a cut: what the knife puts in is stored or goes somewhere."""
 
 import numpy as np
 import pytest
@@ -50,22 +50,22 @@ def run(segments, exchange_period=2e-3, **material):
 
 
 @pytest.mark.parametrize("name", MOTIONS)
-def test_books_close(name):
+def test_the_energy_balance_closes(name):
     model, solver, motion = run(MOTIONS[name])
     result = simulate_slice(solver, motion)
-    assert abs(result.ledger.imbalance(result.energies)) < 0.01 * result.ledger.work
+    assert abs(result.balance.residual(result.energies)) < 0.01 * result.balance.work
 
 
 def test_knife_work_less_everything_else_is_toughness_times_area():
     model, solver, motion = run(PRESS)
     result = simulate_slice(solver, motion)
-    ledger, energies = result.ledger, result.energies
+    balance, energies = result.balance, result.energies
     # The knife's work from forces and path alone.
     moved = np.diff(np.vstack([motion.pose(0.0).p, result.position]), axis=0)
     work = -float((result.food_wrench[:, 3:] * moved).sum())
     stored = energies.elastic + energies.interface + energies.kinetic
-    elsewhere = ledger.opening + ledger.friction + ledger.board_friction + ledger.blade
-    net = work + ledger.gravity - stored - elsewhere - ledger.damping(energies)
+    elsewhere = balance.opening + balance.friction + balance.board_friction + balance.blade
+    net = work + balance.gravity - stored - elsewhere - balance.damping(energies)
     assert net == pytest.approx(400.0 * model.section_area, rel=0.03)
 
 
@@ -84,7 +84,7 @@ def test_no_mechanism_gives_energy_back_in_any_sub_step(name):
     losses = []
     for k in range(round(motion.duration / T)):
         now = pose((k + 1) * T)
-        step = solver.exchange(state, last, now)
+        step = solver.coupling_step(state, last, now)
         state, last = step.state, now
         losses.append(
             (
@@ -126,8 +126,8 @@ def parted():
     start = start_pose(model, clearance=-0.010)
     pose = Pose(model.X_FC_rotation.T @ start.R, model.to_cut_frame(start.p))
     state = solver.initial_state()
-    solver.field(state, "passed")[:] = model.tables.reach
-    solver.field(state, "parted")[:] = 1.0
+    solver.field(state, "edge_depth")[:] = model.tables.reach
+    solver.field(state, "cohesive_damage")[:] = 1.0
 
     def at(shift):
         """Forces on the knife [P, 2, 3] and energy with the half that is cut off moved [3]."""

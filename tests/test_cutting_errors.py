@@ -161,7 +161,7 @@ def test_a_step_beyond_the_limit_names_the_limit_and_the_ways_out():
     assert make_food_model(food, Knife(), taken).critical_time_step >= advised
 
 
-def test_a_step_that_does_not_divide_the_exchange_is_refused():
+def test_a_step_that_does_not_divide_the_coupling_step_is_refused():
     with pytest.raises(
         TimeStepError, match=r"0\.0003 s does not divide.*0\.002 s\. Give 0\.000285"
     ):

@@ -1,4 +1,4 @@
-"""The cutting system in Drake: contexts, order of events, ports, books of the coupling."""
+"""The cutting system in Drake: contexts, order of events, ports, energy balance of the coupling."""
 
 import concurrent.futures
 
@@ -55,7 +55,7 @@ class KnifePath(LeafSystem):
 
 
 class WrenchReader(LeafSystem):
-    """Notes, in a discrete update each exchange, the wrench that it sees."""
+    """Notes, in a discrete update each coupling step, the wrench that it sees."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -112,9 +112,9 @@ class Slice:
     def context(self) -> Context:
         return self.cutting.GetMyContextFromRoot(self.simulator.get_context())
 
-    def advance(self, exchanges: int) -> "Slice":
-        for _ in range(exchanges):
-            # Half way between exchanges no update is due, whatever the rounding of the time.
+    def advance(self, coupling_steps: int) -> "Slice":
+        for _ in range(coupling_steps):
+            # Half way between coupling steps no update is due, whatever the rounding of the time.
             done = int(self.simulator.get_context().get_time() / PERIOD)
             self.simulator.AdvanceTo((done + 1.5) * PERIOD)
             self.wrenches.append(self.cutting.wrench(self.context).copy())
@@ -167,7 +167,7 @@ def test_factors_of_one_call_do_not_reach_contexts_that_share_its_solver(diagram
     fresh = solvers[0].initial_state()
 
     def edge(factors: SurfaceFactors) -> float:
-        return float(solvers[0].exchange(fresh, above, below, factors).edge[5])
+        return float(solvers[0].coupling_step(fresh, above, below, factors).edge[5])
 
     run = Slice(diagram, *MOTIONS[0])
     for _ in range(LENGTH):
@@ -231,7 +231,7 @@ def test_a_new_food_has_no_past():
     simulator.AdvanceTo(0.8)
     cutting = diagram.station.cutting
     context = cutting.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-    names = ("ledger", "cut_progress", "coupling_work_error", "force_components")
+    names = ("balance", "cut_progress", "coupling_work_error", "force_components")
     assert all(cutting.GetOutputPort(name).Eval(context).any() for name in names)
     cutting.SetFood(context, 0)
     assert not any(cutting.GetOutputPort(name).Eval(context).any() for name in names)
@@ -334,8 +334,8 @@ def test_coupling_work_error_is_what_the_delay_costs():
     simulator = Simulator(diagram)
     simulator.AdvanceTo(0.1 + 0.5 * PERIOD)
     context = spring.GetMyContextFromRoot(simulator.get_context())
-    # Each exchange the held force is one step d = v T of depth too small, and the knife moves -d:
-    # n exchanges leave n k d^2 of work that the food did and the knife did not feel.
+    # Each coupling step the held force is one step d = v T of depth too small, and the knife moves
+    # -d: n coupling steps leave n k d^2 of work that the food did and the knife did not feel.
     step = 0.05 * PERIOD
     expected = 50 * Spring.STIFFNESS * step * step
     assert spring.GetOutputPort("coupling_work_error").Eval(context)[0] == pytest.approx(expected)
@@ -397,7 +397,7 @@ def test_each_slice_of_a_sequence_is_judged_by_its_own_energies():
     for _ in range(round(turns[-1] / PERIOD)):
         run.advance(1)
         energies.append(cutting.GetOutputPort("energy").Eval(run.context))
-        ledgers.append(cutting.GetOutputPort("ledger").Eval(run.context))
+        ledgers.append(cutting.GetOutputPort("balance").Eval(run.context))
         slices.append(cutting.food_index(run.context))
     energies, ledgers, second = np.array(energies), np.array(ledgers), np.array(slices) == 1
     ratio, least = energies[:, 3], energies[:, 4]

@@ -14,7 +14,7 @@ from sliceit_drake.diagnosis.evidence.effect_size import effect_in_noise
 from sliceit_drake.diagnosis.evidence.held_out import fitted_changes, held_out_gain
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.noise_levels import ChannelNoise
-from sliceit_drake.diagnosis.evidence.verdict import foretold, reach_verdict
+from sliceit_drake.diagnosis.evidence.verdict import checked_out_of_sample, reach_verdict
 
 
 def problem(
@@ -106,7 +106,7 @@ def test_a_hidden_cause_is_named_with_its_size_and_its_class(hidden, name):
     gain = held_out_gain(found, [(finding.evidence.name, finding.evidence.scan)])
     assert gain.share > 0.8 and gain.after < gain.before
     assert gain.after == pytest.approx(NOISE, rel=0.3)
-    assert foretold(verdict, gain, found) is verdict
+    assert checked_out_of_sample(verdict, gain, found) is verdict
 
 
 def test_a_cause_that_foretells_no_other_record_is_unknown():
@@ -116,19 +116,21 @@ def test_a_cause_that_foretells_no_other_record_is_unknown():
     gain = held_out_gain(found, [(finding.evidence.name, finding.evidence.scan)])
     poor = dc.replace(gain, share=0.5, interval=(0.4, 0.7))
     assert gain.before > gain.floor
-    assert foretold(verdict, poor, found).kind == "unknown"
-    assert "50 %" in foretold(verdict, poor, found).reason
+    assert checked_out_of_sample(verdict, poor, found).kind == "unknown"
+    assert "50 %" in checked_out_of_sample(verdict, poor, found).reason
     # What is not sure to be too little is enough.
-    assert foretold(verdict, dc.replace(poor, interval=(0.2, 1.1)), found) is verdict
+    assert checked_out_of_sample(verdict, dc.replace(poor, interval=(0.2, 1.1)), found) is verdict
     # What is done where the force jumps is not in that error.
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(found, "calm", lambda record: record.depth < 0.1 * record.depth.max())
-        assert foretold(verdict, poor, found) is verdict
+        assert checked_out_of_sample(verdict, poor, found) is verdict
     # Nothing of what is no larger than the noise can be foretold.
-    assert foretold(verdict, dc.replace(poor, before=0.9 * poor.floor), found) is verdict
+    assert (
+        checked_out_of_sample(verdict, dc.replace(poor, before=0.9 * poor.floor), found) is verdict
+    )
     # Nor what differs from record to record.
     finding.evidence.per_record = True
-    assert foretold(verdict, poor, found) is verdict
+    assert checked_out_of_sample(verdict, poor, found) is verdict
 
 
 def test_two_hidden_causes_are_both_named():

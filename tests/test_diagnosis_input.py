@@ -19,7 +19,7 @@ from sliceit_drake.diagnosis.cause import Cause, CauseParameter
 from sliceit_drake.diagnosis.causes import BUILT_IN
 from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
 from sliceit_drake.diagnosis.registry import load_cause
-from sliceit_drake.diagnosis.rehearsal import rehearse
+from sliceit_drake.diagnosis.rehearsal import dry_run
 from sliceit_drake.records.slice_record import SliceRecord, write_record
 
 CUCUMBER = Food(name="cucumber")
@@ -291,7 +291,7 @@ def test_a_users_cause_without_a_mistake_is_taken(tmp_path):
 
 def test_the_rehearsal_takes_every_built_in_cause():
     for kind in BUILT_IN:
-        rehearse(kind())
+        dry_run(kind())
 
 
 def test_a_motion_of_the_wrong_shape_is_refused():
@@ -303,4 +303,4 @@ def test_a_motion_of_the_wrong_shape_is_refused():
             return R[1:], p[1:]
 
     with pytest.raises(ConfigurationError, match="gives arrays"):
-        rehearse(Cut())
+        dry_run(Cut())

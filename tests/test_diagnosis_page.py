@@ -14,7 +14,7 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
     ("page", "words"),
     [
         ("diagnosis", f"The alarm of {100 * verdict.ALARM:g} %"),
-        ("diagnosis", f"its effect must be {verdict.LEAST_SIZE:g} of the noise in contact"),
+        ("diagnosis", f"its effect must be {verdict.MIN_SIZE:g} of the noise in contact"),
         ("diagnosis", f"must show in {100 * verdict.PRESENCE:g} % of the records"),
         ("diagnosis", f"the effect that was found to within {verdict.CLASS_ANGLE:g} degrees"),
         ("diagnosis", f"their gain is less than {100 * verdict.CLASS_GAIN:g} % below the largest"),
@@ -31,14 +31,14 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
         ("diagnosis", f"at least {100 * verdict.SECOND_SHARE:g} % of the sum of squares"),
         ("diagnosis", f"at least {100 * verdict.OF_THE_REST:g} % of what the first leaves"),
         ("diagnosis", f"at least {100 * verdict.SECOND_GAIN:g} % of all that can be gained"),
-        ("diagnosis", f"its effect is {verdict.LEAST_MISFIT:g} of the noise or more"),
+        ("diagnosis", f"its effect is {verdict.MIN_MISFIT:g} of the noise or more"),
         ("diagnosis", f"at least {verdict.MISFIT_FACTOR:g} times what it gains where nothing"),
         (
             "diagnosis",
             f"condition, the last two limits are {verdict.ONE_CONDITION_MISFIT:g} of the noise "
             f"and {verdict.ONE_CONDITION_FACTOR:g} times",
         ),
-        ("diagnosis", f"if the interval ends below {100 * verdict.LEAST_REMOVED:g} % and"),
+        ("diagnosis", f"if the interval ends below {100 * verdict.MIN_REMOVED:g} % and"),
         (
             "next_experiment",
             f"at least {100 * (1.0 - next_experiment.ALIKE_GAIN):g} % as much and lie within "

@@ -55,7 +55,7 @@ def test_the_sum_of_norms_is_never_less_than_the_resultant(drawn):
     touching = drawn.contact_sum > 0.0
     assert touching[-1] and not touching[0]
     resultant = np.linalg.norm(drawn.food_wrench[:, 3:], axis=1)
-    # Two percent, for one is the exchange's mean and the other its end.
+    # Two percent, for one is the coupling step's mean and the other its end.
     assert np.all(drawn.contact_sum >= 0.98 * resultant)
     assert drawn.contact_sum[-1] > 1.5 * resultant[-1]
 
@@ -81,7 +81,7 @@ def test_contact_forces_add_up_to_the_force_on_the_knife():
     pose = Pose(model.X_FC_rotation.T @ pose.R, model.to_cut_frame(pose.p))
     for _ in range(600):
         after = pose._replace(p=pose.p + 2e-4 * np.array([0.03, 0.0, -0.05]))
-        step = solver.exchange(state, pose, after)
+        step = solver.coupling_step(state, pose, after)
         forces = solver.contact_forces(step.state, pose, after)
         state, pose = step.state, after
     assert forces.shape == (len(model.point_nodes), 2, 3)
@@ -94,11 +94,11 @@ def test_contact_forces_add_up_to_the_force_on_the_knife():
 def test_the_edge_takes_its_share_and_leaves_the_rest_to_opening(share):
     model = bar(RAZOR, share, friction=0.0, flank_stiffness=0.01)
     result = cut(model, depth=0.0156)
-    ledger = result.ledger
+    balance = result.balance
     whole = TOUGHNESS * model.section_area
-    assert ledger.edge == pytest.approx(share * whole, rel=0.02, abs=1e-9)
-    assert ledger.opening < 0.02 * whole, "a razor opens nothing"
-    assert abs(ledger.imbalance(result.energies)) < 0.01 * max(ledger.work, 0.02 * whole)
+    assert balance.edge == pytest.approx(share * whole, rel=0.02, abs=1e-9)
+    assert balance.opening < 0.02 * whole, "a razor opens nothing"
+    assert abs(balance.residual(result.energies)) < 0.01 * max(balance.work, 0.02 * whole)
 
 
 def test_bonds_that_the_edge_left_are_torn_apart_by_a_thick_blade():
@@ -106,18 +106,18 @@ def test_bonds_that_the_edge_left_are_torn_apart_by_a_thick_blade():
         material=Material(youngs_modulus=2e6, toughness=20.0, friction=0.0)
     )
     result = cut(model, depth=0.03)
-    ledger, whole = result.ledger, 20.0 * model.section_area
-    assert ledger.edge == 0.0
-    assert ledger.opening == pytest.approx(whole, rel=0.05)
+    balance, whole = result.balance, 20.0 * model.section_area
+    assert balance.edge == 0.0
+    assert balance.opening == pytest.approx(whole, rel=0.05)
     # Bonds that held nothing behind the edge would dissipate what nobody put in.
-    assert abs(ledger.imbalance(result.energies)) < 0.1 * whole
+    assert abs(balance.residual(result.energies)) < 0.1 * whole
 
 
-def test_bonds_that_hold_behind_the_edge_store_what_the_books_say():
+def test_bonds_that_hold_behind_the_edge_store_what_the_energy_balance_says():
     model = bar(Knife(length=0.4, spine_thickness=0.006), 0.0, friction=0.0)
     result = cut(model, depth=0.01)
-    assert result.cut[-1] > 0.5 and result.ledger.opening == 0.0
-    assert abs(result.ledger.imbalance(result.energies)) < 0.003 * result.ledger.work
+    assert result.cut[-1] > 0.5 and result.balance.opening == 0.0
+    assert abs(result.balance.residual(result.energies)) < 0.003 * result.balance.work
 
 
 def test_the_case_holds_disects_parameters_per_area():

@@ -174,7 +174,9 @@ def test_a_skin_takes_its_toughness_times_the_outline_at_entry_and_exit(shape):
     base, skinned = (
         simulate(model, Effects(skin=skin), press(top + 3e-4)) for skin in (Skin(), Skin(toughness))
     )
-    work = (skinned.ledger.edge + skinned.ledger.opening) - (base.ledger.edge + base.ledger.opening)
+    work = (skinned.balance.edge + skinned.balance.opening) - (
+        base.balance.edge + base.balance.opening
+    )
     assert work == pytest.approx(toughness * length, rel=0.02)
     extra = (skinned.edge - base.edge)[:, 2]
     depth = depth_of(base, top)
@@ -232,7 +234,7 @@ def test_a_blunt_edge_asks_for_more_where_it_enters_and_a_draw_relieves_it():
             simulate(bar(), effects, press(0.014, ratio)) for effects in (Effects(), blunt)
         )
         extra[ratio] = (other.edge - base.edge)[:, 2]
-        assert other.ledger.edge - base.ledger.edge == pytest.approx(
+        assert other.balance.edge - base.balance.edge == pytest.approx(
             initiation * WIDTH * reach, rel=0.03
         )
         late = steady(base)
@@ -368,7 +370,7 @@ def test_a_food_that_slips_drops_the_lateral_force_and_jumps():
     draw = {name: -result.food_wrench[:, 3] for name, result in results.items()}
     assert draw["holds"].max() > 1.3 * resistance
     assert draw["slips"].max() < 1.05 * resistance
-    # Within one exchange, more than any other change.
+    # Within one coupling step, more than any other change.
     drops = -np.diff(draw["slips"])
     assert drops.max() > 0.8 * (1.0 - remaining) * resistance
     assert -np.diff(draw["holds"]).min() < 0.5 * drops.max()
@@ -381,7 +383,7 @@ def test_a_food_that_slips_drops_the_lateral_force_and_jumps():
         steps = np.diff(np.vstack([result.position[0], result.position]), axis=0)
         given = -float((result.food_wrench[:, 3:] * steps).sum())
         stored = 0.5 * holder * float(result.food_wrench[-1, 3]) ** 2
-        lost = given - result.ledger.work - stored
+        lost = given - result.balance.work - stored
         expected = remaining * resistance * slid if result is slips else 0.0
         assert lost == pytest.approx(expected, rel=0.25, abs=2e-4)
 
@@ -400,18 +402,18 @@ ALL = Effects(
 )
 
 
-def test_with_all_effects_on_the_books_close_and_no_loss_is_negative():
+def test_with_all_effects_on_the_energy_balance_closes_and_no_loss_is_negative():
     model = bar(razor=False, friction=0.1).derive(effects=ALL)
     solver = CuttingSolver(model, PERIOD)
     losses = []
-    run = solver.exchanges
+    run = solver.coupling_steps
 
     def recorded(*arguments):
         step = run(*arguments)
         losses.append(step.dissipation)
         return step
 
-    solver.exchanges = recorded  # type: ignore[method-assign]
+    solver.coupling_steps = recorded  # type: ignore[method-assign]
     path = motion(
         model,
         press(0.01, 1.0),
@@ -420,11 +422,11 @@ def test_with_all_effects_on_the_books_close_and_no_loss_is_negative():
         Hold(duration=0.3),
     )
     result = simulate_slice(solver, path)
-    ledger = result.ledger
-    assert abs(ledger.imbalance(result.energies)) < 0.01 * ledger.work
+    balance = result.balance
+    assert abs(balance.residual(result.energies)) < 0.01 * balance.work
     assert np.min(losses) > -1e-6 * np.sum(losses)
     # At rest and relaxed: the bulk has lost what it did not give back.
-    assert ledger.damping(result.energies) > 0.0
+    assert balance.damping(result.energies) > 0.0
 
 
 SHOWN = {

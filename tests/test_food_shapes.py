@@ -129,7 +129,7 @@ def test_slices_of_a_tapered_food_take_toughness_times_their_growing_areas():
         plan = MotionPlan([ConstantSpeed(distance=model.top + 1e-3, speed=0.04)])
         result = simulate_slice(CuttingSolver(model, 2e-3), Motion(plan, start_pose(model, 5e-4)))
         assert result.cut[-1] > 0.999
-        work.append(result.ledger.edge + result.ledger.opening)
+        work.append(result.balance.edge + result.balance.opening)
         area.append(section_area(small, each.shape.position))
     np.testing.assert_allclose(work, 400.0 * np.array(area), rtol=0.03)
     assert area[1] > 1.1 * area[0]

@@ -31,11 +31,11 @@ def pressed():
     return solver, result
 
 
-def settle(solver, state, pose, exchanges):
-    """Mean force on the knife over the last ten of some exchanges at rest, and the state."""
+def settle(solver, state, pose, coupling_steps):
+    """Mean force on the knife over the last ten of some coupling steps at rest, and the state."""
     forces = []
-    for _ in range(exchanges):
-        step = solver.exchange(state, pose, pose)
+    for _ in range(coupling_steps):
+        step = solver.coupling_step(state, pose, pose)
         state = step.state
         forces.append(step.friction[3:])
     return np.mean(forces[-10:], axis=0), state
@@ -45,14 +45,14 @@ def displaced(pose, metres):
     return Pose(pose.R, pose.p + np.array([metres, 0.0, 0.0]))
 
 
-def drag(solver, state, pose, distance, exchanges=25):
+def drag(solver, state, pose, distance, coupling_steps=25):
     """Draws the knife along its edge and lets the food settle."""
-    for k in range(exchanges):
+    for k in range(coupling_steps):
         a, b = (
-            displaced(pose, distance * k / exchanges),
-            displaced(pose, distance * (k + 1) / exchanges),
+            displaced(pose, distance * k / coupling_steps),
+            displaced(pose, distance * (k + 1) / coupling_steps),
         )
-        state = solver.exchange(state, a, b).state
+        state = solver.coupling_step(state, a, b).state
     return settle(solver, state, displaced(pose, distance), 150)
 
 
@@ -67,10 +67,10 @@ def test_sliding_friction_is_mu_times_the_normal_force(pressed):
     state, pose = result.state, result.pose
     for k in range(100):
         a, b = displaced(pose, 4e-5 * k), displaced(pose, 4e-5 * (k + 1))
-        step = solver.exchange(state, a, b)
+        step = solver.coupling_step(state, a, b)
         state = step.state
-    # Both flanks press with the lateral share of the wedge's force; take the mean from its vertical
-    # component: N = F_z / sin(half angle), for both together.
+    # Both flanks press with the lateral fraction of the wedge's force; take the mean from its
+    # vertical component: N = F_z / sin(half angle), for both together.
     knife = solver.model.knife
     slope = 0.5 * (knife.spine_thickness - knife.edge_thickness) / knife.height
     normal = step.normal[5] * np.hypot(1.0, slope) / slope
@@ -91,11 +91,11 @@ def test_below_the_slip_load_a_hold_does_not_creep(pressed):
 
     pose = displaced(result.pose, low)
 
-    def mean_positions(state, exchanges=50):
+    def mean_positions(state, coupling_steps=50):
         """Mean over a tenth of a second, so that what still rings does not count as creep."""
         positions = []
-        for _ in range(exchanges):
-            state = solver.exchange(state, pose, pose).state
+        for _ in range(coupling_steps):
+            state = solver.coupling_step(state, pose, pose).state
             positions.append(solver.positions(state).astype(float))
         return np.mean(positions, axis=0), state
 

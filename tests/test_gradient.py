@@ -252,16 +252,18 @@ def test_single_precision_gradients_are_within_one_percent(everything):
 
 def test_the_slice_with_gradients_is_the_slice_without(everything):
     solver = CuttingSolver(everything.model, PERIOD)
-    result = solver.exchanges(everything.run.states[0], everything.run.R[:2], everything.run.p[:2])
+    result = solver.coupling_steps(
+        everything.run.states[0], everything.run.R[:2], everything.run.p[:2]
+    )
     np.testing.assert_array_equal(result.wrenches[0].sum(0), everything.run.wrenches[0])
     state = everything.run.states[60]
-    result = solver.exchanges(state, everything.run.R[60:62], everything.run.p[60:62])
+    result = solver.coupling_steps(state, everything.run.R[60:62], everything.run.p[60:62])
     np.testing.assert_array_equal(result.wrenches[0].sum(0), everything.run.wrenches[60])
     np.testing.assert_array_equal(result.state, everything.run.states[61])
 
 
 def test_memory_does_not_grow_with_the_number_of_sub_steps_kept(everything):
-    # Between exchanges only the state is kept.
+    # Between coupling steps only the state is kept.
     kept = sum(state.nbytes for state in everything.run.states)
     assert kept == (len(everything.p)) * everything.run.states[0].nbytes
 

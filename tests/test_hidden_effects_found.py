@@ -27,7 +27,7 @@ from studies.hidden_effects.truth import CAUSE_OF
 pytestmark = pytest.mark.second_tier
 
 REPLICATES = 100
-LEAST_RIGHT = 10
+MIN_RIGHT = 10
 """Of the twelve runs."""
 SINGLE = (
     "skin",
@@ -115,6 +115,6 @@ def test_a_fresh_draw_of_effects_is_diagnosed_rightly(tmp_path):
     )
     print(said)
     assert len(judgements) == len(cases)
-    assert sum(j.right for j in judgements) >= LEAST_RIGHT, f"seed {seed}\n{said}"
+    assert sum(j.right for j in judgements) >= MIN_RIGHT, f"seed {seed}\n{said}"
     # A confident wrong name is worse than a miss.
     assert not any(map(is_wrong_name, judgements)), f"seed {seed}\n{said}"

@@ -8,7 +8,7 @@ from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan, Pose, Retract
-from sliceit_drake.cutting.solver import CuttingSolver, Exchange
+from sliceit_drake.cutting.solver import CouplingStep, CuttingSolver
 
 PERIOD = 2e-3
 SHAPE = Cylinder(rings=3, layers=[0.0, 0.004, 0.012])
@@ -16,8 +16,9 @@ SHAPE = Cylinder(rings=3, layers=[0.0, 0.004, 0.012])
 
 def follow(
     segments: list, food: Food, time_step: float, **numerics
-) -> tuple[CuttingSolver, list[Exchange], np.ndarray, list[Pose]]:
-    """The exchanges along a path, the positions of the nodes after each, and the poses in C."""
+) -> tuple[CuttingSolver, list[CouplingStep], np.ndarray, list[Pose]]:
+    """The coupling steps along a path, the positions of the nodes after each, and the poses in
+    C."""
     model = make_food_model(food, Knife(), Numerics(time_step=time_step, **numerics))
     solver = CuttingSolver(model, PERIOD)
     motion = Motion(MotionPlan(segments), start_pose(model, clearance=5e-4))
@@ -25,12 +26,12 @@ def follow(
     times = PERIOD * np.arange(round(motion.duration / PERIOD) + 1)
     poses = [Pose(R @ X.R, model.to_cut_frame(X.p)) for X in map(motion.pose, times)]
     state = solver.initial_state()
-    exchanges, positions = [], []
+    coupling_steps, positions = [], []
     for start, end in zip(poses[:-1], poses[1:], strict=True):
-        exchanges.append(solver.exchange(state, start, end))
-        state = exchanges[-1].state
+        coupling_steps.append(solver.coupling_step(state, start, end))
+        state = coupling_steps[-1].state
         positions.append(solver.positions(state).astype(float))
-    return solver, exchanges, np.array(positions), poses
+    return solver, coupling_steps, np.array(positions), poses
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.1])
@@ -41,11 +42,11 @@ def test_a_hold_after_a_press_neither_creeps_nor_relaxes(friction, time_step):
     hold = 0.3
     press = ConstantSpeed(distance=0.012, speed=0.02)
     # In double precision: single rounds to a vibration of 1e-9 of the elastic energy.
-    solver, exchanges, positions, poses = follow(
+    solver, coupling_steps, positions, poses = follow(
         [press, Hold(duration=hold)], food, time_step, precision="float64"
     )
 
-    vertical = np.array([step.wrench[5] for step in exchanges])
+    vertical = np.array([step.wrench[5] for step in coupling_steps])
     resting = round(hold / PERIOD)
     at_stop, late, end = vertical[-resting], vertical[-resting // 2], vertical[-1]
     assert at_stop > 5.0
@@ -55,7 +56,7 @@ def test_a_hold_after_a_press_neither_creeps_nor_relaxes(friction, time_step):
     assert creep < 1e-6
 
     # Nothing feeds a vibration: what rings at the sudden stop dies away.
-    after, rest = (solver.energies(exchanges[k].state, poses[-1]) for k in (-resting, -1))
+    after, rest = (solver.energies(coupling_steps[k].state, poses[-1]) for k in (-resting, -1))
     assert rest.kinetic < 1e-6 * after.kinetic
 
 
@@ -66,10 +67,10 @@ def test_halves_that_are_not_held_come_to_rest_on_the_board_with_their_weight():
         Hold(duration=1.0),
     ]
     food = Food(shape=SHAPE, held_sides="none")
-    solver, exchanges, positions, _ = follow(segments, food, 2e-4)
+    solver, coupling_steps, positions, _ = follow(segments, food, 2e-4)
     weight = -solver.model.weight[solver.model.moving].sum(0)[2]
-    on_board = np.mean([step.board_force[2] for step in exchanges[-100:]])
-    assert exchanges[-1].cut == pytest.approx(1.0, abs=0.01)
+    on_board = np.mean([step.board_force[2] for step in coupling_steps[-100:]])
+    assert coupling_steps[-1].cut == pytest.approx(1.0, abs=0.01)
     assert weight == pytest.approx(950.0 * 9.81 * np.pi * 0.0135**2 * 0.12, rel=1e-3)
     assert on_board == pytest.approx(weight, rel=0.03)
     # The halves stand apart, neither sunk into the board nor lifted off it; they may roll.
@@ -87,10 +88,10 @@ def test_the_force_on_the_way_out_pulls_the_knife_back_and_ends_outside():
         Retract(distance=0.02, speed=0.02, acceleration=0.5),
         Hold(duration=0.05),
     ]
-    _, exchanges, _, poses = follow(segments, Food(shape=SHAPE), 5e-4)
+    _, coupling_steps, _, poses = follow(segments, Food(shape=SHAPE), 5e-4)
     height = np.array([pose.p[2] for pose in poses[1:]])
-    vertical = np.array([step.wrench[5] for step in exchanges])
-    edge = np.array([step.edge[5] for step in exchanges])
+    vertical = np.array([step.wrench[5] for step in coupling_steps])
+    edge = np.array([step.edge[5] for step in coupling_steps])
     deepest = int(height.argmin())
     inside = np.arange(len(height)) > deepest
     inside &= (height > height.min() + 1e-3) & (height < height.min() + 8e-3)
@@ -104,8 +105,8 @@ def test_local_damping_keeps_scaled_masses_from_swinging_on_after_a_sudden_stop(
     held = round(0.06 / PERIOD)
 
     def force(time_step: float, **numerics) -> np.ndarray:
-        _, exchanges, _, _ = follow(segments, Food(shape=SHAPE), time_step, **numerics)
-        return np.array([step.wrench[5] for step in exchanges[-held:]])
+        _, coupling_steps, _, _ = follow(segments, Food(shape=SHAPE), time_step, **numerics)
+        return np.array([step.wrench[5] for step in coupling_steps[-held:]])
 
     reference = force(5e-5)
     errors = [

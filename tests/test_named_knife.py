@@ -55,7 +55,7 @@ def test_a_thicker_wedge_asks_for_more_force_in_the_same_food():
         plan = MotionPlan([ConstantSpeed(distance=0.0165, speed=0.03)])
         result = simulate_slice(CuttingSolver(model, 2e-3), Motion(plan, start_pose(model, 1e-3)))
         assert result.cut[-1] > 0.99
-        work[name] = result.ledger.work / model.section_area
+        work[name] = result.balance.work / model.section_area
     assert 300.0 < work["paring"] < work["chef"]
     assert 300.0 < work["gazebo"] < work["chef"]
 

@@ -159,10 +159,10 @@ def test_pressing_through_an_oblique_plane_takes_toughness_times_its_ellipse(nam
     # The knife's work from forces and path alone, less what is stored or goes elsewhere.
     moved = np.diff(np.vstack([motion.pose(0.0).p, result.position]), axis=0)
     work = -float((result.food_wrench[:, 3:] * moved).sum())
-    ledger, energies = result.ledger, result.energies
+    balance, energies = result.balance, result.energies
     stored = energies.elastic + energies.interface + energies.kinetic
-    elsewhere = ledger.opening + ledger.friction + ledger.board_friction + ledger.blade
-    net = work + ledger.gravity - stored - elsewhere - ledger.damping(energies)
+    elsewhere = balance.opening + balance.friction + balance.board_friction + balance.blade
+    net = work + balance.gravity - stored - elsewhere - balance.damping(energies)
     assert net == pytest.approx(food.material.toughness * ellipse(name), rel=0.01)
 
 

@@ -27,16 +27,16 @@ def bar(strength, toughness=TOUGHNESS, **numerics):
     return model, CuttingSolver(model, 2e-3)
 
 
-def pull_apart(model, solver, state, distance, exchanges=400):
+def pull_apart(model, solver, state, distance, coupling_steps=400):
     """Moves the held plus side away from the cut: what opening dissipates, and the state."""
     held = np.ones(len(model.nodes), bool)
     held[model.moving] = False
     plus = held & (model.split.node_side[model.computed] == 1)
     lost = 0.0
-    for _ in range(exchanges):
+    for _ in range(coupling_steps):
         x = solver.field(state, "x").reshape(-1, 3)
-        x[plus, 1] += distance / exchanges
-        step = solver.exchange(state, FAR, FAR)
+        x[plus, 1] += distance / coupling_steps
+        step = solver.coupling_step(state, FAR, FAR)
         state = step.state
         lost += step.opening_dissipation
     return lost, state
@@ -46,7 +46,7 @@ def pull_apart(model, solver, state, distance, exchanges=400):
 def test_pulling_the_halves_apart_costs_toughness_times_area_whatever_the_strength(strength):
     model, solver = bar(strength)
     lost, state = pull_apart(model, solver, solver.initial_state(), distance=8e-3)
-    assert np.all(solver.field(state, "parted") == 1.0)
+    assert np.all(solver.field(state, "cohesive_damage") == 1.0)
     assert lost == pytest.approx(TOUGHNESS * model.section_area, rel=1e-3)
 
 
@@ -69,9 +69,11 @@ def test_a_strength_that_the_mesh_cannot_hold_is_lowered_and_said():
 def test_faces_that_are_not_pulled_to_their_strength_lose_nothing():
     model, solver = bar(strength=2e5)
     stretch = 0.5 * 2e5 / 5e6 * 0.01
-    lost, state = pull_apart(model, solver, solver.initial_state(), distance=stretch, exchanges=100)
+    lost, state = pull_apart(
+        model, solver, solver.initial_state(), distance=stretch, coupling_steps=100
+    )
     assert lost == 0.0
-    assert np.all(solver.field(state, "parted") == 0.0)
+    assert np.all(solver.field(state, "cohesive_damage") == 0.0)
 
 
 def test_edge_and_opening_share_one_toughness():
@@ -86,7 +88,7 @@ def test_edge_and_opening_share_one_toughness():
     top, middle = model.top + 1e-4, 0.5 * (model.top + model.bottom)
     heights = np.linspace(top, middle, 300)
     for a, b in zip(heights[:-1], heights[1:], strict=True):
-        step = solver.exchange(state, at(a), at(b))
+        step = solver.coupling_step(state, at(a), at(b))
         state = step.state
         by_edge += step.edge_dissipation
         by_opening += step.opening_dissipation
@@ -99,7 +101,9 @@ def test_edge_and_opening_share_one_toughness():
 
 def test_a_food_without_toughness_has_no_bonds():
     model, solver = bar(strength=2e5, toughness=0.0)
-    lost, state = pull_apart(model, solver, solver.initial_state(), distance=1e-3, exchanges=100)
+    lost, state = pull_apart(
+        model, solver, solver.initial_state(), distance=1e-3, coupling_steps=100
+    )
     assert lost == 0.0
     points = solver.positions(state)[model.point_nodes]
     gap = points[:, 2:].mean(1)[:, 1] - points[:, :2].mean(1)[:, 1]

@@ -65,7 +65,7 @@ def test_steady_edge_force_follows_atkins(draw_ratio, mesh):
 
 
 def test_drawing_does_the_work_of_the_toughness_like_pressing():
-    works = [cut_bar(xi, *MESHES["coarse"]).ledger.edge for xi in (0.0, 3.0)]
+    works = [cut_bar(xi, *MESHES["coarse"]).balance.edge for xi in (0.0, 3.0)]
     depth = 1.3 * SPEED - 5e-4
     for work in works:
         assert work == pytest.approx(TOUGHNESS * WIDTH * depth, rel=0.03)

@@ -31,12 +31,12 @@ def test_knife_wrench_equals_the_reaction_of_clamp_and_board(held_sides, depth):
         ]
     )
     result = simulate_slice(solver, Motion(plan, start_pose(model, clearance=5e-4)))
-    # The mean of the last exchanges takes out what still rings.
+    # The mean of the last coupling steps takes out what still rings.
     state, X = result.state, result.pose
     steps = []
     held = []
     for _ in range(50):
-        step = solver.exchange(state, X, X)
+        step = solver.coupling_step(state, X, X)
         state = step.state
         steps.append(step)
         held.append(held_reaction(solver, state, X))

@@ -47,8 +47,8 @@ def test_a_slice_is_the_same_for_the_same_numbers():
         (lambda r: r.food_wrench.__setitem__((5, 3), np.nan), "not finite"),
         (lambda r: r.cut.__setitem__(20, r.cut[19] - 0.1), "closes"),
         (lambda r: r.cut.__setitem__(slice(None), np.minimum(r.cut, 0.5)), "50.0 % are cut"),
-        (lambda r: setattr(r.ledger, "work", 1.5 * r.ledger.work), "books lack"),
-        (lambda r: setattr(r.ledger, "friction", -1e-3), "friction gives energy"),
+        (lambda r: setattr(r.balance, "work", 1.5 * r.balance.work), "energy balance lacks"),
+        (lambda r: setattr(r.balance, "friction", -1e-3), "friction gives energy"),
     ],
 )
 def test_what_no_slice_may_do_is_unexplained(change, said, monkeypatch):

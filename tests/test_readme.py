@@ -72,7 +72,7 @@ def test_the_table_is_what_the_first_command_measures(tmp_path):
             0.1,
             [1e2 * error, found["elements"], 1e3 * found["sub_step_s"]],
         ),
-        "energy that the books do not explain": (
+        "residual of the energy balance": (
             0.01,
             [1e2 * abs(found["energy_imbalance_J"]) / work],
         ),

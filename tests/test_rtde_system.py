@@ -182,7 +182,7 @@ def test_a_robot_that_sends_nothing_is_named_at_the_start(robot, monkeypatch):
         make_link(robot).start()
 
 
-def test_neither_side_of_the_exchange_waits(robot):
+def test_neither_side_of_the_coupling_step_waits(robot):
     link = make_link(robot)
     link.start()
     link.arm()
@@ -197,17 +197,17 @@ def test_neither_side_of_the_exchange_waits(robot):
     link.put(START, robot.time)
     assert inside.wait(10.0)
 
-    def exchange():
+    def coupling_step():
         for _ in range(100):
             link.latest()
             link.put(START, 0.0)
 
-    other = threading.Thread(target=exchange, daemon=True)
+    other = threading.Thread(target=coupling_step, daemon=True)
     other.start()
     other.join(20.0)
     waited = other.is_alive()
     go_on.set()
-    assert not waited, "an exchange waited for the thread"
+    assert not waited, "a coupling step waited for the thread"
     link.finish("test over")
 
 

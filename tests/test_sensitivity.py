@@ -71,14 +71,14 @@ def test_an_uneven_clock_gives_the_forces_and_rates_of_an_even_one():
         ),
         Point(causes=(ActiveCause(BulkRelaxation(), {"share": 0.3}),)),
     ]
-    forces, exchanges = [], []
+    forces, coupling_steps = [], []
     for clock in (EVEN, Clock()):
         predictor = SlicePredictor(setup, records, [Meshing()], clock)
         rows = predictor.predict(points)
         forces.append([row[0].wrench[:, 3:] for row in rows])
-        exchanges.append(len(predictor.targets[0].stretches.ends))
+        coupling_steps.append(len(predictor.targets[0].stretches.ends))
     even, uneven = forces
-    assert exchanges[1] < 0.6 * exchanges[0]
+    assert coupling_steps[1] < 0.6 * coupling_steps[0]
     assert rms(uneven[0] - even[0]) < 0.005 * rms(even[0])
     for name, a, b in zip(("rate", "viscosity", "relaxation"), even[1:], uneven[1:], strict=True):
         change = rms(a - even[0])

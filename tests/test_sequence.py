@@ -94,7 +94,7 @@ def test_knife_stays_in_the_cut_plane_while_it_is_in_the_food(indexed):
     assert travel == pytest.approx(expected, abs=5e-4)
 
 
-def test_books_run_on_over_the_slices_and_close(by_knife):
+def test_the_energy_balance_runs_on_over_the_slices_and_closes(by_knife):
     run, record = by_knife
     models = [solver.model for solver in run.station.cutting.solvers]
     reports = slice_reports(record, run.station.cutting.section_areas())
@@ -121,7 +121,7 @@ def test_a_sequence_repeats_bit_for_bit_and_its_clone_goes_on_identically(by_kni
     for simulator in (original, other):
         diagram.SetStart(simulator.get_mutable_context())
         simulator.Initialize()
-    # Half way between two exchanges no update is due.
+    # Half way between two coupling steps no update is due.
     end = float(record["time"][int(np.argmax(record["food_index"] == 1))]) + 0.001
     original.AdvanceTo(end - 0.05)
     copy = Simulator(diagram, original.get_context().Clone())
@@ -138,7 +138,7 @@ def test_a_sequence_repeats_bit_for_bit_and_its_clone_goes_on_identically(by_kni
     # A row of the record holds what was so until its time.
     following = int(np.searchsorted(record["time"], original.get_context().get_time()))
     context = station.GetMyContextFromRoot(original.get_context())
-    work = station.GetOutputPort("ledger").Eval(context)[0]
+    work = station.GetOutputPort("balance").Eval(context)[0]
     assert work == record["energy_work"][following] > 0.0
 
 

@@ -94,7 +94,8 @@ class Bench:
         return self.cutter.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
 
     def run(self, duration: float) -> np.ndarray:
-        """Moment and force in F, force of the edge in F, progress, after each exchange [N, 10]."""
+        """Moment and force in F, force of the edge in F, progress, after each coupling step [N,
+        10]."""
         self.simulator.Initialize()
         R_FW, rows = X_WF.rotation().matrix().T, []
         for k in range(1, round(duration / PERIOD) + 1):
@@ -229,7 +230,7 @@ def test_a_tilted_edge_is_in_the_food_where_the_food_is():
         R = RotationMatrix.MakeYRotation(0.1) @ RotationMatrix(np.diag([1.0, -1.0, -1.0]))
 
         def pose(t: float) -> RigidTransform:
-            # 5 um more, so that contact falls between two exchanges.
+            # 5 um more, so that contact falls between two coupling steps.
             middle = np.array([0.0, 0.0, DIAMETER + CLEARANCE + 5e-6 - 0.02 * t])
             return RigidTransform(R, middle + x * along)
 

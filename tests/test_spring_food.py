@@ -47,7 +47,7 @@ class Press:
         return self.cutter.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
 
     def run(self, duration: float) -> np.ndarray:
-        """Rows of end time, moment [3], force [3], compression, rate of each exchange."""
+        """Rows of end time, moment [3], force [3], compression, rate of each coupling step."""
         rows = []
         for k in range(1, round(duration / PERIOD) + 1):
             self.simulator.AdvanceTo(k * PERIOD)
@@ -98,7 +98,7 @@ def test_a_knife_below_the_board_feels_full_compression_and_no_more():
 def test_a_moving_button_adds_its_damping():
     rows = Press(lambda t: 0.03 - 0.1 * t).run(0.2)
     steady = rows[10:]
-    # Mean over an exchange of two backward steps, at 1/2 and all of it.
+    # Mean over a coupling step of two backward steps, at 1/2 and all of it.
     mean = 0.1 * (steady[:, 0] - PERIOD) + 0.1 * 0.75 * PERIOD
     np.testing.assert_allclose(steady[:, 6], 500.0 * mean + 2.0 * 0.1, rtol=1e-9)
 
@@ -126,7 +126,7 @@ def test_the_knife_is_never_pulled_back_and_the_button_follows_at_its_own_pace()
     free = rows[:, 0] > 0.1 + PERIOD
     assert not rows[free, 6].any()
     tau = food.damping / food.stiffness
-    # The edge leaves during the exchange that ends at 0.1 s.
+    # The edge leaves during the coupling step that ends at 0.1 s.
     expected = depth * np.exp(-(rows[free, 0] - 0.1 + PERIOD) / tau)
     np.testing.assert_allclose(rows[free, 7], expected, rtol=0.03)
 
@@ -249,13 +249,13 @@ def test_stations_without_elements_keep_the_port_contract_and_complete_a_slice(f
     assert record["food_wrench_f_z"].max() > 8.0
 
 
-def test_the_food_sees_the_plant_at_the_instants_of_the_exchange():
+def test_the_food_sees_the_plant_at_the_instants_of_the_coupling_step():
     scenario = spring_scenario()
     scenario.motion = MotionPlan([ConstantSpeed(distance=0.0368, speed=0.02, acceleration=1.0)])
     run = prepare_run(scenario)
     run.advance(duration=1.2)
     record = run.record()
-    # Row k's force was computed from the knife's pose one exchange before it.
+    # Row k's force was computed from the knife's pose one coupling step before it.
     depth = (scenario.board.height + scenario.food.height - record["knife_pose_p_z"])[:-1]
     force = record["food_wrench_f_z"][1:]
     steady = (record["time"][1:] > 0.7) & (record["time"][1:] < 1.2)

@@ -143,7 +143,7 @@ def added(effect: str, motion: str = "push", world: str = WORLDS[0], index: int 
 
 
 class EveryExchange(Effect):
-    every_exchange = True
+    every_coupling_step = True
 
 
 # Null sizes
@@ -161,7 +161,7 @@ def test_an_effect_of_no_size_changes_nothing(name, world):
     protocol.conditions[0].motion = MotionPlan(plan)
     # A slip that does not move and one that cannot be are the same; so is a dull edge's first cut.
     hidden = [EFFECTS[name](0.0)]
-    plain = [EveryExchange()] if hidden[0].every_exchange else []
+    plain = [EveryExchange()] if hidden[0].every_coupling_step else []
     forces = [
         Session(protocol, effects, world, 1, COARSE).record(3).wrench for effects in (hidden, plain)
     ]
@@ -540,7 +540,7 @@ def test_a_food_with_effects_of_the_simulator_is_refused():
         protocol.check("protocol")
 
 
-def test_a_sensor_whose_readings_fall_between_exchanges_is_refused():
+def test_a_sensor_whose_readings_fall_between_coupling_steps_is_refused():
     protocol = bench("push")
     for rate, nearest in ((300.0, "250"), (800.0, "500")):
         protocol.sensor = dc.replace(IDEAL, rate=rate)
@@ -548,7 +548,7 @@ def test_a_sensor_whose_readings_fall_between_exchanges_is_refused():
             protocol.check("protocol")
 
 
-def test_exchanges_computed_as_one_give_the_force_of_each_for_itself():
+def test_coupling_steps_computed_as_one_give_the_force_of_each_for_itself():
     def force(effects: list[Effect]) -> np.ndarray:
         return Session(bench("slow"), effects, WORLDS[0], 1, COARSE).series(0)[0].force[:, 2]
 

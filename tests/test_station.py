@@ -1,4 +1,4 @@
-"""The simulated station: contract, energy books, measured curve, repeatability."""
+"""The simulated station: contract, energy balance, measured curve, repeatability."""
 
 import numpy as np
 import pytest
@@ -75,8 +75,8 @@ def test_knife_work_in_the_log_less_every_other_mechanism_is_toughness_times_are
     model = run.station.cutting.solver(
         run.station.cutting.GetMyContextFromRoot(run.simulator.get_context())
     ).model
-    # Work from the logged wrench and poses alone, not from the food's own books. Row k's wrench is
-    # the mean over the exchange that ends at its time.
+    # Work from the logged wrench and poses alone, not from the food's own energy balance. Row k's
+    # wrench is the mean over the coupling step that ends at its time.
     moved = np.diff(record.vector("knife_pose_p"), axis=0)
     force = record.vector("food_wrench_f")[1:]
     work = -float((force * moved).sum())
@@ -126,7 +126,7 @@ def test_analytic_food_gives_toughness_times_width():
     height = record["knife_pose_p_z"] - scenario.board.height
     inside = (height > 0.003) & (height < 0.024)
     width = 2.0 * np.sqrt(np.clip(height * (0.027 - height), 0.0, None))
-    # The wrench is held over the exchange after the pose that it was computed from.
+    # The wrench is held over the coupling step after the pose that it was computed from.
     np.testing.assert_allclose(
         record["food_wrench_f_z"][inside], 300.0 * width[inside], rtol=0.0, atol=0.1
     )

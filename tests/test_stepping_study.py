@@ -105,7 +105,7 @@ def test_energy_ratio_is_the_one_that_a_simulation_checks():
     state = solver.initial_state()
     for k in range(20):
         end = motion.pose(2e-3 * (k + 1))
-        state = solver.exchange(state, motion.pose(2e-3 * k), end).state
+        state = solver.coupling_step(state, motion.pose(2e-3 * k), end).state
     energies = solver.energies(state, end)
     ratio = energy_ratio(energies, 1e-3, model)
     assert ratio > 0.0

@@ -100,11 +100,11 @@ def test_edge_friction_and_hold_come_out_as_stored():
 def test_a_cut_beside_its_record_comes_out_as_stored():
     cut = cut_measured_food(FOODS[0], study.COARSE)
     found, stored = food_numbers(FOODS[0], cut), copy.deepcopy(RESULTS["coarse"])
-    books, kept = found.pop("budget"), stored.pop("budget")
-    assert abs(books.pop("imbalance")) <= 0.02 and abs(kept.pop("imbalance")) <= 0.02
-    assert books.pop("energy_ratio") == pytest.approx(kept.pop("energy_ratio"), rel=0.05)
+    balance, kept = found.pop("budget"), stored.pop("budget")
+    assert abs(balance.pop("imbalance")) <= 0.02 and abs(kept.pop("imbalance")) <= 0.02
+    assert balance.pop("energy_ratio") == pytest.approx(kept.pop("energy_ratio"), rel=0.05)
     assert_same(found, stored, "coarse")
-    assert_same(books, kept, "coarse.budget", scale=kept["work"])
+    assert_same(balance, kept, "coarse.budget", scale=kept["work"])
 
 
 def test_errors_of_the_authors_curves_are_those_of_their_record():

@@ -56,7 +56,7 @@ class AppliedForce(LeafSystem):
 
 
 class Reader(LeafSystem):
-    """Records what a controller reads in its own update at each exchange."""
+    """Records what a controller reads in its own update at each coupling step."""
 
     def __init__(self):
         super().__init__()
@@ -209,14 +209,14 @@ def test_free_motion_shows_the_tools_inertia_alone_and_as_an_impulse_exactly():
         largest = max(largest, np.linalg.norm(inertial))
         rig.run(k * EXCHANGE + 1e-6, simulator)
         shown = X_WS.rotation() @ rig.reading(simulator).translational()
-        # The sensor's frame turns by some milliradians within an exchange.
+        # The sensor's frame turns by some milliradians within a coupling step.
         np.testing.assert_allclose(shown, mass * GRAVITY - inertial, atol=0.06)
     assert largest > 3.0
 
 
-def test_a_reading_is_the_mean_over_the_plant_steps_of_the_exchange_before_it():
+def test_a_reading_is_the_mean_over_the_plant_steps_of_the_coupling_step_before_it():
     def wrench(time: float) -> np.ndarray:
-        # Ten newtons in the first step of each exchange.
+        # Ten newtons in the first step of each coupling step.
         first = round(time / STEP) % 2 == 0
         return np.array([0, 0, 0, 0, 0, 10.0 * first])
 
@@ -229,8 +229,8 @@ def test_a_reading_is_the_mean_over_the_plant_steps_of_the_exchange_before_it():
     np.testing.assert_allclose(np.linalg.norm(difference[:, 3:], axis=1), 5.0, atol=0.6)
 
 
-def test_a_controller_of_the_same_instant_reads_the_exchange_just_past():
-    pushed = (0.0099, 0.0119)  # Within the exchange from 10 to 12 ms.
+def test_a_controller_of_the_same_instant_reads_the_coupling_step_just_past():
+    pushed = (0.0099, 0.0119)  # Within the coupling step from 10 to 12 ms.
 
     def wrench(time: float) -> np.ndarray:
         return np.array([0, 0, 0, 0, 0, 10.0 * (pushed[0] < time < pushed[1])])
@@ -247,7 +247,7 @@ def test_a_controller_of_the_same_instant_reads_the_exchange_just_past():
     assert size[at + 1] < 2.0
 
 
-def test_the_reading_is_held_between_exchanges_and_zero_before_the_first():
+def test_the_reading_is_held_between_coupling_steps_and_zero_before_the_first():
     rig = make_rig(WrenchSensorConfig(tare_at_start=False, force_noise=0.1))
     simulator = rig.run(0.001)
     np.testing.assert_array_equal(rig.reading(simulator).get_coeffs(), 0.0)
@@ -381,7 +381,7 @@ def test_two_contexts_of_one_diagram_do_not_disturb_each_other():
 
 
 class Reactions(LeafSystem):
-    """Gives the sensor the wrenches [N, 6] of the environment, one an exchange."""
+    """Gives the sensor the wrenches [N, 6] of the environment, one a coupling step."""
 
     def __init__(self, wrenches: np.ndarray):
         super().__init__()
@@ -402,17 +402,17 @@ class Bench:
     sensor: WrenchSensor
     simulator: Simulator
     log: object
-    exchanges: int
+    coupling_steps: int
 
     def context(self) -> Context:
         return self.sensor.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
 
     def readings(self) -> np.ndarray:
         """Readings [N, 6], moment first, from the first."""
-        self.simulator.AdvanceTo((self.exchanges - 0.5) * EXCHANGE)
+        self.simulator.AdvanceTo((self.coupling_steps - 0.5) * EXCHANGE)
         names = self.sensor.state_columns(list("abcdef"))
         rows = [names.index(name) for name in "abcdef"]
-        # The log shows at each exchange what was read in the one before.
+        # The log shows at each coupling step what was read in the one before.
         return self.log.FindLog(self.simulator.get_context()).data()[rows, 1:].T
 
 
@@ -434,8 +434,8 @@ def read(config: WrenchSensorConfig, wrenches: np.ndarray) -> np.ndarray:
     return make_bench(config, wrenches).readings()
 
 
-def nothing(exchanges: int) -> np.ndarray:
-    return np.zeros((exchanges, 6))
+def nothing(coupling_steps: int) -> np.ndarray:
+    return np.zeros((coupling_steps, 6))
 
 
 def density(readings: np.ndarray, segment: int) -> tuple[np.ndarray, np.ndarray]:
@@ -539,7 +539,7 @@ def test_a_steady_drift_grows_from_the_first_reading_on():
 WRENCHES = np.random.default_rng(5).standard_normal((60, 6))
 
 
-def test_a_delay_of_whole_exchanges_moves_the_readings_and_changes_nothing_else():
+def test_a_delay_of_whole_coupling_steps_moves_the_readings_and_changes_nothing_else():
     prompt = read(WrenchSensorConfig(force_noise=0.1), WRENCHES)
     late = read(WrenchSensorConfig(force_noise=0.1, delay=3 * EXCHANGE), WRENCHES)
     np.testing.assert_array_equal(late[3:], prompt[:-3])
@@ -547,7 +547,7 @@ def test_a_delay_of_whole_exchanges_moves_the_readings_and_changes_nothing_else(
     np.testing.assert_array_equal(late[:3], np.tile(prompt[0], (3, 1)))
 
 
-def test_a_delay_between_exchanges_is_interpolated():
+def test_a_delay_between_coupling_steps_is_interpolated():
     prompt = read(WrenchSensorConfig(), WRENCHES)
     late = read(WrenchSensorConfig(delay=1.25 * EXCHANGE), WRENCHES)
     np.testing.assert_allclose(late[2:], 0.75 * prompt[1:-1] + 0.25 * prompt[:-2], atol=1e-12)
@@ -623,7 +623,7 @@ def test_an_ideal_sensor_keeps_no_drift_and_no_delay_line():
 # Refusals ---------------------------------------------------------------------------------------
 
 
-def test_an_exchange_between_plant_steps_is_refused():
+def test_an_coupling_step_between_plant_steps_is_refused():
     rig = make_rig()
     with pytest.raises(ConfigurationError, match=r"0.0025 s is not a whole number of plant steps"):
         WrenchSensor(rig.plant, rig.robot.sensor_weld, 2.5e-3, WrenchSensorConfig())
@@ -645,6 +645,6 @@ def test_negative_noise_is_refused():
         validate(WrenchSensorConfig(force_noise=-1.0), "sensor")
 
 
-def test_a_sample_period_between_exchanges_is_refused():
+def test_a_sample_period_between_coupling_steps_is_refused():
     with pytest.raises(ConfigurationError, match=r"sensor.sample_period: 0.005 s .*Write 0.004"):
         make_bench(WrenchSensorConfig(sample_period=5e-3), nothing(2))

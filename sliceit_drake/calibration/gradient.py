@@ -56,14 +56,15 @@ def slice_force(
     values: dict[str, torch.Tensor],
     model: CuttingModel | None = None,
 ) -> torch.Tensor:
-    """Mean wrench of each exchange on the knife, moment about Ko and force in C [E, 6], Nm and N.
+    """Mean wrench of each coupling step on the knife, moment about Ko and force in C [E, 6], Nm and
+    N.
 
     Differentiable by all tensors: parameters, and the path, from which a height, a speed or a time
     shift follow by torch.
 
     Args:
         adjoint: The cut on its device.
-        R: Rotations of the knife in C at the ends of the exchanges [E + 1, 3, 3], double.
+        R: Rotations of the knife in C at the ends of the coupling steps [E + 1, 3, 3], double.
         p: Positions of Ko in C there [E + 1, 3], metres, double.
         values: Parameters by name (`cutting.parameters`): scalars, or [P] for those of cut points.
         model: A cut derived from that of `adjoint`; None for that.

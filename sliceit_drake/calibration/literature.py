@@ -21,7 +21,7 @@ __all__ = ["food_from_literature"]
 
 CLEARANCE = 5e-4
 """Height of the edge over the food at the start, metres."""
-LEAST_KEPT = 20
+MIN_KEPT = 20
 """Cuts within the published range without which there is no distribution."""
 
 
@@ -79,7 +79,7 @@ def food_from_literature(
         ]
     )
     kept = (peaks >= low) & (peaks <= high)
-    if kept.sum() < LEAST_KEPT:
+    if kept.sum() < MIN_KEPT:
         middle = np.nanquantile(peaks, [0.05, 0.95])
         raise ConfigurationError(
             f"{int(kept.sum())} of {len(peaks)} cuts peak within {low:g} to {high:g} N; most are "

@@ -17,7 +17,7 @@ PRIOR = 0.5
 """Standard deviation of the logarithm of a point's factor."""
 NOISE = 0.3
 """Error that the prior is weighed against, N."""
-RATE, LEAST_RATE = 0.1, 0.01
+RATE, MIN_RATE = 0.1, 0.01
 EPSILON = 1e-12
 
 
@@ -82,7 +82,7 @@ def fit_points(
         if square < best:
             best, best_x = square, x.copy()
         slope = gradient * np.exp(x) + 2.0 * weight * x
-        rate = RATE * (LEAST_RATE / RATE) ** (k / max(steps - 1, 1))
+        rate = RATE * (MIN_RATE / RATE) ** (k / max(steps - 1, 1))
         x = x + rate * adam.descent(slope, k, EPSILON)
         if progress is not None:
             progress(k + 1, float(np.sqrt(best)))

@@ -37,7 +37,7 @@ HEIGHT, SPEED = "height_offset", "speed_factor"
 
 @dc.dataclass
 class Poses:
-    """The knife's poses X_FK at the ends of even exchanges, as a motion of `cutting`.
+    """The knife's poses X_FK at the ends of even coupling steps, as a motion of `cutting`.
 
     Attributes:
         R, p: [E + 1, 3, 3] and [E + 1, 3], metres.
@@ -52,7 +52,7 @@ class Poses:
         return (len(self.p) - 1) * EXCHANGE_PERIOD
 
     def pose(self, t: float) -> Pose:
-        """X_FK at the end of an exchange, s."""
+        """X_FK at the end of a coupling step, s."""
         k = round(t / EXCHANGE_PERIOD)
         return Pose(self.R[k], self.p[k])
 
@@ -95,7 +95,7 @@ class Prediction:
 
     Attributes:
         predicted: [m, channels], N; NaN where the slice broke down.
-        cut: Share of the section that was cut at the end, or when the slice broke down.
+        cut: Fraction of the section that was cut at the end, or when the slice broke down.
         oscillation: That brings it nearest to the measurement; it is in `predicted`.
         smooth: The prediction without it [m, channels], N.
         failure: Why it broke down, or None.
@@ -243,7 +243,7 @@ class Predictor:
         """The knife's motion of a record with these values."""
         name = target.record.name
         p = target.moved(values[f"{HEIGHT}:{name}"], values.get(f"{SPEED}:{name}", 1.0))
-        return Poses(target.R[target.exchanges], p[target.exchanges])
+        return Poses(target.R[target.coupling_steps], p[target.coupling_steps])
 
     def predict(
         self, units: Sequence[np.ndarray], progress: Callable[[int], None] | None = None

@@ -19,7 +19,7 @@ RIDGE = 1e-3
 """Least curvature that is told apart, relative to the greatest."""
 EPSILON = 1e-8
 BACK_OFF = 0.5
-LEAST_RATE = 1e-6
+MIN_RATE = 1e-6
 
 
 @dc.dataclass

@@ -17,7 +17,7 @@ Simulate a scenario: the arm moves the knife through the food under compliance c
 Writes to DIR:
   replay.html    the run in 3-D, opens in any browser without a server
   force.png      knife, and force over time and depth beside a measured curve if there is one
-  record.csv     joints, poses, wrenches, energies at every exchange (500 Hz), SI units
+  record.csv     joints, poses, wrenches, energies at every coupling step (500 Hz), SI units
   summary.json   peak and mean force, work by mechanism, real-time factor, discretisation error, ...
   scenario.yaml  what was simulated, complete
   paraview/      with --paraview: food, knife and forces as a series for ParaView

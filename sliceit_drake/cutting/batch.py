@@ -16,14 +16,14 @@ __all__ = ["BatchSimulator", "BatchSlice", "cut_together", "simulate_batch"]
 
 @dc.dataclass
 class BatchSlice:
-    """One slice of a batch. Row k holds the mean over the exchange that ends at time[k].
+    """One slice of a batch. Row k holds the mean over the coupling step that ends at time[k].
 
     Attributes:
-        time: End of each exchange [n], s.
+        time: End of each coupling step [n], s.
         position: Position of Ko in F [n, 3], metres.
         food_wrench, board_wrench: On the knife, moment about Ko and force, in F [n, 6]; not finite
             from where the slice failed.
-        cut: Share of the section that is cut [n].
+        cut: Fraction of the section that is cut [n].
         failure: Why it failed, or None.
     """
 
@@ -128,11 +128,11 @@ def cut_together(
     """Simulates slices that advance side by side; their cuts are all derived from one model."""
     T = driver.exchange_period
     paths = [KnifePath(m, x, T) for m, x in zip(models, motions, strict=True)]
-    count = max(path.exchanges for path in paths)
+    count = max(path.coupling_steps for path in paths)
     wrenches = np.full((len(models), count, 6), np.nan)
     cut = np.full((len(models), count), np.nan)
     for launch, steps in driver.run(paths, board=board):
-        at = slice(launch.first, launch.first + launch.exchanges)
+        at = slice(launch.first, launch.first + launch.coupling_steps)
         for c, step in enumerate(steps):
             wrenches[c, at] = step.wrenches.sum(1) if step.finite else np.nan
             cut[c, at] = step.cut
@@ -145,7 +145,7 @@ def cut_together(
 def _slice(
     path: KnifePath, wrench: np.ndarray, cut: np.ndarray, T: float, board: Board | None
 ) -> BatchSlice:
-    n = path.exchanges
+    n = path.coupling_steps
     food = (wrench[:n].reshape(n, 2, 3) @ path.model.X_FC_rotation.T).reshape(n, 6)
     on_board = np.zeros((n, 6))
     if board is not None:

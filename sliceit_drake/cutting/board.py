@@ -49,7 +49,7 @@ def edge_contact_positions(knife: Knife) -> np.ndarray:
 
 
 def impact_peak_loss(stiffness: float, mass: float, time_step: float) -> float:
-    """Share of an impact's peak force that a plant loses to its steps.
+    """Fraction of an impact's peak force that a plant loses to its steps.
 
     A plant takes the contact's spring at the end of its step h (backward Euler), so a free mass on
     it turns by atan(x) and shrinks by sqrt(1 + x^2) a step, x = h sqrt(k / m): over the quarter
@@ -102,14 +102,14 @@ def board_wrench(
 def board_wrenches(
     board: Board, knife: Knife, R: np.ndarray, p: np.ndarray, period: float
 ) -> np.ndarray:
-    """Wrench of the board on the knife at the end of each exchange [E, 6], in F.
+    """Wrench of the board on the knife at the end of each coupling step [E, 6], in F.
 
     Args:
         board: The board, its height in F.
         knife: The knife.
-        R: Rotations of the knife in F at the ends of the exchanges [E + 1, 3, 3].
+        R: Rotations of the knife in F at the ends of the coupling steps [E + 1, 3, 3].
         p: Positions of Ko in F there [E + 1, 3], metres.
-        period: Duration of an exchange, s.
+        period: Duration of a coupling step, s.
     """
     wrenches = np.zeros((len(p) - 1, 6))
     reach = 0.5 * knife.length * np.abs(R[1:, 2, 0])

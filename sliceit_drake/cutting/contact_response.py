@@ -1,4 +1,4 @@
-"""How a food answers small motions of a blade that rests in it, exchange by exchange."""
+"""How a food answers small motions of a blade that rests in it, coupling step by coupling step."""
 
 import contextlib
 
@@ -11,8 +11,8 @@ from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
 
 __all__ = ["contact_responses"]
 
-# The food is cut at this speed to these shares of its height, where the blade rests and is moved.
-# A lower one is taken where the food's elements do not bear it.
+# The food is cut at this speed to these fractions of its height, where the blade rests and is
+# moved. A lower one is taken where the food's elements do not bear it.
 APPROACH_SPEEDS = (0.5, 0.1, 0.02)
 DEPTHS = (0.5, 0.9)
 REST = 8
@@ -33,7 +33,7 @@ def contact_responses(solver: CuttingSolver, offset: float) -> list[np.ndarray]:
         offset: Shift of the knife along its edge, metres.
 
     Returns:
-        For each depth, less the mean wrench over each exchange from the motion's on, per unit
+        For each depth, less the mean wrench over each coupling step from the motion's on, per unit
         [RESPONSE, 6, 6], along and about the axes of K at Ko, translations first. The last is
         the mean of the last `SETTLED`, over the period in which the food rings. Empty if the food
         cannot be cut at any of `APPROACH_SPEEDS`.
@@ -47,7 +47,8 @@ def contact_responses(solver: CuttingSolver, offset: float) -> list[np.ndarray]:
 def _responses(solver: CuttingSolver, speed: float, offset: float) -> list[np.ndarray]:
     """Those of a blade that enters at a speed, m/s, and then rests.
 
-    It moves within one exchange. Of both senses of a direction, that which the food resists more
+    It moves within one coupling step. Of both senses of a direction, that which the food resists
+    more
     counts: pressed further an edge cuts, drawn back it unloads.
 
     Raises:
@@ -65,10 +66,10 @@ def _responses(solver: CuttingSolver, speed: float, offset: float) -> list[np.nd
         count = max(1, int(np.ceil((share * height - depth) / step)))
         for target in np.linspace(depth, share * height, count + 1)[1:]:
             end = Pose(R, p - [0.0, 0.0, target])
-            state, pose = solver.exchange(state, pose, end).state, end
+            state, pose = solver.coupling_step(state, pose, end).state, end
         depth = share * height
         for _ in range(REST):
-            state = solver.exchange(state, pose, pose).state
+            state = solver.coupling_step(state, pose, pose).state
         responses.append(_response(solver, state, pose))
     return responses
 
@@ -77,9 +78,9 @@ def _response(solver: CuttingSolver, state: np.ndarray, pose: Pose) -> np.ndarra
     def wrenches(end: Pose) -> np.ndarray:
         now, start, found = state, pose, []
         for _ in range(RESPONSE):
-            exchange = solver.exchange(now, start, end)
-            now, start = exchange.state, end
-            found.append(np.concatenate([exchange.wrench[3:], exchange.wrench[:3]]))
+            coupling_step = solver.coupling_step(now, start, end)
+            now, start = coupling_step.state, end
+            found.append(np.concatenate([coupling_step.wrench[3:], coupling_step.wrench[:3]]))
         found[-1] = np.mean(found[-SETTLED:], axis=0)
         return np.array(found)
 

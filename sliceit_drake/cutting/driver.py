@@ -14,27 +14,28 @@ from sliceit_drake.cutting.knife_path import KnifePath
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.workspace import Workspace
 
-__all__ = ["Driver", "DriverPool", "Exchanges", "Launch", "even_launches", "run_exchanges"]
+__all__ = ["Driver", "DriverPool", "CouplingSteps", "Launch", "even_launches", "run_coupling_steps"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
 LOSSES = ("edge_loss", "opening_loss", "friction_loss")
-"""Energies dissipated at the cut points, in the order of `Exchanges.dissipation`."""
+"""Energies dissipated at the cut points, in the order of `CouplingSteps.dissipation`."""
 
 
 @dc.dataclass
-class Exchanges:
-    """Result of E exchanges in a row; see `Exchange`.
+class CouplingSteps:
+    """Result of E coupling steps in a row; see `CouplingStep`.
 
     Attributes:
         state: The food's new state.
         wrenches: Wrenches by mechanism (edge, flank pressure, friction) [E, 3, 6].
-        work: Work of each exchange [E], J.
-        dissipation: Energy lost by edge, opening, friction, blade, board over all exchanges [5], J.
-        internal_work, gravity_work: Work over all exchanges, J.
-        cut: Share of the section that the edge has passed [E].
+        work: Work of each coupling step [E], J.
+        dissipation: Energy lost by edge, opening, friction, blade, board over all coupling steps
+            [5], J.
+        internal_work, gravity_work: Work over all coupling steps, J.
+        cut: Fraction of the section that the edge has passed [E].
     """
 
     state: np.ndarray
@@ -51,15 +52,15 @@ class Exchanges:
         return bool(np.isfinite(self.wrenches).all() and np.isfinite(self.state).all())
 
 
-def run_exchanges(
+def run_coupling_steps(
     ws: Workspace, states: np.ndarray, R: np.ndarray, p: np.ndarray
-) -> list[Exchanges]:
-    """Advances all cuts of a workspace by its exchanges.
+) -> list[CouplingSteps]:
+    """Advances all cuts of a workspace by its coupling steps.
 
     Args:
-        ws: Workspace of C cuts and E exchanges.
+        ws: Workspace of C cuts and E coupling steps.
         states: [C, state_size].
-        R: Rotations of the knives in C at the ends of the exchanges [C, E + 1, 3, 3].
+        R: Rotations of the knives in C at the ends of the coupling steps [C, E + 1, 3, 3].
         p: Positions of Ko there [C, E + 1, 3], metres.
 
     Returns:
@@ -70,7 +71,7 @@ def run_exchanges(
     results = ws.results()
     x = ws.layout["x"]
     return [
-        Exchanges(
+        CouplingSteps(
             state=new[c],
             wrenches=row["wrenches"],
             work=row["work"],
@@ -90,26 +91,26 @@ def run_exchanges(
 
 
 class Launch(NamedTuple):
-    """Exchanges that are advanced at once.
+    """Coupling steps that are advanced at once.
 
     Attributes:
         first: Number of the first.
-        exchanges: How many.
+        coupling_steps: How many.
         multiple: Duration of each, and of its sub-step, relative to the shortest.
     """
 
     first: int
-    exchanges: int
+    coupling_steps: int
     multiple: int = 1
 
 
 def even_launches(paths: Sequence[KnifePath]) -> Iterator[Launch]:
-    """Launches of exchanges of one duration, as many at once as all paths allow."""
-    k, count = 0, max(path.exchanges for path in paths)
+    """Launches of coupling steps of one duration, as many at once as all paths allow."""
+    k, count = 0, max(path.coupling_steps for path in paths)
     while k < count:
         launch = Launch(k, min(path.block(k) for path in paths))
         yield launch
-        k += launch.exchanges
+        k += launch.coupling_steps
 
 
 class Driver:
@@ -118,7 +119,7 @@ class Driver:
     Not to be used by several threads at once.
 
     Args:
-        exchange_period: Duration of the shortest exchange, s.
+        exchange_period: Duration of the shortest coupling step, s.
     """
 
     def __init__(self, exchange_period: float) -> None:
@@ -128,12 +129,12 @@ class Driver:
     def workspace(self, models: Sequence[CuttingModel], launch: Launch) -> Workspace:
         """Device arrays for cuts that are all derived from one model."""
         model = models[0]
-        size = (len(models), launch.exchanges, launch.multiple)
+        size = (len(models), launch.coupling_steps, launch.multiple)
         key = (id(model.split), len(model.relaxing), *size, *dc.astuple(model.numerics))
         ws = self._workspaces.get(key)
         if ws is None:
             period = launch.multiple * self.exchange_period
-            ws = self._workspaces[key] = Workspace(models, period, launch.exchanges)
+            ws = self._workspaces[key] = Workspace(models, period, launch.coupling_steps)
         elif any(old is not new for old, new in zip(ws.models, models, strict=True)):
             ws.set_models(models)
         return ws
@@ -143,7 +144,7 @@ class Driver:
         paths: Sequence[KnifePath],
         launches: Iterable[Launch] | None = None,
         board: Board | None = None,
-    ) -> Iterator[tuple[Launch, list[Exchanges]]]:
+    ) -> Iterator[tuple[Launch, list[CouplingSteps]]]:
         """Drives uncut foods side by side.
 
         Where arm or holder give, a launch is repeated until they hold its force. A launch that
@@ -160,20 +161,22 @@ class Driver:
         models = {1: [path.model for path in paths]}
         states = None
         for launch in even_launches(paths) if launches is None else launches:
-            m, last = launch.multiple, launch.first + launch.exchanges
+            m, last = launch.multiple, launch.first + launch.coupling_steps
             if m not in models:
                 models[m] = [_with_longer_steps(model, m) for model in models[1]]
             ws = self.workspace(models[m], launch)
             if states is None:
                 states = np.tile(ws.initial_state(), (len(paths), 1))
             # A knife whose motion is over rests at its end.
-            ends = [np.minimum(np.arange(launch.first, last + 1), path.exchanges) for path in paths]
+            ends = [
+                np.minimum(np.arange(launch.first, last + 1), path.coupling_steps) for path in paths
+            ]
             R = np.array([path.R_CK[rows] for path, rows in zip(paths, ends, strict=True)])
-            steps: list[Exchanges] = []
+            steps: list[CouplingSteps] = []
             unbalanced = list(range(len(paths)))
             while unbalanced:
                 p = np.array([path.p_CK[rows] for path, rows in zip(paths, ends, strict=True)])
-                tried = run_exchanges(ws, states, R, p)
+                tried = run_coupling_steps(ws, states, R, p)
                 steps = [tried[c] if c in unbalanced else steps[c] for c in range(len(paths))]
                 forces = [step.wrenches[-1].sum(0)[3:] for step in steps]
                 unbalanced = [

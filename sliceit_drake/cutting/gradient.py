@@ -1,9 +1,9 @@
 """Gradients of a slice: of any function of the force by parameters, motion and initial state.
 
-Reverse mode. The forward run keeps the food's state at each exchange; going back, an exchange is
-computed once more with the state of each sub-step kept, and its sub-steps are gone through in
-reverse by the kernels' adjoints. Memory is that of one exchange and of one state per exchange.
-"""
+Reverse mode. The forward run keeps the food's state at each coupling step; going back, a coupling
+step is computed once more with the state of each sub-step kept, and its sub-steps are gone through
+in reverse by the kernels' adjoints. Memory is that of one coupling step and of one state per
+coupling step."""
 
 import dataclasses as dc
 import typing
@@ -17,7 +17,7 @@ from sliceit_drake.cutting.kernels.types import PARAMETERS
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.mounting import Mounting
 from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError
-from sliceit_drake.cutting.workspace import DIRECT, Workspace
+from sliceit_drake.cutting.workspace import LAUNCH_LOCK, Workspace
 
 __all__ = ["SliceAdjoint", "SliceGradient", "SliceRun"]
 
@@ -28,7 +28,7 @@ class SliceGradient:
 
     Attributes:
         row: Derivatives by what the kernels read, in the order of `Workspace.parameter_layout`.
-        position: Derivatives by the commanded position of Ko at each exchange [E + 1, 3], 1/m.
+        position: Derivatives by the commanded position of Ko at each coupling step [E + 1, 3], 1/m.
         rotation: Derivatives by the entries of its rotation matrix [E + 1, 3, 3].
         state: Derivatives by the initial state of the food [state_size].
         compliance: Derivatives by the compliances of arm and holder [2], N/m.
@@ -53,8 +53,8 @@ class SliceRun:
 
     Attributes:
         model: The cut.
-        wrenches: Mean of each exchange on the knife, moment about Ko and force in C [E, 6].
-        states: The food at the ends of the exchanges [E + 1] of [state_size].
+        wrenches: Mean of each coupling step on the knife, moment about Ko and force in C [E, 6].
+        states: The food at the ends of the coupling steps [E + 1] of [state_size].
         R, p: Poses of the knife in C there [E + 1, 3, 3] and [E + 1, 3], metres; where arm and
             holder give, relative to the food.
     """
@@ -67,8 +67,8 @@ class SliceRun:
 
 
 class _Back(typing.NamedTuple):
-    """Adjoints of the state before an exchange, of Ko's positions and the knife's rotations at its
-    ends [2, 3] and [2, 3, 3], and of what the kernels read."""
+    """Adjoints of the state before a coupling step, of Ko's positions and the knife's rotations at
+    its ends [2, 3] and [2, 3, 3], and of what the kernels read."""
 
     state: np.ndarray
     p: np.ndarray
@@ -83,7 +83,7 @@ class SliceAdjoint:
 
     Args:
         model: The cut, or one that others are derived from.
-        exchange_period: Duration of an exchange, s.
+        exchange_period: Duration of a coupling step, s.
     """
 
     def __init__(self, model: CuttingModel, exchange_period: float) -> None:
@@ -107,7 +107,7 @@ class SliceAdjoint:
         """Simulates a slice.
 
         Args:
-            R: Rotations of the knife in C at the ends of the exchanges [E + 1, 3, 3].
+            R: Rotations of the knife in C at the ends of the coupling steps [E + 1, 3, 3].
             p: Positions of Ko in C there [E + 1, 3], metres.
             model: A cut derived from that of the constructor; None for that.
             state: The food before; None for at rest.
@@ -153,14 +153,14 @@ class SliceAdjoint:
         of_give, axes = np.zeros(3), np.flatnonzero(give)
         for e in reversed(range(count)):
             ws.advance(run.states[e][None], run.R[None, e : e + 2], run.p[None, e : e + 2])
-            back = self._adjoint_of_exchange(run, e, weights[e], adj_state)
+            back = self._adjoint_of_coupling_step(run, e, weights[e], adj_state)
             if len(axes):
                 # Ko's position p holds the force F(p) that it gives: p = command + give F(p). With
                 # b the adjoint of p at constant give F, that of the command is b + (dF/dp)' give
                 # times itself.
                 force = np.zeros((len(axes), 6))
                 force[np.arange(len(axes)), 3 + axes] = 1.0
-                slopes = [self._adjoint_of_exchange(run, e, w, 0.0 * adj_state) for w in force]
+                slopes = [self._adjoint_of_coupling_step(run, e, w, 0.0 * adj_state) for w in force]
                 b = (adj_p[e + 1] + back.p[1])[axes]
                 dF = np.array([slope.p[1, axes] for slope in slopes])
                 command = np.linalg.solve(np.eye(len(axes)) - dF.T * give[axes], b)
@@ -173,14 +173,14 @@ class SliceAdjoint:
             row += back.row
         return SliceGradient(row, adj_p, adj_R, adj_state, of_give[[2, 0]], ws.parameter_layout)
 
-    def _adjoint_of_exchange(
+    def _adjoint_of_coupling_step(
         self, run: SliceRun, e: int, weights: np.ndarray, adj_state: np.ndarray
     ) -> _Back:
-        """Back through exchange e, whose sub-steps the workspace holds.
+        """Back through coupling step e, whose sub-steps the workspace holds.
 
         Args:
             run: The slice.
-            e: The exchange.
+            e: The coupling step.
             weights: Adjoint of its wrench [6].
             adj_state: Adjoint of the state at its end.
         """
@@ -229,15 +229,15 @@ class SliceAdjoint:
         bending["on_knife"], bending["on_blade"] = along, -along
         adjoint[ws.sum_layout["blade_sums"]] = bending.view(float)
         if area > 0.0:
-            of_buried = np.concatenate([of_middle, [-(of_middle @ middle)]]) / area
-            adjoint[ws.sum_layout["buried"]] = np.tile(of_buried, points)
+            of_immersed = np.concatenate([of_middle, [-(of_middle @ middle)]]) / area
+            adjoint[ws.sum_layout["immersed"]] = np.tile(of_immersed, points)
         return adjoint, of_lateral * push / n
 
     def _capture_backward(self) -> None:
         if self._backward is not None:
             return
         ws = self._w
-        with DIRECT, wp.ScopedCapture(device=ws.device) as capture:
+        with LAUNCH_LOCK, wp.ScopedCapture(device=ws.device) as capture:
             for slot in ws.states[:-1]:
                 slot.grad.zero_()
             for ahead in ws.ahead:

@@ -1,4 +1,5 @@
-"""The knife's poses at the exchanges of a slice, and how arm and holder give under its force."""
+"""The knife's poses at the coupling steps of a slice, and how arm and holder give under its
+force."""
 
 import typing
 
@@ -14,7 +15,7 @@ __all__ = ["CHECK_TRAVEL", "KnifePath", "PosedMotion"]
 CHECK_TRAVEL = 1e-3
 """Travel of the knife between two checks of the energies, metres."""
 BLOCK = 10
-"""Exchanges that are advanced at once where nothing stands against it."""
+"""Coupling steps that are advanced at once where nothing stands against it."""
 
 
 class PosedMotion(typing.Protocol):
@@ -27,19 +28,19 @@ class PosedMotion(typing.Protocol):
 
 
 class KnifePath:
-    """Poses of the knife at the exchanges, in F and relative to the food in C.
+    """Poses of the knife at the coupling steps, in F and relative to the food in C.
 
     Attributes:
         model: The cut.
-        exchanges: Their number E.
+        coupling_steps: Their number E.
         R_FK, p_FK: [E + 1, 3, 3] and [E + 1, 3].
         R_CK, p_CK: The same in C; where the mounting gives, relative to the food.
         rigid: Whether it does not give.
     """
 
     def __init__(self, model: CuttingModel, motion: PosedMotion, period: float) -> None:
-        self.exchanges = max(1, round(motion.duration / period))
-        poses = [motion.pose(k * period) for k in range(self.exchanges + 1)]
+        self.coupling_steps = max(1, round(motion.duration / period))
+        poses = [motion.pose(k * period) for k in range(self.coupling_steps + 1)]
         self.R_FK = np.array([X_FK.R for X_FK in poses])
         self.p_FK = np.array([X_FK.p for X_FK in poses])
         self._commands = self.p_FK.copy()
@@ -50,28 +51,29 @@ class KnifePath:
         self.rigid = self._mounting.rigid
 
     def pose(self, k: int) -> Pose:
-        """X_CK after k exchanges."""
+        """X_CK after k coupling steps."""
         return Pose(self.R_CK[k], self.p_CK[k])
 
     def block(self, k: int) -> int:
-        """How many exchanges from the k-th can be advanced at once, without a check."""
-        if not self.rigid or k + BLOCK > self.exchanges:
+        """How many coupling steps from the k-th can be advanced at once, without a check."""
+        if not self.rigid or k + BLOCK > self.coupling_steps:
             return 1
         steps = np.diff(self.p_FK[k : k + BLOCK + 1], axis=0)
         return BLOCK if float(np.linalg.norm(steps, axis=1).sum()) < CHECK_TRAVEL else 1
 
     def balanced(self, k: int, force: np.ndarray, board: Board | None) -> bool:
-        """Whether arm and holder hold the force on the knife [3], N, in C, of the k-th exchange.
+        """Whether arm and holder hold the force on the knife [3], N, in C, of the k-th coupling
+        step.
 
-        If not, they have given, and the exchange that ends at the k-th pose is to be repeated.
+        If not, they have given, and the coupling step that ends at the k-th pose is to be repeated.
         """
-        if self.rigid or k > self.exchanges:
+        if self.rigid or k > self.coupling_steps:
             return True
         rise = float((self.model.X_FC_rotation @ force)[2])
         height = float(self._commands[k, 2])
         done = self._mounting.balanced(rise, -float(force[0]), height, board)
         at = k + 1 if done else k
-        if at <= self.exchanges:
+        if at <= self.coupling_steps:
             rise, shift = self._mounting.given.tolist()
             self.p_FK[at] = self._commands[at] + [0.0, 0.0, rise]
             self.p_CK[at] = self.model.to_cut_frame(self.p_FK[at])

@@ -29,7 +29,7 @@ GRAVITY = 9.81
 """Acceleration of gravity, as Drake's plants have it, m/s^2."""
 
 SLIVER = 0.1
-"""Share of a vertex's mass below which a node of one side does not set the step."""
+"""Fraction of a vertex's mass below which a node of one side does not set the step."""
 
 
 class TimeStepError(ValueError):
@@ -41,7 +41,7 @@ class Numerics:
     """Numerical settings of a cut. Contacts and bonds scale with E over the edge length h."""
 
     time_step: float = quantity(
-        2.5e-4, "s", low=1e-7, high=5e-3, doc="Sub-step; must divide the exchange period."
+        2.5e-4, "s", low=1e-7, high=5e-3, doc="Sub-step; must divide the coupling period."
     )
     mass_scaling: bool = True
     """Whether masses are raised where the step asks for it; else a step too long is refused."""
@@ -56,7 +56,7 @@ class Numerics:
         "",
         low=0.0,
         high=0.9,
-        doc="Share of the unbalanced force that opposes the motion of nodes with scaled masses.",
+        doc="Fraction of the unbalanced force that opposes the motion of nodes with scaled masses.",
     )
     bond_stiffness: float = quantity(
         4.0,
@@ -113,13 +113,13 @@ class CuttingModel(CutGeometry):
         material, effects, knife, numerics: What the user gave.
         point_scales: Factors by cut point.
         true_mass, mass: Lumped true mass and the mass that is stepped [N], kg.
-        local_damping: Share of the unbalanced force that opposes a node's motion [N].
+        local_damping: Fraction of the unbalanced force that opposes a node's motion [N].
         weight: Gravity force on each node [N, 3], N, by the true mass.
         toughness: Surface energy of each cut point [P], J/m^2.
         outline: Length of skin per height that the edge cuts, as `EdgeTables.width` [P, G].
         unloading: Slope of the edge's force when it retreats [P], N/m.
         element_volume: Stiff volume of the elements times their modulus over the material's [T].
-        relaxing: Shares of the modulus that relax [M].
+        relaxing: Fractions of the modulus that relax [M].
         keep: What a sub-step leaves of each branch's force [M].
         parameters: Scalars by name, see `kernel_types.PARAMETERS`.
         critical_time_step: Stability limit with the true masses, including the margin, s. Slivers

@@ -565,7 +565,8 @@ class _Legs:
         return Velocity(rate * (self._R[leg] @ self._angle[leg]), rate * self._dp[leg])
 
     def _at(self, t: float) -> tuple[int, float, float]:
-        """Returns the leg at the time `t`, the share of it that is done, and the share's rate."""
+        """Returns the leg at the time `t`, the fraction of it that is done, and the share's
+        rate."""
         leg = bisect.bisect_right(self._times, t) - 1
         leg = min(max(leg, 0), len(self._dp) - 1)
         period = self._times[leg + 1] - self._times[leg]

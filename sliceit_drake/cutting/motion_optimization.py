@@ -102,8 +102,8 @@ def mean_force(adjoint: SliceAdjoint, motion: PressAndDraw) -> tuple[float, np.n
     model, period = adjoint.model, adjoint.exchange_period
     A, omega, v = motion.amplitude, 2.0 * np.pi * motion.frequency, motion.press_speed
     way = model.top - model.bottom + CLEARANCE
-    exchanges = way / v / period
-    time = period * np.arange(int(np.ceil(exchanges)) + 1)
+    coupling_steps = way / v / period
+    time = period * np.arange(int(np.ceil(coupling_steps)) + 1)
     middle = 0.5 * float(model.nodes[:, 0].min() + model.nodes[:, 0].max())
     p = np.zeros((len(time), 3))
     p[:, 0] = middle + A * np.sin(omega * time)
@@ -114,15 +114,15 @@ def mean_force(adjoint: SliceAdjoint, motion: PressAndDraw) -> tuple[float, np.n
     force = run.wrenches[:, 3:]
     norm = np.sqrt((force**2).sum(1) + SMOOTH**2)
     share = np.full(len(norm), v * period / way)
-    # The last exchange goes beyond the bottom.
-    share[-1] *= exchanges - (len(norm) - 1)
+    # The last coupling step goes beyond the bottom.
+    share[-1] *= coupling_steps - (len(norm) - 1)
     weights = np.zeros_like(run.wrenches)
     weights[:, 3:] = share[:, None] * force / norm[:, None]
     by_p = adjoint.gradient(run, weights).position
     by_A = by_p[:, 0] @ np.sin(omega * time)
     by_f = by_p[:, 0] @ (A * 2.0 * np.pi * time * np.cos(omega * time))
     value = float(share @ norm)
-    # An exchange's share grows with v, their number with 1 / v.
+    # A coupling step's share grows with v, their number with 1 / v.
     by_v = -by_p[:, 2] @ time + value / v - float(norm[-1]) / v
     return value, np.array([by_A, by_f, by_v])
 
@@ -141,7 +141,7 @@ def optimize_motion(
         model: The cut.
         limits: What the motion may be.
         start: Motion to begin with; None for half of what the limits allow.
-        period: Exchange period, s.
+        period: Coupling step period, s.
         iterations: Most of the optimiser.
         progress: Called with the number of slices, the best force so far, N, and its motion.
 
@@ -219,7 +219,7 @@ def optimize_motion(
 
 
 def _room(values: np.ndarray, limits: MotionLimits) -> tuple[float, float]:
-    """Shares of draw speed and acceleration that are left."""
+    """Fractions of draw speed and acceleration that are left."""
     A, omega = float(values[0]), 2.0 * np.pi * float(values[1])
     return 1.0 - A * omega / limits.draw_speed, 1.0 - A * omega**2 / limits.draw_acceleration
 

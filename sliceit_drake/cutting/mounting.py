@@ -10,23 +10,24 @@ from sliceit_drake.cutting.foods.effects import Effects
 __all__ = ["Mounting"]
 
 ATTEMPTS = 40
-"""Most evaluations of an exchange; what is left is made up for by the next, which starts anew."""
+"""Most evaluations of a coupling step; what is left is made up for by the next, which starts
+anew."""
 
 
 @dc.dataclass
 class Mounting:
-    """Displacements of knife and food, in balance with the mean force of each exchange.
+    """Displacements of knife and food, in balance with the mean force of each coupling step.
 
     Arm and holder are springs without mass. A force that answers a displacement more stiffly than
-    the spring makes any scheme unstable that takes the force of the exchange before; a cut does, by
-    friction on its flanks up to 1e6 N/m. So each exchange is computed until its force and the
-    springs' agree: a quasi-Newton search for the displacements (rise of the knife, displacement of
-    the food along Cx); where only one gives, it is bracketed.
+    the spring makes any scheme unstable that takes the force of the coupling step before; a cut
+    does, by friction on its flanks up to 1e6 N/m. So each coupling step is computed until its force
+    and the springs' agree: a quasi-Newton search for the displacements (rise of the knife,
+    displacement of the food along Cx); where only one gives, it is bracketed.
 
     Attributes:
         arm, holder: Compliances of knife (vertical) and food (along the edge), m/N.
         resistance: Force along the edge at which the food slips, N; None for never.
-        remaining: Share of the resistance that is left while it slips.
+        remaining: Fraction of the resistance that is left while it slips.
         tolerance: Tolerance of the balance of forces, relative to 1 N and the force.
         given: Rise of the knife and displacement of the food, metres [2].
         slipped: How far the food has slipped along Cx, metres.
@@ -60,10 +61,10 @@ class Mounting:
         return self.arm == 0.0 and self.holder == 0.0
 
     def balanced(self, rise: float, draw: float, height: float, board: Board | None) -> bool:
-        """Whether the springs hold the forces that an exchange with `given` has answered.
+        """Whether the springs hold the forces that a coupling step with `given` has answered.
 
         If not, `given` is the next try; if so, the food has slipped as it does, and `given` is what
-        the next exchange begins with.
+        the next coupling step begins with.
 
         Args:
             rise: Upward force of the food on the knife, N.

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from sliceit_drake.cutting.board import Board, board_wrenches
-from sliceit_drake.cutting.driver import Exchanges, Launch, even_launches
+from sliceit_drake.cutting.driver import CouplingSteps, Launch, even_launches
 from sliceit_drake.cutting.knife import signed_distance
 from sliceit_drake.cutting.knife_path import CHECK_TRAVEL, KnifePath
 from sliceit_drake.cutting.model import CuttingModel
@@ -15,7 +15,7 @@ from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError, CuttingSolver
 
 __all__ = [
     "ENERGY_RATIO_LIMIT",
-    "EnergyLedger",
+    "EnergyBalance",
     "SliceResult",
     "check_clear",
     "check_energies",
@@ -30,11 +30,11 @@ LATERAL_LIMIT = 3e-3
 """Greatest distance of the blade from the cut plane, metres."""
 TILT_LIMIT = 0.15
 """Greatest angle between the blade and the cut plane, rad."""
-LEAST_VOLUME_RATIO = 0.0
+MIN_VOLUME_RATIO = 0.0
 
 
 @dc.dataclass
-class EnergyLedger:
+class EnergyBalance:
     """Work and dissipation since the start of a slice, J.
 
     Attributes:
@@ -53,8 +53,8 @@ class EnergyLedger:
     blade: float = 0.0
     internal: float = 0.0
 
-    def add(self, step: Exchanges) -> None:
-        """Adds exchanges."""
+    def add(self, step: CouplingSteps) -> None:
+        """Adds coupling steps."""
         edge, opening, friction, blade, board = step.dissipation.tolist()
         self.work += float(step.work.sum())
         self.gravity += step.gravity_work
@@ -69,7 +69,7 @@ class EnergyLedger:
         """Dissipated by the bulk's viscosity: work on the elements that they do not store."""
         return -self.internal - energies.elastic
 
-    def imbalance(self, energies: Energies) -> float:
+    def residual(self, energies: Energies) -> float:
         """Work put in minus everything that it went into; 0 if energy is conserved."""
         stored = energies.elastic + energies.interface + energies.kinetic
         spent = self.edge + self.opening + self.friction + self.board_friction + self.blade
@@ -78,17 +78,18 @@ class EnergyLedger:
 
 @dc.dataclass
 class SliceResult:
-    """A slice on a prescribed motion. Row k holds the mean over the exchange that ends at time[k].
+    """A slice on a prescribed motion. Row k holds the mean over the coupling step that ends at
+    time[k].
 
     Attributes:
-        time: End of each exchange [n], s.
+        time: End of each coupling step [n], s.
         position: Position of Ko in F [n, 3], metres.
         food_wrench, board_wrench: Wrenches on the knife, moment about Ko and force, in F [n, 6].
         edge, normal, friction: Force of the food by mechanism, in F [n, 3].
-        cut: Share of the section that is cut [n].
+        cut: Fraction of the section that is cut [n].
         state: The food at the end.
         pose: The knife in C at the end.
-        ledger: Work and dissipation.
+        balance: Work and dissipation.
         energies: Energies at the end.
         energy_ratio: Largest kinetic over internal energy.
         contact_sum: Sum of the norms of all contact forces of the food on the knife at time[k] [n],
@@ -105,7 +106,7 @@ class SliceResult:
     cut: np.ndarray
     state: np.ndarray
     pose: Pose
-    ledger: EnergyLedger
+    balance: EnergyBalance
     energies: Energies
     energy_ratio: float
     contact_sum: np.ndarray | None = None
@@ -201,11 +202,11 @@ def check_energies(
     Raises:
         CuttingError: With time, element and cause.
     """
-    if energies.least_volume_ratio <= LEAST_VOLUME_RATIO:
+    if energies.least_volume_ratio <= MIN_VOLUME_RATIO:
         stiffness = model.material.youngs_modulus * model.element_size
         softness = model.material.toughness / stiffness
         raise CuttingError(
-            f"at {time:.4g} s element {energies.least_element} is inverted (volume ratio "
+            f"at {time:.4g} s element {energies.min_element} is inverted (volume ratio "
             f"{energies.least_volume_ratio:.3g}): the edge deforms the food more than its mesh can "
             f"follow. Toughness / (E h) is {softness:.2g}; above about 0.5 elements at the edge "
             "invert. Use a stiffer or less tough food; a finer mesh alone rarely helps."
@@ -230,7 +231,7 @@ def simulate_slice(
     """Drives the knife along `motion` through the food.
 
     Args:
-        solver: The cut and its exchange period.
+        solver: The cut and its coupling period.
         motion: Poses X_FK of the knife.
         board: Board under the knife, its height in F; None for none.
         check_period: Interval of the energy and inversion checks, s; shorter where the knife moves
@@ -242,10 +243,10 @@ def simulate_slice(
     """
     model, T = solver.model, solver.exchange_period
     path = KnifePath(model, motion, T)
-    count, R_FC = path.exchanges, model.X_FC_rotation
+    count, R_FC = path.coupling_steps, model.X_FC_rotation
     every = max(1, round(check_period / T))
     check_clear(model, path.pose(0))
-    ledger = EnergyLedger()
+    balance = EnergyBalance()
     food_wrench, mechanisms = np.zeros((count, 6)), np.zeros((count, 3, 3))
     cut, norms = np.zeros(count), np.zeros(count)
     ratio = travel = 0.0
@@ -254,7 +255,7 @@ def simulate_slice(
     def launches() -> Iterator[Launch]:
         singly = (Launch(k, 1) for k in range(count))
         for launch in singly if contact_sum else even_launches([path]):
-            for m in range(launch.first + 1, launch.first + launch.exchanges + 1):
+            for m in range(launch.first + 1, launch.first + launch.coupling_steps + 1):
                 check_in_plane(model, path.pose(m), m * T)
             yield launch
 
@@ -262,7 +263,7 @@ def simulate_slice(
         if not step.finite:
             raise CuttingError(f"at {(k + 1) * T:.4g} s {NOT_FINITE}")
         at, state = slice(k, k + block), step.state
-        ledger.add(step)
+        balance.add(step)
         parts = step.wrenches.reshape(block, 3, 2, 3) @ R_FC.T
         food_wrench[at] = parts.sum(1).reshape(block, 6)
         mechanisms[at] = parts[:, :, 1]
@@ -276,7 +277,7 @@ def simulate_slice(
         if end - last_check >= every or travel > CHECK_TRAVEL or end == count:
             travel, last_check = 0.0, end
             energies = solver.energies(state, path.pose(end))
-            spent = ledger.edge + ledger.opening + ledger.friction
+            spent = balance.edge + balance.opening + balance.friction
             ratio = max(ratio, check_energies(energies, spent, model, end * T))
     on_board = np.zeros((count, 6))
     if board is not None:
@@ -292,7 +293,7 @@ def simulate_slice(
         cut=cut,
         state=state,
         pose=path.pose(count),
-        ledger=ledger,
+        balance=balance,
         energies=energies,
         energy_ratio=ratio,
         contact_sum=norms if contact_sum else None,

@@ -1,4 +1,5 @@
-"""Advances the food through one exchange: captured Warp graphs on a workspace, state in NumPy."""
+"""Advances the food through one coupling step: captured Warp graphs on a workspace, state in
+NumPy."""
 
 import dataclasses as dc
 import threading
@@ -6,7 +7,7 @@ import typing
 
 import numpy as np
 
-from sliceit_drake.cutting.driver import Driver, Exchanges, Launch, run_exchanges
+from sliceit_drake.cutting.driver import CouplingSteps, Driver, Launch, run_coupling_steps
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose, small_turn
 from sliceit_drake.cutting.workspace import Workspace, parameter_row
@@ -16,7 +17,7 @@ __all__ = [
     "CuttingError",
     "CuttingSolver",
     "Energies",
-    "Exchange",
+    "CouplingStep",
     "SurfaceFactors",
 ]
 
@@ -36,8 +37,9 @@ class SurfaceFactors(typing.NamedTuple):
 
 
 @dc.dataclass
-class Exchange:
-    """Result of one exchange. Wrenches act on the knife, at Ko at the end of the exchange, in C.
+class CouplingStep:
+    """Result of one coupling step. Wrenches act on the knife, at Ko at the end of the coupling
+    step, in C.
 
     Attributes:
         state: The food's new state.
@@ -50,7 +52,7 @@ class Exchange:
         board_force: Mean force of the board on the food [3], N.
         board_dissipation: Friction and damping of the food on the board, J.
         gravity_work: Work of the weight, J.
-        cut: Share of the section that the edge has passed.
+        cut: Fraction of the section that the edge has passed.
     """
 
     state: np.ndarray
@@ -80,14 +82,14 @@ class Energies:
             blade.
         kinetic: Energy of the stepped (scaled) mass.
         least_volume_ratio: Smallest J of all elements.
-        least_element: Element that has it.
+        min_element: Element that has it.
     """
 
     elastic: float
     interface: float
     kinetic: float
     least_volume_ratio: float
-    least_element: int
+    min_element: int
 
 
 UNCHANGED = SurfaceFactors()
@@ -108,10 +110,10 @@ class CuttingSolver:
 
     Args:
         model: The cut.
-        exchange_period: Duration of one `exchange`, s; the time step must divide it.
+        exchange_period: Duration of one `coupling_step`, s; the time step must divide it.
 
     Raises:
-        TimeStepError: The time step does not divide the exchange period.
+        TimeStepError: The time step does not divide the coupling period.
     """
 
     def __init__(self, model: CuttingModel, exchange_period: float) -> None:
@@ -156,23 +158,23 @@ class CuttingSolver:
         return np.asarray(state[self._workspace.layout[name]])
 
     def compile(self) -> None:
-        """Compiles the kernels, once a machine, and captures an exchange as a graph.
+        """Compiles the kernels, once a machine, and captures a coupling step as a graph.
 
-        `exchange` does so at its first call; call this before to keep it out of a measured time.
-        """
+        `coupling_step` does so at its first call; call this before to keep it out of a measured
+        time."""
         with self._lock:
             self._workspace.capture()
 
-    def exchange(
+    def coupling_step(
         self, state: np.ndarray, start: Pose, end: Pose, factors: SurfaceFactors = UNCHANGED
-    ) -> Exchange:
+    ) -> CouplingStep:
         """Advances the food while the knife moves from `start` to `end`.
 
         Args:
             state: The food's state [state_size]; not changed.
             start: Knife pose in C at the beginning.
             end: Knife pose in C at the end.
-            factors: Factors on toughness and friction in this exchange.
+            factors: Factors on toughness and friction in this coupling step.
 
         Raises:
             CuttingError: A force is not finite, or the knife left the region that is modelled.
@@ -190,7 +192,7 @@ class CuttingSolver:
         sums, nodes = result["point_sums"][0], result["node_sums"]
         edge, normal, friction = wrenches = result["wrenches"][0]
         x = ws.layout["x"]
-        return Exchange(
+        return CouplingStep(
             state=new,
             wrench=wrenches.sum(0),
             edge=edge,
@@ -208,12 +210,12 @@ class CuttingSolver:
             cut=float(sums["cut_area"]) / m.section_area,
         )
 
-    def exchanges(self, state: np.ndarray, R: np.ndarray, p: np.ndarray) -> Exchanges:
-        """Advances the food through several exchanges at once, on a motion that is known.
+    def coupling_steps(self, state: np.ndarray, R: np.ndarray, p: np.ndarray) -> CouplingSteps:
+        """Advances the food through several coupling steps at once, on a motion that is known.
 
         Args:
             state: The food's state [state_size]; not changed.
-            R: Rotations of the knife in C at the ends of the exchanges [E + 1, 3, 3].
+            R: Rotations of the knife in C at the ends of the coupling steps [E + 1, 3, 3].
             p: Positions of Ko in C there [E + 1, 3], metres.
 
         Raises:
@@ -221,7 +223,7 @@ class CuttingSolver:
         """
         with self._lock:
             ws = self.driver.workspace([self.model], Launch(0, len(p) - 1))
-            (result,) = run_exchanges(ws, state[None], R[None], p[None])
+            (result,) = run_coupling_steps(ws, state[None], R[None], p[None])
         if not result.finite:
             raise CuttingError(NOT_FINITE)
         return result
@@ -241,13 +243,14 @@ class CuttingSolver:
         ws.write(ws.motion, motion)
 
     def contact_forces(self, state: np.ndarray, start: Pose, end: Pose) -> np.ndarray:
-        """Forces on the knife at the end of an exchange, by cut point and face [P, 2, 3], N, in C.
+        """Forces on the knife at the end of a coupling step, by cut point and face [P, 2, 3], N, in
+        C.
 
         Half of the edge's force, the flank's pressure and its friction. The sum of their norms is
         what DiSECt records as the knife's force; their sum is the resultant.
 
         Args:
-            state: The food's state after the exchange [state_size].
+            state: The food's state after the coupling step [state_size].
             start, end: Knife poses in C between which it moved.
         """
         T, ws = self.exchange_period, self._workspace
@@ -265,7 +268,7 @@ class CuttingSolver:
     def energies(
         self, state: np.ndarray, pose: Pose, factors: SurfaceFactors = UNCHANGED
     ) -> Energies:
-        """Energies of `state` with the knife at `pose`, after an exchange with `factors`."""
+        """Energies of `state` with the knife at `pose`, after a coupling step with `factors`."""
         ws, m = self._workspace, self.model
         with self._lock:
             self._place(state, pose, factors)
@@ -284,5 +287,5 @@ class CuttingSolver:
             interface=interface,
             kinetic=float(0.5 * m.mass[m.moving] @ v2),
             least_volume_ratio=float(ratio[least]),
-            least_element=least,
+            min_element=least,
         )

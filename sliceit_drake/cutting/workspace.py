@@ -14,9 +14,9 @@ from sliceit_drake.cutting.kernels.types import GATHER, LANES, PARAMETERS
 from sliceit_drake.cutting.model import CuttingModel, TimeStepError
 from sliceit_drake.cutting.warp_start import start_warp
 
-__all__ = ["DIRECT", "Workspace", "parameter_row"]
+__all__ = ["LAUNCH_LOCK", "Workspace", "parameter_row"]
 
-DIRECT = threading.RLock()
+LAUNCH_LOCK = threading.RLock()
 """Held while kernels are made, in a capture, which takes in the launches of all threads, and in
 launches outside of one."""
 
@@ -25,43 +25,43 @@ PER_POINT = ("toughness", "flank_scale", "friction_scale", "unloading")
 
 
 class Workspace:
-    """Advances cuts that share a mesh by `exchanges` exchanges a launch.
+    """Advances cuts that share a mesh by `coupling_steps` coupling steps a launch.
 
     Each cut C has parameters, motion and state of its own. A state is one row of `state_size`
     numbers: positions, velocities, history of the cut points, friction anchors, relaxation, blade.
 
     Args:
         models: The cuts; all derived from one model.
-        exchange_period: Duration of an exchange, s; the time step must divide it.
-        exchanges: Exchanges that one launch advances.
+        exchange_period: Duration of a coupling step, s; the time step must divide it.
+        coupling_steps: Coupling steps that one launch advances.
         gradients: Whether each sub-step keeps its state, for an adjoint.
 
     Raises:
-        TimeStepError: The time step does not divide the exchange period.
+        TimeStepError: The time step does not divide the coupling period.
     """
 
     def __init__(
         self,
         models: Sequence[CuttingModel],
         exchange_period: float,
-        exchanges: int = 1,
+        coupling_steps: int = 1,
         gradients: bool = False,
     ) -> None:
         model = models[0]
         dt = model.numerics.time_step
-        self.cuts, self.exchanges = len(models), exchanges
+        self.cuts, self.coupling_steps = len(models), coupling_steps
         self.exchange_period = exchange_period
         self.substeps = max(1, round(exchange_period / dt))
         if abs(self.substeps * dt - exchange_period) > 1e-6 * exchange_period:
             raise TimeStepError(
-                f"numerics.time_step = {dt:g} s does not divide the exchange period "
+                f"numerics.time_step = {dt:g} s does not divide the coupling period "
                 f"{exchange_period:g} s. Give {exchange_period / self.substeps:g}."
             )
-        self.steps = self.substeps * exchanges
+        self.steps = self.substeps * coupling_steps
         single = model.numerics.precision == "float32"
         self.real: Any = wp.float32 if single else wp.float64
         self.dtype: Any = np.float32 if single else np.float64
-        with DIRECT:
+        with LAUNCH_LOCK:
             start_warp()
             self.kernels = kernels(self.real, gradients)
         self.device = _device(model.numerics.device)
@@ -71,7 +71,7 @@ class Workspace:
         self._energy_graph: Any = None
         self._views: dict[int, np.ndarray] = {}
         # What is allocated during a capture in another thread would be taken for part of it.
-        with DIRECT:
+        with LAUNCH_LOCK:
             self._make_arrays()
         self._skin_thickness = model.effects.skin.thickness
         self.set_models(models)
@@ -121,20 +121,20 @@ class Workspace:
 
     def _make_arrays(self) -> None:
         m, k, C, K = self.model, self.kernels, self.cuts, self.steps
-        N, P, B, E = len(m.nodes), len(m.point_nodes), len(m.blocks), self.exchanges
+        N, P, B, E = len(m.nodes), len(m.point_nodes), len(m.blocks), self.coupling_steps
         M = len(m.relaxing)
         real, vec3 = self.real, k.vec3
 
         fields = [
             ("x", (N,), vec3, 3),
             ("v", (N,), vec3, 3),
-            ("passed", (P,), real, 1),
-            ("parted", (P,), real, 1),
+            ("edge_depth", (P,), real, 1),
+            ("cohesive_damage", (P,), real, 1),
             ("edge_force", (P,), real, 1),
-            ("heading", (P,), vec3, 3),
+            ("edge_direction", (P,), vec3, 3),
             ("slip", (P, 2), vec3, 3),
             ("board_slip", (N,), vec3, 3),
-            ("lag", (M, N), vec3, 3),
+            ("overstress", (M, N), vec3, 3),
             ("blade", (2,), real, 1),
         ]
         self.state_size = sum(int(np.prod(shape)) * width for _, shape, _, width in fields)
@@ -159,7 +159,7 @@ class Workspace:
         self.w, self.motion_layout = self._rows(
             self.motion, [(name, (K,), dtype, width) for name, dtype, width in motion]
         )
-        # At the ends of the exchanges, as they are given.
+        # At the ends of the coupling steps, as they are given.
         self.w["R"] = wp.zeros((C, E + 1), dtype=wp.mat33d, device=self.device)
         self.w["p"] = wp.zeros((C, E + 1), dtype=wp.vec3d, device=self.device)
         # Padded with a row of zeros, which fills up the nodes' lists of entries.
@@ -182,7 +182,7 @@ class Workspace:
         )
         sums = [
             ("total", (E, P, layouts.ACCUMULATED), real, 1),
-            ("buried", (E, P), k.vec4, 4),
+            ("immersed", (E, P), k.vec4, 4),
             ("blade_sums", (E, layouts.numbers(layouts.BLADE_SUMS)), real, 1),
             ("board_force", (N,), vec3, 3),
             ("board_loss", (N,), real, 1),
@@ -277,7 +277,7 @@ class Workspace:
                 )
         if thickness != self._skin_thickness:
             self._skin_thickness = thickness
-            with DIRECT:
+            with LAUNCH_LOCK:
                 self.w["outline"].assign(models[0].outline.astype(self.dtype))
         self.models = tuple(models)
         self.write(self.parameters, np.array([parameter_row(m) for m in models]))
@@ -286,8 +286,8 @@ class Workspace:
         """The food at rest, to be cut downwards [state_size]."""
         state = np.zeros(self.state_size, self.dtype)
         state[self.layout["x"]] = self.model.nodes.ravel()
-        state[self.layout["passed"]] = -self.model.tables.reach
-        state[self.layout["heading"]].reshape(-1, 3)[:, 2] = -1.0
+        state[self.layout["edge_depth"]] = -self.model.tables.reach
+        state[self.layout["edge_direction"]].reshape(-1, 3)[:, 2] = -1.0
         return state
 
     def results(self) -> np.ndarray:
@@ -344,7 +344,7 @@ class Workspace:
         """Arguments of `points` in sub-step k."""
         w, tables = self.w, self.model.tables
         now, after = self._slots(k)
-        history = ("passed", "parted", "edge_force", "heading", "slip")
+        history = ("edge_depth", "cohesive_damage", "edge_force", "edge_direction", "slip")
         return (
             [now["x"], now["v"], w["point_nodes"], w["point_weights"]]
             + [w[name] for name in ("area", "width", "fraction", "centroid", "outline", "surface")]
@@ -354,7 +354,7 @@ class Workspace:
             + [w[name] for name in ("R_CK", "p_CK", "v_CK", "w_CK")]
             + [now["blade"], *(now[name] for name in history)]
             + [after[name] for name in history]
-            + [w["point_force"], w["lateral"], w["buried"], w["total"]]
+            + [w["point_force"], w["lateral"], w["immersed"], w["total"]]
         )
 
     def _slots(self, k: int) -> tuple[dict[str, wp.array], dict[str, wp.array]]:
@@ -368,7 +368,7 @@ class Workspace:
         w = self.w
         now, after = self._slots(k)
         head = [w["moving"], self.from_elements[k], w["relaxing"], w["keep"]]
-        return [*head, now["lag"], after["lag"], self.from_bulk[k]]
+        return [*head, now["overstress"], after["overstress"], self.from_bulk[k]]
 
     def step_arguments(self, k: int) -> list[Any]:
         """Arguments of `step_nodes` in sub-step k."""
@@ -418,7 +418,7 @@ class Workspace:
                 [now["x"], now["v"], w["moving"], *gathered]
                 + [w["inverse_mass"], w["local_damping"], w["weight"], w["relaxing"], w["keep"]]
                 + [w["board_area"], w["board"], w["P"], self.substep_time()]
-                + [now["lag"], now["board_slip"]]
+                + [now["overstress"], now["board_slip"]]
                 + [w["board_force"], w["board_loss"], w["internal_work"], self.ahead[0]],
             )
         for kernel, arguments in (
@@ -431,7 +431,7 @@ class Workspace:
         """Compiles the kernels, once a machine, and captures a launch as a graph."""
         if self._graph is not None:
             return
-        with DIRECT:
+        with LAUNCH_LOCK:
             self._graph = self._captured()
 
     def _captured(self) -> Any:
@@ -452,18 +452,18 @@ class Workspace:
         return [self.substeps, wp.float64(self.exchange_period)]
 
     def _launch_motion(self) -> None:
-        """The knife's motion, from its poses at the ends of the exchanges."""
+        """The knife's motion, from its poses at the ends of the coupling steps."""
         w, motion = self.w, [self.w[name] for name in ("R_CK", "p_CK", "v_CK", "w_CK")]
         self.launch(self.kernels.move_knife, self.steps, [w["R"], w["p"], *self._timing(), *motion])
 
     def _launch_results(self) -> None:
-        """Launches the sums of the exchanges."""
-        w, kern, C, E = self.w, self.kernels, self.cuts, self.exchanges
+        """Launches the sums of the coupling steps."""
+        w, kern, C, E = self.w, self.kernels, self.cuts, self.coupling_steps
         outputs = [w["blade"], w["wrenches"], w["work"]]
         wp.launch(
             kern.add_points,
             dim=(C, E, layouts.numbers(layouts.POINT_SUMS)),
-            inputs=[w["total"], w["buried"], w["point_sums"]],
+            inputs=[w["total"], w["immersed"], w["point_sums"]],
             device=self.device,
         )
         at_nodes = [w["board_force"], w["board_loss"], w["internal_work"], w["node_sums"]]
@@ -472,13 +472,13 @@ class Workspace:
         self.launch(kern.knife_wrenches, E, [*sums, *self._timing(), *outputs])
 
     def advance(self, states: np.ndarray, R: np.ndarray, p: np.ndarray) -> None:
-        """Advances all cuts by the workspace's exchanges.
+        """Advances all cuts by the workspace's coupling steps.
 
         The new states are in `states[-1]`, the rest in `result`.
 
         Args:
             states: [C, state_size].
-            R: Rotations of the knives in C at the ends of the exchanges [C, E + 1, 3, 3].
+            R: Rotations of the knives in C at the ends of the coupling steps [C, E + 1, 3, 3].
             p: Positions of Ko there [C, E + 1, 3], metres.
         """
         self.capture()
@@ -492,7 +492,7 @@ class Workspace:
     def stored_energies(self) -> tuple[float, np.ndarray, float]:
         """Elastic energy, volume ratios [T] and energy of the cut points of the first cut, J."""
         if self._energy_graph is None:
-            with DIRECT:
+            with LAUNCH_LOCK:
                 self._energy_graph = self._captured_energies()
         wp.capture_launch(self._energy_graph)
         elastic = self.read(self.w["energy"])[0].sum(dtype=np.float64)
@@ -510,7 +510,7 @@ class Workspace:
             + [w["centroid"], self.real(tables.reach), self.real(1.0 / tables.spacing)]
             + [w["toughness"], w["flank_scale"], w["unloading"], w["P"], w["knife"]]
             + [w["R_CK"], w["p_CK"], 0, now["blade"]]
-            + [now[name] for name in ("passed", "parted", "edge_force", "slip")]
+            + [now[name] for name in ("edge_depth", "cohesive_damage", "edge_force", "slip")]
             + [w["point_energy"]]
         )
         energy, device = self.kernels.element_energy, self.device
@@ -524,7 +524,7 @@ class Workspace:
         """Forces on both faces at the cut points of the first cut [P, 2, 3], N."""
         # A step of no duration changes no history that another call reads.
         points = self.point_arguments(0, self.real(0.0))
-        with DIRECT:
+        with LAUNCH_LOCK:
             self.launch_many(self.kernels.points, len(self.model.point_nodes), points)
         return np.array(self.w["point_force"].numpy()[0], np.float64)
 

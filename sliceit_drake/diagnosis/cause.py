@@ -190,12 +190,12 @@ class Cause:
         """Poses of the knife relative to the food.
 
         Args:
-            R, p: As recorded, in F at the exchanges [N + 1, 3, 3] and [N + 1, 3], metres.
+            R, p: As recorded, in F at the coupling steps [N + 1, 3, 3] and [N + 1, 3], metres.
             t: Times [N + 1], s.
             values: Of the cause.
             facts: Of the slice.
-            force: Of the slice without the cause, in F at the ends of the exchanges [N, 3], N; None
-                unless the cause has `uses_force`, which costs a simulation more.
+            force: Of the slice without the cause, in F at the ends of the coupling steps [N, 3], N;
+                None unless the cause has `uses_force`, which costs a simulation more.
         """
         return R, p
 

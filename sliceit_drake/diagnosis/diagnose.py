@@ -12,7 +12,7 @@ from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.own_values import at_own_values
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
-from sliceit_drake.diagnosis.evidence.verdict import ALARM, foretold, reach_verdict
+from sliceit_drake.diagnosis.evidence.verdict import ALARM, checked_out_of_sample, reach_verdict
 from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
 from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import open_causes
@@ -34,7 +34,7 @@ BASE = (
 )
 """Base parameters of a calibrated food: a shift of theirs is reported as such."""
 
-LEAST_RECORDS = 2
+MIN_RECORDS = 2
 
 
 def setup_of_food(food: CalibratedFood, refinement: float = 1.0) -> CalibrationSetup:
@@ -74,11 +74,11 @@ def diagnose(
         ConfigurationError: The records do not carry a diagnosis, with what would be needed.
     """
     show = progress or (lambda *_: None)
-    if len(records) < LEAST_RECORDS:
+    if len(records) < MIN_RECORDS:
         raise ConfigurationError(
             f"{len(records)} record is too few: what is wrong in one slice may be that slice",
             field="RECORDS_DIR",
-            fix=f"Give at least {LEAST_RECORDS}, better 3 of each condition; `diagnose_slice` says"
+            fix=f"Give at least {MIN_RECORDS}, better 3 of each condition; `diagnose_slice` says"
             " what one slice shows.",
         )
     if replicates * ALARM < 1.0:
@@ -129,7 +129,7 @@ def diagnose(
         predictor = SlicePredictor(setup, records, (Meshing(),), Clock(), runs, workers)
         result.confirm(predictor, seed, lambda done, total: show("confirmation", done, total))
         assert result.gain is not None
-        result.verdict = foretold(result.verdict, result.gain, problem)
+        result.verdict = checked_out_of_sample(result.verdict, result.gain, problem)
     return result
 
 

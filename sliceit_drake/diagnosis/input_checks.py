@@ -21,9 +21,9 @@ from sliceit_drake.records.validation import check_record
 __all__ = ["check_records", "without_lone_torques"]
 
 BEGUN = 0.1
-"""Share of the greatest force that the first rows may have before contact."""
+"""Fraction of the greatest force that the first rows may have before contact."""
 CONTACT = 0.1
-"""Share of the greatest force at which there is contact for certain."""
+"""Fraction of the greatest force at which there is contact for certain."""
 CUTTING = ("slice", "second_pass", "hold", "retract")
 EARLY, LATE = 2e-3, 0.5
 """How far above the food contact may begin, metres, and how deep in it, of its height."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagnosis.cause import Cause, check_cause
 from sliceit_drake.diagnosis.causes import BUILT_IN
-from sliceit_drake.diagnosis.rehearsal import rehearse
+from sliceit_drake.diagnosis.rehearsal import dry_run
 from sliceit_drake.resources import load_module
 
 __all__ = [
@@ -110,7 +110,7 @@ def load_cause(file: str | Path) -> Cause:
         raise _broken(file, error, "cannot be made") from error
     check_cause(cause, str(file))
     try:
-        rehearse(cause, str(file))
+        dry_run(cause, str(file))
     except ConfigurationError:
         raise
     except Exception as error:

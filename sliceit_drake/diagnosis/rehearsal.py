@@ -10,14 +10,14 @@ from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.prediction.series import ForceSeries, SliceFacts
 
-__all__ = ["rehearse"]
+__all__ = ["dry_run"]
 
 ROWS = 200
 PERIOD = 2e-3
 HEIGHT = 0.027
 
 
-def rehearse(cause: Cause, source: str = "") -> None:
+def dry_run(cause: Cause, source: str = "") -> None:
     """Calls the hooks of a cause at its nulls and at its size.
 
     Args:

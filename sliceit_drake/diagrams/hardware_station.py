@@ -61,8 +61,8 @@ class KnifeEstimate(ReportingSystem):
             of the tool's weight and inertia. No sensor of a wrist tells these apart.
         food_wrench_vector: The same as moment and force [6].
         board_wrench: Zero, for the same reason.
-        cut_progress: Greatest depth of the edge's middle so far as a share of the food's height
-            [1]; not the share of the section.
+        cut_progress: Greatest depth of the edge's middle so far as a fraction of the food's height
+            [1]; not the fraction of the section.
 
     Args:
         plant: Model of the arm alone.

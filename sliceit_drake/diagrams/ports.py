@@ -23,7 +23,7 @@ class StationPort:
         frame: Frame in which it is expressed.
         point: Point that it is about.
         meaning: What it is, and its sign.
-        period: "exchange" (2 ms by default), "plant" (1 ms), or "continuous".
+        period: "coupling step" (2 ms by default), "plant" (1 ms), or "continuous".
         required: Whether an input must be connected; otherwise the configured value is used.
     """
 
@@ -51,7 +51,7 @@ def _input(
     meaning: str,
     required: bool = False,
 ) -> StationPort:
-    return StationPort(name, "input", kind, unit, frame, point, meaning, "exchange", required)
+    return StationPort(name, "input", kind, unit, frame, point, meaning, "coupling_step", required)
 
 
 def _output(
@@ -71,9 +71,17 @@ STATION_PORTS: tuple[StationPort, ...] = (
     _output("joint_positions", 6, "rad", "joints", "-", "measured", "plant"),
     _output("joint_velocities", 6, "rad/s", "joints", "-", "measured", "plant"),
     _output(
-        "joint_positions_command", 6, "rad", "joints", "-", "sent to the joint servo", "exchange"
+        "joint_positions_command",
+        6,
+        "rad",
+        "joints",
+        "-",
+        "sent to the joint servo",
+        "coupling_step",
     ),
-    _output("commanded_pose", RigidTransform, "m", "W", "Ko", "X_WK at the command", "exchange"),
+    _output(
+        "commanded_pose", RigidTransform, "m", "W", "Ko", "X_WK at the command", "coupling_step"
+    ),
     _output("knife_pose", RigidTransform, "m", "W", "Ko", "X_WK measured", "plant"),
     _output("knife_velocity", SpatialVelocity, "m/s, rad/s", "W", "Ko", "V_WK measured", "plant"),
     _output(
@@ -83,13 +91,15 @@ STATION_PORTS: tuple[StationPort, ...] = (
         "S",
         "So",
         "of the environment on the robot, after taring",
-        "exchange",
+        "coupling_step",
     ),
     _output(
-        "food_wrench", SpatialForce, "N, Nm", "W", "Ko", "of the food on the knife", "exchange"
+        "food_wrench", SpatialForce, "N, Nm", "W", "Ko", "of the food on the knife", "coupling_step"
     ),
     _output("board_wrench", SpatialForce, "N, Nm", "W", "Ko", "of the board on the knife", "plant"),
-    _output("cut_progress", 1, "1", "-", "-", "share of the section that is cut", "exchange"),
+    _output(
+        "cut_progress", 1, "1", "-", "-", "fraction of the section that is cut", "coupling_step"
+    ),
 )
 
 

@@ -122,7 +122,7 @@ class Run:
             gc.unfreeze()
 
     def record(self) -> Record:
-        """The table of the run so far: joints, poses, wrenches, energies at every exchange."""
+        """The table of the run so far: joints, poses, wrenches, energies at every coupling step."""
         return self.diagram.record(self.simulator.get_context())
 
     @property

@@ -70,7 +70,7 @@ class SimulatedStation(Station):
         motion_plan: The scenario's segments, those of its sequence, or the bounds of its policy.
         start_pose: X_WK at the start.
         start_joints: Joint positions there [6], rad.
-        board_peak_loss: Estimated share of an impact's peak force on the board that the plant's
+        board_peak_loss: Estimated fraction of an impact's peak force on the board that the plant's
             steps take, see `check_plant_step`.
         meshcat: The viewer, or None.
         frame_period: Time between the frames that are drawn, s: longer where the run's replay

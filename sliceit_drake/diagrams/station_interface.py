@@ -34,7 +34,7 @@ class Station(Diagram):
         motion_plan: The scenario's segments, those of its sequence, or the bounds of its policy.
         start_pose: X_WK at the start.
         start_joints: Joint positions there [6], rad.
-        board_peak_loss: Estimated share of an impact's peak force on a simulated board that the
+        board_peak_loss: Estimated fraction of an impact's peak force on a simulated board that the
             plant's steps take.
         meshcat, visualizer, food_visualizer: The viewer, or None.
         estimate_error: Estimates the error of the food's discretisation, see `PreparedFood`.

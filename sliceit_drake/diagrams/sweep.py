@@ -36,14 +36,14 @@ WIDE = 30.0
 
 @dc.dataclass
 class SweptSlice:
-    """One slice of a sweep, row by row at the ends of the exchanges.
+    """One slice of a sweep, row by row at the ends of the coupling steps.
 
     Attributes:
         values: Its values of the fields that were swept.
         time: s [n].
         depth: Of the edge below the top of the food [n], metres.
         force: Of the food on the knife, in W [n, 3], N.
-        cut: Share of the section that is cut [n].
+        cut: Fraction of the section that is cut [n].
         stopped: Why it ended early or did not start, or None.
     """
 

@@ -158,7 +158,7 @@ class Controller:
 
     @property
     def speed_scale(self) -> float:
-        """Share of the planned speeds that the speed slider allows."""
+        """Fraction of the planned speeds that the speed slider allows."""
         if self.registers.values["speed_slider_mask"]:
             fraction = float(self.registers.values["speed_slider_fraction"])  # type: ignore[arg-type]
             return min(max(fraction, 0.0), 1.0)

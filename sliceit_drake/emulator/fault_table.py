@@ -45,7 +45,7 @@ FAULTS = {
             "the network is cut; afterwards what was sent meanwhile arrives at once",
             "_silence",
         ),
-        Fault("drop_packets:SHARE", "a share of the data packages gets lost", "_drop_packets"),
+        Fault("drop_packets:SHARE", "a fraction of the data packages gets lost", "_drop_packets"),
         Fault("late_packets:SECONDS", "data packages come late, both ways", "_late_packets"),
         Fault(
             "close:rtde|dashboard|script[:reset]",

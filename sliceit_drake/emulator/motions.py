@@ -12,7 +12,7 @@ from sliceit_drake.emulator.robot_model import CYCLE
 __all__ = ["Scale", "ScriptError", "joint_motion", "line_motion", "slow_down"]
 
 Scale = Callable[[], float]
-"""Share of the planned speed that the speed slider allows now."""
+"""Fraction of the planned speed that the speed slider allows now."""
 
 _AT_REST = 1e-6
 _LEAST_ROTATION_RADIUS = 0.1
@@ -106,7 +106,7 @@ def slow_down(
 
 
 def _trapezoid(distance: float, speed: float, acceleration: float, scale: Scale) -> Iterator[float]:
-    """Share of a distance that is done after each cycle, up to 1."""
+    """Fraction of a distance that is done after each cycle, up to 1."""
     if not (speed > 0.0 and acceleration > 0.0):
         raise ScriptError(
             f"speed {speed:.6g} and acceleration {acceleration:.6g} of a motion must be positive"

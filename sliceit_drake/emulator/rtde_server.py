@@ -52,7 +52,7 @@ class RtdeServer:
 
     Attributes:
         frequency_limit: Highest frequency that clients get, Hz.
-        drop_share: Share of the data packages, in and out, that gets lost (a fault).
+        drop_share: Fraction of the data packages, in and out, that gets lost (a fault).
         delay: Controller time by which data packages come late, in and out, s (a fault).
         packages_in: Data packages that have arrived and fit their recipe, lost and late ones too.
         command_counts: Number of them by the value that they had for the command register.

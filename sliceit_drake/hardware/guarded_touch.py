@@ -31,7 +31,7 @@ SETTLED = 0.1
 """Time at the start again, before it ends, s."""
 NO_DATA = 1.0
 """How long the robot may be silent, s."""
-LEAST_SAMPLES = 3
+MIN_SAMPLES = 3
 PERIOD = 0.002
 """Period of an e-Series controller, s."""
 
@@ -182,7 +182,7 @@ def contact_of(rows: np.ndarray, noise: float, config: TouchConfig) -> Touch:
     heights, compliances = [], []
     for way in (slice(at_peak, None, -1), slice(at_peak, None)):
         z, f = _one_contact(height[way], force[way], low, high)
-        if len(f) < LEAST_SAMPLES or np.ptp(f) < 0.2 * config.force:
+        if len(f) < MIN_SAMPLES or np.ptp(f) < 0.2 * config.force:
             raise TouchError(
                 f"the contact was too short to tell the height ({len(f)} readings over {low:.2g} "
                 "N): give touch.speed a lower value"

@@ -57,7 +57,7 @@ class SlicingEnv(gymnasium.Env):
         self._moment: dict[str, Any] = {}
 
     def set_progress(self, progress: float) -> None:
-        """Says which share of the training is done, for the reward's schedule."""
+        """Says which fraction of the training is done, for the reward's schedule."""
         self.progress = progress
 
     def moment(self) -> dict[str, Any]:

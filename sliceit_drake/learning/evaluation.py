@@ -32,7 +32,7 @@ class SliceTrace:
     Attributes:
         time: [n], s.
         food, board: Forces on the knife in W [n, 3], N.
-        cut: Share of the section [n].
+        cut: Fraction of the section [n].
         height: Height of the edge over the board at the decisions [m], metres.
         actions: Actions decided [m, 6].
         metrics: Metrics of the slice.

@@ -15,7 +15,7 @@ __all__ = ["COMPLETE", "Ratio", "SliceMetrics", "bootstrap_ratio", "slice_metric
 CONTACT = 0.5
 """Force from which a sample counts as contact, N."""
 COMPLETE = 0.999
-"""Share of a section from which a slice counts as cut off."""
+"""Fraction of a section from which a slice counts as cut off."""
 
 
 @dc.dataclass(frozen=True)
@@ -28,7 +28,7 @@ class SliceMetrics:
         board_peak: Greatest force of the board, N.
         duration: From the start to the end of the slice, s.
         completed: Whether the section was cut through and the policy brought the slice to its end.
-        cut: Share of the section that was cut.
+        cut: Fraction of the section that was cut.
         end: Why the slice ended: goal, force, torque, shaking, workspace, guard or time.
     """
 
@@ -50,7 +50,7 @@ def slice_metrics(
         time: [n], s.
         food: Force of the food on the knife [n, 3], N.
         board: Likewise of the board.
-        cut: Share of the section that is cut [n].
+        cut: Fraction of the section that is cut [n].
         end: Why it ended.
     """
     force = np.linalg.norm(food + board, axis=1)

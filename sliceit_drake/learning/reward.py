@@ -121,7 +121,7 @@ def reward_potential(config: RewardConfig, height: float, at_goal: float) -> flo
     Args:
         config: Its `way` and `hold`.
         height: Height of the edge over the board, metres.
-        at_goal: Share of the decisions at the goal that end a slice.
+        at_goal: Fraction of the decisions at the goal that end a slice.
     """
     return -config.way * max(height, 0.0) / HEIGHT - config.hold * (1.0 - min(at_goal, 1.0))
 

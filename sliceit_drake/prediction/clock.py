@@ -1,8 +1,8 @@
-"""Exchanges that last longer where the knife is slow.
+"""Coupling steps that last longer where the knife is slow.
 
 The bulk has no time scale of its own, and what scaled masses do wrong goes with the product of
-speed and sub-step. So exchange and sub-step of a slow knife are multiples of those of a fast one.
-Time is not bent: speeds, relaxation and whatever else goes by seconds see the recorded ones.
+speed and sub-step. So coupling step and sub-step of a slow knife are multiples of those of a fast
+one. Time is not bent: speeds, relaxation and whatever else goes by seconds see the recorded ones.
 """
 
 import dataclasses as dc
@@ -15,16 +15,16 @@ EXCHANGE_PERIOD = 2e-3
 """Between two forces of the food, s."""
 
 BLOCK = 8
-"""Exchanges that are launched at once, all of one length."""
+"""Coupling steps that are launched at once, all of one length."""
 
 
 @dc.dataclass(frozen=True)
 class Stretches:
-    """Exchanges of a path, each some periods of an even grid.
+    """Coupling steps of a path, each some periods of an even grid.
 
     Attributes:
         ends: Row of the grid at which each ends [E + 1]; the first is where the path begins.
-        multiples: Periods of each block of `BLOCK` exchanges [E / BLOCK].
+        multiples: Periods of each block of `BLOCK` coupling steps [E / BLOCK].
     """
 
     ends: np.ndarray
@@ -33,14 +33,14 @@ class Stretches:
 
 @dc.dataclass(frozen=True)
 class Clock:
-    """How an even grid of times is divided into exchanges.
+    """How an even grid of times is divided into coupling steps.
 
     Attributes:
-        period: Of the grid, the shortest exchange, s.
-        travel: Most motion in an exchange that is longer, metres.
-        longest: Most periods of an exchange, a power of two.
-        settling: Blocks of exchanges that could be longer before they are. Masses grow with the
-            step, so that what still swings when it grows would swing with more energy.
+        period: Of the grid, the shortest coupling step, s.
+        travel: Most motion in a coupling step that is longer, metres.
+        longest: Most periods of a coupling step, a power of two.
+        settling: Blocks of coupling steps that could be longer before they are. Masses grow with
+            the step, so that what still swings when it grows would swing with more energy.
     """
 
     period: float = EXCHANGE_PERIOD
@@ -51,8 +51,8 @@ class Clock:
     def stretches(self, moved: np.ndarray, first: int, last: int) -> Stretches:
         """Divides the grid from row `first` to beyond `last`.
 
-        An exchange is at most twice as long as the one before it, and only `settling` blocks after
-        the motion allows it, so that food settles after a stop at every scale of time.
+        A coupling step is at most twice as long as the one before it, and only `settling` blocks
+        after the motion allows it, so that food settles after a stop at every scale of time.
 
         Args:
             moved: Way of the knife in each period [N], metres; 0 where it touches nothing.

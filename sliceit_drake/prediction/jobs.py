@@ -20,10 +20,10 @@ class Job:
     """A slice to be simulated.
 
     Attributes:
-        model: The cut; its numerics hold the sub-step of exchanges of one period.
-        R, p: Poses X_FK of the knife relative to the food at the ends of the exchanges
+        model: The cut; its numerics hold the sub-step of coupling steps of one period.
+        R, p: Poses X_FK of the knife relative to the food at the ends of the coupling steps
             [E + 1, 3, 3] and [E + 1, 3], metres.
-        stretches: Which exchanges these are.
+        stretches: Which coupling steps these are.
         name: For messages.
     """
 
@@ -35,11 +35,11 @@ class Job:
 
     @property
     def duration(self) -> float:
-        """Number of exchanges, the unit of time in which a job is a motion of the knife."""
+        """Number of coupling steps, the unit of time in which a job is a motion of the knife."""
         return float(len(self.p) - 1)
 
     def pose(self, t: float) -> Pose:
-        """X_FK after `t` exchanges."""
+        """X_FK after `t` coupling steps."""
         return Pose(self.R[round(t)], self.p[round(t)])
 
 
@@ -58,18 +58,18 @@ class Run:
 
 
 Executor = Callable[[Sequence[Job], float, Board], Iterable[tuple[int, Run]]]
-"""Runs jobs, given the period of the shortest exchange, s, and the board under the knife; gives
-their numbers and runs, in any order. Jobs of one mesh come in a row."""
+"""Runs jobs, given the period of the shortest coupling step, s, and the board under the knife;
+gives their numbers and runs, in any order. Jobs of one mesh come in a row."""
 
 
 def run_job(driver: Driver, job: Job, board: Board) -> Run:
     """Simulates a slice."""
     path = KnifePath(job.model, job, 1.0)
     together, multiples = BLOCK if path.rigid else 1, job.stretches.multiples.tolist()
-    starts = range(0, path.exchanges, together)
+    starts = range(0, path.coupling_steps, together)
     launches = [Launch(k, together, multiples[k // BLOCK]) for k in starts]
-    wrenches = np.zeros((path.exchanges, 3, 6))
-    rise = np.zeros(path.exchanges)
+    wrenches = np.zeros((path.coupling_steps, 3, 6))
+    rise = np.zeros(path.coupling_steps)
     for (k, count, _), (step,) in driver.run([path], launches, board):
         wrenches[k : k + count] = step.wrenches
         if not step.finite:

@@ -25,12 +25,12 @@ __all__ = [
     "group_series",
 ]
 
-LEAST_SHARE = 1e-4
+MIN_SHARE = 1e-4
 """Least standard deviation of a series, relative to the root mean square measurement of all."""
 SPREAD_PRIOR, TIME_PRIOR = 2.0, 1.5
 """Standard deviations of weak priors on logarithms: of the standard deviations about the residuals'
 own, and of the correlation time about the middle between step and duration."""
-LEAST_SCALE, FIRST_SCALE, LARGEST_SCALE = 1e-3, 0.1, 1.0
+MIN_SCALE, FIRST_SCALE, LARGEST_SCALE = 1e-3, 0.1, 1.0
 FLAT = 1e-6
 """Precision of parameters without a prior, relative to what the data say of them."""
 DRAWS = 48
@@ -284,7 +284,7 @@ class _Problem:
         columns = np.column_stack([residuals, jacobian, nuisance, scales])
         self.columns = [columns[g.rows] for g in groups]
         self.prior_mean, self.prior_precision = prior_mean, 1.0 / prior_variance
-        least = LEAST_SHARE * level
+        least = MIN_SHARE * level
         rough = [float(np.sqrt(np.mean(residuals[g.rows] ** 2))) for g in groups]
         self.spread = np.maximum(rough, 2.0 * least)
         known = [g.gap[np.isfinite(g.gap)] for g in groups]
@@ -300,7 +300,7 @@ class _Problem:
         self.replicated = scales.shape[1] > 0
         if self.replicated:
             first.append(FIRST_SCALE)
-            bounds.append((np.log(LEAST_SCALE), np.log(LARGEST_SCALE)))
+            bounds.append((np.log(MIN_SCALE), np.log(LARGEST_SCALE)))
         self.first, self.bounds = np.log(first), np.array(bounds)
         self._pieces: dict[tuple, tuple[np.ndarray, float]] = {}
 

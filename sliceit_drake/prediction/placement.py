@@ -16,7 +16,7 @@ from sliceit_drake.records.slice_record import SliceRecord
 __all__ = ["food_of", "is_bare", "knife_of", "poses_in_food"]
 
 ONSET = 0.02
-"""Share of a record's greatest force at which contact is taken to begin, where its height is not
+"""Fraction of a record's greatest force at which contact is taken to begin, where its height is not
 known."""
 
 

@@ -58,7 +58,7 @@ class Meshing:
 
     Attributes:
         refinement: Elements along an edge, relative to the food's mesh.
-        time_step: Sub-step of the shortest exchange, s.
+        time_step: Sub-step of the shortest coupling step, s.
         precision, device: As in `cutting.model.Numerics`.
     """
 
@@ -100,9 +100,9 @@ class RecordTarget:
         depth: Of the edge below the top of the food at the rows [m], metres.
         compared: Whether a row counts in a fit [m]: not where the knife turns round in the food.
         phase: Label at the rows [m]; "" for none.
-        grid: Even times of the exchanges [N + 1], s; row 0 is the first row of the record.
+        grid: Even times of the coupling steps [N + 1], s; row 0 is the first row of the record.
         R, p: Pose X_FK at `grid`.
-        stretches: Exchanges that are simulated; None without food in reach.
+        stretches: Coupling steps that are simulated; None without food in reach.
         height_unknown: Whether the height of the whole record is only known from its force.
         speed_unknown: Whether its speed is known but for a factor.
     """
@@ -219,7 +219,7 @@ class RecordTarget:
     def poses(
         self, stretches: Stretches, R: np.ndarray, p: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Poses at the ends of exchanges; a knife whose record is over rests."""
+        """Poses at the ends of coupling steps; a knife whose record is over rests."""
         rows = np.minimum(stretches.ends, len(p) - 1)
         return R[rows], p[rows]
 
@@ -326,8 +326,8 @@ class RecordTarget:
     def _seen(self, columns: np.ndarray) -> np.ndarray:
         """What would have been measured at the rows [m, k] of series on the grid [N, k].
 
-        A reading stands for the mean over the exchange that ends with it. Before the first and
-        after the last exchange a force is taken to stay as it is.
+        A reading stands for the mean over the coupling step that ends with it. Before the first and
+        after the last coupling step a force is taken to stay as it is.
         """
         before = np.zeros((2, columns.shape[1])) + columns[:1]
         after = np.zeros((2, columns.shape[1])) + columns[-1:]
@@ -340,18 +340,18 @@ class RecordTarget:
         return np.asarray(rows[at - 1] + share[:, None] * (rows[at] - rows[at - 1]))
 
     @property
-    def exchanges(self) -> np.ndarray:
-        """Rows of the grid at which the exchanges of an even clock end [E + 1]."""
+    def coupling_steps(self) -> np.ndarray:
+        """Rows of the grid at which the coupling steps of an even clock end [E + 1]."""
         assert self.stretches is not None
         return self.stretches.ends[self.stretches.ends < len(self.grid)]
 
     @functools.cached_property
     def operator(self) -> np.ndarray:
-        """From forces of `exchanges` to what would have been measured at the rows [m, E].
+        """From forces of `coupling_steps` to what would have been measured at the rows [m, E].
 
-        Filters are linear, so that their effect on each exchange's force is all there is to know.
-        """
-        rows = self.exchanges[1:] - 1
+        Filters are linear, so that their effect on each coupling step's force is all there is to
+        know."""
+        rows = self.coupling_steps[1:] - 1
         series = np.zeros((len(self.grid) - 1, len(rows)))
         series[rows, np.arange(len(rows))] = 1.0
         return self._seen(series)
@@ -362,7 +362,8 @@ class RecordTarget:
         return self._seen(self._weight()[:, 3:])
 
     def compare_forces(self, force: np.ndarray) -> np.ndarray:
-        """Channels at the rows [m, c] from forces of the simulated exchanges [E, 3], N, in F."""
+        """Channels at the rows [m, c] from forces of the simulated coupling steps [E, 3], N, in
+        F."""
         seen = self.operator @ force + self._weight_seen
         return np.linalg.norm(seen, axis=1)[:, None] if self.channels == NORM else seen
 

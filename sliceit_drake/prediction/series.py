@@ -61,10 +61,10 @@ class SharedFacts(SliceFacts):
 @dc.dataclass
 class ForceSeries:
     """A predicted slice on an even grid of times; wrenches on the knife, moment about Ko and force,
-    in F, mean over the exchange that ends at the time, Nm and N.
+    in F, mean over the coupling step that ends at the time, Nm and N.
 
     Attributes:
-        time: Ends of the exchanges [N], s, on the record's clock.
+        time: Ends of the coupling steps [N], s, on the record's clock.
         R, p: Pose X_FK of the knife as recorded [N, 3, 3] and [N, 3], metres.
         v, w: Velocity of Ko and angular velocity, in F [N, 3], m/s and rad/s.
         parts: By mechanism, each [N, 6]: edge, normal, friction, board, weight.

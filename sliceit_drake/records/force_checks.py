@@ -5,12 +5,12 @@ from scipy.integrate import trapezoid
 
 from sliceit_drake.records import slice_record as fmt
 from sliceit_drake.records.findings import Findings, runs
-from sliceit_drake.records.preprocessing import LEAST_AIR_ROWS
+from sliceit_drake.records.preprocessing import MIN_AIR_ROWS
 from sliceit_drake.records.slice_record import SliceRecord, SliceTable
 
 __all__ = ["check_force"]
 
-LEAST_FORCE = 0.1
+MIN_FORCE = 0.1
 """A slice whose force stays below this, N, is too light even for soft tofu: it is in kN."""
 
 FINEST_NOISE = 1e-3
@@ -20,7 +20,7 @@ weak force from a sensor that good is one in kN."""
 WEAK_FORCE = 1.0
 """Below this the noise is looked at, N."""
 
-LEAST_WORK = 1.0
+MIN_WORK = 1.0
 """Work of cutting over cut area below this, J/m2, is less than any food's toughness: soft gels
 have a few, vegetables some hundred."""
 
@@ -31,14 +31,14 @@ FROZEN_TIME = 0.2
 """A sensor that shows exactly the same for this long while the knife cuts is stuck, s."""
 
 OFFSET = 0.02
-"""Share of the greatest force that an offset in the air may have."""
+"""Fraction of the greatest force that an offset in the air may have."""
 
 FLAT, FLAT_FAR = 5.0, 50.0
 """Rows at exactly the greatest value from which on a sensor is taken for saturated, near its range
 and far from it."""
 
 ALONG = 0.2
-"""Share of |F| |v| that the power must have at least for its sign to mean something."""
+"""Fraction of |F| |v| that the power must have at least for its sign to mean something."""
 
 
 def check_force(table: SliceTable, record: SliceRecord, findings: Findings) -> None:
@@ -89,7 +89,7 @@ def _known_offset(record: SliceRecord, air: np.ndarray) -> np.ndarray | None:
     """
     if record.force is None:
         return np.zeros(3)
-    if air.sum() >= LEAST_AIR_ROWS:
+    if air.sum() >= MIN_AIR_ROWS:
         return record.force[air].mean(axis=0)
     facts = record.metadata.wrench
     return np.zeros(3) if facts.tared == "yes" and "gravity" not in facts.includes else None
@@ -97,12 +97,12 @@ def _known_offset(record: SliceRecord, air: np.ndarray) -> np.ndarray | None:
 
 def _check_tare(record: SliceRecord, air: np.ndarray, findings: Findings) -> None:
     facts = record.metadata.wrench
-    if air.sum() < LEAST_AIR_ROWS:
+    if air.sum() < MIN_AIR_ROWS:
         findings.fact(
             "warning",
             "no air phase",
             "motion.phases",
-            f"the first phase labelled air has not {LEAST_AIR_ROWS} rows: the sensor's zero and "
+            f"the first phase labelled air has not {MIN_AIR_ROWS} rows: the sensor's zero and "
             "noise are unknown",
             "Label the time before contact as air; record half a second of it.",
         )
@@ -142,9 +142,9 @@ def _check_units(
     rows = np.flatnonzero(cut)
     peak = float(np.percentile(magnitude[cut], 95.0))
     problem = ""
-    if peak < LEAST_FORCE:
+    if peak < MIN_FORCE:
         problem = f"the force while slicing stays below {peak:.3g} N, expected at least"
-        problem += f" {LEAST_FORCE:g} N"
+        problem += f" {MIN_FORCE:g} N"
     elif peak < WEAK_FORCE and 1e-6 < (noise := _noise(record, air)) < FINEST_NOISE:
         problem = f"the force while slicing stays below {peak:.3g} N, and its noise in the air is"
         problem += f" {noise:.1g} N, less than any such sensor has"
@@ -152,9 +152,9 @@ def _check_units(
         v, _ = fmt.velocities(record.time, record.position, record.rotation)
         speed = np.linalg.norm(v, axis=1)
         work = trapezoid(np.where(cut, magnitude * speed, 0.0), record.time)
-        if work < LEAST_WORK * area:
+        if work < MIN_WORK * area:
             problem = f"the work of slicing is {work / area:.2g} J per m2 of cut, expected at least"
-            problem += f" {LEAST_WORK:g} J/m2"
+            problem += f" {MIN_WORK:g} J/m2"
     if problem:
         findings.error(
             "kilonewtons",
@@ -168,7 +168,7 @@ def _check_units(
 def _noise(record: SliceRecord, air: np.ndarray) -> float:
     """Standard deviation in the air of the noisiest component, N, after drift; 0 if not known."""
     force = record.force if record.force is not None else record.force_magnitude[:, None]
-    if air.sum() < LEAST_AIR_ROWS:
+    if air.sum() < MIN_AIR_ROWS:
         return 0.0
     return float(np.diff(force[air], axis=0).std(axis=0).max() / np.sqrt(2.0))
 

@@ -7,9 +7,9 @@ from sliceit_drake.records.metadata import Phase, SliceMetadata
 __all__ = ["phases_from_motion"]
 
 AT_REST = 0.05
-"""Vertical speed below this share of its greatest is rest."""
+"""Vertical speed below this fraction of its greatest is rest."""
 
-LEAST_HOLD = 0.02
+MIN_HOLD = 0.02
 """A rest shorter than this is a turning point, s."""
 
 
@@ -46,7 +46,7 @@ def phases_from_motion(
     start_up = int(up[0]) if up.size else len(time) - 1
     marks = [("air", 0, contact), ("slice", contact, stop), ("hold", stop, start_up)]
     marks.append(("retract", start_up, len(time) - 1))
-    if time[start_up] - time[stop] < LEAST_HOLD:
+    if time[start_up] - time[stop] < MIN_HOLD:
         marks[2:] = [("retract", stop, len(time) - 1)] if up.size else []
         marks[1] = ("slice", contact, stop if up.size else len(time) - 1)
     return [

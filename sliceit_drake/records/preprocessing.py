@@ -18,7 +18,7 @@ from sliceit_drake.records.metadata import ProcessingStep, SliceMetadata
 from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = [
-    "LEAST_AIR_ROWS",
+    "MIN_AIR_ROWS",
     "apply_filters",
     "as_measured",
     "compensate_tool",
@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 GRAVITY = 9.81
-LEAST_AIR_ROWS = 10
+MIN_AIR_ROWS = 10
 """Fewest samples of the first air phase whose mean is a zero and whose scatter is the noise."""
 
 ANTI_ALIASING = 0.35
@@ -48,11 +48,11 @@ def tare(record: SliceRecord) -> SliceRecord:
             known, from which an offset cannot be subtracted.
     """
     air = record.first_phase("air")
-    if record.force is None or air.sum() < LEAST_AIR_ROWS:
+    if record.force is None or air.sum() < MIN_AIR_ROWS:
         raise ConfigurationError(
             "has the norm of the force alone"
             if record.force is None
-            else f"has {air.sum()} rows in its first phase labelled air, expected {LEAST_AIR_ROWS}",
+            else f"has {air.sum()} rows in its first phase labelled air, expected {MIN_AIR_ROWS}",
             source=record.file or record.name,
             fix="Leave the step tare out, or give components and an air phase.",
         )

@@ -26,7 +26,7 @@ __all__ = [
     "record_files",
 ]
 
-LEAST_ROWS = 10
+MIN_ROWS = 10
 
 KEY_FACTS = (
     "provenance",
@@ -191,8 +191,8 @@ def _check_structure(table: SliceTable, findings: Findings) -> None:
     if findings.found:
         return
     time = table.columns[fmt.TIME]
-    if len(time) < LEAST_ROWS:
-        fix = f"Give at least {LEAST_ROWS} rows."
+    if len(time) < MIN_ROWS:
+        fix = f"Give at least {MIN_ROWS} rows."
         findings.error("short", fmt.TIME, f"the table has {len(time)} rows", fix)
         return
     wrong = np.flatnonzero(np.diff(time) <= 0.0) + 1

@@ -86,10 +86,11 @@ def _section(width: float, height: float) -> EllipticSection:
 class CurveCutter(KnifeForceSystem):
     """The knife in a food of a measured curve; see `KnifeForceSystem` and `curve_laws`.
 
-    Speed and draw are those of the knife's way between two exchanges, with the edge's direction
-    smoothed over `YIELDING`: a controlled knife shakes, and a food yields. The depth is that of the
-    edge at the middle of the food, where the food pushes it; the flanks are pushed half way up to
-    the food's top. `cut_progress` is the share of the section that the edge has passed.
+    Speed and draw are those of the knife's path between two coupling steps, with the edge's
+    direction smoothed over `YIELDING`: a controlled knife shakes, and a food yields. The depth is
+    that of the edge at the middle of the food, where the food pushes it; the flanks are pushed half
+    way up to the food's top. `cut_progress` is the fraction of the section that the edge has
+    passed.
 
     Further output port:
         force_components: Forces on the knife by edge, flank pressure, friction [9], N, in W.
@@ -100,7 +101,7 @@ class CurveCutter(KnifeForceSystem):
     Args:
         food: The food.
         X_WF: Pose of the food frame: the food stands at its origin, the edge is along Fx.
-        exchange_period: Duration of an exchange, s.
+        exchange_period: Duration of a coupling step, s.
     """
 
     def __init__(self, food: CurveFood, X_WF: RigidTransform, exchange_period: float) -> None:

@@ -1,4 +1,5 @@
-"""Laws of the worlds of measured curves: force of the food on the knife, exchange by exchange.
+"""Laws of the worlds of measured curves: force of the food on the knife, coupling step by coupling
+step.
 
 The force over depth is a recorded one (calibration/measured), stretched over the height of the
 food. Around it stand laws of a few lines: a power of the speed (`RATE`), Atkins' draw
@@ -28,7 +29,7 @@ CONTACT = 0.3
 RATE = 0.07
 """Exponent of the speed."""
 
-LEAST_SPEED = 2e-3
+MIN_SPEED = 2e-3
 """Below which the force falls no further, m/s."""
 
 FLANK_SHARE, WEDGE_SHARE = 0.15, 0.03
@@ -44,7 +45,7 @@ TURN = 1e-4
 """Travel over which friction turns round, metres."""
 
 STILL = 1e-9
-"""Move in an exchange below which the knife is held, on a prescribed path, metres."""
+"""Move in a coupling step below which the knife is held, on a prescribed path, metres."""
 
 LARGEST_RATIO = 1e3
 
@@ -54,7 +55,7 @@ class FoodCurve:
     """Force of a press at `CURVE_SPEED` over depth.
 
     Attributes:
-        share: Depths as shares of the food's height, from 0 to 1, increasing [n].
+        share: Depths as fractions of the food's height, from 0 to 1, increasing [n].
         force: Upward force on the knife [n], N.
     """
 
@@ -109,7 +110,7 @@ class EllipticSection:
         self._above = (angle - np.sin(angle) * np.cos(angle)) / np.pi
 
     def above(self, depth: float) -> float:
-        """Share of the section above a depth, metres."""
+        """Fraction of the section above a depth, metres."""
         return float(np.interp(depth, self.depth, self._above))
 
 
@@ -127,7 +128,7 @@ class CutState:
         speed: Speed of the edge, m/s.
         ratio: Draw over press, xi.
         rest: Time for which the knife is held, s.
-        faded: Share of the forces that a hold has left.
+        faded: Fraction of the forces that a hold has left.
     """
 
     place: np.ndarray
@@ -206,7 +207,7 @@ class CutState:
 
     @property
     def loaded(self) -> float:
-        """Share of the edge's force that is there: none in a cut that is open."""
+        """Fraction of the edge's force that is there: none in a cut that is open."""
         behind = (self.deepest - self.depth) / RELOAD
         return max(0.0, 1.0 - behind) * self.faded
 
@@ -238,7 +239,7 @@ def food_forces(
     whole = float(np.interp(share, curve.share, curve.force))
     edge = max(whole - (FLANK_SHARE + WEDGE_SHARE) * flanks, 0.0)
     edge = max(edge + more, 0.0) if share < 1.0 else 0.0
-    speed = max(state.speed, LEAST_SPEED)
+    speed = max(state.speed, MIN_SPEED)
     edge *= toughness * (speed / CURVE_SPEED) ** RATE * state.loaded
     xi = state.ratio
     out[0] = [-xi * edge / (1.0 + xi**2), 0.0, edge / (1.0 + xi**2)]

@@ -81,7 +81,7 @@ class CurveWorld:
         section: EllipticSection,
         effects: Sequence[Effect],
     ) -> Series:
-        timeless = not any(effect.every_exchange for effect in effects)
+        timeless = not any(effect.every_coupling_step for effect in effects)
         stretches = np.array(list(path.stretches(TRAVEL, LONGEST if timeless else 1, 0.0)))
         size = facts.width / section_size(self.protocol.food, 1.0)[0]
         curve = self._curve.scaled(specimen.toughness).scaled(size)

@@ -100,12 +100,12 @@ class Now:
 
 @dc.dataclass
 class Series:
-    """One slice as the world has it, every exchange. Wrenches are on the knife, moment about Ko and
-    force, in F [N, 6], Nm and N.
+    """One slice as the world has it, every coupling step. Wrenches are on the knife, moment about
+    Ko and force, in F [N, 6], Nm and N.
 
     Attributes:
         slice: What is the same during the slice.
-        time: End of each exchange [N], s, equally spaced.
+        time: End of each coupling step [N], s, equally spaced.
         R, p: Commanded pose of the knife in F [N, 3, 3] and [N, 3], metres.
         p_true: True position of Ko [N, 3], metres.
         v: Velocity of Ko, in F [N, 3], m/s.
@@ -113,7 +113,7 @@ class Series:
         depth: Depth of the true edge below the top of the food [N], metres.
         flank: Area of both flanks in front of cut food [N], m^2.
         flank_arm: Vector from Ko to the middle of that area, in F [N, 3], metres.
-        cut: Share of the section that is cut [N].
+        cut: Fraction of the section that is cut [N].
         edge, normal, friction: Wrenches of the food by mechanism.
         board: Wrench of the board.
         other: Wrench of anything else.
@@ -172,7 +172,8 @@ class Effect:
         unit: Unit of the size.
         typical: A size that matters and could be met in a kitchen.
         least: Least size that has a meaning.
-        every_exchange: Whether `drive` must see every exchange, as where it feeds a force back.
+        every_coupling_step: Whether `drive` must see every coupling step, as where it feeds a force
+            back.
         size: How much of the effect there is.
     """
 
@@ -180,7 +181,7 @@ class Effect:
     unit = ""
     typical = 1.0
     least = -np.inf
-    every_exchange = False
+    every_coupling_step = False
 
     def __init__(self, size: float | None = None) -> None:
         """Makes an effect of a size; of its typical one if there is none.

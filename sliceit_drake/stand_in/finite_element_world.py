@@ -5,7 +5,7 @@ null. What an effect changes, it changes from outside: places of the mesh's vert
 toughness and stiffness of the tissue, in each stretch of the path the knife's pose and factors on
 toughness and friction, and at the end the forces by mechanism.
 
-The base model has no time scale of its own, so where the knife is slow several exchanges are
+The base model has no time scale of its own, so where the knife is slow several coupling steps are
 computed as one, with at most `travel` of motion; a hold takes a few steps and the air none.
 """
 
@@ -38,7 +38,7 @@ CLEAR = 1e-3
 """Height of the edge over the food above which nothing is computed, metres."""
 
 LONGEST = 50
-"""Most exchanges that are computed as one."""
+"""Most coupling steps that are computed as one."""
 
 CHECK_TRAVEL = 1e-3
 
@@ -55,7 +55,7 @@ class FiniteElementSettings:
     )
     time_step: float = quantity(2.5e-4, "s", low=1e-6, high=2e-3, doc="Sub-step.")
     travel: float = quantity(
-        4e-5, "m", low=1e-6, high=1e-3, doc="Most motion in exchanges computed as one."
+        4e-5, "m", low=1e-6, high=1e-3, doc="Most motion in coupling steps computed as one."
     )
 
 
@@ -262,7 +262,7 @@ class _Run:
         """Drives the knife along the path."""
         path, settings = self.path, self.world.settings
         reach = 0.5 * self.protocol.knife.length
-        timeless = not any(effect.every_exchange for effect in self.effects)
+        timeless = not any(effect.every_coupling_step for effect in self.effects)
         rates = self.model is not None and (
             self.model.material.static_friction > self.model.material.friction
         )
@@ -309,7 +309,7 @@ class _Run:
             assert self.model is not None
             check_in_plane(self.model, pose, now.time + now.period)
             factors = SurfaceFactors(now.toughness, now.friction)
-            step = self.solver.exchange(self.state, self.fed, pose, factors)
+            step = self.solver.coupling_step(self.state, self.fed, pose, factors)
             self.state, self.cut = step.state, step.cut
             wrenches = np.array([step.edge, step.normal, step.friction])
             parts = (wrenches.reshape(3, 2, 3) @ self.R_FC.T).reshape(3, 6)

@@ -10,7 +10,7 @@ STIFFEST = 3e6
 """Greatest stiffness that arm and holder can meet, N/m."""
 
 FORGET = 0.8
-"""Share of the last estimate of that below which the next does not fall."""
+"""Fraction of the last estimate of that below which the next does not fall."""
 
 
 class BoardHeight(Effect):
@@ -48,7 +48,7 @@ class ArmCompliance(Effect):
     unit = "m/N"
     typical = 5e-5
     least = 0.0
-    every_exchange = True
+    every_coupling_step = True
     fast, slow = 0.03, 0.6
 
     def begin(self, facts: SliceTruth, rng: np.random.Generator) -> None:

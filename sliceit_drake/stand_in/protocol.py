@@ -116,7 +116,7 @@ class Protocol:
         if steps < 1.0 - 1e-9 or abs(steps - round(steps)) > 1e-6 * steps:
             nearest = 1.0 / (max(1, round(steps)) * self.exchange_period)
             raise ConfigurationError(
-                f"= {self.sensor.rate:g} Hz: readings are not whole exchange periods of "
+                f"= {self.sensor.rate:g} Hz: readings are not whole coupling step periods of "
                 f"{self.exchange_period:g} s apart",
                 field=f"{where}.sensor.rate",
                 fix=f"Give {nearest:.6g}, or another exchange_period.",

@@ -69,7 +69,7 @@ class SensorDelay(Effect):
         out = wrench
         if self.size == 0.0:
             return out
-        # A filter y += (x - y) / (n + 1) is n exchanges late.
+        # A filter y += (x - y) / (n + 1) is n coupling steps late.
         keep = self.size / self.stages / series.period
         keep = keep / (1.0 + keep)
         for _ in range(self.stages):

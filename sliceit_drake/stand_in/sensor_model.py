@@ -22,7 +22,11 @@ class SensorModel:
     force_noise: float = quantity(0.05, "N", low=0.0, high=50.0, doc="Standard deviation.")
     torque_noise: float = quantity(0.004, "Nm", low=0.0, high=5.0, doc="Standard deviation.")
     correlated_share: float = quantity(
-        0.5, "", low=0.0, high=1.0, doc="Share of the noise's variance that is correlated in time."
+        0.5,
+        "",
+        low=0.0,
+        high=1.0,
+        doc="Fraction of the noise's variance that is correlated in time.",
     )
     correlation_time: float = quantity(
         0.03, "s", low=1e-4, high=100.0, doc="Time in which that falls to 1/e."

@@ -67,7 +67,7 @@ FORCE_BIAS, MOMENT_BIAS = 0.3, 0.02
 its weighings spread (`WrenchSensorConfig`). Biases differ from slice to slice, by this spread."""
 
 DELAY = 4e-3
-"""Delay of the wrench sensor, s: two exchanges."""
+"""Delay of the wrench sensor, s: two coupling steps."""
 
 
 @dc.dataclass(frozen=True)
@@ -76,7 +76,7 @@ class _Hidden:
 
     Attributes:
         rate: Exponent of the toughness by the edge's speed.
-        relaxing, time: Share of the modulus that relaxes, and with which time, s.
+        relaxing, time: Fraction of the modulus that relaxes, and with which time, s.
         adhesion: Shear of food that sticks to the flanks, Pa; 300 Pa on a cucumber's 11 cm^2 of
             flank are 0.3 N, on a tomato's 36 cm^2 1.1 N.
         bluntness: Excess of the toughness where the edge enters, over the toughness.

@@ -68,10 +68,10 @@ class RateToughness(Effect):
 
     cause = "toughness by speed"
     typical = 0.08
-    least_speed = 1e-4
+    min_speed = 1e-4
 
     def drive(self, now: Now) -> None:
-        speed = max(now.speed, self.least_speed)
+        speed = max(now.speed, self.min_speed)
         now.toughness *= max(0.2, 1.0 + self.size * np.log(speed / self.facts.reference_speed))
 
 

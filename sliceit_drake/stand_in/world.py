@@ -34,7 +34,7 @@ class World(typing.Protocol):
 
 @dc.dataclass
 class Path:
-    """A prescribed motion, sampled every exchange; row 0 is the start.
+    """A prescribed motion, sampled every coupling step; row 0 is the start.
 
     Attributes:
         period: Time between two poses, s.
@@ -77,19 +77,19 @@ class Path:
 
     @property
     def v(self) -> np.ndarray:
-        """Mean velocity of Ko over each exchange [E, 3], m/s."""
+        """Mean velocity of Ko over each coupling step [E, 3], m/s."""
         return np.diff(self.p, axis=0) / self.period
 
     def stretches(self, travel: float, longest: int, reach: float) -> Iterator[tuple[int, int]]:
-        """Cuts the path into stretches [a, b) of exchanges, short where the knife is fast.
+        """Cuts the path into stretches [a, b) of coupling steps, short where the knife is fast.
 
-        A stretch is longer than one exchange only where the knife moves less than `travel` in it,
-        and short before the end of a segment and still more so after its beginning, where food and
-        effects settle.
+        A stretch is longer than one coupling step only where the knife moves less than `travel` in
+        it, and short before the end of a segment and still more so after its beginning, where food
+        and effects settle.
 
         Args:
             travel: metres.
-            longest: Exchanges.
+            longest: Coupling steps.
             reach: Half the length of the edge, for turns, metres.
         """
         moved = np.linalg.norm(np.diff(self.p, axis=0), axis=1)

@@ -110,7 +110,11 @@ class AgentConfig:
         0.03, "m", low=0.0, high=0.1, doc="Farthest that the target goes below the board."
     )
     lead: float = quantity(
-        0.8, "", low=0.01, high=1.0, doc="Share of the way to the target that a decision aims at."
+        0.8,
+        "",
+        low=0.01,
+        high=1.0,
+        doc="Fraction of the way to the target that a decision aims at.",
     )
     goal: list[float] = quantity(
         [0.04, 2e-4, 0.04],

@@ -74,7 +74,7 @@ class ComplianceControllerConfig:
         "force: wrenches alone. parallel: spring and wrenches weighted by the selection.",
     )
     period: float = quantity(
-        0.002, "s", low=1e-4, high=0.1, doc="Time between updates, which is the exchange period."
+        0.002, "s", low=1e-4, high=0.1, doc="Time between updates, which is the coupling period."
     )
     iterations: int = quantity(
         1, "", low=1, high=100, doc="Virtual steps per update; force mode always takes one."

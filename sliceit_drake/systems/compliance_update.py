@@ -8,7 +8,7 @@ import warp as wp
 from pydrake.math import RigidTransform
 
 from sliceit_drake.cutting.warp_start import start_warp
-from sliceit_drake.cutting.workspace import DIRECT
+from sliceit_drake.cutting.workspace import LAUNCH_LOCK
 from sliceit_drake.systems.compliance_kernel import MODES, mat34d, place_arm, update_arm
 from sliceit_drake.systems.ur5e_kinematics import KinematicChain
 
@@ -19,7 +19,7 @@ _CPU = "cpu"
 
 def load_kernels() -> None:
     """Compiles the kernels, once a machine, and loads them, once a process."""
-    with DIRECT:
+    with LAUNCH_LOCK:
         start_warp()
         wp.load_module(update_arm.module, device=_CPU)
 
@@ -83,7 +83,7 @@ class ComplianceUpdate:
         self._failed = np.zeros(1, np.int32)
         load_kernels()
         # What is launched during a capture in another thread would be taken for part of it.
-        with DIRECT:
+        with LAUNCH_LOCK:
             self._capture()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "ComplianceUpdate":

@@ -21,8 +21,8 @@ _PARTS = ("direction", "reach", "turning_value", "turning_time", "count", "recor
 _ALARM = _AXES * len(_PARTS)
 _STATE_SIZE = _ALARM + 1
 
-# A swing of at least this share of the greatest before it, which itself is forgotten by this factor
-# a swing, does not die out: oscillations with a damping ratio above about 1 % do.
+# A swing of at least this fraction of the greatest before it, which itself is forgotten by this
+# factor a swing, does not die out: oscillations with a damping ratio above about 1 % do.
 _LASTING = 0.9
 _FORGETTING = 0.97
 # Swings that suffice if the last is above the force limit: an impact has one or two.
@@ -62,10 +62,11 @@ class ContactMonitor(LeafSystem):
     """Ends a simulation whose contact force oscillates without dying out.
 
     A stable contact answers a disturbance, such as the knife's arrival on the board, with swings
-    that become smaller. Too stiff a contact for the gains, the servo's lag and the exchange makes
-    them grow until torque limits or lost contact bound them. The monitor follows each component of
-    the wrench from one turning point to the next; a reversal by less than the least swing is no
-    turning point, so noise and the ripple of cutting do not count. The alarm is raised by
+    that become smaller. Too stiff a contact for the gains, the servo's lag and the coupling step
+    makes them grow until torque limits or lost contact bound them. The monitor follows each
+    component of the wrench from one turning point to the next; a reversal by less than the least
+    swing is no turning point, so noise and the ripple of cutting do not count. The alarm is raised
+    by
 
     - `swings` in a row, none longer than `longest_swing`, the last of which is not smaller than
       those before it, or

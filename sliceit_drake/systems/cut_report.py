@@ -55,7 +55,7 @@ class FoodBodyFrame:
         food: Which of a sequence's foods it is.
         points, rest: Corners now and before anything touched them, in W [V, 3], metres.
         tetrahedra: Their corners [M, 4].
-        damage: Share of the toughness that is spent at each corner [V]: 0 intact, 1 cut.
+        damage: Fraction of the toughness that is spent at each corner [V]: 0 intact, 1 cut.
         side: Side of the cut on which each corner is [V], 0 or 1.
     """
 

@@ -20,9 +20,9 @@ from sliceit_drake.systems.cut_report import Columns, FoodBodyFrame, FoodPicture
 from sliceit_drake.systems.food_visualizer import FoodVisualizer, frame_size
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 
-__all__ = ["COMPLETE", "ENERGY_NAMES", "LEDGER_NAMES", "CuttingSystem"]
+__all__ = ["COMPLETE", "ENERGY_NAMES", "BALANCE_NAMES", "CuttingSystem"]
 
-LEDGER_NAMES = (
+BALANCE_NAMES = (
     "work",
     "gravity",
     "edge",
@@ -39,37 +39,38 @@ MECHANISMS = ("edge", "opening", "friction", "board_friction", "blade")
 
 NO_ENERGY = (0.0, 0.0, 0.0, 0.0, 1.0)
 
-SPENT = slice(LEDGER_NAMES.index("edge"), LEDGER_NAMES.index("friction") + 1)
+SPENT = slice(BALANCE_NAMES.index("edge"), BALANCE_NAMES.index("friction") + 1)
 
 COMPLETE = 0.999
-"""Share of a section from which a slice counts as cut off."""
+"""Fraction of a section from which a slice counts as cut off."""
 
 INDEXED = 5e-4
 """Distance of the blade from the next cut plane at which the knife counts as indexed, metres."""
 
 
 class CuttingSystem(KnifeForceSystem):
-    """A finite-element food as a cutting system, with sub-steps of its own in each exchange.
+    """A finite-element food as a cutting system, with sub-steps of its own in each coupling step.
 
     All state is in the Context: the food's nodes and history as one discrete vector, the food that
     is cut as an index into the prepared foods. The solvers hold only workspaces that each update
     fills and empties, so contexts do not disturb each other.
 
     In a sequence the prepared foods are what successive slices leave of one body. The next is taken
-    into the Context, at rest and undeformed, at the first exchange where the section of the last is
-    cut, the whole edge is above the next section, and the blade is in its plane. Wrench, progress
-    and energy are then the new food's; ledger and coupling error run on over the slices.
+    into the Context, at rest and undeformed, at the first coupling step where the section of the
+    last is cut, the whole edge is above the next section, and the blade is in its plane. Wrench,
+    progress and energy are then the new food's; energy balance and coupling error run on over the
+    slices.
 
     Further output ports:
         force_components: Forces on the knife by edge, flank pressure, friction [9], N, in W.
-        ledger: Cumulative work and dissipation [8], J, see `LEDGER_NAMES`.
+        balance: Cumulative work and dissipation [8], J, see `BALANCE_NAMES`.
         food_index: Index of the prepared food that is cut [1].
         energy: Energies of this food at the last check [5], see `ENERGY_NAMES`, J.
         surface_vertices: Corners of the food's surface [3 V], metres, in W, padded with zeros.
-        surface_damage: Share of the toughness that is spent there [V], padded with zeros.
+        surface_damage: Fraction of the toughness that is spent there [V], padded with zeros.
 
     Args:
-        solvers: Prepared foods with one exchange period.
+        solvers: Prepared foods with one coupling period.
         X_WF: Pose of the food frame, or one for each of the foods.
         check_period: Interval of the energy and inversion checks, s.
         in_sequence: Whether each food follows the one before it once that is cut.
@@ -97,12 +98,12 @@ class CuttingSystem(KnifeForceSystem):
         self._food = self.DeclareDiscreteState(self._padded(self._solvers[0].initial_state(), size))
         self._food_index = self.DeclareDiscreteState(1)
         self._components = self.DeclareDiscreteState(9)
-        self._ledger = self.DeclareDiscreteState(len(LEDGER_NAMES))
+        self._balance = self.DeclareDiscreteState(len(BALANCE_NAMES))
         self._energy = self.DeclareDiscreteState(NO_ENERGY)
         # Dissipated when this food was taken, J.
         self._spent_before = self.DeclareDiscreteState(1)
         self.DeclareStateOutputPort("force_components", self._components)
-        self.DeclareStateOutputPort("ledger", self._ledger)
+        self.DeclareStateOutputPort("balance", self._balance)
         self.DeclareStateOutputPort("energy", self._energy)
         self.DeclareStateOutputPort("food_index", self._food_index)
         corners = max(len(surface.ends) for surface in self.surfaces)
@@ -117,7 +118,7 @@ class CuttingSystem(KnifeForceSystem):
         parts = ("edge", "flank", "friction")
         return {
             "force_components": [f"{part}_f_{a}" for part in parts for a in "xyz"],
-            "ledger": [f"energy_{name}" for name in LEDGER_NAMES],
+            "balance": [f"energy_{name}" for name in BALANCE_NAMES],
             "energy": [f"energy_{name}" for name in ENERGY_NAMES],
             "coupling_work_error": ["coupling_work_error"],
             "food_index": ["food_index"],
@@ -176,13 +177,15 @@ class CuttingSystem(KnifeForceSystem):
         index, state = self.food_index(context), self.food_state(context)
         solver, (body, rest) = self._solvers[index], self._bodies[index]
         model = solver.model
-        passed, parted = (solver.field(state, name) for name in ("passed", "parted"))
+        edge_depth, cohesive_damage = (
+            solver.field(state, name) for name in ("edge_depth", "cohesive_damage")
+        )
         return FoodBodyFrame(
             index,
             _in_world(self.X_WF(context), body.positions(model, solver.positions(state))),
             rest,
             body.tetrahedra,
-            body.damage(model, passed, parted),
+            body.damage(model, edge_depth, cohesive_damage),
             body.side,
         )
 
@@ -270,7 +273,7 @@ class CuttingSystem(KnifeForceSystem):
             (self._progress, np.zeros(1)),
             (self._coupling, np.zeros(1)),
             (self._components, np.zeros(9)),
-            (self._ledger, np.zeros(len(LEDGER_NAMES))),
+            (self._balance, np.zeros(len(BALANCE_NAMES))),
             (self._energy, np.array(NO_ENERGY)),
             (self._spent_before, np.zeros(1)),
         ):
@@ -286,7 +289,8 @@ class CuttingSystem(KnifeForceSystem):
         return Pose(X_CK[:, :3], X_CK[:, 3] - self._offset[index])
 
     def _index_to_cut(self, context: Context, index: int, X_WK: np.ndarray) -> int:
-        """The food that the next exchange cuts: the one after this, if the knife is ready for it.
+        """The food that the next coupling step cuts: the one after this, if the knife is ready for
+        it.
 
         Args:
             context: This system's context.
@@ -299,7 +303,7 @@ class CuttingSystem(KnifeForceSystem):
         if not self._in_sequence or index + 1 == len(self._solvers):
             return index
         model = self._solvers[index + 1].model
-        # The exchange goes from the last pose to this one; tables blur by one spacing.
+        # The coupling step goes from the last pose to this one; tables blur by one spacing.
         clear = model.top + model.tables.spacing
         poses = (self.last_pose(context), X_WK)
         for following in (self._in_cut_frame(index + 1, X) for X in poses):
@@ -330,19 +334,19 @@ class CuttingSystem(KnifeForceSystem):
         now = X_WK.GetAsMatrix34()
         index = self._index_to_cut(context, before, now)
         solver = self._solvers[index]
-        old_ledger = x.value(self._ledger)
+        old_balance = x.value(self._balance)
         if index == before:
             old = x.value(self._food)[: solver.state_size]
         else:
             old = solver.initial_state()
             new.set_value(self._food_index, [index])
             new.set_value(self._energy, NO_ENERGY)
-            new.set_value(self._spent_before, [old_ledger[SPENT].sum()])
+            new.set_value(self._spent_before, [old_balance[SPENT].sum()])
         last = self._in_cut_frame(index, x.value(self._last_pose).reshape(3, 4))
         pose = self._in_cut_frame(index, now)
         check_in_plane(solver.model, pose, time)
         try:
-            step = solver.exchange(old, last, pose)
+            step = solver.coupling_step(old, last, pose)
         except CuttingError as error:
             raise CuttingError(f"at {time:.4g} s {error}") from error
         food = new.get_mutable_value(self._food)
@@ -360,11 +364,11 @@ class CuttingSystem(KnifeForceSystem):
             "blade": step.blade_dissipation,
             "internal": step.internal_work,
         }
-        ledger = old_ledger + [change[name] for name in LEDGER_NAMES]
-        new.set_value(self._ledger, ledger)
+        balance = old_balance + [change[name] for name in BALANCE_NAMES]
+        new.set_value(self._balance, balance)
         if round(time / self.exchange_period) % self._check_every == 0:
             energies = solver.energies(step.state, pose)
-            spent = float(ledger[SPENT].sum() - new.value(self._spent_before)[0])
+            spent = float(balance[SPENT].sum() - new.value(self._spent_before)[0])
             ratio = check_energies(energies, spent, solver.model, time)
             last_check = dict(zip(ENERGY_NAMES, new.value(self._energy).tolist(), strict=True))
             check = {
@@ -391,8 +395,11 @@ class CuttingSystem(KnifeForceSystem):
     def _calc_damage(self, context: Context, output: BasicVector) -> None:
         index, state = self.food_index(context), self.food_state(context)
         solver = self._solvers[index]
-        passed, parted = solver.field(state, "passed"), solver.field(state, "parted")
-        damage = self.surfaces[index].damage(solver.model, passed, parted)
+        edge_depth, cohesive_damage = (
+            solver.field(state, "edge_depth"),
+            solver.field(state, "cohesive_damage"),
+        )
+        damage = self.surfaces[index].damage(solver.model, edge_depth, cohesive_damage)
         output.SetFromVector(self._padded(damage, output.size()))
 
 
@@ -406,7 +413,7 @@ def _imbalance(record: Columns) -> float:
 
     What a food holds when the next takes its place stays in it.
     """
-    last = {name: float(record[f"energy_{name}"][-1]) for name in LEDGER_NAMES}
+    last = {name: float(record[f"energy_{name}"][-1]) for name in BALANCE_NAMES}
     ends = np.append(np.flatnonzero(np.diff(record["food_index"])), -1)
     elastic, interface, kinetic = (
         float(record[f"energy_{name}"][ends].sum()) for name in ENERGY_NAMES[:3]

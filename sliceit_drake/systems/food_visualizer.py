@@ -24,7 +24,7 @@ def damage_colours(damage: np.ndarray) -> np.ndarray:
     Brightness rises all the way, so that the map is readable in greyscale and colour blindness.
 
     Args:
-        damage: Share of the toughness that is spent [V], 0 to 1.
+        damage: Fraction of the toughness that is spent [V], 0 to 1.
     """
     stops = np.array([INTACT, HALF_CUT, FLESH])
     return np.array([np.interp(damage, (0.0, 0.5, 1.0), channel) for channel in stops.T])

@@ -27,7 +27,7 @@ class CuttingSetup(Protocol):
 
 
 class KnifeForceSystem(ReportingSystem):
-    """A cutting system: exchanges pose for force with a knife, once per `exchange_period`.
+    """A cutting system: coupling steps pose for force with a knife, once per `exchange_period`.
 
     At t_k the update takes the knife's pose and velocity and holds the wrench that `advance`
     returns over [t_k, t_{k+1}). It is an unrestricted update, so it runs before the discrete
@@ -41,12 +41,12 @@ class KnifeForceSystem(ReportingSystem):
     Output ports:
         food_wrench: SpatialForce F_K_W of the food on the knife, at Ko, in W.
         food_wrench_vector: `food_wrench` as moment and force [6].
-        cut_progress: Share of the section that is cut [1].
+        cut_progress: Fraction of the section that is cut [1].
         coupling_work_error: Work that the held wrench did on the knife minus work that the food did
-            on it [1], J; it comes from the delay of one exchange.
+            on it [1], J; it comes from the delay of one coupling step.
 
     Args:
-        exchange_period: Duration of an exchange, s.
+        exchange_period: Duration of a coupling step, s.
     """
 
     def __init__(self, exchange_period: float) -> None:
@@ -72,7 +72,7 @@ class KnifeForceSystem(ReportingSystem):
         self.DeclareStateOutputPort("coupling_work_error", self._coupling)
         self.DeclareInitializationUnrestrictedUpdateEvent(self._initialize)
         # An offset of one period would round k + 1 periods otherwise than the plant's steps do, and
-        # so see the plant a step ahead at some exchanges.
+        # so see the plant a step ahead at some coupling steps.
         self.DeclarePeriodicUnrestrictedUpdateEvent(exchange_period, 0.0, self._update)
 
     def start(self, context: Context, state: State, X_WK: RigidTransform) -> None:
@@ -98,7 +98,7 @@ class KnifeForceSystem(ReportingSystem):
         return self._velocity_input.Eval(context)
 
     def last_pose(self, context: Context) -> np.ndarray:
-        """X_WK at the previous exchange, as [3, 4]."""
+        """X_WK at the previous coupling step, as [3, 4]."""
         return context.get_discrete_state(self._last_pose).value().reshape(3, 4)
 
     def wrench(self, context: Context) -> np.ndarray:

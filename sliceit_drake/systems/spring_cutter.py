@@ -20,7 +20,7 @@ class SpringCutter(KnifeForceSystem):
 
     The edge pushes at its point nearest to the button's axis, as far as the button reaches, and
     never pulls; a rising knife leaves the button behind, which follows at the spring's own pace.
-    Within an exchange the edge goes straight from its last pose to this one in steps of at most
+    Within a coupling step the edge goes straight from its last pose to this one in steps of at most
     `time_step`, and the button by backward Euler as in ODE, its contact solved exactly: stable at
     any stiffness, with half a step times the stiffness of damping on top. An impact is without
     rebound: the button's momentum goes into one step.
@@ -33,7 +33,7 @@ class SpringCutter(KnifeForceSystem):
         food: The spring.
         knife: The knife whose edge pushes.
         X_WF: Pose of the food frame: the button's axis is Fz, the board is at its origin.
-        exchange_period: Duration of an exchange, s.
+        exchange_period: Duration of a coupling step, s.
     """
 
     def __init__(

@@ -23,7 +23,7 @@ from sliceit_drake.configuration import ConfigurationError, quantity
 __all__ = ["WrenchSensor", "WrenchSensorConfig"]
 
 # Parts of the state, one vector so that an update fetches it once.
-_SUM = slice(0, 6)  # Sum of the plant's reactions since the last exchange.
+_SUM = slice(0, 6)  # Sum of the plant's reactions since the last coupling step.
 _COUNT = 6  # How many are in the sum.
 _READING = slice(7, 13)
 _FILTERED = slice(13, 19)  # Wrench behind the low-pass filter.
@@ -94,7 +94,7 @@ class WrenchSensorConfig:
         0.0, "Nm", low=0.0, high=1.0, doc="Step of the shown moments; 0 for none."
     )
     sample_period: float = quantity(
-        0.0, "s", low=0.0, high=1.0, doc="Time between new readings; 0 for the exchange period."
+        0.0, "s", low=0.0, high=1.0, doc="Time between new readings; 0 for the coupling period."
     )
     delay: float = quantity(
         0.0, "s", low=0.0, high=0.2, doc="Time a reading takes to arrive; parts are interpolated."
@@ -112,21 +112,22 @@ class WrenchSensor(LeafSystem):
     sensor's frame S (the weld's frame on the arm). With `tare_at_start` the first reading is
     subtracted from all; what appears of the weight when the tool is then tilted is not compensated.
 
-    A reading is the mean over the exchange before it, the plant's impulse divided by the period.
-    It is then filtered, tared, given bias, drift and noise, rounded, sampled and delayed, in this
-    order, and held until the next exchange. It is zero until the end of the first exchange; filter
-    and delay start as if the first wrench had always been there. Noise of standard deviation sigma
-    at the period h has the one-sided density 2 sigma^2 h up to 1/(2 h); it is not filtered, and
-    stands for what is left behind the filter. A random walk of spread s has the density
-    s^2 / (2 pi^2 f^2) far below 1/h. Like the plant's own state at the end of a step, it is
-    set by the discrete update at the beginning of the exchange's last plant step: whatever reads
-    it at the exchange, in an unrestricted or a discrete update, finds it.
+    A reading is the mean over the coupling step before it, the plant's impulse divided by the
+    period. It is then filtered, tared, given bias, drift and noise, rounded, sampled and delayed,
+    in this order, and held until the next coupling step. It is zero until the end of the first
+    coupling step; filter and delay start as if the first wrench had always been there. Noise of
+    standard deviation sigma at the period h has the one-sided density 2 sigma^2 h up to 1/(2 h); it
+    is not filtered, and stands for what is left behind the filter. A random walk of spread s has
+    the density s^2 / (2 pi^2 f^2) far below 1/h. Like the plant's own state at the end of a step,
+    it is set by the discrete update at the beginning of the coupling step's last plant step:
+    whatever reads it at the coupling step, in an unrestricted or a discrete update, finds it.
 
     Inputs:
         reaction_forces: The plant's port of that name.
 
     Outputs:
-        sensor_wrench: SpatialForce at So, in S; held over each exchange. No direct feedthrough.
+        sensor_wrench: SpatialForce at So, in S; held over each coupling step. No direct
+            feedthrough.
 
     Parameters:
         0: Seed of noise and random walk [1].
@@ -156,7 +157,7 @@ class WrenchSensor(LeafSystem):
             abs(self._hold * exchange_period - config.sample_period) > 1e-9
         ):
             raise ConfigurationError(
-                f"{config.sample_period:.6g} s is not a whole number of exchange periods of "
+                f"{config.sample_period:.6g} s is not a whole number of coupling step periods of "
                 f"{exchange_period:.6g} s",
                 field="sensor.sample_period",
                 fix=f"Write {self._hold * exchange_period:.6g}.",
@@ -165,7 +166,7 @@ class WrenchSensor(LeafSystem):
         steps = round(exchange_period / step) if step > 0.0 else 0
         if steps < 1 or abs(steps * step - exchange_period) > 1e-9:
             raise ConfigurationError(
-                f"exchange period {exchange_period:.6g} s is not a whole number of plant steps of "
+                f"coupling period {exchange_period:.6g} s is not a whole number of plant steps of "
                 f"{step:.6g} s",
                 field="exchange_period and robot.plant_time_step",
                 fix="Change one of the two.",

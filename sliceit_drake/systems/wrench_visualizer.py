@@ -32,14 +32,14 @@ class ArrowScale:
     Attributes:
         newtons_per_metre: Force of an arrow of one metre, N/m.
         newton_metres_per_metre: Moment of an arrow of one metre, N.
-        least_force: Hidden below, N.
-        least_moment: Hidden below, Nm.
+        min_force: Hidden below, N.
+        min_moment: Hidden below, Nm.
     """
 
     newtons_per_metre: float = 200.0
     newton_metres_per_metre: float = 20.0
-    least_force: float = 0.2
-    least_moment: float = 0.1
+    min_force: float = 0.2
+    min_moment: float = 0.1
 
 
 def arrow_rotation(vector: np.ndarray) -> RotationMatrix:
@@ -168,6 +168,6 @@ class WrenchVisualizer(LeafSystem):
                 f, m = X_WS.rotation() @ f, X_WS.rotation() @ m
                 point = X_WS.translation()
             per_N, per_Nm = 1.0 / scale.newtons_per_metre, 1.0 / scale.newton_metres_per_metre
-            force.set(point, per_N * f, per_N * scale.least_force, time)
-            moment.set(point, per_Nm * m, per_Nm * scale.least_moment, time)
+            force.set(point, per_N * f, per_N * scale.min_force, time)
+            moment.set(point, per_Nm * m, per_Nm * scale.min_moment, time)
         return EventStatus.Succeeded()

@@ -44,8 +44,8 @@ __all__ = [
 
 LEVEL = 0.9
 LEAST, MOST = 0.80, 0.98
-"""Between which the share of 90 % intervals that hold the truth must be."""
-LEAST_SQUARES_STEPS = 5
+"""Between which the fraction of 90 % intervals that hold the truth must be."""
+MIN_SQUARES_STEPS = 5
 """Before the weighted fit."""
 CLEARANCE, REST = 2.5e-3, 6e-3
 """Of the knife above the food at the start, and above the board at the end, m: no record's height
@@ -226,7 +226,7 @@ def _run_replicate(problem: Problem, number: int) -> Replicate:
     rng = np.random.default_rng(number)
     predictor, truth = synthetic_predictor(problem, None, rng)
     start = np.clip(truth + rng.normal(0.0, problem.start_error, len(truth)), 0.02, 0.98)
-    fit = gauss_newton(predictor, start, steps=LEAST_SQUARES_STEPS)
+    fit = gauss_newton(predictor, start, steps=MIN_SQUARES_STEPS)
     found = estimate(predictor, fit.unit)
     mean, deviation = found.unit, found.posterior.deviation
     reach = float(ndtri(0.5 + LEVEL / 2.0)) * deviation
@@ -324,7 +324,7 @@ def coverage_page(problem: Problem, replicates: Sequence[Replicate], command: st
         share=100.0 * share,
         verdict="within" if LEAST <= share <= MOST else "outside",
         bounds=(100.0 * LEAST, 100.0 * MOST),
-        # Of a share of n independent replicates.
+        # Of a fraction of n independent replicates.
         error=100.0 * np.sqrt(LEVEL * (1.0 - LEVEL) / n),
         scale=_quantiles(np.array([100.0 * r.record_scale for r in replicates])),
         tau=_quantiles(np.array([1e3 * r.tau for r in replicates])),
@@ -333,7 +333,7 @@ def coverage_page(problem: Problem, replicates: Sequence[Replicate], command: st
 
 
 def coverage_share(replicates: Sequence[Replicate]) -> float:
-    """Share of all intervals that hold the truth."""
+    """Fraction of all intervals that hold the truth."""
     return float(np.mean([inside for r in replicates for inside in r.inside]))
 
 

@@ -17,11 +17,11 @@ import numpy as np
 from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
 from sliceit_drake.diagnosis.cause import EXPERIMENTS
-from sliceit_drake.diagnosis.evidence.verdict import LEAST_REPLICATES
+from sliceit_drake.diagnosis.evidence.verdict import MIN_REPLICATES
 from sliceit_drake.diagnosis.experiments.identifiability import ANGLE, short
 from sliceit_drake.diagnosis.input_checks import check_records
 from sliceit_drake.diagnosis.one_slice.diagnose_slice import diagnose_slice, setup_of_slice
-from sliceit_drake.diagnosis.one_slice.fitted_slice import LEAST_GAIN
+from sliceit_drake.diagnosis.one_slice.fitted_slice import MIN_GAIN
 from sliceit_drake.diagnosis.one_slice.slice_evidence import LEVEL
 from sliceit_drake.diagnosis.one_slice.slice_report import slice_figure
 from sliceit_drake.diagnosis.one_slice.slice_result import OneSlice
@@ -161,7 +161,7 @@ def page(items: Sequence[MeasuredSlice], replicates: int, command: str) -> str:
         command=command,
         replicates=replicates,
         level=LEVEL,
-        least=100 * LEAST_GAIN,
+        least=100 * MIN_GAIN,
         tetrahedra=", ".join(f"{i.food} {i.results['plain'].elements}" for i in items),
         simulations=" and ".join(f"*{k}* ({v})" for k, v in SIMULATIONS.items()),
         fits=[_fit_row(i.food, *named) for i in items for named in i.results.items()],
@@ -173,7 +173,7 @@ def page(items: Sequence[MeasuredSlice], replicates: int, command: str) -> str:
             [text, *(_cell(item.results["plain"], expected, pairs) for item in items)]
             for text, expected, pairs in CLAIMS
         ],
-        slices=LEAST_REPLICATES,
+        slices=MIN_REPLICATES,
         experiments={
             item.food: ", then ".join(
                 f"{EXPERIMENTS[e]} (`{e}`)" for e in item.results["plain"].experiments()[:5]
@@ -195,7 +195,7 @@ def _layers(item: MeasuredSlice) -> str:
     """What the layers of a calibrated food are worth, in a sentence."""
     given, plain = (item.results[k] for k in ("calibrated", "plain"))
     with_them, without = given.error(given.fit.held_out), plain.error(plain.fit.held_out)
-    if abs(without - with_them) > LEAST_GAIN * without:
+    if abs(without - with_them) > MIN_GAIN * without:
         how = "better" if with_them < without else "worse"
         return (
             f"the {item.food}'s predict left-out depth {how} ({with_them:.2f} N with them, "

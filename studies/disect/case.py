@@ -29,7 +29,7 @@ __all__ = [
     "Springs",
     "as_run",
     "break_opening",
-    "intact_share",
+    "intact_fraction",
     "load_case",
     "load_reference",
     "opening_law",
@@ -153,7 +153,7 @@ class CaseResult:
         height: Of the edge above the ground [n], metres.
         norms: Sum of the norms of all contact forces, sampled [n], N.
         resultant, vertical: Norm of the resultant and its vertical part, means of periods [n], N.
-        broken: Share of the cut points whose bond is gone at the end.
+        broken: Fraction of the cut points whose bond is gone at the end.
         intact: Mean stiffness of the bonds at the end over that at the start.
         slope, offset: Opening of the faces at the end, a line over the height above the edge:
             its slope and its value at the edge, metres.
@@ -214,7 +214,7 @@ def break_opening(
     """When a spring breaks in a run, from when it does in the nominal one.
 
     In each sub-step in which the knife touches, a spring loses softness times its opening u beyond
-    the rest length; the faces open by `slope` times the knife's way. So the integral of u over
+    the rest length; the faces open by `slope` times the knife's path. So the integral of u over
     time at the break goes with stiffness and step.
 
     Args:
@@ -275,7 +275,7 @@ def as_run(
     return _at_speed(with_contact(new, run.contact_factor), run.speed)
 
 
-def intact_share(parted: np.ndarray, onset: float, failure: np.ndarray) -> np.ndarray:
+def intact_fraction(parted: np.ndarray, onset: float, failure: np.ndarray) -> np.ndarray:
     """Secant stiffness of bilinear bonds [P] over that at the start."""
     return onset * (1.0 - parted) / (onset + parted * (failure - onset))
 
@@ -307,10 +307,10 @@ def run_case(case: Case, whole_copies: bool = False) -> CaseResult:
     motion = Motion(case.motion, start_pose(model, case.clearance))
     result = simulate_slice(solver, motion, contact_sum=True)
     assert result.contact_sum is not None
-    parted = np.asarray(solver.field(result.state, "parted"), float)
+    parted = np.asarray(solver.field(result.state, "cohesive_damage"), float)
     p = model.parameters
     failure = 2.0 * model.toughness / p["strength"]
-    shares = intact_share(parted, p["strength"] / p["bond_stiffness"], failure)
+    shares = intact_fraction(parted, p["strength"] / p["bond_stiffness"], failure)
     # What the edge has passed it has cut.
     passed = result.cut[-1] * model.effects.edge.share
     above, opening = _opening_of_faces(model, solver, result).T
@@ -324,7 +324,7 @@ def run_case(case: Case, whole_copies: bool = False) -> CaseResult:
         intact=float((1.0 - passed) * shares.mean()),
         slope=float(slope),
         offset=float(offset),
-        opening_energy=result.ledger.opening,
+        opening_energy=result.balance.opening,
         model=model,
         result=result,
     )

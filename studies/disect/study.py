@@ -215,7 +215,7 @@ def _differences(
         Difference(
             "measure of the force",
             "sum of the norms of all contact forces, sampled once in 500 sub-steps",
-            "resultant with its moment, mean over the exchange; the sum on request",
+            "resultant with its moment, mean over the coupling step; the sum on request",
             "a sensor and a robot feel the resultant; the flanks' pressures cancel in it",
             f"{ratio:.1f} times the vertical force in the opening law's run, "
             f"{full.norms.max() / full.resultant.max():.1f} times (peaks) in the full model's",
@@ -316,7 +316,7 @@ def _differences(
         Difference(
             "knife's position",
             "summed in single precision: 0.05 mm off after 66,200 sub-steps",
-            "from the motion at each exchange",
+            "from the motion at each coupling step",
             "no drift",
             f"{drift:+.2f} N at the end",
         ),

@@ -21,7 +21,7 @@ __all__ = ["pack", "unpack"]
 SHARED = (OPTIONS, CASES, NEAR, CLASSES)
 """What all runs of a study have in common."""
 SAID = ("verdict", "classes", "gain", "shifts", "misfit_over_noise")
-"""What is kept of a diagnosis beside the held-out shares of its causes."""
+"""What is kept of a diagnosis beside the held-out fractions of its causes."""
 
 
 def pack(output: Path, file: Path) -> int:

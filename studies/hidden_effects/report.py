@@ -331,7 +331,7 @@ def plot_curves(judgements: Sequence[Judgement], file: Path) -> None:
     axes.set_xticks([0.5, 1.0, 2.0, 4.0], ["0.5", "1", "2", "4"])
     axes.minorticks_off()
     axes.set_xlabel("what a refit leaves of the effect, over the noise")
-    axes.set_ylabel("share of runs with the right cause")
+    axes.set_ylabel("fraction of runs with the right cause")
     axes.set_ylim(-0.05, 1.05)
     axes.set_title("One hidden cause in the rich protocol")
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))

@@ -69,7 +69,7 @@ class Judgement:
         classes: Classes of causes that it named.
         right: Whether it said what it should.
         wrong: Causes that it named and should not have.
-        gain: Share of the reducible held-out error that it removed, or None.
+        gain: Fraction of the reducible held-out error that it removed, or None.
         oracle: The same of the true cause, or None.
         resolved: Whether in the end, after the next experiment, the one cause was named; None but
             in the poor protocol.

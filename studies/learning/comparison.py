@@ -198,7 +198,7 @@ def _listed(foods: Sequence[str], lead: str, none: str) -> str:
 
 
 def _facts(comparison: Comparison) -> dict[str, Any]:
-    """World, board and food; ratios with intervals; share of slices completed by each kind."""
+    """World, board and food; ratios with intervals; fraction of slices completed by each kind."""
     return {
         "world": comparison.world,
         "food": comparison.food,

@@ -171,7 +171,7 @@ def shares(rounds: int) -> list[str]:
                 found[name].setdefault(part, []).append(spent / whole)
     rows = [(part, [np.median(found[name][part]) for name in SIMULATORS]) for part in watch.spent]
     return [
-        "Where the time of simulating goes, in shares of it:",
+        "Where the time of simulating goes, in fractions of it:",
         "",
         table(
             " | ".join(["part", *SIMULATORS]),

@@ -58,7 +58,7 @@ def _forces(solver: CuttingSolver, x: np.ndarray) -> np.ndarray:
     """Force on each node at rest at `x`, less its weight [N, 3], N, from the momentum of a step."""
     state = solver.initial_state()
     solver.positions(state)[:] = x
-    after = solver.velocities(solver.exchange(state, FAR, FAR).state)
+    after = solver.velocities(solver.coupling_step(state, FAR, FAR).state)
     return solver.model.mass[:, None] * after / solver.exchange_period - solver.model.weight
 
 

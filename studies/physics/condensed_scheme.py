@@ -32,7 +32,7 @@ from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.resources import resource_path
 from studies.pages import table
-from studies.physics.cutting_speed import CLEARANCE, PERIOD, least_times, sub_step_time, through
+from studies.physics.cutting_speed import CLEARANCE, PERIOD, min_times, sub_step_time, through
 from studies.physics.neo_hookean import first_piola_stress, small_strain_stiffness
 
 __all__ = ["add_arguments", "run"]
@@ -48,9 +48,9 @@ POINT_COST = 3.0
 """Cost of a point's force and tangent over that of its force in the solver's kernel; assumed."""
 
 TOLERANCE = 1e-3
-"""Of the residual, by the force on the knife or `LEAST_FORCE`, N."""
+"""Of the residual, by the force on the knife or `MIN_FORCE`, N."""
 
-LEAST_FORCE = 0.1
+MIN_FORCE = 0.1
 MOST_ITERATIONS = 60
 MOST_FAILURES = 10
 
@@ -61,10 +61,10 @@ REFRESH = 25
 """Steps after which forces of a linear bulk are computed anew."""
 
 SLOW = 0.3
-"""Share of the residual that an iteration with an old factor may leave."""
+"""Fraction of the residual that an iteration with an old factor may leave."""
 
 CHANGED = 0.1
-"""Share of an unknown's stiffness that a change must have to be part of a correction."""
+"""Fraction of an unknown's stiffness that a change must have to be part of a correction."""
 
 RANK_LIMIT = 0.25
 """Largest rank of a correction over the unknowns."""
@@ -100,9 +100,9 @@ class History:
 
     Attributes:
         s: Depth of the edge below the points at the last step, and the largest so far [2, P].
-        parted: Share of the surface energy that opening spent [P].
+        parted: Fraction of the surface energy that opening spent [P].
         edge: Force of the edge [P], N.
-        share: Share of the point's area above the edge, of both faces [P, 2].
+        share: Fraction of the point's area above the edge, of both faces [P, 2].
         slip: From the friction anchors of both faces [P, 2, 3], metres.
         board_slip: [M, 3], metres.
     """
@@ -638,7 +638,7 @@ def press(bulk: Bulk, linear: Newton, period: float, top: float, depth: float) -
             force, blocks, knife, new = c.evaluate(moved, moved_before, history, z, SPEED * period)
             r = bulk.weight - inner + c.gathered(force)
             old, norm = norm, float(np.linalg.norm(r))
-            if norm < TOLERANCE * max(float(np.linalg.norm(knife)), LEAST_FORCE):
+            if norm < TOLERANCE * max(float(np.linalg.norm(knife)), MIN_FORCE):
                 break
             stuck = iteration % DAMPED == DAMPED - 1
             if linear.prepare(blocks, norm > SLOW * old, stuck) and bulk.linear:
@@ -662,8 +662,8 @@ def press(bulk: Bulk, linear: Newton, period: float, top: float, depth: float) -
     return Cut(times, forces, time.process_time() - start, c.clock, iterations, failures)
 
 
-def exchange_means(cut: Cut, count: int) -> np.ndarray:
-    """Means of the force over the exchanges [count, 3], N; it is linear between the steps."""
+def coupling_means(cut: Cut, count: int) -> np.ndarray:
+    """Means of the force over the coupling steps [count, 3], N; it is linear between the steps."""
     ends = PERIOD * np.arange(count + 1)
     at = np.stack([np.interp(ends, cut.times, cut.forces[:, a]) for a in range(3)], axis=1)
     return 0.5 * (at[1:] + at[:-1])
@@ -699,7 +699,7 @@ def sparse_rate() -> float:
     size = 20_000
     matrix = diags_array(np.ones((7, size)), offsets=range(7), shape=(size, size)).tocsr()
     x = np.ones(size)
-    return least_times({"": lambda: matrix @ x}, 20)[""] / matrix.nnz
+    return min_times({"": lambda: matrix @ x}, 20)[""] / matrix.nnz
 
 
 def compiled(cut: Cut, point: float, element: float, per_entry: float) -> float:
@@ -764,7 +764,7 @@ def compare(name: str, model: CuttingModel, repeats: int) -> None:
         + ("", "", "", "", f"{step_error:.2f} %")
     ]
     for (scheme, step), cut in cuts.items():
-        means = exchange_means(cut, len(explicit.time))
+        means = coupling_means(cut, len(explicit.time))
         bare = compiled(cut, point, 0.0 if schemes[scheme][0].linear else element, per_entry)
         clock = cut.clock
         rows.append(
@@ -814,7 +814,7 @@ def scaling(food: Food, scenario: Scenario, repeats: int) -> None:
         costs = [
             c for cut in cuts.values() for c in (cut.wall, compiled(cut, point, 0.0, per_entry))
         ]
-        errors = [relative(exchange_means(cut, len(force)), force) for cut in cuts.values()]
+        errors = [relative(coupling_means(cut, len(force)), force) for cut in cuts.values()]
         rows.append(
             (model.element_count, len(bulk.weight), f"{condensing:.3f}", f"{wall:.3f}")
             + tuple(f"{c:.3f}" for c in costs)

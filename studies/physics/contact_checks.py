@@ -27,7 +27,7 @@ __all__ = [
 ]
 
 PERIOD = 2e-3
-"""Of an exchange, s."""
+"""Of a coupling step, s."""
 SPEED = 0.02
 """Of the press, m/s."""
 
@@ -106,7 +106,7 @@ def check_edge(mesh: int, draw_ratio: float) -> EdgeCheck:
         vertical=float(vertical.mean() / expected),
         along=float(along.mean() / (draw_ratio * expected)) if draw_ratio else None,
         ripple=float(vertical.std() / vertical.mean()),
-        work=result.ledger.edge / (toughness * width * float(depth[-1])),
+        work=result.balance.edge / (toughness * width * float(depth[-1])),
     )
 
 
@@ -192,7 +192,7 @@ def check_hold(duration: float = 0.5) -> HoldCheck:
     before = solver.positions(state).astype(float)
     forces = []
     for _ in range(round(0.5 * duration / PERIOD)):
-        step = solver.exchange(state, X, X)
+        step = solver.coupling_step(state, X, X)
         state = step.state
         forces.append(step.wrench[5])
     moved = np.abs(solver.positions(state) - before).max()
@@ -211,13 +211,13 @@ class GradientCheck:
 
     Attributes:
         parameters: How many.
-        exchanges: Of the cut.
+        coupling_steps: Of the cut.
         largest: Largest relative difference.
         worst: Its parameter.
     """
 
     parameters: int
-    exchanges: int
+    coupling_steps: int
     largest: float
     worst: str
 
@@ -239,7 +239,7 @@ GRADIENT_PARAMETERS = (
 )
 
 
-def check_gradient(exchanges: int = 100) -> GradientCheck:
+def check_gradient(coupling_steps: int = 100) -> GradientCheck:
     """A press of a cucumber with skin and adhesion in double precision, at 50 mm/s."""
     food = Food(
         shape=Cylinder(rings=2, layers=[0.0, 4e-3, 12e-3]),
@@ -250,9 +250,9 @@ def check_gradient(exchanges: int = 100) -> GradientCheck:
     model = make_food_model(food, Knife(), Numerics(precision="float64"))
     start = np.array([0.0, 0.0, model.top + 1e-4])
     velocity = np.array([0.01, 0.0, -0.05])
-    p = start + PERIOD * np.arange(exchanges + 1)[:, None] * velocity
+    p = start + PERIOD * np.arange(coupling_steps + 1)[:, None] * velocity
     R = np.tile(np.diag([1.0, -1.0, -1.0]), (len(p), 1, 1))
-    weights = np.random.default_rng(0).normal(size=(exchanges, 6))
+    weights = np.random.default_rng(0).normal(size=(coupling_steps, 6))
     adjoint = SliceAdjoint(model, PERIOD)
     exact = pull_back(model, adjoint.gradient(adjoint.run(R, p), weights), GRADIENT_PARAMETERS)
 
@@ -267,4 +267,4 @@ def check_gradient(exchanges: int = 100) -> GradientCheck:
         slope = (value(name, at + step) - value(name, at - step)) / (2.0 * step)
         differences[name] = abs(float(exact[name]) / slope - 1.0)
     worst = max(differences, key=lambda name: differences[name])
-    return GradientCheck(len(differences), exchanges, differences[worst], worst)
+    return GradientCheck(len(differences), coupling_steps, differences[worst], worst)

@@ -16,7 +16,7 @@ from sliceit_drake.cutting.solver import CuttingSolver
 __all__ = ["CutBudget", "Refinement", "cut_budget", "refine_mesh", "refine_step"]
 
 PERIOD = 2e-3
-"""Of an exchange, s."""
+"""Of a coupling step, s."""
 
 
 @dc.dataclass
@@ -136,7 +136,7 @@ class CutBudget:
         edge, opening, friction, board_friction, blade, damping: Dissipated.
         stored: At the end: elastic, in bonds and contacts, kinetic.
         imbalance: Work in less all that it went into, over the work.
-        cut: Share of the section that the edge passed.
+        cut: Fraction of the section that the edge passed.
         area: Of the section, m^2.
         energy_ratio: Largest kinetic over internal energy.
         elements: That are computed.
@@ -159,19 +159,19 @@ class CutBudget:
 
 
 def cut_budget(result: SliceResult, area: float, elements: int) -> CutBudget:
-    """The books of a cut through a section of some area, m^2."""
-    ledger, energies = result.ledger, result.energies
+    """The energy balance of a cut through a section of some area, m^2."""
+    balance, energies = result.balance, result.energies
     return CutBudget(
-        work=ledger.work,
-        gravity=ledger.gravity,
-        edge=ledger.edge,
-        opening=ledger.opening,
-        friction=ledger.friction,
-        board_friction=ledger.board_friction,
-        blade=ledger.blade,
-        damping=ledger.damping(energies),
+        work=balance.work,
+        gravity=balance.gravity,
+        edge=balance.edge,
+        opening=balance.opening,
+        friction=balance.friction,
+        board_friction=balance.board_friction,
+        blade=balance.blade,
+        damping=balance.damping(energies),
         stored=energies.elastic + energies.interface + energies.kinetic,
-        imbalance=ledger.imbalance(energies) / ledger.work,
+        imbalance=balance.residual(energies) / balance.work,
         cut=float(result.cut[-1]),
         area=area,
         energy_ratio=result.energy_ratio,

@@ -32,7 +32,7 @@ from studies.figures import new_figure, save_figure
 from studies.pages import table
 from studies.results import add_json_argument, write_results
 
-__all__ = ["CLEARANCE", "PERIOD", "add_arguments", "least_times", "run", "sub_step_time", "through"]
+__all__ = ["CLEARANCE", "PERIOD", "add_arguments", "min_times", "run", "sub_step_time", "through"]
 
 PERIOD = 2e-3
 CLEARANCE = 6e-4
@@ -47,7 +47,7 @@ def through(model: CuttingModel, depth: float) -> Motion:
     return Motion(plan, start_pose(model, CLEARANCE))
 
 
-def least_times(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+def min_times(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
     """Least wall time of each call, in turns, after one that compiles, s."""
     for call in calls.values():
         call()
@@ -69,11 +69,11 @@ def difference(a: SliceResult, b: SliceResult) -> float:
 def sub_step_time(solver: CuttingSolver, motion: Motion, repeats: int = 20) -> float:
     """Time of a sub-step in mid-cut within a captured graph, s."""
     path = KnifePath(solver.model, motion, PERIOD)
-    middle = path.exchanges // 2 // 10 * 10
+    middle = path.coupling_steps // 2 // 10 * 10
     state = solver.initial_state()
     for k in range(0, middle, 10):
         ends = slice(k, k + 11)
-        state = solver.exchanges(state, path.R_CK[ends], path.p_CK[ends]).state
+        state = solver.coupling_steps(state, path.R_CK[ends], path.p_CK[ends]).state
     ws = solver._workspace
     steps = 50 * ws.steps
     with wp.ScopedCapture(device=ws.device) as capture:
@@ -124,7 +124,7 @@ def run(options: argparse.Namespace) -> int:
     ]
     adjoint = SliceAdjoint(base, PERIOD)
     path = KnifePath(base, motion, PERIOD)
-    weights = np.ones((path.exchanges, 6))
+    weights = np.ones((path.coupling_steps, 6))
     cores = os.cpu_count() or 1
     calls: dict[str, Callable[[], object]] = {
         f"slice {r}": functools.partial(simulate_slice, solvers[r], motion) for r in REFINEMENTS
@@ -137,7 +137,7 @@ def run(options: argparse.Namespace) -> int:
             calls[f"batch {n} {workers}"] = functools.partial(
                 simulate_batch, variants[:n], [motion], PERIOD, workers=workers
             )
-    times = least_times(calls, options.repeats)
+    times = min_times(calls, options.repeats)
     rows = []
     for r in REFINEMENTS:
         m = models[r]
@@ -149,10 +149,9 @@ def run(options: argparse.Namespace) -> int:
                 difference(results[r], reference) if r < REFINEMENTS[-1] else np.nan,
             )
         )
-    print(
-        f"\nPress cut through {1e3 * diameter:g} mm of cucumber at 20 mm/s, {PERIOD:g} s exchange,"
-    )
-    print(f"sub-step {base.numerics.time_step:g} s, {base.numerics.precision}, one thread")
+    print(f"\nPress cut through {1e3 * diameter:g} mm of cucumber at 20 mm/s, one thread,")
+    print(f"{base.numerics.precision}, coupling step {PERIOD:g} s, sub-step")
+    print(f"{base.numerics.time_step:g} s")
     shown = (
         (n, f"{step:.1f}", f"{total:.3f}", "-" if np.isnan(error) else f"{100 * error:.2f} %")
         for n, step, total, error in rows

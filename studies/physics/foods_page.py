@@ -150,9 +150,9 @@ def _cuts(food: Food, numerics: Numerics) -> Sequence[tuple[str, ...]]:
         motion = Motion(plan, start_pose(model, CLEARANCE))
         result = simulate_slice(CuttingSolver(model, PERIOD), motion)
         force = np.linalg.norm(result.food_wrench[:, 3:], axis=1).max()
-        work = result.ledger.work
+        work = result.balance.work
         held = "on both sides" if food.held_sides == "both" else "on one side"
-        share = 100.0 * result.ledger.friction / work
+        share = 100.0 * result.balance.friction / work
         cells = (f"{force:.1f}", f"{work / model.section_area:.0f}", f"{share:.0f} %")
         rows.append((food.name, held, name, *cells))
     return rows

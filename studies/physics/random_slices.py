@@ -1,9 +1,9 @@
 """Random foods, planes, knives and motions: what comes of them is a cut or a reason.
 
 A slice is drawn from wide ranges of what people cut and how, cut on a prescribed motion, and judged
-by what any slice must keep: finite forces, a cut that never closes, books of energy that balance.
-A slice may be refused, or stopped by a guard, with its reason; anything else is unexplained. Takes
-two seconds a slice and processor. Ends with status 1 if a slice is unexplained.
+by what any slice must keep: finite forces, a cut that never closes, energy balance of energy that
+balance. A slice may be refused, or stopped by a guard, with its reason; anything else is
+unexplained. Takes two seconds a slice and processor. Ends with status 1 if a slice is unexplained.
 """
 
 import argparse
@@ -46,9 +46,9 @@ OVERTRAVEL = 5e-4
 """Of the edge into the board, metres: under the blade a soft food sinks into it."""
 KINDS = ("cut", "refused", "stopped", "unexplained")
 IMBALANCE = 0.02
-"""Greatest work that the books may lack, over the work of the knife."""
+"""Greatest work that the energy balance may lack, over the work of the knife."""
 LEFT = 0.01
-"""Share of the section that the last elements may keep."""
+"""Fraction of the section that the last elements may keep."""
 YIELDS = 2.0
 """Of toughness over modulus, the way that a food gives before it parts: as much may be left at the
 board, into which the edge presses it."""
@@ -230,13 +230,13 @@ def _wrong(result: SliceResult, model: CuttingModel) -> str:
         return "the cut closes"
     if result.cut[-1] < 1.0 - left:
         return f"the knife went to the board and {100 * result.cut[-1]:.1f} % are cut"
-    ledger = result.ledger
+    balance = result.balance
     for name in ("edge", "opening", "friction", "board_friction"):
-        if getattr(ledger, name) < -1e-9:
-            return f"{name} gives energy: {getattr(ledger, name):.3g} J"
-    lack = abs(ledger.imbalance(result.energies)) / max(abs(ledger.work), 1e-6)
+        if getattr(balance, name) < -1e-9:
+            return f"{name} gives energy: {getattr(balance, name):.3g} J"
+    lack = abs(balance.residual(result.energies)) / max(abs(balance.work), 1e-6)
     if lack > IMBALANCE:
-        return f"the books lack {100 * lack:.1f} % of the knife's work"
+        return f"the energy balance lacks {100 * lack:.1f} % of the knife's work"
     return ""
 
 

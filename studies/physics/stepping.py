@@ -35,7 +35,7 @@ __all__ = [
 ]
 
 STEPS = (1e-5, 2e-5, 5e-5, 1e-4, 2.5e-4, 5e-4, 1e-3)
-"""Sub-steps, s. They divide the exchange period."""
+"""Sub-steps, s. They divide the coupling period."""
 
 EXCHANGE = 2e-3
 CLEARANCE = 5e-4
@@ -53,7 +53,7 @@ class SteppingCase:
         food, knife, numerics: The cut; `numerics` without its step and mass scaling.
         press_speed: m/s.
         draw_ratio: Draw over press speed.
-        depth: Share of the section's height that the edge goes down.
+        depth: Fraction of the section's height that the edge goes down.
         hold: Rest after a stop there, s; 0 for none.
         retract: Way back from there at the same speed, metres; 0 for none.
         acceleration: Of the ramps, m/s^2; None if the velocity steps.
@@ -115,7 +115,7 @@ class SteppingCase:
 
 @dc.dataclass
 class StepResult:
-    """A case at one step, compared with its reference at the same exchanges.
+    """A case at one step, compared with its reference at the same coupling steps.
 
     Attributes:
         case: The cut.
@@ -196,7 +196,8 @@ def stepping_cases(
 
 
 def true_step(case: SteppingCase, most: float) -> float:
-    """Largest step up to `most` that divides the exchange and is stable with true masses, s."""
+    """Largest step up to `most` that divides the coupling step and is stable with true masses,
+    s."""
     limit = min(most, 0.99 * case.model(most, True).critical_time_step)
     return EXCHANGE / int(np.ceil(EXCHANGE / limit - 1e-9))
 
@@ -213,7 +214,7 @@ def stepping_study(
         cases: The cuts.
         steps: s, each dividing 2 ms.
         workers: Threads; the number of processors by default.
-        progress: Called after each run with the share of all sub-steps done.
+        progress: Called after each run with the fraction of all sub-steps done.
 
     Returns:
         Results by case and step. The reference is the first of its case.
@@ -265,7 +266,7 @@ def stepping_study(
 
 
 def _run(case: SteppingCase, step: float, scaled: bool) -> tuple[StepResult, np.ndarray]:
-    """One run, and the force on the knife at each exchange [n, 3], N."""
+    """One run, and the force on the knife at each coupling step [n, 3], N."""
     result = StepResult(case, step, scaled)
     try:
         model = case.model(step, scaled)
@@ -279,12 +280,12 @@ def _run(case: SteppingCase, step: float, scaled: bool) -> tuple[StepResult, np.
     motion = case.motion(model)
     path = KnifePath(model, motion, EXCHANGE)
     state, spent, ratio = solver.initial_state(), 0.0, 0.0
-    force = np.zeros((path.exchanges, 3))
+    force = np.zeros((path.coupling_steps, 3))
     block = max(1, round(CHECK_TRAVEL / (case.press_speed * EXCHANGE)))
-    for k in range(0, path.exchanges, block):
-        end = min(k + block, path.exchanges)
+    for k in range(0, path.coupling_steps, block):
+        end = min(k + block, path.coupling_steps)
         try:
-            part = solver.exchanges(state, path.R_CK[k : end + 1], path.p_CK[k : end + 1])
+            part = solver.coupling_steps(state, path.R_CK[k : end + 1], path.p_CK[k : end + 1])
         except CuttingError as error:
             result.refusal = f"until {end * EXCHANGE:.4g} s {error}"
             return result, np.empty((0, 3))
@@ -294,7 +295,7 @@ def _run(case: SteppingCase, step: float, scaled: bool) -> tuple[StepResult, np.
     result.energy_ratio = ratio
     if case.hold:
         norm = np.linalg.norm(force, axis=1)
-        # Row k is the mean over the exchange that ends at (k + 1) EXCHANGE.
+        # Row k is the mean over the coupling step that ends at (k + 1) EXCHANGE.
         stop = int(motion.phases[1][1] / EXCHANGE + 1e-6)
         settled = stop + round(SETTLED / EXCHANGE)
         result.force_drop = float(norm[stop - 1] - norm[settled])
@@ -316,7 +317,7 @@ def step_costs(
         steps: s.
         duration: Simulated, s.
         repeats: Over which the wall times are averaged.
-        progress: Called after each run with the share of all sub-steps done.
+        progress: Called after each run with the fraction of all sub-steps done.
     """
     costs, share = [], 0.0
     work = len(foods) * repeats * sum(1.0 / step for step in steps)
@@ -324,17 +325,17 @@ def step_costs(
         case = SteppingCase(*food, press_speed=0.02)
         solvers = [CuttingSolver(case.model(step, True), EXCHANGE) for step in steps]
         path = KnifePath(solvers[0].model, case.motion(solvers[0].model), EXCHANGE)
-        # As many exchanges a call as a slice has between its checks.
+        # As many coupling steps a call as a slice has between its checks.
         blocks = range(0, round(duration / EXCHANGE), 10)
         for solver in solvers:
-            solver.exchanges(solver.initial_state(), path.R_CK[:11], path.p_CK[:11])
+            solver.coupling_steps(solver.initial_state(), path.R_CK[:11], path.p_CK[:11])
         wall = np.zeros((repeats, len(steps)))
         for row in wall:
             for column, solver in enumerate(solvers):
                 state, begin = solver.initial_state(), time.perf_counter()
                 for k in blocks:
                     ends = slice(k, k + 11)
-                    state = solver.exchanges(state, path.R_CK[ends], path.p_CK[ends]).state
+                    state = solver.coupling_steps(state, path.R_CK[ends], path.p_CK[ends]).state
                 row[column] = time.perf_counter() - begin
                 share += 1.0 / steps[column] / work
                 if progress is not None:
@@ -386,7 +387,7 @@ def error_table(results: Sequence[StepResult]) -> str:
 
 
 def largest_table(results: Sequence[StepResult]) -> str:
-    """Largest difference of the force in one exchange over the peak force."""
+    """Largest difference of the force in one coupling step over the peak force."""
     return _by_case(
         results,
         "largest difference [% of peak]",
@@ -396,7 +397,7 @@ def largest_table(results: Sequence[StepResult]) -> str:
 
 
 def inertia_table(results: Sequence[StepResult]) -> str:
-    """Largest kinetic over internal energy of any exchange."""
+    """Largest kinetic over internal energy of any coupling step."""
     return _by_case(
         results, "largest kinetic/internal energy [%]", lambda r: 100.0 * r.energy_ratio, 3
     )

@@ -123,7 +123,7 @@ class StationStep:
     Attributes:
         time_step: s.
         force_error: RMS of the difference of the food's force over RMS of the force.
-        largest_difference: Of the force in one exchange over its peak.
+        largest_difference: Of the force in one coupling step over its peak.
         path_error: Largest distance between the knife's paths, metres.
         energy_ratio: Largest kinetic over internal energy of the food.
         real_time_factor: Simulated over wall time.
@@ -182,7 +182,7 @@ def station_steps(
     Args:
         scenario: A cut.
         steps: s, finest first: the reference.
-        progress: Called after each run with the share of all sub-steps done.
+        progress: Called after each run with the fraction of all sub-steps done.
 
     Raises:
         ConfigurationError: The reference broke off.

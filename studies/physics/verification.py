@@ -98,7 +98,7 @@ def _check_physics(progress: Callable[[], None]) -> dict[str, Any]:
 
 
 def food_numbers(case: MeasuredFood, cut: MeasuredCut) -> dict[str, Any]:
-    """Parameters, curves and books of one food.
+    """Parameters, curves and energy balance of one food.
 
     Each curve has its RMS error [N], peak [N] and apparent work [J/m^2]: force over travel through
     the whole record, over the whole round section.

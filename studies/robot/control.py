@@ -145,7 +145,8 @@ def stability_limits(
         mode: As `study_scenario`.
         gains: Error scale times P gain along z [n].
         lag: Of the servo, s; 0 for an arm that follows each command at once and never yields.
-        on_board: Whether the contact is in the plant, as the board, instead of beyond the exchange.
+        on_board: Whether the contact is in the plant, as the board, instead of beyond the coupling
+            step.
     """
     limits = []
     station: SimulatedStation | None = None
@@ -184,7 +185,7 @@ class _SpringContact(KnifeForceSystem):
 
 
 def station_growth(scenario: Scenario, stiffness: float, duration: float = 2.0) -> float:
-    """Growth of a vibration of the simulated station against a spring, in one exchange.
+    """Growth of a vibration of the simulated station against a spring, in one coupling step.
 
     The knife starts where the spring is slack; a step of the target by 1 um sets it off.
 
@@ -362,7 +363,7 @@ class FactorRow:
         tracking: As `ContactLoop`.
         unstable: How many of the 32 corners are unstable in free air, on food of 5 kN/m, and on
             a board of 100 kN/m.
-        least_limit: Least stable vertical stiffness over the corners that are stable in air, N/m.
+        min_limit: Least stable vertical stiffness over the corners that are stable in air, N/m.
         approach: Time in which a vertical error falls to 1/e in free air, infinite if it grows, at
             the lowest corner, the middle and the highest corner, s.
     """
@@ -371,7 +372,7 @@ class FactorRow:
     lag: float
     tracking: str
     unstable: tuple[int, int, int]
-    least_limit: float
+    min_limit: float
     approach: tuple[float, float, float]
 
 
@@ -410,7 +411,7 @@ def factor_table(rows: Sequence[FactorRow]) -> str:
     cells = []
     for r in rows:
         lag = "-" if r.tracking == "ideal" else f"{1e3 * r.lag:g}"
-        limit = f"{1e-3 * r.least_limit:.3g}" if np.isfinite(r.least_limit) else "-"
+        limit = f"{1e-3 * r.min_limit:.3g}" if np.isfinite(r.min_limit) else "-"
         times = ", ".join(f"{t:.2g}" if np.isfinite(t) else "never" for t in r.approach)
         cells.append((f"{r.factor:g}", lag, _TRACKING[r.tracking], *r.unstable, limit, times))
     return table(

@@ -1,4 +1,4 @@
-"""Error of a run against exchange period and plant step.
+"""Error of a run against coupling period and plant step.
 
 Runs a scenario at several of both and prints the difference from the finest. Force and path errors
 are RMS while the food is cut; the path's is relative to the tracking error.
@@ -31,7 +31,7 @@ COMBINATIONS = (
     (5e-4, 5e-4),
     (2.5e-4, 2.5e-4),
 )
-"""Exchange period and plant step, s; the last is the reference."""
+"""Coupling step period and plant step, s; the last is the reference."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -77,34 +77,36 @@ def coupling_study(
     combinations: Sequence[tuple[float, float]],
     progress: Callable[[int, int], None] | None = None,
 ) -> list[CouplingCase]:
-    """Runs a scenario at several exchange periods and plant steps.
+    """Runs a scenario at several coupling step periods and plant steps.
 
-    The controller keeps its own period, and the food one sub-step, that of the finest exchange, so
-    that only the coupling differs. Forces are compared as means over bins of 4 ms.
+    The controller keeps its own period, and the food one sub-step, that of the finest coupling
+    step, so that only the coupling differs. Forces are compared as means over bins of 4 ms.
 
     Args:
         scenario: A cut.
-        combinations: Exchange period and plant step, s; the last is the reference.
+        combinations: Coupling step period and plant step, s; the last is the reference.
         progress: Called with the number of runs done and their total.
 
     Raises:
         ConfigurationError: A run broke off.
     """
-    sub_step = min([scenario.numerics.time_step, *(exchange for exchange, _ in combinations)])
+    sub_step = min(
+        [scenario.numerics.time_step, *(coupling_step for coupling_step, _ in combinations)]
+    )
     results: list[tuple[Record, float]] = []
-    for done, (exchange, step) in enumerate(combinations):
+    for done, (coupling_step, step) in enumerate(combinations):
         case = copy.deepcopy(scenario)
         case.measurement = None
-        case.exchange_period = exchange
+        case.exchange_period = coupling_step
         case.robot.plant_time_step = step
         case.numerics.time_step = sub_step
         run = prepare_run(case)
         run.advance()
         if run.stopped:
             raise ConfigurationError(
-                f"the run with an exchange of {exchange:g} s broke off: {run.stopped}",
+                f"the run with a coupling step of {coupling_step:g} s broke off: {run.stopped}",
                 field="scenario",
-                fix="Give a scenario that `sliceit simulate` runs to its end at this exchange.",
+                fix="Give a scenario that `sliceit simulate` runs to its end with this step.",
             )
         record = run.record()
         results.append((record, float(record["time"][-1] / run.wall_time)))
@@ -112,18 +114,18 @@ def coupling_study(
             progress(done + 1, len(combinations))
     reference = results[-1][0]
     return [
-        _compare(exchange, step, record, reference, speed)
-        for (exchange, step), (record, speed) in zip(combinations, results, strict=True)
+        _compare(coupling_step, step, record, reference, speed)
+        for (coupling_step, step), (record, speed) in zip(combinations, results, strict=True)
     ]
 
 
 def _compare(
-    exchange: float, step: float, record: Record, reference: Record, speed: float
+    coupling_step: float, step: float, record: Record, reference: Record, speed: float
 ) -> CouplingCase:
     bins = np.arange(0.0, reference["time"][-1], BIN)
 
     def binned(source: Record, values: np.ndarray) -> np.ndarray:
-        # A row holds what acted over the exchange that ends at its time.
+        # A row holds what acted over the coupling step that ends at its time.
         index = np.maximum(np.searchsorted(bins, source["time"] - 1e-9) - 1, 0)
         total = np.zeros((len(bins), values.shape[1]))
         np.add.at(total, index, values)
@@ -140,7 +142,7 @@ def _compare(
         return float(np.sqrt(np.mean(values[cutting] ** 2)))
 
     return CouplingCase(
-        exchange_period=exchange,
+        exchange_period=coupling_step,
         plant_time_step=step,
         force_error=rms(force - true_force) / rms(true_force),
         motion_error=rms(path - true_path) / rms(true_path - target),
@@ -153,7 +155,7 @@ def _compare(
 def coupling_table(cases: Sequence[CouplingCase]) -> str:
     """The cases as a table for people."""
     return table(
-        "exchange [ms] | plant step [ms] | force error | path error | work error"
+        "coupling step [ms] | plant step [ms] | force error | path error | work error"
         " | board peak [N] | x real time",
         (
             (f"{1e3 * c.exchange_period:g}", f"{1e3 * c.plant_time_step:g}")

@@ -14,7 +14,7 @@ The table has a row for each pace:
   late, 99 %, max wall time between two states less the period at that pace: median, 99 %, greatest
   emulator late   cycles that the emulator began more than half a period late while the client ran
   force           RMS difference of the sensor's force from `sliceit simulate`, mean and greatest of
-                  the completed runs, and as a share of the simulated RMS
+                  the completed runs, and as a fraction of the simulated RMS
   stops           why runs ended early, as the operator reads it, each reason with its count
 """
 

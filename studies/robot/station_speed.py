@@ -30,7 +30,7 @@ DURATION = 1.2
 def station_times(scenario: Scenario) -> tuple[float, float, int]:
     """Wall time of a cut of `DURATION`, the part spent in the food's kernels, and its elements."""
     in_food = 0.0
-    calls = {name: getattr(CuttingSolver, name) for name in ("exchange", "energies")}
+    calls = {name: getattr(CuttingSolver, name) for name in ("coupling_step", "energies")}
 
     def timed(name: str) -> Callable[..., Any]:
         def call(self: CuttingSolver, *arguments: Any) -> Any:
@@ -96,7 +96,7 @@ def run(options: argparse.Namespace) -> int:
     (total, food, elements), plant = min(turn[0] for turn in turns), min(turn[1] for turn in turns)
     spring = min(turn[2] for turn in turns)[0]
     print(
-        f"{elements} tetrahedra, sub-step {1e3 * scenario.numerics.time_step:g} ms, exchange "
+        f"{elements} tetrahedra, sub-step {1e3 * scenario.numerics.time_step:g} ms, coupling step "
         f"{1e3 * scenario.exchange_period:g} ms, plant step "
         f"{1e3 * scenario.robot.plant_time_step:g} ms"
     )
@@ -105,7 +105,7 @@ def run(options: argparse.Namespace) -> int:
         f"{DURATION / spring:.2f} ({total / spring:.2f} times as fast)"
     )
     for name, part in (
-        ("food (Warp and its exchange)", food),
+        ("food (Warp and its coupling step)", food),
         ("arm and joint control (Drake)", plant),
         ("other systems, record (Python)", total - food - plant),
     ):

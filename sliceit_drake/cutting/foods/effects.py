@@ -27,7 +27,7 @@ __all__ = [
 
 
 LINEAR_BELOW = 0.1
-"""Share of its reference speed below which adhesion goes linearly with the speed."""
+"""Fraction of its reference speed below which adhesion goes linearly with the speed."""
 
 
 @dc.dataclass
@@ -47,11 +47,11 @@ class ToughnessRate:
 class Relaxation:
     """Viscoelastic bulk: Maxwell branches in parallel with a spring (Prony series).
 
-    E is the instantaneous modulus; a share of it relaxes with each time.
+    E is the instantaneous modulus; a fraction of it relaxes with each time.
     """
 
     shares: list[float] = dc.field(default_factory=list)
-    """Share of E that each branch relaxes; empty for none."""
+    """Fraction of E that each branch relaxes; empty for none."""
     times: list[float] = dc.field(default_factory=list)
     """Relaxation times, s."""
 
@@ -67,7 +67,7 @@ class Relaxation:
             raise ConfigurationError(
                 f"= {self.shares} is no split of the modulus",
                 field=f"{where}.shares",
-                fix="Give shares of at least 0 that sum to less than 0.99.",
+                fix="Give fractions of at least 0 that sum to less than 0.99.",
             )
         if not (np.isfinite(times).all() and (times > 0.0).all()):
             raise ConfigurationError(
@@ -207,7 +207,7 @@ class Slip:
 
     resistance: float | None = quantity(None, "N", low=0.0, high=1e4, doc="null: never slips.")
     remaining: float = quantity(
-        0.5, "", low=0.0, high=1.0, doc="Share of the resistance while it slips."
+        0.5, "", low=0.0, high=1.0, doc="Fraction of the resistance while it slips."
     )
 
 
@@ -219,7 +219,7 @@ class Edge:
     """
 
     share: float = quantity(
-        1.0, "", low=0.0, high=1.0, doc="Share of toughness and bonds; 0 for opening alone."
+        1.0, "", low=0.0, high=1.0, doc="Fraction of toughness and bonds; 0 for opening alone."
     )
 
 

@@ -18,11 +18,11 @@ from sliceit_drake.resources import file_or_resource
 
 __all__ = ["Box", "Cylinder", "Ellipsoid", "MeshFile", "Remainder", "Tapered"]
 
-LEAST_END_RADIUS = 0.3
+MIN_END_RADIUS = 0.3
 """Least radius of a flat end over the greatest, of sliced ellipsoids and tapered foods: towards a
 tip the elements of a layer shrink to nothing."""
 
-LEAST_LAYER = 0.2
+MIN_LAYER = 0.2
 """Least thickness of a slice's element layer over the edge length in the section: stiffness across
 the layer, and with it the scaled mass, grow with the inverse square."""
 
@@ -161,8 +161,8 @@ class Ellipsoid:
 
     @property
     def reach(self) -> float:
-        """Greatest y of a section that can be meshed, metres: see `LEAST_END_RADIUS`."""
-        return 0.5 * self.diameters[1] * float(np.sqrt(1.0 - LEAST_END_RADIUS**2))
+        """Greatest y of a section that can be meshed, metres: see `MIN_END_RADIUS`."""
+        return 0.5 * self.diameters[1] * float(np.sqrt(1.0 - MIN_END_RADIUS**2))
 
     @property
     def section_edge(self) -> float:
@@ -195,7 +195,7 @@ class Tapered:
 
     def check(self, where: str) -> None:
         thin = int(np.argmin(self.diameters))
-        least = LEAST_END_RADIUS * max(self.diameters)
+        least = MIN_END_RADIUS * max(self.diameters)
         if self.diameters[thin] < least:
             raise ConfigurationError(
                 f"{self.diameters[thin]:g} m is too thin an end beside {max(self.diameters):g} m",
@@ -346,7 +346,7 @@ class Remainder:
                 field=f"{where}.position",
                 fix="Move the cut, or make the slice thinner.",
             )
-        least = LEAST_LAYER * self.body.section_edge * self.slice_layers
+        least = MIN_LAYER * self.body.section_edge * self.slice_layers
         if self.thickness < least:
             raise ConfigurationError(
                 f"{1e3 * self.thickness:.4g} mm in {self.slice_layers} layers is too thin for "

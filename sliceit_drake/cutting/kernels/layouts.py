@@ -38,27 +38,27 @@ POINT_SUMS = np.dtype(
     ]
 )
 """Sums over the cut points: forces and moments on the knife by edge, flank pressure and friction,
-and energies dissipated, each summed over the sub-steps of an exchange; at its end the area that is
-cut, and the moment about Ko and the size of that part of the flanks which is in the food."""
+and energies dissipated, each summed over the sub-steps of a coupling step; at its end the area that
+is cut, and the moment about Ko and the size of that part of the flanks which is in the food."""
 
 NODE_SUMS = np.dtype([("board_force", "f8", 3), ("board_loss", "f8"), ("internal_work", "f8")])
 """Sums over nodes and sub-steps: the board's force on the food, the energy that it dissipates, and
 the work of the bulk's forces."""
 
 BLADE_SUMS = np.dtype([("loss", "f8"), ("on_knife", "f8"), ("on_blade", "f8")])
-"""Sums over the sub-steps of an exchange: energy lost in the bending blade, the force that it
+"""Sums over the sub-steps of a coupling step: energy lost in the bending blade, the force that it
 passes on to the knife's body, and the force of the flanks on it."""
 
 
-def results(exchanges: int) -> np.dtype:
-    """Results of one cut over E exchanges; the sums over nodes are those of all of them."""
+def results(coupling_steps: int) -> np.dtype:
+    """Results of one cut over E coupling steps; the sums over nodes are those of all of them."""
     return np.dtype(
         [
-            ("point_sums", POINT_SUMS, (exchanges,)),
+            ("point_sums", POINT_SUMS, (coupling_steps,)),
             ("node_sums", NODE_SUMS),
-            ("blade", BLADE_SUMS, (exchanges,)),
-            ("wrenches", "f8", (exchanges, 3, 6)),
-            ("work", "f8", (exchanges,)),
+            ("blade", BLADE_SUMS, (coupling_steps,)),
+            ("wrenches", "f8", (coupling_steps, 3, 6)),
+            ("work", "f8", (coupling_steps,)),
         ]
     )
 
@@ -70,7 +70,7 @@ def first(layout: np.dtype, *names: str) -> list[int]:
 
 
 ACCUMULATED = first(POINT_SUMS, "buried_moment")[0]
-"""Numbers that each cut point keeps in `total`; those of `buried` follow in the sums."""
+"""Numbers that each cut point keeps in `total`; those of `immersed` follow in the sums."""
 
 
 def numbers(layout: np.dtype) -> int:

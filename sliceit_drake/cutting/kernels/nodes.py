@@ -74,19 +74,20 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         force: vec3,
         share: wp.array2d(dtype=real),
         keep: wp.array2d(dtype=real),
-        lag: wp.array3d(dtype=vec3),
-        lag_next: wp.array3d(dtype=vec3),
+        overstress: wp.array3d(dtype=vec3),
+        overstress_next: wp.array3d(dtype=vec3),
     ):
         """Force of the bulk on node i after relaxation, from that of the instantaneous moduli.
 
-        Each Maxwell branch carries its share of the force less what has relaxed: `lag`, the force
-        filtered with the branch's time.
-        """
+        Each Maxwell branch carries its fraction of the force less what has relaxed: `overstress`,
+        the force filtered with the branch's time."""
         f = force
         for m in range(share.shape[1]):
-            new_lag = keep[cut, m] * lag[cut, m, i] + (real(1.0) - keep[cut, m]) * force
-            lag_next[cut, m, i] = new_lag
-            f = f - share[cut, m] * new_lag
+            new_overstress = (
+                keep[cut, m] * overstress[cut, m, i] + (real(1.0) - keep[cut, m]) * force
+            )
+            overstress_next[cut, m, i] = new_overstress
+            f = f - share[cut, m] * new_overstress
         return f
 
     @wp.func
@@ -111,9 +112,8 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
     ):
         """Velocity after the sub-step; board contact, sums over the launch.
 
-        A share of the unbalanced force opposes the node's motion (Cundall's local damping): none in
-        equilibrium, however fast the motion, and the more the larger the inertia.
-        """
+        A fraction of the unbalanced force opposes the node's motion (Cundall's local damping): none
+        in equilibrium, however fast the motion, and the more the larger the inertia."""
         f = internal + external
         pressed = real(0.0)
         on_food = vec3()
@@ -181,7 +181,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         board: wp.array(dtype=real),
         P: wp.array2d(dtype=real),
         dt: real,
-        lag: wp.array3d(dtype=vec3),
+        overstress: wp.array3d(dtype=vec3),
         board_slip: wp.array2d(dtype=vec3),
         board_force: wp.array2d(dtype=vec3),
         board_loss: wp.array2d(dtype=real),
@@ -194,7 +194,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         for entry in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, moving.shape[0])):
             i = moving[entry]
             force = gather_elements(cut, i, element_force, element_start, element_entry)
-            internal = relax(cut, i, force, relaxing, keep, lag, lag)
+            internal = relax(cut, i, force, relaxing, keep, overstress, overstress)
             external = weight[cut, i] + gather_points(
                 cut, i, point_force, point_start, point_entry, point_weight
             )
@@ -237,7 +237,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
     def bend_blade(
         push: wp.array(dtype=real),
         P: wp.array2d(dtype=real),
-        exchange: wp.int32,
+        coupling_step: wp.int32,
         dt: real,
         blade: wp.array2d(dtype=real),
         blade_next: wp.array2d(dtype=real),
@@ -257,9 +257,9 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         deflection = blade[cut, 0] + dt * rate
         blade_next[cut, 1] = rate
         blade_next[cut, 0] = deflection
-        blade_sums[cut, exchange, LOSS] += c * rate * rate * dt
-        blade_sums[cut, exchange, ON_KNIFE] += k * deflection + c * rate
-        blade_sums[cut, exchange, ON_BLADE] += F
+        blade_sums[cut, coupling_step, LOSS] += c * rate * rate * dt
+        blade_sums[cut, coupling_step, ON_KNIFE] += k * deflection + c * rate
+        blade_sums[cut, coupling_step, ON_BLADE] += F
 
     out = types.SimpleNamespace(move_nodes=move_nodes, push_blade=push_blade, bend_blade=bend_blade)
     if not gradients:
@@ -296,8 +296,8 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         from_elements: wp.array2d(dtype=vec3),
         relaxing: wp.array2d(dtype=real),
         keep: wp.array2d(dtype=real),
-        lag: wp.array3d(dtype=vec3),
-        lag_next: wp.array3d(dtype=vec3),
+        overstress: wp.array3d(dtype=vec3),
+        overstress_next: wp.array3d(dtype=vec3),
         internal: wp.array2d(dtype=vec3),
         per_thread: wp.int32,
     ):
@@ -306,7 +306,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         for entry in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, moving.shape[0])):
             i = moving[entry]
             force = from_elements[cut, i]
-            internal[cut, i] = relax(cut, i, force, relaxing, keep, lag, lag_next)
+            internal[cut, i] = relax(cut, i, force, relaxing, keep, overstress, overstress_next)
 
     @wp.kernel(enable_backward=gradients, module=module)
     def step_nodes(

@@ -39,11 +39,16 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
     LINEAR = wp.constant(real(LINEAR_BELOW**2))
 
     @wp.func
-    def intact_share(parted: real, onset: real, failure: real):
-        """Secant over initial stiffness of a bilinear bond that spent the share `parted`."""
+    def intact_fraction(cohesive_damage: real, onset: real, failure: real):
+        """Secant over initial stiffness of a bilinear bond that spent the share
+        `cohesive_damage`."""
         share = real(0.0)
         if failure > onset:
-            share = onset * (real(1.0) - parted) / (onset + parted * (failure - onset))
+            share = (
+                onset
+                * (real(1.0) - cohesive_damage)
+                / (onset + cohesive_damage * (failure - onset))
+            )
         return share
 
     @wp.func
@@ -181,26 +186,26 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         P: wp.array2d(dtype=real),
         knife: wp.array2d(dtype=real),
         k: wp.int32,
-        exchange: wp.int32,
+        coupling_step: wp.int32,
         dt: real,
         R_CK: wp.array2d(dtype=mat33),
         p_CK: wp.array2d(dtype=vec3),
         v_CK: wp.array2d(dtype=vec3),
         w_CK: wp.array2d(dtype=vec3),
         blade: wp.array2d(dtype=real),
-        passed: wp.array2d(dtype=real),
-        parted: wp.array2d(dtype=real),
+        edge_depth: wp.array2d(dtype=real),
+        cohesive_damage: wp.array2d(dtype=real),
         edge_force: wp.array2d(dtype=real),
-        heading: wp.array2d(dtype=vec3),
+        edge_direction: wp.array2d(dtype=vec3),
         slip: wp.array3d(dtype=vec3),
-        passed_next: wp.array2d(dtype=real),
-        parted_next: wp.array2d(dtype=real),
+        edge_depth_next: wp.array2d(dtype=real),
+        cohesive_damage_next: wp.array2d(dtype=real),
         edge_force_next: wp.array2d(dtype=real),
-        heading_next: wp.array2d(dtype=vec3),
+        edge_direction_next: wp.array2d(dtype=vec3),
         slip_next: wp.array3d(dtype=vec3),
         force: wp.array3d(dtype=vec3),
         lateral: wp.array2d(dtype=real),
-        buried: wp.array3d(dtype=vec4),
+        immersed: wp.array3d(dtype=vec4),
         total: wp.array4d(dtype=real),
     ):
         """One cut point, see `points`."""
@@ -223,15 +228,15 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         toughness_i = toughness[cut, i]
         grid = fraction.shape[1]
         # s: depth of the edge below the point. Nothing happens beyond the ends of the blade.
-        old_passed = passed[cut, i]
-        s = old_passed
+        old_edge_depth = edge_depth[cut, i]
+        s = old_edge_depth
         beyond = wp.abs(wp.dot(arm, knife_x)) >= knife[cut, HALF_LENGTH]
         if not beyond:
             s = -wp.dot(arm, knife_z)
-        new_passed = wp.max(old_passed, s)
-        passed_next[cut, i] = new_passed
-        k0, w0 = place(old_passed, reach, per_spacing, grid)
-        k1, w1 = place(new_passed, reach, per_spacing, grid)
+        new_edge_depth = wp.max(old_edge_depth, s)
+        edge_depth_next[cut, i] = new_edge_depth
+        k0, w0 = place(old_edge_depth, reach, per_spacing, grid)
+        k1, w1 = place(new_edge_depth, reach, per_spacing, grid)
         D0 = table(fraction, i, k0, w0)
         D = table(fraction, i, k1, w1)
 
@@ -242,18 +247,23 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         bond = P[cut, BOND_STIFFNESS]
         onset = P[cut, STRENGTH] / bond
         failure = real(2.0) * toughness_i / P[cut, STRENGTH]
-        old_parted = parted[cut, i]
-        new_parted = wp.max(
-            old_parted,
+        old_cohesive_damage = cohesive_damage[cut, i]
+        new_cohesive_damage = wp.max(
+            old_cohesive_damage,
             wp.clamp((length - onset) / wp.max(failure - onset, TINY), real(0.0), real(1.0)),
         )
-        parted_next[cut, i] = new_parted
-        intact = intact_share(new_parted, onset, failure)
+        cohesive_damage_next[cut, i] = new_cohesive_damage
+        intact = intact_fraction(new_cohesive_damage, onset, failure)
         by_edge = P[cut, EDGE_SHARE]
         stiffness = bond * A * (real(1.0) - by_edge * D) * intact
         closing = bond * A * wp.min(gap[1], real(0.0))
         pull = stiffness * opening + vec3(real(0.0), closing, real(0.0))
-        opening_loss = toughness_i * A * (real(1.0) - by_edge * D0) * (new_parted - old_parted)
+        opening_loss = (
+            toughness_i
+            * A
+            * (real(1.0) - by_edge * D0)
+            * (new_cohesive_damage - old_cohesive_damage)
+        )
 
         # Edge: a force against the edge's direction d, elastic up to R T (d . n), where R is the
         # toughness that opening left less what the bonds that the edge cuts give up. d follows the
@@ -263,19 +273,19 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         along = moved - wp.dot(moved, knife_y) * knife_y
         speed = wp.length(along)
         travel = speed * dt
-        old_heading = heading[cut, i]
-        followed = old_heading
+        old_edge_direction = edge_direction[cut, i]
+        followed = old_edge_direction
         if travel > real(0.0):
             keep = wp.exp(-travel / P[cut, DIRECTION_LENGTH])
-            followed = keep * old_heading + ((real(1.0) - keep) * dt / travel) * along
+            followed = keep * old_edge_direction + ((real(1.0) - keep) * dt / travel) * along
         in_plane = followed - wp.dot(followed, knife_y) * knife_y
         size = wp.length(in_plane)
-        d = old_heading
+        d = old_edge_direction
         if size > real(1.0e-6):
             d = in_plane / size
-        heading_next[cut, i] = d
+        edge_direction_next[cut, i] = d
         bonded = real(0.5) * by_edge * bond * intact * length * length
-        left = wp.max(by_edge * toughness_i * (real(1.0) - new_parted) - bonded, real(0.0))
+        left = wp.max(by_edge * toughness_i * (real(1.0) - new_cohesive_damage) - bonded, real(0.0))
         # The edge cuts what its direction has across it; pressing straight, all.
         across = wp.max(wp.dot(d, knife_z), real(0.0))
         effect = across
@@ -287,13 +297,13 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
             relative_speed = wp.max(speed / P[cut, REFERENCE_SPEED], real(1.0e-3))
             effect = effect * wp.pow(relative_speed, P[cut, RATE_EXPONENT])
         if ALL or P[cut, INITIATION] > real(0.0):
-            below = wp.max(surface[i] + new_passed, real(0.0))
+            below = wp.max(surface[i] + new_edge_depth, real(0.0))
             left = left + P[cut, INITIATION] * wp.exp(-below / P[cut, INITIATION_DEPTH])
         resistance = left * table(width, i, k1, w1)
         if ALL or P[cut, SKIN_TOUGHNESS] > real(0.0):
             resistance = resistance + P[cut, SKIN_TOUGHNESS] * table(outline, i, k1, w1)
         spring = wp.max(unloading[cut, i], TINY)
-        slack = wp.max(new_passed - s - P[cut, UNLOADING_LENGTH], real(0.0))
+        slack = wp.max(new_edge_depth - s - P[cut, UNLOADING_LENGTH], real(0.0))
         limit = wp.max(resistance * effect - spring * slack, real(0.0))
         if beyond:
             limit = real(0.0)
@@ -370,19 +380,19 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         normal = normal_m + normal_p
         friction = friction_m + friction_p
         for c in range(3):
-            total[cut, exchange, i, FORCES + c] += -edge[c]
-            total[cut, exchange, i, FORCES + 3 + c] += -normal[c]
-            total[cut, exchange, i, FORCES + 6 + c] += -friction[c]
-            total[cut, exchange, i, MOMENTS + c] += -edge_moment[c]
-            total[cut, exchange, i, MOMENTS + 3 + c] += -normal_moment[c]
-            total[cut, exchange, i, MOMENTS + 6 + c] += -friction_moment[c]
-        total[cut, exchange, i, EDGE_LOSS] += edge_loss
-        total[cut, exchange, i, OPENING_LOSS] += opening_loss
-        total[cut, exchange, i, FRICTION_LOSS] += loss_m + loss_p
-        total[cut, exchange, i, CUT_AREA] = A * D
+            total[cut, coupling_step, i, FORCES + c] += -edge[c]
+            total[cut, coupling_step, i, FORCES + 3 + c] += -normal[c]
+            total[cut, coupling_step, i, FORCES + 6 + c] += -friction[c]
+            total[cut, coupling_step, i, MOMENTS + c] += -edge_moment[c]
+            total[cut, coupling_step, i, MOMENTS + 3 + c] += -normal_moment[c]
+            total[cut, coupling_step, i, MOMENTS + 6 + c] += -friction_moment[c]
+        total[cut, coupling_step, i, EDGE_LOSS] += edge_loss
+        total[cut, coupling_step, i, OPENING_LOSS] += opening_loss
+        total[cut, coupling_step, i, FRICTION_LOSS] += loss_m + loss_p
+        total[cut, coupling_step, i, CUT_AREA] = A * D
         a = real(0.5) * (area_m + area_p)
         b = real(0.5) * (area_m * (xm - origin) + area_p * (xp - origin))
-        buried[cut, exchange, i] = vec4(b[0], b[1], b[2], a)
+        immersed[cut, coupling_step, i] = vec4(b[0], b[1], b[2], a)
 
     @wp.kernel(enable_backward=gradients, module=module)
     def points(
@@ -405,38 +415,37 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         P: wp.array2d(dtype=real),
         knife: wp.array2d(dtype=real),
         k: wp.int32,
-        exchange: wp.int32,
+        coupling_step: wp.int32,
         dt: real,
         R_CK: wp.array2d(dtype=mat33),
         p_CK: wp.array2d(dtype=vec3),
         v_CK: wp.array2d(dtype=vec3),
         w_CK: wp.array2d(dtype=vec3),
         blade: wp.array2d(dtype=real),
-        passed: wp.array2d(dtype=real),
-        parted: wp.array2d(dtype=real),
+        edge_depth: wp.array2d(dtype=real),
+        cohesive_damage: wp.array2d(dtype=real),
         edge_force: wp.array2d(dtype=real),
-        heading: wp.array2d(dtype=vec3),
+        edge_direction: wp.array2d(dtype=vec3),
         slip: wp.array3d(dtype=vec3),
-        passed_next: wp.array2d(dtype=real),
-        parted_next: wp.array2d(dtype=real),
+        edge_depth_next: wp.array2d(dtype=real),
+        cohesive_damage_next: wp.array2d(dtype=real),
         edge_force_next: wp.array2d(dtype=real),
-        heading_next: wp.array2d(dtype=vec3),
+        edge_direction_next: wp.array2d(dtype=vec3),
         slip_next: wp.array3d(dtype=vec3),
         force: wp.array3d(dtype=vec3),
         lateral: wp.array2d(dtype=real),
-        buried: wp.array3d(dtype=vec4),
+        immersed: wp.array3d(dtype=vec4),
         total: wp.array4d(dtype=real),
         per_thread: wp.int32,
     ):
         """Edge, opening, self contact, flank contact and friction at each cut point.
 
-        Advances the history: `passed`, the largest depth of the edge below the point; `parted`, the
-        share of the surface energy spent by opening; `edge_force` on the food and its direction
-        `heading`; `slip`, from the friction anchors. Adds to `total` forces on the
-        knife, their moments about Ko and energies dissipated, and writes the area that is cut; see
-        `POINT_SUMS`. Writes to `buried` the moment about Ko of the part of it above the edge, and
-        that part.
-        """
+        Advances the history: `edge_depth`, the largest depth of the edge below the point;
+        `cohesive_damage`, the fraction of the surface energy spent by opening; `edge_force` on the
+        food and its direction `edge_direction`; `slip`, from the friction anchors. Adds to `total`
+        forces on the knife, their moments about Ko and energies dissipated, and writes the area
+        that is cut; see `POINT_SUMS`. Writes to `immersed` the moment about Ko of the part of it
+        above the edge, and that part."""
         cut, chunk = wp.tid()
         for i in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, area.shape[0])):
             advance_point(
@@ -461,26 +470,26 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
                 P,
                 knife,
                 k,
-                exchange,
+                coupling_step,
                 dt,
                 R_CK,
                 p_CK,
                 v_CK,
                 w_CK,
                 blade,
-                passed,
-                parted,
+                edge_depth,
+                cohesive_damage,
                 edge_force,
-                heading,
+                edge_direction,
                 slip,
-                passed_next,
-                parted_next,
+                edge_depth_next,
+                cohesive_damage_next,
                 edge_force_next,
-                heading_next,
+                edge_direction_next,
                 slip_next,
                 force,
                 lateral,
-                buried,
+                immersed,
                 total,
             )
 
@@ -503,8 +512,8 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         p_CK: wp.array2d(dtype=vec3),
         k: wp.int32,
         blade: wp.array2d(dtype=real),
-        passed: wp.array2d(dtype=real),
-        parted: wp.array2d(dtype=real),
+        edge_depth: wp.array2d(dtype=real),
+        cohesive_damage: wp.array2d(dtype=real),
         edge_force: wp.array2d(dtype=real),
         slip: wp.array3d(dtype=vec3),
         energy: wp.array2d(dtype=real),
@@ -517,13 +526,13 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         R = R_CK[cut, k]
         A = area[i]
         grid = fraction.shape[1]
-        k0, w0 = place(passed[cut, i], reach, per_spacing, grid)
+        k0, w0 = place(edge_depth[cut, i], reach, per_spacing, grid)
         D = table(fraction, i, k0, w0)
         gap = xp - xm
         bond = P[cut, BOND_STIFFNESS]
         onset = P[cut, STRENGTH] / bond
         failure = real(2.0) * toughness[cut, i] / P[cut, STRENGTH]
-        intact = intact_share(parted[cut, i], onset, failure)
+        intact = intact_fraction(cohesive_damage[cut, i], onset, failure)
         opening = vec3(gap[0], wp.max(gap[1], real(0.0)), gap[2])
         closing = wp.min(gap[1], real(0.0))
         doubled = (

@@ -10,8 +10,8 @@ import functools
 import types
 from typing import Any
 
+from sliceit_drake.cutting.kernels.coupling_step import coupling_kernels
 from sliceit_drake.cutting.kernels.elements import element_kernels
-from sliceit_drake.cutting.kernels.exchange import exchange_kernels
 from sliceit_drake.cutting.kernels.nodes import node_kernels
 from sliceit_drake.cutting.kernels.points import point_kernels
 from sliceit_drake.cutting.kernels.types import kernel_types
@@ -30,5 +30,5 @@ def kernels(real: Any, gradients: bool = False) -> types.SimpleNamespace:
         **vars(element_kernels(real, module, gradients)),
         **vars(point_kernels(real, module, gradients)),
         **vars(node_kernels(real, module, gradients)),
-        **vars(exchange_kernels(real, module)),
+        **vars(coupling_kernels(real, module)),
     )

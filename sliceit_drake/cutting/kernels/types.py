@@ -77,7 +77,8 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
 
     @wp.func
     def place(s: real, reach: real, per_spacing: real, size: wp.int32):
-        """Interval of a table with `size` entries over [-reach, reach] and the share of its end."""
+        """Interval of a table with `size` entries over [-reach, reach] and the fraction of its
+        end."""
         u = (s + reach) * per_spacing
         k = wp.clamp(wp.int32(wp.floor(u)), 0, size - 2)
         return k, wp.clamp(u - real(k), real(0.0), real(1.0))

@@ -19,13 +19,13 @@ from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh, boundary_face
 
 __all__ = ["CutGeometry", "make_cut_geometry"]
 
-LEAST_SHARE = 0.05
-"""Least share of a split element's stiffness that a copy gets; the other gets the rest.
+MIN_SHARE = 0.05
+"""Least fraction of a split element's stiffness that a copy gets; the other gets the rest.
 
-A corner of material that is much smaller than its element would be held by a share of the stiffness
-that vanishes as its size cubed, but pushed by the edge in proportion to its size: it would invert.
-Volume, mass and weight keep their true shares, and the two copies together their stiffness.
-"""
+A corner of material that is much smaller than its element would be held by a fraction of the
+stiffness that vanishes as its size cubed, but pushed by the edge in proportion to its size: it
+would invert. Volume, mass and weight keep their true shares, and the two copies together their
+stiffness. """
 
 
 @dc.dataclass
@@ -233,7 +233,7 @@ def make_cut_geometry(
         nodes=nodes,
         tetrahedra=t,
         inverse=np.linalg.inv(edges),
-        # Both copies of a split element share its stiffness; see `LEAST_SHARE`.
+        # Both copies of a split element share its stiffness; see `MIN_SHARE`.
         stiff_volume=whole * _stiffness_share(fraction),
         node_volume=node_volume,
         weight_volume=weight_volume,
@@ -251,7 +251,7 @@ def make_cut_geometry(
 
 
 def _stiffness_share(fraction: np.ndarray) -> np.ndarray:
-    return np.where(fraction < 1.0, np.clip(fraction, LEAST_SHARE, 1.0 - LEAST_SHARE), 1.0)
+    return np.where(fraction < 1.0, np.clip(fraction, MIN_SHARE, 1.0 - MIN_SHARE), 1.0)
 
 
 def _vertex_volume(split: SplitMesh) -> np.ndarray:

@@ -14,7 +14,7 @@ TOUCHING = 1e-4
 what only touches comes apart, and what overlaps by more than twice that does not."""
 
 ROUNDING = 1e-6
-"""Share of a face by which an edge may pass beside it and still counts as going through."""
+"""Fraction of a face by which an edge may pass beside it and still counts as going through."""
 
 
 def bodies(tetrahedra: np.ndarray) -> np.ndarray:

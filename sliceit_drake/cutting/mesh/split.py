@@ -1,11 +1,11 @@
 """Virtual-node split of a tetrahedral mesh by a plane, with material fractions.
 
 Each tetrahedron with material on one side of the plane gets a copy for that side, which refers to
-that side's copies of its vertices and holds the share of the volume on its side (Molino, Bao and
+that side's copies of its vertices and holds the fraction of the volume on its side (Molino, Bao and
 Fedkiw 2004; Sifakis, Der and Fedkiw 2007). Nothing is moved, so volume, mass and section are
 conserved for any plane. A vertex within `SNAP` of the plane counts as on it. No sliver is merged:
 its bulk stiffness and its mass shrink alike, but the stiffness of bonds, flanks and edge at its
-surface does not, nor does the force of the edge on it; `model.SLIVER` and `geometry.LEAST_SHARE`
+surface does not, nor does the force of the edge on it; `model.SLIVER` and `geometry.MIN_SHARE`
 say what becomes of it, studies/physics/split_step_limit.py what that leaves of the step limit.
 """
 
@@ -18,7 +18,7 @@ from sliceit_drake.cutting.mesh.tetrahedra import MeshError, TetrahedralMesh
 __all__ = ["CutPlane", "SplitMesh", "split_mesh"]
 
 SNAP = 1e-6
-"""Share of the mean edge length by which a vertex may be off the plane and counts as on it."""
+"""Fraction of the mean edge length by which a vertex may be off the plane and counts as on it."""
 
 
 @dc.dataclass
@@ -71,7 +71,7 @@ class SplitMesh:
         node_source: Vertex of the original mesh [N].
         node_is_material: Whether the node lies in its side's material, not beyond the plane [N].
         tetrahedra: Node indices [T, 4].
-        fraction: Share of each tetrahedron that is material [T].
+        fraction: Fraction of each tetrahedron that is material [T].
         centroid: Barycentric coordinates of the centroid of that share [T, 4].
         point_nodes: Nodes of each cut point [P, 2, 2]: side, end.
         point_weights: Their weights [P, 2], same for both sides; they sum to 1.

@@ -45,23 +45,27 @@ class FoodCorners:
         corners = (nodes[self.ends] * self.weights[..., None]).sum(1)
         return corners @ model.X_FC_rotation.T + model.X_FC_position
 
-    def damage(self, model: CuttingModel, passed: np.ndarray, parted: np.ndarray) -> np.ndarray:
-        """Share of the toughness that is spent at each corner [V]: 0 intact and skin, 1 cut.
+    def damage(
+        self, model: CuttingModel, edge_depth: np.ndarray, cohesive_damage: np.ndarray
+    ) -> np.ndarray:
+        """Fraction of the toughness that is spent at each corner [V]: 0 intact and skin, 1 cut.
 
         The edge has spent the cut fraction D of a point and opening the share phi of the rest:
         1 - (1 - D) (1 - phi).
 
         Args:
             model: The cut.
-            passed: Largest depth of the edge below each cut point [P], metres.
-            parted: phi of each cut point [P].
+            edge_depth: Largest depth of the edge below each cut point [P], metres.
+            cohesive_damage: phi of each cut point [P].
         """
         tables = model.tables
-        grid = np.clip((passed + tables.reach) / tables.spacing, 0.0, tables.fraction.shape[1] - 1)
+        grid = np.clip(
+            (edge_depth + tables.reach) / tables.spacing, 0.0, tables.fraction.shape[1] - 1
+        )
         low = np.minimum(grid.astype(int), tables.fraction.shape[1] - 2)
         rows, part = np.arange(len(grid)), grid - low
         cut = (1.0 - part) * tables.fraction[rows, low] + part * tables.fraction[rows, low + 1]
-        spent = 1.0 - (1.0 - cut) * (1.0 - parted)
+        spent = 1.0 - (1.0 - cut) * (1.0 - cohesive_damage)
         return np.where(self.is_cut_face, spent[self.cut_point], 0.0)
 
 

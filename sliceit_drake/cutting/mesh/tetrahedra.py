@@ -120,7 +120,7 @@ class TetrahedralMesh:
             count = np.sort(np.bincount(body))[::-1]
             listed = ", ".join(str(n) for n in count[:5]) + (", ..." if len(count) > 5 else "")
             fix = "Keep one of them."
-            gap = _least_gap(v, t, body)
+            gap = _min_gap(v, t, body)
             if gap <= 1e-6 * self.mean_edge_length():
                 fix = "They touch: merge the vertices that lie on each other when meshing."
             raise MeshError(
@@ -158,7 +158,7 @@ class TetrahedralMesh:
             )
 
 
-def _least_gap(vertices: np.ndarray, tetrahedra: np.ndarray, body: np.ndarray) -> float:
+def _min_gap(vertices: np.ndarray, tetrahedra: np.ndarray, body: np.ndarray) -> float:
     """Least distance of a vertex of the first body to one of the others, metres."""
     first, others = np.unique(tetrahedra[body == 0]), np.unique(tetrahedra[body != 0])
     return float(cKDTree(vertices[first]).query(vertices[others])[0].min())

@@ -149,7 +149,7 @@ class CoreRatio(Cause):
     def model(
         self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
     ) -> CuttingModel:
-        """Another core; the rind is given as a share of half the section's size."""
+        """Another core; the rind is given as a fraction of half the section's size."""
         half = 0.5 * min(facts.height, facts.width)
         weakening, old = values["weakening"], model.effects.core
         core = Core(

@@ -21,7 +21,7 @@ __all__ = ["Confirmation", "confirm"]
 
 ROUNDS = 2
 WORTH = 0.5
-"""Least share of the gain that the derivatives promise which a simulation must show."""
+"""Least fraction of the gain that the derivatives promise which a simulation must show."""
 
 
 @dc.dataclass

@@ -10,7 +10,7 @@ from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 __all__ = ["HeldOutGain", "fitted_changes", "held_out_gain", "held_out_share", "own_coefficients"]
 
 BOOTSTRAP = 1000
-LEAST_REDUCIBLE = 0.02
+MIN_REDUCIBLE = 0.02
 """Least of the mean square that is called reducible, against the noise."""
 FLAT = 1e4
 """Variance of a coefficient of which nothing is known, in the column's size."""
@@ -98,8 +98,8 @@ def _noise(problem: LinearProblem) -> float:
 
 
 def _share(mean: np.ndarray, noise: float) -> float:
-    # Where nothing is above the noise there is nothing to remove a share of.
-    return float((mean[0] - mean[1]) / max(mean[0] - noise, LEAST_REDUCIBLE * noise))
+    # Where nothing is above the noise there is nothing to remove a fraction of.
+    return float((mean[0] - mean[1]) / max(mean[0] - noise, MIN_REDUCIBLE * noise))
 
 
 def fitted_changes(

@@ -18,7 +18,7 @@ from sliceit_drake.prediction.noise import MarkovCovariance
 __all__ = ["ChannelNoise", "differences", "estimate_noise"]
 
 LAGS = 40
-LEAST_ROWS = 60
+MIN_ROWS = 60
 FLOOR = 1e-3
 """Least standard deviation, in N and Nm."""
 

@@ -36,7 +36,7 @@ CORRECTION_VARIANCE = 1e4
 """Prior variance of the nonparametric correction, N^2."""
 UNUSUAL = 0.98
 """Quantile of the gain beyond the usual from which on what a sensor has a little of is a cause."""
-LEAST_DEVIATION = 0.5
+MIN_DEVIATION = 0.5
 """Least standard deviation of a gain by chance: a cause that never gains by chance is not proved by
 a gain of next to nothing."""
 PRESENT = 5.0
@@ -66,8 +66,8 @@ class CauseEvidence:
         units: Of the parameters.
         per_record: Whether each record has coefficients of its own.
         by_record: These [R, n]; empty where they are shared.
-        presence: Share of the records that it could show in in which it does; 1 where coefficients
-            are shared.
+        presence: Fraction of the records that it could show in in which it does; 1 where
+            coefficients are shared.
     """
 
     name: str
@@ -93,7 +93,7 @@ class CauseEvidence:
     @property
     def deviations(self) -> float:
         """Gain beyond its mean by chance, in its standard deviations there."""
-        return (self.gain - self.expected) / max(self.deviation, LEAST_DEVIATION)
+        return (self.gain - self.expected) / max(self.deviation, MIN_DEVIATION)
 
 
 @dc.dataclass
@@ -154,7 +154,7 @@ class _Statistics:
 
     Attributes:
         baseline, own: Numbers of the columns F and E of the module's formulas.
-        own_extra: Those of E that belong to causes that are assumed.
+        unpenalised: Those of E that belong to causes that are assumed.
         options: Of each cause and value of its scan the numbers of its columns.
         reduced: A_r of each record [K, K].
         projected: A beside the baseline [K, K].
@@ -165,11 +165,11 @@ class _Statistics:
         found = problem.found
         self.prior = problem.prior()
         self.baseline = [*problem.base, *problem.numerical, *problem.spline, *problem.usual]
-        self.own_extra: list[int] = []
+        self.unpenalised: list[int] = []
         for name, scan in assumed:
             columns = found.index("cause", name, scan)
             if found.columns[columns[0]].per_record:
-                self.own_extra += columns
+                self.unpenalised += columns
             else:
                 self.baseline += columns
         # At another value of its scan an assumed cause may still add something.
@@ -185,8 +185,8 @@ class _Statistics:
             for name in self.names
         }
         own, variance = problem.own_prior()
-        variance = np.concatenate([variance, np.full(len(self.own_extra), FLAT)])
-        self.own = [*own, *self.own_extra]
+        variance = np.concatenate([variance, np.full(len(self.unpenalised), FLAT)])
+        self.own = [*own, *self.unpenalised]
         K = problem.size
         self.reduced, self.own_weights = [], []
         for G in problem.moments.gram:
@@ -294,8 +294,8 @@ class _Statistics:
         if not mine & {*problem.usual, *problem.usual_own}:
             return 0.0
         own, variance = problem.own_prior(without=columns)
-        variance = np.concatenate([variance, np.full(len(self.own_extra), FLAT)])
-        own = [*own, *self.own_extra]
+        variance = np.concatenate([variance, np.full(len(self.unpenalised), FLAT)])
+        own = [*own, *self.unpenalised]
         baseline = [k for k in self.baseline if k not in mine]
         prior = self.prior.copy()
         prior[columns] = 0.0
@@ -453,7 +453,7 @@ def screen(
             )
         )
     means = np.array([[e.expected] for e in evidence])
-    spreads = np.array([[max(e.deviation, LEAST_DEVIATION)] for e in evidence])
+    spreads = np.array([[max(e.deviation, MIN_DEVIATION)] for e in evidence])
     by_chance = (np.array([chance_gains[e.name] for e in evidence]) - means) / spreads
     largest = max(e.deviations for e in evidence)
     p = (1.0 + (by_chance.max(0) >= largest).sum()) / (replicates + 1.0)

@@ -13,19 +13,19 @@ from sliceit_drake.diagnosis.evidence.screen import CauseEvidence, Screening, sc
 __all__ = [
     "ALARM",
     "CLASS_ANGLE",
-    "LEAST_REPLICATES",
+    "MIN_REPLICATES",
     "Finding",
     "Verdict",
-    "foretold",
+    "checked_out_of_sample",
     "reach_verdict",
 ]
 
 ALARM = 0.02
 """Greatest p-value of the largest gain."""
-LEAST_SIZE = 0.7
+MIN_SIZE = 0.7
 """Least effect against the in-contact noise that is called one: below, the simulation's own errors
 are as large."""
-LEAST_MISFIT = 0.25
+MIN_MISFIT = 0.25
 """Least misfit against the in-contact noise that calls for a cause."""
 MISFIT_FACTOR = 1.5
 """Least gain by a free correction that calls for a cause, of that where nothing is wrong: the noise
@@ -37,20 +37,20 @@ meet: where nothing is wrong up to 0.9 of the noise is left (docs/hidden_effects
 TOLERATED = 0.4
 """Misfit against the in-contact noise that the simulation leaves where nothing is wrong."""
 EXPLAINED = 0.6
-"""Least share of what could be gained that a named cause explains."""
+"""Least fraction of what could be gained that a named cause explains."""
 SECOND_SHARE = 0.15
-"""Least share of a second cause in the squares of the sizes of both."""
+"""Least fraction of a second cause in the squares of the sizes of both."""
 SECOND_GAIN = 0.1
-"""Least share of a second cause in what both gain."""
+"""Least fraction of a second cause in what both gain."""
 OF_THE_REST = 0.5
-"""Least share of what the first cause leaves that a second one explains."""
-LEAST_REMOVED = 0.8
-"""Least share of the reducible held-out error that what is named must remove, at the upper end of
-its interval: a flexible cause may explain each record and foretell none."""
-LEAST_COUNTED = 0.5
-"""Least share of a cause's doing at the rows that this error counts, for it to be judged so."""
+"""Least fraction of what the first cause leaves that a second one explains."""
+MIN_REMOVED = 0.8
+"""Least fraction of the reducible held-out error that what is named must remove, at the upper end
+of its interval: a flexible cause may explain each record and foretell none."""
+MIN_COUNTED = 0.5
+"""Least fraction of a cause's doing at the rows that this error counts, for it to be judged so."""
 PRESENCE = 0.4
-"""Least share of the records in which a cause shows that has numbers of its own in each."""
+"""Least fraction of the records in which a cause shows that has numbers of its own in each."""
 CLASS_ANGLE = 15.0
 """Causes that can do what was found to within this, degrees, are one class."""
 ONE_CONDITION_ANGLE = 22.0
@@ -61,7 +61,7 @@ CLASS_GAIN = 0.2
 ONE_CONDITION_GAIN = 0.05
 """The same where all cuts are of one condition: where more causes are near, what they gain has to
 tell them apart."""
-LEAST_REPLICATES = 3
+MIN_REPLICATES = 3
 """Slices of a condition from which variation can be told from an effect."""
 CANDIDATES = 8
 """Causes that are looked at more closely, those with most evidence."""
@@ -122,7 +122,7 @@ class Verdict:
         return [f.names for f in self.findings] if named else []
 
 
-def foretold(verdict: Verdict, gain: HeldOutGain, problem: LinearProblem) -> Verdict:
+def checked_out_of_sample(verdict: Verdict, gain: HeldOutGain, problem: LinearProblem) -> Verdict:
     """The verdict once its causes were tried on records that were left out: unknown where they
     remove less of the error than causes that are the right ones.
 
@@ -133,10 +133,10 @@ def foretold(verdict: Verdict, gain: HeldOutGain, problem: LinearProblem) -> Ver
     named = verdict.kind in ("cause", "causes")
     if not named or any(f.evidence.per_record for f in verdict.findings):
         return verdict
-    # Where hardly anything is above the noise, a share of it says nothing.
-    if gain.before <= gain.floor or gain.interval[1] >= LEAST_REMOVED:
+    # Where hardly anything is above the noise, a fraction of it says nothing.
+    if gain.before <= gain.floor or gain.interval[1] >= MIN_REMOVED:
         return verdict
-    if any(_counted(problem, f.evidence) < LEAST_COUNTED for f in verdict.findings):
+    if any(_counted(problem, f.evidence) < MIN_COUNTED for f in verdict.findings):
         return verdict
     names = " and ".join(f.evidence.name for f in verdict.findings)
     reason = (
@@ -147,7 +147,7 @@ def foretold(verdict: Verdict, gain: HeldOutGain, problem: LinearProblem) -> Ver
 
 
 def _counted(problem: LinearProblem, evidence: CauseEvidence) -> float:
-    """Share of a cause's doing, squared, at the rows that the held-out error counts."""
+    """Fraction of a cause's doing, squared, at the rows that the held-out error counts."""
     columns = problem.found.index("cause", evidence.name, evidence.scan)
     inside = counted = 0.0
     for record in problem.found.records:
@@ -174,14 +174,14 @@ def reach_verdict(
     """
     first = screen(problem, replicates, seed, progress=progress)
     counts = [len(m) for m in problem.conditions.values()]
-    needed = max(0, LEAST_REPLICATES - min(counts)) if max(counts) < LEAST_REPLICATES else 0
+    needed = max(0, MIN_REPLICATES - min(counts)) if max(counts) < MIN_REPLICATES else 0
     unexplained = max(first.misfit - first.expected_misfit, 0.0)
     findings = [_finding(problem, first, e, unexplained) for e in first.causes[:CANDIDATES]]
     misfit = _misfit_size(problem, findings, unexplained)
-    large = [f for f in findings if f.spread >= LEAST_SIZE and f.evidence.presence >= PRESENCE]
+    large = [f for f in findings if f.spread >= MIN_SIZE and f.evidence.presence >= PRESENCE]
     if first.p_value > ALARM or not large:
         several = len(problem.conditions) > 1
-        least = LEAST_MISFIT if several else ONE_CONDITION_MISFIT
+        least = MIN_MISFIT if several else ONE_CONDITION_MISFIT
         factor = MISFIT_FACTOR if several else ONE_CONDITION_FACTOR
         wrong = misfit >= least and first.misfit >= factor * first.expected_misfit
         if first.misfit_p_value <= ALARM and wrong:
@@ -210,7 +210,7 @@ def reach_verdict(
     added = [
         f
         for f in added
-        if f.spread >= LEAST_SIZE
+        if f.spread >= MIN_SIZE
         and f.spread**2 >= SECOND_SHARE * (f.spread**2 + best.size**2)
         and f.evidence.gain - f.evidence.expected >= OF_THE_REST * left
         # Fast waves gain out of proportion: beside them all else is little.
@@ -230,7 +230,7 @@ def reach_verdict(
     found = [best] if other is None else [best, other]
     if needed:
         reason = (
-            f"no condition has {LEAST_REPLICATES} slices, so that an effect cannot be told from "
+            f"no condition has {MIN_REPLICATES} slices, so that an effect cannot be told from "
             "how slices vary"
         )
         return Verdict("too_few_replicates", found, first, second, misfit, reason, needed)

@@ -162,7 +162,8 @@ class Evidence:
 
 
 def _share_explained(G: np.ndarray, a: slice, b: slice) -> float:
-    """Share of the square of columns `a` that columns `b` explain, from their scalar products."""
+    """Fraction of the square of columns `a` that columns `b` explain, from their scalar
+    products."""
     total = float(np.trace(G[a, a]))
     if total <= 0.0:
         return 0.0

@@ -22,7 +22,7 @@ import numpy as np
 from sliceit_drake.cutting.foods.shapes import MeshFile, Remainder, Tapered
 from sliceit_drake.diagnosis.evidence.screen import CauseEvidence
 from sliceit_drake.diagnosis.evidence.sensitivity import Progress
-from sliceit_drake.diagnosis.evidence.verdict import CLASS_ANGLE, LEAST_REPLICATES
+from sliceit_drake.diagnosis.evidence.verdict import CLASS_ANGLE, MIN_REPLICATES
 from sliceit_drake.diagnosis.experiments.designs import Experiment, menu
 from sliceit_drake.diagnosis.experiments.planned_record import (
     experiment_of_record,
@@ -89,7 +89,7 @@ def _repeat(diagnosis: Diagnosis, records: Sequence[SliceRecord]) -> NextExperim
     template, knife = template_of(records), next_knife_slice(records)
     steps = []
     for members in conditions.values():
-        missing = LEAST_REPLICATES - len(members)
+        missing = MIN_REPLICATES - len(members)
         if missing > 0:
             own = template if is_bare(members[0]) else members[0]
             experiment = experiment_of_record(members[0], diagnosis.setup)
@@ -130,9 +130,7 @@ def _exploring(diagnosis: Diagnosis, records: Sequence[SliceRecord]) -> list[Ste
         names.remove("draw_1")
     template, knife = template_of(records), next_knife_slice(records)
     return [
-        Step(
-            choice[n], planned_slice(choice[n], diagnosis.setup, template, knife), LEAST_REPLICATES
-        )
+        Step(choice[n], planned_slice(choice[n], diagnosis.setup, template, knife), MIN_REPLICATES)
         for n in names
     ]
 

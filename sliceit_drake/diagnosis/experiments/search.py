@@ -11,7 +11,7 @@ from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, Sensitiv
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem, integrate_out, scaled_inverse
 from sliceit_drake.diagnosis.evidence.screen import CauseEvidence, Screening
 from sliceit_drake.diagnosis.evidence.sensitivity import Progress, sensitivities
-from sliceit_drake.diagnosis.evidence.verdict import LEAST_REPLICATES
+from sliceit_drake.diagnosis.evidence.verdict import MIN_REPLICATES
 from sliceit_drake.diagnosis.experiments.designs import Experiment
 from sliceit_drake.diagnosis.experiments.planned_record import (
     next_knife_slice,
@@ -162,7 +162,7 @@ class ExperimentSearch:
             if number in choice.counts:
                 continue
             by_hand = choice.by_hand + bool(experiment.by_hand)
-            for slices in range(LEAST_REPLICATES, MOST_SLICES + 1):
+            for slices in range(MIN_REPLICATES, MOST_SLICES + 1):
                 counts = {**choice.counts, number: slices}
                 choices.append(_Choice(counts, self.pairs(counts), by_hand))
         return min(choices, key=lambda c: c.key)

@@ -23,7 +23,7 @@ from sliceit_drake.diagnosis.diagnose import BASE, Progress
 from sliceit_drake.diagnosis.evidence.columns import Sensitivities
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.experiments.identifiability import SHIFT, Evidence, identifiability
-from sliceit_drake.diagnosis.one_slice.fitted_slice import LEAST_GAIN
+from sliceit_drake.diagnosis.one_slice.fitted_slice import MIN_GAIN
 from sliceit_drake.diagnosis.one_slice.slice_evidence import (
     LEVEL,
     CauseInSlice,
@@ -179,7 +179,7 @@ def _rows(found: Sensitivities, kept: np.ndarray) -> Sensitivities:
 def _promising(evidence: SliceEvidence) -> list[CauseInSlice]:
     """Causes that are worth a fit by simulation."""
     likely = [c for c in evidence.causes if c.p_value <= LEVEL]
-    found = [c for c in evidence.causes if c.held_out <= (1.0 - LEAST_GAIN) * evidence.held_out]
+    found = [c for c in evidence.causes if c.held_out <= (1.0 - MIN_GAIN) * evidence.held_out]
     found = sorted(found, key=lambda c: c.held_out)
     return [*likely, *(c for c in found if c not in likely)][:CONFIRMED]
 

@@ -8,10 +8,10 @@ from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
 from sliceit_drake.diagnosis.one_slice.slice_evidence import LEVEL, CauseInSlice, SliceEvidence
 from sliceit_drake.diagnosis.one_slice.slice_fit import SliceFit
 
-__all__ = ["LEAST_GAIN", "FittedSlice"]
+__all__ = ["MIN_GAIN", "FittedSlice"]
 
-LEAST_GAIN = 0.1
-"""Least share of the error on left-out depth that such a cause removes."""
+MIN_GAIN = 0.1
+"""Least fraction of the error on left-out depth that such a cause removes."""
 
 
 @dc.dataclass
@@ -41,8 +41,8 @@ class FittedSlice:
             for c in self.evidence.causes
             if c.p_value <= LEVEL
             and c.confirmed is not None
-            and c.confirmed <= (1.0 - LEAST_GAIN) * before
-            and c.without_best <= 1.0 - LEAST_GAIN
+            and c.confirmed <= (1.0 - MIN_GAIN) * before
+            and c.without_best <= 1.0 - MIN_GAIN
         ]
 
     @property

@@ -20,7 +20,7 @@ __all__ = ["LEVEL", "CauseInSlice", "SliceEvidence", "slice_evidence"]
 
 LEVEL = 0.05
 """Greatest p-value, over all causes, of one that the slice supports."""
-LEAST_SPREAD = 0.5
+MIN_SPREAD = 0.5
 """Least standard deviation of a gain where nothing is wrong. A cause that hardly shows has next to
 none, which would turn a small gain into many standard deviations."""
 
@@ -112,7 +112,7 @@ def slice_evidence(
         gains = _best_gains(problem, options, problem.sample(rng))
         by_chance.append([gains[name][0] for name in found.causes])
     draws = np.array(by_chance)
-    mean, spread = draws.mean(0), np.maximum(draws.std(0), LEAST_SPREAD)
+    mean, spread = draws.mean(0), np.maximum(draws.std(0), MIN_SPREAD)
     largest = ((draws - mean) / spread).max(1)
     held_out = HeldOutDepth(problem, block, own)
     causes = []

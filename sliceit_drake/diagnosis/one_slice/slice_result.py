@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sliceit_drake.diagnosis.cause import EXPERIMENTS, Cause
-from sliceit_drake.diagnosis.evidence.verdict import LEAST_REPLICATES
+from sliceit_drake.diagnosis.evidence.verdict import MIN_REPLICATES
 from sliceit_drake.diagnosis.experiments.identifiability import (
     SHOWS,
     Identifiability,
@@ -139,7 +139,7 @@ class OneSlice(FittedSlice):
     def needed(self) -> list[str]:
         """What would make a diagnosis of it."""
         lines = [
-            f"Needed for a diagnosis: at least {LEAST_REPLICATES} slices of each condition (one"
+            f"Needed for a diagnosis: at least {MIN_REPLICATES} slices of each condition (one"
             " slice says nothing of how slices vary)."
         ]
         for name in self.experiments()[:3]:
@@ -173,7 +173,7 @@ class OneSlice(FittedSlice):
             "cannot_show": self.hidden,
             "not_above_what_is_left": self.drowned,
             "experiments": self.experiments(),
-            "slices_needed_of_each_condition": LEAST_REPLICATES,
+            "slices_needed_of_each_condition": MIN_REPLICATES,
             "remarks": self.remarks,
         }
 

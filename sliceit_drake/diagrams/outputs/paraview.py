@@ -32,11 +32,12 @@ WRENCHES = ("food", "board", "sensor")
 class FoodFrames:
     """Keeps the food's body at a fixed rate while a run is simulated.
 
-    Frames are at exchanges, as the rows of the record are. Keeping them changes nothing of the run.
+    Frames are at coupling steps, as the rows of the record are. Keeping them changes nothing of the
+    run.
 
     Args:
         run: Prepared, not yet simulated.
-        rate: Frames a second, at most one an exchange.
+        rate: Frames a second, at most one a coupling step.
 
     Raises:
         ConfigurationError: The food has no body, or the rate is not positive.
@@ -54,8 +55,8 @@ class FoodFrames:
             )
         if not rate > 0.0:
             raise ConfigurationError(f"is {rate:g}", field="--fps", fix="Give frames a second.")
-        exchange = run.scenario.exchange_period
-        self._period = max(1, round(1.0 / rate / exchange)) * exchange
+        coupling_step = run.scenario.exchange_period
+        self._period = max(1, round(1.0 / rate / coupling_step)) * coupling_step
         run.simulator.set_monitor(self._keep)
         self._keep(run.simulator.get_context())
 

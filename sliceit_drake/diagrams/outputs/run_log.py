@@ -1,6 +1,6 @@
-"""The record of a run: a table at the exchange rate, from a log of the station's vectors.
+"""The record of a run: a table at the coupling step rate, from a log of the station's vectors.
 
-Logging runs at every exchange, so it takes only vectors that exist anyway, without a line of
+Logging runs at every coupling step, so it takes only vectors that exist anyway, without a line of
 Python; poses and velocities follow afterwards from the joints by forward kinematics.
 """
 
@@ -42,7 +42,7 @@ class Record:
 
     Attributes:
         columns: Column names, `time` first.
-        values: One row an exchange [n, columns], SI units.
+        values: One row a coupling step [n, columns], SI units.
     """
 
     columns: list[str]
@@ -164,7 +164,7 @@ def add_recorder(
     motion: Motion,
     sources: Mapping[str, OutputPort],
 ) -> Recorder:
-    """Logs the station's outputs and commands once per exchange.
+    """Logs the station's outputs and commands once per coupling step.
 
     Args:
         builder: Builder of the diagram that holds the station.

@@ -30,7 +30,7 @@ class SliceReport:
         work_of_cutting_J: Work of the knife on the food.
         section_area_mm2: Area of the cut.
         work_per_area_J_m2: Their ratio.
-        cut_share: Share of the section that is cut.
+        cut_share: Fraction of the section that is cut.
         least_volume_ratio: Of any element.
     """
 

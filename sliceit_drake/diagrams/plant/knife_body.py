@@ -117,7 +117,7 @@ def check_plant_step(board: Board, mass: float, time_step: float, exchange_perio
         exchange_period: Whole number of such steps, s.
 
     Returns:
-        Estimated share of an impact's peak force that the steps take.
+        Estimated fraction of an impact's peak force that the steps take.
 
     Raises:
         ConfigurationError: It is above `PEAK_LOSS_LIMIT`.

@@ -3,7 +3,8 @@
 At rest everything in a station is discrete and, for small motions, linear. `ContactLoop` writes
 down one cycle of it in the order in which the station's events run, with the same periods:
 
-- exchange: the food takes the knife's pose x = J q and holds its force ``f = -G x`` on the knife;
+- coupling step: the food takes the knife's pose x = J q and holds its force ``f = -G x`` on the
+knife;
 - controller: ``q_c = q + h v``, ``v <- 0.9 (v + h H^-1 J^T s p e)``, with e the net force of the
   mode, the spring's part at the pose of the last command, f as the sensor read it;
 - servo: ``a_d = gain (q_c - q_d - lookahead v_d)``;
@@ -11,7 +12,7 @@ down one cycle of it in the order in which the station's events run, with the sa
   integral of ``reset P (q_d - q)``, one symplectic step;
 - board: a spring in the plant's own step, ``f_b = -K_b J (q + h v_next)``, as the plant's contact
   solver has it;
-- sensor: mean of ``f + f_b + tilt of the tool's weight - M_tool J a`` over the exchange,
+- sensor: mean of ``f + f_b + tilt of the tool's weight - M_tool J a`` over the coupling step,
   filtered, sampled and late.
 
 The loop is stable if the matrix of a cycle has no eigenvalue outside the unit circle.
@@ -78,7 +79,8 @@ class ContactLoop:
     """The linear loop of a station at its start, for contacts to be put into it.
 
     Attributes:
-        period: Duration of a cycle, s: the least common multiple of exchange and controller period.
+        period: Duration of a cycle, s: the least common multiple of coupling step and controller
+            period.
         mobility: J M^-1 J^T of the arm with rotors and tool [6, 6], 1/kg, 1/(kg m), 1/(kg m2).
         virtual_mobility: The same of the controller's virtual model.
     """
@@ -127,15 +129,15 @@ class ContactLoop:
         self._delay_steps = round(servo.delay / h)
         self._P, self._D = np.array(control.stiffness), np.array(control.damping)
         self._reset = control.reset_rate
-        self._exchange_steps = round(scenario.exchange_period / h)
+        self._coupling_steps = round(scenario.exchange_period / h)
         self._control_steps = round(self._config.period / h)
         sensor = scenario.sensor
-        self._reading_steps = max(self._exchange_steps, round(sensor.sample_period / h))
+        self._reading_steps = max(self._coupling_steps, round(sensor.sample_period / h))
         self._cycle_steps = math.lcm(self._reading_steps, self._control_steps)
         self.period = self._cycle_steps * h
         self._readings_late = sensor.delay / scenario.exchange_period
         self._line = math.ceil(round(self._readings_late, 9)) + 1
-        if self._line == 1 and self._reading_steps == self._exchange_steps:
+        if self._line == 1 and self._reading_steps == self._coupling_steps:
             self._line = 0
         turn = 2.0 * math.pi * sensor.cutoff_frequency * scenario.exchange_period
         self._filter_share = -math.expm1(-turn) if turn > 0.0 else 1.0
@@ -172,9 +174,9 @@ class ContactLoop:
         """The mode that grows fastest.
 
         Args:
-            response: What the food does after a unit step of the knife that lasts one exchange
-                [n, 6, 6]: less the mean wrench over each exchange from the step on, N/m and so on,
-                constant after the last; a stiffness [6, 6] for a spring; None for no food.
+            response: What the food does after a unit step of the knife that lasts one coupling step
+                [n, 6, 6]: less the mean wrench over each coupling step from the step on, N/m and so
+                on, constant after the last; a stiffness [6, 6] for a spring; None for no food.
             board: Stiffness [6, 6] of a contact in the plant; None for none.
         """
         values = np.linalg.eigvals(self.cycle(response, board))
@@ -222,7 +224,7 @@ class ContactLoop:
 
         Args:
             direction: Translations first, in W.
-            on_board: Whether the spring is in the plant instead of beyond the exchange.
+            on_board: Whether the spring is in the plant instead of beyond the coupling step.
         """
         if not self.least_stable_mode().stable:
             return 0.0
@@ -259,13 +261,13 @@ class ContactLoop:
         poses, targets = queues[:history], queues[history : history + delay]
         line = queues[history + delay :]
 
-        total = 0.0 * reading  # A cycle ends with an exchange.
+        total = 0.0 * reading  # A cycle ends with a coupling step.
         mass = self._M
         if board is not None:
             mass = mass + h * h * J.T @ board @ J
         inverse = np.linalg.inv(mass)
         for i in range(self._cycle_steps):
-            if i % self._exchange_steps == 0:
+            if i % self._coupling_steps == 0:
                 past = [J @ q, *poses]
                 wrench = -G[-1] @ past[-1]
                 for j in range(history):
@@ -294,8 +296,8 @@ class ContactLoop:
                 if board is not None:
                     felt = felt - board @ (J @ q_next)
             shown, total_next, reading_next = self._shown(reading, line), total + felt, reading
-            if i % self._exchange_steps == self._exchange_steps - 1:
-                mean = total_next / self._exchange_steps
+            if i % self._coupling_steps == self._coupling_steps - 1:
+                mean = total_next / self._coupling_steps
                 reading_next = reading + self._filter_share * (mean - reading)
                 is_new = (i + 1) % self._reading_steps == 0
                 line = [reading_next if is_new else line[0], *line[:-1]] if line else []

@@ -1,9 +1,9 @@
 """The start-up check of contact: how much stiffer food and board could be before the loop shakes.
 
 The prepared food is pressed, on the side, by the blade; small motions in six directions then give
-its response, exchange by exchange, with the blade's bending in it. Put into the linear loop of the
-station (`contact_loop`), that response times a factor leaves the loop stable up to the margin.
-"""
+its response, coupling step by coupling step, with the blade's bending in it. Put into the linear
+loop of the station (`contact_loop`), that response times a factor leaves the loop stable up to the
+margin."""
 
 import dataclasses as dc
 
@@ -16,14 +16,14 @@ from sliceit_drake.diagrams.simulated_station import SimulatedStation
 from sliceit_drake.diagrams.stability.contact_loop import ContactLoop
 
 __all__ = [
-    "LEAST_MARGIN",
+    "MIN_MARGIN",
     "ContactMargin",
     "board_stiffness",
     "check_contact_margin",
     "contact_margin",
 ]
 
-LEAST_MARGIN = 2.0
+MIN_MARGIN = 2.0
 DIRECTIONS = ("x", "y", "z", "rotation x", "rotation y", "rotation z")
 
 
@@ -48,17 +48,17 @@ def check_contact_margin(station: SimulatedStation) -> ContactMargin:
     """Computes the margins of a station and refuses one that is too close to instability.
 
     Raises:
-        ConfigurationError: The margin of the food is below `LEAST_MARGIN`.
+        ConfigurationError: The margin of the food is below `MIN_MARGIN`.
     """
     margin = contact_margin(station)
-    if margin.food is not None and margin.food < LEAST_MARGIN:
+    if margin.food is not None and margin.food < MIN_MARGIN:
         names = ", ".join(
             f"{name} {value:.3g}" for name, value in zip(DIRECTIONS, margin.stiffness, strict=True)
         )
         raise ConfigurationError(
             f"knife and food would shake each other: the loop is stable up to {margin.food:.2g} "
             f"times the food's stiffness ({names} N/m and Nm/rad in the knife's axes), at least "
-            f"{LEAST_MARGIN:g} is asked",
+            f"{MIN_MARGIN:g} is asked",
             field="scenario.exchange_period, scenario.controller and scenario.knife",
             fix="Shorten exchange_period, lower controller.error_scale or controller.p_gains, or "
             "lower knife.lateral_stiffness (the blade's bending).",

@@ -1,4 +1,4 @@
-"""Kernels of an exchange: the knife's motion in its sub-steps, and what they add up to.
+"""Kernels of a coupling step: the knife's motion in its sub-steps, and what they add up to.
 
 In double precision whatever the scalars of the sub-steps.
 """
@@ -17,10 +17,10 @@ from sliceit_drake.cutting.kernels.layouts import (
 )
 from sliceit_drake.cutting.kernels.types import kernel_types
 
-__all__ = ["exchange_kernels"]
+__all__ = ["coupling_kernels"]
 
 
-def exchange_kernels(real: Any, module: str) -> types.SimpleNamespace:
+def coupling_kernels(real: Any, module: str) -> types.SimpleNamespace:
     """The kernels for sub-steps with scalars `real`, in the Warp module `module`."""
     t = kernel_types(real)
     vec3, vec4, mat33 = t.vec3, t.vec4, t.mat33
@@ -43,7 +43,7 @@ def exchange_kernels(real: Any, module: str) -> types.SimpleNamespace:
         e: wp.int32,
         period: float64,
     ):
-        """Velocity of Ko and angular velocity in an exchange."""
+        """Velocity of Ko and angular velocity in a coupling step."""
         # R - R^T holds twice the axis times the sine.
         turn = R[cut, e + 1] * wp.transpose(R[cut, e])
         twice = vec3d(turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1])
@@ -60,12 +60,12 @@ def exchange_kernels(real: Any, module: str) -> types.SimpleNamespace:
         v_CK: wp.array2d(dtype=vec3),
         w_CK: wp.array2d(dtype=vec3),
     ):
-        """Knife poses at the ends of the sub-steps, from those at the ends of the exchanges.
+        """Knife poses at the ends of the sub-steps, from those at the ends of the coupling steps.
 
-        Velocity and rotation rate are constant in an exchange. Rotation matrices are interpolated
-        linearly: for a turn of angle a between exchanges they are orthonormal to a^2 / 8, 1e-6 at
-        1 rad/s and 2 ms.
-        """
+        Velocity and rotation rate are constant in a coupling step. Rotation matrices are
+        interpolated
+        linearly: for a turn of angle a between coupling steps they are orthonormal to a^2 / 8, 1e-6
+            at 1 rad/s and 2 ms."""
         cut, k = wp.tid()
         e = k / substeps
         share = float64(k - e * substeps + 1) / float64(substeps)
@@ -83,17 +83,17 @@ def exchange_kernels(real: Any, module: str) -> types.SimpleNamespace:
     @wp.kernel(enable_backward=False, module=module)
     def add_points(
         total: wp.array4d(dtype=real),
-        buried: wp.array3d(dtype=vec4),
+        immersed: wp.array3d(dtype=vec4),
         sums: wp.array3d(dtype=float64),
     ):
-        """Sums of `total` and `buried` over the cut points, a thread for each column."""
+        """Sums of `total` and `immersed` over the cut points, a thread for each column."""
         cut, e, j = wp.tid()
         s = float64(0.0)
         for i in range(total.shape[2]):
             if j < ACCUMULATED:
                 s += float64(total[cut, e, i, j])
             else:
-                s += float64(buried[cut, e, i][j - ACCUMULATED])
+                s += float64(immersed[cut, e, i][j - ACCUMULATED])
         sums[cut, e, j] = s
 
     @wp.kernel(enable_backward=False, module=module)
@@ -127,7 +127,8 @@ def exchange_kernels(real: Any, module: str) -> types.SimpleNamespace:
         wrenches: wp.array4d(dtype=float64),
         work: wp.array2d(dtype=float64),
     ):
-        """Mean wrenches on the knife in each exchange, moment about Ko and force, and its work.
+        """Mean wrenches on the knife in each coupling step, moment about Ko and force, and its
+        work.
 
         By edge, flank pressure with the blade's bending, friction. Moments are about Ko at each
         sub-step; its mean position is half a period back.
