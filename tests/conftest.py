@@ -14,10 +14,7 @@ def no_test_hangs():
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Leaves the second tier to `-m second_tier`, and to who names a file or a test.
-
-    The workers of pytest-xdist take the expression from the process that started them.
-    """
+    """Leaves the second tier to `-m second_tier`, and to who names a file or a test."""
     whole = config.args_source == pytest.Config.ArgsSource.TESTPATHS
-    if whole and not hasattr(config, "workerinput") and not config.option.markexpr:
+    if whole and not config.option.markexpr:
         config.option.markexpr = "not second_tier"

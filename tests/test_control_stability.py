@@ -121,7 +121,7 @@ def test_that_blade_would_shake_and_the_run_ends_by_name(monkeypatch):
     scenario.motion = MotionPlan(
         [ConstantSpeed(distance=0.0345, speed=0.1, acceleration=2.0), Hold(duration=0.2)]
     )
-    monkeypatch.setattr("sliceit_drake.diagrams.stability.contact_margin.LEAST_MARGIN", 0.0)
+    monkeypatch.setattr("sliceit_drake.diagrams.stability.contact_margin.MIN_MARGIN", 0.0)
     run = prepare_run(scenario)
     assert run.contact_margin.food < 1.0
     run.advance()

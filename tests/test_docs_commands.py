@@ -28,11 +28,13 @@ COMMANDS = [command for page in PAGES for command in commands_of(page, ROOT)]
 HERE = """
 sliceit simulate --set "{calibration: cucumber}"
 sliceit simulate --set "{calibration: potato, knife_name: nakiri}"
-sliceit simulate scenarios/carrot_sequence.yaml --set "{food: {shape: !Tapered {diameters: [0.018,
-0.034], length: 0.10}}}" sliceit simulate --set "{food: {cut_normal: [0.2, 1.0, 0.1]}}" sliceit
-calibrate --show cucumber sliceit calibrate --show NAME sliceit diagram --ports python -c "from
-sliceit_drake.hardware.edge_kinematics import flange_pose; print(flange_pose([q1, q2, q3, q4, q5,
-q6])[11] - 0.21)" """  # noqa: E501
+sliceit simulate scenarios/carrot_sequence.yaml --set "{food: {shape: !Tapered {diameters: [0.018, 0.034], length: 0.10}}}"
+sliceit simulate --set "{food: {cut_normal: [0.2, 1.0, 0.1]}}"
+sliceit calibrate --show cucumber
+sliceit calibrate --show NAME
+sliceit diagram --ports
+python -c "from sliceit_drake.hardware.edge_kinematics import flange_pose; print(flange_pose([q1, q2, q3, q4, q5, q6])[11] - 0.21)"
+"""  # noqa: E501
 
 # Run by another test, perhaps on a smaller food.
 TESTED = {
@@ -212,22 +214,24 @@ READ_ONLY = {
         sliceit simulate radish.yaml --set "{calibration: output/radish_food/food.yaml}"
         sliceit calibrate RECORD... --food cucumber --output DIR
         sliceit calibrate RECORD... --food NAME --output DIR
-        sliceit calibrate calibration/records/NAME.csv --food NAME --start NAME --output FOLDER
-        --blocks 0 --per-point 60 sliceit calibrate --food carrot --literature --output DIR sliceit
-        record calibration/protocols/poor.yaml --effect skin --refinement 0.7 --seed 32 --output old
-        sliceit record next.yaml --replicates 3 --effect skin --refinement 0.7 --seed 132 --output
-        new """,  # noqa: E501
+        sliceit calibrate calibration/records/NAME.csv --food NAME --start NAME --output FOLDER --blocks 0 --per-point 60
+        sliceit calibrate --food carrot --literature --output DIR
+        sliceit record calibration/protocols/poor.yaml --effect skin --refinement 0.7 --seed 32 --output old
+        sliceit record next.yaml --replicates 3 --effect skin --refinement 0.7 --seed 132 --output new
+        """,  # noqa: E501
     "a study of minutes to hours, whose results stand in docs": """
         python -m studies calibration --output FOLDER
         python -m studies control --output FOLDER
         python -m studies coverage --replicates 24 --output docs
         python -m studies disect --output docs
         python -m studies hidden --output output/hidden --seed 1 --replicates 100
-        python -m studies identifiability --output docs/identifiability.md --figure
-        docs/figures/identifiability.png python -m studies random --count 200 --seed 1 --output docs
-        python -m studies real --output docs python -m studies stepping --output FOLDER python -m
-        studies verification --fit python -m studies verification --output docs/verification.md """,
-    # noqa: E501
+        python -m studies identifiability --output docs/identifiability.md --figure docs/figures/identifiability.png
+        python -m studies random --count 200 --seed 1 --output docs
+        python -m studies real --output docs
+        python -m studies stepping --output FOLDER
+        python -m studies verification --fit
+        python -m studies verification --output docs/verification.md
+        """,  # noqa: E501
     "measures times or draws figures, whose results stand in docs": """
         python -m studies batch_speed --output docs/speed.md
         python -m studies condensed_scheme
@@ -236,17 +240,21 @@ READ_ONLY = {
         python -m studies diagnosis_speed --json docs/benchmarks/diagnosis_speed.json
         python -m studies effects_figure
         python -m studies endurance --minutes 60 --output docs/endurance.md
-        python -m studies faster_draws docs/slicing_evaluation.jsonl docs/faster_draws.jsonl
-        --output docs/learning.md python -m studies first_run --json docs/benchmarks/first_run.json
-        python -m studies foods_page --cut --output docs/foods.md python -m studies learning_speed
-        --output docs/learning.md --json docs/benchmarks/learning_speed.json python -m studies
-        policy_and_motion models/policies/cutting_0 --output docs/learning.md python -m studies
-        safety_layer python -m studies scaling --output docs/scaling.md python -m studies scaling
-        --trials 24 --slices 4 --tasks 500 --seconds 2 --output docs/scaling.md python -m studies
-        slicing_ablations --folder output/ablations --output docs/learning.md python -m studies
-        split_step_limit python -m studies stand_in_figure python -m studies station_speed python -m
-        studies station_speed --json docs/benchmarks/station_speed.json python -m studies
-        unfinished_slices docs/slicing_evaluation.jsonl --output docs/learning.md """,  # noqa: E501
+        python -m studies faster_draws docs/slicing_evaluation.jsonl docs/faster_draws.jsonl --output docs/learning.md
+        python -m studies first_run --json docs/benchmarks/first_run.json
+        python -m studies foods_page --cut --output docs/foods.md
+        python -m studies learning_speed --output docs/learning.md --json docs/benchmarks/learning_speed.json
+        python -m studies policy_and_motion models/policies/cutting_0 --output docs/learning.md
+        python -m studies safety_layer
+        python -m studies scaling --output docs/scaling.md
+        python -m studies scaling --trials 24 --slices 4 --tasks 500 --seconds 2 --output docs/scaling.md
+        python -m studies slicing_ablations --folder output/ablations --output docs/learning.md
+        python -m studies split_step_limit
+        python -m studies stand_in_figure
+        python -m studies station_speed
+        python -m studies station_speed --json docs/benchmarks/station_speed.json
+        python -m studies unfinished_slices docs/slicing_evaluation.jsonl --output docs/learning.md
+        """,  # noqa: E501
 }
 
 # Files that a reader has, by the pages that say so.

@@ -406,14 +406,14 @@ def test_with_all_effects_on_the_energy_balance_closes_and_no_loss_is_negative()
     model = bar(razor=False, friction=0.1).derive(effects=ALL)
     solver = CuttingSolver(model, PERIOD)
     losses = []
-    run = solver.coupling_steps
+    run = solver.driver.run
 
     def recorded(*arguments):
-        step = run(*arguments)
-        losses.append(step.dissipation)
-        return step
+        for launch, steps in run(*arguments):
+            losses.append(steps[0].dissipation)
+            yield launch, steps
 
-    solver.coupling_steps = recorded  # type: ignore[method-assign]
+    solver.driver.run = recorded  # type: ignore[method-assign]
     path = motion(
         model,
         press(0.01, 1.0),

@@ -183,7 +183,7 @@ def test_bar_pressed_on_the_board_takes_the_neo_hookean_shape_and_force():
     assert energies.least_volume_ratio == pytest.approx(side**2 * stretch, rel=1e-4)
 
 
-# Through cells, but with no copy below LEAST_SHARE, whose stiffness is not that of its material.
+# Through cells, but with no copy below MIN_SHARE, whose stiffness is not that of its material.
 @pytest.mark.parametrize("offset", [0.0, 3.3e-3], ids=["between layers", "through cells"])
 def test_bar_pressed_between_its_held_ends_is_a_spring_in_series_with_its_uncut_faces(offset):
     mesh = box_mesh(0.02 * UNEVEN - 0.01, np.linspace(-0.02, 0.02, 7), 0.015 * UNEVEN)

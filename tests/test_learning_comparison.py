@@ -203,7 +203,7 @@ def test_the_readme_says_what_the_policies_are_worth():
     facts = json.loads((ROOT / "docs/slicing_results.json").read_text())
     usual = [case for case in facts if case["board_stiffness"] == 3e4]
     ratios = [case["ratios"]["median_force"][0] for case in usual]
-    said = f"meet {min(ratios):.2f} to {max(ratios):.2f} times the contact force"
+    said = f"press with {min(ratios):.2f} to {max(ratios):.2f} times the contact force"
     assert said in " ".join((ROOT / "README.md").read_text().split())
 
 

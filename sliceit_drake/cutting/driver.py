@@ -14,7 +14,7 @@ from sliceit_drake.cutting.knife_path import KnifePath
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.workspace import Workspace
 
-__all__ = ["Driver", "DriverPool", "CouplingSteps", "Launch", "even_launches", "run_coupling_steps"]
+__all__ = ["CouplingSteps", "Driver", "DriverPool", "Launch", "even_launches", "run_coupling_steps"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -14,10 +14,10 @@ from sliceit_drake.cutting.workspace import Workspace, parameter_row
 
 __all__ = [
     "NOT_FINITE",
+    "CouplingStep",
     "CuttingError",
     "CuttingSolver",
     "Energies",
-    "CouplingStep",
     "SurfaceFactors",
 ]
 

@@ -51,7 +51,7 @@ def _input(
     meaning: str,
     required: bool = False,
 ) -> StationPort:
-    return StationPort(name, "input", kind, unit, frame, point, meaning, "coupling_step", required)
+    return StationPort(name, "input", kind, unit, frame, point, meaning, "coupling step", required)
 
 
 def _output(
@@ -77,10 +77,10 @@ STATION_PORTS: tuple[StationPort, ...] = (
         "joints",
         "-",
         "sent to the joint servo",
-        "coupling_step",
+        "coupling step",
     ),
     _output(
-        "commanded_pose", RigidTransform, "m", "W", "Ko", "X_WK at the command", "coupling_step"
+        "commanded_pose", RigidTransform, "m", "W", "Ko", "X_WK at the command", "coupling step"
     ),
     _output("knife_pose", RigidTransform, "m", "W", "Ko", "X_WK measured", "plant"),
     _output("knife_velocity", SpatialVelocity, "m/s, rad/s", "W", "Ko", "V_WK measured", "plant"),
@@ -91,14 +91,14 @@ STATION_PORTS: tuple[StationPort, ...] = (
         "S",
         "So",
         "of the environment on the robot, after taring",
-        "coupling_step",
+        "coupling step",
     ),
     _output(
-        "food_wrench", SpatialForce, "N, Nm", "W", "Ko", "of the food on the knife", "coupling_step"
+        "food_wrench", SpatialForce, "N, Nm", "W", "Ko", "of the food on the knife", "coupling step"
     ),
     _output("board_wrench", SpatialForce, "N, Nm", "W", "Ko", "of the board on the knife", "plant"),
     _output(
-        "cut_progress", 1, "1", "-", "-", "fraction of the section that is cut", "coupling_step"
+        "cut_progress", 1, "1", "-", "-", "fraction of the section that is cut", "coupling step"
     ),
 )
 

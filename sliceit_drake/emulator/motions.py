@@ -15,7 +15,7 @@ Scale = Callable[[], float]
 """Fraction of the planned speed that the speed slider allows now."""
 
 _AT_REST = 1e-6
-_LEAST_ROTATION_RADIUS = 0.1
+_MIN_ROTATION_RADIUS = 0.1
 
 
 class ScriptError(Exception):
@@ -71,7 +71,7 @@ def line_motion(
     # A turn on the spot goes as fast as a point 0.1 m from its axis: our choice.
     distance = max(
         float(np.linalg.norm(end[:3, 3] - X0[:3, 3])),
-        _LEAST_ROTATION_RADIUS * float(np.linalg.norm(turn)),
+        _MIN_ROTATION_RADIUS * float(np.linalg.norm(turn)),
     )
     for share in _trapezoid(distance, speed, acceleration, scale):
         X = np.eye(4)

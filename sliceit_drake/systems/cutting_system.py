@@ -20,7 +20,7 @@ from sliceit_drake.systems.cut_report import Columns, FoodBodyFrame, FoodPicture
 from sliceit_drake.systems.food_visualizer import FoodVisualizer, frame_size
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 
-__all__ = ["COMPLETE", "ENERGY_NAMES", "BALANCE_NAMES", "CuttingSystem"]
+__all__ = ["BALANCE_NAMES", "COMPLETE", "ENERGY_NAMES", "CuttingSystem"]
 
 BALANCE_NAMES = (
     "work",

@@ -4,7 +4,7 @@ At rest everything in a station is discrete and, for small motions, linear. `Con
 down one cycle of it in the order in which the station's events run, with the same periods:
 
 - coupling step: the food takes the knife's pose x = J q and holds its force ``f = -G x`` on the
-knife;
+  knife;
 - controller: ``q_c = q + h v``, ``v <- 0.9 (v + h H^-1 J^T s p e)``, with e the net force of the
   mode, the spring's part at the pose of the last command, f as the sensor read it;
 - servo: ``a_d = gain (q_c - q_d - lookahead v_d)``;
