@@ -28,7 +28,13 @@ FILES = {"record.csv", "replay.html", "force.png", "summary.json", "scenario.yam
 # --- The names.
 
 
-@pytest.mark.parametrize("name", sliceit.__all__)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.second_tier] if name in LEARN else [])
+        for name in sliceit.__all__
+    ],
+)
 def test_a_name_resolves_and_its_docstring_begins_with_what_it_is(name):
     if name in LEARN and importlib.util.find_spec(LEARN[name]) is None:
         pytest.skip(f"{name} is of the extra [learn]")

@@ -274,6 +274,7 @@ def test_a_food_that_slips_is_refused():
         SliceAdjoint(model, PERIOD).run(*path(model))
 
 
+@pytest.mark.second_tier  # Which has torch.
 def test_torch_differentiates_a_slice_by_parameters_and_path(everything):
     torch = pytest.importorskip("torch")
     from sliceit_drake.calibration.gradient import slice_force
