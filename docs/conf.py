@@ -11,6 +11,7 @@ import dataclasses as dc
 import importlib
 import importlib.metadata
 import itertools
+import pydoc
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -261,20 +262,15 @@ def check_names(app: Sphinx, env) -> None:
 # --- Docstrings.
 
 
-def add_fields(app, what: str, name: str, obj, options, lines: list[str]) -> None:
-    """Adds to the docstring of a configuration what its fields say of themselves."""
-    if what != "class" or not dc.is_dataclass(obj):
+def add_limits(app, what: str, name: str, obj, options, lines: list[str]) -> None:
+    """Adds to what a field of a configuration says of itself its unit and range."""
+    owner, _, field_name = name.rpartition(".")
+    if what != "attribute" or not dc.is_dataclass(configuration := pydoc.locate(owner)):
         return
-    found = []
-    for field in dc.fields(obj):
+    for field in dc.fields(configuration):
         rule = field.metadata.get(project)
-        if rule is not None:
-            found.append(f"    {field.name}: {rule.doc} {limits(rule)}".rstrip())
-    if found:
-        while lines and not lines[-1].strip():
-            lines.pop()
-        heading = [] if "Attributes:" in lines else ["", "Attributes:"]
-        lines += [*heading, *found, ""]
+        if rule is not None and field.name == field_name:
+            lines[:] = [f"{' '.join(lines).rstrip()} {limits(rule)}".rstrip(), ""]
 
 
 def limits(rule) -> str:
@@ -322,6 +318,6 @@ def setup(app: Sphinx) -> dict:
     app.connect("env-check-consistency", check_names)
     app.connect("build-finished", open_at_the_index)
     # Before napoleon, which takes sections apart.
-    app.connect("autodoc-process-docstring", add_fields, priority=300)
+    app.connect("autodoc-process-docstring", add_limits, priority=300)
     app.connect("autodoc-process-docstring", as_markdown, priority=310)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,9 +1,9 @@
 """Configuration dataclasses: units and ranges where a field is declared, validation, YAML.
 
-A configuration is a plain dataclass whose fields carry their unit, range and meaning, declared
-with `quantity` and `choice`. `validate` walks a configuration and says where a value is wrong and
-what to do about it; `load_yaml` and `dump_yaml` read and write it as YAML. The dataclass is the
-file format: there is no second schema.
+A configuration is a plain dataclass whose fields carry their unit and range, declared with
+`quantity` and `choice`, and their meaning in a docstring below. `validate` walks a configuration
+and says where a value is wrong and what to do about it; `load_yaml` and `dump_yaml` read and write
+it as YAML. The dataclass is the file format: there is no second schema.
 
 Drake's YAML functions read the field types at run time, so a module that declares configuration
 dataclasses must not use ``from __future__ import annotations``.
@@ -81,21 +81,19 @@ class ConfigurationError(ValueError):
 
 @dc.dataclass(frozen=True)
 class _Quantity:
-    """Unit, range and meaning of a numeric field."""
+    """Unit and range of a numeric field."""
 
     unit: str
     low: float | None
     high: float | None
     size: int | None
-    doc: str
 
 
 @dc.dataclass(frozen=True)
 class _Choice:
-    """Allowed values and meaning of a text field."""
+    """Allowed values of a text field."""
 
     options: tuple[str, ...]
-    doc: str
 
 
 def quantity(
@@ -105,9 +103,8 @@ def quantity(
     low: float | None = None,
     high: float | None = None,
     size: int | None = None,
-    doc: str,
 ) -> Any:
-    """Declares a numeric dataclass field with its unit, range and meaning.
+    """Declares a numeric dataclass field with its unit and range; what it means stands below it.
 
     Args:
         default: Number, list, tuple or array of numbers, or None for an optional field.
@@ -115,7 +112,6 @@ def quantity(
         low: Least allowed value of every element; None for no bound.
         high: Greatest allowed value of every element; None for no bound.
         size: Number of elements that a list or array must have; None for any.
-        doc: What the field means.
 
     Returns:
         The field, for the right-hand side of a dataclass attribute.
@@ -123,25 +119,24 @@ def quantity(
     Raises:
         ValueError: If the declaration contradicts itself.
     """
-    rule = _Quantity(unit, low, high, size, doc)
+    rule = _Quantity(unit, low, high, size)
     if default is not None:
         try:
             _check_quantity(default, rule, "default", is_integer=False)
         except ConfigurationError as error:
-            raise ValueError(f"quantity(...) declared for {doc!r}: {error}") from None
+            raise ValueError(f"quantity(...): {error}") from None
     metadata = {_METADATA_KEY: rule}
     if isinstance(default, list | np.ndarray):
         return dc.field(default_factory=lambda: copy.deepcopy(default), metadata=metadata)
     return dc.field(default=default, metadata=metadata)
 
 
-def choice(default: str, options: collections.abc.Sequence[str], *, doc: str) -> Any:
+def choice(default: str, options: collections.abc.Sequence[str]) -> Any:
     """Declares a text dataclass field that takes one of a few values.
 
     Args:
         default: The value if none is given; one of `options`.
         options: Allowed values.
-        doc: What the field means.
 
     Returns:
         The field, for the right-hand side of a dataclass attribute.
@@ -150,8 +145,8 @@ def choice(default: str, options: collections.abc.Sequence[str], *, doc: str) ->
         ValueError: If the default is not among the options.
     """
     if default not in options:
-        raise ValueError(f"choice(...) declared for {doc!r}: {default!r} is not in {options}")
-    return dc.field(default=default, metadata={_METADATA_KEY: _Choice(tuple(options), doc)})
+        raise ValueError(f"choice(...): {default!r} is not in {options}")
+    return dc.field(default=default, metadata={_METADATA_KEY: _Choice(tuple(options))})
 
 
 def unit_of(config: Any, path: str) -> str:
@@ -193,7 +188,7 @@ def validate(config: Any, where: str) -> None:
         for key, item in config.items():
             validate(item, f"{where}.{key}")
     elif isinstance(config, float | np.ndarray):
-        _check_quantity(config, _Quantity("", None, None, None, ""), where, is_integer=False)
+        _check_quantity(config, _Quantity("", None, None, None), where, is_integer=False)
 
 
 def _check_field(value: Any, field: dc.Field, where: str) -> None:

@@ -1,6 +1,8 @@
 """Configuration: units, ranges and YAML, and errors that say where and what to do."""
 
+import ast
 import dataclasses as dc
+import itertools
 import subprocess
 import sys
 import typing
@@ -9,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import sliceit_drake
 from sliceit_drake.configuration import (
     ConfigurationError,
     choice,
@@ -21,18 +24,22 @@ from sliceit_drake.configuration import (
 
 @dc.dataclass
 class Board:
-    height: float = quantity(0.05, "m", low=-1.0, high=2.0, doc="Height of the top surface.")
-    spheres: int = quantity(7, "", low=1, high=50, doc="Number of contact spheres.")
+    height: float = quantity(0.05, "m", low=-1.0, high=2.0)
+    """Height of the top surface."""
+    spheres: int = quantity(7, "", low=1, high=50)
+    """Number of contact spheres."""
 
 
 @dc.dataclass
 class Press:
-    speed: float = quantity(0.02, "m/s", low=1e-4, high=1.0, doc="Speed of the press.")
+    speed: float = quantity(0.02, "m/s", low=1e-4, high=1.0)
+    """Speed of the press."""
 
 
 @dc.dataclass
 class Hold:
-    duration: float = quantity(0.5, "s", low=0.0, high=60.0, doc="Time at rest.")
+    duration: float = quantity(0.5, "s", low=0.0, high=60.0)
+    """Time at rest."""
 
 
 @dc.dataclass
@@ -42,19 +49,26 @@ class Station:
     motion: Press | Hold = dc.field(default_factory=Press)
     motions: list[Press | Hold] = dc.field(default_factory=list)
     foods: dict[str, Board] = dc.field(default_factory=dict)
-    position: list[float] = quantity([0.0, 0.0, 0.2], "m", low=-1, high=1, size=3, doc="Place.")
-    gains: np.ndarray = quantity(np.full(6, 0.1), "", low=0.0, high=10.0, doc="Gains.")
-    tilt: float = quantity(0.0, "rad", low=-0.5, high=0.5, doc="Tilt of the knife.")
-    mass: float | None = quantity(None, "kg", low=0.1, high=10.0, doc="Mass, if known.")
-    shape: str = choice("box", ("box", "cylinder"), doc="Shape of the food.")
+    position: list[float] = quantity([0.0, 0.0, 0.2], "m", low=-1, high=1, size=3)
+    """Place."""
+    gains: np.ndarray = quantity(np.full(6, 0.1), "", low=0.0, high=10.0)
+    """Gains."""
+    tilt: float = quantity(0.0, "rad", low=-0.5, high=0.5)
+    """Tilt of the knife."""
+    mass: float | None = quantity(None, "kg", low=0.1, high=10.0)
+    """Mass, if known."""
+    shape: str = choice("box", ("box", "cylinder"))
+    """Shape of the food."""
     name: str = ""
     closed: bool = False
 
 
 @dc.dataclass
 class Range:
-    begin: float = quantity(0.0, "s", low=0.0, doc="Begin.")
-    end: float = quantity(1.0, "s", low=0.0, doc="End.")
+    begin: float = quantity(0.0, "s", low=0.0)
+    """Begin."""
+    end: float = quantity(1.0, "s", low=0.0)
+    """End."""
 
     def check(self, where: str) -> None:
         if self.end <= self.begin:
@@ -240,10 +254,25 @@ def test_a_configuration_built_in_python_is_checked_too(change, message):
 
 
 def test_a_contradictory_declaration_is_refused_when_it_is_made():
-    with pytest.raises(ValueError, match="declared for 'Height.'"):
-        quantity(3.0, "m", high=2.0, doc="Height.")
-    with pytest.raises(ValueError, match="declared for 'Shape.'"):
-        choice("cone", ("box",), doc="Shape.")
+    with pytest.raises(ValueError, match="default: 3 m is not at most 2 m"):
+        quantity(3.0, "m", high=2.0)
+    with pytest.raises(ValueError, match="'cone' is not in"):
+        choice("cone", ("box",))
+
+
+def test_every_declared_field_of_the_package_says_what_it_means():
+    package = Path(sliceit_drake.__file__).parent
+    undocumented = [
+        f"{file}:{node.lineno}"
+        for file in sorted(package.rglob("*.py"))
+        for cls in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(cls, ast.ClassDef)
+        for node, following in itertools.pairwise([*cls.body, ast.Pass()])
+        if isinstance(node, ast.AnnAssign)
+        and ast.unparse(node.value or node).startswith(("quantity(", "choice("))
+        and not (isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant))
+    ]
+    assert not undocumented
 
 
 def test_a_list_default_is_not_shared_between_instances():

@@ -29,10 +29,10 @@ class Posterior(ParameterDistribution):
         notes: What a reader must know.
     """
 
-    effective_samples: float = quantity(0.0, "", low=0.0, high=1e12, doc="In number.")
-    record_variation: float | None = quantity(
-        None, "", low=0.0, high=10.0, doc="Relative, between slices."
-    )
+    effective_samples: float = quantity(0.0, "", low=0.0, high=1e12)
+    """In number."""
+    record_variation: float | None = quantity(None, "", low=0.0, high=10.0)
+    """Relative, between slices."""
     notes: list[str] = dc.field(default_factory=list)
 
     def shared(self) -> ParameterDistribution:

@@ -28,9 +28,12 @@ class ParameterRange:
     """
 
     name: str = ""
-    low: float = quantity(0.0, "", low=-1e12, high=1e12, doc="Least value, in the field's unit.")
-    high: float = quantity(1.0, "", low=-1e12, high=1e12, doc="Greatest value.")
-    scale: str = choice("log", ("log", "linear"), doc="In what the search is uniform.")
+    low: float = quantity(0.0, "", low=-1e12, high=1e12)
+    """Least value, in the field's unit."""
+    high: float = quantity(1.0, "", low=-1e12, high=1e12)
+    """Greatest value."""
+    scale: str = choice("log", ("log", "linear"))
+    """In what the search is uniform."""
     why: str = ""
 
     def check(self, where: str) -> None:
@@ -46,10 +49,10 @@ class ParameterRange:
 class Literature:
     """What is published of a food that nobody recorded for us."""
 
-    peak_force: list[float] = quantity(
-        [1.0, 100.0], "N", low=0.01, high=1e4, size=2, doc="Range of the largest force of a cut."
-    )
-    speed: float = quantity(0.02, "m/s", low=1e-4, high=1.0, doc="Of the simulated press cut.")
+    peak_force: list[float] = quantity([1.0, 100.0], "N", low=0.01, high=1e4, size=2)
+    """Range of the largest force of a cut."""
+    speed: float = quantity(0.02, "m/s", low=1e-4, high=1.0)
+    """Of the simulated press cut."""
     source: str = ""
 
     def check(self, where: str) -> None:
@@ -75,28 +78,18 @@ class CalibrationSetup:
     board: Board = dc.field(default_factory=Board)
     numerics: Numerics = dc.field(default_factory=Numerics)
     parameters: list[ParameterRange] = dc.field(default_factory=list)
-    height_offset: list[float] = quantity(
-        [-2e-3, 2e-3], "m", low=-0.02, high=0.02, size=2, doc="Range of each record's height."
-    )
-    speed_factor: list[float] = quantity(
-        [0.9, 1.2], "", low=0.2, high=5.0, size=2, doc="Range where a record's speed is unknown."
-    )
-    refinement: float = quantity(
-        1.0, "", low=0.2, high=4.0, doc="Elements along an edge, relative to the food's mesh."
-    )
+    height_offset: list[float] = quantity([-2e-3, 2e-3], "m", low=-0.02, high=0.02, size=2)
+    """Range of each record's height."""
+    speed_factor: list[float] = quantity([0.9, 1.2], "", low=0.2, high=5.0, size=2)
+    """Range where a record's speed is unknown."""
+    refinement: float = quantity(1.0, "", low=0.2, high=4.0)
+    """Elements along an edge, relative to the food's mesh."""
     literature: Literature | None = None
     """For a food without records, see literature.py."""
-    oscillation: list[float] | None = quantity(
-        None,
-        "Hz",
-        low=0.1,
-        high=250.0,
-        size=2,
-        doc="Frequencies of an oscillation of each record, see oscillation.py; null for none.",
-    )
-    search_time_step: float = quantity(
-        1e-3, "s", low=1e-6, high=1e-2, doc="Sub-step of the search; must divide 2 ms."
-    )
+    oscillation: list[float] | None = quantity(None, "Hz", low=0.1, high=250.0, size=2)
+    """Frequencies of an oscillation of each record, see oscillation.py; null for none."""
+    search_time_step: float = quantity(1e-3, "s", low=1e-6, high=1e-2)
+    """Sub-step of the search; must divide 2 ms."""
 
     def check(self, where: str) -> None:
         names = [p.name for p in self.parameters]

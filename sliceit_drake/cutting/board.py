@@ -31,16 +31,14 @@ class Board:
     assumed here; the default is as stiff as steps of 1 ms resolve (docs/physics.md).
     """
 
-    height: float = quantity(0.05, "m", low=-1.0, high=2.0, doc="Top surface in the world frame.")
-    size: list[float] = quantity(
-        [0.30, 0.20, 0.02], "m", low=1e-3, high=2.0, size=3, doc="Extent along x, y and thickness."
-    )
-    stiffness: float = quantity(
-        3e4, "N/m", low=1e2, high=1e8, doc="Force over penetration of the whole edge."
-    )
-    dissipation: float = quantity(
-        1.0, "s/m", low=0.0, high=100.0, doc="Hunt-Crossley dissipation: F = k d (1 + D d')."
-    )
+    height: float = quantity(0.05, "m", low=-1.0, high=2.0)
+    """Top surface in the world frame."""
+    size: list[float] = quantity([0.30, 0.20, 0.02], "m", low=1e-3, high=2.0, size=3)
+    """Extent along x, y and thickness."""
+    stiffness: float = quantity(3e4, "N/m", low=1e2, high=1e8)
+    """Force over penetration of the whole edge."""
+    dissipation: float = quantity(1.0, "s/m", low=0.0, high=100.0)
+    """Hunt-Crossley dissipation: F = k d (1 + D d')."""
 
 
 def edge_contact_positions(knife: Knife) -> np.ndarray:

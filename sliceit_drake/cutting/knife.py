@@ -29,42 +29,25 @@ class Knife:
     docs/physics.md.
     """
 
-    profile: str = choice(
-        "straight",
-        ("straight", *UNSUPPORTED),
-        doc="Kind of edge; only a straight one with two equal bevels can be computed.",
-    )
-    spine_thickness: float = quantity(
-        3.5e-3, "m", low=2e-4, high=2e-2, doc="Thickness at the spine."
-    )
-    edge_thickness: float = quantity(
-        8e-5,
-        "m",
-        low=1e-6,
-        high=2e-3,
-        doc="Thickness at the shoulder, where the edge bevel begins.",
-    )
-    height: float = quantity(59e-3, "m", low=5e-3, high=0.3, doc="From the shoulder to the spine.")
-    tip_height: float = quantity(
-        4e-5, "m", low=1e-6, high=5e-3, doc="From the edge to the shoulder."
-    )
-    length: float = quantity(0.150, "m", low=0.02, high=0.6, doc="Length of the edge.")
-    edge_radius: float = quantity(
-        0.0, "m", low=0.0, high=5e-4, doc="Radius of the rounded edge and of the other corners."
-    )
-    lateral_stiffness: float = quantity(
-        2e4,
-        "N/m",
-        low=1e2,
-        high=1e8,
-        doc=(
-            "Stiffness of the edge's middle against lateral force: a steel cantilever of the mean "
-            "section held 0.1 m away, 3 E I / L^3 = 17 kN/m with E = 200 GPa."
-        ),
-    )
-    lateral_relaxation_time: float = quantity(
-        1e-3, "s", low=0.0, high=0.1, doc="Damping over stiffness of the bending blade."
-    )
+    profile: str = choice("straight", ("straight", *UNSUPPORTED))
+    """Kind of edge; only a straight one with two equal bevels can be computed."""
+    spine_thickness: float = quantity(3.5e-3, "m", low=2e-4, high=2e-2)
+    """Thickness at the spine."""
+    edge_thickness: float = quantity(8e-5, "m", low=1e-6, high=2e-3)
+    """Thickness at the shoulder, where the edge bevel begins."""
+    height: float = quantity(59e-3, "m", low=5e-3, high=0.3)
+    """From the shoulder to the spine."""
+    tip_height: float = quantity(4e-5, "m", low=1e-6, high=5e-3)
+    """From the edge to the shoulder."""
+    length: float = quantity(0.150, "m", low=0.02, high=0.6)
+    """Length of the edge."""
+    edge_radius: float = quantity(0.0, "m", low=0.0, high=5e-4)
+    """Radius of the rounded edge and of the other corners."""
+    lateral_stiffness: float = quantity(2e4, "N/m", low=1e2, high=1e8)
+    """Stiffness of the edge's middle against lateral force: a steel cantilever of the mean section
+    held 0.1 m away, 3 E I / L^3 = 17 kN/m with E = 200 GPa."""
+    lateral_relaxation_time: float = quantity(1e-3, "s", low=0.0, high=0.1)
+    """Damping over stiffness of the bending blade."""
 
     def check(self, where: str) -> None:
         if self.profile in UNSUPPORTED:

@@ -40,52 +40,32 @@ class TimeStepError(ValueError):
 class Numerics:
     """Numerical settings of a cut. Contacts and bonds scale with E over the edge length h."""
 
-    time_step: float = quantity(
-        2.5e-4, "s", low=1e-7, high=5e-3, doc="Sub-step; must divide the coupling period."
-    )
+    time_step: float = quantity(2.5e-4, "s", low=1e-7, high=5e-3)
+    """Sub-step; must divide the coupling period."""
     mass_scaling: bool = True
     """Whether masses are raised where the step asks for it; else a step too long is refused."""
-    stability_margin: float = quantity(
-        0.8, "", low=0.1, high=0.95, doc="Step over the Gershgorin stability limit."
-    )
-    numerical_damping: float = quantity(
-        0.2, "", low=0.0, high=0.5, doc="Viscosity added to the material's, in steps."
-    )
-    local_damping: float = quantity(
-        0.5,
-        "",
-        low=0.0,
-        high=0.9,
-        doc="Fraction of the unbalanced force that opposes the motion of nodes with scaled masses.",
-    )
-    bond_stiffness: float = quantity(
-        4.0,
-        "E/h",
-        low=0.01,
-        high=1e3,
-        doc="Stiffness of the uncut faces and of their self contact.",
-    )
-    flank_stiffness: float = quantity(
-        4.0, "E/h", low=0.01, high=1e3, doc="Contact stiffness of the flanks, also in friction."
-    )
-    board_stiffness: float = quantity(
-        1.0, "E/h", low=0.01, high=1e3, doc="Contact stiffness of the food on the board."
-    )
-    board_friction: float = quantity(0.3, "", low=0.0, high=2.0, doc="Friction of food on board.")
-    board_damping_time: float = quantity(
-        5e-3, "s", low=0.0, high=1.0, doc="Damping over stiffness of the food on the board."
-    )
-    unloading_length: float = quantity(
-        1e-4,
-        "m",
-        low=1e-6,
-        high=1e-2,
-        doc="Retreat of the edge over which its force vanishes; less where it rises more steeply.",
-    )
-    direction_length: float = quantity(
-        2e-4, "m", low=1e-7, high=1e-2, doc="Travel over which the edge's direction follows."
-    )
-    precision: str = choice("float32", ("float32", "float64"), doc="Arithmetic of the kernels.")
+    stability_margin: float = quantity(0.8, "", low=0.1, high=0.95)
+    """Step over the Gershgorin stability limit."""
+    numerical_damping: float = quantity(0.2, "", low=0.0, high=0.5)
+    """Viscosity added to the material's, in steps."""
+    local_damping: float = quantity(0.5, "", low=0.0, high=0.9)
+    """Fraction of the unbalanced force that opposes the motion of nodes with scaled masses."""
+    bond_stiffness: float = quantity(4.0, "E/h", low=0.01, high=1e3)
+    """Stiffness of the uncut faces and of their self contact."""
+    flank_stiffness: float = quantity(4.0, "E/h", low=0.01, high=1e3)
+    """Contact stiffness of the flanks, also in friction."""
+    board_stiffness: float = quantity(1.0, "E/h", low=0.01, high=1e3)
+    """Contact stiffness of the food on the board."""
+    board_friction: float = quantity(0.3, "", low=0.0, high=2.0)
+    """Friction of food on board."""
+    board_damping_time: float = quantity(5e-3, "s", low=0.0, high=1.0)
+    """Damping over stiffness of the food on the board."""
+    unloading_length: float = quantity(1e-4, "m", low=1e-6, high=1e-2)
+    """Retreat of the edge over which its force vanishes; less where it rises more steeply."""
+    direction_length: float = quantity(2e-4, "m", low=1e-7, high=1e-2)
+    """Travel over which the edge's direction follows."""
+    precision: str = choice("float32", ("float32", "float64"))
+    """Arithmetic of the kernels."""
     device: str = "cpu"
     """A device by Warp's name: "cpu", "cuda" or "cuda:1"."""
 

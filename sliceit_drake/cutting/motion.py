@@ -94,35 +94,20 @@ class _Path(typing.Protocol):
     def velocity(self, t: float) -> Velocity: ...
 
 
-def _acceleration_field() -> typing.Any:
-    return quantity(
-        None,
-        "m/s2",
-        low=1e-3,
-        high=100.0,
-        doc="Acceleration of the ramps at start and stop; if not given, the velocity steps.",
-    )
-
-
 @dc.dataclass
 class ConstantSpeed:
     """Straight motion at constant speed, over a distance or for a duration (give one of them)."""
 
-    speed: float = quantity(
-        0.02,
-        "m/s",
-        low=1e-6,
-        high=2.0,
-        doc="Speed between the ramps; not reached on a path too short for them.",
-    )
-    direction: list[float] = quantity(
-        [0.0, 0.0, 1.0], "", size=3, doc="Direction in K at the start; its length does not matter."
-    )
-    distance: float | None = quantity(None, "m", low=1e-6, high=1.0, doc="Distance to travel.")
-    duration: float | None = quantity(
-        None, "s", low=1e-6, high=3600.0, doc="Duration of the segment, ramps included."
-    )
-    acceleration: float | None = _acceleration_field()
+    speed: float = quantity(0.02, "m/s", low=1e-6, high=2.0)
+    """Speed between the ramps; not reached on a path too short for them."""
+    direction: list[float] = quantity([0.0, 0.0, 1.0], "", size=3)
+    """Direction in K at the start; its length does not matter."""
+    distance: float | None = quantity(None, "m", low=1e-6, high=1.0)
+    """Distance to travel."""
+    duration: float | None = quantity(None, "s", low=1e-6, high=3600.0)
+    """Duration of the segment, ramps included."""
+    acceleration: float | None = quantity(None, "m/s2", low=1e-3, high=100.0)
+    """Acceleration of the ramps at start and stop; if not given, the velocity steps."""
     label: str = "slice"
 
     def check(self, where: str) -> None:
@@ -167,14 +152,18 @@ class PressAndDraw:
     z = press_speed tau and x = draw_ratio z + amplitude sin(2 pi frequency tau).
     """
 
-    press_speed: float = quantity(0.02, "m/s", low=1e-6, high=2.0, doc="Speed along z.")
-    distance: float = quantity(0.03, "m", low=1e-6, high=1.0, doc="Distance to travel along z.")
-    draw_ratio: float = quantity(
-        0.0, "", low=-100.0, high=100.0, doc="Draw over press speed, xi, of the steady draw."
-    )
-    amplitude: float = quantity(0.0, "m", low=0.0, high=0.5, doc="Amplitude of the sinusoid.")
-    frequency: float = quantity(1.0, "Hz", low=1e-3, high=50.0, doc="Frequency of the sinusoid.")
-    acceleration: float | None = _acceleration_field()
+    press_speed: float = quantity(0.02, "m/s", low=1e-6, high=2.0)
+    """Speed along z."""
+    distance: float = quantity(0.03, "m", low=1e-6, high=1.0)
+    """Distance to travel along z."""
+    draw_ratio: float = quantity(0.0, "", low=-100.0, high=100.0)
+    """Draw over press speed, xi, of the steady draw."""
+    amplitude: float = quantity(0.0, "m", low=0.0, high=0.5)
+    """Amplitude of the sinusoid."""
+    frequency: float = quantity(1.0, "Hz", low=1e-3, high=50.0)
+    """Frequency of the sinusoid."""
+    acceleration: float | None = quantity(None, "m/s2", low=1e-3, high=100.0)
+    """Acceleration of the ramps at start and stop; if not given, the velocity steps."""
     label: str = "slice"
 
     def build(self) -> _Path:
@@ -201,7 +190,8 @@ class PressAndDraw:
 class Hold:
     """Rest at the pose where the segment before it ended."""
 
-    duration: float = quantity(0.2, "s", low=1e-6, high=3600.0, doc="Duration.")
+    duration: float = quantity(0.2, "s", low=1e-6, high=3600.0)
+    """Duration."""
     label: str = "hold"
 
     def build(self) -> _Path:
@@ -213,15 +203,12 @@ class Hold:
 class Retract:
     """Straight withdrawal against the cutting direction."""
 
-    distance: float = quantity(0.05, "m", low=1e-6, high=1.0, doc="Distance to travel along -z.")
-    speed: float = quantity(
-        0.05,
-        "m/s",
-        low=1e-6,
-        high=2.0,
-        doc="Speed between the ramps; not reached on a path too short for them.",
-    )
-    acceleration: float | None = _acceleration_field()
+    distance: float = quantity(0.05, "m", low=1e-6, high=1.0)
+    """Distance to travel along -z."""
+    speed: float = quantity(0.05, "m/s", low=1e-6, high=2.0)
+    """Speed between the ramps; not reached on a path too short for them."""
+    acceleration: float | None = quantity(None, "m/s2", low=1e-3, high=100.0)
+    """Acceleration of the ramps at start and stop; if not given, the velocity steps."""
     label: str = "retract"
 
     def build(self) -> _Path:
@@ -234,25 +221,15 @@ class Retract:
 class Waypoints:
     """Motion from the start through given poses, each reached at its time."""
 
-    times: list[float] = quantity(
-        [1.0], "s", low=1e-6, high=3600.0, doc="Time since the start of each waypoint, increasing."
-    )
-    positions: list[list[float]] = quantity(
-        [[0.0, 0.0, 0.0]], "m", low=-2.0, high=2.0, doc="Position of each waypoint in K at start."
-    )
-    rotations: list[list[float]] = quantity(
-        [],
-        "rad",
-        low=-np.pi,
-        high=np.pi,
-        doc="Roll, pitch, yaw of each waypoint relative to K at start (about fixed x, y, z in this"
-        " order); empty for none.",
-    )
-    interpolation: str = choice(
-        "smooth",
-        ("smooth", "linear"),
-        doc="smooth: each leg starts and ends at rest (minimum jerk); linear: at constant speed.",
-    )
+    times: list[float] = quantity([1.0], "s", low=1e-6, high=3600.0)
+    """Time since the start of each waypoint, increasing."""
+    positions: list[list[float]] = quantity([[0.0, 0.0, 0.0]], "m", low=-2.0, high=2.0)
+    """Position of each waypoint in K at start."""
+    rotations: list[list[float]] = quantity([], "rad", low=-np.pi, high=np.pi)
+    """Roll, pitch, yaw of each waypoint relative to K at start (about fixed x, y, z in this order);
+    empty for none."""
+    interpolation: str = choice("smooth", ("smooth", "linear"))
+    """smooth: each leg starts and ends at rest (minimum jerk); linear: at constant speed."""
     label: str = "move"
 
     def check(self, where: str) -> None:
@@ -299,12 +276,9 @@ class Recorded:
     """
 
     file: str = ""
-    placement: str = choice(
-        "start",
-        ("start", "world"),
-        doc="start: moved so that its first pose is where the segment starts; world: as recorded,"
-        " which only the first segment can be.",
-    )
+    placement: str = choice("start", ("start", "world"))
+    """start: moved so that its first pose is where the segment starts; world: as recorded, which
+    only the first segment can be."""
     label: str = "recorded"
 
     def check(self, where: str) -> None:

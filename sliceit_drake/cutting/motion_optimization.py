@@ -30,20 +30,18 @@ NAMES = ("amplitude", "frequency", "press_speed")
 class MotionLimits:
     """Limits of a slicing motion."""
 
-    duration: float = quantity(3.0, "s", low=0.05, high=600.0, doc="Longest time of the cut.")
-    draw_speed: float = quantity(0.15, "m/s", low=1e-4, high=2.0, doc="Greatest, along the edge.")
-    draw_acceleration: float = quantity(
-        2.0, "m/s2", low=1e-3, high=50.0, doc="Greatest, along the edge."
-    )
-    press_speed: list[float] = quantity(
-        [0.003, 0.1], "m/s", low=1e-4, high=1.0, size=2, doc="Least and greatest."
-    )
-    frequency: list[float] = quantity(
-        [0.2, 5.0], "Hz", low=1e-2, high=50.0, size=2, doc="Least and greatest."
-    )
-    margin: float = quantity(
-        0.01, "m", low=0.0, high=0.5, doc="Length of edge that stays beyond the food at each end."
-    )
+    duration: float = quantity(3.0, "s", low=0.05, high=600.0)
+    """Longest time of the cut."""
+    draw_speed: float = quantity(0.15, "m/s", low=1e-4, high=2.0)
+    """Greatest, along the edge."""
+    draw_acceleration: float = quantity(2.0, "m/s2", low=1e-3, high=50.0)
+    """Greatest, along the edge."""
+    press_speed: list[float] = quantity([0.003, 0.1], "m/s", low=1e-4, high=1.0, size=2)
+    """Least and greatest."""
+    frequency: list[float] = quantity([0.2, 5.0], "Hz", low=1e-2, high=50.0, size=2)
+    """Least and greatest."""
+    margin: float = quantity(0.01, "m", low=0.0, high=0.5)
+    """Length of edge that stays beyond the food at each end."""
 
     def amplitude(self, model: CuttingModel) -> float:
         """Greatest amplitude that keeps the food on the edge, m.

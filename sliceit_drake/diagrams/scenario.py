@@ -39,24 +39,20 @@ CLEAR_OF_FOOD = 1e-3
 class Placement:
     """Where the food lies on the board, in the world."""
 
-    position: list[float] = quantity(
-        [0.026, -0.505], "m", low=-3.0, high=3.0, size=2, doc="Origin of F, x and y."
-    )
-    yaw: float = quantity(
-        0.5 * np.pi, "rad", low=-6.3, high=6.3, doc="Direction of Fx, along the blade, about Wz."
-    )
+    position: list[float] = quantity([0.026, -0.505], "m", low=-3.0, high=3.0, size=2)
+    """Origin of F, x and y."""
+    yaw: float = quantity(0.5 * np.pi, "rad", low=-6.3, high=6.3)
+    """Direction of Fx, along the blade, about Wz."""
 
 
 @dc.dataclass
 class Start:
     """Where the knife starts, relative to the top of the cut."""
 
-    clearance: float = quantity(
-        0.01, "m", low=-0.05, high=0.5, doc="Height of the edge above the food."
-    )
-    offset: float = quantity(
-        0.0, "m", low=-0.2, high=0.2, doc="Shift of the edge's middle along the edge."
-    )
+    clearance: float = quantity(0.01, "m", low=-0.05, high=0.5)
+    """Height of the edge above the food."""
+    offset: float = quantity(0.0, "m", low=-0.2, high=0.2)
+    """Shift of the edge's middle along the edge."""
 
 
 @dc.dataclass
@@ -65,10 +61,10 @@ class Measurement:
 
     file: str = ""
     """CSV of `records.force_profile`, relative to the resources or to the working directory."""
-    speed: float = quantity(0.02, "m/s", low=1e-4, high=1.0, doc="Downward speed of the record.")
-    time_offset: float | None = quantity(
-        None, "s", low=-10.0, high=10.0, doc="Record time at first contact; null: fitted."
-    )
+    speed: float = quantity(0.02, "m/s", low=1e-4, high=1.0)
+    """Downward speed of the record."""
+    time_offset: float | None = quantity(None, "s", low=-10.0, high=10.0)
+    """Record time at first contact; null: fitted."""
 
 
 @dc.dataclass
@@ -80,16 +76,10 @@ class Preparation:
     """
 
     peeled: bool = False
-    weight: float = quantity(
-        0.0,
-        "kg",
-        low=0.0,
-        high=20.0,
-        doc='Mass hung on the knife at Ko in segments "weight"; the simulated arm has none.',
-    )
-    knife_slices: int = quantity(
-        0, "", low=0, high=10**6, doc="Slices since sharpening before the first."
-    )
+    weight: float = quantity(0.0, "kg", low=0.0, high=20.0)
+    """Mass hung on the knife at Ko in segments "weight"; the simulated arm has none."""
+    knife_slices: int = quantity(0, "", low=0, high=10**6)
+    """Slices since sharpening before the first."""
 
 
 @dc.dataclass
@@ -97,14 +87,10 @@ class Scenario:
     """One slice: robot, controller, knife, food, board, motion."""
 
     name: str = "cucumber"
-    seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Seed of everything random.")
-    exchange_period: float = quantity(
-        0.002,
-        "s",
-        low=2.5e-4,
-        high=0.02,
-        doc="Interval at which food, controller and sensor update.",
-    )
+    seed: int = quantity(0, "", low=0, high=2**31 - 1)
+    """Seed of everything random."""
+    exchange_period: float = quantity(0.002, "s", low=2.5e-4, high=0.02)
+    """Interval at which food, controller and sensor update."""
     robot: RobotConfig = dc.field(default_factory=RobotConfig)
     sensor: WrenchSensorConfig = dc.field(default_factory=WrenchSensorConfig)
     controller: ComplianceControllerConfig = dc.field(default_factory=ComplianceControllerConfig)
@@ -118,11 +104,8 @@ class Scenario:
     """A calibrated food, by name (calibration/foods) or file: its material, effects and flank
     stiffness take the place of those in `food` and `numerics`."""
     numerics: Numerics = dc.field(default_factory=Numerics)
-    holder: str = choice(
-        "clamp",
-        ("clamp", "arm"),
-        doc="What is drawn where the food is held; arm: a second UR5e that stands still.",
-    )
+    holder: str = choice("clamp", ("clamp", "arm"))
+    """What is drawn where the food is held; arm: a second UR5e that stands still."""
     placement: Placement = dc.field(default_factory=Placement)
     start: Start = dc.field(default_factory=Start)
     motion: MotionPlan = dc.field(default_factory=MotionPlan)

@@ -23,34 +23,29 @@ class SliceSequence:
     strain is forgotten.
     """
 
-    count: int = quantity(5, "", low=1, high=200, doc="Slices to cut.")
-    thickness: float = quantity(5e-3, "m", low=5e-4, high=0.1, doc="Of every slice.")
-    trim: float = quantity(
-        0.0, "m", low=0.0, high=0.5, doc="Length that has been cut off the free end before."
-    )
-    indexing: str = choice(
-        "knife",
-        ("knife", "food"),
-        doc="What moves by the thickness between two slices. knife: the knife, towards the holder;"
-        " food: the holder pushes the food while the knife waits above it.",
-    )
-    slice_speed: float = quantity(0.02, "m/s", low=1e-4, high=1.0, doc="Of the knife, downwards.")
-    travel_speed: float = quantity(
-        0.15, "m/s", low=1e-3, high=1.0, doc="Of retracting, indexing and approaching."
-    )
-    acceleration: float = quantity(1.0, "m/s2", low=1e-2, high=20.0, doc="Of all ramps.")
-    overtravel: float = quantity(
-        2e-4, "m", low=0.0, high=5e-3, doc="Depth of the knife's target below the board's top."
-    )
-    hold: float = quantity(0.1, "s", low=1e-3, high=60.0, doc="Rest at the board.")
-    slice_layers: int = quantity(2, "", low=1, high=20, doc="Layers of elements in a slice.")
-    layers: list[float] = quantity(
-        [2.8e-3, 6.4e-3, 12e-3],
-        "m",
-        low=1e-4,
-        high=0.5,
-        doc="Distances of the element layers behind the cut; takes the place of food.shape's.",
-    )
+    count: int = quantity(5, "", low=1, high=200)
+    """Slices to cut."""
+    thickness: float = quantity(5e-3, "m", low=5e-4, high=0.1)
+    """Of every slice."""
+    trim: float = quantity(0.0, "m", low=0.0, high=0.5)
+    """Length that has been cut off the free end before."""
+    indexing: str = choice("knife", ("knife", "food"))
+    """What moves by the thickness between two slices. knife: the knife, towards the holder; food:
+    the holder pushes the food while the knife waits above it."""
+    slice_speed: float = quantity(0.02, "m/s", low=1e-4, high=1.0)
+    """Of the knife, downwards."""
+    travel_speed: float = quantity(0.15, "m/s", low=1e-3, high=1.0)
+    """Of retracting, indexing and approaching."""
+    acceleration: float = quantity(1.0, "m/s2", low=1e-2, high=20.0)
+    """Of all ramps."""
+    overtravel: float = quantity(2e-4, "m", low=0.0, high=5e-3)
+    """Depth of the knife's target below the board's top."""
+    hold: float = quantity(0.1, "s", low=1e-3, high=60.0)
+    """Rest at the board."""
+    slice_layers: int = quantity(2, "", low=1, high=20)
+    """Layers of elements in a slice."""
+    layers: list[float] = quantity([2.8e-3, 6.4e-3, 12e-3], "m", low=1e-4, high=0.5)
+    """Distances of the element layers behind the cut; takes the place of food.shape's."""
 
     def foods(self, food: Food) -> list[Food]:
         """The food of each slice: what the slices before it have left."""

@@ -26,57 +26,25 @@ least value."""
 class RewardConfig:
     """Weights of the terms, and what an episode's end gives."""
 
-    weights: list[float] = quantity(
-        [0.25, 8.0, 1.0, 0.25],
-        "",
-        low=0.0,
-        size=4,
-        doc="Weights of distance, force, jerk and step; only their ratios count. SliceIt! has all "
-        "equal.",
-    )
-    schedule: str = choice(
-        "constant",
-        ("constant", "gaussian"),
-        doc="gaussian: the weight moves from distance to force to jerk during the training.",
-    )
-    force_shape: str = choice(
-        "square",
-        ("square", "sigmoid"),
-        doc="Shape of the force term: the square of force over scale, at most 1, or SliceIt!'s.",
-    )
-    force_scale: float = quantity(
-        40.0,
-        "N",
-        low=0.01,
-        high=1e3,
-        doc="Scale of the force term. A sigmoid is half at three times as much; 2 in SliceIt!.",
-    )
-    goal: float = quantity(
-        15.0, "", low=0.0, doc="Reward for a slice that is done; 100 in SliceIt!."
-    )
-    way: float = quantity(
-        15.0,
-        "",
-        low=0.0,
-        doc="Part of `reward_potential` for 60 mm of way down; not in SliceIt!.",
-    )
-    hold: float = quantity(
-        5.0, "", low=0.0, doc="Part of `reward_potential` for the decisions at the goal."
-    )
-    discount: float = quantity(
-        0.99,
-        "",
-        low=0.0,
-        high=1.0,
-        doc="Discount of a decision; of the potential too, so that it changes no policy's worth.",
-    )
-    collision: float = quantity(
-        -15.0,
-        "",
-        high=0.0,
-        doc="Reward for a force over the limit, leaving the workspace, or a failure; -100 in "
-        "SliceIt!.",
-    )
+    weights: list[float] = quantity([0.25, 8.0, 1.0, 0.25], "", low=0.0, size=4)
+    """Weights of distance, force, jerk and step; only their ratios count. SliceIt! has all
+    equal."""
+    schedule: str = choice("constant", ("constant", "gaussian"))
+    """gaussian: the weight moves from distance to force to jerk during the training."""
+    force_shape: str = choice("square", ("square", "sigmoid"))
+    """Shape of the force term: the square of force over scale, at most 1, or SliceIt!'s."""
+    force_scale: float = quantity(40.0, "N", low=0.01, high=1e3)
+    """Scale of the force term. A sigmoid is half at three times as much; 2 in SliceIt!."""
+    goal: float = quantity(15.0, "", low=0.0)
+    """Reward for a slice that is done; 100 in SliceIt!."""
+    way: float = quantity(15.0, "", low=0.0)
+    """Part of `reward_potential` for 60 mm of way down; not in SliceIt!."""
+    hold: float = quantity(5.0, "", low=0.0)
+    """Part of `reward_potential` for the decisions at the goal."""
+    discount: float = quantity(0.99, "", low=0.0, high=1.0)
+    """Discount of a decision; of the potential too, so that it changes no policy's worth."""
+    collision: float = quantity(-15.0, "", high=0.0)
+    """Reward for a force over the limit, leaving the workspace, or a failure; -100 in SliceIt!."""
 
     def check(self, where: str) -> None:
         if sum(self.weights) <= 0.0:

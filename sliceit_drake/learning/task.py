@@ -39,27 +39,19 @@ VARIED = ("material.toughness", "material.youngs_modulus", "material.friction")
 class RandomizationConfig:
     """How episodes differ."""
 
-    foods: str = choice(
-        "posterior",
-        ("posterior", "uniform", "none"),
-        doc="Where a food's parameters are drawn from: its calibration, a uniform relative noise "
-        "on toughness, modulus and friction, or nowhere. The spring's ERP has its own noise.",
-    )
-    variants: int = quantity(
-        8, "", low=1, high=1000, doc="Draws prepared of each food; an episode takes one."
-    )
-    noise: float = quantity(
-        0.3, "", low=0.0, high=0.9, doc="Half width of the uniform noise, and of that on ERP."
-    )
-    height: list[float] = quantity(
-        [0.0, 0.01], "m", low=-0.01, high=0.1, size=2, doc="Range of the start, above its place."
-    )
-    offset: float = quantity(
-        0.01, "m", low=0.0, high=0.05, doc="Half width of the start's place along the edge."
-    )
-    tilt: float = quantity(
-        0.01, "rad", low=0.0, high=0.1, doc="Half width of the blade's turn about Ky."
-    )
+    foods: str = choice("posterior", ("posterior", "uniform", "none"))
+    """Where a food's parameters are drawn from: its calibration, a uniform relative noise on
+    toughness, modulus and friction, or nowhere. The spring's ERP has its own noise."""
+    variants: int = quantity(8, "", low=1, high=1000)
+    """Draws prepared of each food; an episode takes one."""
+    noise: float = quantity(0.3, "", low=0.0, high=0.9)
+    """Half width of the uniform noise, and of that on ERP."""
+    height: list[float] = quantity([0.0, 0.01], "m", low=-0.01, high=0.1, size=2)
+    """Range of the start, above its place."""
+    offset: float = quantity(0.01, "m", low=0.0, high=0.05)
+    """Half width of the start's place along the edge."""
+    tilt: float = quantity(0.01, "rad", low=0.0, high=0.1)
+    """Half width of the blade's turn about Ky."""
 
     def check(self, where: str) -> None:
         if not self.height[0] <= self.height[1]:
@@ -72,39 +64,30 @@ class RandomizationConfig:
 class TaskConfig:
     """A training's task; the same but for `simulator` for an agent and its baseline."""
 
-    simulator: str = choice(
-        "cutting",
-        ("cutting", "spring"),
-        doc="cutting: finite elements. spring: the spring-only baseline of SliceIt!.",
-    )
+    simulator: str = choice("cutting", ("cutting", "spring"))
+    """cutting: finite elements. spring: the spring-only baseline of SliceIt!."""
     foods: list[str] = dc.field(default_factory=lambda: ["cucumber", "tomato", "potato"])
     """Calibrated foods, by name or file; an episode takes one."""
     randomization: RandomizationConfig = dc.field(default_factory=RandomizationConfig)
-    refinement: float = quantity(
-        0.75, "", low=0.3, high=4.0, doc="Elements along an edge, relative to the food's mesh."
-    )
-    time_step: float = quantity(
-        2e-3 / 12,
-        "s",
-        low=1e-6,
-        high=2e-3,
-        doc="Sub-step of the food: two thirds of the station's default, whose scaled masses have "
-        "more than 5 % of the energy for an instant where the fastest agents touch a food.",
-    )
+    refinement: float = quantity(0.75, "", low=0.3, high=4.0)
+    """Elements along an edge, relative to the food's mesh."""
+    time_step: float = quantity(2e-3 / 12, "s", low=1e-6, high=2e-3)
+    """Sub-step of the food: two thirds of the station's default, whose scaled masses have more than
+    5 % of the energy for an instant where the fastest agents touch a food."""
     board: Board = dc.field(default_factory=Board)
     sensor: WrenchSensorConfig = dc.field(default_factory=WrenchSensorConfig)
     start: Start = dc.field(default_factory=Start)
     agent: AgentConfig = dc.field(default_factory=AgentConfig)
     """`descent` follows from the food and `start`, and `network` and `duration` are not used."""
     reward: RewardConfig = dc.field(default_factory=RewardConfig)
-    decisions: int = quantity(500, "", low=1, high=100_000, doc="Most in an episode.")
-    workspace: list[float] = quantity(
-        [0.05, 0.1, 0.1745], "m, m, rad", low=0.0, size=3, doc="Errors that end an episode."
-    )
-    force_limit: float = quantity(
-        50.0, "N", low=0.1, doc="Greatest force of each component; more ends an episode."
-    )
-    torque_limit: float = quantity(10.0, "Nm", low=0.1, doc="Greatest torque, likewise.")
+    decisions: int = quantity(500, "", low=1, high=100_000)
+    """Most in an episode."""
+    workspace: list[float] = quantity([0.05, 0.1, 0.1745], "m, m, rad", low=0.0, size=3)
+    """Errors that end an episode."""
+    force_limit: float = quantity(50.0, "N", low=0.1)
+    """Greatest force of each component; more ends an episode."""
+    torque_limit: float = quantity(10.0, "Nm", low=0.1)
+    """Greatest torque, likewise."""
 
     def limits(self) -> Limits:
         """What ends an episode before its goal."""

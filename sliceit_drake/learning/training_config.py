@@ -16,42 +16,32 @@ class TrainingConfig:
     """A training: its task, its algorithm and its length."""
 
     task: TaskConfig = dc.field(default_factory=TaskConfig)
-    steps: int = quantity(15_000, "", low=1, high=10**9, doc="Decisions of the training.")
-    seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Seed of everything random.")
-    learning_rate: float = quantity(
-        3e-4, "", low=1e-7, high=1.0, doc="Learning rate of all networks."
-    )
-    batch: int = quantity(256, "", low=1, high=10**6, doc="Transitions in an update.")
-    warm_up: int = quantity(1000, "", low=1, high=10**9, doc="Random decisions at the start.")
-    entropy: float = quantity(
-        0.03,
-        "",
-        low=1e-6,
-        high=10.0,
-        doc="Weight of the entropy at the start, from which it adapts. At Stable-Baselines3's 1 "
-        "lingering is worth more than the goal at first, and is overestimated long after.",
-    )
-    tau: float = quantity(
-        0.01, "", low=0.0, high=1.0, doc="Weight of the newest in the targets' moving average."
-    )
+    steps: int = quantity(15_000, "", low=1, high=10**9)
+    """Decisions of the training."""
+    seed: int = quantity(0, "", low=0, high=2**31 - 1)
+    """Seed of everything random."""
+    learning_rate: float = quantity(3e-4, "", low=1e-7, high=1.0)
+    """Learning rate of all networks."""
+    batch: int = quantity(256, "", low=1, high=10**6)
+    """Transitions in an update."""
+    warm_up: int = quantity(1000, "", low=1, high=10**9)
+    """Random decisions at the start."""
+    entropy: float = quantity(0.03, "", low=1e-6, high=10.0)
+    """Weight of the entropy at the start, from which it adapts. At Stable-Baselines3's 1 lingering
+    is worth more than the goal at first, and is overestimated long after."""
+    tau: float = quantity(0.01, "", low=0.0, high=1.0)
+    """Weight of the newest in the targets' moving average."""
     layers: list[int] = dc.field(default_factory=lambda: [128, 128])
     """Widths of the fully connected layers behind the joined features."""
-    priority: float = quantity(
-        0.6, "", low=0.0, high=1.0, doc="Power of the priorities; 0 replays uniformly."
-    )
+    priority: float = quantity(0.6, "", low=0.0, high=1.0)
+    """Power of the priorities; 0 replays uniformly."""
     history: bool = True
     """Whether the network sees the force/torque history."""
-    environments: int = quantity(
-        1,
-        "",
-        low=1,
-        high=64,
-        doc="Environments side by side, each a process; there is an update for each decision. "
-        "Another number gives another policy.",
-    )
-    checkpoint_interval: int = quantity(
-        5000, "", low=1, high=10**9, doc="Decisions between checkpoints."
-    )
+    environments: int = quantity(1, "", low=1, high=64)
+    """Environments side by side, each a process; there is an update for each decision. Another
+    number gives another policy."""
+    checkpoint_interval: int = quantity(5000, "", low=1, high=10**9)
+    """Decisions between checkpoints."""
 
 
 def load_training(file: str | Path | None, overrides: str | None = None) -> TrainingConfig:

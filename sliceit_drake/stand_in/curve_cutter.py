@@ -62,16 +62,22 @@ class CurveFood:
     The spreads are of logarithms and act in `CurveCutter.randomize_context` alone.
     """
 
-    curve: str = choice(
-        "cucumber", ("cucumber", "tomato", "potato", "carrot"), doc="Whose curve it has."
-    )
-    width: float = quantity(0.027, "m", low=5e-3, high=0.3, doc="Along the edge.")
-    height: float = quantity(0.027, "m", low=5e-3, high=0.3, doc="From the board to the top.")
-    toughness: float = quantity(1.0, "", low=0.0, high=10.0, doc="Factor on the edge's force.")
-    friction: float = quantity(1.0, "", low=0.0, high=10.0, doc="Factor on the flanks' friction.")
-    toughness_spread: float = quantity(0.0, "", low=0.0, high=0.5, doc="From slice to slice.")
-    friction_spread: float = quantity(0.0, "", low=0.0, high=0.5, doc="From slice to slice.")
-    height_spread: float = quantity(0.0, "", low=0.0, high=0.1, doc="From slice to slice.")
+    curve: str = choice("cucumber", ("cucumber", "tomato", "potato", "carrot"))
+    """Whose curve it has."""
+    width: float = quantity(0.027, "m", low=5e-3, high=0.3)
+    """Along the edge."""
+    height: float = quantity(0.027, "m", low=5e-3, high=0.3)
+    """From the board to the top."""
+    toughness: float = quantity(1.0, "", low=0.0, high=10.0)
+    """Factor on the edge's force."""
+    friction: float = quantity(1.0, "", low=0.0, high=10.0)
+    """Factor on the flanks' friction."""
+    toughness_spread: float = quantity(0.0, "", low=0.0, high=0.5)
+    """From slice to slice."""
+    friction_spread: float = quantity(0.0, "", low=0.0, high=0.5)
+    """From slice to slice."""
+    height_spread: float = quantity(0.0, "", low=0.0, high=0.1)
+    """From slice to slice."""
 
     def make_cutting(self, setup: CuttingSetup) -> "CurveCutter":
         """The system that this food is in a station."""

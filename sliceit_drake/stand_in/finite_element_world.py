@@ -50,13 +50,12 @@ SAMPLES = 5
 class FiniteElementSettings:
     """Mesh and step of the world, other than what looks at its records."""
 
-    refinement: float = quantity(
-        0.85, "", low=0.3, high=3.0, doc="Elements along an edge, relative to the food's mesh."
-    )
-    time_step: float = quantity(2.5e-4, "s", low=1e-6, high=2e-3, doc="Sub-step.")
-    travel: float = quantity(
-        4e-5, "m", low=1e-6, high=1e-3, doc="Most motion in coupling steps computed as one."
-    )
+    refinement: float = quantity(0.85, "", low=0.3, high=3.0)
+    """Elements along an edge, relative to the food's mesh."""
+    time_step: float = quantity(2.5e-4, "s", low=1e-6, high=2e-3)
+    """Sub-step."""
+    travel: float = quantity(4e-5, "m", low=1e-6, high=1e-3)
+    """Most motion in coupling steps computed as one."""
 
 
 class _Section:

@@ -36,23 +36,20 @@ class Condition:
     motion: MotionPlan = dc.field(default_factory=MotionPlan)
     """Labels of segments that are those of records (air, slice, hold, retract, second_pass,
     board_press, weight, ...) become phases; others become "other"."""
-    replicates: int = quantity(3, "", low=1, high=1000, doc="How often.")
-    clearance: float = quantity(
-        3e-3, "m", low=-0.05, high=0.5, doc="Height of the edge above the food at the start."
-    )
-    offset: float = quantity(
-        0.0, "m", low=-0.2, high=0.2, doc="Shift of the edge's middle along the edge at the start."
-    )
+    replicates: int = quantity(3, "", low=1, high=1000)
+    """How often."""
+    clearance: float = quantity(3e-3, "m", low=-0.05, high=0.5)
+    """Height of the edge above the food at the start."""
+    offset: float = quantity(0.0, "m", low=-0.2, high=0.2)
+    """Shift of the edge's middle along the edge at the start."""
     without_food: bool = False
     """The bare board; the clearance is over where the food's top would be."""
     peeled: bool = False
     """The skin is off."""
-    width_scale: float = quantity(
-        1.0, "", low=0.3, high=3.0, doc="Size of the section against the food's."
-    )
-    weight: float = quantity(
-        0.0, "kg", low=0.0, high=20.0, doc='Mass hung on the knife at Ko in segments "weight".'
-    )
+    width_scale: float = quantity(1.0, "", low=0.3, high=3.0)
+    """Size of the section against the food's."""
+    weight: float = quantity(0.0, "kg", low=0.0, high=20.0)
+    """Mass hung on the knife at Ko in segments "weight"."""
 
     def check(self, where: str) -> None:
         if not self.label:
@@ -66,13 +63,16 @@ class Variation:
     """How slices differ. Relative values are spreads of logarithms; neighbours resemble each other
     by `correlation`."""
 
-    toughness: float = quantity(0.05, "", low=0.0, high=0.5, doc="Relative spread.")
-    stiffness: float = quantity(0.05, "", low=0.0, high=0.5, doc="Relative spread.")
-    friction: float = quantity(0.05, "", low=0.0, high=0.5, doc="Relative spread.")
-    height: float = quantity(3e-4, "m", low=0.0, high=0.01, doc="Spread of the food's height.")
-    correlation: float = quantity(
-        0.3, "", low=0.0, high=0.99, doc="Correlation of neighbouring slices."
-    )
+    toughness: float = quantity(0.05, "", low=0.0, high=0.5)
+    """Relative spread."""
+    stiffness: float = quantity(0.05, "", low=0.0, high=0.5)
+    """Relative spread."""
+    friction: float = quantity(0.05, "", low=0.0, high=0.5)
+    """Relative spread."""
+    height: float = quantity(3e-4, "m", low=0.0, high=0.01)
+    """Spread of the food's height."""
+    correlation: float = quantity(0.3, "", low=0.0, high=0.99)
+    """Correlation of neighbouring slices."""
 
 
 @dc.dataclass
@@ -87,17 +87,15 @@ class Protocol:
     knife: Knife = dc.field(default_factory=Knife)
     board: Board = dc.field(default_factory=Board)
     placement: Placement = dc.field(default_factory=Placement)
-    exchange_period: float = quantity(
-        2e-3, "s", low=2.5e-4, high=0.02, doc="Between two values of the true wrench."
-    )
+    exchange_period: float = quantity(2e-3, "s", low=2.5e-4, high=0.02)
+    """Between two values of the true wrench."""
     sensor: SensorModel = dc.field(default_factory=SensorModel)
     variation: Variation = dc.field(default_factory=Variation)
     conditions: list[Condition] = dc.field(default_factory=list)
     random_order: bool = True
     """Whether the slices are cut in random order; else as listed, replicate by replicate."""
-    knife_slices: int = quantity(
-        0, "", low=0, high=10**6, doc="Slices since sharpening before the first."
-    )
+    knife_slices: int = quantity(0, "", low=0, high=10**6)
+    """Slices since sharpening before the first."""
 
     def check(self, where: str) -> None:
         if not self.conditions:

@@ -18,43 +18,36 @@ class SensorModel:
     The defaults are a good six-axis sensor at a robot's wrist, tared before each slice.
     """
 
-    rate: float = quantity(250.0, "Hz", low=1.0, high=1e4, doc="Readings a second.")
-    force_noise: float = quantity(0.05, "N", low=0.0, high=50.0, doc="Standard deviation.")
-    torque_noise: float = quantity(0.004, "Nm", low=0.0, high=5.0, doc="Standard deviation.")
-    correlated_share: float = quantity(
-        0.5,
-        "",
-        low=0.0,
-        high=1.0,
-        doc="Fraction of the noise's variance that is correlated in time.",
-    )
-    correlation_time: float = quantity(
-        0.03, "s", low=1e-4, high=100.0, doc="Time in which that falls to 1/e."
-    )
-    force_bias: float = quantity(
-        0.05, "N", low=0.0, high=50.0, doc="Spread of what taring leaves, each axis."
-    )
-    torque_bias: float = quantity(
-        0.003, "Nm", low=0.0, high=5.0, doc="Spread of what taring leaves, each axis."
-    )
-    force_drift: float = quantity(
-        0.01, "N/s^0.5", low=0.0, high=10.0, doc="Random walk: its spread after 1 s."
-    )
-    torque_drift: float = quantity(
-        5e-4, "Nm/s^0.5", low=0.0, high=1.0, doc="Random walk: its spread after 1 s."
-    )
-    delay: float = quantity(0.002, "s", low=0.0, high=0.2, doc="Time that a reading is late.")
-    cutoff_frequency: float = quantity(
-        80.0, "Hz", low=0.0, high=1e4, doc="First-order low-pass filter; 0 for none."
-    )
-    force_resolution: float = quantity(
-        0.01, "N", low=0.0, high=10.0, doc="Step of the shown forces; 0 for none."
-    )
-    torque_resolution: float = quantity(
-        5e-4, "Nm", low=0.0, high=1.0, doc="Step of the shown torques; 0 for none."
-    )
-    force_range: float = quantity(150.0, "N", low=0.1, high=1e5, doc="Forces saturate there.")
-    torque_range: float = quantity(15.0, "Nm", low=1e-3, high=1e4, doc="Torques saturate there.")
+    rate: float = quantity(250.0, "Hz", low=1.0, high=1e4)
+    """Readings a second."""
+    force_noise: float = quantity(0.05, "N", low=0.0, high=50.0)
+    """Standard deviation."""
+    torque_noise: float = quantity(0.004, "Nm", low=0.0, high=5.0)
+    """Standard deviation."""
+    correlated_share: float = quantity(0.5, "", low=0.0, high=1.0)
+    """Fraction of the noise's variance that is correlated in time."""
+    correlation_time: float = quantity(0.03, "s", low=1e-4, high=100.0)
+    """Time in which that falls to 1/e."""
+    force_bias: float = quantity(0.05, "N", low=0.0, high=50.0)
+    """Spread of what taring leaves, each axis."""
+    torque_bias: float = quantity(0.003, "Nm", low=0.0, high=5.0)
+    """Spread of what taring leaves, each axis."""
+    force_drift: float = quantity(0.01, "N/s^0.5", low=0.0, high=10.0)
+    """Random walk: its spread after 1 s."""
+    torque_drift: float = quantity(5e-4, "Nm/s^0.5", low=0.0, high=1.0)
+    """Random walk: its spread after 1 s."""
+    delay: float = quantity(0.002, "s", low=0.0, high=0.2)
+    """Time that a reading is late."""
+    cutoff_frequency: float = quantity(80.0, "Hz", low=0.0, high=1e4)
+    """First-order low-pass filter; 0 for none."""
+    force_resolution: float = quantity(0.01, "N", low=0.0, high=10.0)
+    """Step of the shown forces; 0 for none."""
+    torque_resolution: float = quantity(5e-4, "Nm", low=0.0, high=1.0)
+    """Step of the shown torques; 0 for none."""
+    force_range: float = quantity(150.0, "N", low=0.1, high=1e5)
+    """Forces saturate there."""
+    torque_range: float = quantity(15.0, "Nm", low=1e-3, high=1e4)
+    """Torques saturate there."""
 
 
 def measured(

@@ -213,11 +213,12 @@ def _diameter(calibrated: CalibratedFood, rng: np.random.Generator) -> float:
 class StandInWorld:
     """Finite elements with hidden effects, finer than a training's; see `SlicingWorld`."""
 
-    seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Seed of all deviations.")
-    refinement: float = quantity(
-        1.25, "", low=0.3, high=4.0, doc="Elements along an edge, relative to the food's mesh."
-    )
-    time_step: float = quantity(1e-4, "s", low=1e-6, high=2e-3, doc="Sub-step of the food.")
+    seed: int = quantity(0, "", low=0, high=2**31 - 1)
+    """Seed of all deviations."""
+    refinement: float = quantity(1.25, "", low=0.3, high=4.0)
+    """Elements along an edge, relative to the food's mesh."""
+    time_step: float = quantity(1e-4, "s", low=1e-6, high=2e-3)
+    """Sub-step of the food."""
 
     def scenario(self, food: str, slice: int, board_stiffness: float | None = None) -> WorldSlice:
         """One slice; see `SlicingWorld`."""
@@ -258,7 +259,8 @@ class StandInWorld:
 class CurvesWorld:
     """Measured curves in place of the scenario's food; see `SlicingWorld` and `curve_cutter`."""
 
-    seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Seed of all deviations.")
+    seed: int = quantity(0, "", low=0, high=2**31 - 1)
+    """Seed of all deviations."""
 
     def scenario(self, food: str, slice: int, board_stiffness: float | None = None) -> WorldSlice:
         """One slice; see `SlicingWorld`."""

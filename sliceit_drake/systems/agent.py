@@ -67,72 +67,45 @@ class AgentConfig:
 
     network: str = ""
     """Exported network (`sliceit train`), relative to the resources or to the working directory."""
-    descent: float = quantity(
-        0.037, "m", low=1e-3, high=0.5, doc="Height of the edge over the board at the start."
-    )
-    duration: float = quantity(8.0, "s", low=0.05, high=600.0, doc="Duration of the run.")
-    period: float = quantity(0.05, "s", low=0.002, high=1.0, doc="Time between two decisions.")
-    history: int = quantity(12, "", low=1, high=100, doc="Force/torque readings that it sees.")
-    reading_period: float = quantity(
-        0.01, "s", low=0.002, high=1.0, doc="Time between two of these readings."
-    )
-    mapping: str = choice(
-        "whole",
-        ("whole", "upper"),
-        doc="Part of [-1, 1] that spans the ranges of stiffness and gains; upper: [0, 1], as in "
-        "SliceIt!'s code.",
-    )
-    stiffness_x: list[float] = quantity(
-        [1000.0, 10000.0], "N/m", low=0.0, high=1e5, size=2, doc="Range, along the edge."
-    )
-    stiffness_ry: list[float] = quantity(
-        [40.0, 200.0], "Nm/rad", low=0.0, high=1e4, size=2, doc="Range, about Ky."
-    )
-    p_z: list[float] = quantity([0.02, 0.1], "", low=0.0, size=2, doc="Range of the gain, down.")
-    p_ry: list[float] = quantity([0.2, 3.0], "", low=0.0, size=2, doc="Range of the gain about Ky.")
-    error_scale: list[float] = quantity(
-        [0.15, 0.25],
-        "",
-        low=0.0,
-        size=2,
-        doc="Error scale far from the final pose, and at it; with the factor of docs/control.md.",
-    )
-    draw_increment: float = quantity(
-        2e-3, "m", low=0.0, high=0.05, doc="Greatest move of the target along Kx in a decision."
-    )
-    press_increment: float = quantity(
-        2e-3, "m", low=0.0, high=0.05, doc="Greatest move of the target down in a decision."
-    )
-    draw: float = quantity(
-        0.035, "m", low=0.0, high=0.2, doc="Farthest that the target goes along Kx, either way."
-    )
-    overtravel: float = quantity(
-        0.03, "m", low=0.0, high=0.1, doc="Farthest that the target goes below the board."
-    )
-    lead: float = quantity(
-        0.8,
-        "",
-        low=0.01,
-        high=1.0,
-        doc="Fraction of the way to the target that a decision aims at.",
-    )
-    goal: list[float] = quantity(
-        [0.04, 2e-4, 0.04],
-        "m, m, rad",
-        low=0.0,
-        size=3,
-        doc="Error along Kx, height over the board and error about Ky within which the slice ends.",
-    )
-    goal_decisions: int = quantity(
-        10,
-        "",
-        low=0,
-        high=1000,
-        doc="Decisions in a row within the goal, after which the slice ends.",
-    )
-    lift_speed: float = quantity(
-        0.05, "m/s", low=1e-3, high=0.5, doc="Speed of the target upwards once the slice has ended."
-    )
+    descent: float = quantity(0.037, "m", low=1e-3, high=0.5)
+    """Height of the edge over the board at the start."""
+    duration: float = quantity(8.0, "s", low=0.05, high=600.0)
+    """Duration of the run."""
+    period: float = quantity(0.05, "s", low=0.002, high=1.0)
+    """Time between two decisions."""
+    history: int = quantity(12, "", low=1, high=100)
+    """Force/torque readings that it sees."""
+    reading_period: float = quantity(0.01, "s", low=0.002, high=1.0)
+    """Time between two of these readings."""
+    mapping: str = choice("whole", ("whole", "upper"))
+    """Part of [-1, 1] that spans the ranges of stiffness and gains; upper: [0, 1], as in SliceIt!'s
+    code."""
+    stiffness_x: list[float] = quantity([1000.0, 10000.0], "N/m", low=0.0, high=1e5, size=2)
+    """Range, along the edge."""
+    stiffness_ry: list[float] = quantity([40.0, 200.0], "Nm/rad", low=0.0, high=1e4, size=2)
+    """Range, about Ky."""
+    p_z: list[float] = quantity([0.02, 0.1], "", low=0.0, size=2)
+    """Range of the gain, down."""
+    p_ry: list[float] = quantity([0.2, 3.0], "", low=0.0, size=2)
+    """Range of the gain about Ky."""
+    error_scale: list[float] = quantity([0.15, 0.25], "", low=0.0, size=2)
+    """Error scale far from the final pose, and at it; with the factor of docs/control.md."""
+    draw_increment: float = quantity(2e-3, "m", low=0.0, high=0.05)
+    """Greatest move of the target along Kx in a decision."""
+    press_increment: float = quantity(2e-3, "m", low=0.0, high=0.05)
+    """Greatest move of the target down in a decision."""
+    draw: float = quantity(0.035, "m", low=0.0, high=0.2)
+    """Farthest that the target goes along Kx, either way."""
+    overtravel: float = quantity(0.03, "m", low=0.0, high=0.1)
+    """Farthest that the target goes below the board."""
+    lead: float = quantity(0.8, "", low=0.01, high=1.0)
+    """Fraction of the way to the target that a decision aims at."""
+    goal: list[float] = quantity([0.04, 2e-4, 0.04], "m, m, rad", low=0.0, size=3)
+    """Error along Kx, height over the board and error about Ky within which the slice ends."""
+    goal_decisions: int = quantity(10, "", low=0, high=1000)
+    """Decisions in a row within the goal, after which the slice ends."""
+    lift_speed: float = quantity(0.05, "m/s", low=1e-3, high=0.5)
+    """Speed of the target upwards once the slice has ended."""
 
     def check(self, where: str) -> None:
         ratio = self.period / self.reading_period

@@ -20,11 +20,12 @@ class AnalyticFood:
     Below that force it is a spring, so that a knife may rest on it.
     """
 
-    diameter: float = quantity(0.027, "m", low=5e-3, high=0.3, doc="Diameter.")
-    toughness: float = quantity(350.0, "J/m2", low=0.0, high=1e5, doc="Energy per cut area.")
-    stiffness: float = quantity(
-        5e3, "N/m", low=1.0, high=1e7, doc="Force over indentation, as a vegetable's."
-    )
+    diameter: float = quantity(0.027, "m", low=5e-3, high=0.3)
+    """Diameter."""
+    toughness: float = quantity(350.0, "J/m2", low=0.0, high=1e5)
+    """Energy per cut area."""
+    stiffness: float = quantity(5e3, "N/m", low=1.0, high=1e7)
+    """Force over indentation, as a vegetable's."""
 
     @property
     def height(self) -> float:

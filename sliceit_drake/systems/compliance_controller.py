@@ -67,63 +67,36 @@ class ComplianceControllerConfig:
     README of cartesian_controllers, without its D gains.
     """
 
-    mode: str = choice(
-        "compliance",
-        MODES,
-        doc="compliance: spring plus wrenches. motion: pose error alone, without stiffness. "
-        "force: wrenches alone. parallel: spring and wrenches weighted by the selection.",
-    )
-    period: float = quantity(
-        0.002, "s", low=1e-4, high=0.1, doc="Time between updates, which is the coupling period."
-    )
-    iterations: int = quantity(
-        1, "", low=1, high=100, doc="Virtual steps per update; force mode always takes one."
-    )
-    virtual_time_step: float = quantity(
-        0.02, "s", low=1e-4, high=0.1, doc="Virtual time that one step advances the model."
-    )
-    damping_factor: float = quantity(
-        0.9, "", low=0.0, high=1.0, doc="Factor on the virtual joint velocity at each step."
-    )
-    link_mass: float = quantity(
-        0.1, "kg", low=1e-9, high=10.0, doc="Virtual mass at the origin of each moving link."
-    )
+    mode: str = choice("compliance", MODES)
+    """compliance: spring plus wrenches. motion: pose error alone, without stiffness. force:
+    wrenches alone. parallel: spring and wrenches weighted by the selection."""
+    period: float = quantity(0.002, "s", low=1e-4, high=0.1)
+    """Time between updates, which is the coupling period."""
+    iterations: int = quantity(1, "", low=1, high=100)
+    """Virtual steps per update; force mode always takes one."""
+    virtual_time_step: float = quantity(0.02, "s", low=1e-4, high=0.1)
+    """Virtual time that one step advances the model."""
+    damping_factor: float = quantity(0.9, "", low=0.0, high=1.0)
+    """Factor on the virtual joint velocity at each step."""
+    link_mass: float = quantity(0.1, "kg", low=1e-9, high=10.0)
+    """Virtual mass at the origin of each moving link."""
     dead_zones: bool = True
     """Whether pose errors below about 1e-6 m and 5e-7 rad count as zero, as KDL has it."""
     hand_frame_control: bool = False
     """Whether the target wrench is given in the axes of the end effector E, not of the world."""
-    error_scale: float = quantity(0.5, "", low=0.0, doc="Factor on the controlled error.")
+    error_scale: float = quantity(0.5, "", low=0.0)
+    """Factor on the controlled error."""
     stiffness: list[float] = quantity(
-        [500.0, 500.0, 500.0, 20.0, 20.0, 20.0],
-        "N/m and Nm/rad",
-        low=0.0,
-        size=6,
-        doc="Stiffness along and about the axes of the compliance reference frame C.",
+        [500.0, 500.0, 500.0, 20.0, 20.0, 20.0], "N/m and Nm/rad", low=0.0, size=6
     )
-    p_gains: list[float] = quantity(
-        [0.05, 0.05, 0.05, 1.5, 1.5, 1.5],
-        "",
-        low=0.0,
-        size=6,
-        doc="Proportional gains along and about the axes of the base B (in motion mode N/m and "
-        "Nm/rad).",
-    )
-    d_gains: list[float] = quantity(
-        [0.0] * 6,
-        "s",
-        low=0.0,
-        size=6,
-        doc="Derivative gains, per virtual second, along and about the axes of the base B.",
-    )
-    selection: list[float] = quantity(
-        [1.0, 1.0, 0.5, 1.0, 0.5, 1.0],
-        "",
-        low=0.0,
-        high=1.0,
-        size=6,
-        doc="Weight of the spring in parallel mode (1: position only, 0: force only), along and "
-        "about the axes of the base B. The default is that of the SliceIt! agent.",
-    )
+    """Stiffness along and about the axes of the compliance reference frame C."""
+    p_gains: list[float] = quantity([0.05, 0.05, 0.05, 1.5, 1.5, 1.5], "", low=0.0, size=6)
+    """Proportional gains along and about the axes of the base B (in motion mode N/m and Nm/rad)."""
+    d_gains: list[float] = quantity([0.0] * 6, "s", low=0.0, size=6)
+    """Derivative gains, per virtual second, along and about the axes of the base B."""
+    selection: list[float] = quantity([1.0, 1.0, 0.5, 1.0, 0.5, 1.0], "", low=0.0, high=1.0, size=6)
+    """Weight of the spring in parallel mode (1: position only, 0: force only), along and about the
+    axes of the base B. The default is that of the SliceIt! agent."""
 
 
 def make_virtual_model(chain: KinematicChain, link_mass: float) -> MultibodyPlant:

@@ -42,20 +42,17 @@ class ContactMonitorConfig:
 
     enabled: bool = True
     """Whether an unstable contact ends the run."""
-    force_swing: float = quantity(5.0, "N", low=0.01, high=1e3, doc="Least swing that counts.")
-    moment_swing: float = quantity(1.0, "Nm", low=0.01, high=1e3, doc="Least swing that counts.")
-    swings: int = quantity(8, "", low=4, high=1000, doc="Swings in a row that make an alarm.")
-    longest_swing: float = quantity(
-        0.1, "s", low=0.01, high=1.0, doc="Slower swings end the row: 0.1 s is 5 Hz."
-    )
-    force_limit: float = quantity(
-        150.0,
-        "N",
-        low=1.0,
-        high=1e5,
-        doc="A swing above it makes an alarm with two others before it; UR arms let a user limit "
-        "the force to about 100 to 250 N.",
-    )
+    force_swing: float = quantity(5.0, "N", low=0.01, high=1e3)
+    """Least swing that counts."""
+    moment_swing: float = quantity(1.0, "Nm", low=0.01, high=1e3)
+    """Least swing that counts."""
+    swings: int = quantity(8, "", low=4, high=1000)
+    """Swings in a row that make an alarm."""
+    longest_swing: float = quantity(0.1, "s", low=0.01, high=1.0)
+    """Slower swings end the row: 0.1 s is 5 Hz."""
+    force_limit: float = quantity(150.0, "N", low=1.0, high=1e5)
+    """A swing above it makes an alarm with two others before it; UR arms let a user limit the force
+    to about 100 to 250 N."""
 
 
 class ContactMonitor(LeafSystem):

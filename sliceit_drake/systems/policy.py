@@ -83,11 +83,16 @@ class PressByForce:
     `force`, and turns round beyond.
     """
 
-    fastest: float = quantity(0.03, "m/s", low=1e-4, high=0.5, doc="Speed without force.")
-    force: float = quantity(30.0, "N", low=0.1, high=200.0, doc="Force at which it stands still.")
-    draw_ratio: float = quantity(0.0, "", low=-10.0, high=10.0, doc="Draw over press.")
-    cut_time: float = quantity(2.0, "s", low=0.05, high=600.0, doc="When it begins to lift.")
-    lift_speed: float = quantity(0.05, "m/s", low=1e-4, high=0.5, doc="Speed of lifting.")
+    fastest: float = quantity(0.03, "m/s", low=1e-4, high=0.5)
+    """Speed without force."""
+    force: float = quantity(30.0, "N", low=0.1, high=200.0)
+    """Force at which it stands still."""
+    draw_ratio: float = quantity(0.0, "", low=-10.0, high=10.0)
+    """Draw over press."""
+    cut_time: float = quantity(2.0, "s", low=0.05, high=600.0)
+    """When it begins to lift."""
+    lift_speed: float = quantity(0.05, "m/s", low=1e-4, high=0.5)
+    """Speed of lifting."""
 
     def decide(self, observation: PolicyObservation) -> PolicyAction:
         """See `Policy`."""
@@ -104,19 +109,20 @@ class PolicyConfig:
 
     decide: PressByForce = dc.field(default_factory=PressByForce)
     """The policy, by its parameters; one that a network decides is an `AgentConfig`."""
-    period: float = quantity(0.05, "s", low=0.002, high=1.0, doc="Time between two decisions.")
-    history: int = quantity(3, "", low=1, high=100, doc="Wrenches that it sees, one a decision.")
-    duration: float = quantity(3.0, "s", low=0.05, high=600.0, doc="Duration of the run.")
-    press: float = quantity(
-        0.0372, "m", low=1e-3, high=0.5, doc="Farthest that the target goes down from the start."
-    )
-    draw: float = quantity(
-        0.0, "m", low=0.0, high=0.2, doc="Farthest that it goes along the edge, either way."
-    )
-    speed: float = quantity(0.05, "m/s", low=1e-4, high=0.5, doc="Greatest speed of the target.")
-    acceleration: float = quantity(
-        0.5, "m/s2", low=0.01, high=20.0, doc="With which the speed follows a decision."
-    )
+    period: float = quantity(0.05, "s", low=0.002, high=1.0)
+    """Time between two decisions."""
+    history: int = quantity(3, "", low=1, high=100)
+    """Wrenches that it sees, one a decision."""
+    duration: float = quantity(3.0, "s", low=0.05, high=600.0)
+    """Duration of the run."""
+    press: float = quantity(0.0372, "m", low=1e-3, high=0.5)
+    """Farthest that the target goes down from the start."""
+    draw: float = quantity(0.0, "m", low=0.0, high=0.2)
+    """Farthest that it goes along the edge, either way."""
+    speed: float = quantity(0.05, "m/s", low=1e-4, high=0.5)
+    """Greatest speed of the target."""
+    acceleration: float = quantity(0.5, "m/s2", low=0.01, high=20.0)
+    """With which the speed follows a decision."""
 
     def check(self, where: str) -> None:
         least = envelope_time(self._corners(), self.speed)

@@ -25,15 +25,12 @@ class ServoConfig:
     Robots' own client library (`UrDriver`).
     """
 
-    lookahead_time: float = quantity(
-        0.03, "s", low=1e-3, high=1.0, doc="How far ahead the arm's own motion is projected."
-    )
-    gain: float = quantity(
-        2000.0, "1/s2", low=1.0, high=4e6, doc="Acceleration per unit of the projected error."
-    )
-    delay: float = quantity(
-        0.0, "s", low=0.0, high=0.1, doc="Transport delay of the targets before the servo."
-    )
+    lookahead_time: float = quantity(0.03, "s", low=1e-3, high=1.0)
+    """How far ahead the arm's own motion is projected."""
+    gain: float = quantity(2000.0, "1/s2", low=1.0, high=4e6)
+    """Acceleration per unit of the projected error."""
+    delay: float = quantity(0.0, "s", low=0.0, high=0.1)
+    """Transport delay of the targets before the servo."""
 
     @property
     def lag(self) -> float:

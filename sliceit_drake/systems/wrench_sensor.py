@@ -60,46 +60,34 @@ class WrenchSensorConfig:
     """
 
     tare_at_start: bool = True
-    force_bias: list[float] = quantity(
-        [0.0, 0.0, 0.0], "N", low=-100.0, high=100.0, size=3, doc="Zero error left after taring."
-    )
-    moment_bias: list[float] = quantity(
-        [0.0, 0.0, 0.0], "Nm", low=-10.0, high=10.0, size=3, doc="Zero error left after taring."
-    )
-    force_noise: float = quantity(
-        0.0, "N", low=0.0, high=100.0, doc="Standard deviation of a reading's force, each axis."
-    )
-    moment_noise: float = quantity(
-        0.0, "Nm", low=0.0, high=10.0, doc="Standard deviation of a reading's moment, each axis."
-    )
-    cutoff_frequency: float = quantity(
-        0.0, "Hz", low=0.0, high=1e4, doc="First-order low-pass filter; 0 for none."
-    )
-    force_drift: float = quantity(
-        0.0, "N/s^0.5", low=0.0, high=10.0, doc="Random walk since taring: its spread after 1 s."
-    )
-    moment_drift: float = quantity(
-        0.0, "Nm/s^0.5", low=0.0, high=1.0, doc="Random walk since taring: its spread after 1 s."
-    )
-    force_drift_rate: list[float] = quantity(
-        [0.0, 0.0, 0.0], "N/s", low=-1.0, high=1.0, size=3, doc="Steady drift since taring."
-    )
-    moment_drift_rate: list[float] = quantity(
-        [0.0, 0.0, 0.0], "Nm/s", low=-0.1, high=0.1, size=3, doc="Steady drift since taring."
-    )
-    force_resolution: float = quantity(
-        0.0, "N", low=0.0, high=10.0, doc="Step of the shown forces; 0 for none."
-    )
-    moment_resolution: float = quantity(
-        0.0, "Nm", low=0.0, high=1.0, doc="Step of the shown moments; 0 for none."
-    )
-    sample_period: float = quantity(
-        0.0, "s", low=0.0, high=1.0, doc="Time between new readings; 0 for the coupling period."
-    )
-    delay: float = quantity(
-        0.0, "s", low=0.0, high=0.2, doc="Time a reading takes to arrive; parts are interpolated."
-    )
-    seed: int = quantity(0, "", low=0, high=2**31 - 1, doc="Seed of noise and random walk.")
+    force_bias: list[float] = quantity([0.0, 0.0, 0.0], "N", low=-100.0, high=100.0, size=3)
+    """Zero error left after taring."""
+    moment_bias: list[float] = quantity([0.0, 0.0, 0.0], "Nm", low=-10.0, high=10.0, size=3)
+    """Zero error left after taring."""
+    force_noise: float = quantity(0.0, "N", low=0.0, high=100.0)
+    """Standard deviation of a reading's force, each axis."""
+    moment_noise: float = quantity(0.0, "Nm", low=0.0, high=10.0)
+    """Standard deviation of a reading's moment, each axis."""
+    cutoff_frequency: float = quantity(0.0, "Hz", low=0.0, high=1e4)
+    """First-order low-pass filter; 0 for none."""
+    force_drift: float = quantity(0.0, "N/s^0.5", low=0.0, high=10.0)
+    """Random walk since taring: its spread after 1 s."""
+    moment_drift: float = quantity(0.0, "Nm/s^0.5", low=0.0, high=1.0)
+    """Random walk since taring: its spread after 1 s."""
+    force_drift_rate: list[float] = quantity([0.0, 0.0, 0.0], "N/s", low=-1.0, high=1.0, size=3)
+    """Steady drift since taring."""
+    moment_drift_rate: list[float] = quantity([0.0, 0.0, 0.0], "Nm/s", low=-0.1, high=0.1, size=3)
+    """Steady drift since taring."""
+    force_resolution: float = quantity(0.0, "N", low=0.0, high=10.0)
+    """Step of the shown forces; 0 for none."""
+    moment_resolution: float = quantity(0.0, "Nm", low=0.0, high=1.0)
+    """Step of the shown moments; 0 for none."""
+    sample_period: float = quantity(0.0, "s", low=0.0, high=1.0)
+    """Time between new readings; 0 for the coupling period."""
+    delay: float = quantity(0.0, "s", low=0.0, high=0.2)
+    """Time a reading takes to arrive; parts are interpolated."""
+    seed: int = quantity(0, "", low=0, high=2**31 - 1)
+    """Seed of noise and random walk."""
 
 
 class WrenchSensor(LeafSystem):

@@ -52,19 +52,20 @@ MIDDLE = 0.0151
 class Springs:
     """What DiSECt sets for the faces of the cut: a spring with two contacts on each cut edge."""
 
-    count: int = quantity(113, "", low=1, high=100000, doc="Springs in the section.")
-    stiffness: float = quantity(200.0, "N/m", low=0.0, high=1e6, doc="Of a spring.")
-    rest_length: float = quantity(
-        5e-5, "m", low=0.0, high=1e-2, doc="Opening it begins to pull at."
-    )
-    contact_stiffness: float = quantity(
-        1430.0, "N/m", low=0.0, high=1e6, doc="Of the knife on each face of a spring."
-    )
-    section: float = quantity(1.08e-3, "m2", low=1e-6, high=1.0, doc="Area that they share.")
-    friction: float = quantity(0.5, "", low=0.0, high=2.0, doc="Its coefficient at high speed.")
-    transition_speed: float = quantity(
-        50.0, "m/s", low=1e-3, high=1e4, doc="Its contact friction stiffness, which is a speed."
-    )
+    count: int = quantity(113, "", low=1, high=100000)
+    """Springs in the section."""
+    stiffness: float = quantity(200.0, "N/m", low=0.0, high=1e6)
+    """Of a spring."""
+    rest_length: float = quantity(5e-5, "m", low=0.0, high=1e-2)
+    """Opening it begins to pull at."""
+    contact_stiffness: float = quantity(1430.0, "N/m", low=0.0, high=1e6)
+    """Of the knife on each face of a spring."""
+    section: float = quantity(1.08e-3, "m2", low=1e-6, high=1.0)
+    """Area that they share."""
+    friction: float = quantity(0.5, "", low=0.0, high=2.0)
+    """Its coefficient at high speed."""
+    transition_speed: float = quantity(50.0, "m/s", low=1e-3, high=1e4)
+    """Its contact friction stiffness, which is a speed."""
 
     def per_area(self, stiffness: float) -> float:
         """Stiffness per area of a stiffness per spring, Pa/m."""
@@ -80,26 +81,30 @@ class ReferenceRun:
     """One run of DiSECt: what differs from the nominal run, and what came out."""
 
     name: str = "nominal"
-    speed: float = quantity(0.05, "m/s", low=1e-4, high=1.0, doc="Of the knife.")
-    time_step: float = quantity(1e-5, "s", low=1e-7, high=1e-3, doc="Its sub-step.")
-    spring_factor: float = quantity(1.0, "", low=0.0, high=1e3, doc="On the springs' stiffness.")
-    contact_factor: float = quantity(1.0, "", low=0.0, high=1e3, doc="On the contact's.")
-    sum_peak: float = quantity(0.0, "N", low=0.0, high=1e6, doc="Largest sum of norms.")
-    vertical_peak: float = quantity(0.0, "N", low=0.0, high=1e6, doc="Largest vertical resultant.")
-    broken: int = quantity(0, "", low=0, high=100000, doc="Springs without stiffness at the end.")
-    mean_stiffness: float = quantity(
-        0.0, "N/m", low=0.0, high=1e6, doc="Mean of all springs at the end."
-    )
-    sum_middle: float | None = quantity(
-        None, "N", low=0.0, high=1e6, doc="Sum of norms with the edge 15.1 mm above the ground."
-    )
-    sum_end: float | None = quantity(None, "N", low=0.0, high=1e6, doc="Sum of norms at the end.")
-    vertical_end: float | None = quantity(
-        None, "N", low=0.0, high=1e6, doc="Vertical resultant at the end."
-    )
-    break_delay: float | None = quantity(
-        None, "s", low=0.0, high=100.0, doc="Mean time of a spring from first contact to none left."
-    )
+    speed: float = quantity(0.05, "m/s", low=1e-4, high=1.0)
+    """Of the knife."""
+    time_step: float = quantity(1e-5, "s", low=1e-7, high=1e-3)
+    """Its sub-step."""
+    spring_factor: float = quantity(1.0, "", low=0.0, high=1e3)
+    """On the springs' stiffness."""
+    contact_factor: float = quantity(1.0, "", low=0.0, high=1e3)
+    """On the contact's."""
+    sum_peak: float = quantity(0.0, "N", low=0.0, high=1e6)
+    """Largest sum of norms."""
+    vertical_peak: float = quantity(0.0, "N", low=0.0, high=1e6)
+    """Largest vertical resultant."""
+    broken: int = quantity(0, "", low=0, high=100000)
+    """Springs without stiffness at the end."""
+    mean_stiffness: float = quantity(0.0, "N/m", low=0.0, high=1e6)
+    """Mean of all springs at the end."""
+    sum_middle: float | None = quantity(None, "N", low=0.0, high=1e6)
+    """Sum of norms with the edge 15.1 mm above the ground."""
+    sum_end: float | None = quantity(None, "N", low=0.0, high=1e6)
+    """Sum of norms at the end."""
+    vertical_end: float | None = quantity(None, "N", low=0.0, high=1e6)
+    """Vertical resultant at the end."""
+    break_delay: float | None = quantity(None, "s", low=0.0, high=100.0)
+    """Mean time of a spring from first contact to none left."""
 
 
 @dc.dataclass
@@ -107,8 +112,10 @@ class EnteredFood:
     """Moduli of a food as SliceIt! enters them into DiSECt."""
 
     name: str = ""
-    youngs_modulus: float = quantity(2.6e6, "Pa", low=1e3, high=1e9, doc="As entered.")
-    poisson_ratio: float = quantity(0.37, "", low=0.0, high=0.49, doc="As entered.")
+    youngs_modulus: float = quantity(2.6e6, "Pa", low=1e3, high=1e9)
+    """As entered."""
+    poisson_ratio: float = quantity(0.37, "", low=0.0, high=0.49)
+    """As entered."""
 
 
 @dc.dataclass
@@ -128,13 +135,11 @@ class Case:
     food: Food = dc.field(default_factory=Food)
     knife: Knife = dc.field(default_factory=Knife)
     numerics: Numerics = dc.field(default_factory=Numerics)
-    clearance: float = quantity(
-        2e-3, "m", low=0.0, high=0.1, doc="Of the edge above the food at the start."
-    )
+    clearance: float = quantity(2e-3, "m", low=0.0, high=0.1)
+    """Of the edge above the food at the start."""
     motion: MotionPlan = dc.field(default_factory=MotionPlan)
-    period: float = quantity(
-        5e-3, "s", low=1e-5, high=0.1, doc="Between recorded forces; the sum of norms is sampled."
-    )
+    period: float = quantity(5e-3, "s", low=1e-5, high=0.1)
+    """Between recorded forces; the sum of norms is sampled."""
 
     def model(self) -> CuttingModel:
         """The prepared cut.

@@ -71,9 +71,8 @@ class MeasuredFood:
     food: Food = dc.field(default_factory=Food)
     numerics: Numerics = dc.field(default_factory=Numerics)
     measurement: Measurement = dc.field(default_factory=Measurement)
-    fit_refinement: float = quantity(
-        1.0, "", low=0.1, high=4.0, doc="Elements along an edge in the fit, relative to the mesh."
-    )
+    fit_refinement: float = quantity(1.0, "", low=0.1, high=4.0)
+    """Elements along an edge in the fit, relative to the mesh."""
 
     def check(self, where: str) -> None:
         if not isinstance(self.food.shape, Cylinder):

@@ -33,19 +33,14 @@ class CalibratedFood:
 
     food: Food = dc.field(default_factory=Food)
     knife: Knife = dc.field(default_factory=Knife)
-    flank_stiffness: float = quantity(
-        4.0,
-        "E/h",
-        low=0.01,
-        high=1e3,
-        doc="Flank stiffness of the numerics, a parameter of the food as well.",
-    )
+    flank_stiffness: float = quantity(4.0, "E/h", low=0.01, high=1e3)
+    """Flank stiffness of the numerics, a parameter of the food as well."""
     distribution: ParameterDistribution = dc.field(default_factory=ParameterDistribution)
     spring: SpringFood | None = None
-    rms_error: float | None = quantity(None, "N", low=0.0, high=1e6, doc="On the records.")
-    held_out_error: float | None = quantity(
-        None, "N", low=0.0, high=1e6, doc="On blocks of depth that were held out, each in turn."
-    )
+    rms_error: float | None = quantity(None, "N", low=0.0, high=1e6)
+    """On the records."""
+    held_out_error: float | None = quantity(None, "N", low=0.0, high=1e6)
+    """On blocks of depth that were held out, each in turn."""
     records: list[str] = dc.field(default_factory=list)
     date: str = ""
     command: str = ""

@@ -37,10 +37,10 @@ class ToughnessRate:
     v is not taken below a thousandth of the reference: an edge at rest has a force left.
     """
 
-    exponent: float = quantity(0.0, "", low=-1.0, high=1.0, doc="0 for none.")
-    reference_speed: float = quantity(
-        0.02, "m/s", low=1e-4, high=1.0, doc="Speed at which the toughness is the material's."
-    )
+    exponent: float = quantity(0.0, "", low=-1.0, high=1.0)
+    """0 for none."""
+    reference_speed: float = quantity(0.02, "m/s", low=1e-4, high=1.0)
+    """Speed at which the toughness is the material's."""
 
 
 @dc.dataclass
@@ -81,24 +81,24 @@ class Relaxation:
 class Skin:
     """A skin around the section, cut on the way in and on the way out."""
 
-    toughness: float = quantity(
-        0.0, "J/m", low=0.0, high=100.0, doc="Energy per length of skin: its toughness x thickness."
-    )
-    thickness: float = quantity(
-        3e-4, "m", low=5e-5, high=5e-3, doc="Depth over which a level skin is cut."
-    )
+    toughness: float = quantity(0.0, "J/m", low=0.0, high=100.0)
+    """Energy per length of skin: its toughness x thickness."""
+    thickness: float = quantity(3e-4, "m", low=5e-5, high=5e-3)
+    """Depth over which a level skin is cut."""
 
 
 @dc.dataclass
 class Core:
     """An inner part of another toughness and stiffness, as of seeds or gel."""
 
-    rind: float = quantity(
-        5e-3, "m", low=0.0, high=0.1, doc="Distance from the outside at which the core begins."
-    )
-    transition: float = quantity(1e-3, "m", low=1e-5, high=0.05, doc="Width of the transition.")
-    toughness_ratio: float = quantity(1.0, "", low=0.01, high=10.0, doc="Core over rind.")
-    stiffness_ratio: float = quantity(1.0, "", low=0.01, high=10.0, doc="Core over rind.")
+    rind: float = quantity(5e-3, "m", low=0.0, high=0.1)
+    """Distance from the outside at which the core begins."""
+    transition: float = quantity(1e-3, "m", low=1e-5, high=0.05)
+    """Width of the transition."""
+    toughness_ratio: float = quantity(1.0, "", low=0.01, high=10.0)
+    """Core over rind."""
+    stiffness_ratio: float = quantity(1.0, "", low=0.01, high=10.0)
+    """Core over rind."""
 
     def share(self, distance: np.ndarray) -> np.ndarray:
         """How much of the core is at a distance from the outside: 0 outside, 1 inside."""
@@ -109,13 +109,12 @@ class Core:
 class Centre:
     """A middle of another toughness, as of the columella between a tomato's chambers."""
 
-    distance: float = quantity(
-        0.018, "m", low=0.0, high=0.1, doc="From the outside to where the middle begins."
-    )
-    transition: float = quantity(1e-3, "m", low=1e-5, high=0.05, doc="Width of the transition.")
-    toughness_ratio: float = quantity(
-        1.0, "", low=0.01, high=100.0, doc="Middle over what is around it."
-    )
+    distance: float = quantity(0.018, "m", low=0.0, high=0.1)
+    """From the outside to where the middle begins."""
+    transition: float = quantity(1e-3, "m", low=1e-5, high=0.05)
+    """Width of the transition."""
+    toughness_ratio: float = quantity(1.0, "", low=0.01, high=100.0)
+    """Middle over what is around it."""
 
     def share(self, distance: np.ndarray) -> np.ndarray:
         """How much of the middle is at a distance from the outside: 0 outside, 1 inside."""
@@ -133,17 +132,16 @@ class Bluntness:
     After n slices the excess at the surface is `initiation` + `dulling` n^`dulling_exponent`.
     """
 
-    initiation: float = quantity(
-        0.0, "J/m2", low=0.0, high=1e5, doc="Excess over R where the edge enters the food."
-    )
-    depth: float = quantity(
-        2e-3, "m", low=1e-4, high=0.05, doc="Depth over which the excess falls to 1/e."
-    )
-    dulling: float = quantity(0.0, "J/m2", low=0.0, high=1e5, doc="Growth of the excess, a slice.")
-    dulling_exponent: float = quantity(
-        1.0, "", low=0.1, high=3.0, doc="Exponent of the slice number."
-    )
-    slices: int = quantity(0, "", low=0, high=100000, doc="Slices cut since sharpening.")
+    initiation: float = quantity(0.0, "J/m2", low=0.0, high=1e5)
+    """Excess over R where the edge enters the food."""
+    depth: float = quantity(2e-3, "m", low=1e-4, high=0.05)
+    """Depth over which the excess falls to 1/e."""
+    dulling: float = quantity(0.0, "J/m2", low=0.0, high=1e5)
+    """Growth of the excess, a slice."""
+    dulling_exponent: float = quantity(1.0, "", low=0.1, high=3.0)
+    """Exponent of the slice number."""
+    slices: int = quantity(0, "", low=0, high=100000)
+    """Slices cut since sharpening."""
 
     @property
     def grown(self) -> float:
@@ -165,16 +163,14 @@ class Adhesion:
     Below a tenth of the reference it is linear, so that it has a slope at rest.
     """
 
-    stress: float = quantity(0.0, "Pa", low=0.0, high=1e6, doc="Shear at which it slides.")
-    viscosity: float = quantity(
-        0.0, "Pa s/m", low=0.0, high=1e7, doc="Stress per sliding speed, at the reference."
-    )
-    exponent: float = quantity(
-        1.0, "", low=0.1, high=1.0, doc="Exponent of the speed; 1 for linear."
-    )
-    reference_speed: float = quantity(
-        0.02, "m/s", low=1e-4, high=1.0, doc="Speed at which the viscosity is meant."
-    )
+    stress: float = quantity(0.0, "Pa", low=0.0, high=1e6)
+    """Shear at which it slides."""
+    viscosity: float = quantity(0.0, "Pa s/m", low=0.0, high=1e7)
+    """Stress per sliding speed, at the reference."""
+    exponent: float = quantity(1.0, "", low=0.1, high=1.0)
+    """Exponent of the speed; 1 for linear."""
+    reference_speed: float = quantity(0.02, "m/s", low=1e-4, high=1.0)
+    """Speed at which the viscosity is meant."""
 
     @property
     def steepest(self) -> float:
@@ -186,15 +182,18 @@ class Adhesion:
 class SlicePush:
     """How much a draw helps: the vertical force is R w / (1 + xi^2)^exponent; Atkins: 1."""
 
-    exponent: float = quantity(1.0, "", low=0.5, high=3.0, doc="1 for Atkins' law.")
+    exponent: float = quantity(1.0, "", low=0.5, high=3.0)
+    """1 for Atkins' law."""
 
 
 @dc.dataclass
 class Compliance:
     """Elasticity of what holds knife and food, on a prescribed motion without a robot."""
 
-    arm: float = quantity(0.0, "m/N", low=0.0, high=1e-3, doc="The knife's, vertically.")
-    holder: float = quantity(0.0, "m/N", low=0.0, high=1e-3, doc="The food's, along the edge.")
+    arm: float = quantity(0.0, "m/N", low=0.0, high=1e-3)
+    """The knife's, vertically."""
+    holder: float = quantity(0.0, "m/N", low=0.0, high=1e-3)
+    """The food's, along the edge."""
 
 
 @dc.dataclass
@@ -205,10 +204,10 @@ class Slip:
     `Compliance.holder` > 0, which holds it before.
     """
 
-    resistance: float | None = quantity(None, "N", low=0.0, high=1e4, doc="null: never slips.")
-    remaining: float = quantity(
-        0.5, "", low=0.0, high=1.0, doc="Fraction of the resistance while it slips."
-    )
+    resistance: float | None = quantity(None, "N", low=0.0, high=1e4)
+    """null: never slips."""
+    remaining: float = quantity(0.5, "", low=0.0, high=1.0)
+    """Fraction of the resistance while it slips."""
 
 
 @dc.dataclass
@@ -218,9 +217,8 @@ class Edge:
     At 0 the edge cuts nothing: bonds last behind it until the flanks have torn them, as in DiSECt.
     """
 
-    share: float = quantity(
-        1.0, "", low=0.0, high=1.0, doc="Fraction of toughness and bonds; 0 for opening alone."
-    )
+    share: float = quantity(1.0, "", low=0.0, high=1.0)
+    """Fraction of toughness and bonds; 0 for opening alone."""
 
 
 @dc.dataclass

@@ -39,20 +39,14 @@ class Food:
     )
     material: Material = dc.field(default_factory=Material)
     effects: Effects = dc.field(default_factory=Effects)
-    cut_point: list[float] = quantity(
-        [0.0, 0.0, 0.0], "m", low=-0.5, high=0.5, size=3, doc="A point of the cut plane."
-    )
-    cut_normal: list[float] = quantity(
-        [0.0, 1.0, 0.0], "", low=-1.0, high=1.0, size=3, doc="Normal of the cut plane."
-    )
-    held_sides: str = choice(
-        "both",
-        ("both", "minus", "plus", "none"),
-        doc="Sides of the cut that are held; plus is the side that the normal points to.",
-    )
-    hold_distance: float = quantity(
-        0.0119, "m", low=0.0, high=1.0, doc="Held material is farther than this from the cut."
-    )
+    cut_point: list[float] = quantity([0.0, 0.0, 0.0], "m", low=-0.5, high=0.5, size=3)
+    """A point of the cut plane."""
+    cut_normal: list[float] = quantity([0.0, 1.0, 0.0], "", low=-1.0, high=1.0, size=3)
+    """Normal of the cut plane."""
+    held_sides: str = choice("both", ("both", "minus", "plus", "none"))
+    """Sides of the cut that are held; plus is the side that the normal points to."""
+    hold_distance: float = quantity(0.0119, "m", low=0.0, high=1.0)
+    """Held material is farther than this from the cut."""
 
     def look_beside(self, file: str | Path) -> None:
         """Lets a mesh be found beside the file that this food was read from."""

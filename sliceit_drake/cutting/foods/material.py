@@ -15,39 +15,24 @@ class Material:
     whichever comes first (docs/physics.md).
     """
 
-    youngs_modulus: float = quantity(
-        2.6e6, "Pa", low=1e3, high=1e9, doc="Young's modulus at small strain."
-    )
-    poisson_ratio: float = quantity(0.37, "", low=0.0, high=0.49, doc="Poisson's ratio.")
-    density: float = quantity(950.0, "kg/m3", low=50.0, high=3000.0, doc="True density.")
-    damping_time: float = quantity(
-        4e-6,
-        "s",
-        low=0.0,
-        high=0.1,
-        doc="Kelvin-Voigt viscosity over stiffness; the viscous stress is that of the strain rate.",
-    )
-    toughness: float = quantity(
-        350.0, "J/m2", low=0.0, high=1e5, doc="Energy to part one unit of cut surface."
-    )
-    strength: float = quantity(
-        3e5,
-        "Pa",
-        low=1e2,
-        high=1e8,
-        doc="Traction at which the uncut faces begin to part; a mesh may allow less, and says so.",
-    )
-    friction: float = quantity(0.1, "", low=0.0, high=2.0, doc="Sliding friction on the flanks.")
-    static_friction: float = quantity(
-        0.0,
-        "",
-        low=0.0,
-        high=2.0,
-        doc="Friction at rest (Stribeck); values below `friction` mean no Stribeck effect.",
-    )
-    stribeck_velocity: float = quantity(
-        1e-2, "m/s", low=1e-6, high=10.0, doc="Speed over which static falls to sliding friction."
-    )
+    youngs_modulus: float = quantity(2.6e6, "Pa", low=1e3, high=1e9)
+    """Young's modulus at small strain."""
+    poisson_ratio: float = quantity(0.37, "", low=0.0, high=0.49)
+    """Poisson's ratio."""
+    density: float = quantity(950.0, "kg/m3", low=50.0, high=3000.0)
+    """True density."""
+    damping_time: float = quantity(4e-6, "s", low=0.0, high=0.1)
+    """Kelvin-Voigt viscosity over stiffness; the viscous stress is that of the strain rate."""
+    toughness: float = quantity(350.0, "J/m2", low=0.0, high=1e5)
+    """Energy to part one unit of cut surface."""
+    strength: float = quantity(3e5, "Pa", low=1e2, high=1e8)
+    """Traction at which the uncut faces begin to part; a mesh may allow less, and says so."""
+    friction: float = quantity(0.1, "", low=0.0, high=2.0)
+    """Sliding friction on the flanks."""
+    static_friction: float = quantity(0.0, "", low=0.0, high=2.0)
+    """Friction at rest (Stribeck); values below `friction` mean no Stribeck effect."""
+    stribeck_velocity: float = quantity(1e-2, "m/s", low=1e-6, high=10.0)
+    """Speed over which static falls to sliding friction."""
 
     def lame(self) -> tuple[float, float]:
         """Lame's small-strain moduli (mu, lambda), Pa."""

@@ -31,17 +31,15 @@ the layer, and with it the scaled mass, grow with the inverse square."""
 class Cylinder:
     """A cylinder along Fy that lies on the board, meshed in rings and graded layers."""
 
-    diameter: float = quantity(0.027, "m", low=5e-3, high=0.3, doc="Diameter.")
-    length: float = quantity(0.12, "m", low=1e-2, high=1.0, doc="Length.")
-    rings: int = quantity(4, "", low=2, high=40, doc="Rings of elements across the radius.")
-    layers: list[float] = quantity(
-        [0.0, 2.8e-3, 6.4e-3, 12e-3],
-        "m",
-        low=0.0,
-        high=0.5,
-        doc="Distances of the element layers from y = 0, on both sides; the rest is one layer, "
-        "and layers beyond the food's end are left out.",
-    )
+    diameter: float = quantity(0.027, "m", low=5e-3, high=0.3)
+    """Diameter."""
+    length: float = quantity(0.12, "m", low=1e-2, high=1.0)
+    """Length."""
+    rings: int = quantity(4, "", low=2, high=40)
+    """Rings of elements across the radius."""
+    layers: list[float] = quantity([0.0, 2.8e-3, 6.4e-3, 12e-3], "m", low=0.0, high=0.5)
+    """Distances of the element layers from y = 0, on both sides; the rest is one layer, and layers
+    beyond the food's end are left out."""
 
     @property
     def section(self) -> tuple[float, float]:
@@ -75,20 +73,13 @@ class Cylinder:
 class Box:
     """A box with axes of F, centred in x, meshed on a grid."""
 
-    size: list[float] = quantity(
-        [0.027, 0.12, 0.027], "m", low=2e-3, high=1.0, size=3, doc="Extent along x, y, z."
-    )
-    divisions: list[int] = quantity(
-        [8, 8], "", low=1, high=1000, size=2, doc="Elements along x and along z."
-    )
-    layers: list[float] = quantity(
-        [0.0, 2.8e-3, 6.4e-3, 12e-3],
-        "m",
-        low=0.0,
-        high=0.5,
-        doc="Distances of the element layers from y = 0, on both sides; the rest is one layer, "
-        "and layers beyond the food's end are left out.",
-    )
+    size: list[float] = quantity([0.027, 0.12, 0.027], "m", low=2e-3, high=1.0, size=3)
+    """Extent along x, y, z."""
+    divisions: list[int] = quantity([8, 8], "", low=1, high=1000, size=2)
+    """Elements along x and along z."""
+    layers: list[float] = quantity([0.0, 2.8e-3, 6.4e-3, 12e-3], "m", low=0.0, high=0.5)
+    """Distances of the element layers from y = 0, on both sides; the rest is one layer, and layers
+    beyond the food's end are left out."""
 
     @property
     def section(self) -> tuple[float, float]:
@@ -125,12 +116,10 @@ class Box:
 class Ellipsoid:
     """An ellipsoid with axes of F, standing on the board."""
 
-    diameters: list[float] = quantity(
-        [0.05, 0.05, 0.048], "m", low=5e-3, high=0.5, size=3, doc="Extent along x, y, z."
-    )
-    refinements: int = quantity(
-        3, "", low=0, high=5, doc="Halvings of the 20 tetrahedra of an icosahedron."
-    )
+    diameters: list[float] = quantity([0.05, 0.05, 0.048], "m", low=5e-3, high=0.5, size=3)
+    """Extent along x, y, z."""
+    refinements: int = quantity(3, "", low=0, high=5)
+    """Halvings of the 20 tetrahedra of an icosahedron."""
 
     @property
     def section(self) -> tuple[float, float]:
@@ -179,19 +168,15 @@ class Tapered:
     wide by 1 / sqrt(1 - t^2), where t is the slope of its side to its axis: 0.2 % for the default.
     """
 
-    diameters: list[float] = quantity(
-        [0.015, 0.030], "m", low=5e-3, high=0.3, size=2, doc="At least and at greatest y."
-    )
-    length: float = quantity(0.12, "m", low=1e-2, high=1.0, doc="Length.")
-    rings: int = quantity(4, "", low=2, high=40, doc="Rings of elements across the radius.")
-    layers: list[float] = quantity(
-        [0.0, 2.8e-3, 6.4e-3, 12e-3],
-        "m",
-        low=0.0,
-        high=0.5,
-        doc="Distances of the element layers from y = 0, on both sides; the rest is one layer, "
-        "and layers beyond the food's end are left out.",
-    )
+    diameters: list[float] = quantity([0.015, 0.030], "m", low=5e-3, high=0.3, size=2)
+    """At least and at greatest y."""
+    length: float = quantity(0.12, "m", low=1e-2, high=1.0)
+    """Length."""
+    rings: int = quantity(4, "", low=2, high=40)
+    """Rings of elements across the radius."""
+    layers: list[float] = quantity([0.0, 2.8e-3, 6.4e-3, 12e-3], "m", low=0.0, high=0.5)
+    """Distances of the element layers from y = 0, on both sides; the rest is one layer, and layers
+    beyond the food's end are left out."""
 
     def check(self, where: str) -> None:
         thin = int(np.argmin(self.diameters))
@@ -233,7 +218,8 @@ class MeshFile:
 
     path: str = ""
     """Relative to the scenario that names it, to the working directory, or to the resources."""
-    scale: float = quantity(1.0, "", low=1e-6, high=1e6, doc="Factor to metres.")
+    scale: float = quantity(1.0, "", low=1e-6, high=1e6)
+    """Factor to metres."""
 
     def check(self, where: str) -> None:
         if not self.path:
@@ -317,24 +303,14 @@ class Remainder:
     """
 
     body: Cylinder | Box | Ellipsoid | Tapered = dc.field(default_factory=Cylinder)
-    position: float = quantity(
-        0.0, "m", low=-0.5, high=0.5, doc="Place of the next cut, y in the frame of the whole body."
-    )
-    thickness: float = quantity(
-        5e-3,
-        "m",
-        low=5e-4,
-        high=0.5,
-        doc="Thickness of the next slice, from the free end to the cut.",
-    )
-    slice_layers: int = quantity(2, "", low=1, high=20, doc="Layers of elements in the slice.")
-    layers: list[float] = quantity(
-        [2.8e-3, 6.4e-3, 12e-3],
-        "m",
-        low=1e-4,
-        high=0.5,
-        doc="Distances of the element layers behind the cut; takes the place of the body's own.",
-    )
+    position: float = quantity(0.0, "m", low=-0.5, high=0.5)
+    """Place of the next cut, y in the frame of the whole body."""
+    thickness: float = quantity(5e-3, "m", low=5e-4, high=0.5)
+    """Thickness of the next slice, from the free end to the cut."""
+    slice_layers: int = quantity(2, "", low=1, high=20)
+    """Layers of elements in the slice."""
+    layers: list[float] = quantity([2.8e-3, 6.4e-3, 12e-3], "m", low=1e-4, high=0.5)
+    """Distances of the element layers behind the cut; takes the place of the body's own."""
 
     def check(self, where: str) -> None:
         reach = self.body.reach

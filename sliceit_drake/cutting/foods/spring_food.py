@@ -23,25 +23,20 @@ class SpringFood:
     the cucumber, at full compression, with ODE's default ERP at a step of 1 ms.
     """
 
-    height: float = quantity(0.027, "m", low=5e-3, high=0.3, doc="Height of the food: the travel.")
-    diameter: float = quantity(0.027, "m", low=1e-3, high=0.3, doc="Diameter of the button.")
-    stiffness: float = quantity(613.0, "N/m", low=1.0, high=1e6, doc="Force per compression.")
-    damping: float = quantity(2.45, "Ns/m", low=0.0, high=1e4, doc="Force per compression rate.")
-    mass: float = quantity(0.01, "kg", low=1e-6, high=10.0, doc="Mass of the button.")
-    time_step: float = quantity(
-        1e-3,
-        "s",
-        low=1e-6,
-        high=0.02,
-        doc="Longest inner step; also ODE's step, for which erp() and cfm() hold.",
-    )
-    erp_noise: float = quantity(
-        0.0,
-        "",
-        low=0.0,
-        high=0.99,
-        doc="Half width of the uniform relative noise on ERP at constant CFM; 0.3 in SliceIt!.",
-    )
+    height: float = quantity(0.027, "m", low=5e-3, high=0.3)
+    """Height of the food: the travel."""
+    diameter: float = quantity(0.027, "m", low=1e-3, high=0.3)
+    """Diameter of the button."""
+    stiffness: float = quantity(613.0, "N/m", low=1.0, high=1e6)
+    """Force per compression."""
+    damping: float = quantity(2.45, "Ns/m", low=0.0, high=1e4)
+    """Force per compression rate."""
+    mass: float = quantity(0.01, "kg", low=1e-6, high=10.0)
+    """Mass of the button."""
+    time_step: float = quantity(1e-3, "s", low=1e-6, high=0.02)
+    """Longest inner step; also ODE's step, for which erp() and cfm() hold."""
+    erp_noise: float = quantity(0.0, "", low=0.0, high=0.99)
+    """Half width of the uniform relative noise on ERP at constant CFM; 0.3 in SliceIt!."""
 
     def check(self, where: str) -> None:
         if self.erp_noise > 0.0 and (1.0 + self.erp_noise) * self.erp() > 1.0:

@@ -54,51 +54,39 @@ class JointControlConfig:
     """
 
     stiffness: list[float] = quantity(
-        [3e4, 3e4, 3e4, 1e4, 1e4, 1e4],
-        "Nm/rad",
-        low=0.0,
-        high=1e6,
-        size=JOINTS,
-        doc="Torque per position error.",
+        [3e4, 3e4, 3e4, 1e4, 1e4, 1e4], "Nm/rad", low=0.0, high=1e6, size=JOINTS
     )
+    """Torque per position error."""
     damping: list[float] = quantity(
-        [600.0, 600.0, 500.0, 110.0, 110.0, 100.0],
-        "Nms/rad",
-        low=0.0,
-        high=1e5,
-        size=JOINTS,
-        doc="Torque per velocity error.",
+        [600.0, 600.0, 500.0, 110.0, 110.0, 100.0], "Nms/rad", low=0.0, high=1e5, size=JOINTS
     )
-    reset_rate: float = quantity(
-        20.0, "1/s", low=0.0, high=200.0, doc="Integral gain over stiffness; 0 for no integral."
-    )
+    """Torque per velocity error."""
+    reset_rate: float = quantity(20.0, "1/s", low=0.0, high=200.0)
+    """Integral gain over stiffness; 0 for no integral."""
 
 
 @dc.dataclass
 class RobotConfig:
     """The arm, where it stands, and how it is simulated."""
 
-    base_position: list[float] = quantity(
-        [0.0, 0.0, 0.0], "m", low=-5.0, high=5.0, size=3, doc="Origin of B in the world."
-    )
-    base_rpy: list[float] = quantity(
-        [0.0, 0.0, 0.0], "rad", low=-6.3, high=6.3, size=3, doc="Roll, pitch, yaw of B in W."
-    )
+    base_position: list[float] = quantity([0.0, 0.0, 0.0], "m", low=-5.0, high=5.0, size=3)
+    """Origin of B in the world."""
+    base_rpy: list[float] = quantity([0.0, 0.0, 0.0], "rad", low=-6.3, high=6.3, size=3)
+    """Roll, pitch, yaw of B in W."""
     joint_positions: list[float] = quantity(
         [1.3524, -1.5555, 1.7697, -1.7785, -1.5644, 1.3493],
         "rad",
         low=-6.2832,
         high=6.2832,
         size=JOINTS,
-        doc="Joints at the start; the default is the start of SliceIt!.",
     )
-    tool_position: list[float] = quantity(
-        [0.0, 0.0, 0.21], "m", low=-1.0, high=1.0, size=3, doc="Origin of the knife frame in tool0."
-    )
-    tool_rpy: list[float] = quantity(
-        [0.0, 0.0, 0.0], "rad", low=-6.3, high=6.3, size=3, doc="Rotation of the knife in tool0."
-    )
-    plant_time_step: float = quantity(1e-3, "s", low=1e-5, high=4e-3, doc="Step of the plant.")
+    """Joints at the start; the default is the start of SliceIt!."""
+    tool_position: list[float] = quantity([0.0, 0.0, 0.21], "m", low=-1.0, high=1.0, size=3)
+    """Origin of the knife frame in tool0."""
+    tool_rpy: list[float] = quantity([0.0, 0.0, 0.0], "rad", low=-6.3, high=6.3, size=3)
+    """Rotation of the knife in tool0."""
+    plant_time_step: float = quantity(1e-3, "s", low=1e-5, high=4e-3)
+    """Step of the plant."""
     servo: ServoConfig = dc.field(default_factory=ServoConfig)
     joint_control: JointControlConfig = dc.field(default_factory=JointControlConfig)
 
