@@ -26,6 +26,7 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
 from sliceit_drake.prediction.series import ForceSeries, SharedFacts, SliceFacts
 
@@ -35,6 +36,7 @@ __all__ = [
     "Cause",
     "CauseParameter",
     "Scan",
+    "Values",
     "check_cause",
 ]
 
@@ -62,6 +64,9 @@ EXPERIMENTS = {
 }
 """What a cause may name as the experiment that reveals it."""
 
+Values = Mapping[str, float]
+"""Parameters of a cause by name and, where there is a scan, its value by its name."""
+
 
 @dc.dataclass(frozen=True)
 class CauseParameter:
@@ -73,6 +78,7 @@ class CauseParameter:
         size: A size that matters and is plausible before any measurement, from the null.
         low, high: Range.
         null: Value at which the cause is absent.
+        adds_to: Dotted name of the parameter of the cut to which it is added; "" for none.
     """
 
     name: str
@@ -81,6 +87,7 @@ class CauseParameter:
     low: float = -np.inf
     high: float = np.inf
     null: float = 0.0
+    adds_to: str = ""
 
     @property
     def one_sided(self) -> bool:
@@ -106,8 +113,8 @@ class Scan:
 class Cause:
     """One way in which measured slices may differ from the base model.
 
-    Hooks do nothing unless they are overridden, and change nothing where all values are at their
-    null. `values` holds the parameters by name and, where there is a scan, its value by its name.
+    Hooks change nothing where all values are at their null. Unless they are overridden, `model`
+    adds each parameter to the one of the cut that its `adds_to` names, and the others do nothing.
 
     Attributes:
         name: Short and unique, with underscores.
@@ -122,7 +129,7 @@ class Cause:
             (`SliceFacts.slice_index`, `knife_slices`).
         uses_force: Whether its `motion` needs the force of the slice without it.
         absorbed_by: Base parameters that are the same thing: where one of them is free, this is
-            no cause but a shift of it.
+            no cause but a shift of it. So it is with those that its parameters name.
         signature: What it does to the force, in words.
         experiment: What reveals it, a key of `EXPERIMENTS`.
     """
@@ -143,8 +150,12 @@ class Cause:
     @property
     def simulates(self) -> bool:
         """Whether its slices must be simulated; else it only changes wrenches that are there."""
-        kind = type(self)
-        return kind.model is not Cause.model or kind.motion is not Cause.motion
+        return self.changes_model or type(self).motion is not Cause.motion
+
+    @property
+    def changes_model(self) -> bool:
+        """Whether it acts in the cut."""
+        return type(self).model is not Cause.model or any(p.adds_to for p in self.parameters)
 
     @property
     def adapts(self) -> bool:
@@ -167,13 +178,20 @@ class Cause:
         """Values at which it is absent."""
         return {p.name: p.null for p in self.parameters}
 
-    def model(
-        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
-    ) -> CuttingModel:
+    def model(self, model: CuttingModel, values: Values, facts: SliceFacts) -> CuttingModel:
         """The cut with the cause in it, derived from the cut without."""
-        return model
+        added = {
+            p.adds_to: float(get_parameter(model, p.adds_to)) + values[p.name]
+            for p in self.parameters
+            if p.adds_to and values[p.name] != p.null
+        }
+        return with_parameters(model, added) if added else model
 
-    def extension(self, model: CuttingModel, values: Mapping[str, float]) -> CuttingModel:
+    def absorbed(self, base: Sequence[str]) -> bool:
+        """Whether it is the same thing as one of these base parameters."""
+        return not {*self.absorbed_by, *(p.adds_to for p in self.parameters)}.isdisjoint(base)
+
+    def extension(self, model: CuttingModel, values: Values) -> CuttingModel:
         """The cut with the cause in material and effects alone, as the food of a scenario has it;
         the same cut if it is not of the food."""
         return self.model(model, values, SliceFacts())
@@ -183,7 +201,7 @@ class Cause:
         R: np.ndarray,
         p: np.ndarray,
         t: np.ndarray,
-        values: Mapping[str, float],
+        values: Values,
         facts: SliceFacts,
         force: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -199,9 +217,7 @@ class Cause:
         """
         return R, p
 
-    def wrench(
-        self, series: ForceSeries, values: Mapping[str, float], facts: SliceFacts
-    ) -> np.ndarray:
+    def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:
         """The wrench as it would be measured [N, 6], from `series.wrench`."""
         return series.wrench
 

@@ -60,7 +60,7 @@ def open_causes(base: Sequence[str], extra: Sequence[Cause] = ()) -> list[Cause]
     """
     causes = [*all_causes(), *extra]
     _check_names(causes)
-    return [c for c in causes if not set(c.absorbed_by) & set(base)]
+    return [c for c in causes if not c.absorbed(base)]
 
 
 def is_users(cause: Cause) -> bool:

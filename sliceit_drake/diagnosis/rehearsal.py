@@ -38,7 +38,7 @@ def dry_run(cause: Cause, source: str = "") -> None:
     _try_wrench(cause, nulls, full, facts, source)
     if type(cause).motion is not Cause.motion:
         _try_motion(cause, nulls, full, facts, source)
-    if type(cause).model is not Cause.model:
+    if cause.changes_model:
         food = Food(shape=Cylinder(HEIGHT, 0.06, 2, [0.0, 0.004, 0.012]), hold_distance=0.0119)
         model = make_food_model(food, Knife(), Numerics(time_step=1e-3))
         for values in (nulls, full):

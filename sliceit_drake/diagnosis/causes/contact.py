@@ -1,13 +1,13 @@
 """Causes between knife and food: adhesion, static friction, a blunt and a dulling edge."""
 
 import dataclasses as dc
-from collections.abc import Mapping
 
 import numpy as np
 
 from sliceit_drake.cutting.foods.effects import Bluntness
 from sliceit_drake.cutting.model import CuttingModel
-from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan
+from sliceit_drake.cutting.parameters import with_parameters
+from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan, Values
 from sliceit_drake.diagnosis.causes.material import tougher
 from sliceit_drake.prediction.series import SliceFacts
 
@@ -31,9 +31,7 @@ class StaticFriction(Cause):
     signature = "as friction, less the faster the knife; flips its sign on withdrawal"
     experiment = "second_pass"
 
-    def model(
-        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
-    ) -> CuttingModel:
+    def model(self, model: CuttingModel, values: Values, facts: SliceFacts) -> CuttingModel:
         """Higher friction at rest."""
         old = model.material
         rest = max(old.static_friction, old.friction) + values["share"] * old.friction
@@ -51,26 +49,22 @@ class FlankAdhesion(Cause):
     family = "knife and contact"
     row = 5
     parameters = (
-        CauseParameter("stress", "Pa", 400.0, low=0.0, high=1e5),
-        CauseParameter("viscosity", "Pa s/m", 1.5e4, low=0.0, high=1e6),
+        CauseParameter("stress", "Pa", 400.0, low=0.0, high=1e5, adds_to="effects.adhesion.stress"),
+        CauseParameter(
+            "viscosity", "Pa s/m", 1.5e4, low=0.0, high=1e6, adds_to="effects.adhesion.viscosity"
+        ),
     )
     scan = Scan("exponent", "", (0.5, 1.0))
-    absorbed_by = ("effects.adhesion.stress", "effects.adhesion.viscosity")
     signature = "as friction without pressure; pulls at the end of a withdrawal, more the faster"
     experiment = "retract"
 
-    def model(
-        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
-    ) -> CuttingModel:
+    def model(self, model: CuttingModel, values: Values, facts: SliceFacts) -> CuttingModel:
         """More adhesion."""
-        old = model.effects.adhesion
-        adhesion = dc.replace(
-            old, stress=old.stress + values["stress"], viscosity=old.viscosity + values["viscosity"]
-        )
+        model = super().model(model, values, facts)
         # At its null nothing may change, and the null has no exponent.
         if values["viscosity"] != 0.0:
-            adhesion = dc.replace(adhesion, exponent=values["exponent"])
-        return model.derive(effects=dc.replace(model.effects, adhesion=adhesion))
+            model = with_parameters(model, {"effects.adhesion.exponent": values["exponent"]})
+        return model
 
 
 class BluntEdge(Cause):
@@ -85,13 +79,11 @@ class BluntEdge(Cause):
     signature = "raises the first peak, the plateau hardly; with skin or without, less in a draw"
     experiment = "skinned"
 
-    def model(
-        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
-    ) -> CuttingModel:
+    def model(self, model: CuttingModel, values: Values, facts: SliceFacts) -> CuttingModel:
         """Tougher points near the surface."""
         return _harder_to_begin(model, values["initiation"], values["depth"])
 
-    def extension(self, model: CuttingModel, values: Mapping[str, float]) -> CuttingModel:
+    def extension(self, model: CuttingModel, values: Values) -> CuttingModel:
         """More to begin with; the depth over which it falls takes the place of the model's."""
         return _blunter(model, values["initiation"], values["depth"])
 
@@ -109,14 +101,12 @@ class Dulling(Cause):
     signature = "the first peak grows from slice to slice, and is back when the knife is sharpened"
     experiment = "repeats"
 
-    def model(
-        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
-    ) -> CuttingModel:
+    def model(self, model: CuttingModel, values: Values, facts: SliceFacts) -> CuttingModel:
         """Tougher points near the surface, by the number of slices."""
         grown = values["growth"] * (facts.knife_slices / DULLED) ** values["exponent"]
         return _harder_to_begin(model, grown, DULLED_DEPTH)
 
-    def extension(self, model: CuttingModel, values: Mapping[str, float]) -> CuttingModel:
+    def extension(self, model: CuttingModel, values: Values) -> CuttingModel:
         """An edge after `DULLED` slices."""
         return _blunter(model, values["growth"], DULLED_DEPTH)
 

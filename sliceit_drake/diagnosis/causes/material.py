@@ -1,13 +1,12 @@
 """Causes in the food's material: rates, skin, core, the law of the draw."""
 
 import dataclasses as dc
-from collections.abc import Mapping
 
 import numpy as np
 
-from sliceit_drake.cutting.foods.effects import Core, Relaxation, Skin, SlicePush, ToughnessRate
+from sliceit_drake.cutting.foods.effects import Core, Relaxation, Skin
 from sliceit_drake.cutting.model import CuttingModel
-from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan
+from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan, Values
 from sliceit_drake.prediction.series import ForceSeries, SliceFacts
 
 __all__ = [
@@ -49,9 +48,7 @@ class Viscoelasticity(Cause):
     signature = "decays in a hold; grows with the logarithm of the speed"
     experiment = "hold"
 
-    def model(
-        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
-    ) -> CuttingModel:
+    def model(self, model: CuttingModel, values: Values, facts: SliceFacts) -> CuttingModel:
         """Further branches."""
         old = model.effects.relaxation
         added = {time: values[f"share_{speed}"] for speed, time in BRANCHES.items()}
@@ -61,9 +58,7 @@ class Viscoelasticity(Cause):
         relaxation = Relaxation([*old.shares, *added.values()], [*old.times, *added])
         return model.derive(effects=dc.replace(model.effects, relaxation=relaxation))
 
-    def wrench(
-        self, series: ForceSeries, values: Mapping[str, float], facts: SliceFacts
-    ) -> np.ndarray:
+    def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:
         """Less what has faded while the knife rests."""
         shares = {time: values[f"rest_{speed}"] for speed, time in BRANCHES.items()}
         if not any(shares.values()):
@@ -89,18 +84,13 @@ class ToughnessBySpeed(Cause):
     name = "toughness_rate"
     family = "material"
     row = 2
-    parameters = (CauseParameter("exponent", "", 0.08, low=-0.5, high=0.5),)
-    absorbed_by = ("effects.toughness_rate.exponent",)
+    parameters = (
+        CauseParameter(
+            "exponent", "", 0.08, low=-0.5, high=0.5, adds_to="effects.toughness_rate.exponent"
+        ),
+    )
     signature = "scales the whole plateau with the speed; ceases at once when the edge stops"
     experiment = "speeds"
-
-    def model(
-        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
-    ) -> CuttingModel:
-        """Another exponent."""
-        old = model.effects.toughness_rate
-        rate = ToughnessRate(old.exponent + values["exponent"], old.reference_speed)
-        return model.derive(effects=dc.replace(model.effects, toughness_rate=rate))
 
 
 class SkinToughness(Cause):
@@ -119,9 +109,7 @@ class SkinToughness(Cause):
     signature = "peaks at entry and exit; none where the food is skinned"
     experiment = "skinned"
 
-    def model(
-        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
-    ) -> CuttingModel:
+    def model(self, model: CuttingModel, values: Values, facts: SliceFacts) -> CuttingModel:
         """Tougher points near the outside; in all by `toughness` times the outline."""
         if facts.peeled:
             return model
@@ -129,7 +117,7 @@ class SkinToughness(Cause):
         shape = np.exp(-model.point_distance / values["thickness"])
         return tougher(model, shape, values["toughness"] * outline)
 
-    def extension(self, model: CuttingModel, values: Mapping[str, float]) -> CuttingModel:
+    def extension(self, model: CuttingModel, values: Values) -> CuttingModel:
         """More skin; its thickness takes the place of the model's."""
         skin = Skin(model.effects.skin.toughness + values["toughness"], values["thickness"])
         return model.derive(effects=dc.replace(model.effects, skin=skin))
@@ -146,9 +134,7 @@ class CoreRatio(Cause):
     signature = "locked to depth, at any speed; another shape than the section's width"
     experiment = "repeats"
 
-    def model(
-        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
-    ) -> CuttingModel:
+    def model(self, model: CuttingModel, values: Values, facts: SliceFacts) -> CuttingModel:
         """Another core; the rind is given as a fraction of half the section's size."""
         half = 0.5 * min(facts.height, facts.width)
         weakening, old = values["weakening"], model.effects.core
@@ -169,25 +155,15 @@ class SlicePushLaw(Cause):
     family = "material"
     row = 10
     parameters = (
-        CauseParameter("exponent", "", 0.25, low=-0.5, high=2.0),
+        CauseParameter(
+            "exponent", "", 0.25, low=-0.5, high=2.0, adds_to="effects.slice_push.exponent"
+        ),
         CauseParameter("pull", "", 0.15, low=-1.0, high=1.0),
     )
-    absorbed_by = ("effects.slice_push.exponent",)
     signature = "nothing without a draw, grows with the draw; along the edge unlike down"
     experiment = "draw"
 
-    def model(
-        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
-    ) -> CuttingModel:
-        """Another exponent."""
-        if values["exponent"] == 0.0:
-            return model
-        law = SlicePush(model.effects.slice_push.exponent + values["exponent"])
-        return model.derive(effects=dc.replace(model.effects, slice_push=law))
-
-    def wrench(
-        self, series: ForceSeries, values: Mapping[str, float], facts: SliceFacts
-    ) -> np.ndarray:
+    def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:
         """With more or less of the edge's force along itself."""
         edge = series.R[:, :, 0]
         along = np.einsum("nc,nc->n", series.parts["edge"][:, 3:], edge)

@@ -1,13 +1,12 @@
 """Causes in board, holder, arm and geometry."""
 
-import dataclasses as dc
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.signal import lfilter
 
 from sliceit_drake.cutting.model import CuttingModel, PointScales
-from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan
+from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan, Values
 from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
 from sliceit_drake.diagnosis.evidence.jumps import largest_jump, unlike_others
 from sliceit_drake.prediction.series import ForceSeries, SliceFacts
@@ -42,7 +41,7 @@ class BoardHeight(Cause):
         R: np.ndarray,
         p: np.ndarray,
         t: np.ndarray,
-        values: Mapping[str, float],
+        values: Values,
         facts: SliceFacts,
         force: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -63,9 +62,7 @@ class BoardLaw(Cause):
     signature = "only where the board is touched; the same on the way back"
     experiment = "board_press"
 
-    def wrench(
-        self, series: ForceSeries, values: Mapping[str, float], facts: SliceFacts
-    ) -> np.ndarray:
+    def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:
         """With the board's part F (1 + share) (|F| / 5 N)^exponent."""
         board = series.parts["board"]
         force = np.abs(board[:, 5:])
@@ -80,31 +77,22 @@ class ArmCompliance(Cause):
     family = "robot"
     row = 14
     parameters = (
-        CauseParameter("compliance", "m/N", 1e-5, low=0.0, high=1e-3),
+        CauseParameter(
+            "compliance", "m/N", 1e-5, low=0.0, high=1e-3, adds_to="effects.compliance.arm"
+        ),
         CauseParameter("creep", "m/N", 5e-6, low=0.0, high=1e-3),
     )
     scan = Scan("time", "s", (0.1, 0.5))
     uses_force = True
-    absorbed_by = ("effects.compliance.arm",)
     signature = "depth stretched in proportion to the force"
     experiment = "board_press"
-
-    def model(
-        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
-    ) -> CuttingModel:
-        """A softer arm."""
-        if values["compliance"] == 0.0:
-            return model
-        old = model.effects.compliance
-        softer = dc.replace(old, arm=old.arm + values["compliance"])
-        return model.derive(effects=dc.replace(model.effects, compliance=softer))
 
     def motion(
         self,
         R: np.ndarray,
         p: np.ndarray,
         t: np.ndarray,
-        values: Mapping[str, float],
+        values: Values,
         facts: SliceFacts,
         force: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -130,18 +118,13 @@ class HolderCompliance(Cause):
     name = "holder_compliance"
     family = "board, holder, geometry"
     row = 14
-    parameters = (CauseParameter("compliance", "m/N", 4e-5, low=0.0, high=1e-3),)
-    absorbed_by = ("effects.compliance.holder",)
+    parameters = (
+        CauseParameter(
+            "compliance", "m/N", 4e-5, low=0.0, high=1e-3, adds_to="effects.compliance.holder"
+        ),
+    )
     signature = "the force along the edge of a draw comes later, and ends later"
     experiment = "draw"
-
-    def model(
-        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
-    ) -> CuttingModel:
-        """A softer holder."""
-        old = model.effects.compliance
-        softer = dc.replace(old, holder=old.holder + values["compliance"])
-        return model.derive(effects=dc.replace(model.effects, compliance=softer))
 
 
 class FoodSlip(Cause):
@@ -174,9 +157,7 @@ class FoodSlip(Cause):
                 out._moments[r.name] = moment
         return out
 
-    def wrench(
-        self, series: ForceSeries, values: Mapping[str, float], facts: SliceFacts
-    ) -> np.ndarray:
+    def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:
         """With the knock."""
         moment = self._moments.get(facts.name)
         if moment is None:
@@ -202,9 +183,7 @@ class SectionShape(Cause):
     signature = "locked to depth, at any speed and draw; multiplies cutting and friction alike"
     experiment = "skinned"
 
-    def model(
-        self, model: CuttingModel, values: Mapping[str, float], facts: SliceFacts
-    ) -> CuttingModel:
+    def model(self, model: CuttingModel, values: Values, facts: SliceFacts) -> CuttingModel:
         """Cut points that stand for more or less of the section, by their height."""
         if values["taper"] == 0.0 and values["belly"] == 0.0:
             return model

@@ -2,12 +2,12 @@
 
 import copy
 import dataclasses as dc
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from sliceit_drake.cutting.model import GRAVITY
-from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan
+from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan, Values
 from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
 from sliceit_drake.diagnosis.evidence.periodicity import strongest_frequencies
 from sliceit_drake.prediction.series import ForceSeries, SliceFacts
@@ -32,9 +32,7 @@ class ToolWeight(Cause):
     signature = "there in the air; goes with acceleration and the tool's orientation"
     experiment = "air"
 
-    def wrench(
-        self, series: ForceSeries, values: Mapping[str, float], facts: SliceFacts
-    ) -> np.ndarray:
+    def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:
         """With what a mass on Kz adds, `moment` its mass times its place there from Ko.
 
         A sensor that was zeroed at the start does not show what was there then.
@@ -84,9 +82,7 @@ class Vibration(Cause):
             series.append((r.time[moving], r.residual[moving][:, forces]))
         return _at(self, strongest_frequencies(series, *self.range))
 
-    def wrench(
-        self, series: ForceSeries, values: Mapping[str, float], facts: SliceFacts
-    ) -> np.ndarray:
+    def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:
         """With the waves."""
         angle = 2.0 * np.pi * values["frequency"] * (series.time - series.time[0])
         moving = np.tanh(series.speed / REST)
@@ -130,9 +126,7 @@ class StickSlip(Cause):
         found = strongest_frequencies(series, 1.0 / self.range[1], 1.0 / self.range[0])
         return _at(self, tuple(1.0 / f for f in found))
 
-    def wrench(
-        self, series: ForceSeries, values: Mapping[str, float], facts: SliceFacts
-    ) -> np.ndarray:
+    def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:
         """With the waves, against the motion."""
         path = np.cumsum(series.speed) * series.period
         angle = 2.0 * np.pi * path / values["pitch"]

@@ -1,11 +1,9 @@
 """Causes in the wrench sensor and its mounting. They act on predicted wrenches alone."""
 
-from collections.abc import Mapping
-
 import numpy as np
 from scipy.signal import lfilter
 
-from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan
+from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan, Values
 from sliceit_drake.prediction.series import ForceSeries, SliceFacts
 
 __all__ = ["SensorDelay", "SensorGain", "SensorTilt", "SensorZero"]
@@ -26,9 +24,7 @@ class SensorZero(Cause):
     signature = "there without contact; independent of depth and speed"
     experiment = "air"
 
-    def wrench(
-        self, series: ForceSeries, values: Mapping[str, float], facts: SliceFacts
-    ) -> np.ndarray:
+    def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:
         """With the zero added."""
         bias, drift = (np.array([values[f"{k}_{a}"] for a in AXES]) for k in ("bias", "drift"))
         out = series.wrench.copy()
@@ -47,9 +43,7 @@ class SensorGain(Cause):
     signature = "scales everything, a known weight too"
     experiment = "weight"
 
-    def wrench(
-        self, series: ForceSeries, values: Mapping[str, float], facts: SliceFacts
-    ) -> np.ndarray:
+    def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:
         """Scaled."""
         return series.wrench * (1.0 + values["gain"])
 
@@ -67,9 +61,7 @@ class SensorTilt(Cause):
     signature = "sideways forces in proportion to the press; turns with the tool"
     experiment = "weight"
 
-    def wrench(
-        self, series: ForceSeries, values: Mapping[str, float], facts: SliceFacts
-    ) -> np.ndarray:
+    def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:
         """Turned."""
         turn = series.in_food(np.array([values["about_x"], values["about_y"], 0.0]))
         angle = float(np.hypot(values["about_x"], values["about_y"]))
@@ -95,9 +87,7 @@ class SensorDelay(Cause):
     signature = "minus the delay times the rate of the force; in depth it goes with the speed"
     experiment = "retract"
 
-    def wrench(
-        self, series: ForceSeries, values: Mapping[str, float], facts: SliceFacts
-    ) -> np.ndarray:
+    def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:
         """Delayed; a filter y += (x - y) / (n + 1) is n rows late."""
         stages = round(values["stages"])
         rows = values["delay"] / stages / series.period
