@@ -167,7 +167,7 @@ def test_factors_of_one_call_do_not_reach_contexts_that_share_its_solver(diagram
     fresh = solvers[0].initial_state()
 
     def edge(factors: SurfaceFactors) -> float:
-        return float(solvers[0].coupling_step(fresh, above, below, factors).edge[5])
+        return float(solvers[0].coupling_step(fresh, above, below, factors).wrenches[0, 0, 5])
 
     run = Slice(diagram, *MOTIONS[0])
     for _ in range(LENGTH):

@@ -40,6 +40,7 @@ SPEED = 0.02
 TOUGHNESS = 300.0
 WIDTH, HEIGHT = 0.024, 0.02
 CLEARANCE = 5e-4
+LOSSES = ("edge", "opening", "friction", "board_friction", "blade")
 
 
 @functools.cache
@@ -410,7 +411,7 @@ def test_with_all_effects_on_the_energy_balance_closes_and_no_loss_is_negative()
 
     def recorded(*arguments):
         for launch, steps in run(*arguments):
-            losses.append(steps[0].dissipation)
+            losses.append([getattr(steps[0].balance, name) for name in LOSSES])
             yield launch, steps
 
     solver.driver.run = recorded  # type: ignore[method-assign]

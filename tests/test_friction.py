@@ -37,7 +37,7 @@ def settle(solver, state, pose, coupling_steps):
     for _ in range(coupling_steps):
         step = solver.coupling_step(state, pose, pose)
         state = step.state
-        forces.append(step.friction[3:])
+        forces.append(step.wrenches[0, 2, 3:])
     return np.mean(forces[-10:], axis=0), state
 
 
@@ -73,8 +73,9 @@ def test_sliding_friction_is_mu_times_the_normal_force(pressed):
     # vertical component: N = F_z / sin(half angle), for both together.
     knife = solver.model.knife
     slope = 0.5 * (knife.spine_thickness - knife.edge_thickness) / knife.height
-    normal = step.normal[5] * np.hypot(1.0, slope) / slope
-    assert abs(step.friction[3]) == pytest.approx(FRICTION * normal, rel=0.05)
+    _, pressure, friction = step.wrenches[0]
+    normal = pressure[5] * np.hypot(1.0, slope) / slope
+    assert abs(friction[3]) == pytest.approx(FRICTION * normal, rel=0.05)
 
 
 def test_below_the_slip_load_a_hold_does_not_creep(pressed):

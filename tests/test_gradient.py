@@ -24,6 +24,7 @@ from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.gradient import SliceAdjoint, SliceGradient, SliceRun
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel, Numerics
+from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.parameters import (
     POINT_PARAMETERS,
     get_parameter,
@@ -251,15 +252,12 @@ def test_single_precision_gradients_are_within_one_percent(everything):
 
 
 def test_the_slice_with_gradients_is_the_slice_without(everything):
-    solver = CuttingSolver(everything.model, PERIOD)
-    result = solver.coupling_steps(
-        everything.run.states[0], everything.run.R[:2], everything.run.p[:2]
-    )
-    np.testing.assert_array_equal(result.wrenches[0].sum(0), everything.run.wrenches[0])
-    state = everything.run.states[60]
-    result = solver.coupling_steps(state, everything.run.R[60:62], everything.run.p[60:62])
-    np.testing.assert_array_equal(result.wrenches[0].sum(0), everything.run.wrenches[60])
-    np.testing.assert_array_equal(result.state, everything.run.states[61])
+    solver, run = CuttingSolver(everything.model, PERIOD), everything.run
+    for k in (0, 60):
+        start, end = (Pose(run.R[j], run.p[j]) for j in (k, k + 1))
+        result = solver.coupling_step(run.states[k], start, end)
+        np.testing.assert_array_equal(result.wrench, run.wrenches[k])
+        np.testing.assert_array_equal(result.state, run.states[k + 1])
 
 
 def test_memory_does_not_grow_with_the_number_of_sub_steps_kept(everything):

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
+from sliceit_drake.cutting.coupling_steps import CouplingSteps
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan, Pose, Retract
-from sliceit_drake.cutting.solver import CouplingStep, CuttingSolver
+from sliceit_drake.cutting.solver import CuttingSolver
 
 PERIOD = 2e-3
 SHAPE = Cylinder(rings=3, layers=[0.0, 0.004, 0.012])
@@ -16,7 +17,7 @@ SHAPE = Cylinder(rings=3, layers=[0.0, 0.004, 0.012])
 
 def follow(
     segments: list, food: Food, time_step: float, **numerics
-) -> tuple[CuttingSolver, list[CouplingStep], np.ndarray, list[Pose]]:
+) -> tuple[CuttingSolver, list[CouplingSteps], np.ndarray, list[Pose]]:
     """The coupling steps along a path, the positions of the nodes after each, and the poses in
     C."""
     model = make_food_model(food, Knife(), Numerics(time_step=time_step, **numerics))
@@ -91,7 +92,7 @@ def test_the_force_on_the_way_out_pulls_the_knife_back_and_ends_outside():
     _, coupling_steps, _, poses = follow(segments, Food(shape=SHAPE), 5e-4)
     height = np.array([pose.p[2] for pose in poses[1:]])
     vertical = np.array([step.wrench[5] for step in coupling_steps])
-    edge = np.array([step.edge[5] for step in coupling_steps])
+    edge = np.array([step.wrenches[0, 0, 5] for step in coupling_steps])
     deepest = int(height.argmin())
     inside = np.arange(len(height)) > deepest
     inside &= (height > height.min() + 1e-3) & (height < height.min() + 8e-3)

@@ -38,7 +38,7 @@ def pull_apart(model, solver, state, distance, coupling_steps=400):
         x[plus, 1] += distance / coupling_steps
         step = solver.coupling_step(state, FAR, FAR)
         state = step.state
-        lost += step.opening_dissipation
+        lost += step.balance.opening
     return lost, state
 
 
@@ -90,8 +90,8 @@ def test_edge_and_opening_share_one_toughness():
     for a, b in zip(heights[:-1], heights[1:], strict=True):
         step = solver.coupling_step(state, at(a), at(b))
         state = step.state
-        by_edge += step.edge_dissipation
-        by_opening += step.opening_dissipation
+        by_edge += step.balance.edge
+        by_opening += step.balance.opening
     half = 0.5 * TOUGHNESS * model.section_area
     assert by_edge + by_opening == pytest.approx(half, rel=0.25)
     opened, state = pull_apart(model, solver, state, distance=8e-3)

@@ -10,84 +10,15 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from sliceit_drake.cutting.board import Board
+from sliceit_drake.cutting.coupling_steps import CouplingSteps, run_coupling_steps
 from sliceit_drake.cutting.knife_path import KnifePath
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.workspace import Workspace
 
-__all__ = ["CouplingSteps", "Driver", "DriverPool", "Launch", "even_launches", "run_coupling_steps"]
+__all__ = ["Driver", "DriverPool", "Launch", "even_launches"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-
-
-LOSSES = ("edge_loss", "opening_loss", "friction_loss")
-"""Energies dissipated at the cut points, in the order of `CouplingSteps.dissipation`."""
-
-
-@dc.dataclass
-class CouplingSteps:
-    """Result of E coupling steps in a row; see `CouplingStep`.
-
-    Attributes:
-        state: The food's new state.
-        wrenches: Wrenches by mechanism (edge, flank pressure, friction) [E, 3, 6].
-        work: Work of each coupling step [E], J.
-        dissipation: Energy lost by edge, opening, friction, blade, board over all coupling steps
-            [5], J.
-        internal_work, gravity_work: Work over all coupling steps, J.
-        cut: Fraction of the section that the edge has passed [E].
-    """
-
-    state: np.ndarray
-    wrenches: np.ndarray
-    work: np.ndarray
-    dissipation: np.ndarray
-    internal_work: float
-    gravity_work: float
-    cut: np.ndarray
-
-    @property
-    def finite(self) -> bool:
-        """Whether the cut has not broken down; limits on forces can hide a state that has."""
-        return bool(np.isfinite(self.wrenches).all() and np.isfinite(self.state).all())
-
-
-def run_coupling_steps(
-    ws: Workspace, states: np.ndarray, R: np.ndarray, p: np.ndarray
-) -> list[CouplingSteps]:
-    """Advances all cuts of a workspace by its coupling steps.
-
-    Args:
-        ws: Workspace of C cuts and E coupling steps.
-        states: [C, state_size].
-        R: Rotations of the knives in C at the ends of the coupling steps [C, E + 1, 3, 3].
-        p: Positions of Ko there [C, E + 1, 3], metres.
-
-    Returns:
-        One result a cut; what is not finite is left so.
-    """
-    ws.advance(states, R, p)
-    new = ws.read(ws.states[0]).copy()
-    results = ws.results()
-    x = ws.layout["x"]
-    return [
-        CouplingSteps(
-            state=new[c],
-            wrenches=row["wrenches"],
-            work=row["work"],
-            dissipation=np.array(
-                [
-                    *np.stack([row["point_sums"][name] for name in LOSSES], axis=1).sum(0),
-                    row["blade"]["loss"].sum(),
-                    row["node_sums"]["board_loss"],
-                ]
-            ),
-            internal_work=float(row["node_sums"]["internal_work"]),
-            gravity_work=float(model.weight.ravel() @ (new[c, x] - states[c, x])),
-            cut=row["point_sums"]["cut_area"] / model.section_area,
-        )
-        for c, (model, row) in enumerate(zip(ws.models, results, strict=True))
-    ]
 
 
 class Launch(NamedTuple):

@@ -6,16 +6,16 @@ from collections.abc import Iterator
 import numpy as np
 
 from sliceit_drake.cutting.board import Board, board_wrenches
-from sliceit_drake.cutting.driver import CouplingSteps, Launch, even_launches
+from sliceit_drake.cutting.coupling_steps import Energies, EnergyBalance
+from sliceit_drake.cutting.driver import Launch, even_launches
 from sliceit_drake.cutting.knife import signed_distance
 from sliceit_drake.cutting.knife_path import CHECK_TRAVEL, KnifePath
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Motion, Pose
-from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError, CuttingSolver, Energies
+from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError, CuttingSolver
 
 __all__ = [
     "ENERGY_RATIO_LIMIT",
-    "EnergyBalance",
     "SliceResult",
     "check_clear",
     "check_energies",
@@ -31,49 +31,6 @@ LATERAL_LIMIT = 3e-3
 TILT_LIMIT = 0.15
 """Greatest angle between the blade and the cut plane, rad."""
 MIN_VOLUME_RATIO = 0.0
-
-
-@dc.dataclass
-class EnergyBalance:
-    """Work and dissipation since the start of a slice, J.
-
-    Attributes:
-        work: Work of the knife on the food.
-        gravity: Work of the food's weight.
-        edge, opening, friction, board_friction, blade: Energy dissipated.
-        internal: Work of the bulk's forces on the nodes.
-    """
-
-    work: float = 0.0
-    gravity: float = 0.0
-    edge: float = 0.0
-    opening: float = 0.0
-    friction: float = 0.0
-    board_friction: float = 0.0
-    blade: float = 0.0
-    internal: float = 0.0
-
-    def add(self, step: CouplingSteps) -> None:
-        """Adds coupling steps."""
-        edge, opening, friction, blade, board = step.dissipation.tolist()
-        self.work += float(step.work.sum())
-        self.gravity += step.gravity_work
-        self.edge += edge
-        self.opening += opening
-        self.friction += friction
-        self.board_friction += board
-        self.blade += blade
-        self.internal += step.internal_work
-
-    def damping(self, energies: Energies) -> float:
-        """Dissipated by the bulk's viscosity: work on the elements that they do not store."""
-        return -self.internal - energies.elastic
-
-    def residual(self, energies: Energies) -> float:
-        """Work put in minus everything that it went into; 0 if energy is conserved."""
-        stored = energies.elastic + energies.interface + energies.kinetic
-        spent = self.edge + self.opening + self.friction + self.board_friction + self.blade
-        return self.work + self.gravity - stored - spent - self.damping(energies)
 
 
 @dc.dataclass
@@ -263,7 +220,7 @@ def simulate_slice(
         if not step.finite:
             raise CuttingError(f"at {(k + 1) * T:.4g} s {NOT_FINITE}")
         at, state = slice(k, k + block), step.state
-        balance.add(step)
+        balance += step.balance
         parts = step.wrenches.reshape(block, 3, 2, 3) @ R_FC.T
         food_wrench[at] = parts.sum(1).reshape(block, 6)
         mechanisms[at] = parts[:, :, 1]

@@ -1,25 +1,18 @@
 """Advances the food through one coupling step: captured Warp graphs on a workspace, state in
 NumPy."""
 
-import dataclasses as dc
 import threading
 import typing
 
 import numpy as np
 
-from sliceit_drake.cutting.driver import CouplingSteps, Driver, Launch, run_coupling_steps
+from sliceit_drake.cutting.coupling_steps import CouplingSteps, Energies, run_coupling_steps
+from sliceit_drake.cutting.driver import Driver
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose, small_turn
 from sliceit_drake.cutting.workspace import Workspace, parameter_row
 
-__all__ = [
-    "NOT_FINITE",
-    "CouplingStep",
-    "CuttingError",
-    "CuttingSolver",
-    "Energies",
-    "SurfaceFactors",
-]
+__all__ = ["NOT_FINITE", "CuttingError", "CuttingSolver", "SurfaceFactors"]
 
 
 class CuttingError(RuntimeError):
@@ -34,62 +27,6 @@ class SurfaceFactors(typing.NamedTuple):
 
     toughness: float = 1.0
     friction: float = 1.0
-
-
-@dc.dataclass
-class CouplingStep:
-    """Result of one coupling step. Wrenches act on the knife, at Ko at the end of the coupling
-    step, in C.
-
-    Attributes:
-        state: The food's new state.
-        wrench: Mean moment about Ko and force [6], Nm and N.
-        edge, normal, friction: Wrenches by mechanism; they sum to `wrench`.
-        work: Work done by the knife on the food, J.
-        edge_dissipation, opening_dissipation, friction_dissipation: Each never negative, J.
-        internal_work: Work of the bulk's forces (elastic and damping) on the nodes, J.
-        blade_dissipation: Dissipated in the bending blade, J.
-        board_force: Mean force of the board on the food [3], N.
-        board_dissipation: Friction and damping of the food on the board, J.
-        gravity_work: Work of the weight, J.
-        cut: Fraction of the section that the edge has passed.
-    """
-
-    state: np.ndarray
-    wrench: np.ndarray
-    edge: np.ndarray
-    normal: np.ndarray
-    friction: np.ndarray
-    work: float
-    edge_dissipation: float
-    opening_dissipation: float
-    friction_dissipation: float
-    internal_work: float
-    blade_dissipation: float
-    board_force: np.ndarray
-    board_dissipation: float
-    gravity_work: float
-    cut: float
-
-
-@dc.dataclass
-class Energies:
-    """Energies of a state, J.
-
-    Attributes:
-        elastic: Energy of the bulk.
-        interface: Energy of bonds, contacts, friction anchors, the edge's unloading and the bent
-            blade.
-        kinetic: Energy of the stepped (scaled) mass.
-        least_volume_ratio: Smallest J of all elements.
-        min_element: Element that has it.
-    """
-
-    elastic: float
-    interface: float
-    kinetic: float
-    least_volume_ratio: float
-    min_element: int
 
 
 UNCHANGED = SurfaceFactors()
@@ -167,7 +104,7 @@ class CuttingSolver:
 
     def coupling_step(
         self, state: np.ndarray, start: Pose, end: Pose, factors: SurfaceFactors = UNCHANGED
-    ) -> CouplingStep:
+    ) -> CouplingSteps:
         """Advances the food while the knife moves from `start` to `end`.
 
         Args:
@@ -179,54 +116,13 @@ class CuttingSolver:
         Raises:
             CuttingError: A force is not finite, or the knife left the region that is modelled.
         """
-        m, ws = self.model, self._workspace
         R, p = np.array([[start.R, end.R]]), np.array([[start.p, end.p]])
         with self._lock:
             self._take_factors(factors)
-            ws.advance(state[None], R, p)
-            new = ws.read(ws.states[0])[0].copy()
-            results = ws.results()
-        if not np.isfinite(results.view(np.float64)).all():
+            (step,) = run_coupling_steps(self._workspace, state[None], R, p)
+        if not step.finite:
             raise CuttingError(NOT_FINITE)
-        (result,) = results
-        sums, nodes = result["point_sums"][0], result["node_sums"]
-        edge, normal, friction = wrenches = result["wrenches"][0]
-        x = ws.layout["x"]
-        return CouplingStep(
-            state=new,
-            wrench=wrenches.sum(0),
-            edge=edge,
-            normal=normal,
-            friction=friction,
-            work=float(result["work"][0]),
-            edge_dissipation=float(sums["edge_loss"]),
-            opening_dissipation=float(sums["opening_loss"]),
-            friction_dissipation=float(sums["friction_loss"]),
-            internal_work=float(nodes["internal_work"]),
-            blade_dissipation=float(result["blade"]["loss"][0]),
-            board_force=nodes["board_force"] / self.substeps,
-            board_dissipation=float(nodes["board_loss"]),
-            gravity_work=float(m.weight.ravel() @ (new[x] - state[x])),
-            cut=float(sums["cut_area"]) / m.section_area,
-        )
-
-    def coupling_steps(self, state: np.ndarray, R: np.ndarray, p: np.ndarray) -> CouplingSteps:
-        """Advances the food through several coupling steps at once, on a motion that is known.
-
-        Args:
-            state: The food's state [state_size]; not changed.
-            R: Rotations of the knife in C at the ends of the coupling steps [E + 1, 3, 3].
-            p: Positions of Ko in C there [E + 1, 3], metres.
-
-        Raises:
-            CuttingError: A force is not finite.
-        """
-        with self._lock:
-            ws = self.driver.workspace([self.model], Launch(0, len(p) - 1))
-            (result,) = run_coupling_steps(ws, state[None], R[None], p[None])
-        if not result.finite:
-            raise CuttingError(NOT_FINITE)
-        return result
+        return step
 
     def _place(self, state: np.ndarray, pose: Pose, factors: SurfaceFactors = UNCHANGED) -> None:
         """Puts food and knife, at rest at `pose`, into the workspace for launches with k = 0."""

@@ -309,11 +309,9 @@ class _Run:
             check_in_plane(self.model, pose, now.time + now.period)
             factors = SurfaceFactors(now.toughness, now.friction)
             step = self.solver.coupling_step(self.state, self.fed, pose, factors)
-            self.state, self.cut = step.state, step.cut
-            wrenches = np.array([step.edge, step.normal, step.friction])
-            parts = (wrenches.reshape(3, 2, 3) @ self.R_FC.T).reshape(3, 6)
-            self.spent += step.edge_dissipation + step.opening_dissipation
-            self.spent += step.friction_dissipation
+            self.state, self.cut = step.state, float(step.cut[-1])
+            parts = (step.wrenches.reshape(3, 2, 3) @ self.R_FC.T).reshape(3, 6)
+            self.spent += step.balance.edge + step.balance.opening + step.balance.friction
             moved = float(np.linalg.norm(pose.p - self.fed.p))
             self._check(moved, pose, factors, now.time + now.period)
             if pose.p[2] < self.top:

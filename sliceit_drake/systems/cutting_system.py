@@ -1,5 +1,6 @@
 """The finite-element food as a Drake system."""
 
+import dataclasses as dc
 import functools
 from collections.abc import Sequence
 from typing import Any
@@ -10,6 +11,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, State
 
 from sliceit_drake.cutting.contact_response import contact_responses
+from sliceit_drake.cutting.coupling_steps import EnergyBalance
 from sliceit_drake.cutting.mesh.body import FoodBody, food_body
 from sliceit_drake.cutting.mesh.surface import FoodSurface, food_surface
 from sliceit_drake.cutting.model import CuttingModel
@@ -22,16 +24,7 @@ from sliceit_drake.systems.knife_force import KnifeForceSystem
 
 __all__ = ["BALANCE_NAMES", "COMPLETE", "ENERGY_NAMES", "CuttingSystem"]
 
-BALANCE_NAMES = (
-    "work",
-    "gravity",
-    "edge",
-    "opening",
-    "friction",
-    "board_friction",
-    "blade",
-    "internal",
-)
+BALANCE_NAMES = tuple(field.name for field in dc.fields(EnergyBalance))
 ENERGY_NAMES = ("elastic", "interface", "kinetic", "largest_energy_ratio", "least_volume_ratio")
 
 MECHANISMS = ("edge", "opening", "friction", "board_friction", "blade")
@@ -352,19 +345,9 @@ class CuttingSystem(KnifeForceSystem):
         food = new.get_mutable_value(self._food)
         food[: len(old)] = step.state
         R_CW = self._R_CW[index]
-        forces = np.array([step.edge[3:], step.normal[3:], step.friction[3:]]).dot(R_CW)
+        forces = step.wrenches[-1, :, 3:].dot(R_CW)
         new.set_value(self._components, forces.ravel())
-        change = {
-            "work": step.work,
-            "gravity": step.gravity_work,
-            "edge": step.edge_dissipation,
-            "opening": step.opening_dissipation,
-            "friction": step.friction_dissipation,
-            "board_friction": step.board_dissipation,
-            "blade": step.blade_dissipation,
-            "internal": step.internal_work,
-        }
-        balance = old_balance + [change[name] for name in BALANCE_NAMES]
+        balance = old_balance + dc.astuple(step.balance)
         new.set_value(self._balance, balance)
         if round(time / self.exchange_period) % self._check_every == 0:
             energies = solver.energies(step.state, pose)
@@ -381,7 +364,7 @@ class CuttingSystem(KnifeForceSystem):
                 ),
             }
             new.set_value(self._energy, [check[name] for name in ENERGY_NAMES])
-        return step.wrench.reshape(2, 3).dot(R_CW).ravel(), step.cut
+        return step.wrench.reshape(2, 3).dot(R_CW).ravel(), float(step.cut[-1])
 
     def _calc_surface(self, context: Context, output: BasicVector) -> None:
         index = self.food_index(context)

@@ -17,6 +17,7 @@ import warp as wp
 from tqdm import tqdm
 
 from sliceit_drake.cutting.batch import simulate_batch
+from sliceit_drake.cutting.driver import Launch
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.gradient import SliceAdjoint
@@ -69,11 +70,8 @@ def difference(a: SliceResult, b: SliceResult) -> float:
 def sub_step_time(solver: CuttingSolver, motion: Motion, repeats: int = 20) -> float:
     """Time of a sub-step in mid-cut within a captured graph, s."""
     path = KnifePath(solver.model, motion, PERIOD)
-    middle = path.coupling_steps // 2 // 10 * 10
-    state = solver.initial_state()
-    for k in range(0, middle, 10):
-        ends = slice(k, k + 11)
-        state = solver.coupling_steps(state, path.R_CK[ends], path.p_CK[ends]).state
+    launches = [Launch(k, 10) for k in range(0, path.coupling_steps // 2 // 10 * 10, 10)]
+    *_, (_, (middle,)) = solver.driver.run([path], launches)
     ws = solver._workspace
     steps = 50 * ws.steps
     with wp.ScopedCapture(device=ws.device) as capture:
@@ -81,7 +79,7 @@ def sub_step_time(solver: CuttingSolver, motion: Motion, repeats: int = 20) -> f
             ws.launch_substep(k % ws.steps)
     best = np.inf
     for _ in range(repeats):
-        ws.write(ws.states[0], state[None])
+        ws.write(ws.states[0], middle.state[None])
         start = time.perf_counter()
         wp.capture_launch(capture.graph)
         best = min(best, time.perf_counter() - start)

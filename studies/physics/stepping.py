@@ -8,13 +8,14 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 
 import numpy as np
 
+from sliceit_drake.cutting.driver import Launch
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.knife_path import KnifePath
 from sliceit_drake.cutting.model import CuttingModel, Numerics, TimeStepError
 from sliceit_drake.cutting.motion import Hold, Motion, MotionPlan, PressAndDraw, Retract, Segment
 from sliceit_drake.cutting.simulate import ENERGY_RATIO_LIMIT, energy_ratio
-from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
+from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError, CuttingSolver
 from studies.pages import table
 
 __all__ = [
@@ -279,19 +280,19 @@ def _run(case: SteppingCase, step: float, scaled: bool) -> tuple[StepResult, np.
     solver = CuttingSolver(model, EXCHANGE)
     motion = case.motion(model)
     path = KnifePath(model, motion, EXCHANGE)
-    state, spent, ratio = solver.initial_state(), 0.0, 0.0
+    spent = ratio = 0.0
     force = np.zeros((path.coupling_steps, 3))
     block = max(1, round(CHECK_TRAVEL / (case.press_speed * EXCHANGE)))
-    for k in range(0, path.coupling_steps, block):
-        end = min(k + block, path.coupling_steps)
-        try:
-            part = solver.coupling_steps(state, path.R_CK[k : end + 1], path.p_CK[k : end + 1])
-        except CuttingError as error:
-            result.refusal = f"until {end * EXCHANGE:.4g} s {error}"
+    starts = range(0, path.coupling_steps, block)
+    launches = [Launch(k, min(block, path.coupling_steps - k)) for k in starts]
+    for (k, count, _), (part,) in solver.driver.run([path], launches):
+        end = k + count
+        if not part.finite:
+            result.refusal = f"until {end * EXCHANGE:.4g} s {NOT_FINITE}"
             return result, np.empty((0, 3))
-        state, force[k:end] = part.state, part.wrenches.sum(1)[:, 3:]
-        spent += float(part.dissipation[:3].sum())
-        ratio = max(ratio, energy_ratio(solver.energies(state, path.pose(end)), spent, model))
+        force[k:end] = part.wrenches.sum(1)[:, 3:]
+        spent += part.balance.edge + part.balance.opening + part.balance.friction
+        ratio = max(ratio, energy_ratio(solver.energies(part.state, path.pose(end)), spent, model))
     result.energy_ratio = ratio
     if case.hold:
         norm = np.linalg.norm(force, axis=1)
@@ -324,23 +325,23 @@ def step_costs(
     for food in foods:
         case = SteppingCase(*food, press_speed=0.02)
         solvers = [CuttingSolver(case.model(step, True), EXCHANGE) for step in steps]
-        path = KnifePath(solvers[0].model, case.motion(solvers[0].model), EXCHANGE)
-        # As many coupling steps a call as a slice has between its checks.
-        blocks = range(0, round(duration / EXCHANGE), 10)
-        for solver in solvers:
-            solver.coupling_steps(solver.initial_state(), path.R_CK[:11], path.p_CK[:11])
+        motion = case.motion(solvers[0].model)
+        paths = [KnifePath(solver.model, motion, EXCHANGE) for solver in solvers]
+        # As many coupling steps a launch as a slice has between its checks.
+        launches = [Launch(k, 10) for k in range(0, round(duration / EXCHANGE), 10)]
+        for solver, path in zip(solvers, paths, strict=True):
+            next(solver.driver.run([path], launches))
         wall = np.zeros((repeats, len(steps)))
         for row in wall:
-            for column, solver in enumerate(solvers):
-                state, begin = solver.initial_state(), time.perf_counter()
-                for k in blocks:
-                    ends = slice(k, k + 11)
-                    state = solver.coupling_steps(state, path.R_CK[ends], path.p_CK[ends]).state
+            for column, (solver, path) in enumerate(zip(solvers, paths, strict=True)):
+                begin = time.perf_counter()
+                for _ in solver.driver.run([path], launches):
+                    pass
                 row[column] = time.perf_counter() - begin
                 share += 1.0 / steps[column] / work
                 if progress is not None:
                     progress(share)
-        seconds = wall / (10 * len(blocks) * EXCHANGE)
+        seconds = wall / (10 * len(launches) * EXCHANGE)
         for step, mean, deviation in zip(steps, seconds.mean(0), seconds.std(0), strict=True):
             count = solvers[0].model.element_count
             costs.append(

@@ -1,0 +1,136 @@
+"""Advances food through coupling steps: forces on the knife, work and dissipation."""
+
+import dataclasses as dc
+
+import numpy as np
+
+from sliceit_drake.cutting.workspace import Workspace
+
+__all__ = ["CouplingSteps", "Energies", "EnergyBalance", "run_coupling_steps"]
+
+
+@dc.dataclass
+class Energies:
+    """Energies of a state, J.
+
+    Attributes:
+        elastic: Energy of the bulk.
+        interface: Energy of bonds, contacts, friction anchors, the edge's unloading and the bent
+            blade.
+        kinetic: Energy of the stepped (scaled) mass.
+        least_volume_ratio: Smallest J of all elements.
+        min_element: Element that has it.
+    """
+
+    elastic: float
+    interface: float
+    kinetic: float
+    least_volume_ratio: float
+    min_element: int
+
+
+@dc.dataclass
+class EnergyBalance:
+    """Work and dissipation over a time, J.
+
+    Attributes:
+        work: Work of the knife on the food.
+        gravity: Work of the food's weight.
+        edge, opening, friction, board_friction, blade: Energy dissipated, each never negative, by
+            the edge, bonds that open, friction on the flanks, friction and damping on the board,
+            and the bending blade.
+        internal: Work of the bulk's forces (elastic and damping) on the nodes.
+    """
+
+    work: float = 0.0
+    gravity: float = 0.0
+    edge: float = 0.0
+    opening: float = 0.0
+    friction: float = 0.0
+    board_friction: float = 0.0
+    blade: float = 0.0
+    internal: float = 0.0
+
+    def __add__(self, later: "EnergyBalance") -> "EnergyBalance":
+        both = zip(dc.astuple(self), dc.astuple(later), strict=True)
+        return EnergyBalance(*(a + b for a, b in both))
+
+    def damping(self, energies: Energies) -> float:
+        """Dissipated by the bulk's viscosity: work on the elements that they do not store."""
+        return -self.internal - energies.elastic
+
+    def residual(self, energies: Energies) -> float:
+        """Work put in minus everything that it went into; 0 if energy is conserved."""
+        stored = energies.elastic + energies.interface + energies.kinetic
+        spent = self.edge + self.opening + self.friction + self.board_friction + self.blade
+        return self.work + self.gravity - stored - spent - self.damping(energies)
+
+
+@dc.dataclass
+class CouplingSteps:
+    """Result of E coupling steps in a row.
+
+    Wrenches act on the knife, at Ko at the end of their coupling step, in C: moment, Nm, and force,
+    N.
+
+    Attributes:
+        state: The food's new state [state_size].
+        wrenches: Mean wrenches by mechanism: edge, flank pressure, friction [E, 3, 6].
+        cut: Fraction of the section that the edge has passed [E].
+        board_force: Mean force of the board on the food [3], N.
+        balance: Work and dissipation over all coupling steps.
+    """
+
+    state: np.ndarray
+    wrenches: np.ndarray
+    cut: np.ndarray
+    board_force: np.ndarray
+    balance: EnergyBalance
+
+    @property
+    def wrench(self) -> np.ndarray:
+        """Wrench of all mechanisms in the last coupling step [6]."""
+        return np.asarray(self.wrenches[-1].sum(0))
+
+    @property
+    def finite(self) -> bool:
+        """Whether the cut has not broken down; limits on forces can hide a state that has."""
+        return bool(np.isfinite(self.wrenches).all() and np.isfinite(self.state).all())
+
+
+def run_coupling_steps(
+    ws: Workspace, states: np.ndarray, R: np.ndarray, p: np.ndarray
+) -> list[CouplingSteps]:
+    """Advances all cuts of a workspace by its coupling steps.
+
+    Args:
+        ws: Workspace of C cuts and E coupling steps.
+        states: [C, state_size].
+        R: Rotations of the knives in C at the ends of the coupling steps [C, E + 1, 3, 3].
+        p: Positions of Ko there [C, E + 1, 3], metres.
+
+    Returns:
+        One result a cut; what is not finite is left so.
+    """
+    ws.advance(states, R, p)
+    new = ws.read(ws.states[0]).copy()
+    x = ws.layout["x"]
+    steps = []
+    for c, (model, row) in enumerate(zip(ws.models, ws.results(), strict=True)):
+        at_points, at_nodes = row["point_sums"], row["node_sums"]
+        losses = [at_points[name] for name in ("edge_loss", "opening_loss", "friction_loss")]
+        edge, opening, friction = np.stack(losses, axis=1).sum(0).tolist()
+        balance = EnergyBalance(
+            work=float(row["work"].sum()),
+            gravity=float(model.weight.ravel() @ (new[c, x] - states[c, x])),
+            edge=edge,
+            opening=opening,
+            friction=friction,
+            board_friction=float(at_nodes["board_loss"]),
+            blade=float(row["blade"]["loss"].sum()),
+            internal=float(at_nodes["internal_work"]),
+        )
+        cut = at_points["cut_area"] / model.section_area
+        board_force = at_nodes["board_force"] / ws.steps
+        steps.append(CouplingSteps(new[c], row["wrenches"], cut, board_force, balance))
+    return steps
