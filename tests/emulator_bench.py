@@ -9,7 +9,7 @@ import numpy as np
 from sliceit_drake.emulator.control_script import ControlScript
 from sliceit_drake.emulator.controller import Controller, ControllerConfig
 from sliceit_drake.emulator.emulator import Emulator
-from sliceit_drake.emulator.frames import FrameReader, PackageType, Recipe, encode_frame
+from sliceit_drake.emulator.frames import PackageType, Recipe, encode_frame, take_frames
 from sliceit_drake.emulator.robot_model import KinematicRobot
 
 _number = itertools.count(1)
@@ -60,7 +60,7 @@ class RawClient:
         self.socket.settimeout(2.0)
         self.socket.connect((bench.address, port))
         self.socket.setblocking(False)
-        self._reader = FrameReader()
+        self._unread = bytearray()
         self.is_closed = False
         bench.serve()
 
@@ -77,7 +77,8 @@ class RawClient:
             if not data:
                 self.is_closed = True
                 return found
-            found += self._reader.feed(data)
+            self._unread += data
+            found += take_frames(self._unread)
 
     def ask(self, kind: int, payload: bytes = b"") -> bytes:
         """Sends a request; returns the payload of its answer."""
@@ -117,7 +118,7 @@ class ScriptBench:
 
     def __init__(self, robot=None, config: ControllerConfig | None = None) -> None:
         self.controller = Controller(robot or KinematicRobot(), config)
-        self.controller.start_program(ControlScript(self.controller), "test")
+        self.controller.start_program(ControlScript(self.controller).step, "test")
         self.step()
 
     def step(self, count: int = 1) -> None:

@@ -20,11 +20,11 @@ from sliceit_drake.emulator.emulator import ControllerClock, Emulator
 from sliceit_drake.emulator.fault_table import FAULTS
 from sliceit_drake.emulator.frames import (
     FrameError,
-    FrameReader,
     PackageType,
     Recipe,
     encode_frame,
     split_names,
+    take_frames,
 )
 from sliceit_drake.emulator.joint_targets import JointTargets
 from sliceit_drake.emulator.kinematics import Posture, forward, inverse, pose_of_matrix
@@ -75,10 +75,11 @@ def test_frames_are_found_however_the_network_splits_them(seed):
     rng = random.Random(seed)
     frames = [(rng.randrange(256), rng.randbytes(rng.choice([0, 1, 9, 3000]))) for _ in range(30)]
     stream = b"".join(encode_frame(kind, payload) for kind, payload in frames)
-    reader, found = FrameReader(), []
+    unread, found = bytearray(), []
     while stream:
         size = rng.choice([1, 2, 3, 700, 5000])
-        found += reader.feed(stream[:size])
+        unread += stream[:size]
+        found += take_frames(unread)
         stream = stream[size:]
     assert found == frames
 
@@ -93,7 +94,7 @@ def test_a_data_package_has_the_bytes_of_the_protocol():
 
 def test_what_is_no_frame_is_refused():
     with pytest.raises(FrameError, match="cannot have 2 bytes"):
-        list(FrameReader().feed(b"\x00\x02U"))
+        list(take_frames(bytearray(b"\x00\x02U")))
     with pytest.raises(FrameError, match="65532"):
         encode_frame(PackageType.DATA, bytes(65533))
     with pytest.raises(FrameError, match="ASCII"):
@@ -675,7 +676,7 @@ def test_lockstep_does_not_wait_for_the_answer_to_a_package_that_did_not_arrive(
     clock = ControllerClock(lockstep=True, patience=1.0)
     emulator = Emulator(KinematicRobot(), free_address(), clock)
     controller = emulator.controller
-    controller.start_program(ControlScript(controller), "test")
+    controller.start_program(ControlScript(controller).step, "test")
     thread = threading.Thread(target=emulator.run)
     thread.start()
     try:
@@ -689,9 +690,10 @@ def test_lockstep_does_not_wait_for_the_answer_to_a_package_that_did_not_arrive(
         ):
             sock.sendall(encode_frame(kind, payload))
         servo = struct.pack(">Bi11d", 1, 11, *START, 0.0, 0.0, 0.002, 0.03, 2000.0)
-        reader, answered = FrameReader(), 0
+        unread, answered = bytearray(), 0
         while answered < 200:
-            for kind, _ in reader.feed(sock.recv(4096)):
+            unread += sock.recv(4096)
+            for kind, _ in take_frames(unread):
                 if kind == PackageType.DATA:
                     sock.sendall(encode_frame(PackageType.DATA, servo))
                     answered += 1

@@ -5,9 +5,9 @@ import selectors
 import socket
 import struct
 import time
-from typing import Protocol
+from functools import partial
 
-__all__ = ["Connection", "Service", "SocketHub"]
+__all__ = ["Connection", "Service", "SocketHub", "take_until"]
 
 _RECEIVE = 65536
 _LINGER_NOT = struct.pack("ii", 1, 0)
@@ -17,14 +17,15 @@ class Connection:
     """A client.
 
     Attributes:
-        peer: Address and port of the client.
+        service: Service that it has connected to.
+        unread: What has come, and the service has not taken yet.
         is_open: Whether anything can still be sent.
     """
 
     def __init__(self, hub: "SocketHub", sock: socket.socket, service: "Service") -> None:
-        self._hub, self._socket, self._service = hub, sock, service
+        self._hub, self._socket, self.service = hub, sock, service
         self._unsent = bytearray()
-        self.peer = sock.getpeername()
+        self.unread = bytearray()
         self.is_open = True
 
     @property
@@ -52,22 +53,20 @@ class Connection:
                 return
             del self._unsent[:sent]
         if self.is_open:
-            self._hub.watch(self)
+            wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if self._unsent else 0)
+            if self._hub.selector.get_key(self._socket).events != wanted:
+                self._hub.selector.modify(self._socket, wanted, self)
 
     def close(self, reset: bool = False) -> None:
         """Closes the connection, and tells its service; with `reset` the client sees an error."""
         if not self.is_open:
             return
         self.is_open = False
-        self._hub.forget(self)
+        self._hub.selector.unregister(self._socket)
         if reset:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER_NOT)
         self._socket.close()
-        self._service.closed(self)
-
-    def fileno(self) -> int:
-        """File descriptor for the selector."""
-        return self._socket.fileno()
+        self.service.closed(self)
 
     def receive(self) -> None:
         """Reads what has come, and hands it to the service."""
@@ -78,19 +77,21 @@ class Connection:
         except OSError:
             data = b""
         if data:
-            self._service.received(self, data)
+            self.unread += data
+            self.service.received(self)
         else:
             self.close()
 
 
-class Service(Protocol):
+class Service:
     """Service that answers on a port."""
 
     def opened(self, connection: Connection) -> None:
         """A client has connected."""
 
-    def received(self, connection: Connection, data: bytes) -> None:
-        """A client has sent some bytes, split anyhow."""
+    def received(self, connection: Connection) -> None:
+        """A client has sent some bytes, split anyhow, to `Connection.unread`."""
+        raise NotImplementedError
 
     def closed(self, connection: Connection) -> None:
         """A connection has ended."""
@@ -100,15 +101,15 @@ class SocketHub:
     """All ports of one address.
 
     Attributes:
+        selector: What waits for all sockets; the data of a key is its `Connection`, if it is none
+            of the ports.
         refuses: While set, new clients are turned away.
     """
 
     def __init__(self, address: str) -> None:
         self.refuses = self._is_silent = False
         self._address = address
-        self._selector = selectors.DefaultSelector()
-        self._listeners: dict[socket.socket, Service] = {}
-        self._connections: dict[Connection, Service] = {}
+        self.selector = selectors.DefaultSelector()
 
     @property
     def is_silent(self) -> bool:
@@ -119,7 +120,7 @@ class SocketHub:
     def is_silent(self, value: bool) -> None:
         self._is_silent = value
         if not value:
-            for connection in list(self._connections):
+            for connection in self.connections():
                 connection.flush()
 
     def listen(self, port: int, service: Service) -> None:
@@ -128,62 +129,50 @@ class SocketHub:
         Raises:
             OSError: It is taken, or the address is not of this machine.
         """
-        sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        sock = socket.socket()
         try:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             sock.bind((self._address, port))
             sock.listen(8)
-            sock.setblocking(False)
         except OSError as error:
             sock.close()
             raise OSError(
                 f"cannot listen on {self._address}:{port}: {error.strerror}. Another emulator may "
                 "use it: give another --address, such as 127.0.0.2."
             ) from error
-        self._listeners[sock] = service
-        self._selector.register(sock, selectors.EVENT_READ)
+        sock.setblocking(False)
+        self.selector.register(sock, selectors.EVENT_READ, partial(self._accept, sock, service))
 
-    def connections(self, service: Service) -> list[Connection]:
-        """Clients of a service."""
-        return [c for c, its_service in self._connections.items() if its_service is service]
+    def connections(self, service: Service | None = None) -> list[Connection]:
+        """Clients of a service, or of all."""
+        all_data = [key.data for key in self.selector.get_map().values()]
+        clients = [data for data in all_data if isinstance(data, Connection)]
+        return [c for c in clients if service is None or c.service is service]
 
     def poll(self, timeout: float) -> None:
         """Serves what is ready, waiting up to `timeout` s for something to be."""
         if self.is_silent:
             time.sleep(max(0.0, timeout))
             return
-        for key, events in self._selector.select(max(0.0, timeout)):
-            if isinstance(key.fileobj, Connection):
-                if events & selectors.EVENT_WRITE:
-                    key.fileobj.flush()
-                if events & selectors.EVENT_READ and key.fileobj.is_open:
-                    key.fileobj.receive()
-            else:
-                assert isinstance(key.fileobj, socket.socket)
-                self._accept(key.fileobj)
-
-    def watch(self, connection: Connection) -> None:
-        """Waits for a connection to be readable, and writable if it has something to send."""
-        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if connection.backlog else 0)
-        if self._selector.get_key(connection).events != wanted:
-            self._selector.modify(connection, wanted)
-
-    def forget(self, connection: Connection) -> None:
-        """Stops waiting for a connection that is about to close."""
-        self._selector.unregister(connection)
-        del self._connections[connection]
+        for key, events in self.selector.select(max(0.0, timeout)):
+            if not isinstance(key.data, Connection):
+                key.data()
+                continue
+            if events & selectors.EVENT_WRITE:
+                key.data.flush()
+            if events & selectors.EVENT_READ and key.data.is_open:
+                key.data.receive()
 
     def close(self) -> None:
         """Closes all ports and connections."""
-        for connection in list(self._connections):
+        for connection in self.connections():
             connection.close()
-        for sock in self._listeners:
-            self._selector.unregister(sock)
-            sock.close()
-        self._listeners.clear()
-        self._selector.close()
+        for key in self.selector.get_map().values():
+            assert isinstance(key.fileobj, socket.socket)
+            key.fileobj.close()
+        self.selector.close()
 
-    def _accept(self, listener: socket.socket) -> None:
+    def _accept(self, listener: socket.socket, service: Service) -> None:
         try:
             sock, _ = listener.accept()
         except OSError:
@@ -194,11 +183,16 @@ class SocketHub:
         sock.setblocking(False)
         with contextlib.suppress(OSError):
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        try:
-            connection = Connection(self, sock, self._listeners[listener])
-        except OSError:
-            sock.close()
-            return
-        self._connections[connection] = self._listeners[listener]
-        self._selector.register(connection, selectors.EVENT_READ)
-        self._listeners[listener].opened(connection)
+        connection = Connection(self, sock, service)
+        self.selector.register(sock, selectors.EVENT_READ, connection)
+        service.opened(connection)
+
+
+def take_until(buffer: bytearray, end: bytes) -> bytes | None:
+    """Takes what comes first, up to and with `end`; None, and nothing, while there is no end."""
+    place = buffer.find(end)
+    if place < 0:
+        return None
+    taken = bytes(buffer[: place + len(end)])
+    del buffer[: len(taken)]
+    return taken

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Iterator
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sliceit_drake.emulator.controller import Controller
 from sliceit_drake.emulator.kinematics import forward, inverse, matrix_of_pose, pose_of_matrix
@@ -85,7 +86,7 @@ class ControlScript:
         self._async_writes = self._async_operation = 0
 
     def step(self) -> bool:
-        """See `controller.Program`."""
+        """Runs one cycle, as a `controller.Program`."""
         # A command to stop that begins in this cycle also ends what would move the arm in it.
         if next(self._main, _END) is _END:
             return False
@@ -124,16 +125,18 @@ class ControlScript:
 
     def _run(self, command: int) -> Iterator[None]:
         """Runs a command to its end; each `yield` is the end of a cycle."""
-        method = _METHODS.get(command)
-        if method is None:
-            name = COMMAND_NAMES.get(command, "of no known name")
-            raise ScriptError(f"command {command} ({name}) is not emulated")
-        steps = method(self)
-        if steps is not None:
-            for target in steps:
+        if command in _DOUBLES:
+            self._controller.write_doubles(self._offset, _DOUBLES[command](self))
+        elif command in _QUESTIONS:
+            self._controller.write_integer(self._offset + 1, int(_QUESTIONS[command](self)))
+        elif command in _ACTIONS:
+            for target in _ACTIONS[command](self) or ():
                 if target is not None:
                     self._controller.command(target)
                 yield
+        else:
+            name = COMMAND_NAMES.get(command, "of no known name")
+            raise ScriptError(f"command {command} ({name}) is not emulated")
 
     # Registers.
 
@@ -146,14 +149,11 @@ class ControlScript:
     def _doubles(self, index: int, count: int = 6) -> list[float]:
         return self._controller.registers.doubles(self._offset + index, count)
 
+    def _pose(self, index: int = 0) -> np.ndarray:
+        return matrix_of_pose(self._doubles(index))
+
     def _answer(self, state: int) -> None:
         self._controller.write_integer(self._offset, state)
-
-    def _return_integer(self, value: int) -> None:
-        self._controller.write_integer(self._offset + 1, value)
-
-    def _return(self, values: "np.ndarray | list[float]") -> None:
-        self._controller.write_doubles(self._offset, values)
 
     def _report_async(self, progress: int) -> None:
         """Status word of asynchronous motions: running flag, number of operation and of writes."""
@@ -166,6 +166,9 @@ class ControlScript:
         self._controller.write_integer(self._offset + 2, word)
 
     # Motions.
+
+    def _scale(self) -> float:
+        return self._controller.speed_scale
 
     def _end_motion(self) -> None:
         if self._motion is not None:
@@ -181,38 +184,20 @@ class ControlScript:
             return None
         return motion
 
-    def _move_joints(self) -> Iterator[np.ndarray] | None:
-        return self._joint_motion(np.array(self._doubles(0)))
+    def _move_joints(self, end: ArrayLike) -> Iterator[np.ndarray] | None:
+        speed, acceleration = self._doubles(6, 2)
+        target = self._controller.target
+        return self._move(joint_motion(target, end, speed, acceleration, self._scale))
 
-    def _move_joints_to_pose(self) -> Iterator[np.ndarray] | None:
-        return self._joint_motion(self._inverse(self._controller.target))
+    def _move_line(self, end: np.ndarray) -> Iterator[np.ndarray] | None:
+        speed, acceleration = self._doubles(6, 2)
+        target, X_FT = self._controller.target, self._controller.X_FT
+        return self._move(line_motion(target, end, X_FT, speed, acceleration, self._scale))
 
-    def _joint_motion(self, end: np.ndarray) -> Iterator[np.ndarray] | None:
-        start, scale = self._controller.target, lambda: self._controller.speed_scale
-        return self._move(joint_motion(start, end, self._double(6), self._double(7), scale))
-
-    def _move_line(self) -> Iterator[np.ndarray] | None:
-        return self._line_motion(matrix_of_pose(self._doubles(0)))
-
-    def _move_line_to_joints(self) -> Iterator[np.ndarray] | None:
-        return self._line_motion(forward(self._doubles(0), self._controller.X_FT))
-
-    def _line_motion(self, end: np.ndarray) -> Iterator[np.ndarray] | None:
-        controller = self._controller
-        return self._move(
-            line_motion(
-                controller.target,
-                end,
-                controller.X_FT,
-                self._double(6),
-                self._double(7),
-                lambda: controller.speed_scale,
-            )
-        )
-
-    def _stop(self, deceleration: float) -> Iterator[np.ndarray]:
+    def _stop(self, factor: float = 1.0) -> Iterator[np.ndarray]:
+        """Comes to rest with a deceleration of `factor` times the argument."""
         state = self._controller.robot.state
-        return slow_down(state.positions, state.velocities, deceleration)
+        return slow_down(state.positions, state.velocities, factor * self._double(0))
 
     def _servo_joints(self) -> None:
         lookahead_time, gain = self._doubles(9, 2)
@@ -223,7 +208,7 @@ class ControlScript:
 
     def _stop_servo(self) -> Iterator[np.ndarray]:
         self._servo = None
-        return self._stop(self._double(0))
+        return self._stop()
 
     def _speed_joints(self) -> None:
         # The real script keeps the speed until told otherwise, whatever the time sent.
@@ -237,15 +222,11 @@ class ControlScript:
 
     def _stop_speed(self) -> Iterator[np.ndarray]:
         self._speed = None
-        return self._stop(self._double(0))
+        return self._stop()
 
-    def _stop_line(self) -> Iterator[np.ndarray]:
+    def _stop_motion(self, factor: float) -> Iterator[np.ndarray]:
         self._end_motion()
-        return self._stop(_RADIANS_PER_METRE * self._double(0))
-
-    def _stop_joints(self) -> Iterator[np.ndarray]:
-        self._end_motion()
-        return self._stop(self._double(0))
+        return self._stop(factor)
 
     # Settings.
 
@@ -279,106 +260,69 @@ class ControlScript:
 
     # Questions.
 
-    def _inverse(self, guess: np.ndarray) -> np.ndarray:
-        found = inverse(matrix_of_pose(self._doubles(0)), guess, self._controller.X_FT)
+    @property
+    def _positions(self) -> np.ndarray:
+        return self._controller.robot.state.positions
+
+    def _inverse(self, guess: ArrayLike) -> np.ndarray | None:
+        """Joint positions near `guess` for the pose that was sent; None where there are none."""
+        return inverse(self._pose(), guess, self._controller.X_FT)
+
+    def _inverse_or_stop(self, guess: ArrayLike) -> np.ndarray:
+        found = self._inverse(guess)
         if found is None:
             raise ScriptError("get_inverse_kin: no solution")
         return found
 
-    def _get_inverse(self) -> None:
-        self._return(self._inverse(self._controller.target))
+    def _is_reachable(self, q: ArrayLike | None) -> bool:
+        limit = self._controller.config.position_limit + _TOLERANCE
+        return q is not None and bool(np.abs(q).max() <= limit)
 
-    def _get_inverse_near(self) -> None:
-        self._return(self._inverse(np.array(self._doubles(6))))
-
-    def _has_inverse(self) -> None:
-        self._has_inverse_from(self._controller.target)
-
-    def _has_inverse_near(self) -> None:
-        self._has_inverse_from(np.array(self._doubles(6)))
-
-    def _has_inverse_from(self, guess: np.ndarray) -> None:
-        X = matrix_of_pose(self._doubles(0))
-        self._return_integer(inverse(X, guess, self._controller.X_FT) is not None)
-
-    def _is_reachable(self, q: np.ndarray | None) -> bool:
-        return q is not None and bool(
-            np.abs(q).max() <= self._controller.config.position_limit + _TOLERANCE
-        )
-
-    def _pose_is_safe(self) -> None:
-        X = matrix_of_pose(self._doubles(0))
-        q = inverse(X, self._controller.target, self._controller.X_FT)
-        self._return_integer(self._is_reachable(q))
-
-    def _joints_are_safe(self) -> None:
-        self._return_integer(self._is_reachable(np.array(self._doubles(0))))
-
-    def _get_forward(self) -> None:
-        positions = self._controller.robot.state.positions
-        self._return(pose_of_matrix(forward(positions, self._controller.X_FT)))
-
-    def _get_forward_of(self) -> None:
-        X_FT = matrix_of_pose(self._doubles(6))
-        self._return(pose_of_matrix(forward(self._doubles(0), X_FT)))
-
-    def _get_flange_pose(self) -> None:
-        self._return(pose_of_matrix(forward(self._controller.robot.state.positions)))
-
-    def _get_tcp(self) -> None:
-        self._return(self._controller.tcp)
-
-    def _get_step_time(self) -> None:
-        self._return([CYCLE])
-
-    def _get_positions(self) -> None:
+    def _joint_history(self) -> np.ndarray:
         if self._integer(1) != 0:
             raise ScriptError("get_actual_joint_positions_history: only 0 steps are emulated")
-        self._return(self._controller.robot.state.positions)
-
-    def _get_torques(self) -> None:
-        self._return(self._controller.robot.state.torques)
-
-    def _multiply_poses(self) -> None:
-        X = matrix_of_pose(self._doubles(0)) @ matrix_of_pose(self._doubles(6))
-        self._return(pose_of_matrix(X))
-
-    def _is_steady(self) -> None:
-        self._return_integer(self._controller.is_steady)
+        return self._positions
 
 
 _END = object()
 
-_METHODS: dict[int, Callable[[ControlScript], Iterator | None]] = {
-    1: ControlScript._move_joints,
-    2: ControlScript._move_joints_to_pose,
-    3: ControlScript._move_line,
-    4: ControlScript._move_line_to_joints,
+# What moves the arm, or takes a cycle to set.
+_ACTIONS: dict[int, Callable[[ControlScript], Iterator | None]] = {
+    1: lambda script: script._move_joints(script._doubles(0)),
+    2: lambda script: script._move_joints(script._inverse_or_stop(script._controller.target)),
+    3: lambda script: script._move_line(script._pose()),
+    4: lambda script: script._move_line(forward(script._doubles(0), script._controller.X_FT)),
     8: ControlScript._zero_sensor,
     9: ControlScript._speed_joints,
     SERVO_COMMAND: ControlScript._servo_joints,
     15: ControlScript._stop_speed,
     16: ControlScript._stop_servo,
     17: ControlScript._set_payload,
-    26: ControlScript._get_step_time,
-    27: ControlScript._get_positions,
     29: ControlScript._set_tcp,
-    30: ControlScript._get_inverse_near,
     31: ControlScript._trigger_protective_stop,
-    33: ControlScript._stop_line,
-    34: ControlScript._stop_joints,
+    33: lambda script: script._stop_motion(_RADIANS_PER_METRE),
+    34: lambda script: script._stop_motion(1.0),
     35: ControlScript._set_watchdog,
-    36: ControlScript._pose_is_safe,
-    37: ControlScript._joints_are_safe,
-    38: ControlScript._get_torques,
-    39: ControlScript._multiply_poses,
-    40: ControlScript._get_tcp,
-    43: ControlScript._get_forward,
-    44: ControlScript._get_forward_of,
-    46: ControlScript._get_inverse,
-    47: ControlScript._is_steady,
-    58: ControlScript._get_flange_pose,
-    60: ControlScript._has_inverse,
-    61: ControlScript._has_inverse_near,
     65: ControlScript._set_payload,
+}
+# What is answered with doubles.
+_DOUBLES: dict[int, Callable[[ControlScript], ArrayLike]] = {
+    26: lambda script: [CYCLE],
+    27: ControlScript._joint_history,
+    30: lambda script: script._inverse_or_stop(script._doubles(6)),
+    38: lambda script: script._controller.robot.state.torques,
+    39: lambda script: pose_of_matrix(script._pose() @ script._pose(6)),
+    40: lambda script: script._controller.tcp,
+    43: lambda script: pose_of_matrix(forward(script._positions, script._controller.X_FT)),
+    44: lambda script: pose_of_matrix(forward(script._doubles(0), script._pose(6))),
+    46: lambda script: script._inverse_or_stop(script._controller.target),
+    58: lambda script: pose_of_matrix(forward(script._positions)),
+}
+# What is answered with yes or no.
+_QUESTIONS: dict[int, Callable[[ControlScript], bool]] = {
+    36: lambda script: script._is_reachable(script._inverse(script._controller.target)),
+    37: lambda script: script._is_reachable(script._doubles(0)),
+    47: lambda script: script._controller.is_steady,
+    60: lambda script: script._inverse(script._controller.target) is not None,
+    61: lambda script: script._inverse(script._doubles(6)) is not None,
 }

@@ -5,8 +5,7 @@ It knows no sockets and no wall clock. One `step` is one cycle of controller tim
 
 import collections
 import dataclasses as dc
-from collections.abc import Iterator
-from typing import Protocol
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -69,15 +68,9 @@ class ControllerConfig:
     is_zeroed: bool = False
 
 
-class Program(Protocol):
-    """A program that the controller plays."""
-
-    def step(self) -> bool:
-        """Runs one cycle; False once it has ended.
-
-        Raises:
-            ScriptError: It cannot go on.
-        """
+Program = Callable[[], bool]
+"""A program that the controller plays: runs one cycle; False once it has ended. Raises a
+ScriptError where it cannot go on."""
 
 
 class Controller:
@@ -89,7 +82,8 @@ class Controller:
         registers: What the clients have written.
         outputs: Value of each output variable at the end of the last cycle.
         time: Controller time, s.
-        cycle: Cycles done.
+        target: Joint positions that the arm was last told to go to [6], rad.
+        X_FT: Tool in the flange [4, 4]; follows from `tcp`.
         runtime: What the program does.
         safety: Mode of the safety system.
         mode: How far the arm is powered.
@@ -109,7 +103,7 @@ class Controller:
         self.outputs: dict[str, object] = {
             name: zero(kind) for name, kind in OUTPUTS.items() if name not in self.registers.values
         }
-        self.time, self.cycle = 0.0, 0
+        self.time, self._cycle = 0.0, 0
         self.runtime = RuntimeState.STOPPED
         self.safety = SafetyMode.NORMAL
         self.mode = RobotMode.RUNNING
@@ -124,7 +118,7 @@ class Controller:
         self._program: Program | None = None
         self._watchdog: tuple[str, float] | None = None
         self._stopped_at = -np.inf
-        self._target = self._last_target = robot.state.positions
+        self.target = self._last_target = robot.state.positions
         self._target_velocity = np.zeros(6)
         self._servo: ServoConfig | None = None
         self._braking: Iterator[np.ndarray] | None = None
@@ -137,16 +131,6 @@ class Controller:
     # What a program uses.
 
     @property
-    def target(self) -> np.ndarray:
-        """Joint positions that the arm was last told to go to [6], rad."""
-        return self._target
-
-    @property
-    def X_FT(self) -> np.ndarray:
-        """Tool in the flange [4, 4]."""
-        return self._X_FT
-
-    @property
     def tcp(self) -> np.ndarray:
         """Pose of the tool in the flange [6]."""
         return self._tcp
@@ -154,7 +138,7 @@ class Controller:
     @tcp.setter
     def tcp(self, pose: ArrayLike) -> None:
         self._tcp = np.array(pose, float)
-        self._X_FT = matrix_of_pose(self._tcp)
+        self.X_FT = matrix_of_pose(self._tcp)
 
     @property
     def speed_scale(self) -> float:
@@ -178,7 +162,7 @@ class Controller:
         q = np.array(targets, float)
         if not np.isfinite(q).all():
             raise ScriptError(f"joint targets {q.tolist()} are not finite")
-        self._target, self._servo = q, servo
+        self.target, self._servo = q, servo
 
     def set_watchdog(self, name: str, period: float) -> None:
         """Stops the program when input `name` is not written for `period` s from now on."""
@@ -220,12 +204,12 @@ class Controller:
             return
         self.stop_program("replaced by another program")
         self._program, self.runtime = program, RuntimeState.PLAYING
-        self._note(f"program started: {what}")
+        self.note(f"program started: {what}")
 
     def stop_program(self, why: str) -> None:
         """Stops the program, if there is one, and the arm."""
         if self._program is not None:
-            self._note(f"program stopped: {why}")
+            self.note(f"program stopped: {why}")
         self._program, self._watchdog = None, None
         self.runtime = RuntimeState.STOPPED
 
@@ -233,7 +217,7 @@ class Controller:
         """Pauses the program; False if none plays."""
         if self.runtime != RuntimeState.PLAYING:
             return False
-        self._note(f"program paused: {why}")
+        self.note(f"program paused: {why}")
         self.runtime = RuntimeState.PAUSED
         return True
 
@@ -241,7 +225,7 @@ class Controller:
         """Resumes a paused program; False if it cannot."""
         if self.runtime != RuntimeState.PAUSED or not self.safety.may_move:
             return False
-        self._note("program resumed")
+        self.note("program resumed")
         if self._watchdog is not None:
             self.registers.written_at[self._watchdog[0]] = self.time
         self.runtime = RuntimeState.PLAYING
@@ -259,7 +243,7 @@ class Controller:
         if mode == self.safety:
             return
         self.safety = mode
-        self._note(f"safety mode {mode.name}: {why}")
+        self.note(f"safety mode {mode.name}: {why}")
         if mode.may_move:
             return
         self.messages.append((MessageLevel.ERROR, f"{mode.name}: {why}"))
@@ -283,24 +267,28 @@ class Controller:
             self.set_safety(SafetyMode.NORMAL, "unlocked")
         return True
 
+    def note(self, text: str) -> None:
+        """Adds a text to the log."""
+        self.log.append((self.time, text))
+
     def tell(self, level: int, text: str) -> None:
         """Sends a text message to all clients, and notes it."""
-        self._note(text)
+        self.note(text)
         self.messages.append((level, text))
 
     # One cycle.
 
     def step(self) -> None:
         """Advances one cycle of controller time."""
-        self.cycle += 1
-        self.time = self.cycle * CYCLE
+        self._cycle += 1
+        self.time = self._cycle * CYCLE
         if self.runtime == RuntimeState.PLAYING:
             self._check_watchdog()
         if self.runtime == RuntimeState.PLAYING and self._program is not None:
-            self._play()
+            self._play(self._program)
         self._brake_if_uncommanded()
-        self._target_velocity = (self._target - self._last_target) / CYCLE
-        self._last_target = self._target
+        self._target_velocity = (self.target - self._last_target) / CYCLE
+        self._last_target = self.target
         self._move()
         while self.robot.warnings:
             self.tell(MessageLevel.WARNING, self.robot.warnings.pop(0))
@@ -311,30 +299,28 @@ class Controller:
         if self._simulation_has_stopped:
             return
         try:
-            self.robot.step(self._target, self._servo)
+            self.robot.step(self.target, self._servo)
         except SimulationStopped as error:
             # A robot has no such state; a fault is the nearest that clients understand.
             self._simulation_has_stopped = True
             self.robot.state.velocities = np.zeros(6)
             self.set_safety(SafetyMode.FAULT, f"the simulation stopped: {error}")
 
-    def _play(self) -> None:
-        assert self._program is not None
+    def _play(self, program: Program) -> None:
         try:
-            if not self._program.step():
+            if not program():
                 self.stop_program("it ended")
         except ScriptError as error:
             self.messages.append((MessageLevel.ERROR, f"program error: {error}"))
             self.stop_program(f"error: {error}")
 
     def _check_watchdog(self) -> None:
-        if self._watchdog is None:
-            return
-        name, period = self._watchdog
-        silent = self.time - self.registers.written_at[name]
-        if silent > period:
-            self.tell(MessageLevel.ERROR, f"RTDE watchdog: no {name} for {silent:.3f} s")
-            self.stop_program("RTDE watchdog")
+        if self._watchdog is not None:
+            name, period = self._watchdog
+            silent = self.time - self.registers.written_at[name]
+            if silent > period:
+                self.tell(MessageLevel.ERROR, f"RTDE watchdog: no {name} for {silent:.3f} s")
+                self.stop_program("RTDE watchdog")
 
     def _brake_if_uncommanded(self) -> None:
         """Holds the last target while a program plays; else the arm comes to rest."""
@@ -345,8 +331,8 @@ class Controller:
             state = self.robot.state
             self._braking = slow_down(state.positions, state.velocities, self.config.deceleration)
             if not self.is_steady:
-                self._target, self._servo = state.positions, None
-        self._target = next(self._braking, self._target)
+                self.target, self._servo = state.positions, None
+        self.target = next(self._braking, self.target)
 
     def _supervise(self) -> None:
         if not self.safety.may_move or self.mode != RobotMode.RUNNING:
@@ -365,9 +351,6 @@ class Controller:
         else:
             return
         self.set_safety(SafetyMode.PROTECTIVE_STOP, why)
-
-    def _note(self, text: str) -> None:
-        self.log.append((self.time, text))
 
     # What RTDE shows.
 
@@ -392,7 +375,7 @@ class Controller:
             "timestamp": self.time,
             "actual_q": state.positions.tolist(),
             "actual_qd": state.velocities.tolist(),
-            "target_q": self._target.tolist(),
+            "target_q": self.target.tolist(),
             "target_qd": self._target_velocity.tolist(),
             "target_moment": state.torques.tolist(),
             "actual_current_as_torque": state.torques.tolist(),
@@ -401,7 +384,7 @@ class Controller:
             "actual_TCP_force": np.concatenate([R @ force, R @ moment]).tolist(),
             "tcp_force_scalar": float(np.linalg.norm(force)),
             "ft_raw_wrench": raw.tolist(),
-            "target_TCP_pose": pose_of_matrix(Posture(self._target).X_BF @ X_FT).tolist(),
+            "target_TCP_pose": pose_of_matrix(Posture(self.target).X_BF @ X_FT).tolist(),
             "tcp_offset": self.tcp.tolist(),
             "payload": self.payload,
             "payload_cog": self.payload_cog.tolist(),

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from sliceit_drake.emulator.connections import Connection
+from sliceit_drake.emulator.connections import Connection, Service, take_until
 from sliceit_drake.emulator.controller import Controller
 from sliceit_drake.emulator.modes import RobotMode, RuntimeState, SafetyMode
 
@@ -13,12 +13,11 @@ _PROGRAM = "rtde_control.urp"
 _LONGEST_LINE = 4096
 
 
-class Dashboard:
+class Dashboard(Service):
     """Answers as a UR's dashboard server does to what the public clients ask."""
 
     def __init__(self, controller: Controller) -> None:
         self._controller = controller
-        self._buffers: dict[Connection, bytearray] = {}
         self._answers: dict[str, Callable[[], str]] = {
             "polyscopeversion": self._version,
             "get serial number": lambda: controller.config.serial_number,
@@ -46,29 +45,17 @@ class Dashboard:
             "brake release": self._brake_release,
         }
 
-    # Service.
-
     def opened(self, connection: Connection) -> None:
-        """See `connections.Service`."""
-        self._buffers[connection] = bytearray()
         connection.send(_GREETING)
 
-    def closed(self, connection: Connection) -> None:
-        """See `connections.Service`."""
-        del self._buffers[connection]
-
-    def received(self, connection: Connection, data: bytes) -> None:
-        """See `connections.Service`."""
-        buffer = self._buffers[connection]
-        buffer += data
-        while (end := buffer.find(b"\n")) >= 0:
-            line = bytes(buffer[:end]).decode("utf-8", "replace").strip()
-            del buffer[: end + 1]
+    def received(self, connection: Connection) -> None:
+        while (text := take_until(connection.unread, b"\n")) is not None:
+            line = text.decode("utf-8", "replace").strip()
             connection.send(self.answer(line).encode() + b"\n")
             if line.lower() in ("quit", "shutdown"):
                 connection.close()
                 return
-        if len(buffer) > _LONGEST_LINE:
+        if len(connection.unread) > _LONGEST_LINE:
             connection.close()
 
     def answer(self, line: str) -> str:
@@ -87,7 +74,7 @@ class Dashboard:
         if command.startswith("popup"):
             return "showing popup"
         if command.startswith("addtolog"):
-            self._controller.log.append((self._controller.time, f"client says {line[8:].strip()}"))
+            self._controller.note(f"client says {line[8:].strip()}")
             return "Added log message"
         return f"could not understand: '{line}' (not emulated)"
 

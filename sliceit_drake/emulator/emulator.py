@@ -99,12 +99,12 @@ class Emulator:
         self._busy: collections.deque[float] = collections.deque(maxlen=5000)
         # Apart from the robot's own ports, so that it answers while they are silent.
         self._hub, self._own_hub = SocketHub(address), SocketHub(address)
-        self.rtde = RtdeServer(self._hub, controller)
+        self.rtde = RtdeServer(controller)
         dashboard, script = Dashboard(controller), ScriptServer(controller)
-        services: dict[str, list[Service]] = {
-            "rtde": [self.rtde],
-            "dashboard": [dashboard],
-            "script": [script],
+        services: dict[str, Service] = {
+            "rtde": self.rtde,
+            "dashboard": dashboard,
+            "script": script,
         }
         self.faults = FaultInjector(controller, self._hub, self.rtde, services)
         pendant = Pendant(self.faults, self.status, self.stop, self.put_fresh_food)
@@ -206,7 +206,7 @@ class Emulator:
 
             food = load_yaml(Scenario, None, defaults=Scenario(), overrides_text=scenario)
         controller.robot.put_fresh_food(food)
-        controller.log.append((controller.time, "fresh food"))
+        controller.note("fresh food")
 
     def _wait(self, due: float) -> None:
         """Serves the sockets until the next cycle is due."""

@@ -2,7 +2,10 @@
 
 import heapq
 import itertools
+import math
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +15,7 @@ from sliceit_drake.emulator.controller import Controller
 from sliceit_drake.emulator.fault_table import FAULTS
 from sliceit_drake.emulator.modes import RobotMode, SafetyMode
 from sliceit_drake.emulator.robot_model import CYCLE
-from sliceit_drake.emulator.rtde_server import RATE, RtdeServer
+from sliceit_drake.emulator.rtde_server import RtdeServer
 from sliceit_drake.emulator.variables import INPUTS
 
 __all__ = ["FaultInjector"]
@@ -28,7 +31,7 @@ class FaultInjector:
         controller: Controller,
         hub: SocketHub,
         rtde: RtdeServer,
-        services: dict[str, list[Service]],
+        services: dict[str, Service],
     ) -> None:
         """Prepares.
 
@@ -38,10 +41,49 @@ class FaultInjector:
             rtde: Its RTDE service.
             services: Services by the name that ``close`` has for them.
         """
-        self._controller, self._hub, self._rtde = controller, hub, rtde
-        self._services = services
+        self._controller, self._hub, self._services = controller, hub, services
         self._number = itertools.count()
-        self._waiting: list[tuple[float, int, Callable[[], None], str]] = []
+        self._waiting: list[tuple[float, int, Callable[[], object], str]] = []
+        # How the argument of each is read when it is injected, and what is then done with it.
+        self._faults: dict[str, tuple[Callable[[str], tuple], Callable[..., object]]] = {
+            "protective_stop": (
+                _value(str, lambda word: word in ("", "pause", "stop")),
+                partial(controller.set_safety, SafetyMode.PROTECTIVE_STOP, "injected"),
+            ),
+            "safeguard_stop": (
+                _nothing,
+                partial(controller.set_safety, SafetyMode.SAFEGUARD_STOP, "injected"),
+            ),
+            "emergency_stop": (
+                _nothing,
+                partial(controller.set_safety, SafetyMode.ROBOT_EMERGENCY_STOP, "injected"),
+            ),
+            "normal": (_nothing, self._make_normal),
+            "program_stopped": (
+                _nothing,
+                partial(controller.stop_program, "stopped on the pendant"),
+            ),
+            "program_paused": (_nothing, partial(controller.pause, "on the pendant")),
+            "program_resumed": (_nothing, controller.play),
+            "remote_control_off": (
+                _value(str, lambda word: word in ("", "keep")),
+                self._leave_remote_control,
+            ),
+            "remote_control_on": (_nothing, partial(setattr, controller, "is_remote", True)),
+            "silence": (_value(float, _is_duration), partial(self._for_a_time, "is_silent")),
+            "refuse": (_value(float, _is_duration), partial(self._for_a_time, "refuses")),
+            "drop_packets": (
+                _value(float, lambda share: 0.0 <= share <= 1.0),
+                partial(setattr, rtde, "drop_share"),
+            ),
+            "late_packets": (_value(float, _is_amount), partial(setattr, rtde, "delay")),
+            "close": (self._service_to_close, self._close),
+            "frequency_125": (_nothing, partial(setattr, rtde, "frequency_limit", _CB3_RATE)),
+            "wrong_payload": (_value(float, _is_amount), self._lock_payload),
+            "sensor_bias": (_value(float, math.isfinite), self._bias_sensor),
+            "model": (_value(str, bool), partial(setattr, controller.config, "model")),
+            "second_client": (_nothing, self._claim_inputs),
+        }
 
     def inject(self, fault: str, at: float | None = None) -> None:
         """Injects a fault.
@@ -58,11 +100,12 @@ class FaultInjector:
             raise ConfigurationError(
                 f"{name!r} is no fault", field="inject", fix=f"Give one of {', '.join(FAULTS)}."
             )
+        read, act = self._faults[name]
         try:
-            action = getattr(self, FAULTS[name].method)(argument)
+            action = partial(act, *read(argument))
         except (ValueError, KeyError):
             raise ConfigurationError(
-                f"{fault!r} is not understood", field="inject", fix=f"Write {FAULTS[name].usage}."
+                f"{fault!r} is not understood", field="inject", fix=f"Write {FAULTS[name]}."
             ) from None
         self._at(self._controller.time if at is None else at, action, fault)
 
@@ -72,155 +115,72 @@ class FaultInjector:
         while self._waiting and self._waiting[0][0] <= now + 0.5 * CYCLE:
             _, _, action, what = heapq.heappop(self._waiting)
             if what:
-                self._controller.log.append((now, f"injected: {what}"))
+                self._controller.note(f"injected: {what}")
             action()
 
-    def _at(self, time: float, action: Callable[[], None], what: str = "") -> None:
+    def _at(self, time: float, action: Callable[[], object], what: str = "") -> None:
         heapq.heappush(self._waiting, (time, next(self._number), action, what))
 
-    # Each method reads its argument now and returns what to do later.
+    def _make_normal(self) -> None:
+        self._controller.set_safety(SafetyMode.NORMAL, "injected")
+        self._controller.mode = RobotMode.RUNNING
 
-    def _protective_stop(self, argument: str) -> Callable[[], None]:
-        program = _one_of(argument, "pause", "stop") if argument else None
-        return lambda: self._controller.set_safety(SafetyMode.PROTECTIVE_STOP, "injected", program)
+    def _leave_remote_control(self, keep: str) -> None:
+        self._controller.is_remote = False
+        if not keep:
+            self._controller.stop_program("remote control off")
 
-    def _safeguard_stop(self, argument: str) -> Callable[[], None]:
-        _nothing(argument)
-        return lambda: self._controller.set_safety(SafetyMode.SAFEGUARD_STOP, "injected")
+    def _for_a_time(self, flag: str, duration: float) -> None:
+        setattr(self._hub, flag, True)
+        self._at(self._controller.time + duration, partial(setattr, self._hub, flag, False))
 
-    def _emergency_stop(self, argument: str) -> Callable[[], None]:
-        _nothing(argument)
-        return lambda: self._controller.set_safety(SafetyMode.ROBOT_EMERGENCY_STOP, "injected")
-
-    def _normal(self, argument: str) -> Callable[[], None]:
-        _nothing(argument)
-
-        def act() -> None:
-            self._controller.set_safety(SafetyMode.NORMAL, "injected")
-            self._controller.mode = RobotMode.RUNNING
-
-        return act
-
-    def _program_stopped(self, argument: str) -> Callable[[], None]:
-        _nothing(argument)
-        return lambda: self._controller.stop_program("stopped on the pendant")
-
-    def _program_paused(self, argument: str) -> Callable[[], None]:
-        _nothing(argument)
-        return lambda: _discard(self._controller.pause("on the pendant"))
-
-    def _program_resumed(self, argument: str) -> Callable[[], None]:
-        _nothing(argument)
-        return lambda: _discard(self._controller.play())
-
-    def _remote_control_off(self, argument: str) -> Callable[[], None]:
-        stops = not argument or _one_of(argument, "keep") != "keep"
-
-        def act() -> None:
-            self._controller.is_remote = False
-            if stops:
-                self._controller.stop_program("remote control off")
-
-        return act
-
-    def _remote_control_on(self, argument: str) -> Callable[[], None]:
-        _nothing(argument)
-        return lambda: setattr(self._controller, "is_remote", True)
-
-    def _silence(self, argument: str) -> Callable[[], None]:
-        return self._for_a_time("is_silent", _positive(argument))
-
-    def _refuse(self, argument: str) -> Callable[[], None]:
-        return self._for_a_time("refuses", _positive(argument))
-
-    def _for_a_time(self, flag: str, duration: float) -> Callable[[], None]:
-        def act() -> None:
-            setattr(self._hub, flag, True)
-            end = self._controller.time + duration
-            self._at(end, lambda: setattr(self._hub, flag, False))
-
-        return act
-
-    def _drop_packets(self, argument: str) -> Callable[[], None]:
-        share = float(argument)
-        if not 0.0 <= share <= 1.0:
-            raise ValueError(argument)
-        return lambda: setattr(self._rtde, "drop_share", share)
-
-    def _late_packets(self, argument: str) -> Callable[[], None]:
-        delay = float(argument)
-        if not 0.0 <= delay < 1e3:
-            raise ValueError(argument)
-        return lambda: setattr(self._rtde, "delay", delay)
-
-    def _close(self, argument: str) -> Callable[[], None]:
+    def _service_to_close(self, argument: str) -> tuple[Service, bool]:
         name, _, how = argument.partition(":")
-        services = self._services[name]
-        reset = bool(how) and _one_of(how, "reset") == "reset"
-
-        def act() -> None:
-            for service in services:
-                for connection in self._hub.connections(service):
-                    connection.close(reset)
-
-        return act
-
-    def _frequency(self, argument: str) -> Callable[[], None]:
-        _nothing(argument)
-        return lambda: setattr(self._rtde, "frequency_limit", min(_CB3_RATE, RATE))
-
-    def _wrong_payload(self, argument: str) -> Callable[[], None]:
-        mass = float(argument)
-        if not 0.0 <= mass < 1e3:
+        if how not in ("", "reset"):
             raise ValueError(argument)
+        return self._services[name], how == "reset"
 
-        def act() -> None:
-            self._controller.payload_is_locked = False
-            self._controller.set_payload(mass, None)
-            self._controller.payload_is_locked = True
+    def _close(self, service: Service, reset: bool) -> None:
+        for connection in self._hub.connections(service):
+            connection.close(reset)
 
-        return act
+    def _lock_payload(self, mass: float) -> None:
+        self._controller.payload_is_locked = False
+        self._controller.set_payload(mass, None)
+        self._controller.payload_is_locked = True
 
-    def _sensor_bias(self, argument: str) -> Callable[[], None]:
-        force = float(argument)
-        if not np.isfinite(force):
-            raise ValueError(argument)
-        bias = np.array([0.0, 0.0, force, 0.0, 0.0, 0.0])
-        return lambda: setattr(self._controller, "sensor_bias", bias)
+    def _bias_sensor(self, force: float) -> None:
+        self._controller.sensor_bias = np.array([0.0, 0.0, force, 0.0, 0.0, 0.0])
 
-    def _model(self, argument: str) -> Callable[[], None]:
-        if not argument:
-            raise ValueError(argument)
-        return lambda: setattr(self._controller.config, "model", argument)
-
-    def _second_client(self, argument: str) -> Callable[[], None]:
-        _nothing(argument)
-
-        def act() -> None:
-            taken = self._controller.registers.claim_free("another client", list(INPUTS))
-            text = f"another client has taken {len(taken)} of {len(INPUTS)} input registers"
-            self._controller.log.append((self._controller.time, text))
-
-        return act
+    def _claim_inputs(self) -> None:
+        taken = self._controller.registers.claim_free("another client", list(INPUTS))
+        self._controller.note(
+            f"another client has taken {len(taken)} of {len(INPUTS)} input registers"
+        )
 
 
-def _discard(_: object) -> None:
-    """Ignores the answer of an action."""
+# Readers of a fault's argument; they raise a ValueError where it has no meaning.
 
 
-def _nothing(argument: str) -> None:
+def _nothing(argument: str) -> tuple[()]:
     if argument:
         raise ValueError(argument)
+    return ()
 
 
-def _one_of(argument: str, *choices: str) -> str:
-    if argument not in choices:
-        raise ValueError(argument)
-    return argument
+def _value(read: Callable[[str], Any], is_valid: Callable[[Any], bool]) -> Callable[[str], tuple]:
+    def checked(argument: str) -> tuple:
+        value = read(argument)
+        if not is_valid(value):
+            raise ValueError(argument)
+        return (value,)
+
+    return checked
 
 
-def _positive(argument: str) -> float:
-    value = float(argument)
-    if not 0.0 < value < 1e3:
-        raise ValueError(argument)
-    return value
+def _is_amount(value: float) -> bool:
+    return 0.0 <= value < 1e3
+
+
+def _is_duration(value: float) -> bool:
+    return 0.0 < value < 1e3

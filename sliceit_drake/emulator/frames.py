@@ -11,12 +11,12 @@ from sliceit_drake.emulator.variables import TYPES
 
 __all__ = [
     "FrameError",
-    "FrameReader",
     "PackageType",
     "Recipe",
     "encode_frame",
     "encode_text",
     "split_names",
+    "take_frames",
 ]
 
 _HEADER = struct.Struct(">HB")
@@ -71,28 +71,21 @@ def split_names(payload: bytes) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-class FrameReader:
-    """Cuts a stream of bytes into frames, however the network has split it."""
+def take_frames(buffer: bytearray) -> Iterator[tuple[int, bytes]]:
+    """Takes all complete frames from a stream's bytes; yields type and payload of each.
 
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-
-    def feed(self, data: bytes) -> Iterator[tuple[int, bytes]]:
-        """Takes bytes; yields type and payload of each frame that is complete.
-
-        Raises:
-            FrameError: A size is smaller than a header: the stream cannot be read further.
-        """
-        self._buffer += data
-        while len(self._buffer) >= _HEADER.size:
-            size, kind = _HEADER.unpack_from(self._buffer)
-            if size < _HEADER.size:
-                raise FrameError(f"a frame cannot have {size} bytes")
-            if len(self._buffer) < size:
-                return
-            payload = bytes(self._buffer[_HEADER.size : size])
-            del self._buffer[:size]
-            yield kind, payload
+    Raises:
+        FrameError: A size is smaller than a header: the stream cannot be read further.
+    """
+    while len(buffer) >= _HEADER.size:
+        size, kind = _HEADER.unpack_from(buffer)
+        if size < _HEADER.size:
+            raise FrameError(f"a frame cannot have {size} bytes")
+        if len(buffer) < size:
+            return
+        payload = bytes(buffer[_HEADER.size : size])
+        del buffer[:size]
+        yield kind, payload
 
 
 class Recipe:

@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.emulator.connections import Connection
+from sliceit_drake.emulator.connections import Connection, Service, take_until
 from sliceit_drake.emulator.faults import FaultInjector
 
 __all__ = ["PENDANT_PORT", "Pendant"]
@@ -18,7 +18,7 @@ __all__ = ["PENDANT_PORT", "Pendant"]
 PENDANT_PORT = 30099
 
 
-class Pendant:
+class Pendant(Service):
     """Takes faults from another process and tells it how the controller does."""
 
     def __init__(
@@ -30,23 +30,9 @@ class Pendant:
     ) -> None:
         self._faults, self._status, self._stop = faults, status, stop
         self._put_fresh_food = put_fresh_food
-        self._buffers: dict[Connection, bytearray] = {}
 
-    def opened(self, connection: Connection) -> None:
-        """See `connections.Service`."""
-        self._buffers[connection] = bytearray()
-
-    def closed(self, connection: Connection) -> None:
-        """See `connections.Service`."""
-        del self._buffers[connection]
-
-    def received(self, connection: Connection, data: bytes) -> None:
-        """See `connections.Service`."""
-        buffer = self._buffers[connection]
-        buffer += data
-        while (end := buffer.find(b"\n")) >= 0:
-            line = bytes(buffer[:end])
-            del buffer[: end + 1]
+    def received(self, connection: Connection) -> None:
+        while (line := take_until(connection.unread, b"\n")) is not None:
             connection.send(json.dumps(self._answer(line)).encode() + b"\n")
 
     def _answer(self, line: bytes) -> dict[str, object]:

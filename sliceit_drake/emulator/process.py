@@ -12,7 +12,6 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 
 from sliceit_drake.emulator.pendant import PENDANT_PORT
 
@@ -203,10 +202,5 @@ class EmulatorProcess:
     def __enter__(self) -> "EmulatorProcess":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

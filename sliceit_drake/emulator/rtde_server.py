@@ -5,16 +5,16 @@ import dataclasses as dc
 import random
 import struct
 
-from sliceit_drake.emulator.connections import Connection, SocketHub
+from sliceit_drake.emulator.connections import Connection, Service
 from sliceit_drake.emulator.controller import Controller
 from sliceit_drake.emulator.frames import (
     FrameError,
-    FrameReader,
     PackageType,
     Recipe,
     encode_frame,
     encode_text,
     split_names,
+    take_frames,
 )
 from sliceit_drake.emulator.modes import MessageLevel
 from sliceit_drake.emulator.registers import IN_USE
@@ -37,7 +37,6 @@ _Values = dict[str, int | float | bool | tuple]
 class _Session:
     """Agreement with a client."""
 
-    reader: FrameReader = dc.field(default_factory=FrameReader)
     inputs: list[Recipe] = dc.field(default_factory=list)
     outputs: Recipe | None = None
     frequency: float = 0.0
@@ -47,7 +46,7 @@ class _Session:
     ready: collections.deque[tuple[float, bytes]] = dc.field(default_factory=collections.deque)
 
 
-class RtdeServer:
+class RtdeServer(Service):
     """Answers RTDE clients, sends them the controller's outputs and takes their inputs.
 
     Attributes:
@@ -60,34 +59,31 @@ class RtdeServer:
         has_reached_all: Whether all clients that want data got a package after the last cycle.
     """
 
-    def __init__(self, hub: SocketHub, controller: Controller, seed: int = 0) -> None:
+    def __init__(self, controller: Controller) -> None:
         self.frequency_limit = RATE
         self.drop_share = self.delay = 0.0
         self.packages_in = 0
         self.command_counts: collections.Counter[int] = collections.Counter()
         self.last_command = 0
         self.has_reached_all = False
-        self._hub, self._controller = hub, controller
-        self._random = random.Random(seed)
+        self._controller = controller
+        self._random = random.Random(0)
         self._sessions: dict[Connection, _Session] = {}
         self._late_inputs: collections.deque[tuple[float, _Values]] = collections.deque()
 
     # Service.
 
     def opened(self, connection: Connection) -> None:
-        """See `connections.Service`."""
         self._sessions[connection] = _Session()
 
     def closed(self, connection: Connection) -> None:
-        """See `connections.Service`."""
         del self._sessions[connection]
         self._controller.registers.release(connection)
 
-    def received(self, connection: Connection, data: bytes) -> None:
-        """See `connections.Service`."""
+    def received(self, connection: Connection) -> None:
         session = self._sessions[connection]
         try:
-            for kind, payload in session.reader.feed(data):
+            for kind, payload in take_frames(connection.unread):
                 self._answer(connection, session, kind, payload)
                 if not connection.is_open:
                     return
@@ -153,7 +149,7 @@ class RtdeServer:
         if kind == PackageType.DATA:
             self._take_input(connection, session, payload)
         elif kind == PackageType.TEXT:
-            self._controller.log.append((self._controller.time, f"client says {payload!r}"))
+            self._controller.note(f"client says {payload!r}")
         elif kind in (PackageType.START, PackageType.PAUSE):
             is_start = kind == PackageType.START
             accepted = session.outputs is not None or not is_start

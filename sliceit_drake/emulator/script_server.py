@@ -1,8 +1,8 @@
 """The services that take robot programs: ports 30003, 30001 and 30002."""
 
-import dataclasses as dc
+import weakref
 
-from sliceit_drake.emulator.connections import Connection
+from sliceit_drake.emulator.connections import Connection, Service, take_until
 from sliceit_drake.emulator.control_script import ControlScript, register_offset
 from sliceit_drake.emulator.controller import Controller
 from sliceit_drake.emulator.modes import MessageLevel
@@ -13,13 +13,7 @@ _LONGEST_PROGRAM = 1 << 20
 _END = b"\nend\n"
 
 
-@dc.dataclass
-class _Upload:
-    text: bytearray
-    is_read_only: bool
-
-
-class ScriptServer:
+class ScriptServer(Service):
     """Starts ur_rtde's control script when a client uploads it; refuses other programs aloud.
 
     On a real controller these ports also stream the robot's state, which ur_rtde does not read;
@@ -29,38 +23,29 @@ class ScriptServer:
 
     def __init__(self, controller: Controller) -> None:
         self._controller = controller
-        self._uploads: dict[Connection, _Upload] = {}
+        self._read_only: weakref.WeakSet[Connection] = weakref.WeakSet()
 
     def opened(self, connection: Connection) -> None:
-        """See `connections.Service`."""
-        self._uploads[connection] = _Upload(bytearray(), not self._controller.is_remote)
+        if not self._controller.is_remote:
+            self._read_only.add(connection)
 
-    def closed(self, connection: Connection) -> None:
-        """See `connections.Service`."""
-        del self._uploads[connection]
-
-    def received(self, connection: Connection, data: bytes) -> None:
-        """See `connections.Service`."""
-        upload = self._uploads[connection]
-        upload.text += data
+    def received(self, connection: Connection) -> None:
         # A program has a top-level "end"; a bare line is a program of its own.
-        while upload.text:
-            is_function = upload.text.startswith((b"def ", b"sec "))
-            mark = _END if is_function else b"\n"
-            end = upload.text.find(mark)
-            if end < 0:
+        while unread := connection.unread:
+            is_function = unread.startswith((b"def ", b"sec "))
+            program = take_until(unread, _END if is_function else b"\n")
+            if program is None:
                 break
-            text = bytes(upload.text[: end + len(mark)]).decode("utf-8", "replace")
-            del upload.text[: end + len(mark)]
+            text = program.decode("utf-8", "replace")
             if text.strip():
-                self._run(text, upload)
-        if len(upload.text) > _LONGEST_PROGRAM:
+                self._run(text, connection in self._read_only)
+        if len(connection.unread) > _LONGEST_PROGRAM:
             connection.close()
 
-    def _run(self, text: str, upload: _Upload) -> None:
+    def _run(self, text: str, is_read_only: bool) -> None:
         controller = self._controller
-        if upload.is_read_only or not controller.is_remote:
-            controller.log.append((controller.time, "program ignored: not in remote control"))
+        if is_read_only or not controller.is_remote:
+            controller.note("program ignored: not in remote control")
             return
         offset = register_offset(text)
         if offset is None:
@@ -71,6 +56,5 @@ class ScriptServer:
             )
             controller.stop_program("a program that is not emulated was sent")
             return
-        controller.start_program(
-            ControlScript(controller, offset), f"control script, {len(text)} characters"
-        )
+        program = ControlScript(controller, offset)
+        controller.start_program(program.step, f"control script, {len(text)} characters")
