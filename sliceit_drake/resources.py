@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pydrake.multibody.parsing import Parser
 
-__all__ = ["add_package_map", "file_or_resource", "load_module", "named_yaml", "resource_path"]
+__all__ = [
+    "add_package_map",
+    "file_or_resource",
+    "here_or_shipped",
+    "load_module",
+    "named_yaml",
+    "resource_path",
+]
 
 _MODEL_PACKAGE = "sliceit_drake_models"
 FOLDERS = ("calibration", "hardware", "models", "scenarios")
@@ -49,21 +56,24 @@ def resource_path(relative: str) -> Path:
     return path
 
 
-def file_or_resource(path: str) -> Path | None:
-    """The file at a path from the working directory, or else from the resources.
+def here_or_shipped(path: str | Path) -> Path:
+    """A file or folder from the working directory, or else from the resources.
 
     Args:
-        path: As a user writes it.
-
-    Returns:
-        The file, or None where there is none at either.
+        path: As a user writes it; it is returned where there is none at either.
     """
-    if Path(path).is_file():
-        return Path(path)
+    path = Path(path)
+    if path.exists():
+        return path
     try:
-        file = resource_path(path)
+        return resource_path(path.as_posix())
     except (FileNotFoundError, ValueError):
-        return None
+        return path
+
+
+def file_or_resource(path: str) -> Path | None:
+    """As `here_or_shipped`, of files alone; None where there is none."""
+    file = here_or_shipped(path)
     return file if file.is_file() else None
 
 

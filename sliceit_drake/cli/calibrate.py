@@ -1,20 +1,4 @@
-"""`sliceit calibrate`: find a food's parameters from slice records."""
-
-import argparse
-import os
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-from sliceit_drake.cli.progress import StageBars
-from sliceit_drake.cli.scenario_argument import here_or_shipped
-
-if TYPE_CHECKING:
-    from sliceit_drake.calibration.result import Calibration
-
-__all__ = ["add_parser"]
-
-DESCRIPTION = """\
-Calibrate a food from slice records (NAME.csv and NAME.yaml, see docs/records.md).
+"""Calibrate a food from slice records (NAME.csv and NAME.yaml, see docs/records.md).
 
 Searches with Optuna's TPE, refines the best places with Adam on the exact gradient, polishes with
 Gauss-Newton, and says how sure it is. Writes to DIR:
@@ -38,17 +22,25 @@ A food that nobody recorded, from published levels in its setup:
   sliceit calibrate --food carrot --literature --output output/carrot
 """
 
+import argparse
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Adds the command."""
-    parser = commands.add_parser(
-        "calibrate",
-        help="find a food's parameters, with their uncertainty, from slice records",
-        description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+from sliceit_drake.cli.progress import StageBars
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.resources import here_or_shipped
+
+if TYPE_CHECKING:
+    from sliceit_drake.calibration.result import Calibration
+
+__all__ = ["add_arguments", "run"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's arguments."""
     parser.add_argument(
-        "records", metavar="RECORD", nargs="*", type=Path, help="NAME.csv or folder"
+        "records", metavar="RECORD", nargs="*", type=here_or_shipped, help="NAME.csv or folder"
     )
     parser.add_argument("--food", metavar="NAME", help="a setup by name, or a YAML file of one")
     parser.add_argument("--output", metavar="DIR", type=Path, help="where the results go")
@@ -91,13 +83,11 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         default=5,
         help="blocks of depth held out in turn (default 5; 0: none)",
     )
-    parser.set_defaults(run=_run, resumes=True)
+    parser.set_defaults(resumes=True)
 
 
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     """Runs the command."""
-    from sliceit_drake.configuration import ConfigurationError
-
     if options.show:
         return _show(options.show)
     for name in ("food", "output"):
@@ -116,21 +106,20 @@ def _run(options: argparse.Namespace) -> int:
 def _from_literature(options: argparse.Namespace) -> int:
     import datetime
 
-    from tqdm import tqdm
-
     from sliceit_drake.calibration.literature import food_from_literature
     from sliceit_drake.calibration.report import parameter_table
     from sliceit_drake.calibration.setup import load_setup
     from sliceit_drake.configuration import dump_yaml
 
     setup = load_setup(options.food)
-    with tqdm(total=options.trials, desc="cuts") as bar:
+    trials = options.trials
+    with StageBars() as bars:
         food = food_from_literature(
-            setup, options.trials, options.seed, lambda done: (bar.update(done - bar.n), None)[1]
+            setup, trials, options.seed, lambda done: bars.show("cuts", done, trials)
         )
     food.date = datetime.date.today().isoformat()
     food.command = (
-        f"sliceit calibrate --food {options.food} --literature --trials {options.trials} "
+        f"sliceit calibrate --food {options.food} --literature --trials {trials} "
         f"--seed {options.seed}"
     )
     options.output.mkdir(parents=True, exist_ok=True)
@@ -166,14 +155,11 @@ def _calibrate(options: argparse.Namespace) -> int:
     from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate, values_of
     from sliceit_drake.calibration.setup import load_setup
     from sliceit_drake.calibration.storage import without_password
-    from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
     from sliceit_drake.records.validation import check_record, load_record, record_files
 
     setup = load_setup(options.food)
-    given = map(here_or_shipped, options.records)
-    files = [file for path in given for file in record_files(path)]
-    records = [load_record(file) for file in files]
+    records = [load_record(file) for path in options.records for file in record_files(path)]
     for record in records:
         for finding in check_record(record):
             print(f"{finding.severity}: {finding}")

@@ -1,28 +1,4 @@
-"""`sliceit collect`: cut the slices of a protocol on a station, and write their records."""
-
-import argparse
-import logging
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-from sliceit_drake.cli.hardware import add_robot_arguments, robot_of
-from sliceit_drake.cli.scenario_argument import add_protocol_argument, protocol_file
-from sliceit_drake.hardware.client import is_loopback
-from sliceit_drake.output_folder import check_folder
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from sliceit_drake.diagrams.scenario import Scenario
-
-__all__ = ["add_parser"]
-
-STATION = "scenarios/cucumber.yaml"
-PREPARATION = 120.0
-"""Wall time that an emulator may take to prepare a food, s."""
-
-DESCRIPTION = """\
-Cut the slices of a protocol, in random order, with the arm under compliance control, and write a
+"""Cut the slices of a protocol, in random order, with the arm under compliance control, and write a
 record of each: constant speeds, holds, withdrawals, air, replicates, as the protocol says
 (calibration/protocols; `sliceit record --help`).
 
@@ -47,21 +23,35 @@ Examples
   sliceit collect --host 192.168.1.10 --robot my_ur5e.yaml --move-to-start --output records/real
 """
 
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Adds the command."""
-    parser = commands.add_parser(
-        "collect",
-        help="cut the slices of a protocol on a station, simulated or real, and record them",
-        description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+from sliceit_drake.cli.arguments import SCENARIO, add_protocol_argument, protocol_file
+from sliceit_drake.cli.hardware import add_robot_arguments, robot_of
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.hardware.client import is_loopback
+from sliceit_drake.output_folder import check_folder
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from sliceit_drake.diagrams.scenario import Scenario
+
+__all__ = ["add_arguments", "run"]
+
+PREPARATION = 120.0
+"""Wall time that an emulator may take to prepare a food, s."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's arguments."""
     add_protocol_argument(parser)
     parser.add_argument(
         "--station",
-        default=STATION,
+        default=SCENARIO,
         metavar="SCENARIO",
-        help=f"whose robot, controller, sensor and numerics are used (default {STATION})",
+        help=f"whose robot, controller, sensor and numerics are used (default {SCENARIO})",
     )
     add_robot_arguments(parser)
     parser.add_argument(
@@ -80,12 +70,11 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         metavar="PORT",
         help="of the emulator at --host, to put fresh food there before each slice",
     )
-    parser.set_defaults(run=_run, resumes=True)
+    parser.set_defaults(resumes=True)
 
 
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     """Runs the command."""
-    logging.getLogger("drake").setLevel(logging.WARNING)
     _check(options)
     robot = robot_of(options) if options.host else None
 
@@ -116,8 +105,6 @@ def _check(options: argparse.Namespace) -> None:
     Raises:
         ConfigurationError: Naming option and fix.
     """
-    from sliceit_drake.configuration import ConfigurationError
-
     if options.emulator_pendant is not None and not is_loopback(options.host or ""):
         raise ConfigurationError(
             "is of an emulated controller on this machine",
@@ -141,7 +128,7 @@ def _fresh_food(options: argparse.Namespace) -> "Callable[[Scenario], None] | No
     port = options.emulator_pendant
     if port is None:
         return None
-    from sliceit_drake.configuration import ConfigurationError, dump_yaml
+    from sliceit_drake.configuration import dump_yaml
     from sliceit_drake.emulator.process import EmulatorError, PendantClient
 
     def put_fresh_food(scenario: "Scenario") -> None:

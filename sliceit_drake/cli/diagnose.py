@@ -1,24 +1,4 @@
-"""`sliceit diagnose`: show what the simulation gets wrong, and name the cause."""
-
-import argparse
-import os
-from contextlib import nullcontext
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-from sliceit_drake.cli.cluster_arguments import add_cluster_arguments, check_cluster_arguments
-from sliceit_drake.cli.progress import StageBars
-from sliceit_drake.cli.scenario_argument import here_or_shipped
-
-if TYPE_CHECKING:
-    from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
-    from sliceit_drake.diagnosis.cause import Cause
-    from sliceit_drake.records.slice_record import SliceRecord
-
-__all__ = ["add_parser"]
-
-DESCRIPTION = """\
-Compare slice records with a calibrated food, name what causes the difference and measure the gain.
+"""Compare slice records with a calibrated food, name what causes the difference, measure the gain.
 
 RECORDS_DIR holds slice records (docs/records.md), or is one; best three or more of each condition
 at several speeds, with a hold, a withdrawal and draws. Writes to DIR:
@@ -42,19 +22,31 @@ then diagnosed together; give the folders in the order in which they were record
       --backend dask --scheduler tcp://192.168.0.5:8786
 """
 
+import argparse
+import functools
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Adds the command."""
-    parser = commands.add_parser(
-        "diagnose",
-        help="show what the simulation gets wrong in records, and name the cause",
-        description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+from sliceit_drake.cli.arguments import add_cluster_arguments, cluster_of
+from sliceit_drake.cli.progress import StageBars
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.output_folder import check_folder
+from sliceit_drake.resources import here_or_shipped
+
+if TYPE_CHECKING:
+    from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
+    from sliceit_drake.records.slice_record import SliceRecord
+
+__all__ = ["add_arguments", "run"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's arguments."""
     parser.add_argument(
         "records",
         metavar="RECORDS_DIR",
-        type=Path,
+        type=here_or_shipped,
         nargs="+",
         help="folder of records; sessions in order",
     )
@@ -92,45 +84,21 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         "--workers", type=int, default=os.cpu_count() or 1, help="processors (default: all)"
     )
     add_cluster_arguments(parser, "threads", "slices are simulated")
-    parser.set_defaults(run=_run, resumes=True)
+    parser.set_defaults(resumes=True)
 
 
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     """Runs the command."""
-    from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
     from sliceit_drake.diagnosis.registry import load_cause
-    from sliceit_drake.output_folder import check_folder
     from sliceit_drake.prediction.cluster import on_cluster
     from sliceit_drake.records.validation import load_sessions
 
-    options.records = list(map(here_or_shipped, options.records))
     for folder in options.records:
         if not folder.is_dir() and folder.suffix not in (".csv", ".yaml"):
             raise ConfigurationError(
                 "is no folder", source=str(folder), fix="Give folders of slice records."
             )
-    _check_options(options)
-    food = load_calibrated_food(options.model)
-    extra = [load_cause(file) for file in options.cause]
-    records = load_sessions(options.records)
-    # Before hours are spent for what cannot be kept.
-    options.cache = options.cache or options.output / "cache"
-    check_folder(options.output, "--output")
-    check_folder(options.cache, "--cache")
-    if options.next_experiment is not None:
-        check_folder(options.next_experiment.parent, "--next-experiment")
-    there = options.backend == "dask"
-    with on_cluster(options.scheduler) if there else nullcontext(options.workers) as workers:
-        options.workers = workers
-        if len(records) == 1:
-            return _one_slice(options, food, records[0], extra)
-        return _diagnose(options, food, records, extra)
-
-
-def _check_options(options: argparse.Namespace) -> None:
-    from sliceit_drake.configuration import ConfigurationError
-
     for name, least, most in (
         ("workers", 1, 10_000),
         ("refinement", 0.2, 4.0),
@@ -141,41 +109,49 @@ def _check_options(options: argparse.Namespace) -> None:
             raise ConfigurationError(
                 f"is {value:g}", field=f"--{name}", fix=f"Give {least:g} to {most:g}."
             )
-    check_cluster_arguments(options)
+    cluster = cluster_of(options, on_cluster)
+    food = load_calibrated_food(options.model)
+    extra = [load_cause(file) for file in options.cause]
+    records = load_sessions(options.records)
+    # Before hours are spent for what cannot be kept.
+    cache = options.cache or options.output / "cache"
+    check_folder(options.output, "--output")
+    check_folder(cache, "--cache")
+    if options.next_experiment is not None:
+        check_folder(options.next_experiment.parent, "--next-experiment")
+    with cluster as executor, StageBars() as bars:
+        settings = {
+            "extra": extra,
+            "cache": cache,
+            "replicates": options.replicates,
+            "seed": options.seed,
+            "workers": executor or options.workers,
+            "progress": bars.show,
+        }
+        if len(records) == 1:
+            return _one_slice(options, food, records[0], settings)
+        return _diagnose(options, food, records, settings)
 
 
 def _diagnose(
     options: argparse.Namespace,
     food: "CalibratedFood",
     records: "list[SliceRecord]",
-    extra: "list[Cause]",
+    settings: dict[str, Any],
 ) -> int:
     """Diagnoses several slices."""
     from sliceit_drake.diagnosis.diagnose import diagnose, setup_of_food
     from sliceit_drake.diagnosis.experiments.next_experiment import next_experiment
     from sliceit_drake.diagrams.planned_scenario import scenario_of_slice
 
-    with StageBars() as bars:
-        result = diagnose(
-            setup_of_food(food, options.refinement),
-            records,
-            extra,
-            options.cache,
-            options.replicates,
-            options.seed,
-            options.workers,
-            bars.show,
-            options.other_food,
+    setup = setup_of_food(food, options.refinement)
+    result = diagnose(setup, records, **settings, other_food=options.other_food)
+    if options.next_experiment is not None:
+        show = functools.partial(settings["progress"], "motions of the menu")
+        result.next_experiment = next_experiment(
+            result, records, settings["cache"], settings["workers"], show
         )
-        if options.next_experiment is not None:
-            result.next_experiment = next_experiment(
-                result,
-                records,
-                options.cache,
-                options.workers,
-                lambda done, total: bars.show("motions of the menu", done, total),
-            )
-            result.next_experiment.write(options.next_experiment, scenario_of_slice)
+        result.next_experiment.write(options.next_experiment, scenario_of_slice)
     print(result.table())
     result.save(options.output, not options.no_report)
     report = "" if options.no_report else ", report.html"
@@ -187,10 +163,9 @@ def _one_slice(
     options: argparse.Namespace,
     food: "CalibratedFood",
     record: "SliceRecord",
-    extra: "list[Cause]",
+    settings: dict[str, Any],
 ) -> int:
     """Says what one slice shows."""
-    from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.diagnosis.input_checks import check_records
     from sliceit_drake.diagnosis.one_slice.diagnose_slice import diagnose_slice, setup_of_slice
 
@@ -202,18 +177,8 @@ def _one_slice(
             " scenario is written.",
         )
     remarks = check_records([record], food.food, options.other_food)
-    with StageBars() as bars:
-        result = diagnose_slice(
-            setup_of_slice(food, options.refinement),
-            record,
-            extra,
-            options.cache,
-            options.replicates,
-            options.seed,
-            options.workers,
-            bars.show,
-            remarks,
-        )
+    setup = setup_of_slice(food, options.refinement)
+    result = diagnose_slice(setup, record, **settings, remarks=remarks)
     print(result.table())
     result.save(options.output)
     print(f"Results in {options.output}/: diagnosis.json, report.html")

@@ -1,30 +1,22 @@
-"""`sliceit diagram`: draw the systems of a scenario and their connections."""
+"""Draw the block diagram of a scenario.
+
+With Graphviz installed (its program `dot`) the picture is written in the format of FILE's ending:
+.svg, .png or .pdf. Without it, give a .dot file and draw that elsewhere.
+"""
 
 import argparse
 import shutil
 import subprocess
 from pathlib import Path
 
-from sliceit_drake.cli.scenario_argument import add_scenario_arguments, scenario_of
+from sliceit_drake.cli.arguments import add_scenario_arguments, scenario_of
+from sliceit_drake.configuration import ConfigurationError
 
-__all__ = ["add_parser"]
-
-DESCRIPTION = """\
-Draw the block diagram of a scenario.
-
-With Graphviz installed (its program `dot`) the picture is written in the format of FILE's ending:
-.svg, .png or .pdf. Without it, give a .dot file and draw that elsewhere.
-"""
+__all__ = ["add_arguments", "run"]
 
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Adds the command."""
-    parser = commands.add_parser(
-        "diagram",
-        help="draw the systems of a scenario, or print its port contract",
-        description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's arguments."""
     add_scenario_arguments(parser)
     parser.add_argument(
         "--output", metavar="FILE", type=Path, default=Path("diagram.svg"), help="picture to write"
@@ -35,10 +27,9 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument(
         "--ports", action="store_true", help="print the station's port contract and draw nothing"
     )
-    parser.set_defaults(run=_run)
 
 
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     if options.ports:
         from sliceit_drake.diagrams.ports import ports_as_markdown
@@ -46,7 +37,6 @@ def _run(options: argparse.Namespace) -> int:
         print(ports_as_markdown())
         return 0
 
-    from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
 
     kind = options.output.suffix.lstrip(".")

@@ -1,25 +1,4 @@
-"""`sliceit emulate`: an emulated UR5e controller, for everything that talks to a real one."""
-
-import argparse
-import gc
-import logging
-import signal
-import sys
-import threading
-from collections.abc import Callable
-from typing import TYPE_CHECKING
-
-from sliceit_drake.cli.scenario_argument import add_scenario_arguments, scenario_of
-from sliceit_drake.emulator.fault_table import faults_as_text
-
-if TYPE_CHECKING:
-    from sliceit_drake.emulator.controller import ControllerConfig
-    from sliceit_drake.emulator.robot_model import RobotModel
-
-__all__ = ["add_parser"]
-
-DESCRIPTION = f"""\
-Emulate the controller of a UR5e on the loopback interface: RTDE (port 30004), dashboard (29999),
+"""Emulate the controller of a UR5e on the loopback interface: RTDE (port 30004), dashboard (29999),
 script upload (30003, 30001, 30002) and the register protocol of ur_rtde's control script. Behind it
 the scenario's arm, knife and food are simulated, as by `sliceit simulate`.
 
@@ -27,21 +6,33 @@ The emulator is the clock. One cycle is 2 ms of controller time; --pace says how
 time passes per wall time. With --lockstep a cycle waits for the client's servoJ instead: the same
 run every time, on any machine.
 
-Port 30099 takes lines of JSON, as {{"inject": "silence:0.1", "at": 2.5}}, {{"status": true}},
-{{"fresh_food": true}} (uncut food under the knife) or {{"stop": true}}. --inject does the same
-from the start. Times are the controller's. What can be injected:
-{faults_as_text()}
+Port 30099 takes lines of JSON, as {"inject": "silence:0.1", "at": 2.5}, {"status": true},
+{"fresh_food": true} (uncut food under the knife) or {"stop": true}. --inject does the same
+from the start. Times are the controller's.
 """
 
+import argparse
+import gc
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Adds the command."""
-    parser = commands.add_parser(
-        "emulate",
-        help="emulate a UR5e's controller that ur_rtde talks to, with the scenario behind it",
-        description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+from sliceit_drake.cli.arguments import add_scenario_arguments, scenario_of
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.emulator.fault_table import faults_as_text
+
+if TYPE_CHECKING:
+    from sliceit_drake.emulator.controller import ControllerConfig
+    from sliceit_drake.emulator.robot_model import RobotModel
+
+__all__ = ["add_arguments", "run"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's arguments."""
+    parser.description = f"{__doc__}What can be injected:\n{faults_as_text()}\n"
     add_scenario_arguments(parser)
     parser.add_argument(
         "--address",
@@ -74,14 +65,10 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     )
     parser.add_argument("--end-with-stdin", action="store_true", help=argparse.SUPPRESS)
     # The arm alone needs none.
-    parser.set_defaults(run=_run)
 
 
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     """Runs the command."""
-    logging.getLogger("drake").setLevel(logging.WARNING)
-
-    from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.emulator.controller import ControllerConfig
     from sliceit_drake.emulator.emulator import ControllerClock, Emulator
 
@@ -127,7 +114,6 @@ def _robot(options: argparse.Namespace, config: "ControllerConfig") -> "RobotMod
 
 
 def _version(text: str) -> tuple[int, ...]:
-    from sliceit_drake.configuration import ConfigurationError
 
     try:
         parts = tuple(int(part) for part in text.split("."))

@@ -1,12 +1,4 @@
-"""`sliceit evaluate`: lets policies cut slices in worlds that no training has seen."""
-
-import argparse
-from pathlib import Path
-
-__all__ = ["add_parser"]
-
-DESCRIPTION = """\
-Let trained policies cut slices, and measure contact force, duration and completion.
+"""Let trained policies cut slices, and measure contact force, duration and completion.
 
 Each POLICY is a folder that `sliceit train` wrote. Worlds, none of which a training sees:
   stand_in   finite elements on a finer mesh, effects that no training has, a noisy, late sensor
@@ -17,18 +9,21 @@ policies cut the same slices. Everything here is simulated.
 Writes a line for each slice to --output, a .jsonl file, and goes on where it is.
 `python -m studies slicing` compares the policies of both simulators.
 """
+
+import argparse
+from pathlib import Path
+
+from sliceit_drake.cli.extras import needs_extra
+from sliceit_drake.cli.progress import StageBars
+
+__all__ = ["add_arguments", "run"]
+
 WORLDS = ("stand_in", "curves")
 FOODS = ("cucumber", "tomato", "potato", "carrot")
 
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Adds the command."""
-    parser = commands.add_parser(
-        "evaluate",
-        help="let trained policies cut slices in unseen worlds",
-        description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's arguments."""
     parser.add_argument(
         "policies", nargs="+", metavar="POLICY", type=Path, help="folder of a training"
     )
@@ -52,15 +47,11 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument(
         "--output", metavar="FILE", type=Path, required=True, help=".jsonl file of slices"
     )
-    parser.set_defaults(run=_run, resumes=True)
+    parser.set_defaults(resumes=True)
 
 
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     """Runs the command."""
-    from tqdm import tqdm
-
-    from sliceit_drake.cli.extras import needs_extra
-
     with needs_extra("learn"):
         from sliceit_drake.learning.unseen_worlds import cases_of, evaluate, results_table
 
@@ -72,7 +63,12 @@ def _run(options: argparse.Namespace) -> int:
         options.seed,
         options.slices,
     )
-    with tqdm(total=len(cases), desc="slices") as bar:
-        evaluate(cases, options.output, options.workers, lambda done: bar.update(done - bar.n))
+    with StageBars() as bars:
+        evaluate(
+            cases,
+            options.output,
+            options.workers,
+            lambda done: bars.show("slices", done, len(cases)),
+        )
     print(results_table(options.output, cases))
     return 0

@@ -1,13 +1,4 @@
-"""`sliceit export`: the run of a folder as a series for ParaView."""
-
-import argparse
-import logging
-from pathlib import Path
-
-__all__ = ["add_parser"]
-
-DESCRIPTION = """\
-Write a run that `sliceit simulate` left in FOLDER as a time series for ParaView.
+"""Write a run that `sliceit simulate` left in FOLDER as a time series for ParaView.
 
 FOLDER has the scenario and the record, not the food's states: the scenario is simulated once more,
 which repeats it bit for bit on the same machine and version, and its force is compared with
@@ -21,46 +12,39 @@ Writes to DIR (docs/paraview.md):
   sliceit export output/cucumber --format xdmf --fps 10 --output /tmp/series
 """
 
+import argparse
+import functools
+from pathlib import Path
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Adds the command."""
-    parser = commands.add_parser(
-        "export",
-        help="write a run as a series for ParaView",
-        description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+from sliceit_drake.cli.progress import SIMULATED_TIME, StageBars
+
+__all__ = ["add_arguments", "run"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's arguments."""
     parser.add_argument("folder", metavar="FOLDER", type=Path, help="of `sliceit simulate`")
     parser.add_argument("--format", choices=("vtu", "xdmf"), default="vtu", help="default: vtu")
     parser.add_argument("--fps", type=float, default=30.0, help="frames a second (default 30)")
     parser.add_argument(
         "--output", metavar="DIR", type=Path, help="default: paraview, in the folder"
     )
-    parser.set_defaults(run=_run)
 
 
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     """Runs the command."""
-    from tqdm import tqdm
-
     from sliceit_drake.diagrams.outputs.paraview import write_series
     from sliceit_drake.diagrams.outputs.run_again import run_again
 
-    logging.getLogger("drake").setLevel(logging.WARNING)
-    shown = "{desc}: {percentage:3.0f}%|{bar}| {n:.2f}/{total:.2f} s"
-    with tqdm(desc=options.folder.name, bar_format=shown, total=0.0) as bar:
-
-        def show(time: float, duration: float) -> None:
-            bar.total = duration
-            bar.update(time - bar.n)
-
-        again = run_again(options.folder, options.fps, show)
+    folder = options.folder
+    with StageBars(bar_format=SIMULATED_TIME) as bars:
+        again = run_again(folder, options.fps, functools.partial(bars.show, folder.name))
     if not again.agrees:
         print(
             f"This run differs from the record by up to {again.difference:.3g} N: it was made by"
             " another version or on another machine. The series is of this run."
         )
-    output = options.output or options.folder / "paraview"
+    output = options.output or folder / "paraview"
     files = write_series(again.frames, output, options.format)
     print(f"{len(again.frames)} frames. Open in ParaView: {', '.join(map(str, files))}")
     return 0

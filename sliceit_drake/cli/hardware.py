@@ -1,22 +1,4 @@
-"""`sliceit hardware`: run a scenario on a UR5e."""
-
-import argparse
-import logging
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-from sliceit_drake.cli.scenario_argument import add_scenario_arguments, find_file, scenario_of
-from sliceit_drake.hardware.client import is_loopback
-
-if TYPE_CHECKING:
-    from sliceit_drake.robot_run.operated_robot import OperatedRobot
-
-__all__ = ["add_parser", "add_robot_arguments", "robot_of"]
-
-DEFAULT_ROBOT = "hardware/ur5e.yaml"
-
-DESCRIPTION = """\
-Run a scenario on a UR5e, through RTDE, with the same controller and plan as `sliceit simulate`.
+"""Run a scenario on a UR5e, through RTDE, with the same controller and plan as `sliceit simulate`.
 
 THIS SOFTWARE IS NOT A SAFETY FUNCTION, and no physical robot has run it yet. Read docs/hardware.md
 first. Stay out of the arm's reach, with the emergency stop in your hand.
@@ -37,15 +19,24 @@ Writes to DIR what `sliceit simulate` writes, and
 --robot names the file with your robot's payload, board height and limits. Copy hardware/ur5e.yaml.
 """
 
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Adds the command."""
-    parser = commands.add_parser(
-        "hardware",
-        help="run a scenario on a UR5e: checks, plan, your word, motion, record",
-        description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+from sliceit_drake.cli.arguments import add_scenario_arguments, find_file, scenario_of
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.hardware.client import is_loopback
+
+if TYPE_CHECKING:
+    from sliceit_drake.robot_run.operated_robot import OperatedRobot
+
+__all__ = ["add_arguments", "run", "add_robot_arguments", "robot_of"]
+
+DEFAULT_ROBOT = "hardware/ur5e.yaml"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's arguments."""
     add_scenario_arguments(parser)
     add_robot_arguments(parser)
     parser.add_argument(
@@ -56,7 +47,6 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument(
         "--touch", action="store_true", help="first find the board's height with the knife"
     )
-    parser.set_defaults(run=_run)
 
 
 def add_robot_arguments(parser: argparse.ArgumentParser) -> None:
@@ -93,9 +83,8 @@ def add_robot_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     """Runs the command."""
-    logging.getLogger("drake").setLevel(logging.WARNING)
     scenario = scenario_of(options)
     robot = robot_of(options)
 
@@ -126,7 +115,7 @@ def robot_of(options: argparse.Namespace) -> "OperatedRobot":
     Raises:
         ConfigurationError: The file is missing or wrong, or there is no address.
     """
-    from sliceit_drake.configuration import ConfigurationError, validate
+    from sliceit_drake.configuration import validate
     from sliceit_drake.hardware.hardware_config import load_hardware_config
 
     if not options.host:

@@ -2,6 +2,7 @@
 
 import argparse
 import errno
+import importlib
 import os
 import signal
 import sys
@@ -11,31 +12,36 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from sliceit_drake.cli import (
-    calibrate,
-    collect,
-    diagnose,
-    diagram,
-    emulate,
-    evaluate,
-    export,
-    hardware,
-    optimize_motion,
-    record,
-    records,
-    simulate,
-    train,
-)
 from sliceit_drake.output_folder import check_output
 
 __all__ = ["main", "make_parser", "run_program"]
 
-GROUPS = {
-    "run a slice": (simulate, hardware, emulate, collect),
-    "records and foods": (record, records, calibrate, diagnose),
-    "motions and policies": (train, evaluate, optimize_motion),
-    "look at it": (diagram, export),
+COMMANDS = {
+    "run a slice": {
+        "simulate": "run a scenario and write record, summary, figure and replay",
+        "hardware": "run a scenario on a UR5e: checks, plan, your word, motion, record",
+        "emulate": "emulate a UR5e's controller that ur_rtde talks to, with the scenario behind it",
+        "collect": "cut the slices of a protocol on a station, simulated or real, and record them",
+    },
+    "records and foods": {
+        "record": "cut slices in a world with hidden effects and write their records",
+        "records": "check slice records, or make them from other formats",
+        "calibrate": "find a food's parameters, with their uncertainty, from slice records",
+        "diagnose": "show what the simulation gets wrong in records, and name the cause",
+    },
+    "motions and policies": {
+        "train": "train a slicing policy",
+        "evaluate": "let trained policies cut slices in unseen worlds",
+        "optimize-motion": "find the press and draw with the least force",
+    },
+    "look at it": {
+        "diagram": "draw the systems of a scenario, or print its port contract",
+        "export": "write a run as a series for ParaView",
+    },
 }
+"""What each command does, by group. A command is a module of this package with `add_arguments` and
+`run`, which returns the exit status; its docstring is the text of `--help`."""
+
 BAD_INPUT = 2
 INTERRUPTED = 130
 WIDTH = 88
@@ -65,17 +71,19 @@ def make_parser() -> argparse.ArgumentParser:
         prog="sliceit", metavar="COMMAND", required=True, help=argparse.SUPPRESS
     )
     lines = []
-    for title, group in GROUPS.items():
+    for title, group in COMMANDS.items():
         lines += [f"{title}:"]
-        for command in group:
-            command.add_parser(commands)
-            # argparse has no public way to read a command's help back, nor to group commands.
-            added = commands._choices_actions[-1]
+        for name, line in group.items():
+            command = importlib.import_module(f"sliceit_drake.cli.{name.replace('-', '_')}")
+            command_parser = commands.add_parser(
+                name,
+                description=command.__doc__,
+                formatter_class=argparse.RawDescriptionHelpFormatter,
+            )
+            command.add_arguments(command_parser)
+            command_parser.set_defaults(run=command.run)
             lines += textwrap.wrap(
-                added.help or "",
-                WIDTH,
-                initial_indent=f"  {added.dest:17}",
-                subsequent_indent=19 * " ",
+                line, WIDTH, initial_indent=f"  {name:17}", subsequent_indent=19 * " "
             )
         lines.append("")
     lines.append("`sliceit COMMAND --help` explains a command. SI units everywhere.")

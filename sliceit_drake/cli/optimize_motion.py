@@ -1,14 +1,4 @@
-"""`sliceit optimize-motion`: the press and draw with the least force, by gradient."""
-
-import argparse
-from pathlib import Path
-
-from sliceit_drake.cli.scenario_argument import add_scenario_arguments, scenario_of
-
-__all__ = ["add_parser"]
-
-DESCRIPTION = """\
-Find the press and draw that cut a scenario's food with the least force, without learning.
+"""Find the press and draw that cut a scenario's food with the least force, without learning.
 
 The knife presses at constant speed and draws to and fro by a sinusoid. Speed, amplitude and
 frequency are moved along the gradient of the mean force over the depth, which the cutting
@@ -20,15 +10,17 @@ Writes to --output:
   summary.json    motion, mean forces, limits that it touches
 """
 
+import argparse
+from pathlib import Path
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Adds the command."""
-    parser = commands.add_parser(
-        "optimize-motion",
-        help="find the press and draw with the least force",
-        description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+from sliceit_drake.cli.arguments import add_scenario_arguments, scenario_of
+from sliceit_drake.cli.progress import StageBars
+
+__all__ = ["add_arguments", "run"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's arguments."""
     add_scenario_arguments(parser)
     parser.add_argument(
         "--output", metavar="FOLDER", type=Path, required=True, help="where motion and figure go"
@@ -45,15 +37,12 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument(
         "--iterations", metavar="N", type=int, default=30, help="most of the optimiser; 30"
     )
-    parser.set_defaults(run=_run)
 
 
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     import dataclasses as dc
     import json
-
-    from tqdm import tqdm
 
     from sliceit_drake.configuration import dump_yaml
     from sliceit_drake.cutting.motion import PressAndDraw
@@ -66,18 +55,16 @@ def _run(options: argparse.Namespace) -> int:
         draw_acceleration=options.draw_acceleration,
         margin=options.margin,
     )
-    with tqdm(desc="slices", unit="slice") as bar:
+    with StageBars(unit="slice") as bars:
 
         def show(count: int, force: float, motion: PressAndDraw) -> None:
-            bar.set_postfix_str(f"{force:.2f} N", refresh=False)
-            bar.update(count - bar.n)
+            bars.show("slices", count, None, f"{force:.2f} N")
 
         scenario, found = optimize_scenario(scenario_of(options), limits, options.iterations, show)
     motion = found.motion
     options.output.mkdir(parents=True, exist_ok=True)
     dump_yaml(scenario, options.output / "scenario.yaml")
-    summary = dc.asdict(found)
-    text = json.dumps(summary, indent=2) + "\n"
+    text = json.dumps(dc.asdict(found), indent=2) + "\n"
     (options.output / "summary.json").write_text(text, encoding="utf-8")
     print(
         f"press {1e3 * motion.press_speed:.1f} mm/s, draw {1e3 * motion.amplitude:.1f} mm at "

@@ -1,28 +1,34 @@
-"""Progress bars of commands that run in stages."""
+"""Progress bars of commands, one for each stage."""
 
-from types import TracebackType
+from contextlib import ExitStack
 from typing import Any
 
-__all__ = ["StageBars"]
+__all__ = ["SIMULATED_TIME", "StageBars"]
+
+SIMULATED_TIME = "{desc}: {percentage:3.0f}%|{bar}| {n:.2f}/{total:.2f} s {postfix}"
+"""Form of a bar that counts seconds of a simulation."""
 
 
-class StageBars:
+class StageBars(ExitStack):
     """One bar for each stage, made when the stage begins.
 
     Args:
         prefix: Text before the stages' names.
+        style: Further arguments of tqdm, as unit and bar_format.
     """
 
-    def __init__(self, prefix: str = "") -> None:
-        self._prefix = prefix
+    def __init__(self, prefix: str = "", **style: Any) -> None:
+        super().__init__()
+        self._prefix, self._style = prefix, style
         self._bars: dict[str, Any] = {}
 
-    def show(self, stage: str, done: int, total: int, remark: str = "") -> None:
-        """Moves a stage's bar to `done` of `total`, with a remark behind it."""
+    def show(self, stage: str, done: float, total: float | None, remark: str = "") -> None:
+        """Moves a stage's bar to `done` of `total`, None if unknown, with a remark behind it."""
         from tqdm import tqdm
 
         if stage not in self._bars:
-            self._bars[stage] = tqdm(total=total, desc=f"{self._prefix}{stage}")
+            bar = tqdm(total=total, desc=f"{self._prefix}{stage}", **self._style)
+            self._bars[stage] = self.enter_context(bar)
         bar = self._bars[stage]
         bar.set_postfix_str(remark, refresh=False)
         bar.update(done - bar.n)
@@ -30,15 +36,3 @@ class StageBars:
     def show_error(self, stage: str, done: int, total: int, error: float) -> None:
         """The same, with the best error so far, N."""
         self.show(stage, done, total, f"best RMS {error:.3f} N")
-
-    def __enter__(self) -> "StageBars":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        for bar in self._bars.values():
-            bar.close()

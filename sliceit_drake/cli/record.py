@@ -1,20 +1,4 @@
-"""`sliceit record`: cut slices in a world with hidden effects and write their records."""
-
-import argparse
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-from sliceit_drake.cli.cluster_arguments import add_cluster_arguments, cluster_of
-from sliceit_drake.cli.scenario_argument import add_protocol_argument, protocol_file
-from sliceit_drake.output_folder import check_output
-
-if TYPE_CHECKING:
-    from sliceit_drake.stand_in.protocol import Protocol
-
-__all__ = ["add_parser"]
-
-DESCRIPTION = """\
-Record slices on a bench that stands in for a real one, on prescribed knife motions.
+"""Record slices on a bench that stands in for a real one, on prescribed knife motions.
 
 PROTOCOL lists what is cut: food, knife, board, sensor, and conditions with their motions and
 replicates. Shipped are (calibration/protocols)
@@ -43,15 +27,29 @@ Examples
 The workers of a cluster need no shared disk, but a FILE.py of yours at its place on each of them.
 """
 
+import argparse
+import functools
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Adds the command."""
-    parser = commands.add_parser(
-        "record",
-        help="cut slices in a world with hidden effects and write their records",
-        description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+from sliceit_drake.cli.arguments import (
+    add_cluster_arguments,
+    add_protocol_argument,
+    cluster_of,
+    protocol_file,
+)
+from sliceit_drake.cli.progress import StageBars
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.output_folder import check_output
+
+if TYPE_CHECKING:
+    from sliceit_drake.stand_in.protocol import Protocol
+
+__all__ = ["add_arguments", "run"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's arguments."""
     add_protocol_argument(parser, "a protocol or a scenario")
     parser.add_argument(
         "--output", metavar="DIR", type=Path, help="folder of the records; default output/NAME"
@@ -77,10 +75,9 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         "--refinement", type=float, help="finite elements along an edge, against the food's mesh"
     )
     parser.add_argument("--time-step", type=float, metavar="S", help="their sub-step")
-    parser.set_defaults(run=_run)
 
 
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     if options.list_effects:
         from sliceit_drake.stand_in.effect_registry import effects_as_markdown
@@ -92,8 +89,6 @@ def _run(options: argparse.Namespace) -> int:
     check_output(directory)
     options.resumes = options.seed is not None
 
-    from tqdm import tqdm
-
     from sliceit_drake.configuration import validate
     from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
     from sliceit_drake.stand_in.session import record_session
@@ -102,12 +97,7 @@ def _run(options: argparse.Namespace) -> int:
     settings.refinement = options.refinement or settings.refinement
     settings.time_step = options.time_step or settings.time_step
     validate(settings, "settings")
-    with cluster_of(options) as client, tqdm(desc=protocol.name, unit="slice") as bar:
-
-        def show(done: int, count: int) -> None:
-            bar.total = count
-            bar.update(done - bar.n)
-
+    with cluster_of(options) as client, StageBars(unit="slice") as bars:
         files = record_session(
             protocol,
             directory,
@@ -116,7 +106,7 @@ def _run(options: argparse.Namespace) -> int:
             options.seed,
             options.workers,
             settings,
-            show,
+            functools.partial(bars.show, protocol.name),
             client,
         )
     print(f"{len(files)} records in {directory}/")
@@ -126,7 +116,6 @@ def _run(options: argparse.Namespace) -> int:
 def _protocol(options: argparse.Namespace) -> "Protocol":
     import yaml
 
-    from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.cutting.foods.effects import Effects
     from sliceit_drake.cutting.foods.food import Food
     from sliceit_drake.diagrams.scenario import load_scenario

@@ -1,22 +1,20 @@
-"""`sliceit records`: check slice records, and make them from other formats."""
+"""Slice records: one slice as a table (NAME.csv) and what is known about it (NAME.yaml), SI units.
+docs/records.md describes the format; calibration/records holds three to look at.
+"""
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sliceit_drake.cli.extras import needs_extra
-from sliceit_drake.cli.scenario_argument import here_or_shipped
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.resources import here_or_shipped
 
 if TYPE_CHECKING:
     from sliceit_drake.records.metadata import SliceMetadata
     from sliceit_drake.records.slice_record import SliceRecord
 
-__all__ = ["add_parser"]
-
-DESCRIPTION = """\
-Slice records: one slice as a table (NAME.csv) and what is known about it (NAME.yaml), SI units.
-docs/records.md describes the format; calibration/records holds three to look at.
-"""
+__all__ = ["add_arguments", "run"]
 
 CHECK = """\
 Say what is wrong with slice records: by file, column and line, and what to do about it.
@@ -53,14 +51,8 @@ what `sliceit records check` finds in them.
 """
 
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Adds the command."""
-    parser = commands.add_parser(
-        "records",
-        help="check slice records, or make them from other formats",
-        description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's arguments."""
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     check = actions.add_parser(
         "check",
@@ -69,9 +61,13 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     check.add_argument(
-        "paths", metavar="PATH", nargs="+", type=Path, help="a record (NAME.csv), or a folder"
+        "paths",
+        metavar="PATH",
+        nargs="+",
+        type=here_or_shipped,
+        help="a record (NAME.csv), or a folder",
     )
-    check.set_defaults(run=_run_check)
+    check.set_defaults(action=_check)
     make = actions.add_parser(
         "import",
         help="make a record from another format",
@@ -134,17 +130,20 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         default="header",
         help="rosbag: stamps of the messages (the default), or when they were recorded",
     )
-    make.set_defaults(run=_run_import)
+    make.set_defaults(action=_import)
 
 
-def _run_check(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
+    """Runs the command."""
+    return options.action(options)
+
+
+def _check(options: argparse.Namespace) -> int:
     """Runs `sliceit records check`."""
-    from sliceit_drake.configuration import ConfigurationError
     from sliceit_drake.records.slice_record import read_table
     from sliceit_drake.records.validation import check_table, record_files
 
-    paths = map(here_or_shipped, options.paths)
-    files = [file for path in paths for file in record_files(path)]
+    files = [file for path in options.paths for file in record_files(path)]
     bad = 0
     for file in files:
         try:
@@ -159,7 +158,7 @@ def _run_check(options: argparse.Namespace) -> int:
     return 1 if bad else 0
 
 
-def _run_import(options: argparse.Namespace) -> int:
+def _import(options: argparse.Namespace) -> int:
     """Runs `sliceit records import`."""
     from sliceit_drake.configuration import load_yaml
     from sliceit_drake.records.metadata import SliceMetadata
@@ -168,7 +167,7 @@ def _run_import(options: argparse.Namespace) -> int:
 
     metadata = load_yaml(SliceMetadata, options.metadata)
     metadata.name = options.name or metadata.name
-    record = _import(options, metadata)
+    record = _imported(options, metadata)
     file = write_record(record, options.output / record.name)
     print(f"{file} and .yaml: {len(record)} rows, {record.time[-1] - record.time[0]:.4g} s")
     record.file = str(file)
@@ -178,8 +177,7 @@ def _run_import(options: argparse.Namespace) -> int:
     return 1 if any(finding.severity == "error" for finding in findings) else 0
 
 
-def _import(options: argparse.Namespace, metadata: "SliceMetadata") -> "SliceRecord":
-    from sliceit_drake.configuration import ConfigurationError
+def _imported(options: argparse.Namespace, metadata: "SliceMetadata") -> "SliceRecord":
     from sliceit_drake.records import importers
 
     if options.format == "profile":

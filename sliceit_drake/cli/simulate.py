@@ -1,18 +1,4 @@
-"""`sliceit simulate`: run a scenario and write its results."""
-
-import argparse
-import logging
-from pathlib import Path
-
-from sliceit_drake.cli.scenario_argument import add_scenario_arguments, scenario_of
-from sliceit_drake.output_folder import check_output
-
-__all__ = ["add_parser"]
-
-WAIT_FOR_BROWSER = 60.0
-
-DESCRIPTION = """\
-Simulate a scenario: the arm moves the knife through the food under compliance control.
+"""Simulate a scenario: the arm moves the knife through the food under compliance control.
 
 Writes to DIR:
   replay.html    the run in 3-D, opens in any browser without a server
@@ -33,15 +19,21 @@ the cut face of the other half, wrench for no arrows; tick frames (or give --fra
 coordinate frames W world, B robot base, S sensor, K knife, F food.
 """
 
+import argparse
+from pathlib import Path
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Adds the command."""
-    parser = commands.add_parser(
-        "simulate",
-        help="run a scenario and write record, summary, figure and replay",
-        description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+from sliceit_drake.cli.arguments import add_scenario_arguments, scenario_of
+from sliceit_drake.cli.progress import SIMULATED_TIME, StageBars
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.output_folder import check_output
+
+__all__ = ["add_arguments", "run"]
+
+WAIT_FOR_BROWSER = 60.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's arguments."""
     add_scenario_arguments(parser)
     parser.add_argument(
         "--output", metavar="DIR", type=Path, default=None, help="default: output/NAME"
@@ -65,18 +57,13 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     )
     parser.add_argument("--fps", type=float, default=30.0, help="its frames a second (default 30)")
     parser.add_argument("--no-replay", action="store_true", help="do not write replay.html")
-    parser.set_defaults(run=_run)
 
 
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     scenario = scenario_of(options)
     directory = options.output or Path("output") / scenario.name
     check_output(directory)
-
-    from tqdm import tqdm
-
-    logging.getLogger("drake").setLevel(logging.WARNING)
 
     from sliceit_drake.diagrams.live_view import (
         FASTEST,
@@ -89,8 +76,6 @@ def _run(options: argparse.Namespace) -> int:
     from sliceit_drake.diagrams.run import prepare_run
 
     if options.duration is not None and not options.duration > 0.0:
-        from sliceit_drake.configuration import ConfigurationError
-
         raise ConfigurationError(
             f"{options.duration} s is not a duration", field="--duration", fix="Give seconds > 0."
         )
@@ -110,16 +95,10 @@ def _run(options: argparse.Namespace) -> int:
         wait_for_browser(meshcat, WAIT_FOR_BROWSER)
     frames = FoodFrames(prepared, options.fps) if options.paraview else None
     duration = options.duration or prepared.motion.duration
-    with tqdm(
-        total=duration,
-        desc=scenario.name,
-        unit="s",
-        bar_format="{desc}: {percentage:3.0f}%|{bar}| {n:.2f}/{total:.2f} s {postfix}",
-    ) as bar:
+    with StageBars(bar_format=SIMULATED_TIME) as bars:
 
         def show(time: float, wall: float) -> None:
-            bar.set_postfix_str(f"{time / wall:.2f} x real time", refresh=False)
-            bar.update(time - bar.n)
+            bars.show(scenario.name, time, duration, f"{time / wall:.2f} x real time")
 
         prepared.advance(duration, show)
     summary = prepared.save(directory, replay=not options.no_replay)

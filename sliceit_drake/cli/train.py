@@ -1,17 +1,4 @@
-"""`sliceit train`: learns a slicing policy in a simulator."""
-
-import argparse
-import signal
-import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
-
-__all__ = ["add_parser"]
-
-DESCRIPTION = """\
-Train a slicing policy: SAC with prioritised replay, a temporal convolution over the wrench.
+"""Train a slicing policy: SAC with prioritised replay, a temporal convolution over the wrench.
 
 The agent of SliceIt! decides at 20 Hz how compliant the knife is and where its target lies, on
 calibrated foods that differ from slice to slice (docs/learning.md). --simulator spring trains the
@@ -29,15 +16,22 @@ Ctrl-C ends the training with a checkpoint.
 Ends with status 1 if guards of the simulation ended more than 0.1 % of the episodes.
 """
 
+import argparse
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Adds the command."""
-    parser = commands.add_parser(
-        "train",
-        help="train a slicing policy",
-        description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+from sliceit_drake.cli.extras import needs_extra
+from sliceit_drake.cli.progress import StageBars
+
+__all__ = ["add_arguments", "run"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the command's arguments."""
     parser.add_argument(
         "config",
         nargs="?",
@@ -55,7 +49,6 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument(
         "--set", metavar="YAML", help="fields that replace others, as '{task: {foods: [potato]}}'"
     )
-    parser.set_defaults(run=_run)
 
 
 @contextmanager
@@ -78,12 +71,8 @@ def _stop_by(asked: threading.Event) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     """Runs the command."""
-    from tqdm import tqdm
-
-    from sliceit_drake.cli.extras import needs_extra
-
     with needs_extra("learn"):
         from sliceit_drake.learning.training import train
         from sliceit_drake.learning.training_config import load_training
@@ -94,11 +83,10 @@ def _run(options: argparse.Namespace) -> int:
     for name in ("steps", "seed"):
         if getattr(options, name) is not None:
             setattr(config, name, getattr(options, name))
-    with tqdm(total=config.steps, desc="decisions") as bar:
+    with StageBars() as bars:
 
         def show(steps: int, remark: str) -> None:
-            bar.set_postfix_str(remark, refresh=False)
-            bar.update(steps - bar.n)
+            bars.show("decisions", steps, config.steps, remark)
 
         asked = threading.Event()
         try:
@@ -110,7 +98,6 @@ def _run(options: argparse.Namespace) -> int:
                 raise
             print(f"Stopped. The same command goes on from the last checkpoint in {options.output}")
             return 130
-        bar.update(outcome.steps - bar.n)
     if asked.is_set() and outcome.steps < config.steps:
         print(f"Stopped after {outcome.steps} decisions; the same command goes on from there.")
         return 130

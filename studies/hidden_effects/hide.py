@@ -20,7 +20,7 @@ On a cluster the list of runs and the sizes are made here, the runs there; no di
 import argparse
 from pathlib import Path
 
-from sliceit_drake.cli.cluster_arguments import add_cluster_arguments, cluster_of
+from sliceit_drake.cli.arguments import add_cluster_arguments, cluster_of
 from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.stand_in.effect_registry import make_effect

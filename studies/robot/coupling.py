@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from sliceit_drake.cli.scenario_argument import add_scenario_arguments, scenario_of
+from sliceit_drake.cli.arguments import add_scenario_arguments, scenario_of
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.outputs.run_log import Record
 from sliceit_drake.diagrams.run import prepare_run

@@ -1,0 +1,145 @@
+"""The arguments that several commands share: a scenario, a protocol, a Dask cluster."""
+
+import argparse
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sliceit_drake.cluster import connected
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.resources import file_or_resource, resource_path
+
+if TYPE_CHECKING:
+    from sliceit_drake.diagrams.scenario import Scenario
+
+__all__ = [
+    "add_cluster_arguments",
+    "add_protocol_argument",
+    "add_scenario_arguments",
+    "cluster_of",
+    "find_file",
+    "protocol_file",
+    "scenario_of",
+]
+
+SCENARIO = "scenarios/cucumber.yaml"
+PROTOCOL = "calibration/protocols/rich.yaml"
+DASK = "dask"
+
+
+def add_scenario_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds SCENARIO and --set."""
+    shipped = ", ".join(sorted(file.stem for file in resource_path("scenarios").glob("*.yaml")))
+    parser.add_argument(
+        "scenario",
+        nargs="?",
+        default=SCENARIO,
+        metavar="SCENARIO",
+        help=f"YAML file, or the name of one that ships with the package: {shipped}; default "
+        f"{SCENARIO}",
+    )
+    parser.add_argument(
+        "--set",
+        metavar="YAML",
+        default=None,
+        help="fields that replace those of the file, as '{food: {material: {toughness: 400}}}'",
+    )
+
+
+def scenario_of(options: argparse.Namespace) -> "Scenario":
+    """Loads the scenario that the options name.
+
+    Raises:
+        ConfigurationError: It is missing or invalid.
+    """
+    from sliceit_drake.diagrams.scenario import load_scenario
+
+    return load_scenario(options.scenario, options.set)
+
+
+def add_protocol_argument(parser: argparse.ArgumentParser, kind: str = "a protocol") -> None:
+    """Adds PROTOCOL.
+
+    Args:
+        parser: Parser of the command.
+        kind: What it may be, for the help.
+    """
+    parser.add_argument(
+        "protocol",
+        nargs="?",
+        default=PROTOCOL,
+        metavar="PROTOCOL",
+        help=f"YAML of {kind}; default {PROTOCOL}",
+    )
+
+
+def protocol_file(options: argparse.Namespace) -> Path:
+    """The file that PROTOCOL names.
+
+    Raises:
+        ConfigurationError: There is none.
+    """
+    return find_file(options.protocol, "protocol", PROTOCOL)
+
+
+def find_file(name: str, kind: str, example: str) -> Path:
+    """The file that a user names: where they are, or one that ships with the package.
+
+    Args:
+        name: What they wrote.
+        kind: What it is, for the error.
+        example: One that ships, for the error.
+
+    Raises:
+        ConfigurationError: There is none.
+    """
+    file = file_or_resource(name)
+    if file is None:
+        raise ConfigurationError(
+            f"there is no such {kind}, neither here nor in the package",
+            source=name,
+            fix=f"Give a YAML file; {example} is one to start from.",
+        )
+    return file
+
+
+def add_cluster_arguments(parser: argparse.ArgumentParser, here: str, work: str) -> None:
+    """Adds --backend and --scheduler.
+
+    Args:
+        parser: Parser of the command.
+        here: What the work is done by without a cluster: "threads" or "processes".
+        work: What is spread, as "slices are simulated".
+    """
+    parser.add_argument(
+        "--backend",
+        choices=(here, DASK),
+        default=here,
+        help=f"where {work}: {here} of this machine (the default), or the workers of a Dask"
+        " cluster",
+    )
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="of the cluster, as tcp://192.168.0.5:8786"
+    )
+
+
+def cluster_of(
+    options: argparse.Namespace, connect: Callable[[str], AbstractContextManager] = connected
+) -> AbstractContextManager[Any]:
+    """The cluster that the options name, for a with statement; None without one.
+
+    Args:
+        options: With those of `add_cluster_arguments`.
+        connect: What makes it of the scheduler's address.
+
+    Raises:
+        ConfigurationError: One of the two options is given without the other.
+    """
+    if (options.backend == DASK) != (options.scheduler is not None):
+        raise ConfigurationError(
+            "is given without --backend dask" if options.scheduler else "is not given",
+            field="--scheduler",
+            fix="Give both: --backend dask --scheduler tcp://HOST:8786.",
+        )
+    return connect(options.scheduler) if options.backend == DASK else nullcontext()
