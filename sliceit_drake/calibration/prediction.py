@@ -2,7 +2,8 @@
 
 import copy
 import dataclasses as dc
-from collections.abc import Callable, Mapping, Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -10,51 +11,30 @@ from scipy.linalg import block_diag
 from sliceit_drake.calibration.oscillation import Oscillation, fit_oscillation
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.batch import BatchSimulator, BatchSlice
-from sliceit_drake.cutting.board import board_wrenches
 from sliceit_drake.cutting.foods.distribution import from_unit, to_unit
 from sliceit_drake.cutting.gradient import SliceAdjoint
-from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.knife_path import KnifePath
 from sliceit_drake.cutting.model import CuttingModel, TimeStepError
-from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.parameters import get_parameter, pull_back, with_parameters
-from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError
 from sliceit_drake.prediction.clock import EXCHANGE_PERIOD, Clock
+from sliceit_drake.prediction.jobs import Job, JobResult
 from sliceit_drake.prediction.placement import is_bare
 from sliceit_drake.prediction.record_target import Meshing, RecordTarget, make_targets
+from sliceit_drake.prediction.simulator import Simulator
 from sliceit_drake.records.slice_record import SliceRecord
 
-__all__ = ["Parameter", "Poses", "Prediction", "Predictor"]
+__all__ = ["Parameter", "Prediction", "Predictor"]
 
 NO_ADJOINT = ("effects.skin.thickness",)
 """Parameters whose derivative is taken by differences."""
 STEP = 1e-3
 """Step of these differences, in the unit range."""
 
+KEPT = 200
+"""Slices that are kept in memory: a step's Jacobian needs what its residuals have simulated."""
+
 HEIGHT, SPEED = "height_offset", "speed_factor"
-
-
-@dc.dataclass
-class Poses:
-    """The knife's poses X_FK at the ends of even coupling steps, as a motion of `cutting`.
-
-    Attributes:
-        R, p: [E + 1, 3, 3] and [E + 1, 3], metres.
-    """
-
-    R: np.ndarray
-    p: np.ndarray
-
-    @property
-    def duration(self) -> float:
-        """In s."""
-        return (len(self.p) - 1) * EXCHANGE_PERIOD
-
-    def pose(self, t: float) -> Pose:
-        """X_FK at the end of a coupling step, s."""
-        k = round(t / EXCHANGE_PERIOD)
-        return Pose(self.R[k], self.p[k])
 
 
 @dc.dataclass(frozen=True)
@@ -145,12 +125,13 @@ class Predictor:
                 )
         # Forces are fitted, and on an even clock the solver has an adjoint.
         forces = [dc.replace(r, torque=None) for r in records]
-        self.targets = make_targets(setup, forces, [meshing], Clock(longest=1), near_food=True)
+        clock = Clock(longest=1)
+        self.targets = make_targets(setup, forces, [meshing], clock, near_food=True)
         self.board = dc.replace(setup.board, height=0.0)
         self.parameters = self._list_parameters()
         self.used = self._by_entry("compared")
         self.point_factors: dict[str, np.ndarray] = {}
-        self._simulator = BatchSimulator(EXCHANGE_PERIOD, self.board, workers)
+        self._simulator = Simulator(clock, self.board, workers=workers, kept=KEPT)
         self._adjoints: dict[int, SliceAdjoint] = {}
 
     def _list_parameters(self) -> list[Parameter]:
@@ -239,55 +220,57 @@ class Predictor:
         other.point_factors = dict(factors)
         return other
 
-    def motion(self, target: RecordTarget, values: Mapping[str, float]) -> Poses:
-        """The knife's motion of a record with these values."""
+    def _positions(self, target: RecordTarget, values: Mapping[str, float]) -> np.ndarray:
+        """Positions of Ko at the ends of the coupling steps [E + 1, 3] with these values."""
         name = target.record.name
         p = target.moved(values[f"{HEIGHT}:{name}"], values.get(f"{SPEED}:{name}", 1.0))
-        return Poses(target.R[target.coupling_steps], p[target.coupling_steps])
+        return p[target.coupling_steps]
 
-    def predict(
-        self, units: Sequence[np.ndarray], progress: Callable[[int], None] | None = None
-    ) -> list[list[Prediction]]:
+    def _job(self, target: RecordTarget, model: CuttingModel, values: Mapping[str, float]) -> Job:
+        assert target.stretches is not None
+        R, p = target.R[target.coupling_steps], self._positions(target, values)
+        return Job(model, R, p, target.stretches, target.record.name, "float64")
+
+    def predict(self, units: Sequence[np.ndarray]) -> list[list[Prediction]]:
         """Forces for several sets of parameters.
 
         Args:
             units: Places in the ranges, each [d].
-            progress: Called with the number of slices done.
 
         Returns:
             For each set, one prediction a record.
         """
-        models, motions, failed = [], [], {}
-        for s, unit in enumerate(units):
+        jobs, failures = [], []
+        for unit in units:
             values = self.values(unit)
-            for r, target in enumerate(self.targets):
+            for target in self.targets:
+                model, failure = target.model, None
                 try:
-                    models.append(self.model(target, values))
+                    model = self.model(target, values)
                 except TimeStepError as error:
-                    failed[s, r] = str(error)
-                    models.append(target.model)
-                motions.append(self.motion(target, values))
-        slices = self._simulator.run(models, motions, progress)
+                    failure = str(error)
+                jobs.append(self._job(target, model, values))
+                failures.append(failure)
+        results = self._simulator.run(jobs)
+        parts = zip(itertools.cycle(self.targets), jobs, results, failures, strict=False)
+        predictions = [self._prediction(*part) for part in parts]
         n = len(self.targets)
-        return [
-            [
-                self._prediction(target, slices[s * n + r], failed.get((s, r)))
-                for r, target in enumerate(self.targets)
-            ]
-            for s in range(len(units))
-        ]
+        return [predictions[k : k + n] for k in range(0, len(predictions), n)]
 
     def _prediction(
-        self, target: RecordTarget, result: BatchSlice, failure: str | None
+        self, target: RecordTarget, job: Job, result: JobResult, failure: str | None
     ) -> Prediction:
-        force = (result.food_wrench + result.board_wrench)[:, 3:]
         finite = np.isfinite(result.cut)
         cut = float(result.cut[finite][-1]) if finite.any() else 0.0
-        failure = failure or result.failure
+        if failure is None and not finite.all():
+            failure = f"at {(int(finite.argmin()) + 1) * EXCHANGE_PERIOD:.4g} s {NOT_FINITE}"
         if failure is not None:
             nothing = np.full(target.measured.shape, np.nan)
             return Prediction(nothing, cut, Oscillation(), nothing, failure)
-        smooth = target.compare_forces(force)
+        p = job.p.copy()
+        p[1:, 2] += result.rise
+        wrench = result.parts.sum(1) + target.board(self.board, job.R, p)
+        smooth = target.compare_forces(wrench[:, 3:])
         wave = self._oscillation(target, smooth)
         return Prediction(wave.factor(target.time)[:, None] * smooth, cut, wave, smooth, None)
 
@@ -356,12 +339,12 @@ class Predictor:
         gradient: dict[str, float | np.ndarray] = dict.fromkeys(names, 0.0)
         total, scale = 0.0, float(self.used.sum())
         for target, used in zip(self.targets, self.split(self.used), strict=True):
-            model, motion = self.model(target, values), self.motion(target, values)
-            path = KnifePath(model, motion, EXCHANGE_PERIOD)
-            adjoint = self._adjoint(model)
+            model = self.model(target, values)
+            job = self._job(target, model, values)
+            path, adjoint = KnifePath(model, job, 1.0), self._adjoint(model)
             run = adjoint.run(path.R_CK, path.p_CK, model)
             R_FC = model.X_FC_rotation
-            board = self._board(path.R_FK, path.p_FK, model.knife)
+            board = target.board(self.board, job.R, job.p)
             force = run.wrenches[:, 3:] @ R_FC.T + board[:, 3:]
             smooth = target.compare_forces(force)
             factor = self._oscillation(target, smooth).factor(target.time)[:, None]
@@ -394,10 +377,9 @@ class Predictor:
         step = 1e-7 if key.startswith(HEIGHT) else 1e-5
         ends = []
         for sign in (1.0, -1.0):
-            moved = self.motion(target, values | {key: values[key] + sign * step})
-            path = KnifePath(target.model, moved, EXCHANGE_PERIOD)
-            forces = self._board(path.R_FK, path.p_FK, target.model.knife)[:, 3:]
-            ends.append((path.p_FK, forces))
+            p = self._positions(target, values | {key: values[key] + sign * step})
+            board = target.board(self.board, target.R[target.coupling_steps], p)
+            ends.append((p, board[:, 3:]))
         dp = (ends[0][0] - ends[1][0]) / (2.0 * step)
         dF = (ends[0][1] - ends[1][1]) / (2.0 * step)
         return float((of_position * dp).sum() + (of_force * dF).sum())
@@ -409,21 +391,13 @@ class Predictor:
         squares = [self.error(row) ** 2 for row in self.predict(list(ends))]
         return (squares[0] - squares[1]) / float(ends[0, k] - ends[1, k])
 
-    def _board(self, R: np.ndarray, p: np.ndarray, knife: Knife) -> np.ndarray:
-        return board_wrenches(self.board, knife, R, p, EXCHANGE_PERIOD)
-
     def _adjoint(self, model: CuttingModel) -> SliceAdjoint:
         key = id(model.split)
         if key not in self._adjoints:
             self._adjoints[key] = SliceAdjoint(model, EXCHANGE_PERIOD)
         return self._adjoints[key]
 
-    def jacobian(
-        self,
-        unit: np.ndarray,
-        step: float = 2e-3,
-        progress: Callable[[int], None] | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def jacobian(self, unit: np.ndarray, step: float = 2e-3) -> tuple[np.ndarray, np.ndarray]:
         """Residuals [M] and their derivatives by the unit values [M, d], by central differences.
 
         The oscillation is held. Steps that would leave a range are taken inwards.
@@ -437,7 +411,7 @@ class Predictor:
         for members in moved:
             for end in (high, low):
                 sets.append(np.where(np.isin(np.arange(len(unit)), members), end, unit))
-        rows = self.predict(sets, progress)
+        rows = self.predict(sets)
         for row in rows:
             for p in row:
                 if p.failure is not None:

@@ -12,7 +12,7 @@ from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.parameters import with_parameters
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.prediction.clock import Clock
-from sliceit_drake.prediction.jobs import Job, Run
+from sliceit_drake.prediction.jobs import Job, JobResult
 from sliceit_drake.prediction.record_target import Meshing, RecordTarget, make_targets
 from sliceit_drake.prediction.series import ForceSeries
 from sliceit_drake.prediction.simulator import Simulator, Workers
@@ -133,10 +133,10 @@ class SlicePredictor:
             For each point a series a record; None for those that it does not name. One that broke
             down is not finite.
         """
-        plan, runs = self._simulated(points, progress)
+        plan, results = self._simulated(points, progress)
         return [
             [
-                None if planned is None else self._series(point, target, planned, runs)
+                None if planned is None else self._series(point, target, planned, results)
                 for target, planned in zip(self.targets, row, strict=True)
             ]
             for point, row in zip(points, plan, strict=True)
@@ -150,7 +150,7 @@ class SlicePredictor:
 
     def _simulated(
         self, points: Sequence[Point], progress: Callable[[int, int], None] | None
-    ) -> tuple[list[list["_Planned | None"]], list[Run]]:
+    ) -> tuple[list[list["_Planned | None"]], list[JobResult]]:
         jobs: list[Job] = []
         plan: list[list[_Planned | None]] = []
         for point in points:
@@ -215,17 +215,21 @@ class SlicePredictor:
         )
 
     def _series(
-        self, point: Point, target: RecordTarget, planned: "_Planned", runs: Sequence[Run]
+        self,
+        point: Point,
+        target: RecordTarget,
+        planned: "_Planned",
+        results: Sequence[JobResult],
     ) -> ForceSeries:
-        run = None if planned.job is None else runs[planned.job]
+        result = None if planned.job is None else results[planned.job]
         p = planned.p
-        rise = target.rise(run)
+        rise = target.rise(result)
         if rise.any():
             p = p + rise[:, None] * [0.0, 0.0, 1.0]
         key = planned.R.tobytes() + p.tobytes()
         if key not in self._boards:
             self._boards[key] = target.board(self.board, planned.R, p)
-        series = target.series(run, self._boards[key])
+        series = target.series(result, self._boards[key])
         for active in point.causes:
             facts = active.cause.visible(target.facts)
             series.wrench = active.cause.wrench(series, active.values, facts)

@@ -21,7 +21,7 @@ from sliceit_drake.cutting.driver import Driver
 from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.prediction.clock import Stretches
-from sliceit_drake.prediction.jobs import Executor, Job, Run, run_job
+from sliceit_drake.prediction.jobs import Executor, Job, JobResult, run_job
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -49,7 +49,7 @@ def on_cluster(scheduler: str, patience: float = CONNECT) -> Iterator[Executor]:
 
 def _run_jobs(
     client: "Client", jobs: Sequence[Job], period: float, board: Board
-) -> Iterator[tuple[int, Run]]:
+) -> Iterator[tuple[int, JobResult]]:
     import joblib
 
     work: list[Any] = []
@@ -64,7 +64,7 @@ def _run_jobs(
             for f in dc.fields(model)
             if getattr(model, f.name) is not getattr(shared, f.name)
         }
-        rest = (job.R, job.p, job.stretches, job.name)
+        rest = (job.R, job.p, job.stretches, job.name, job.precision)
         work.append(joblib.delayed(_run_there)(number, shared, own, rest, period, board))
     # What is scattered travels to a worker once, however many calls name it.
     with joblib.parallel_config(backend="dask", client=client, scatter=meshes):
@@ -89,10 +89,10 @@ def _run_there(
     number: int,
     shared: CuttingModel,
     own: dict[str, Any],
-    rest: tuple[np.ndarray, np.ndarray, Stretches, str],
+    rest: tuple[np.ndarray, np.ndarray, Stretches, str, str],
     period: float,
     board: Board,
-) -> tuple[int, Run]:
+) -> tuple[int, JobResult]:
     """Runs a job on a worker, which keeps what it needs from one to the next."""
     drivers: dict[float, Driver] = _THREAD.__dict__.setdefault("drivers", {})
     driver = drivers.setdefault(period, Driver(period))

@@ -12,7 +12,7 @@ from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.prediction.clock import BLOCK, Stretches
 
-__all__ = ["Executor", "Job", "Run", "run_job"]
+__all__ = ["Executor", "Job", "JobResult", "run_job"]
 
 
 @dc.dataclass
@@ -25,6 +25,7 @@ class Job:
             [E + 1, 3, 3] and [E + 1, 3], metres.
         stretches: Which coupling steps these are.
         name: For messages.
+        precision: That the result is kept in, float32 or float64.
     """
 
     model: CuttingModel
@@ -32,6 +33,7 @@ class Job:
     p: np.ndarray
     stretches: Stretches
     name: str = ""
+    precision: str = "float32"
 
     @property
     def duration(self) -> float:
@@ -44,37 +46,43 @@ class Job:
 
 
 @dc.dataclass
-class Run:
-    """What a job gives; nothing is finite where the slice broke down.
+class JobResult:
+    """What a job gives.
 
     Attributes:
         parts: Mean wrenches on the knife by edge, flank pressure, friction, moment about Ko and
-            force, in F [E, 3, 6], single precision.
+            force, in F [E, 3, 6]; none of them is finite where the slice broke down.
         rise: By which an arm that gives stood higher than its command, at the ends [E], metres.
+        cut: Fraction of the section that is cut [E]; NaN from where the slice broke down.
     """
 
     parts: np.ndarray
     rise: np.ndarray
+    cut: np.ndarray
 
 
-Executor = Callable[[Sequence[Job], float, Board], Iterable[tuple[int, Run]]]
+Executor = Callable[[Sequence[Job], float, Board], Iterable[tuple[int, JobResult]]]
 """Runs jobs, given the period of the shortest coupling step, s, and the board under the knife;
-gives their numbers and runs, in any order. Jobs of one mesh come in a row."""
+gives their numbers and results, in any order. Jobs of one mesh come in a row."""
 
 
-def run_job(driver: Driver, job: Job, board: Board) -> Run:
+def run_job(driver: Driver, job: Job, board: Board) -> JobResult:
     """Simulates a slice."""
     path = KnifePath(job.model, job, 1.0)
+    count = path.coupling_steps
     together, multiples = BLOCK if path.rigid else 1, job.stretches.multiples.tolist()
-    starts = range(0, path.coupling_steps, together)
-    launches = [Launch(k, together, multiples[k // BLOCK]) for k in starts]
-    wrenches = np.zeros((path.coupling_steps, 3, 6))
-    rise = np.zeros(path.coupling_steps)
-    for (k, count, _), (step,) in driver.run([path], launches, board):
-        wrenches[k : k + count] = step.wrenches
-        if not step.finite:
+    launches = [Launch(k, together, multiples[k // BLOCK]) for k in range(0, count, together)]
+    wrenches, cut = np.zeros((count, 3, 6)), np.full(count, np.nan)
+    rise = np.zeros(count)
+    for launch, (step,) in driver.run([path], launches, board):
+        at = slice(launch.first, launch.first + launch.coupling_steps)
+        # The last launch may go on beyond the job, with a knife that rests.
+        wrenches[at] = step.wrenches[: count - launch.first]
+        if step.finite:
+            cut[at] = step.cut[: count - launch.first]
+        else:
             wrenches[:] = np.nan
     if np.isfinite(wrenches).all():
         rise = path.p_FK[1:, 2] - job.p[1:, 2]
     parts = (wrenches.reshape(-1, 3, 2, 3) @ job.model.X_FC_rotation.T).reshape(-1, 3, 6)
-    return Run(parts.astype(np.float32), rise.astype(np.float32))
+    return JobResult(*(series.astype(job.precision) for series in (parts, rise, cut)))

@@ -16,7 +16,7 @@ from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import GRAVITY, CuttingModel, Numerics
 from sliceit_drake.cutting.parameters import with_parameters
 from sliceit_drake.prediction.clock import Clock, Stretches
-from sliceit_drake.prediction.jobs import Run
+from sliceit_drake.prediction.jobs import JobResult
 from sliceit_drake.prediction.placement import food_of, is_bare, knife_of, poses_in_food
 from sliceit_drake.prediction.series import ForceSeries, SliceFacts
 from sliceit_drake.records.preprocessing import as_measured
@@ -234,21 +234,21 @@ class RecordTarget:
         moved faster by a factor."""
         return self.home + faster * (self.p - self.home) - np.array([0.0, 0.0, lower])
 
-    def series(self, run: Run | None, board_wrench: np.ndarray) -> ForceSeries:
+    def series(self, result: JobResult | None, board_wrench: np.ndarray) -> ForceSeries:
         """The predicted slice on the even grid.
 
         Args:
-            run: Of the food; None where the knife never comes near any.
+            result: Of the food; None where the knife never comes near any.
             board_wrench: Of the board, from `board` [N, 6].
         """
         T, n = self.clock.period, len(self.grid) - 1
         parts = {name: np.zeros((n, 6)) for name in ("edge", "normal", "friction")}
-        if run is not None:
+        if result is not None:
             assert self.stretches is not None
             ends = self.stretches.ends.astype(float)
             middle = 0.5 * (ends[:-1] + ends[1:])
             wanted = np.arange(n) + 0.5
-            known = run.parts.reshape(len(run.parts), 18)
+            known = result.parts.reshape(len(result.parts), 18)
             inside = (wanted > ends[0]) & (wanted < ends[-1])
             values = np.column_stack([np.interp(wanted, middle, c) for c in known.T])
             values = np.where(inside[:, None], values, 0.0)
@@ -271,13 +271,13 @@ class RecordTarget:
             wrench=np.asarray(sum(parts.values())),
         )
 
-    def rise(self, run: Run | None) -> np.ndarray:
+    def rise(self, result: JobResult | None) -> np.ndarray:
         """By which an arm that gives stands higher at the grid [N + 1], metres."""
-        if run is None or not run.rise.any():
+        if result is None or not result.rise.any():
             return np.zeros(len(self.grid))
         assert self.stretches is not None
         ends = self.stretches.ends.astype(float)
-        return np.interp(np.arange(len(self.grid)), ends[1:], run.rise)
+        return np.interp(np.arange(len(self.grid)), ends[1:], result.rise)
 
     def board(self, board: Board, R: np.ndarray, p: np.ndarray) -> np.ndarray:
         """Wrench of a board, its height in F, with the knife at poses at even times [N, 6], Nm, N.
