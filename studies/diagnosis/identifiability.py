@@ -16,13 +16,14 @@ from tqdm import tqdm
 from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
-from sliceit_drake.diagnosis.experiments.identifiability import Evidence, identifiability
+from sliceit_drake.diagnosis.experiments.identifiability import Evidence
 from sliceit_drake.diagnosis.registry import load_cause, open_causes
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
 from sliceit_drake.stand_in.protocol import Protocol, load_protocol
 from sliceit_drake.stand_in.session import Session
+from studies.diagnosis.conditions import protocol_identifiability
 from studies.diagnosis.identifiability_page import Study, plot_angles, report
 from studies.hidden_effects.quiet import records_of_conditions, without_noise
 from studies.pages import publish
@@ -120,7 +121,7 @@ def study(
             label = found.records[k].condition
             if label in new:
                 menu.setdefault(label, []).append(k)
-        results.append(identifiability(evidence, causes, protocol.name, own_records, menu))
+        results.append(protocol_identifiability(evidence, causes, protocol.name, own_records, menu))
     return Study(results, causes, found)
 
 

@@ -12,10 +12,10 @@ from sliceit_drake.diagnosis.experiments.identifiability import (
     ANGLE,
     SHIFT,
     SHOWS,
-    Identifiability,
     classes,
     short,
 )
+from studies.diagnosis.conditions import ProtocolIdentifiability
 from studies.figures import new_figure, save_figure
 from studies.pages import render
 
@@ -32,12 +32,12 @@ class Study:
         found: Sensitivities of all records.
     """
 
-    results: list[Identifiability]
+    results: list[ProtocolIdentifiability]
     causes: Sequence[Cause]
     found: Sensitivities
 
 
-def _rows(result: Identifiability) -> Sequence[tuple[str, ...]]:
+def _rows(result: ProtocolIdentifiability) -> Sequence[tuple[str, ...]]:
     """A row a cause: what shows, with what it can be confused, what would part it."""
     rows = []
     for a, name in enumerate(result.names):
@@ -126,7 +126,7 @@ def report(study: Study, figure: str = "docs/figures/identifiability.png") -> st
     )
 
 
-def _protocol(result: Identifiability) -> dict[str, object]:
+def _protocol(result: ProtocolIdentifiability) -> dict[str, object]:
     """What the template tells of a protocol."""
     named = zip(result.names, result.visible, strict=True)
     visible = [n for n, v in list(named)[result.shifts :] if v]

@@ -60,7 +60,7 @@ def protocol_classes(name: str, cache: Path | None = None) -> ProtocolClasses:
     records = QuietBench(protocol, SEED).records()
     setup = setup_of_food(model_food(protocol), DIAGNOSIS_REFINEMENT)
     found = sensitivities(setup, records, causes, cache=cache)
-    told = identifiability(Evidence(found), causes, name, range(len(records)), {})
+    told = identifiability(Evidence(found), causes, range(len(records)))
     listed = [n for n in told.names if "." not in n]
     at = {n: told.names.index(n) for n in listed}
     result = ProtocolClasses(

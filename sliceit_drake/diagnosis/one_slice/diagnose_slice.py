@@ -145,7 +145,7 @@ def diagnose_slice(
     evidence = slice_evidence(
         found, fit.jacobian[kept], _priors(fit), block[kept], replicates, seed, _own_columns(fit)
     )
-    angles = identifiability(Evidence(_all_free(found)), causes, record.name, [0], {})
+    angles = identifiability(Evidence(_all_free(found)), causes, [0])
     result = OneSlice(
         record=whole,
         evidence=evidence,
