@@ -133,8 +133,8 @@ def test_a_fit_finds_parameters_and_cause_of_a_simulated_slice():
     predictor = SlicePredictor(setup, [own], (Meshing(0.5),), workers=1)
     (target,) = predictor.targets
     block = depth_blocks(target.depth, target.depth > 0.0)
-    alone = fit_slice(predictor, parameters, block)
-    both = fit_slice(predictor, parameters, block, cause, 1.2e-3)
+    alone = fit_slice(predictor, block)
+    both = fit_slice(predictor, block, cause, 1.2e-3)
     rms = [float(np.std(target.measured - f.predicted)) for f in (alone, both)]
     assert rms[1] == pytest.approx(0.5 * NOISE, rel=0.3) and rms[0] > 1.5 * rms[1]
     assert both.values("base")["material.toughness"] == pytest.approx(300.0, rel=0.1)

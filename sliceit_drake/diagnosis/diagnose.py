@@ -37,10 +37,12 @@ BASE = (
 MIN_RECORDS = 2
 
 
-def setup_of_food(food: CalibratedFood, refinement: float = 1.0) -> CalibrationSetup:
-    """The setup in which a calibrated food is diagnosed: its values, with `BASE` free."""
+def setup_of_food(
+    food: CalibratedFood, refinement: float = 1.0, free: Sequence[ParameterRange] = BASE
+) -> CalibrationSetup:
+    """The setup in which a calibrated food is diagnosed: its values, with some parameters free."""
     setup = CalibrationSetup(
-        food=food.food, knife=food.knife, parameters=list(BASE), refinement=refinement
+        food=food.food, knife=food.knife, parameters=list(free), refinement=refinement
     )
     setup.numerics.flank_stiffness = food.flank_stiffness
     return setup

@@ -19,11 +19,10 @@ from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
 from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.diagnosis.cause import Cause
-from sliceit_drake.diagnosis.diagnose import BASE, Progress
+from sliceit_drake.diagnosis.diagnose import BASE, Progress, setup_of_food
 from sliceit_drake.diagnosis.evidence.columns import Sensitivities
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.experiments.identifiability import SHIFT, Evidence, identifiability
-from sliceit_drake.diagnosis.one_slice.fitted_slice import MIN_GAIN
 from sliceit_drake.diagnosis.one_slice.slice_evidence import (
     LEVEL,
     CauseInSlice,
@@ -31,13 +30,11 @@ from sliceit_drake.diagnosis.one_slice.slice_evidence import (
     slice_evidence,
 )
 from sliceit_drake.diagnosis.one_slice.slice_fit import (
-    BLOCKS,
     OWN,
-    SliceFit,
     depth_blocks,
     fit_slice,
 )
-from sliceit_drake.diagnosis.one_slice.slice_result import OneSlice
+from sliceit_drake.diagnosis.one_slice.slice_result import MIN_GAIN, OneSlice
 from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import open_causes
 from sliceit_drake.prediction.simulator import Workers
@@ -81,11 +78,7 @@ def setup_of_slice(
             own.effects, skin=effects.skin, core=effects.core, centre=effects.centre
         )
         parameters = [p for p in parameters if not p.name.startswith("effects.")]
-    setup = CalibrationSetup(
-        food=own, knife=food.knife, parameters=parameters, refinement=refinement
-    )
-    setup.numerics.flank_stiffness = food.flank_stiffness
-    return setup
+    return setup_of_food(dc.replace(food, food=own), refinement, parameters)
 
 
 def diagnose_slice(
@@ -125,9 +118,8 @@ def diagnose_slice(
         setup, [record], cache=None if cache is None else cache / "slices", workers=workers
     )
     (target,) = predictor.targets
-    contact = target.depth > 0.0
-    block = depth_blocks(target.depth, contact, BLOCKS)
-    fit = fit_slice(predictor, setup.parameters, block)
+    block = depth_blocks(target.depth, target.depth > 0.0)
+    fit = fit_slice(predictor, block)
     show("fits", 1, stages)
     found = sensitivities(
         setup,
@@ -142,8 +134,10 @@ def diagnose_slice(
     whole = found.records[0]
     kept = whole.compared & (whole.time < whole.time[-1] - END)
     found = _rows(found, kept)
+    precision = np.array([1.0 / u.spread**2 for u in fit.unknowns])
+    own = [k for k, u in enumerate(fit.unknowns) if u.kind == "own"]
     evidence = slice_evidence(
-        found, fit.jacobian[kept], _priors(fit), block[kept], replicates, seed, _own_columns(fit)
+        found, fit.jacobian[kept], precision, block[kept], replicates, seed, own
     )
     angles = identifiability(Evidence(_all_free(found)), causes, [0])
     result = OneSlice(
@@ -159,7 +153,7 @@ def diagnose_slice(
     )
     show("fits", 2, stages)
     for done, c in enumerate(_promising(evidence), 3):
-        _confirm(result, c, predictor, setup, by_name[c.name])
+        _confirm(result, c, predictor, by_name[c.name])
         show("fits", done, stages)
     show("fits", stages, stages)
     for c in evidence.causes:
@@ -185,15 +179,12 @@ def _promising(evidence: SliceEvidence) -> list[CauseInSlice]:
 
 
 def _confirm(
-    result: OneSlice,
-    evidence: CauseInSlice,
-    predictor: SlicePredictor,
-    setup: CalibrationSetup,
-    cause: Cause,
+    result: OneSlice, evidence: CauseInSlice, predictor: SlicePredictor, cause: Cause
 ) -> None:
+    """Fits a cause by simulation, and writes into its evidence what that shows."""
     fit = result.fit
     start = {u.name: float(x) for u, x in zip(fit.unknowns, fit.theta, strict=True)}
-    own = fit_slice(predictor, setup.parameters, result.block, cause, evidence.scan, start)
+    own = fit_slice(predictor, result.block, cause, evidence.scan, start)
     result.fits[evidence.name] = own
     evidence.fitted = result.error(own.predicted)
     evidence.confirmed = result.error(own.held_out)
@@ -205,14 +196,6 @@ def _confirm(
     evidence.blocks_better = int((squares[1] < squares[0]).sum())
     rest = np.arange(len(rows)) != np.argmax(squares[0] - squares[1])
     evidence.without_best = float(np.sqrt(squares[1, rest].sum() / squares[0, rest].sum()))
-
-
-def _priors(fit: SliceFit) -> np.ndarray:
-    return np.array([1.0 / u.spread**2 for u in fit.unknowns])
-
-
-def _own_columns(fit: SliceFit) -> list[int]:
-    return [k for k, u in enumerate(fit.unknowns) if u.kind == "own"]
 
 
 def _all_free(found: Sensitivities) -> Sensitivities:

@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from sliceit_drake.calibration.setup import ParameterRange
 from sliceit_drake.cutting.parameters import get_parameter
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagnosis.cause import Cause
@@ -29,6 +28,8 @@ LONGEST = 6.0
 """Longest step of an unknown, in its sizes."""
 ENOUGH = 1e-3
 """Relative gain below which a fit is at its end."""
+NOISE = 0.1
+"""Standard deviation of a row, against what is plausible beforehand, N."""
 BASE_SPREAD = 0.5
 """Plausible standard deviation of the logarithm of a base parameter about its calibrated value."""
 
@@ -67,14 +68,12 @@ OWN = {"height": (1e-4, 2e-3), "speed": (0.01, 0.15)}
 """Step and plausible standard deviation of what a record does not say of its motion; m, log."""
 
 
-def _unknowns(
-    predictor: SlicePredictor, parameters: Sequence[ParameterRange], cause: Cause | None = None
-) -> list[Unknown]:
+def _unknowns(predictor: SlicePredictor, cause: Cause | None) -> list[Unknown]:
     """What is fitted: base parameters, where the knife was as far as it is unknown, a cause."""
-    (target,) = predictor.targets
+    setup, (target,) = predictor.setup, predictor.targets
     model = target.models[predictor.meshings[0]]
     out = []
-    for p in parameters:
+    for p in setup.parameters:
         start = float(get_parameter(model, p.name))
         if p.scale == "log":
             low, high = (float(np.log(v / start)) / LOG_STEP for v in (p.low, p.high))
@@ -86,17 +85,15 @@ def _unknowns(
         # A calibration may have ended on the end of its range.
         low, high = min(low, -1e-6), max(high, 1e-6)
         out.append(Unknown("base", p.name, size, start, log, low, high, spread))
-    setup = predictor.setup
-    height, speed = np.array(setup.height_offset), np.log(setup.speed_factor)
-    free = [
-        ("height", target.height_unknown, height),
-        ("speed", target.speed_unknown, speed),
-    ]
-    for name, unknown, ends in free:
-        if unknown:
-            size, spread = OWN[name]
-            low, high = (ends / size).tolist()
-            out.append(Unknown("own", name, size, 0.0, False, low, high, spread / size))
+    ends = {}
+    if target.height_unknown:
+        ends["height"] = np.array(setup.height_offset)
+    if target.speed_unknown:
+        ends["speed"] = np.log(setup.speed_factor)
+    for name, values in ends.items():
+        size, spread = OWN[name]
+        low, high = (values / size).tolist()
+        out.append(Unknown("own", name, size, 0.0, False, low, high, spread / size))
     for q in cause.parameters if cause else ():
         sign = -1.0 if q.one_sided and q.null == q.high else 1.0
         low, high = sorted((bound - q.null) / (sign * q.size) for bound in (q.low, q.high))
@@ -111,23 +108,18 @@ class SliceFit:
     Attributes:
         unknowns: What was fitted [n].
         theta: In their sizes [n].
-        cause, scan: That was fitted beside, and the value of its scan; None without.
         point: Of the fit.
         predicted: At the rows [m, c].
         jacobian: Change of the prediction by each unknown at the fit [m, c, n].
         held_out: Prediction of each row from the fit without its block of depth [m, c].
-        failures: Simulations that broke down on the way.
     """
 
     unknowns: list[Unknown]
     theta: np.ndarray
-    cause: Cause | None
-    scan: float | None
     point: Point
     predicted: np.ndarray
     jacobian: np.ndarray
     held_out: np.ndarray
-    failures: int
 
     def values(self, kind: str) -> dict[str, float]:
         """Values of a kind of unknowns."""
@@ -149,12 +141,10 @@ def depth_blocks(depth: np.ndarray, inside: np.ndarray, count: int = BLOCKS) -> 
 
 def fit_slice(
     predictor: SlicePredictor,
-    parameters: Sequence[ParameterRange],
     block: np.ndarray,
     cause: Cause | None = None,
     scan: float | None = None,
     start: Mapping[str, float] | None = None,
-    noise: float = 0.1,
 ) -> SliceFit:
     """Fits a slice, and predicts each block of depth from a fit to the others.
 
@@ -162,55 +152,41 @@ def fit_slice(
     predicted.
 
     Args:
-        predictor: Of one record.
-        parameters: Base parameters.
+        predictor: Of one record; the parameters of its setup are fitted.
         block: Number of each row's block [m].
         cause, scan: Fitted beside them.
         start: Places of unknowns to start from, by name, in their sizes.
-        noise: Standard deviation of a row, against what is plausible beforehand, N.
 
     Raises:
         CuttingError: The slice breaks down where the fit begins.
     """
-    unknowns = _unknowns(predictor, parameters, cause)
+    unknowns = _unknowns(predictor, cause)
     given = start or {}
     theta = np.array([np.clip(given.get(u.name, 0.0), u.low, u.high) for u in unknowns])
-    work = _Work(predictor, unknowns, cause, scan, noise)
+    work = _Work(predictor, unknowns, cause, scan)
     theta, predicted, jacobian = work.fit(theta)
     held_out = np.empty_like(predicted)
     shared = np.array([u.kind != "own" for u in unknowns])
     for number in np.unique(block):
         rows = block == number
         held_out[rows] = work.without(theta, predicted, jacobian, rows, shared)[rows]
-    return SliceFit(
-        unknowns,
-        theta,
-        cause,
-        scan,
-        work.point(theta),
-        predicted,
-        jacobian,
-        held_out,
-        work.failures,
-    )
+    return SliceFit(unknowns, theta, work.point(theta), predicted, jacobian, held_out)
 
 
+@dc.dataclass
 class _Work:
-    def __init__(
-        self,
-        predictor: SlicePredictor,
-        unknowns: list[Unknown],
-        cause: Cause | None,
-        scan: float | None,
-        noise: float,
-    ) -> None:
-        self.predictor, self.unknowns, self.cause, self.scan = predictor, unknowns, cause, scan
-        (self.target,) = predictor.targets
-        self.noise = noise
-        self.low = np.array([u.low for u in unknowns])
-        self.high = np.array([u.high for u in unknowns])
-        self.spread = np.array([u.spread for u in unknowns])
-        self.failures = 0
+    """Gauss-Newton steps of one slice."""
+
+    predictor: SlicePredictor
+    unknowns: list[Unknown]
+    cause: Cause | None
+    scan: float | None
+
+    def __post_init__(self) -> None:
+        (self.target,) = self.predictor.targets
+        self.low, self.high, self.spread = np.array(
+            [(u.low, u.high, u.spread) for u in self.unknowns]
+        ).T
 
     def point(self, theta: np.ndarray) -> Point:
         values: dict[str, dict[str, float]] = {"base": {}, "own": {}, "cause": {}}
@@ -229,9 +205,7 @@ class _Work:
         out = []
         for (series,) in self.predictor.predict([self.point(t) for t in thetas]):
             assert series is not None
-            seen = self.target.compare(series.wrench[:, :, None])[:, :, 0]
-            self.failures += not np.isfinite(seen).all()
-            out.append(seen)
+            out.append(self.target.compare(series.wrench[:, :, None])[:, :, 0])
         return out
 
     def cost(self, theta: np.ndarray, predicted: np.ndarray, rows: np.ndarray) -> float:
@@ -239,7 +213,7 @@ class _Work:
         that broke."""
         if not np.isfinite(predicted).all():
             return np.inf
-        rest = (self.target.measured - predicted)[rows].ravel() / self.noise
+        rest = (self.target.measured - predicted)[rows].ravel() / NOISE
         return float(rest @ rest + ((theta / self.spread) ** 2).sum())
 
     def fit(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -315,8 +289,8 @@ class _Work:
         free: np.ndarray,
     ) -> np.ndarray:
         """One Gauss-Newton step over some rows and some unknowns, within their ranges."""
-        A = jacobian[rows][:, :, free].reshape(-1, int(free.sum())) / self.noise
-        b = (self.target.measured - predicted)[rows].ravel() / self.noise
+        A = jacobian[rows][:, :, free].reshape(-1, int(free.sum())) / NOISE
+        b = (self.target.measured - predicted)[rows].ravel() / NOISE
         prior = np.diag(1.0 / self.spread[free])
         low = np.maximum(self.low, theta - LONGEST)[free] - theta[free]
         high = np.minimum(self.high, theta + LONGEST)[free] - theta[free]

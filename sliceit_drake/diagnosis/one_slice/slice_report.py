@@ -7,19 +7,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sliceit_drake.diagnosis.html_page import html_page, image
-from sliceit_drake.diagnosis.one_slice.fitted_slice import FittedSlice
 from sliceit_drake.diagnosis.one_slice.slice_evidence import LEVEL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from sliceit_drake.diagnosis.one_slice.slice_result import OneSlice
+
 __all__ = ["report_html", "slice_figure"]
 
 MEASURED, FITTED, LEFT_OUT, CAUSE = "#111827", "#2563eb", "#c2410c", "#047857"
 
 
-def slice_figure(results: Sequence[FittedSlice], titles: Sequence[str]) -> "Figure":
+def slice_figure(results: Sequence["OneSlice"], titles: Sequence[str]) -> "Figure":
     """Force over depth, what the fit leaves, and what is left of depth that was left out.
 
     Args:
@@ -91,7 +92,7 @@ def slice_figure(results: Sequence[FittedSlice], titles: Sequence[str]) -> "Figu
     return figure
 
 
-def _blocks(axis: "Axes", result: FittedSlice) -> None:
+def _blocks(axis: "Axes", result: "OneSlice") -> None:
     """Shades every other block of depth."""
     depth = 1e3 * result.record.depth
     for k in np.unique(result.block)[1::2]:
@@ -99,7 +100,7 @@ def _blocks(axis: "Axes", result: FittedSlice) -> None:
         axis.axvspan(depth[rows].min(), depth[rows].max(), color="0.5", alpha=0.10, lw=0)
 
 
-def report_html(result: FittedSlice, table: str) -> str:
+def report_html(result: "OneSlice", table: str) -> str:
     """The report as one self-contained page, with the result as text."""
     parts = [
         "<h1>What the simulation gets wrong in one slice</h1>",
