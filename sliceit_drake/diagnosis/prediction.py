@@ -124,6 +124,11 @@ class SlicePredictor:
             return ()
         return RECORD_EFFECTS + ((SPEED,) if target.speed_unknown else ())
 
+    @property
+    def model_with_food(self) -> CuttingModel | None:
+        """The cut of the first record with food, at the setup's values; None without one."""
+        return next((t.models[self.meshings[0]] for t in self.targets if t.models), None)
+
     def predict(
         self, points: Sequence[Point], progress: Callable[[int, int], None] | None = None
     ) -> list[list[ForceSeries | None]]:

@@ -132,12 +132,10 @@ def _at_point(
 ) -> LinearProblem:
     """The problem with what slices simulated there predict."""
     found = problem.found
-    values = {}
-    for k, change in logs.items():
-        name = found.columns[k].name
-        models = next(t.models for t in predictor.targets if t.models)
-        start = float(get_parameter(models[predictor.meshings[0]], name))
-        values[name] = start * float(np.exp(change))
+    model = predictor.model_with_food
+    assert model is not None
+    names = {found.columns[k].name: change for k, change in logs.items()}
+    values = {n: float(get_parameter(model, n)) * float(np.exp(x)) for n, x in names.items()}
     active = tuple(ActiveCause(cause, at[cause.name]) for cause, _ in causes)
     before, after = predictor.predict([Point(), Point(values=values, causes=active)], progress)
     mesh = next((k for k in problem.numerical if found.columns[k] == MESH), None)

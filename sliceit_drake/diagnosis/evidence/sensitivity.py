@@ -35,11 +35,11 @@ from pathlib import Path
 
 import numpy as np
 
-from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
+from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.content_store import ContentStore, content_key, source_key
 from sliceit_drake.cutting.parameters import get_parameter
 from sliceit_drake.cutting.solver import CuttingError
-from sliceit_drake.diagnosis.cause import Cause
+from sliceit_drake.diagnosis.cause import Cause, Values
 from sliceit_drake.diagnosis.evidence.columns import MESH, Column, RecordSensitivity, Sensitivities
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.prediction.clock import Clock
@@ -70,8 +70,69 @@ STORED = ("in_contact", "predicted", "columns", "even")
 """Arrays of a record that take simulations."""
 
 
-def _cause_columns(cause: Cause) -> list[tuple[Column, dict[str, float], dict[str, float] | None]]:
-    """Columns of a cause, with the values at plus its size, and at minus where that may be."""
+@dc.dataclass(frozen=True)
+class _Change:
+    """What the prediction changes by in a column.
+
+    Attributes:
+        column: The column.
+        ends: Points at plus its size and, where that may be, at minus.
+        factor: On the change.
+        cause, values: Of a cause that needs no simulation, and so no points: its values there.
+    """
+
+    column: Column
+    ends: tuple[Point, ...] = ()
+    factor: float = 1.0
+    cause: Cause | None = None
+    values: tuple[Values, ...] = ()
+
+
+def _model_changes(predictor: SlicePredictor, point: Point) -> list[_Change]:
+    """Base parameters, what differs from slice to slice, and the discretisation."""
+    out = []
+    for parameter in predictor.setup.parameters:
+        name = parameter.name
+        start = point.values.get(name)
+        if start is None:
+            if predictor.model_with_food is None:
+                continue
+            start = float(get_parameter(predictor.model_with_food, name))
+        if parameter.scale == "log":
+            size = LOG_STEP
+            ends = start * float(np.exp(size)), start * float(np.exp(-size))
+        else:
+            size = LINEAR_STEP * (parameter.high - parameter.low)
+            ends = start + size, start - size
+        points = tuple(dc.replace(point, values={**point.values, name: v}) for v in ends)
+        out.append(_Change(Column("base", name, size=size), points))
+    effects = [e for t in predictor.targets for e in predictor.record_effects(t)]
+    for effect in dict.fromkeys(effects):
+        column = Column("record", effect.name, size=effect.size, unit=effect.unit, per_record=True)
+        points = tuple(
+            _with_record_effect(predictor, point, effect.name, sign * effect.size)
+            for sign in (1.0, -1.0)
+        )
+        out.append(_Change(column, points))
+    for name, finer in zip(("step", "mesh"), predictor.meshings[1:], strict=False):
+        out.append(_Change(Column("numerical", name), (dc.replace(point, meshing=finer),), -1.0))
+    return out
+
+
+def _with_record_effect(
+    predictor: SlicePredictor, point: Point, effect: str, change: float
+) -> Point:
+    """A point at which all records differ by as much."""
+    records = {}
+    for target in predictor.targets:
+        own = dict(point.records.get(target.facts.name, {}))
+        own[effect] = own.get(effect, 0.0) + change
+        records[target.facts.name] = own
+    return dc.replace(point, records=records)
+
+
+def _cause_changes(cause: Cause, point: Point) -> list[_Change]:
+    """Each parameter of a cause by its size, at each value of its scan."""
     out = []
     for value in cause.scan.values if cause.scan else (None,):
         at = cause.nulls()
@@ -79,8 +140,8 @@ def _cause_columns(cause: Cause) -> list[tuple[Column, dict[str, float], dict[st
             at[cause.scan.name] = value
         for p in cause.parameters:
             sign = -1.0 if p.one_sided and p.null == p.high else 1.0
-            up = at | {p.name: p.null + sign * p.size}
-            down = None if p.one_sided else at | {p.name: p.null - p.size}
+            signs = (sign,) if p.one_sided else (sign, -sign)
+            values = tuple(at | {p.name: p.null + s * p.size} for s in signs)
             column = Column(
                 "cause",
                 cause.name,
@@ -92,7 +153,13 @@ def _cause_columns(cause: Cause) -> list[tuple[Column, dict[str, float], dict[st
                 cause.per_record,
                 cause.searched,
             )
-            out.append((column, up, down))
+            if cause.simulates:
+                ends = tuple(
+                    dc.replace(point, causes=(*point.causes, ActiveCause(cause, v))) for v in values
+                )
+                out.append(_Change(column, ends))
+            else:
+                out.append(_Change(column, cause=cause, values=values))
     return out
 
 
@@ -135,173 +202,111 @@ def sensitivities(
         meshings.append(dc.replace(meshing, refinement=finer * meshing.refinement))
     runs = None if cache is None else cache / "slices"
     predictor = SlicePredictor(setup, records, meshings, clock, runs, workers)
-    store = None if cache is None else ContentStore(cache / "sensitivities")
+    store = ContentStore(None if cache is None else cache / "sensitivities")
 
-    def computed(some: Sequence[Cause], alone: bool, show: Progress | None) -> Sensitivities:
-        kept = None
-        if store is not None and not any(cause.adapts for cause in some):
-            common = _common_key(setup, some, point, alone, meshing, finer, clock)
-            if common is not None:
-                by_slice = any(c.by_slice for c in (*some, *(a.cause for a in point.causes)))
-                kept = _RecordStore(store, common, point, by_slice)
-        return _Computation(predictor, point, some, alone).result(kept, show)
+    def computed(
+        changes: list[_Change], some: Sequence[Cause], show: Progress | None
+    ) -> Sensitivities:
+        common = None
+        if cache is not None and not any(cause.adapts for cause in some):
+            common = _common_key(setup, some, point, not changes, meshing, finer, clock)
+        by_slice = any(c.by_slice for c in (*some, *(a.cause for a in point.causes)))
+        changes = changes + [change for cause in some for change in _cause_changes(cause, point)]
+        return _Computation(predictor, point, changes, store, common, by_slice).result(show)
 
     # What replicates share is computed once for all of them.
-    found = computed([c for c in causes if not (c.by_slice or c.adapts)], False, progress)
+    shared = [c for c in causes if not (c.by_slice or c.adapts)]
+    found = computed(_model_changes(predictor, point), shared, progress)
     for some in (
         [c for c in causes if c.by_slice and not c.adapts],
         [c.adapted(found.records) for c in causes if c.adapts],
     ):
         if some:
-            found.append(computed(some, True, None))
+            found.append(computed([], some, None))
     return found
 
 
+@dc.dataclass
 class _Computation:
-    """Sensitivities of one set of records.
+    """Some columns of one set of records; records that are known are not computed again.
 
-    Args:
+    What was measured does not matter: another cut along the same path is found at once.
+
+    Attributes:
         predictor: Of the records.
         point: Where.
-        causes: What may be wrong.
-        alone: Whether there are to be columns of the causes alone.
+        changes: The columns.
+        store: Predictions of records and their changes that were computed before.
+        common: Key of all that does not differ between records; None where nothing is kept.
+        by_slice: Whether it matters which slice of the session a record is.
     """
 
-    def __init__(
-        self,
-        predictor: SlicePredictor,
-        point: Point,
-        causes: Sequence[Cause],
-        alone: bool = False,
-    ) -> None:
-        self.predictor, self.point = predictor, point
-        self.columns: list[Column] = []
-        self.ends: list[tuple[Point, Point | None, float]] = []
-        """Points at plus and minus the size of each column, and a factor on the change."""
-        self.shown: list[tuple[int, Cause, dict[str, float], dict[str, float] | None]] = []
-        """Columns that follow from the prediction without a simulation."""
-        if not alone:
-            for parameter in predictor.setup.parameters:
-                self._add_base(parameter)
-            effects = {e.name: e for t in predictor.targets for e in predictor.record_effects(t)}
-            for effect in effects.values():
-                column = Column(
-                    "record", effect.name, size=effect.size, unit=effect.unit, per_record=True
-                )
-                up, down = (self._record_point(effect.name, s * effect.size) for s in (1.0, -1.0))
-                self._add(column, up, down)
-            for name, finer in zip(("step", "mesh"), predictor.meshings[1:], strict=False):
-                self._add(Column("numerical", name), dc.replace(point, meshing=finer), None, -1.0)
-        for cause in causes:
-            for column, up_values, down_values in _cause_columns(cause):
-                if not cause.simulates:
-                    self.shown.append((len(self.columns), cause, up_values, down_values))
-                    self._add(column, point, None)
-                    continue
-                other = None if down_values is None else self._cause_point(cause, down_values)
-                self._add(column, self._cause_point(cause, up_values), other)
+    predictor: SlicePredictor
+    point: Point
+    changes: list[_Change]
+    store: ContentStore
+    common: str | None
+    by_slice: bool
 
-    def _add(self, column: Column, up: Point, down: Point | None, factor: float = 1.0) -> None:
-        self.columns.append(column)
-        self.ends.append((up, down, factor))
-
-    def _add_base(self, parameter: ParameterRange) -> None:
-        name = parameter.name
-        start = self.point.values.get(name)
-        if start is None:
-            models = next((t.models for t in self.predictor.targets if t.models), None)
-            if models is None:
-                return
-            start = float(get_parameter(models[self.predictor.meshings[0]], name))
-        if parameter.scale == "log":
-            size, high = LOG_STEP, start * float(np.exp(LOG_STEP))
-            low = start * float(np.exp(-LOG_STEP))
-        else:
-            size = LINEAR_STEP * (parameter.high - parameter.low)
-            high, low = start + size, start - size
-        up, down = (
-            dc.replace(self.point, values={**self.point.values, name: v}) for v in (high, low)
-        )
-        self._add(Column("base", name, size=size), up, down)
-
-    def _record_point(self, effect: str, change: float) -> Point:
-        own = {
-            t.facts.name: dict(self.point.records.get(t.facts.name, {}))
-            for t in self.predictor.targets
-        }
-        for values in own.values():
-            values[effect] = values.get(effect, 0.0) + change
-        return dc.replace(self.point, records=own)
-
-    def _cause_point(self, cause: Cause, values: dict[str, float]) -> Point:
-        return dc.replace(self.point, causes=(*self.point.causes, ActiveCause(cause, values)))
-
-    def result(self, store: "_RecordStore | None", progress: Progress | None) -> Sensitivities:
-        """All columns of all records; those that are known are not computed again."""
-        predictor = self.predictor
-        targets = predictor.targets
-        warnings: list[str] = []
-        known = [store.load(t, len(self.columns)) if store else None for t in targets]
+    def result(self, progress: Progress | None) -> Sensitivities:
+        """All columns of all records."""
+        targets = self.predictor.targets
+        known = [self._load(target) for target in targets]
         missing = tuple(k for k, found in enumerate(known) if found is None)
         if missing:
-            points = [self.point, *(p for ends in self.ends for p in ends[:2] if p is not None)]
+            points = [self.point, *(p for change in self.changes for p in change.ends)]
             points = [dc.replace(p, only=missing) for p in points]
             # First, because causes may ask for its force.
-            predictor.simulate(points[:1])
-            predictor.simulate(points, progress)
-        records = []
-        for number, found in enumerate(known):
-            if found is None and store is not None:
-                # A replicate may just have been computed.
-                found = store.load(targets[number], len(self.columns))
-            if found is None:
-                found = self._record(number)
-                if store is not None:
-                    store.save(targets[number], *found)
-            records.append(found[0])
-            warnings += [f"{label}: {found[0].name} broke down" for label in found[1]]
-        first = predictor.meshings[0]
+            self.predictor.simulate(points[:1])
+            self.predictor.simulate(points, progress)
+        records, warnings = [], []
+        for number, (target, found) in enumerate(zip(targets, known, strict=True)):
+            # A replicate may just have been computed.
+            record, failed = found or self._load(target) or self._computed(number)
+            records.append(record)
+            warnings += [f"{label}: {record.name} broke down" for label in failed]
+        first = self.predictor.meshings[0]
         counts = [t.models[first].element_count for t in targets if t.models]
-        return Sensitivities(self.columns, records, warnings, max(counts, default=0))
+        columns = [change.column for change in self.changes]
+        return Sensitivities(columns, records, warnings, max(counts, default=0))
 
-    def _record(self, number: int) -> tuple[RecordSensitivity, list[str]]:
+    def _computed(self, number: int) -> tuple[RecordSensitivity, list[str]]:
         """A record, and labels of the columns whose slices broke down."""
         failed: list[str] = []
         target = self.predictor.targets[number]
         base = self._series(self.point, number)
-        shown = {k: (cause, up, down) for k, cause, up, down in self.shown}
-        wrenches, of = [base.wrench], []
-        for k, (up, down, _) in enumerate(self.ends):
-            if k in shown:
-                cause, *values = shown[k]
-                moved = [
-                    cause.wrench(base, v, cause.visible(target.facts))
-                    for v in values
-                    if v is not None
-                ]
+        wrenches, places = [base.wrench], []
+        for change in self.changes:
+            if change.cause is None:
+                moved = [self._series(p, number).wrench for p in change.ends]
             else:
-                moved = [self._series(p, number).wrench for p in (up, down) if p is not None]
-            of.append(range(len(wrenches), len(wrenches) + len(moved)))
+                facts = change.cause.visible(target.facts)
+                moved = [change.cause.wrench(base, v, facts) for v in change.values]
+            places.append(slice(len(wrenches), len(wrenches) + len(moved)))
             wrenches += moved
         # All at once: the filters of the record are made anew in each call.
         seen = target.compare(np.stack(wrenches, axis=2))
-        predicted, changes = seen[:, :, 0], seen - seen[:, :, :1]
+        predicted, differences = seen[:, :, 0], seen - seen[:, :, :1]
         if not np.isfinite(predicted).all():
             raise CuttingError(
                 f"{target.facts.name}: the prediction broke down at the calibrated values"
             )
-        record = _empty(target, target.at_rows(base.in_contact), predicted, len(self.columns))
-        for k, (members, (_, _, factor)) in enumerate(zip(of, self.ends, strict=True)):
-            change = changes[:, :, members.start : members.stop]
-            if not np.isfinite(change).all():
-                failed.append(self.columns[k].label)
-            elif len(members) == 1:
-                record.columns[:, :, k] = factor * change[:, :, 0]
-                if self.columns[k] == MESH:
-                    record.predicted = predicted + change[:, :, 0]
+        record = self._empty(target, target.at_rows(base.in_contact), predicted)
+        for k, (place, change) in enumerate(zip(places, self.changes, strict=True)):
+            moved = differences[:, :, place]
+            up, down = moved[:, :, 0], moved[:, :, -1]
+            if not np.isfinite(moved).all():
+                failed.append(change.column.label)
+            elif moved.shape[2] == 1:
+                record.columns[:, :, k] = change.factor * up
+                if change.column == MESH:
+                    record.predicted = predicted + up
             else:
-                record.columns[:, :, k] = 0.5 * factor * (change[:, :, 0] - change[:, :, 1])
-                record.even[:, :, k] = 0.5 * factor * (change[:, :, 0] + change[:, :, 1])
+                record.columns[:, :, k] = 0.5 * change.factor * (up - down)
+                record.even[:, :, k] = 0.5 * change.factor * (up + down)
+        if self.common is not None:
+            arrays = {name: getattr(record, name) for name in STORED}
+            self.store.save(self._key(target), arrays | {"failed": np.array(failed, np.str_)})
         return record, failed
 
     def _series(self, point: Point, number: int) -> ForceSeries:
@@ -310,74 +315,51 @@ class _Computation:
         assert series is not None
         return series
 
-
-def _empty(
-    target: RecordTarget, in_contact: np.ndarray, predicted: np.ndarray, columns: int
-) -> RecordSensitivity:
-    facts = target.facts
-    moved = np.linalg.norm(np.diff(target.p, axis=0), axis=1)
-    way = np.concatenate([[0.0], np.cumsum(moved)])
-    return RecordSensitivity(
-        name=facts.name,
-        condition=facts.condition,
-        slice_index=facts.slice_index,
-        knife_slices=facts.knife_slices,
-        speed=facts.speed,
-        draw_ratio=facts.draw_ratio,
-        channels=target.channels,
-        time=target.time,
-        phase=target.phase,
-        depth=target.depth,
-        path=np.interp(target.time, target.grid, way),
-        in_contact=in_contact,
-        compared=target.compared,
-        measured=target.measured,
-        predicted=predicted,
-        columns=np.zeros((*predicted.shape, columns), np.float32),
-        even=np.zeros((*predicted.shape, columns), np.float32),
-    )
-
-
-class _RecordStore:
-    """Predictions of records and their changes that were computed before.
-
-    What was measured does not matter: another cut along the same path is found at once.
-
-    Args:
-        store: Where they are.
-        common: Key of all that does not differ between records.
-        point: Where records are predicted.
-        by_slice: Whether it matters which slice of the session a record is.
-    """
-
-    def __init__(self, store: ContentStore, common: str, point: Point, by_slice: bool) -> None:
-        self._store, self._common, self._point = store, common, point
-        self._by_slice = by_slice
+    def _load(self, target: RecordTarget) -> tuple[RecordSensitivity, list[str]] | None:
+        arrays = None if self.common is None else self.store.load(self._key(target))
+        if arrays is None:
+            return None
+        record = self._empty(target, arrays["in_contact"], arrays["predicted"])
+        record.columns, record.even = arrays["columns"], arrays["even"]
+        return record, arrays["failed"].tolist()
 
     def _key(self, target: RecordTarget) -> str:
         metadata = dc.replace(target.record.metadata, name="", condition="")
         facts = dc.replace(target.facts, name="", condition="")
-        if not self._by_slice:
+        if not self.by_slice:
             metadata = dc.replace(metadata, slice_index=0, knife_slices=None)
             facts = dc.replace(facts, slice_index=0, knife_slices=0)
-        own = [dict(a.values) for a in self._point.causes]
-        at = (self._point.records.get(target.facts.name), own)
+        own = [dict(a.values) for a in self.point.causes]
+        at = (self.point.records.get(target.facts.name), own)
         path = (target.time, target.grid, target.R, target.p)
-        return content_key(self._common, metadata, facts, target.channels, at, *path)
+        return content_key(self.common, metadata, facts, target.channels, at, *path)
 
-    def load(
-        self, target: RecordTarget, columns: int
-    ) -> tuple[RecordSensitivity, list[str]] | None:
-        arrays = self._store.load(self._key(target))
-        if arrays is None:
-            return None
-        record = _empty(target, arrays["in_contact"], arrays["predicted"], columns)
-        record.columns, record.even = arrays["columns"], arrays["even"]
-        return record, arrays["failed"].tolist()
-
-    def save(self, target: RecordTarget, record: RecordSensitivity, failed: list[str]) -> None:
-        arrays = {name: getattr(record, name) for name in STORED}
-        self._store.save(self._key(target), arrays | {"failed": np.array(failed, np.str_)})
+    def _empty(
+        self, target: RecordTarget, in_contact: np.ndarray, predicted: np.ndarray
+    ) -> RecordSensitivity:
+        facts = target.facts
+        moved = np.linalg.norm(np.diff(target.p, axis=0), axis=1)
+        way = np.concatenate([[0.0], np.cumsum(moved)])
+        nothing = np.zeros((*predicted.shape, len(self.changes)), np.float32)
+        return RecordSensitivity(
+            name=facts.name,
+            condition=facts.condition,
+            slice_index=facts.slice_index,
+            knife_slices=facts.knife_slices,
+            speed=facts.speed,
+            draw_ratio=facts.draw_ratio,
+            channels=target.channels,
+            time=target.time,
+            phase=target.phase,
+            depth=target.depth,
+            path=np.interp(target.time, target.grid, way),
+            in_contact=in_contact,
+            compared=target.compared,
+            measured=target.measured,
+            predicted=predicted,
+            columns=nothing,
+            even=np.zeros_like(nothing),
+        )
 
 
 def _common_key(
