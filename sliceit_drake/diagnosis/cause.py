@@ -1,22 +1,6 @@
 """What a cause is: a small class that changes the prediction of a slice in one way.
 
-A user's own cause is a file with one subclass (docs/causes.md has a complete example):
-
-    from sliceit_drake.diagnosis.cause import Cause, CauseParameter
-
-    class Suction(Cause):
-        '''Wet slices suck the blade down as it leaves.'''
-
-        name = "suction"
-        family = "knife and contact"
-        parameters = (CauseParameter("pull", "N", 0.5, low=0.0),)
-        signature = "a pull on the way out, none on the way in"
-        experiment = "retract"
-
-        def wrench(self, series, values, facts):
-            out = series.wrench.copy()
-            out[series.v[:, 2] > 0.0, 5] -= values["pull"]
-            return out
+A user's own cause is a file with one subclass (docs/causes.md has a complete example).
 """
 
 import dataclasses as dc

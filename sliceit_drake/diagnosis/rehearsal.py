@@ -33,80 +33,48 @@ def dry_run(cause: Cause, source: str = "") -> None:
     if cause.scan is not None:
         nulls[cause.scan.name] = cause.scan.values[0]
     full = dict(nulls)
-    for p in cause.parameters:
-        full[p.name] = p.null - p.size if p.null == p.high else p.null + p.size
-    _try_wrench(cause, nulls, full, facts, source)
-    if type(cause).motion is not Cause.motion:
-        _try_motion(cause, nulls, full, facts, source)
-    if cause.changes_model:
-        food = Food(shape=Cylinder(HEIGHT, 0.06, 2, [0.0, 0.004, 0.012]), hold_distance=0.0119)
-        model = make_food_model(food, Knife(), Numerics(time_step=1e-3))
-        for values in (nulls, full):
-            if not isinstance(cause.model(model, values, facts), CuttingModel):
-                raise _refuse(cause, "model", "gives no CuttingModel", "Return one.", source)
+    for number in cause.parameters:
+        sign = -1.0 if number.null == number.high else 1.0
+        full[number.name] = number.null + sign * number.size
 
+    def refuse(hook: str, problem: str, fix: str) -> ConfigurationError:
+        return ConfigurationError(
+            problem, source=source, field=f"{type(cause).__name__}.{hook}", fix=fix
+        )
 
-def _try_wrench(
-    cause: Cause,
-    nulls: dict[str, float],
-    full: dict[str, float],
-    facts: SliceFacts,
-    source: str,
-) -> None:
+    adds = "Multiply all that it adds by a parameter whose null is 0."
     series = _made_up_slice()
     before = series.wrench.copy()
     for values, name in ((nulls, "nulls"), (full, "size")):
         out = cause.wrench(series, values, facts)
         if not np.array_equal(series.wrench, before):
             fix = "Begin with out = series.wrench.copy(), change out and return it."
-            raise _refuse(cause, "wrench", "changes series.wrench itself", fix, source)
+            raise refuse("wrench", "changes series.wrench itself", fix)
         if np.shape(out) != before.shape:
-            raise _refuse(
-                cause,
-                "wrench",
-                f"gives an array {list(np.shape(out))}, expected {list(before.shape)}",
-                "Return moments and forces of all rows [N, 6].",
-                source,
-            )
+            problem = f"gives an array {list(np.shape(out))}, expected {list(before.shape)}"
+            fix = "Return moments and forces of all rows [N, 6]."
+            raise refuse("wrench", problem, fix)
         if not np.isfinite(out).all():
             fix = "Mind divisions by a speed or depth of zero."
-            raise _refuse(cause, "wrench", f"is not finite at its {name}", fix, source)
+            raise refuse("wrench", f"is not finite at its {name}", fix)
         if values is nulls and not np.allclose(out, before, rtol=0.0, atol=1e-9):
-            fix = "Multiply all that it adds by a parameter whose null is 0."
-            raise _refuse(cause, "wrench", "changes the force at its nulls", fix, source)
-
-
-def _try_motion(
-    cause: Cause,
-    nulls: dict[str, float],
-    full: dict[str, float],
-    facts: SliceFacts,
-    source: str,
-) -> None:
-    series = _made_up_slice()
+            raise refuse("wrench", "changes the force at its nulls", adds)
     t = np.concatenate([[series.time[0] - PERIOD], series.time])
     R, p = (np.concatenate([v[:1], v]) for v in (series.R, series.p))
-    force = series.wrench[:, 3:]
     for values in (nulls, full):
-        moved = cause.motion(R.copy(), p.copy(), t, values, facts, force)
-        shapes = [list(np.shape(v)) for v in moved]
-        if shapes != [list(R.shape), list(p.shape)]:
-            raise _refuse(
-                cause,
-                "motion",
-                f"gives arrays {shapes}, expected {[list(R.shape), list(p.shape)]}",
-                "Return R [N + 1, 3, 3] and p [N + 1, 3].",
-                source,
-            )
+        moved = cause.motion(R.copy(), p.copy(), t, values, facts, series.wrench[:, 3:])
+        shapes, expected = ([list(np.shape(v)) for v in pair] for pair in (moved, (R, p)))
+        if shapes != expected:
+            fix = "Return R [N + 1, 3, 3] and p [N + 1, 3]."
+            raise refuse("motion", f"gives arrays {shapes}, expected {expected}", fix)
         if values is nulls and not (np.allclose(moved[0], R) and np.allclose(moved[1], p)):
-            fix = "Multiply all that it adds by a parameter whose null is 0."
-            raise _refuse(cause, "motion", "changes the motion at its nulls", fix, source)
-
-
-def _refuse(cause: Cause, hook: str, problem: str, fix: str, source: str) -> ConfigurationError:
-    return ConfigurationError(
-        problem, source=source, field=f"{type(cause).__name__}.{hook}", fix=fix
-    )
+            raise refuse("motion", "changes the motion at its nulls", adds)
+    if cause.changes_model:
+        food = Food(shape=Cylinder(HEIGHT, 0.06, 2, [0.0, 0.004, 0.012]), hold_distance=0.0119)
+        model = make_food_model(food, Knife(), Numerics(time_step=1e-3))
+        for values in (nulls, full):
+            if not isinstance(cause.model(model, values, facts), CuttingModel):
+                raise refuse("model", "gives no CuttingModel", "Return one.")
 
 
 def _made_up_slice() -> ForceSeries:
@@ -118,9 +86,8 @@ def _made_up_slice() -> ForceSeries:
     v[:, 2] = -np.gradient(depth, PERIOD)
     p = np.zeros((ROWS, 3))
     p[:, 2] = HEIGHT - depth
-    inside = depth > 0.0
-    parts = {name: np.zeros((ROWS, 6)) for name in ("edge", "normal", "friction", "board")}
-    parts["weight"] = np.zeros((ROWS, 6))
+    names = ("edge", "normal", "friction", "board", "weight")
+    parts = {name: np.zeros((ROWS, 6)) for name in names}
     parts["edge"][:, 5] = 500.0 * np.clip(depth, 0.0, None)
     parts["friction"][:, 5] = -50.0 * np.sign(v[:, 2]) * np.clip(depth, 0.0, None)
     return ForceSeries(
@@ -131,6 +98,6 @@ def _made_up_slice() -> ForceSeries:
         w=np.zeros((ROWS, 3)),
         parts=parts,
         depth=depth,
-        in_contact=inside,
+        in_contact=depth > 0.0,
         wrench=np.asarray(sum(parts.values())),
     )
