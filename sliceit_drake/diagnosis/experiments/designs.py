@@ -34,6 +34,8 @@ WEIGHT = 1.0
 """Hung on the knife, kg."""
 NARROW = 0.8
 """Size of the narrow food over that of the food."""
+CLEARANCE = 3e-3
+"""Height of the edge over the food at the start of a cut, metres."""
 
 
 @dc.dataclass(frozen=True)
@@ -44,18 +46,31 @@ class Scale:
         height, width: Of the food's section, metres.
         length: Of the edge, metres.
         speed: Of the press in the records, m/s.
-        clearance: Height of the edge over the food at the start, metres.
     """
 
     height: float
     width: float
     length: float
     speed: float = 0.02
-    clearance: float = 3e-3
 
     def times(self, factor: float) -> float:
         """A multiple of the records' speed that the station can follow, m/s."""
         return round(min(max(factor * self.speed, SLOWEST), FASTEST), 6)
+
+    @property
+    def through(self) -> float:
+        """From the start of a cut through the food, metres."""
+        return round(CLEARANCE + self.height + OVERTRAVEL, 6)
+
+    @property
+    def half(self) -> float:
+        """From the start of a cut to the middle of the food, metres."""
+        return CLEARANCE + 0.5 * self.height
+
+    @property
+    def again(self) -> float:
+        """Of a second pass through the open cut, metres."""
+        return self.through - CLEARANCE - 2.0 * OVERTRAVEL
 
 
 @dc.dataclass(frozen=True)
@@ -79,7 +94,7 @@ class Experiment:
     name: str
     what: str
     motion: MotionPlan
-    clearance: float
+    clearance: float = CLEARANCE
     offset: float = 0.0
     by_hand: str = ""
     food: bool = True
@@ -91,7 +106,7 @@ class Experiment:
 
 def menu(scale: Scale) -> list[Experiment]:
     """All that may be proposed, those without handwork first."""
-    return [*_cuts(scale), *_in_air(scale), *_by_hand(scale)]
+    return [*_cuts(scale), _in_air(scale), *_by_hand(scale)]
 
 
 def _ramp(speed: float) -> float:
@@ -108,182 +123,138 @@ def _retract(distance: float, speed: float, label: str = "retract") -> Retract:
     return Retract(distance=way, speed=speed, acceleration=_ramp(speed), label=label)
 
 
-def _air(duration: float = 0.3) -> Hold:
-    return Hold(duration=duration, label="air")
+def _rest(duration: float = 0.3, label: str = "air") -> Hold:
+    return Hold(duration=duration, label=label)
 
 
-def _end() -> Hold:
-    """On the board."""
-    return Hold(duration=0.3, label="hold")
+def _turn(*times: float) -> Waypoints:
+    """To a pose turned by `TILT`, and on in it."""
+    return Waypoints(
+        times=list(times),
+        positions=[[0.0] * 3] * len(times),
+        rotations=[[TILT, 0.0, 0.0]] * len(times),
+        label="air",
+    )
 
 
 def _plan(*segments: Segment) -> MotionPlan:
-    return MotionPlan(segments=list(segments))
+    """From the air over the food and back."""
+    return MotionPlan(segments=[_rest(), *segments, _rest()])
 
 
-def _through(scale: Scale) -> float:
-    """From the start through the food."""
-    return round(scale.clearance + scale.height + OVERTRAVEL, 6)
-
-
-def _tour(scale: Scale, speeds: tuple[float, float] = (0.3, 3.0)) -> MotionPlan:
+def _tour(scale: Scale) -> MotionPlan:
     """Slow to the middle, held there, fast through; out slowly, once more in, out fast."""
-    slow, fast = (scale.times(x) for x in speeds)
-    way = _through(scale)
-    half = scale.clearance + 0.5 * scale.height
-    again = way - scale.clearance - 2.0 * OVERTRAVEL
+    usual, slow, fast = (scale.times(x) for x in (1.0, 0.3, 3.0))
     return _plan(
-        _air(),
-        _press(half, slow),
-        Hold(duration=2.0, label="hold"),
-        _press(way - half, fast),
-        _end(),
-        _retract(way, scale.times(1.0)),
-        _air(0.2),
-        _press(again, scale.times(1.0), "second_pass"),
-        _retract(again, fast),
-        _air(),
+        _press(scale.half, slow),
+        _rest(2.0, "hold"),
+        _press(scale.through - scale.half, fast),
+        _rest(label="hold"),
+        _retract(scale.through, usual),
+        _rest(0.2),
+        _press(scale.again, usual, "second_pass"),
+        _retract(scale.again, fast),
     )
 
 
 def _cuts(scale: Scale) -> list[Experiment]:
-    way, half = _through(scale), scale.clearance + 0.5 * scale.height
-    usual, slow, fast = scale.times(1.0), scale.times(0.3), scale.times(3.0)
-    again = way - scale.clearance - 2.0 * OVERTRAVEL
+    usual, slow, fast = (scale.times(x) for x in (1.0, 0.3, 3.0))
+    way, on_board = scale.through, _rest(label="hold")
     out = [
         Experiment(
-            "slow",
-            f"a press at {1e3 * slow:.3g} mm/s, and out",
-            _plan(_air(), _press(way, slow), _end(), _retract(way, usual), _air()),
-            scale.clearance,
-        ),
-        Experiment(
-            "fast",
-            f"a press at {1e3 * fast:.3g} mm/s, and out",
-            _plan(_air(), _press(way, fast), _end(), _retract(way, usual), _air()),
-            scale.clearance,
-        ),
+            name,
+            f"a press at {1e3 * speed:.3g} mm/s, and out",
+            _plan(_press(way, speed), on_board, _retract(way, usual)),
+        )
+        for name, speed in (("slow", slow), ("fast", fast))
+    ]
+    out += [
         Experiment(
             "hold",
             "a press that is held in the middle of the food for 3 s",
             _plan(
-                _air(),
-                _press(half, usual),
-                Hold(duration=3.0, label="hold"),
-                _press(way - half, usual),
-                _end(),
+                _press(scale.half, usual),
+                _rest(3.0, "hold"),
+                _press(way - scale.half, usual),
+                on_board,
                 _retract(way, fast),
-                _air(),
             ),
-            scale.clearance,
         ),
         Experiment(
             "second_pass",
             "a press, out slowly, once more through the open cut, out fast",
             _plan(
-                _air(),
                 _press(way, usual),
-                _end(),
+                on_board,
                 _retract(way, slow),
-                _air(0.2),
-                _press(again, usual, "second_pass"),
-                _retract(again, fast),
-                _air(),
+                _rest(0.2),
+                _press(scale.again, usual, "second_pass"),
+                _retract(scale.again, fast),
             ),
-            scale.clearance,
         ),
         Experiment(
             "tour",
             "slowly to the middle, held, fast through, out, once more through the open cut",
             _tour(scale),
-            scale.clearance,
         ),
     ]
     for ratio in (1.0, 3.0):
         # The draw is centred, so that the food stays under the edge as long as may be.
-        reach = 0.5 * (scale.length - scale.width)
         travel = ratio * way
-        if 0.5 * travel > reach:
+        if travel > scale.length - scale.width:
             continue
+        draw = PressAndDraw(press_speed=usual, distance=way, draw_ratio=ratio, acceleration=RAMP)
         out.append(
             Experiment(
                 f"draw_{ratio:.0f}",
                 f"a press with {ratio:.0f} m along the edge for each metre down",
-                _plan(
-                    _air(),
-                    PressAndDraw(
-                        press_speed=usual, distance=way, draw_ratio=ratio, acceleration=RAMP
-                    ),
-                    _end(),
-                    _retract(way, fast),
-                    _air(),
-                ),
-                scale.clearance,
+                _plan(draw, on_board, _retract(way, fast)),
                 offset=round(-0.5 * travel, 6),
             )
         )
     return out
 
 
-def _in_air(scale: Scale) -> list[Experiment]:
+def _in_air(scale: Scale) -> Experiment:
     usual, fast = scale.times(1.0), scale.times(3.0)
-    turned = [[TILT, 0.0, 0.0]]
-    return [
-        Experiment(
-            "air",
-            "up and down over the food at two speeds, in two poses of the tool",
-            _plan(
-                _air(0.5),
-                _press(0.02, usual, "air"),
-                _retract(0.02, fast, "air"),
-                Waypoints(
-                    times=[0.8, 1.6], positions=[[0.0] * 3] * 2, rotations=turned * 2, label="air"
-                ),
-                _press(0.02, fast, "air"),
-                _retract(0.02, usual, "air"),
-            ),
-            AIR,
-        )
+    segments = [
+        _rest(0.5),
+        _press(0.02, usual, "air"),
+        _retract(0.02, fast, "air"),
+        _turn(0.8, 1.6),
+        _press(0.02, fast, "air"),
+        _retract(0.02, usual, "air"),
     ]
+    what = "up and down over the food at two speeds, in two poses of the tool"
+    return Experiment("air", what, MotionPlan(segments=segments), AIR)
 
 
 def _by_hand(scale: Scale) -> list[Experiment]:
+    usual, slow, fast = (scale.times(x) for x in (1.0, 0.3, 3.0))
     narrow = dc.replace(scale, height=NARROW * scale.height, width=NARROW * scale.width)
-    first = _plan(_air(), _press(_through(scale), scale.times(1.0)), _end())
     # Down to a clearance's height over the board, then slowly.
-    press = scale.clearance + BOARD_PRESS
+    press = CLEARANCE + BOARD_PRESS
+    hung = [_rest(0.5), _rest(1.0, "weight")]
     return [
         Experiment(
             "board",
             "the bare board pressed at two speeds, held, withdrawn",
             _plan(
-                _air(),
-                _press(scale.height, scale.times(3.0), "approach"),
-                _press(press, scale.times(1.0), "board_press"),
-                Hold(duration=0.7, label="board_press"),
-                _retract(press, scale.times(1.0)),
-                _press(press, scale.times(0.3), "board_press"),
-                Hold(duration=0.3, label="board_press"),
-                _retract(press + scale.height, scale.times(3.0)),
-                _air(),
+                _press(scale.height, fast, "approach"),
+                _press(press, usual, "board_press"),
+                _rest(0.7, "board_press"),
+                _retract(press, usual),
+                _press(press, slow, "board_press"),
+                _rest(label="board_press"),
+                _retract(press + scale.height, fast),
             ),
-            scale.clearance,
             by_hand="take the food away",
             food=False,
         ),
         Experiment(
             "weight",
             f"a known mass of {WEIGHT:g} kg on the knife in two poses, in the air",
-            _plan(
-                _air(0.5),
-                Hold(duration=1.0, label="weight"),
-                _air(),
-                Waypoints(
-                    times=[0.8], positions=[[0.0] * 3], rotations=[[TILT, 0.0, 0.0]], label="air"
-                ),
-                _air(0.5),
-                Hold(duration=1.0, label="weight"),
-            ),
+            MotionPlan(segments=[*hung, _rest(), _turn(0.8), *hung]),
             AIR,
             by_hand=f"hang {WEIGHT:g} kg on the knife at the middle of its edge while the phases "
             '"weight" last (1 s, twice), and take it off between; no food is needed',
@@ -294,7 +265,6 @@ def _by_hand(scale: Scale) -> list[Experiment]:
             "peeled",
             "peeled food: slowly to the middle, held, fast through, out, once more",
             _tour(scale),
-            scale.clearance,
             by_hand="take the skin off the food",
             peeled=True,
         ),
@@ -302,7 +272,6 @@ def _by_hand(scale: Scale) -> list[Experiment]:
             "narrow",
             f"food of {NARROW:g} times the size: slowly to the middle, held, fast through, out",
             _tour(narrow),
-            scale.clearance,
             by_hand=f"take a piece of {1e3 * narrow.height:.3g} mm height, or as near as there is, "
             "and write its size into the scenario and its motion",
             size=NARROW,
@@ -310,8 +279,7 @@ def _by_hand(scale: Scale) -> list[Experiment]:
         Experiment(
             "sharpened",
             "a press with a freshly sharpened knife",
-            first,
-            scale.clearance,
+            MotionPlan(segments=[_rest(), _press(scale.through, usual), _rest(label="hold")]),
             by_hand="sharpen the knife before the first slice",
             sharpened=True,
         ),

@@ -17,7 +17,7 @@ from sliceit_drake.cutting.foods.food import Food, make_food_model, shape_facts,
 from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid
 from sliceit_drake.cutting.motion import Motion, MotionPlan, Pose, Segment, Waypoints
 from sliceit_drake.cutting.planned_slice import PlannedSlice
-from sliceit_drake.diagnosis.experiments.designs import Experiment, Scale
+from sliceit_drake.diagnosis.experiments.designs import CLEARANCE, Experiment, Scale
 from sliceit_drake.prediction.placement import food_of, is_bare, knife_of
 from sliceit_drake.records.metadata import PHASE_LABELS, FoodFacts, NominalMotion, Phase, ToolFacts
 from sliceit_drake.records.slice_record import SliceRecord
@@ -148,7 +148,7 @@ def experiment_of_record(record: SliceRecord, setup: CalibrationSetup) -> Experi
     bare = is_bare(record)
     food = food_of(setup.food, record)
     height = _section(food, setup)[1]
-    clearance, offset = 3e-3, 0.0
+    clearance, offset = CLEARANCE, 0.0
     if facts.position is not None:
         R_WF = Rotation.from_euler("z", facts.yaw or 0.0)
         p_FK = R_WF.inv().apply(record.position[0] - np.array(facts.position))
