@@ -10,11 +10,13 @@ import ast
 import dataclasses as dc
 import importlib
 import importlib.metadata
+import inspect
 import itertools
 import pydoc
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import nbformat
 from myst_parser.parsers.sphinx_ import MystParser
@@ -22,7 +24,6 @@ from sphinx.application import Sphinx
 from sphinx.ext.autodoc.mock import mock
 from sphinx.util import logging
 
-import sliceit_drake
 from sliceit_drake.cli.main import make_parser
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -106,9 +107,6 @@ EXTENSION_POINTS = (
     "PolicySystem",
     "MotionSource",
     "Cause",
-    "CauseParameter",
-    "Scan",
-    "Effect",
 )
 """What a user subclasses, or gives and connects in place of ours."""
 GROUPS = {
@@ -118,38 +116,51 @@ GROUPS = {
     "Records": ("records",),
     "Calibration": ("calibration",),
     "Diagnosis": ("diagnosis",),
-    "Simulated bench": ("stand_in",),
     "Learning": ("learning",),
     "Robot": ("hardware", "robot_run", "emulator"),
 }
 """Names of the front door by the folder that they come from."""
 
 
+def names_of(package: str) -> dict[str, Any]:
+    """Each name that a package has beside its modules, and what it is."""
+    with mock(autodoc_mock_imports):
+        module = importlib.import_module(package)
+        return {name: getattr(module, name) for name in getattr(module, "__all__", ())}
+
+
 def front_door() -> list[str]:
-    """The names of `import sliceit_drake as sliceit`, by what they are for."""
-    groups: dict[str, list[str]] = {title: [] for title in [*GROUPS, "Extension points"]}
-    for home, names in sliceit_drake._HOME.items():
-        (title,) = (t for t, folders in GROUPS.items() if home.partition(".")[0] in folders)
-        for name in names:
-            groups["Extension points" if name in EXTENSION_POINTS else title].append(name)
+    """The names of `import sliceit_drake as sliceit`, by what they are for; modules at the end."""
+    groups: dict[str, list[str]] = {title: [] for title in [*GROUPS, "Extension points", "Modules"]}
+    for name, found in names_of(project).items():
+        if inspect.ismodule(found):
+            groups["Modules"] += [f"- ``{name}``: :py:mod:`{found.__name__}`"]
+            continue
+        folder = found.__module__.split(".")[1]
+        (title,) = (title for title, folders in GROUPS.items() if folder in folders)
+        kind = "autoclass" if inspect.isclass(found) else "autofunction"
+        title = "Extension points" if name in EXTENSION_POINTS else title
+        groups[title] += [f".. {kind}:: {project}.{name}", ""]
     lines = []
-    for title, names in groups.items():
-        lines += [title, "-" * len(title), ""]
-        for name in names:
-            is_class = name[0].isupper() and name != "MakeStation"
-            kind = "autoclass" if is_class else "autofunction"
-            lines += [f".. {kind}:: {project}.{name}", ""]
-    title = "Modules"
-    lines += [title, "-" * len(title), ""]
-    for name, home in sliceit_drake._MODULES.items():
-        lines += [f"- ``{name}``: :py:mod:`{project}.{home}`"]
+    for title, entries in groups.items():
+        lines += [title, "-" * len(title), "", *entries]
     return [*lines, ""]
+
+
+def further_names(package: str) -> list[str]:
+    """The names that a package of the front door has itself, with links to where they are."""
+    lines = [f"``sliceit.{package.removeprefix(f'{project}.')}`` has", ""]
+    for name, found in names_of(package).items():
+        is_module = inspect.ismodule(found)
+        path = found.__name__ if is_module else f"{found.__module__}.{name}"
+        lines += [f"- ``{name}``: :py:{'mod' if is_module else 'obj'}:`{path}`"]
+    return [*lines, ""] if len(lines) > 2 else []
 
 
 def package_page(package: str) -> str:
     """The docstring of a package, then each of its modules with the names of its `__all__`."""
     lines = [package, "=" * len(package), "", f".. automodule:: {package}", "   :no-members:", ""]
-    lines += front_door() if package == project else []
+    lines += front_door() if package == project else further_names(package)
     for module in modules(package):
         title = module.removeprefix(f"{package}.")
         lines += [title, "-" * len(title), "", f".. automodule:: {module}", ""]
@@ -246,10 +257,9 @@ def open_at_the_index(app: Sphinx, exception: Exception | None) -> None:
 def check_names(app: Sphinx, env) -> None:
     """Warns of a public name that no page has."""
     shown = env.get_domain("py").objects
-    for names in sliceit_drake._HOME.values():
-        for name in names:
-            if f"{project}.{name}" not in shown:
-                logging.getLogger(__name__).warning("%s is on no page", name)
+    for name, found in names_of(project).items():
+        if not inspect.ismodule(found) and f"{project}.{name}" not in shown:
+            logging.getLogger(__name__).warning("%s is on no page", name)
     for package in packages():
         for module in modules(package):
             with mock(autodoc_mock_imports):

@@ -1,6 +1,5 @@
 """`import sliceit_drake as sliceit`: its names, and what a user makes with them."""
 
-import ast
 import csv
 import importlib.util
 import inspect
@@ -21,52 +20,66 @@ from sliceit_drake.diagrams.run import prepare_run
 
 ROOT = Path(__file__).resolve().parent.parent
 COARSE = "{food: {shape: !Cylinder {rings: 2, layers: [0.0, 0.004, 0.012]}}}"
-LEARN = {"train": "stable_baselines3", "TrainingConfig": "stable_baselines3"}
+LEARN = {"train": "stable_baselines3", "learning.TrainingConfig": "stable_baselines3"}
 FILES = {"record.csv", "replay.html", "force.png", "summary.json", "scenario.yaml"}
 
 
 # --- The names.
 
 
+def with_packages() -> dict[str, object]:
+    """Names of the front door, and of its packages as PACKAGE.NAME, each with where it is found."""
+    names: dict[str, object] = dict.fromkeys(sliceit.__all__, sliceit)
+    for package in sorted(
+        set(sliceit.__all__) & {path.name for path in Path(*sliceit.__path__).iterdir()}
+    ):
+        home = getattr(sliceit, package)
+        names |= {f"{package}.{name}": home for name in home.__all__}
+    return names
+
+
+NAMES = with_packages()
+
+
 @pytest.mark.parametrize(
     "name",
     [
         pytest.param(name, marks=[pytest.mark.second_tier] if name in LEARN else [])
-        for name in sliceit.__all__
+        for name in NAMES
     ],
 )
 def test_a_name_resolves_and_its_docstring_begins_with_what_it_is(name):
     if name in LEARN and importlib.util.find_spec(LEARN[name]) is None:
         pytest.skip(f"{name} is of the extra [learn]")
-    words = inspect.getdoc(getattr(sliceit, name)) or ""
+    words = inspect.getdoc(getattr(NAMES[name], name.rpartition(".")[2])) or ""
     assert words[:1].isupper()
     assert words.split()[0] not in ("Of", "What", "How", "Which", "All", name)
     assert not words.startswith(f"{name}(")  # As a dataclass without one has.
 
 
-def test_what_is_loaded_is_what_type_checkers_see_and_nothing_else_has_a_second_path():
-    tree = ast.parse(Path(sliceit.__file__).read_text(encoding="utf-8"))
-    (block,) = (node for node in tree.body if isinstance(node, ast.If))
-    seen, modules = {}, {}
-    for node in block.body:
-        for alias in node.names:
-            if alias.asname is None:
-                seen.setdefault(node.module.removeprefix("sliceit_drake."), []).append(alias.name)
-            else:
-                path = f"{node.module}.{alias.name}".removeprefix("sliceit_drake.")
-                modules[alias.asname] = path
-    assert {home: sorted(names) for home, names in seen.items()} == {
-        home: sorted(names) for home, names in sliceit._HOME.items()
-    }
-    assert modules == sliceit._MODULES
-    names = [name for found in sliceit._HOME.values() for name in found]
-    assert sorted([*names, *modules]) == sorted(sliceit.__all__)
-    assert set(sliceit.__all__) <= set(dir(sliceit))
+def test_a_user_sees_some_forty_names_first_and_each_name_in_one_place():
+    assert 35 <= len(sliceit.__all__) <= 45
+    names = [name.rpartition(".")[2] for name in NAMES]
+    assert sorted(set(names)) == sorted(names)
+    for name, home in NAMES.items():
+        assert name.rpartition(".")[2] in dir(home)
+
+
+def test_a_name_is_found_by_import_and_by_attribute():
+    from sliceit_drake.hardware import UrClient
+    from sliceit_drake.records import preprocessing
+
+    assert UrClient is sliceit.hardware.UrClient
+    assert preprocessing is sliceit.records.preprocessing
+    names: dict = {}
+    exec("from sliceit_drake.stand_in import *", names)
+    assert names["Protocol"] is sliceit.stand_in.Protocol
 
 
 def test_a_name_that_is_not_there_is_an_attribute_error():
-    with pytest.raises(AttributeError, match="has no attribute 'simulat'"):
-        getattr(sliceit, "simulat")  # noqa: B009
+    for home in (sliceit, sliceit.hardware):
+        with pytest.raises(AttributeError, match="has no attribute 'simulat'"):
+            getattr(home, "simulat")  # noqa: B009
 
 
 def test_a_plain_session_simulates_without_a_word_of_warp():
@@ -186,7 +199,7 @@ def test_a_named_food_can_be_changed_after_it_is_loaded_and_replaced_by_another(
     knives = sliceit.load_scenario(
         sliceit.load_scenario("cucumber", {"knife_name": "nakiri"}), {"knife_name": "chef"}
     )
-    assert knives.knife == sliceit.load_knife("chef").knife
+    assert knives.knife == sliceit.cutting.load_knife("chef").knife
 
 
 # --- What is put in.

@@ -56,9 +56,7 @@ def violations(package: Path) -> list[str]:
         names = exports[module_name(file, package)]
         if names != sorted(names, key=order):
             problems.append(f"{place}: __all__ is not sorted: {sorted(names, key=order)}")
-        # The front door gives names of other modules (tests/test_front_door.py).
-        elsewhere = set() if file == package / "__init__.py" else set(names) - made_here(tree)
-        for name in sorted(elsewhere):
+        for name in sorted(set(names) - made_here(tree)):
             problems.append(f"{place}: {name} is in __all__ and made elsewhere")
         for node in definitions(tree):
             if not node.name.startswith("_") and node.name not in names:
