@@ -149,12 +149,15 @@ def front_door() -> list[str]:
 
 def further_names(package: str) -> list[str]:
     """The names that a package of the front door has itself, with links to where they are."""
-    lines = [f"``sliceit.{package.removeprefix(f'{project}.')}`` has", ""]
+    name = package.removeprefix(f"{project}.")
+    if name not in names_of(project):
+        return []
+    lines = [f"``sliceit.{name}`` has", ""]
     for name, found in names_of(package).items():
         is_module = inspect.ismodule(found)
         path = found.__name__ if is_module else f"{found.__module__}.{name}"
         lines += [f"- ``{name}``: :py:{'mod' if is_module else 'obj'}:`{path}`"]
-    return [*lines, ""] if len(lines) > 2 else []
+    return [*lines, ""]
 
 
 def package_page(package: str) -> str:
