@@ -8,10 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.mesh.cut_geometry import make_cut_geometry
 from sliceit_drake.cutting.mesh.generators import box_mesh
 from sliceit_drake.cutting.mesh.split import CutPlane
 from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh
-from sliceit_drake.cutting.model import CuttingModel, Numerics, make_cutting_model
+from sliceit_drake.cutting.model import CuttingModel, Numerics, prepare_cut
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.solver import CuttingSolver
 from studies.physics.neo_hookean import energy_density, first_piola_stress
@@ -49,9 +50,8 @@ def prepare(
     undamped = {"numerical_damping": 0.0, "local_damping": 0.0, "board_friction": 0.0}
     numerics = {"precision": "float64"} | undamped | numerics
     held = np.zeros(len(mesh.vertices), bool) if held is None else held
-    model = make_cutting_model(
-        mesh, plane, held, material, Knife(), Numerics(**numerics), up=up, board_height=board_height
-    )
+    geometry = make_cut_geometry(mesh, plane, held, up, board_height)
+    model = prepare_cut(geometry, material, Knife(), Numerics(**numerics))
     return CuttingSolver(model, substeps * model.numerics.time_step)
 
 

@@ -10,9 +10,10 @@ from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.mesh.cut_geometry import make_cut_geometry
 from sliceit_drake.cutting.mesh.split import CutPlane
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError, TetrahedralMesh
-from sliceit_drake.cutting.model import CuttingModel, Numerics, make_cutting_model
+from sliceit_drake.cutting.model import CuttingModel, Numerics, prepare_cut
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
@@ -47,14 +48,9 @@ def press(
     distance: float,
     numerics: Numerics | None = None,
 ) -> tuple[CuttingModel, SliceResult]:
-    model = make_cutting_model(
-        mesh,
-        CutPlane(np.array(point), np.array(normal), np.array([0.0, 0.0, 1.0])),
-        held,
-        Food().material,
-        Knife(),
-        numerics or Numerics(),
-    )
+    plane = CutPlane(np.array(point), np.array(normal), np.array([0.0, 0.0, 1.0]))
+    geometry = make_cut_geometry(mesh, plane, held)
+    model = prepare_cut(geometry, Food().material, Knife(), numerics or Numerics())
     plan = MotionPlan([ConstantSpeed(distance=distance, speed=0.02)])
     motion = Motion(plan, start_pose(model, clearance=5e-4))
     return model, simulate_slice(CuttingSolver(model, 2e-3), motion)
@@ -92,14 +88,9 @@ def test_corners_of_material_far_smaller_than_their_elements_do_not_invert():
 def test_true_masses_are_stable_at_the_limit_however_the_plane_cuts():
     normal, point = PLANES["tilted"]
     mesh, _, held = meshes(normal, point, 0.5)
-    limit = make_cutting_model(
-        mesh,
-        CutPlane(np.array(point), np.array(normal), np.array([0.0, 0.0, 1.0])),
-        held,
-        Food().material,
-        Knife(),
-        Numerics(),
-    ).critical_time_step
+    plane = CutPlane(np.array(point), np.array(normal), np.array([0.0, 0.0, 1.0]))
+    geometry = make_cut_geometry(mesh, plane, held)
+    limit = prepare_cut(geometry, Food().material, Knife(), Numerics()).critical_time_step
     step = 2e-3 / np.ceil(2e-3 / limit)
     model, true = press(
         mesh, held, normal, point, 0.004, Numerics(time_step=step, mass_scaling=False)

@@ -8,11 +8,12 @@ from scipy.spatial import ConvexHull
 
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.mesh.cut_geometry import make_cut_geometry
 from sliceit_drake.cutting.mesh.generators import box_mesh, cylinder_mesh, ellipsoid_mesh
 from sliceit_drake.cutting.mesh.manifold import bodies
 from sliceit_drake.cutting.mesh.split import CutPlane, split_mesh
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError, TetrahedralMesh
-from sliceit_drake.cutting.model import Numerics, make_cutting_model
+from sliceit_drake.cutting.model import Numerics, prepare_cut
 
 BODIES = ("box", "cylinder", "ellipsoid")
 PLANES = 334
@@ -111,9 +112,8 @@ def test_mass_and_weight_are_those_of_the_body(name, hold):
         height = (mesh.vertices - plane.point) @ plane.normal
         held = height < (-0.6 * np.ptp(height) / 2 if hold else -np.inf)
         up = rng.normal(size=3)
-        model = make_cutting_model(
-            mesh, plane, held, material, Knife(), Numerics(), up=up, board_height=None
-        )
+        geometry = make_cut_geometry(mesh, plane, held, up, board_height=None)
+        model = prepare_cut(geometry, material, Knife(), Numerics())
         # Elements of which every corner is held are not computed.
         computed = ~held[mesh.tetrahedra].all(1)
         volume = mesh.volumes()[computed].sum()

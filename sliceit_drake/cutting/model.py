@@ -1,7 +1,7 @@
 """One cut, prepared: geometry with parameters and the masses that are stepped."""
 
+import copy
 import dataclasses as dc
-from collections.abc import Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -9,11 +9,8 @@ import numpy as np
 from sliceit_drake.configuration import choice, quantity
 from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.cutting.foods.material import Material
-from sliceit_drake.cutting.kernels.types import PARAMETERS
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry, make_cut_geometry
-from sliceit_drake.cutting.mesh.split import CutPlane
-from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh
+from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry
 
 __all__ = [
     "GRAVITY",
@@ -21,7 +18,6 @@ __all__ = [
     "Numerics",
     "PointScales",
     "TimeStepError",
-    "make_cutting_model",
     "prepare_cut",
 ]
 
@@ -111,18 +107,126 @@ class CuttingModel(CutGeometry):
     knife: Knife
     numerics: Numerics
     point_scales: PointScales
-    true_mass: np.ndarray
-    mass: np.ndarray
-    local_damping: np.ndarray
-    weight: np.ndarray
-    toughness: np.ndarray
-    outline: np.ndarray
-    unloading: np.ndarray
-    element_volume: np.ndarray
-    relaxing: np.ndarray
-    keep: np.ndarray
-    parameters: dict[str, float]
-    critical_time_step: float
+    true_mass: np.ndarray = dc.field(init=False)
+    mass: np.ndarray = dc.field(init=False)
+    local_damping: np.ndarray = dc.field(init=False)
+    weight: np.ndarray = dc.field(init=False)
+    toughness: np.ndarray = dc.field(init=False)
+    outline: np.ndarray = dc.field(init=False)
+    unloading: np.ndarray = dc.field(init=False)
+    element_volume: np.ndarray = dc.field(init=False)
+    relaxing: np.ndarray = dc.field(init=False)
+    keep: np.ndarray = dc.field(init=False)
+    parameters: dict[str, float] = dc.field(init=False)
+    critical_time_step: float = dc.field(init=False)
+
+    def __post_init__(self) -> None:
+        material, effects, numerics = self.material, self.effects, self.numerics
+        self.true_mass = material.density * self.node_volume
+        self.weight = -GRAVITY * material.density * self.weight_volume[:, None] * self.up
+        self.toughness = material.toughness * self.point_scales.toughness
+        for part in (effects.core, effects.centre):
+            inside = part.share(self.point_distance)
+            self.toughness = self.toughness * (1.0 + (part.toughness_ratio - 1.0) * inside)
+        inside = effects.core.share(self.element_distance)
+        stiffer = effects.core.stiffness_ratio - 1.0
+        self.element_volume = self.stiff_volume * (1.0 + stiffer * inside)
+        # Never flatter than the rise of the force on the way in: a retreat must not return more
+        # energy than the advance took.
+        self.outline = self.tables.skin(effects.skin.thickness)
+        force = self.edge_forces()
+        steepest = (np.diff(force, axis=1) / self.tables.spacing).max(1)
+        self.unloading = np.maximum(force.max(1) / numerics.unloading_length, steepest)
+        self.relaxing = np.array(effects.relaxation.shares, float)
+        self.keep = np.exp(-numerics.time_step / np.array(effects.relaxation.times, float))
+        self.parameters = self._parameters()
+        self._scale_masses()
+
+    def _parameters(self) -> dict[str, float]:
+        material, effects, knife, numerics = self.material, self.effects, self.knife, self.numerics
+        scale = material.youngs_modulus / self.element_size
+        bond = numerics.bond_stiffness * scale
+        weakest = min(1.0, effects.core.toughness_ratio) * min(1.0, effects.centre.toughness_ratio)
+        weakest = max(material.toughness * weakest, 1e-12)
+        mu, lam = material.stable_neo_hookean()
+        stiffness = numerics.flank_stiffness * scale
+        flank = float((stiffness * self.point_scales.flank_stiffness) @ self.tables.area)
+        blade_need = 0.25 * (4.0 * flank + knife.lateral_stiffness)
+        step = numerics.time_step
+        return {
+            "mu": mu,
+            "lam": lam,
+            "damping_time": material.damping_time + numerics.numerical_damping * step,
+            "bond_stiffness": bond,
+            # A bond holds up to a quarter of its opening at failure, 2 R / strength, or less.
+            "strength": min(material.strength, 0.5 * float(np.sqrt(2.0 * weakest * bond))),
+            "flank_stiffness": stiffness,
+            "friction": material.friction,
+            "static_friction": material.static_friction,
+            "stribeck_velocity": material.stribeck_velocity,
+            "unloading_length": numerics.unloading_length,
+            "direction_length": numerics.direction_length,
+            "board_stiffness": numerics.board_stiffness * scale,
+            "board_friction": numerics.board_friction,
+            "board_damping_time": numerics.board_damping_time,
+            "blade_stiffness": knife.lateral_stiffness,
+            "blade_damping": knife.lateral_stiffness * knife.lateral_relaxation_time,
+            "blade_mass": max(
+                knife.lateral_mass(), blade_need * (step / numerics.stability_margin) ** 2
+            ),
+            "rate_exponent": effects.toughness_rate.exponent,
+            "reference_speed": effects.toughness_rate.reference_speed,
+            "slice_push_exponent": effects.slice_push.exponent,
+            "skin_toughness": effects.skin.toughness,
+            "adhesion": effects.adhesion.stress,
+            "flank_viscosity": effects.adhesion.viscosity,
+            "flank_exponent": effects.adhesion.exponent,
+            "flank_speed": effects.adhesion.reference_speed,
+            "initiation": effects.bluntness.grown,
+            "initiation_depth": effects.bluntness.depth,
+            "edge_share": effects.edge.share,
+        }
+
+    def _scale_masses(self) -> None:
+        """Sets the masses that are stepped, and the limit of the step.
+
+        Raises:
+            TimeStepError: The step is beyond the limit and masses are not scaled.
+        """
+        material, numerics, parameters = self.material, self.numerics, self.parameters
+        area, adhesion, step = self.tables.area, self.effects.adhesion, numerics.time_step
+        # In a layer between core and rind the stiffer of two elements sets a node's bound.
+        bulk = 0.25 * self.stiffness_bound(self.element_volume, *material.lame())
+        flank = parameters["flank_stiffness"] * self.point_scales.flank_stiffness
+        per_point = area * (2.0 * parameters["bond_stiffness"] + 2.0 * flank) + 0.5 * self.unloading
+        contact = 2.0 * parameters["board_stiffness"] * self.board_area
+        viscous = 2.0 * material.damping_time * bulk
+        dragged = adhesion.viscosity * adhesion.steepest * area
+        ends, shares = self.point_nodes.T.ravel(), np.tile(self.point_weights.T, (2, 1))
+        np.add.at(contact, ends, (per_point * shares).ravel())
+        np.add.at(viscous, ends, (dragged * shares).ravel())
+        # A step margin x is stable if stiff x^2 + viscous x <= mass; explicit damping counts twice.
+        stiff = bulk * (1.0 + 2.0 * numerics.numerical_damping) + 0.25 * contact
+        limit = _largest_step(self.true_mass, stiff, viscous)
+        sliver = self.node_volume < SLIVER * self.vertex_volume
+        setting = self.moving[~sliver[self.moving]]
+        if not len(setting):
+            setting = self.moving
+        worst = setting[int(limit[setting].argmin())]
+        self.critical_time_step = critical = numerics.stability_margin * float(limit[worst])
+        if not numerics.mass_scaling and step > critical:
+            raise TimeStepError(
+                f"numerics.time_step = {step:.3g} s is beyond the stability limit "
+                f"{critical:.3g} s, set by the node at {self.nodes[worst]} m of the cut frame "
+                f"(true mass {self.true_mass[worst]:.3g} kg, stiffness bound "
+                f"{4.0 * stiff[worst]:.3g} N/m). Give at most {0.99 * critical:.3g}, a coarser "
+                "mesh, or mass_scaling: true."
+            )
+        x = (step if numerics.mass_scaling else critical) / numerics.stability_margin
+        needed = np.maximum(self.true_mass, (stiff * x + viscous) * x)
+        self.mass = np.where(numerics.mass_scaling | sliver, needed, self.true_mass)
+        scaled = self.mass > self.true_mass
+        self.local_damping = np.where(scaled, numerics.local_damping, 0.0)
 
     @property
     def mass_ratio(self) -> float:
@@ -154,8 +258,15 @@ class CuttingModel(CutGeometry):
         )
 
     def edge_forces(self) -> np.ndarray:
-        """Greatest force of the edge at each cut point on the grid of its tables [P, G], N."""
-        return _edge_forces(self, self.effects, self.toughness, self.outline)
+        """Greatest force of the edge at each cut point on the grid of its tables [P, G], N.
+
+        Pressing, at the speed of reference.
+        """
+        tables, effects = self.tables, self.effects
+        grid = np.linspace(-tables.reach, tables.reach, tables.width.shape[1])
+        below = np.maximum(self.point_depth[:, None] + grid, 0.0)
+        work = self.toughness[:, None] + effects.bluntness.excess(below)
+        return np.asarray(work * tables.width + effects.skin.toughness * self.outline)
 
     def derive(self, **changes: Any) -> Self:
         """The same cut with another material, effects, knife, numerics or point_scales.
@@ -163,55 +274,14 @@ class CuttingModel(CutGeometry):
         Raises:
             TimeStepError: The step is beyond the limit and masses are not scaled.
         """
-        given = {
-            name: changes.pop(name, getattr(self, name))
-            for name in ("material", "effects", "knife", "numerics", "point_scales")
-        }
-        if changes:
-            raise TypeError(f"a cut has no {', '.join(changes)} to change")
-        geometry = {f.name: getattr(self, f.name) for f in dc.fields(CutGeometry)}
-        derived = type(self)(**geometry, **given, **_derived(self, **given))
-        derived.share_geometry(self)
+        unknown = changes.keys() - {"material", "effects", "knife", "numerics", "point_scales"}
+        if unknown:
+            raise TypeError(f"a cut has no {', '.join(unknown)} to change")
+        # With what was computed of the geometry.
+        derived = copy.copy(self)
+        vars(derived).update(changes)
+        derived.__post_init__()
         return derived
-
-    def share_geometry(self, other: "CuttingModel") -> None:
-        """Takes what another model of the same geometry has computed of it, which is costly."""
-        for name in ("blocks", "shape", "_gradient_products", "section_area"):
-            if name in other.__dict__:
-                self.__dict__[name] = other.__dict__[name]
-
-
-def make_cutting_model(
-    mesh: TetrahedralMesh,
-    plane: CutPlane,
-    held: np.ndarray,
-    material: Material,
-    knife: Knife,
-    numerics: Numerics,
-    effects: Effects | None = None,
-    up: Sequence[float] = (0.0, 0.0, 1.0),
-    board_height: float | None = 0.0,
-) -> CuttingModel:
-    """Splits the mesh and prepares one cut.
-
-    Args:
-        mesh: The food in F; one that no generator of ours made should pass its `check_solid`.
-        plane: The cut plane in F.
-        held: Vertices of the mesh that cannot move, mask [V].
-        material: Food.
-        knife: Knife.
-        numerics: Discretisation.
-        effects: What goes beyond the base model; None for nothing.
-        up: Opposite of gravity in F [3].
-        board_height: Height of the board's top along `up` in F, metres; None for no board.
-
-    Raises:
-        MeshError: Bad mesh, or the plane misses it.
-        TimeStepError: The step is beyond the limit and masses are not scaled.
-        ConfigurationError: Nothing can move.
-    """
-    geometry = make_cut_geometry(mesh, plane, held, up, board_height)
-    return prepare_cut(geometry, material, knife, numerics, effects)
 
 
 def prepare_cut(
@@ -221,147 +291,27 @@ def prepare_cut(
     numerics: Numerics,
     effects: Effects | None = None,
 ) -> CuttingModel:
-    """A cut of a known geometry; see `make_cutting_model`.
+    """Prepares a cut.
+
+    Args:
+        geometry: The geometry of the cut.
+        material: Food.
+        knife: Knife.
+        numerics: Discretisation.
+        effects: What goes beyond the base model; None for nothing.
 
     Raises:
         TimeStepError: The step is beyond the limit and masses are not scaled.
     """
     ones = np.ones(len(geometry.point_nodes))
-    given: dict[str, Any] = {
-        "material": material,
-        "effects": effects or Effects(),
-        "knife": knife,
-        "numerics": numerics,
-        "point_scales": PointScales(ones, ones, ones),
-    }
-    fields = {f.name: getattr(geometry, f.name) for f in dc.fields(CutGeometry)}
-    return CuttingModel(**fields, **given, **_derived(geometry, **given))
-
-
-def _derived(
-    geometry: CutGeometry,
-    material: Material,
-    effects: Effects,
-    knife: Knife,
-    numerics: Numerics,
-    point_scales: PointScales,
-) -> dict[str, Any]:
-    """The fields of `CuttingModel` after `point_scales`, which follow from the others."""
-    g, tables, step = geometry, geometry.tables, numerics.time_step
-    true_mass = material.density * g.node_volume
-    weight = -GRAVITY * material.density * g.weight_volume[:, None] * g.up
-
-    core = effects.core
-    inside = core.share(g.point_distance)
-    toughness = material.toughness * point_scales.toughness
-    toughness = toughness * (1.0 + (core.toughness_ratio - 1.0) * inside)
-    centre = effects.centre
-    inside = centre.share(g.point_distance)
-    toughness = toughness * (1.0 + (centre.toughness_ratio - 1.0) * inside)
-    inside = core.share(g.element_distance)
-    element_volume = g.stiff_volume * (1.0 + (core.stiffness_ratio - 1.0) * inside)
-
-    scale = material.youngs_modulus / g.element_size
-    # Never flatter than the rise of the force on the way in: a retreat must not return more energy
-    # than the advance took.
-    outline = tables.skin(effects.skin.thickness)
-    force = _edge_forces(g, effects, toughness, outline)
-    steepest = (np.diff(force, axis=1) / tables.spacing).max(1)
-    unloading = np.maximum(force.max(1) / numerics.unloading_length, steepest)
-    bond = numerics.bond_stiffness * scale
-    weakest = min(1.0, core.toughness_ratio) * min(1.0, centre.toughness_ratio)
-    weakest = max(material.toughness * weakest, 1e-12)
-    # A bond holds up to a quarter of its opening at failure, 2 R / strength, or less.
-    strength = min(material.strength, 0.5 * float(np.sqrt(2.0 * weakest * bond)))
-    mu, lam = material.stable_neo_hookean()
-    parameters = dict.fromkeys(PARAMETERS, 0.0) | {
-        "mu": mu,
-        "lam": lam,
-        "damping_time": material.damping_time + numerics.numerical_damping * step,
-        "bond_stiffness": bond,
-        "strength": strength,
-        "flank_stiffness": numerics.flank_stiffness * scale,
-        "friction": material.friction,
-        "static_friction": material.static_friction,
-        "stribeck_velocity": material.stribeck_velocity,
-        "unloading_length": numerics.unloading_length,
-        "direction_length": numerics.direction_length,
-        "board_stiffness": numerics.board_stiffness * scale,
-        "board_friction": numerics.board_friction,
-        "board_damping_time": numerics.board_damping_time,
-        "blade_stiffness": knife.lateral_stiffness,
-        "blade_damping": knife.lateral_stiffness * knife.lateral_relaxation_time,
-        "rate_exponent": effects.toughness_rate.exponent,
-        "reference_speed": effects.toughness_rate.reference_speed,
-        "slice_push_exponent": effects.slice_push.exponent,
-        "skin_toughness": effects.skin.toughness,
-        "adhesion": effects.adhesion.stress,
-        "flank_viscosity": effects.adhesion.viscosity,
-        "flank_exponent": effects.adhesion.exponent,
-        "flank_speed": effects.adhesion.reference_speed,
-        "initiation": effects.bluntness.grown,
-        "initiation_depth": effects.bluntness.depth,
-        "edge_share": effects.edge.share,
-    }
-
-    flank = parameters["flank_stiffness"] * point_scales.flank_stiffness
-    blade_need = 0.25 * (4.0 * float(flank @ tables.area) + knife.lateral_stiffness)
-    parameters["blade_mass"] = max(
-        knife.lateral_mass(), blade_need * (step / numerics.stability_margin) ** 2
+    return CuttingModel(
+        **{field.name: getattr(geometry, field.name) for field in dc.fields(CutGeometry)},
+        material=material,
+        effects=effects or Effects(),
+        knife=knife,
+        numerics=numerics,
+        point_scales=PointScales(ones, ones, ones),
     )
-    # In a layer between core and rind the stiffer of two elements sets a node's bound.
-    bulk = 0.25 * g.stiffness_bound(element_volume, *material.lame())
-    per_point = tables.area * (2.0 * bond + 2.0 * flank) + 0.5 * unloading
-    contact = 2.0 * parameters["board_stiffness"] * g.board_area
-    viscous = 2.0 * material.damping_time * bulk
-    dragged = effects.adhesion.viscosity * effects.adhesion.steepest * tables.area
-    for side in range(2):
-        for end in range(2):
-            node, share = g.point_nodes[:, 2 * side + end], g.point_weights[:, end]
-            np.add.at(contact, node, per_point * share)
-            np.add.at(viscous, node, dragged * share)
-    # Step dt = margin x is stable if stiff x^2 + viscous x <= mass; explicit damping counts twice.
-    stiff = bulk * (1.0 + 2.0 * numerics.numerical_damping) + 0.25 * contact
-    limit = _largest_step(true_mass, stiff, viscous)
-    sliver = g.node_volume < SLIVER * g.vertex_volume
-    setting = g.moving[~sliver[g.moving]] if not sliver[g.moving].all() else g.moving
-    worst = setting[int(limit[setting].argmin())]
-    critical = numerics.stability_margin * float(limit[worst])
-    if not numerics.mass_scaling and step > critical:
-        raise TimeStepError(
-            f"numerics.time_step = {step:.3g} s is beyond the stability limit {critical:.3g} s, "
-            f"set by the node at {g.nodes[worst]} m of the cut frame (true mass "
-            f"{true_mass[worst]:.3g} kg, stiffness bound {4.0 * stiff[worst]:.3g} N/m). Give at "
-            f"most {0.99 * critical:.3g}, a coarser mesh, or mass_scaling: true."
-        )
-    x = (step if numerics.mass_scaling else critical) / numerics.stability_margin
-    scaled = np.ones(len(g.nodes), bool) if numerics.mass_scaling else sliver
-    mass = np.where(scaled, np.maximum(true_mass, (stiff * x + viscous) * x), true_mass)
-    return {
-        "true_mass": true_mass,
-        "mass": mass,
-        "local_damping": np.where(mass > true_mass, numerics.local_damping, 0.0),
-        "weight": weight,
-        "toughness": toughness,
-        "outline": outline,
-        "unloading": unloading,
-        "element_volume": element_volume,
-        "relaxing": np.array(effects.relaxation.shares, float),
-        "keep": np.exp(-step / np.array(effects.relaxation.times, float)),
-        "parameters": parameters,
-        "critical_time_step": critical,
-    }
-
-
-def _edge_forces(
-    geometry: CutGeometry, effects: Effects, toughness: np.ndarray, outline: np.ndarray
-) -> np.ndarray:
-    """See `CuttingModel.edge_forces`; pressing, at the speed of reference."""
-    tables = geometry.tables
-    grid = np.linspace(-tables.reach, tables.reach, tables.width.shape[1])
-    below = np.maximum(geometry.point_depth[:, None] + grid, 0.0)
-    work = toughness[:, None] + effects.bluntness.excess(below)
-    return np.asarray(work * tables.width + effects.skin.toughness * outline)
 
 
 def _largest_step(mass: np.ndarray, stiff: np.ndarray, viscous: np.ndarray) -> np.ndarray:

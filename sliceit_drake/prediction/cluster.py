@@ -8,6 +8,7 @@ and what comes back is kept here, so that results are those of one process.
 """
 
 import contextlib
+import copy
 import dataclasses as dc
 import threading
 from collections.abc import Iterator, Sequence
@@ -18,7 +19,6 @@ import numpy as np
 from sliceit_drake.cluster import CONNECT, connected
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.driver import Driver
-from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.prediction.clock import Stretches
 from sliceit_drake.prediction.jobs import Executor, Job, JobResult, run_job
@@ -75,10 +75,8 @@ def _run_jobs(
 
 def _rebuilt(shared: CuttingModel, own: dict[str, Any]) -> CuttingModel:
     """The cut of a job from the one that it shares most with."""
-    fields = {f.name: getattr(shared, f.name) for f in dc.fields(shared)} | own
-    model = type(shared)(**fields)
-    if not set(own) & {f.name for f in dc.fields(CutGeometry)}:
-        model.share_geometry(shared)
+    model = copy.copy(shared)
+    vars(model).update(own)
     return model
 
 

@@ -18,9 +18,10 @@ from sliceit_drake.configuration import quantity
 from sliceit_drake.cutting.board import board_wrench, board_wrenches
 from sliceit_drake.cutting.foods.food import Food, start_pose
 from sliceit_drake.cutting.foods.shapes import Box, Cylinder
+from sliceit_drake.cutting.mesh.cut_geometry import make_cut_geometry
 from sliceit_drake.cutting.mesh.cut_surface import depth_below, distance_inside
 from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh
-from sliceit_drake.cutting.model import CuttingModel, Numerics, PointScales, make_cutting_model
+from sliceit_drake.cutting.model import CuttingModel, Numerics, PointScales, prepare_cut
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.simulate import (
     check_clear,
@@ -194,14 +195,8 @@ class FiniteElementWorld:
     def _section(self, food: Food, mesh: TetrahedralMesh) -> _Section:
         key = mesh.vertices.tobytes()
         if key not in self._cuts:
-            model = make_cutting_model(
-                mesh,
-                food.plane(),
-                food.held(mesh),
-                food.material,
-                self.protocol.knife,
-                self._numerics,
-            )
+            geometry = make_cut_geometry(mesh, food.plane(), food.held(mesh))
+            model = prepare_cut(geometry, food.material, self.protocol.knife, self._numerics)
             self._cuts[key] = _Section(model)
         return self._cuts[key]
 

@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.mesh.cut_geometry import make_cut_geometry
 from sliceit_drake.cutting.mesh.generators import box_mesh
 from sliceit_drake.cutting.mesh.split import CutPlane
 from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh
-from sliceit_drake.cutting.model import GRAVITY, Numerics, make_cutting_model
+from sliceit_drake.cutting.model import GRAVITY, Numerics, prepare_cut
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.solver import CuttingSolver
 from studies.physics.neo_hookean import first_piola_stress, small_strain_stiffness
@@ -50,7 +51,8 @@ def _uncut(
         board_friction=0.0,
         bond_stiffness=bond_stiffness,
     )
-    model = make_cutting_model(mesh, plane, held, material, Knife(), given, board_height=None)
+    geometry = make_cut_geometry(mesh, plane, held, board_height=None)
+    model = prepare_cut(geometry, material, Knife(), given)
     return CuttingSolver(model, given.time_step)
 
 

@@ -14,9 +14,10 @@ import numpy as np
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid
 from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.mesh.cut_geometry import make_cut_geometry
 from sliceit_drake.cutting.mesh.split import CutPlane
 from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh
-from sliceit_drake.cutting.model import Numerics, make_cutting_model
+from sliceit_drake.cutting.model import Numerics, prepare_cut
 from studies.figures import ORANGE, new_figure, save_figure
 from studies.physics.neo_hookean import small_strain_stiffness
 
@@ -48,7 +49,7 @@ def limits(
     mesh: TetrahedralMesh, plane: CutPlane, material: Material, names: tuple[str, ...]
 ) -> dict[str, float]:
     """Limits of the `names`: "all" terms, "bulk" alone, or the bulk and one of `TERMS`, s."""
-    free = np.zeros(len(mesh.vertices), bool)
+    geometry = make_cut_geometry(mesh, plane, held=np.zeros(len(mesh.vertices), bool))
     every = Numerics(mass_scaling=True)
     none = dc.replace(every, bond_stiffness=NONE, flank_stiffness=NONE, board_stiffness=NONE)
     soft = dc.replace(material, toughness=0.0)
@@ -62,7 +63,7 @@ def limits(
     }
     chosen = {name: cases[name] for name in names}
     return {
-        name: make_cutting_model(mesh, plane, free, m, Knife(), n).critical_time_step
+        name: prepare_cut(geometry, m, Knife(), n).critical_time_step
         for name, (n, m) in chosen.items()
     }
 

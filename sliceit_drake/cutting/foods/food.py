@@ -83,7 +83,8 @@ def make_food_model(
         refinement: Elements along an edge, relative to the food's mesh.
 
     Raises:
-        MeshError, TimeStepError, ConfigurationError: As `make_cutting_model`.
+        MeshError, ConfigurationError: As `make_cut_geometry`.
+        TimeStepError: The step is beyond the limit and masses are not scaled.
     """
     geometry = make_food_geometry(food, refinement)
     return prepare_cut(geometry, food.material, knife, numerics, food.effects)
@@ -97,7 +98,7 @@ def make_food_geometry(food: Food, refinement: float = 1.0) -> CutGeometry:
         refinement: Elements along an edge, relative to the food's mesh.
 
     Raises:
-        MeshError, ConfigurationError: As `make_cutting_model`.
+        MeshError, ConfigurationError: As `make_cut_geometry`.
     """
     mesh = food.shape.mesh(refinement)
     where = f"food.shape of {food.name}"

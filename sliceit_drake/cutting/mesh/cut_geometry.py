@@ -167,7 +167,7 @@ def make_cut_geometry(
     """Splits the mesh and prepares what follows from the geometry alone.
 
     Args:
-        mesh: The food in F.
+        mesh: The food in F; one that no generator of ours made should pass its `check_solid`.
         plane: The cut plane in F.
         held: Vertices of the mesh that cannot move, mask [V].
         up: Opposite of gravity in F [3].
