@@ -7,7 +7,7 @@ from pydrake.systems.analysis import Simulator
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.randomize import randomize
 from sliceit_drake.diagrams.scenario import load_scenario
-from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
+from sliceit_drake.diagrams.scenario_diagram import ScenarioDiagram
 from sliceit_drake.learning.task import RandomizationConfig, TaskConfig, make_agent_station
 from sliceit_drake.systems.agent import AgentConfig, AgentSystem
 from sliceit_drake.systems.exported_network import LAYOUT, layout_of
@@ -69,7 +69,7 @@ def test_a_scenario_with_a_network_runs_as_its_network_decides(tmp_path):
     weights[5] = 0.0  # It always presses.
     bias = np.array([0.2, -0.4, 0.1, 0.3, 0.0, 9.0])
     network = network_of(tmp_path / "policy.onnx", bias, weights)
-    diagram = MakeScenarioDiagram(scenario_of(tmp_path, network))
+    diagram = ScenarioDiagram(scenario_of(tmp_path, network))
     assert isinstance(diagram.policy, AgentSystem)
     simulator = Simulator(diagram)
     context = simulator.get_mutable_context()
@@ -92,7 +92,7 @@ def test_a_scenario_with_a_network_runs_as_its_network_decides(tmp_path):
 def test_a_network_of_another_observation_is_refused(tmp_path):
     network = network_of(tmp_path / "policy.onnx", config=AgentConfig(history=12))
     with pytest.raises(ConfigurationError, match="observes 55 numbers.* 28") as caught:
-        MakeScenarioDiagram(scenario_of(tmp_path, network))
+        ScenarioDiagram(scenario_of(tmp_path, network))
     assert caught.value.field == "scenario.policy.network"
     assert "training.yaml" in caught.value.fix
 
@@ -101,14 +101,14 @@ def test_a_network_of_another_pace_is_refused(tmp_path):
     slow = AgentConfig(history=3, period=0.1)
     network = network_of(tmp_path / "policy.onnx", config=slow)
     with pytest.raises(ConfigurationError, match="has period 0.1, the scenario's agent 0.05"):
-        MakeScenarioDiagram(scenario_of(tmp_path, network))
+        ScenarioDiagram(scenario_of(tmp_path, network))
 
 
 def test_a_network_whose_actions_meant_something_else_is_refused(tmp_path):
     theirs = AgentConfig(history=3, mapping="upper")
     network = network_of(tmp_path / "policy.onnx", config=theirs)
     with pytest.raises(ConfigurationError, match="has mapping upper, the scenario's agent whole"):
-        MakeScenarioDiagram(scenario_of(tmp_path, network))
+        ScenarioDiagram(scenario_of(tmp_path, network))
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_a_network_whose_actions_meant_something_else_is_refused(tmp_path):
 def test_a_network_without_a_layout_is_refused(tmp_path, layout, problem):
     file = write_network(tmp_path / "policy.onnx", np.zeros((6, 28)), np.zeros(6), layout)
     with pytest.raises(ConfigurationError, match=problem) as caught:
-        MakeScenarioDiagram(scenario_of(tmp_path, file))
+        ScenarioDiagram(scenario_of(tmp_path, file))
     assert caught.value.field == "scenario.policy.network"
 
 
@@ -125,7 +125,7 @@ def test_a_network_without_a_layout_is_refused(tmp_path, layout, problem):
 def test_a_network_that_says_another_layout_than_it_has_is_refused(tmp_path, shape):
     network = network_of(tmp_path / "policy.onnx", np.zeros(shape[0]), np.zeros(shape))
     with pytest.raises(ConfigurationError, match="none that decides"):
-        MakeScenarioDiagram(scenario_of(tmp_path, network))
+        ScenarioDiagram(scenario_of(tmp_path, network))
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_a_network_that_says_another_layout_than_it_has_is_refused(tmp_path, sha
 def test_what_is_no_network_is_refused(tmp_path, monkeypatch, name, problem):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigurationError, match=problem) as caught:
-        MakeScenarioDiagram(scenario_of(tmp_path, name))
+        ScenarioDiagram(scenario_of(tmp_path, name))
     assert caught.value.field == "scenario.policy.network"
     assert "policy.onnx" in caught.value.fix
 
@@ -143,14 +143,14 @@ def test_what_is_no_network_is_refused(tmp_path, monkeypatch, name, problem):
 def test_an_agent_needs_parallel_control(tmp_path):
     network = network_of(tmp_path / "policy.onnx")
     with pytest.raises(ConfigurationError, match="'motion'.*parallel") as caught:
-        MakeScenarioDiagram(scenario_of(tmp_path, network, mode="motion"))
+        ScenarioDiagram(scenario_of(tmp_path, network, mode="motion"))
     assert caught.value.field == "scenario.controller.mode"
 
 
 def test_an_agent_starts_as_high_as_it_says(tmp_path):
     network = network_of(tmp_path / "policy.onnx")
     with pytest.raises(ConfigurationError, match=r"0\.0500 m; the start is 0\.0370 m") as caught:
-        MakeScenarioDiagram(scenario_of(tmp_path, network, descent=0.05))
+        ScenarioDiagram(scenario_of(tmp_path, network, descent=0.05))
     assert caught.value.field == "scenario.policy.descent"
     assert "0.0370" in caught.value.fix
 

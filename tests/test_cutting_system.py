@@ -221,11 +221,11 @@ def test_foods_of_different_meshes_take_turns_in_one_context(diagram, solvers):
 
 def test_a_new_food_has_no_past():
     from sliceit_drake.diagrams.scenario import load_scenario
-    from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
+    from sliceit_drake.diagrams.scenario_diagram import ScenarioDiagram
     from sliceit_drake.resources import resource_path
 
     small = "{food: {shape: !Cylinder {rings: 2, layers: [0.0, 0.004, 0.012]}}}"
-    diagram = MakeScenarioDiagram(load_scenario(resource_path("scenarios/cucumber.yaml"), small))
+    diagram = ScenarioDiagram(load_scenario(resource_path("scenarios/cucumber.yaml"), small))
     simulator = Simulator(diagram)
     diagram.SetStart(simulator.get_mutable_context())
     simulator.AdvanceTo(0.8)

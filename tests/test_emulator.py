@@ -13,7 +13,7 @@ from pydrake.systems.analysis import Simulator
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.plant.robot_plant import RobotConfig
 from sliceit_drake.diagrams.scenario import load_scenario
-from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
+from sliceit_drake.diagrams.scenario_diagram import ScenarioDiagram
 from sliceit_drake.emulator.control_script import COMMAND_NAMES, ControlScript
 from sliceit_drake.emulator.controller import ControllerConfig
 from sliceit_drake.emulator.emulator import ControllerClock, Emulator
@@ -717,7 +717,7 @@ def test_the_emulated_station_moves_as_the_simulated_one_under_the_same_commands
     scenario = load_scenario(
         resource_path("scenarios/cucumber_spring.yaml"), "{start: {clearance: 0.001}}"
     )
-    diagram = MakeScenarioDiagram(scenario)
+    diagram = ScenarioDiagram(scenario)
     station = diagram.station
     simulator = Simulator(diagram)
     diagram.SetStart(simulator.get_mutable_context())

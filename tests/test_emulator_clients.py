@@ -18,7 +18,7 @@ from urpy.rtde import rtde as universal_robots
 
 from sliceit_drake.cli.main import main
 from sliceit_drake.diagrams.scenario import load_scenario
-from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
+from sliceit_drake.diagrams.scenario_diagram import ScenarioDiagram
 from sliceit_drake.emulator.kinematics import forward
 from sliceit_drake.emulator.process import EmulatorError, EmulatorProcess
 from sliceit_drake.emulator.robot_model import CYCLE, START
@@ -268,7 +268,7 @@ def test_in_lockstep_a_run_is_the_same_every_time_however_slow_the_client():
 
 def commands_and_record(scenario, cycles):
     """What the simulated station commands, and its joints and force in the robot's base."""
-    diagram = MakeScenarioDiagram(scenario)
+    diagram = ScenarioDiagram(scenario)
     simulator = Simulator(diagram)
     diagram.SetStart(simulator.get_mutable_context())
     simulator.Initialize()

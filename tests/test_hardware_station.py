@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from fake_robot import FakeRobot
 from fake_station import CONFIG, PACE, spring_scenario
+from station_contract import check_station_ports
 
 from sliceit_drake.cli.hardware import robot_of
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.hardware_station import RobotConnection
 from sliceit_drake.diagrams.outputs.slice_record_of_run import slice_record_of
-from sliceit_drake.diagrams.ports import check_station_ports
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.hardware.checks import check_facts, check_start
 from sliceit_drake.hardware.hardware_config import (

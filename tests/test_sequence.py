@@ -12,7 +12,7 @@ from sliceit_drake.diagrams.outputs.sequence_report import slice_reports
 from sliceit_drake.diagrams.plant.holder_arm import FINGERTIPS, HoldingArm
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
-from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
+from sliceit_drake.diagrams.scenario_diagram import ScenarioDiagram
 from sliceit_drake.diagrams.sequence import SliceSequence
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.cutting_system import COMPLETE
@@ -110,7 +110,7 @@ def test_the_energy_balance_runs_on_over_the_slices_and_closes(by_knife):
 
 def test_a_sequence_repeats_bit_for_bit_and_its_clone_goes_on_identically(by_knife):
     _, record = by_knife
-    diagram = MakeScenarioDiagram(scenario())
+    diagram = ScenarioDiagram(scenario())
     station, cutting = diagram.station, diagram.station.cutting
 
     def food(simulator: Simulator) -> np.ndarray:
@@ -204,7 +204,7 @@ def test_remainder_has_its_next_cut_at_y_0_and_all_of_the_body_behind_it():
 def test_holding_arm_grips_the_food_and_adds_no_joints_to_the_plant():
     held = scenario()
     held.holder = "arm"
-    station = MakeScenarioDiagram(held).station
+    station = ScenarioDiagram(held).station
     assert station.plant.num_velocities() == 6
     X_WF, grip = held.X_WF(), np.array([0.0, 0.02, 0.008])
     arm = HoldingArm(X_WF, grip)

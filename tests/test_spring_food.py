@@ -9,12 +9,12 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.math import SpatialVelocity
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
+from station_contract import check_station_ports
 
 from sliceit_drake.configuration import ConfigurationError, validate
 from sliceit_drake.cutting.foods.spring_food import SpringFood, calibrate_spring
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
-from sliceit_drake.diagrams.ports import check_station_ports
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.diagrams.station import MakeStation

@@ -5,11 +5,12 @@ import pytest
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
+from station_contract import check_station_ports
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan, Retract
 from sliceit_drake.diagrams.outputs.run_log import Record
-from sliceit_drake.diagrams.ports import STATION_PORTS, check_station_ports, ports_as_markdown
+from sliceit_drake.diagrams.ports import STATION_PORTS, ports_as_markdown
 from sliceit_drake.diagrams.run import Run, prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.station import MakeStation

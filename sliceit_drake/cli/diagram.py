@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> int:
         print(ports_as_markdown())
         return 0
 
-    from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
+    from sliceit_drake.diagrams.scenario_diagram import ScenarioDiagram
 
     kind = options.output.suffix.lstrip(".")
     dot = shutil.which("dot")
@@ -53,7 +53,7 @@ def run(options: argparse.Namespace) -> int:
             field="--output",
             fix="Install Graphviz (Debian: apt install graphviz), or give a .dot file.",
         )
-    text = MakeScenarioDiagram(scenario_of(options)).GetGraphvizString(options.depth)
+    text = ScenarioDiagram(scenario_of(options)).GetGraphvizString(options.depth)
     options.output.parent.mkdir(parents=True, exist_ok=True)
     if kind == "dot" or dot is None:
         options.output.write_text(text, encoding="utf-8")

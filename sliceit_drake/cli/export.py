@@ -33,18 +33,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Runs the command."""
-    from sliceit_drake.diagrams.outputs.paraview import write_series
-    from sliceit_drake.diagrams.outputs.run_again import run_again
+    from sliceit_drake.diagrams.outputs.paraview import run_again, write_series
 
     folder = options.folder
     with StageBars(bar_format=SIMULATED_TIME) as bars:
-        again = run_again(folder, options.fps, functools.partial(bars.show, folder.name))
-    if not again.agrees:
+        show = functools.partial(bars.show, folder.name)
+        frames, difference = run_again(folder, options.fps, show)
+    if difference is not None:
         print(
-            f"This run differs from the record by up to {again.difference:.3g} N: it was made by"
+            f"This run differs from the record by up to {difference:.3g} N: it was made by"
             " another version or on another machine. The series is of this run."
         )
     output = options.output or folder / "paraview"
-    files = write_series(again.frames, output, options.format)
-    print(f"{len(again.frames)} frames. Open in ParaView: {', '.join(map(str, files))}")
+    files = write_series(frames, output, options.format)
+    print(f"{len(frames)} frames. Open in ParaView: {', '.join(map(str, files))}")
     return 0

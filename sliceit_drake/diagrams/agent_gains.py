@@ -1,13 +1,10 @@
 """The gains that the SliceIt! agent chooses from, and the factor on its error."""
 
 import dataclasses as dc
-import itertools
-
-import numpy as np
 
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
 
-__all__ = ["ERROR_FACTOR", "AgentGains", "agent_box"]
+__all__ = ["ERROR_FACTOR", "AgentGains"]
 
 ERROR_FACTOR = 0.1
 """Factor on the agent's error scale, the same in simulation and on hardware (docs/control.md)."""
@@ -40,20 +37,3 @@ class AgentGains:
             p_gains=[0.2, 0.2, self.p_z, 2.0, self.p_ry, 2.0],
             selection=[1.0, 1.0, 0.5, 1.0, 0.5, 1.0],
         )
-
-
-_LOW = AgentGains(1000.0, 40.0, 0.02, 0.2, 1.5)
-_HIGH = AgentGains(10000.0, 200.0, 0.1, 3.0, 2.5)
-
-
-def agent_box(interior: int = 0, seed: int = 0) -> list[AgentGains]:
-    """The 32 corners of the agent's box, lowest first and highest last, then points within.
-
-    Args:
-        interior: How many random points within.
-        seed: Of those.
-    """
-    low, high = (np.array(dc.astuple(gains)) for gains in (_LOW, _HIGH))
-    corners = itertools.product(*zip(low, high, strict=True))
-    inside = np.random.default_rng(seed).uniform(low, high, (interior, len(low)))
-    return [AgentGains(*map(float, point)) for point in [*corners, *inside]]

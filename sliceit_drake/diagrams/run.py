@@ -31,11 +31,7 @@ from sliceit_drake.diagrams.outputs.sequence_report import plot_sequence, slice_
 from sliceit_drake.diagrams.outputs.snapshot import Snapshot, take_snapshot
 from sliceit_drake.diagrams.prepared_food import OwnCutting
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
-from sliceit_drake.diagrams.scenario_diagram import (
-    MakeScenarioDiagram,
-    OwnPolicy,
-    ScenarioDiagram,
-)
+from sliceit_drake.diagrams.scenario_diagram import OwnPolicy, ScenarioDiagram
 from sliceit_drake.diagrams.stability.contact_margin import ContactMargin, check_contact_margin
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.diagrams.station_interface import OwnController, Station
@@ -236,7 +232,7 @@ def prepare_run(
         scenario: What to simulate.
         meshcat: Viewer to draw and to record in, or None.
         policy: A configuration, which takes the place of the scenario's motion; or a policy of your
-            own, see `MakeScenarioDiagram`.
+            own, see `ScenarioDiagram`.
         cutting, controller: See `MakeStation`.
 
     Raises:
@@ -248,7 +244,7 @@ def prepare_run(
         policy = None
     profile = measured_profile(scenario)
     station = MakeStation(scenario, meshcat, cutting=cutting, controller=controller)
-    diagram = MakeScenarioDiagram(scenario, station=station, policy=policy)
+    diagram = ScenarioDiagram(scenario, station=station, policy=policy)
     margin = check_contact_margin(station) if controller is None else None
     simulator = Simulator(diagram)
     diagram.SetStart(simulator.get_mutable_context())

@@ -28,7 +28,7 @@ from sliceit_drake.systems.exported_network import load_network
 from sliceit_drake.systems.motion_sources import MotionSource, placed_motion
 from sliceit_drake.systems.policy import Policy, PolicyConfig, PolicySystem
 
-__all__ = ["MakeScenarioDiagram", "OwnPolicy", "ScenarioDiagram"]
+__all__ = ["OwnPolicy", "ScenarioDiagram"]
 
 OwnPolicy: TypeAlias = LeafSystem | Callable[[Station], LeafSystem] | Policy
 """A user's own source of targets: a system, what makes one for a station, or what decides."""
@@ -39,6 +39,17 @@ CLEAR_OF_BOARD = 2e-4
 
 class ScenarioDiagram(Diagram):
     """A station driven by its scenario's motion or policy, with a log of all ports.
+
+    Args:
+        scenario: What to simulate.
+        meshcat: Viewer to draw in, or None.
+        station: What to drive; None for a simulated station of the scenario.
+        policy: Drives the station in place of the scenario's motion or policy: a system with an
+            output port `target_pose`, what makes such a system for a station, or an object that
+            decides (`Policy`). Its ports are connected with those of the station by their names.
+
+    Raises:
+        ConfigurationError, MeshError, TimeStepError: The scenario cannot be built.
 
     Attributes:
         station: The slicing station, simulated or hardware.
@@ -153,25 +164,3 @@ def _connect_by_name(
     for name, port in driving.items():
         builder.Connect(port, station.GetInputPort(name))
     return driving
-
-
-def MakeScenarioDiagram(
-    scenario: Scenario,
-    meshcat: Meshcat | None = None,
-    station: Station | None = None,
-    policy: OwnPolicy | None = None,
-) -> ScenarioDiagram:
-    """The diagram of a scenario, ready for a Simulator.
-
-    Args:
-        scenario: What to simulate.
-        meshcat: Viewer to draw in, or None.
-        station: What to drive; None for a simulated station of the scenario.
-        policy: Drives the station in place of the scenario's motion or policy: a system with an
-            output port `target_pose`, what makes such a system for a station, or an object that
-            decides (`Policy`). Its ports are connected with those of the station by their names.
-
-    Raises:
-        ConfigurationError, MeshError, TimeStepError: The scenario cannot be built.
-    """
-    return ScenarioDiagram(scenario, meshcat, station, policy)

@@ -20,7 +20,7 @@ from sliceit_drake.diagrams.hardware_station import (
 )
 from sliceit_drake.diagrams.run import Run, measured_profile
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
+from sliceit_drake.diagrams.scenario_diagram import ScenarioDiagram
 from sliceit_drake.diagrams.simulated_station import FRAMES_PER_SECOND, SimulatedStation
 from sliceit_drake.diagrams.stability.contact_margin import check_contact_margin
 from sliceit_drake.diagrams.station import MakeStation
@@ -147,7 +147,7 @@ class HardwareRun:
         return self.run
 
     def _prepare(self, station: HardwareStation) -> Run:
-        diagram = MakeScenarioDiagram(self.scenario, None, station)
+        diagram = ScenarioDiagram(self.scenario, None, station)
         simulator = Simulator(diagram)
         diagram.SetStart(simulator.get_mutable_context())
         margin = check_contact_margin(self.twin)

@@ -21,10 +21,10 @@ from pydrake.systems.primitives import LogVectorOutput
 from tqdm import tqdm
 
 from sliceit_drake.cutting.board import Board
-from sliceit_drake.diagrams.agent_gains import AgentGains, agent_box
+from sliceit_drake.diagrams.agent_gains import AgentGains
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.simulated_station import SimulatedStation
-from sliceit_drake.diagrams.stability.contact_loop import ContactLoop, directional_stiffness
+from sliceit_drake.diagrams.stability.contact_loop import ContactLoop
 from sliceit_drake.diagrams.stability.contact_margin import board_stiffness
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
@@ -33,12 +33,14 @@ from sliceit_drake.systems.knife_force import KnifeForceSystem
 from sliceit_drake.systems.servo import ServoConfig
 from studies.figures import BLUE, GREEN, ORANGE, PURPLE, RED, new_figure, save_figure
 from studies.pages import publish, table
+from studies.robot.stiffness_limit import directional_stiffness, stiffness_limit
 
 __all__ = [
     "BoxRun",
     "Check",
     "FactorRow",
     "add_arguments",
+    "agent_box",
     "box_table",
     "check_on_station",
     "check_table",
@@ -53,6 +55,8 @@ __all__ = [
     "with_lag",
 ]
 
+AGENT_LOW = AgentGains(1000.0, 40.0, 0.02, 0.2, 1.5)
+AGENT_HIGH = AgentGains(10000.0, 200.0, 0.1, 3.0, 2.5)
 VERTICAL = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 FOOD_STIFFNESS = (4e3, 5e3)
 BOARD_STIFFNESS = (1e5, 1e6)
@@ -159,7 +163,7 @@ def stability_limits(
         # Only what the loop reads of the scenario differs, not the station's systems.
         station.scenario = scenario
         loop = ContactLoop(station, tracking="arm" if lag > 0.0 else "ideal")
-        limits.append(loop.stiffness_limit(VERTICAL, on_board=on_board))
+        limits.append(stiffness_limit(loop, VERTICAL, on_board=on_board))
     return np.array(limits)
 
 
@@ -336,6 +340,19 @@ def run_in_contact(
     return BoxRun(gains, factor, contact, peak, stopped, context.get_time())
 
 
+def agent_box(interior: int = 0, seed: int = 0) -> list[AgentGains]:
+    """The 32 corners of the agent's box, lowest first and highest last, then points within.
+
+    Args:
+        interior: How many random points within.
+        seed: Of those.
+    """
+    low, high = (np.array(dc.astuple(gains)) for gains in (AGENT_LOW, AGENT_HIGH))
+    corners = itertools.product(*zip(low, high, strict=True))
+    inside = np.random.default_rng(seed).uniform(low, high, (interior, len(low)))
+    return [AgentGains(*map(float, point)) for point in [*corners, *inside]]
+
+
 def _approach_time(loop: ContactLoop) -> float:
     """Time in which a vertical error falls to 1/e in free air, s; infinite if it grows."""
     if not loop.least_stable_mode().stable:
@@ -397,7 +414,7 @@ def factor_row(factor: float, lag: float, tracking: str = "arm") -> FactorRow:
         stable = [loop.least_stable_mode(*c).stable for c in ((), (food,), on_board)]
         unstable += ~np.array(stable)
         if stable[0]:
-            limit = min(limit, loop.stiffness_limit(VERTICAL))
+            limit = min(limit, stiffness_limit(loop, VERTICAL))
     low, middle, high = (_approach_time(loop_of(g)) for g in (box[0], AgentGains(), box[-1]))
     counts = (int(unstable[0]), int(unstable[1]), int(unstable[2]))
     return FactorRow(factor, lag, tracking, counts, limit, (low, middle, high))

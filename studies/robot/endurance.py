@@ -23,7 +23,7 @@ from sliceit_drake.cutting.motion import Motion, MotionPlan, PressAndDraw
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
-from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
+from sliceit_drake.diagrams.scenario_diagram import ScenarioDiagram
 from sliceit_drake.resources import resource_path
 from studies.pages import publish, render
 
@@ -54,7 +54,7 @@ def growth(hours: np.ndarray, held: np.ndarray) -> float:
 
 def station_slices(scenario: Scenario) -> Callable[[], None]:
     """Cuts into the food with one station, in a new context, whenever it is called."""
-    diagram = MakeScenarioDiagram(scenario)
+    diagram = ScenarioDiagram(scenario)
     simulator = Simulator(diagram)
 
     def cut() -> None:
@@ -104,10 +104,10 @@ def run(options: argparse.Namespace) -> int:
             rows.append(((time.monotonic() - begin) / 3600.0, memory()))
     hours, held = np.array(rows).T
     slope = growth(hours, held)
-    MakeScenarioDiagram(scenario)
+    ScenarioDiagram(scenario)
     before = memory()
     for _ in range(BUILT):
-        MakeScenarioDiagram(scenario)
+        ScenarioDiagram(scenario)
     built = (memory() - before) / BUILT
     page = render(
         "endurance",

@@ -16,7 +16,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.plant.robot_plant import add_plant, add_robot, connect_arm_controller
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
-from sliceit_drake.diagrams.scenario_diagram import MakeScenarioDiagram
+from sliceit_drake.diagrams.scenario_diagram import ScenarioDiagram
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.cutting_system import CuttingSystem
 from studies.results import add_json_argument, write_results
@@ -44,7 +44,7 @@ def station_times(scenario: Scenario) -> tuple[float, float, int]:
 
     for name in calls:
         setattr(CuttingSolver, name, timed(name))
-    diagram = MakeScenarioDiagram(scenario)
+    diagram = ScenarioDiagram(scenario)
     simulator = Simulator(diagram)
     diagram.SetStart(simulator.get_mutable_context())
     simulator.AdvanceTo(WARM_UP)

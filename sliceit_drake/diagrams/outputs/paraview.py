@@ -5,11 +5,10 @@ run.advance()
 write_series(frames, Path("output/cucumber/paraview"))
 """
 
-import dataclasses as dc
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import meshio
 import numpy as np
@@ -17,16 +16,17 @@ from pydrake.systems.framework import Context, EventStatus
 from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.diagrams.outputs.run_log import Record
 from sliceit_drake.diagrams.plant.knife_body import blade_surface
-from sliceit_drake.diagrams.run import Run
+from sliceit_drake.diagrams.run import Run, prepare_run
+from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.systems.cut_report import FoodBodyFrame
+from sliceit_drake.tables import read_columns
 
-__all__ = ["FORMATS", "FoodFrames", "write_series"]
+__all__ = ["FoodFrames", "run_again", "write_series"]
 
-FORMATS = ("vtu", "xdmf")
-
-WRENCHES = ("food", "board", "sensor")
+AGREES = 1e-6
+"""Difference of the force from the record's up to which the run is the same, N, or as a fraction of
+a peak above 1 N: the record is printed with eight digits."""
 
 
 class FoodFrames:
@@ -41,12 +41,17 @@ class FoodFrames:
 
     Raises:
         ConfigurationError: The food has no body, or the rate is not positive.
+
+    Attributes:
+        run: The run.
+        times: Times of the frames [n], s.
+        bodies: Bodies of the food, one a frame.
     """
 
     def __init__(self, run: Run, rate: float) -> None:
         self.run = run
-        self._times: list[float] = []
-        self._bodies: list[FoodBodyFrame] = []
+        self.times: list[float] = []
+        self.bodies: list[FoodBodyFrame] = []
         if self._body(run.simulator.get_context()) is None:
             raise ConfigurationError(
                 "this food has no body to show; one of finite elements has",
@@ -69,31 +74,17 @@ class FoodFrames:
         if time >= len(self) * self._period - 1e-9:
             body = self._body(root)
             assert body is not None
-            self._times.append(time)
-            self._bodies.append(body)
+            self.times.append(time)
+            self.bodies.append(body)
         return EventStatus.DidNothing()
 
-    def end(self, time: float) -> None:
-        """Drops the frames after a time, s."""
-        while self._times and self._times[-1] > time + 1e-9:
-            self._times.pop()
-            self._bodies.pop()
-
     def __len__(self) -> int:
-        return len(self._times)
-
-    @property
-    def times(self) -> np.ndarray:
-        """Times of the frames [n], s."""
-        return np.array(self._times)
-
-    @property
-    def bodies(self) -> list[FoodBodyFrame]:
-        """Bodies of the food, one a frame."""
-        return self._bodies
+        return len(self.times)
 
 
-def write_series(frames: FoodFrames, directory: Path, kind: str = "vtu") -> list[Path]:
+def write_series(
+    frames: FoodFrames, directory: Path, kind: Literal["vtu", "xdmf"] = "vtu"
+) -> list[Path]:
     """Writes what was kept, after the run.
 
     The series are `food` (tetrahedra of both halves; at the corners `displacement`, m, `damage`, 0
@@ -111,13 +102,9 @@ def write_series(frames: FoodFrames, directory: Path, kind: str = "vtu") -> list
         The files to open.
 
     Raises:
-        ConfigurationError: There is no such kind; in an XDMF file the mesh cannot change, as it
-            does from slice to slice of a sequence.
+        ConfigurationError: In an XDMF file the mesh cannot change, as it does from slice to slice
+            of a sequence.
     """
-    if kind not in FORMATS:
-        raise ConfigurationError(
-            f"{kind!r} is no format", field="--format", fix=f"Give one of {', '.join(FORMATS)}."
-        )
     if kind == "xdmf" and len({body.food for body in frames.bodies}) > 1:
         raise ConfigurationError(
             "the mesh changes from slice to slice, which an XDMF series cannot hold",
@@ -125,86 +112,65 @@ def write_series(frames: FoodFrames, directory: Path, kind: str = "vtu") -> list
             fix="Give vtu.",
         )
     # Whether the very end of a run is logged depends on how its time is rounded.
-    frames.end(float(frames.run.record()["time"][-1]))
+    end = float(frames.run.record()["time"][-1]) + 1e-9
+    count = int(np.searchsorted(frames.times, end, side="right"))
+    del frames.times[count:], frames.bodies[count:]
     directory.mkdir(parents=True, exist_ok=True)
     return (_write_vtu if kind == "vtu" else _write_xdmf)(frames, directory)
 
 
-@dc.dataclass
-class _Part:
-    """A mesh of one frame: corners now and at rest [V, 3], cells, and values at the corners."""
-
-    points: np.ndarray
-    rest: np.ndarray
-    cells: dict[str, np.ndarray]
-    values: dict[str, np.ndarray]
-
-
-class _Parts:
-    """The parts of a frame by name."""
-
-    def __init__(self, frames: FoodFrames) -> None:
-        self._frames = frames
-        self._record: Record = frames.run.record()
-        blade = blade_surface(frames.run.scenario.knife)
-        self._blade = np.array(blade.vertices())
-        self._triangles = np.array(
-            [[t.vertex(i) for i in range(3)] for t in blade.triangles()], dtype=np.int64
-        )
-
-    def of(self, k: int) -> Mapping[str, _Part]:
-        """Those of frame k."""
-        body, time = self._frames.bodies[k], self._frames.times[k]
-        row = int(np.abs(self._record["time"] - time).argmin())
-        X_WK, first = self._pose(row), self._pose(0)
-        origin = X_WK[:, 3][None]
-        return {
-            "food": _Part(
+def _meshes(frames: FoodFrames) -> Iterator[dict[str, meshio.Mesh]]:
+    """Food, knife and force at each frame."""
+    record = frames.run.record()
+    p_WK = record.vector("knife_pose_p")
+    quaternions = record.vector("knife_pose_quat", "wxyz")
+    R_WK = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
+    wrenches = {
+        f"{name}_{what}": record.vector(f"{name}_wrench_{letter}")
+        for name in ("food", "board", "sensor")
+        for what, letter in (("force", "f"), ("moment", "m"))
+    }
+    surface = blade_surface(frames.run.scenario.knife)
+    vertices = np.array(surface.vertices())
+    triangles = np.array([[t.vertex(i) for i in range(3)] for t in surface.triangles()])
+    rest = vertices @ R_WK[0].T + p_WK[0]
+    for time, body in zip(frames.times, frames.bodies, strict=True):
+        row = int(np.abs(record["time"] - time).argmin())
+        R, p = R_WK[row], p_WK[row]
+        yield {
+            "food": _mesh(
                 body.points,
                 body.rest,
                 {"tetra": body.tetrahedra},
-                {
-                    "damage": body.damage,
-                    "side": body.side.astype(float),
-                    "food": np.full(len(body.points), float(body.food)),
-                },
+                damage=body.damage,
+                side=body.side.astype(float),
+                food=np.full(len(body.points), float(body.food)),
             ),
-            "knife": _Part(
-                self._blade @ X_WK[:, :3].T + X_WK[:, 3],
-                self._blade @ first[:, :3].T + first[:, 3],
-                {"triangle": self._triangles},
-                {},
-            ),
-            "force": _Part(
-                origin,
-                first[:, 3][None],
+            "knife": _mesh(vertices @ R.T + p, rest, {"triangle": triangles}),
+            "force": _mesh(
+                p[None],
+                p_WK[:1],
                 {"vertex": np.zeros((1, 1), dtype=np.int64)},
-                {
-                    f"{name}_{what}": self._record.vector(f"{name}_wrench_{letter}")[row][None]
-                    for name in WRENCHES
-                    for what, letter in (("force", "f"), ("moment", "m"))
-                }
-                | {"K_x": X_WK[:, 0][None], "K_z": X_WK[:, 2][None]},
+                **{name: values[row][None] for name, values in wrenches.items()},
+                K_x=R[:, 0][None],
+                K_z=R[:, 2][None],
             ),
         }
 
-    def _pose(self, row: int) -> np.ndarray:
-        """X_WK [3, 4] of a row of the record."""
-        names = [f"knife_pose_quat_{a}" for a in "wxyz"]
-        quaternion = [self._record[name][row] for name in names]
-        R = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
-        return np.column_stack([R, self._record.vector("knife_pose_p")[row]])
+
+def _mesh(
+    points: np.ndarray, rest: np.ndarray, cells: dict[str, np.ndarray], **values: np.ndarray
+) -> meshio.Mesh:
+    return meshio.Mesh(points, cells, point_data={"displacement": points - rest} | values)
 
 
 def _write_vtu(frames: FoodFrames, directory: Path) -> list[Path]:
     root = ET.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
     collection = ET.SubElement(root, "Collection")
-    parts = _Parts(frames)
-    for k, time in enumerate(frames.times):
-        for number, (name, part) in enumerate(parts.of(k).items()):
+    for k, (time, meshes) in enumerate(zip(frames.times, _meshes(frames), strict=True)):
+        for number, (name, mesh) in enumerate(meshes.items()):
             file = directory / f"{name}_{k:04d}.vtu"
-            values = {"displacement": part.points - part.rest} | part.values
-            meshio.Mesh(part.points, part.cells, point_data=values).write(file)
+            mesh.write(file)
             ET.SubElement(
                 collection,
                 "DataSet",
@@ -220,17 +186,56 @@ def _write_vtu(frames: FoodFrames, directory: Path) -> list[Path]:
 
 
 def _write_xdmf(frames: FoodFrames, directory: Path) -> list[Path]:
-    parts = _Parts(frames)
-    shown = [parts.of(k) for k in range(len(frames))]
+    shown = list(_meshes(frames))
     files = []
     for name, first in shown[0].items():
         files.append(directory / f"{name}.xdmf")
         # As text: HDF5 would need another package, and raw files lie where the program runs.
         writer: Any = meshio.xdmf.TimeSeriesWriter(files[-1], data_format="XML")
         with writer:
-            writer.write_points_cells(first.rest, list(first.cells.items()))
-            for time, frame in zip(frames.times.tolist(), shown, strict=True):
-                part = frame[name]
-                values = {"displacement": part.points - part.rest} | part.values
-                writer.write_data(time, point_data=values)
+            # The knife is at rest in the first frame.
+            rest = frames.bodies[0].rest if name == "food" else first.points
+            writer.write_points_cells(rest, first.cells)
+            for time, meshes in zip(frames.times, shown, strict=True):
+                writer.write_data(time, point_data=meshes[name].point_data)
     return files
+
+
+def run_again(
+    folder: Path, fps: float, progress: Callable[[float, float], None] | None = None
+) -> tuple[FoodFrames, float | None]:
+    """Simulates the scenario of a saved run for as long as its record is.
+
+    Args:
+        folder: Folder of the run, with scenario.yaml and record.csv.
+        fps: Frames a second.
+        progress: Called with the simulated time and the duration, s.
+
+    Returns:
+        Shapes of the food, and the greatest difference of its vertical force from the record, N;
+        None where the run is that of the record.
+
+    Raises:
+        ConfigurationError: The folder is not of a run, or the scenario cannot start.
+    """
+    for name in ("scenario.yaml", "record.csv"):
+        if not (folder / name).is_file():
+            raise ConfigurationError(
+                f"there is no {name}",
+                source=str(folder),
+                fix="Give the folder that `sliceit simulate --output FOLDER` wrote.",
+            )
+    kept = read_columns(folder / "record.csv", ["time", "food_wrench_f_z"])
+    run = prepare_run(load_scenario(folder / "scenario.yaml"))
+    frames, duration = FoodFrames(run, fps), float(kept["time"][-1])
+
+    def show(time: float, _: float) -> None:
+        if progress is not None:
+            progress(time, duration)
+
+    run.advance(duration, show)
+    force = run.record()["food_wrench_f_z"]
+    count = min(len(force), len(kept["time"]))
+    difference = float(np.abs(force[:count] - kept["food_wrench_f_z"][:count]).max())
+    agrees = difference <= AGREES * max(1.0, float(np.abs(force).max()))
+    return frames, None if agrees else difference

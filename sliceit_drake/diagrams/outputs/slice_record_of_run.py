@@ -45,7 +45,7 @@ def slice_record_of(
     """
     table, scenario = run.record(), run.scenario
     time, p = table["time"], table.vector("knife_pose_p")
-    quaternion = np.column_stack([table[f"knife_pose_quat_{a}"] for a in "wxyz"])
+    quaternion = table.vector("knife_pose_quat", "wxyz")
     R_WK = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
     X_KS = scenario.robot.X_TK().inverse()  # The sensor has the flange's frame.
     R_WS = R_WK @ X_KS.rotation().matrix()

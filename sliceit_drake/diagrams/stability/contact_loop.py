@@ -38,11 +38,10 @@ from sliceit_drake.systems.compliance_controller import (
 from sliceit_drake.systems.servo import JOINTS
 from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
 
-__all__ = ["ContactLoop", "Mode", "directional_stiffness"]
+__all__ = ["ContactLoop", "Mode"]
 
 # Eigenvalues of free drift are 1 up to rounding; a growth of 1e-6 a cycle takes 2,000 s for e.
 NEUTRAL = 1e-6
-GREATEST_STIFFNESS = 1e7
 GREATEST_MARGIN = 20.0
 
 # The state: q, v, q_d, v_d, integral, command, virtual velocity, error, reading, food's wrench;
@@ -69,45 +68,33 @@ class Mode:
         return self.growth <= 1.0 + NEUTRAL
 
 
-def directional_stiffness(direction: Sequence[float], stiffness: float) -> np.ndarray:
-    """A spring [6, 6] that resists motion along one direction [6], translations first."""
-    d = np.asarray(direction, float)
-    return stiffness * np.outer(d, d)
-
-
 class ContactLoop:
     """The linear loop of a station at its start, for contacts to be put into it.
 
     Attributes:
         period: Duration of a cycle, s: the least common multiple of coupling step and controller
             period.
-        mobility: J M^-1 J^T of the arm with rotors and tool [6, 6], 1/kg, 1/(kg m), 1/(kg m2).
-        virtual_mobility: The same of the controller's virtual model.
+        virtual_mobility: J H^-1 J^T of the virtual model [6, 6], 1/kg, 1/(kg m), 1/(kg m2).
     """
 
-    def __init__(
-        self, station: SimulatedStation, *, tracking: str = "arm", joints: Sequence[float] = ()
-    ) -> None:
-        """Linearises a station about rest.
+    def __init__(self, station: SimulatedStation, *, tracking: str = "arm") -> None:
+        """Linearises a station about rest at its start.
 
         Args:
             station: Its scenario's controller gives mode and gains.
             tracking: "arm" as the station is; "servo" for an arm that follows the servo and yields
                 to no force; "ideal" for one that reaches each command at the plant's next step.
-            joints: Where [6], rad; empty for the station's start.
         """
         scenario = station.scenario
         self._config = scenario.controller
         self._tracking = tracking
-        q = np.asarray(joints, float) if len(joints) else station.start_joints
-        plant, robot = station.plant, station.robot
+        plant, robot, q = station.plant, station.robot, station.start_joints
         context = plant.CreateDefaultContext()
         plant.SetPositions(context, robot.arm, q)
         K, W = robot.knife.body_frame(), plant.world_frame()
         J = plant.CalcJacobianSpatialVelocity(context, JacobianWrtVariable.kV, K, np.zeros(3), W, W)
         self._J = _swap(J)
         self._M = plant.CalcMassMatrix(context)
-        self.mobility = self._J @ np.linalg.solve(self._M, self._J.T)
 
         R_WK = plant.EvalBodyPoseInWorld(context, robot.knife).rotation().matrix()
         inertia = plant.CalcSpatialInertia(context, K, _tool_bodies(station, robot))
@@ -218,32 +205,6 @@ class ContactLoop:
             middle = 0.5 * (low + high)
             low, high = (middle, high) if stable(middle) else (low, middle)
         return low
-
-    def stiffness_limit(self, direction: Sequence[float], *, on_board: bool = False) -> float:
-        """Stiffness of a spring along a direction [6] above which the loop is unstable, N/m.
-
-        Args:
-            direction: Translations first, in W.
-            on_board: Whether the spring is in the plant instead of beyond the coupling step.
-        """
-        if not self.least_stable_mode().stable:
-            return 0.0
-        low = 100.0
-
-        def stable(stiffness: float) -> bool:
-            K = directional_stiffness(direction, stiffness)
-            mode = self.least_stable_mode(None, K) if on_board else self.least_stable_mode(K)
-            return mode.stable
-
-        # Upwards in small steps: a loop can be unstable in a window of stiffness alone.
-        while low < GREATEST_STIFFNESS and stable(high := 1.3 * low):
-            low = high
-        if low >= GREATEST_STIFFNESS:
-            return GREATEST_STIFFNESS
-        while high > 1.01 * low:
-            middle = np.sqrt(low * high)
-            low, high = (middle, high) if stable(middle) else (low, middle)
-        return float(np.sqrt(low * high))
 
     def cycle(
         self, response: np.ndarray | None = None, board: np.ndarray | None = None
