@@ -20,9 +20,13 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.systems.compliance_controller import (
     ComplianceController,
     ComplianceControllerConfig,
-    make_virtual_model,
 )
-from sliceit_drake.systems.ur5e_kinematics import ChainJoint, KinematicChain, ur5e_chain
+from sliceit_drake.systems.ur5e_kinematics import (
+    ChainJoint,
+    KinematicChain,
+    make_virtual_model,
+    ur5e_chain,
+)
 
 DATA = Path(__file__).resolve().parent / "data" / "fdcc"
 Q0 = np.array([1.3524, -1.5555, 1.7697, -1.7785, -1.5644, 1.3493])

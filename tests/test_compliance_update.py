@@ -12,10 +12,14 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from sliceit_drake.systems.compliance_controller import (
     ComplianceController,
     ComplianceControllerConfig,
-    make_virtual_model,
+    ComplianceUpdate,
 )
-from sliceit_drake.systems.compliance_update import ComplianceLaw, ComplianceUpdate
-from sliceit_drake.systems.ur5e_kinematics import ChainJoint, KinematicChain, ur5e_chain
+from sliceit_drake.systems.ur5e_kinematics import (
+    ChainJoint,
+    KinematicChain,
+    make_virtual_model,
+    ur5e_chain,
+)
 
 LINK_MASS = 0.3
 FORCE_LAW = ComplianceControllerConfig(
@@ -72,19 +76,8 @@ def test_an_arm_of_any_joints_moves_as_its_multibody_plant_does(joints, end_effe
 
 
 def motion_room():
-    law = ComplianceLaw(
-        chain=ur5e_chain(RigidTransform([0.0, 0.0, 0.15])),
-        mass=np.array([0.1] * 6 + [1.0]),
-        moment=np.array([1e-6] * 6 + [1.0]),
-        R_EC=np.eye(3),
-        mode="motion",
-        iterations=3,
-        time_step=0.02,
-        damping_factor=0.9,
-        threshold=1e-6,
-        hand_frame_control=False,
-    )
-    return ComplianceUpdate(law)
+    config = ComplianceControllerConfig(mode="motion", iterations=3, link_mass=0.1)
+    return ComplianceUpdate(config, ur5e_chain(RigidTransform([0.0, 0.0, 0.15])), np.eye(3))
 
 
 Q0 = np.array([1.3524, -1.5555, 1.7697, -1.7785, -1.5644, 1.3493])

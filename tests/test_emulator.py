@@ -35,8 +35,7 @@ from sliceit_drake.emulator.station_robot import StationRobot
 from sliceit_drake.emulator.variables import INPUTS, OUTPUTS, TYPES
 from sliceit_drake.hardware.hardware_config import load_hardware_config
 from sliceit_drake.resources import resource_path
-from sliceit_drake.systems.compliance_controller import make_virtual_model
-from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
+from sliceit_drake.systems.ur5e_kinematics import make_virtual_model, ur5e_chain
 
 # Bytes.
 

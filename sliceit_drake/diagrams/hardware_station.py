@@ -1,22 +1,16 @@
 """The hardware station: the ports of the simulated one, with a real robot behind them."""
 
 import dataclasses as dc
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-from pydrake.common.value import AbstractValue, Value
+from pydrake.common.value import Value
 from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce, SpatialVelocity
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiagramBuilder,
-    DiscreteValues,
-    ValueProducer,
-)
+from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues
 from pydrake.systems.primitives import ConstantVectorSource
 
 from sliceit_drake.configuration import ConfigurationError
@@ -33,6 +27,7 @@ from sliceit_drake.hardware.rtde_system import RtdeSystem
 from sliceit_drake.hardware.safety import SafetyLayer
 from sliceit_drake.systems.contact_monitor import ContactMonitor
 from sliceit_drake.systems.cut_report import ReportingSystem
+from sliceit_drake.systems.declare import declare_cached, declare_output
 from sliceit_drake.systems.servo import JOINTS
 
 __all__ = [
@@ -81,50 +76,33 @@ class KnifeEstimate(ReportingSystem):
             "sensor_wrench", Value(SpatialForce.Zero())
         )
         # Scratch paper, as in the compliance controller: every use overwrites it first.
-        self._scratch = self.DeclareCacheEntry(
-            "model",
-            ValueProducer(
-                allocate=lambda: Value(object()),
-                calc=lambda context, value: value.set_value(plant.CreateDefaultContext()),
-            ),
-            {self.nothing_ticket()},
+        self._scratch = declare_cached(
+            self, "model", lambda context: plant.CreateDefaultContext(), {self.nothing_ticket()}
         )
-        self._declare("knife_pose", RigidTransform(), self._calc_pose, {q.ticket()})
-        self._declare(
-            "knife_velocity", SpatialVelocity.Zero(), self._calc_velocity, {q.ticket(), qd.ticket()}
-        )
-        contact = {q.ticket(), wrench.ticket()}
-        self._declare("food_wrench", SpatialForce.Zero(), self._contact, contact)
-        self._declare("board_wrench", SpatialForce.Zero(), lambda _: SpatialForce.Zero(), set())
-        self.DeclareVectorOutputPort("food_wrench_vector", 6, self._calc_vector, contact)
+        moving, contact = {q.ticket(), qd.ticket()}, {q.ticket(), wrench.ticket()}
         self._deepest = self.DeclareDiscreteState(1)
-        self.DeclareVectorOutputPort(
-            "cut_progress",
-            1,
-            self._calc_progress,
-            {q.ticket(), self.discrete_state_ticket(self._deepest)},
-        )
+        deepest = {q.ticket(), self.discrete_state_ticket(self._deepest)}
+        nothing, no_force = {self.nothing_ticket()}, SpatialForce.Zero()
+        for name, example, calc, prerequisites in (
+            ("knife_pose", Value(RigidTransform()), self._pose, {q.ticket()}),
+            ("knife_velocity", Value(SpatialVelocity.Zero()), self._velocity, moving),
+            ("food_wrench", Value(no_force), self._contact, contact),
+            ("board_wrench", Value(no_force), lambda context: no_force, nothing),
+            ("food_wrench_vector", 6, lambda context: self._contact(context).get_coeffs(), contact),
+            ("cut_progress", 1, lambda context: [self._progress(context)], deepest),
+        ):
+            declare_output(self, name, example, calc, prerequisites)
         self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, 0.0, self._update)
-
-    def _declare(
-        self, name: str, example: object, calc: Callable[[Context], object], depends: set
-    ) -> None:
-        def set_output(context: Context, output: AbstractValue) -> None:
-            output.set_value(calc(context))
-
-        self.DeclareAbstractOutputPort(
-            name, lambda: Value(example), set_output, depends or {self.nothing_ticket()}
-        )
 
     def _model(self, context: Context) -> Context:
         scratch = self._scratch.Eval(context)
         self._plant.SetPositions(scratch, self._q.Eval(context))
         return scratch
 
-    def _calc_pose(self, context: Context) -> RigidTransform:
+    def _pose(self, context: Context) -> RigidTransform:
         return self._plant.EvalBodyPoseInWorld(self._model(context), self._knife)
 
-    def _calc_velocity(self, context: Context) -> SpatialVelocity:
+    def _velocity(self, context: Context) -> SpatialVelocity:
         scratch = self._model(context)
         self._plant.SetVelocities(scratch, self._qd.Eval(context))
         return self._plant.EvalBodySpatialVelocityInWorld(scratch, self._knife)
@@ -138,19 +116,13 @@ class KnifeEstimate(ReportingSystem):
         moment = R @ wrench.rotational() + np.cross(X_WS.translation() - p_WK, force)
         return SpatialForce(moment, force)
 
-    def _calc_vector(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._contact(context).get_coeffs())
-
     def _progress(self, context: Context) -> float:
-        depth = self._top - self._calc_pose(context).translation()[2]
+        depth = self._top - self._pose(context).translation()[2]
         deepest = context.get_discrete_state(self._deepest).value()[0]
         return max(float(deepest), min(1.0, depth / (self._top - self._board)))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._deepest, [self._progress(context)])
-
-    def _calc_progress(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._progress(context))
 
 
 @dc.dataclass

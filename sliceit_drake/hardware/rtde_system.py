@@ -1,7 +1,6 @@
 """The robot as a Drake system: measured joints and wrench out, joint targets in."""
 
 import time as clock
-from collections.abc import Callable
 
 import numpy as np
 from pydrake.common.value import AbstractValue, Value
@@ -15,10 +14,16 @@ from sliceit_drake.hardware.safety import Stop
 __all__ = ["RtdeSystem"]
 
 _JOINTS = 6
-# Parts of the state.
-_Q, _QD, _WRENCH = slice(0, 6), slice(6, 12), slice(12, 18)
-_TIME, _PERIOD, _LATENESS, _ARRIVAL, _LATCHED, _MISSED = range(18, 24)
-_SIZE = 24
+# Parts of the state that are outputs, and how many numbers they have.
+_SHOWN = {
+    "joint_positions": _JOINTS,
+    "joint_velocities": _JOINTS,
+    "wrench_vector": 6,
+    "period": 1,
+    "lateness": 1,
+    "missed_cycles": 1,
+    "latched": 1,
+}
 
 
 class RtdeSystem(LeafSystem):
@@ -52,33 +57,22 @@ class RtdeSystem(LeafSystem):
         super().__init__()
         self._link, self._pace = link, pace
         self._command = self.DeclareVectorInputPort("joint_positions_command", _JOINTS)
-        self._state = self.DeclareDiscreteState(_SIZE)
-        self._reason = self.DeclareAbstractState(Value(""))
-        depends = {self.discrete_state_ticket(self._state)}
-        for name, part in (("joint_positions", _Q), ("joint_velocities", _QD)):
-            self.DeclareVectorOutputPort(name, _JOINTS, self._copier(part), depends)
+        self._parts = {
+            name: self.DeclareDiscreteState(size)
+            for name, size in (_SHOWN | {"time": 1, "arrival": 1}).items()
+        }
+        for name in _SHOWN:
+            self.DeclareStateOutputPort(name, self._parts[name])
         self.DeclareAbstractOutputPort(
-            "sensor_wrench", lambda: Value(SpatialForce.Zero()), self._calc_wrench, depends
+            "sensor_wrench",
+            lambda: Value(SpatialForce.Zero()),
+            self._calc_wrench,
+            {self.discrete_state_ticket(self._parts["wrench_vector"])},
         )
-        self.DeclareVectorOutputPort("wrench_vector", 6, self._copier(_WRENCH), depends)
-        for name, index in (
-            ("period", _PERIOD),
-            ("lateness", _LATENESS),
-            ("missed_cycles", _MISSED),
-            ("latched", _LATCHED),
-        ):
-            part = slice(index, index + 1)
-            self.DeclareVectorOutputPort(name, 1, self._copier(part), depends)
         age = self.DeclareVectorOutputPort("age", 1, self._calc_age, {self.all_sources_ticket()})
         age.disable_caching_by_default()
-        self.DeclareAbstractOutputPort(
-            "stop_reason",
-            lambda: Value(""),
-            lambda context, output: output.set_value(
-                context.get_abstract_state(int(self._reason)).get_value()
-            ),
-            {self.abstract_state_ticket(self._reason)},
-        )
+        self._reason = self.DeclareAbstractState(Value(""))
+        self.DeclareStateOutputPort("stop_reason", self._reason)
 
     def receive(self, context: Context, status: LinkStatus | None = None) -> Stop | None:
         """Puts a measurement into the system's own context.
@@ -92,35 +86,36 @@ class RtdeSystem(LeafSystem):
         """
         status = status or self._link.latest()
         state = status.state
-        x = context.get_mutable_discrete_state_vector().get_mutable_value()
-        x[_Q], x[_QD] = state.q, state.qd
         pose = flange_pose(state.q)
         R_TB = np.array(pose[:9]).reshape(3, 3)  # The rotation's columns are its rows.
         force, torque = R_TB @ state.wrench[:3], R_TB @ state.wrench[3:]
-        x[_WRENCH] = np.concatenate([torque, force])
-        x[_TIME], x[_PERIOD], x[_LATENESS] = state.time, status.period, status.lateness
-        x[_ARRIVAL], x[_MISSED] = status.arrival, status.missed
-        if status.stop is not None and not x[_LATCHED]:
+        if status.stop is not None and not self._value(context, "latched")[0]:
             context.get_mutable_abstract_state(int(self._reason)).set_value(str(status.stop))
-        x[_LATCHED] = float(status.stop is not None)
+        for name, value in {
+            "joint_positions": state.q,
+            "joint_velocities": state.qd,
+            "wrench_vector": np.concatenate([torque, force]),
+            "period": [status.period],
+            "lateness": [status.lateness],
+            "missed_cycles": [status.missed],
+            "latched": [status.stop is not None],
+            "time": [state.time],
+            "arrival": [status.arrival],
+        }.items():
+            context.SetDiscreteState(self._parts[name], value)
         return status.stop
 
     def send(self, context: Context) -> None:
         """Hands the target at the input port to the link, as the answer to the measurement."""
-        x = context.get_discrete_state_vector().value()
-        self._link.put(self._command.Eval(context).tolist(), float(x[_TIME]))
+        time = float(self._value(context, "time")[0])
+        self._link.put(self._command.Eval(context).tolist(), time)
 
-    @staticmethod
-    def _copier(part: slice) -> Callable[[Context, BasicVector], None]:
-        def calc(context: Context, output: BasicVector) -> None:
-            output.SetFromVector(context.get_discrete_state_vector().value()[part])
-
-        return calc
+    def _value(self, context: Context, part: str) -> np.ndarray:
+        return context.get_discrete_state(self._parts[part]).value()
 
     def _calc_wrench(self, context: Context, output: AbstractValue) -> None:
-        wrench = context.get_discrete_state_vector().value()[_WRENCH]
-        output.set_value(SpatialForce(wrench[:3], wrench[3:]))
+        output.set_value(SpatialForce(self._value(context, "wrench_vector")))
 
     def _calc_age(self, context: Context, output: BasicVector) -> None:
-        arrival = context.get_discrete_state_vector().value()[_ARRIVAL]
+        arrival = self._value(context, "arrival")[0]
         output.SetAtIndex(0, (clock.perf_counter() - arrival) * self._pace)

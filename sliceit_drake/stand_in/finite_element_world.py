@@ -23,11 +23,7 @@ from sliceit_drake.cutting.mesh.cut_surface import depth_below, distance_inside
 from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh
 from sliceit_drake.cutting.model import CuttingModel, Numerics, PointScales, prepare_cut
 from sliceit_drake.cutting.motion import Pose
-from sliceit_drake.cutting.simulate import (
-    check_clear,
-    check_energies,
-    check_in_plane,
-)
+from sliceit_drake.cutting.simulate import check_clear, check_energies, check_in_plane
 from sliceit_drake.cutting.solver import CuttingSolver, SurfaceFactors
 from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceTruth, Tissue
 from sliceit_drake.stand_in.protocol import Protocol, Specimen, scaled_food, section_size

@@ -25,20 +25,14 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 
 import numpy as np
-from pydrake.common.value import AbstractValue, Value
+from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteStateIndex,
-    DiscreteValues,
-    LeafSystem,
-    ValueProducer,
-)
+from pydrake.systems.framework import Context, DiscreteStateIndex, DiscreteValues, LeafSystem
 
 from sliceit_drake.configuration import ConfigurationError, choice, quantity
 from sliceit_drake.cutting.motion import MotionPlan
+from sliceit_drake.systems.declare import declare_cached, declare_output
 from sliceit_drake.systems.envelope import envelope, envelope_time
 
 __all__ = ["ACTIONS", "ERROR", "AgentConfig", "AgentSystem", "Decide", "observation_names"]
@@ -240,18 +234,14 @@ class AgentSystem(LeafSystem):
         held = {self.discrete_state_ticket(each) for each in (self._place, self._lift_time)}
         moving = held | {self.time_ticket()}
         # Until the knife is lifted the target moves at decisions alone, but is read far more often.
-        self._waiting = self.DeclareCacheEntry(
+        self._waiting = declare_cached(
+            self,
             "target until the lift",
-            ValueProducer(
-                allocate=lambda: Value(object()),
-                calc=lambda context, value: value.set_value(self._target_until_lift(context)),
-            ),
+            lambda context: None if self.is_done(context) else self._pose_there(context),
             held,
         )
-        self.DeclareAbstractOutputPort(
-            "target_pose", lambda: Value(RigidTransform()), self._calc_target_pose, moving
-        )
-        self.DeclareVectorOutputPort("target_offset", 2, self._calc_offset, moving)
+        declare_output(self, "target_pose", Value(RigidTransform()), self._target_pose, moving)
+        declare_output(self, "target_offset", 2, self._target, moving)
         for name, state in (
             ("stiffness", self._stiffness),
             ("p_gains", self._p_gains),
@@ -265,7 +255,7 @@ class AgentSystem(LeafSystem):
             ("error", 3, self._error),
             ("wrench", 3, lambda context: self._history(context).mean(axis=0)),
         ):
-            self.DeclareVectorOutputPort(name, size, self._setter(calc), seen)
+            declare_output(self, name, size, calc, seen)
 
     def observe(self, context: Context) -> np.ndarray:
         """The observation in this context, float64."""
@@ -380,21 +370,8 @@ class AgentSystem(LeafSystem):
         return np.array([place[0], max(place[1] - risen, 0.0)])
 
     def _target_pose(self, context: Context) -> RigidTransform:
+        return self._waiting.Eval(context) or self._pose_there(context)
+
+    def _pose_there(self, context: Context) -> RigidTransform:
         x, z = self._target(context)
         return self._X_WK @ RigidTransform([x, 0.0, z])
-
-    def _target_until_lift(self, context: Context) -> RigidTransform | None:
-        return None if self.is_done(context) else self._target_pose(context)
-
-    def _calc_target_pose(self, context: Context, output: AbstractValue) -> None:
-        waiting = self._waiting.Eval(context)
-        output.set_value(self._target_pose(context) if waiting is None else waiting)
-
-    def _calc_offset(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._target(context))
-
-    @staticmethod
-    def _setter(
-        calc: Callable[[Context], np.ndarray],
-    ) -> Callable[[Context, BasicVector], None]:
-        return lambda context, output: output.SetFromVector(calc(context))

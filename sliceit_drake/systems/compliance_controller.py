@@ -11,46 +11,28 @@ part and whose second is the rotational one, so that a change of axes is one pro
 v_B = v_C @ R_BC.T.
 """
 
+import copy
 import dataclasses as dc
-from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
-from pydrake.common.value import AbstractValue, Value
+import warp as wp
+from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import (
-    FixedOffsetFrame,
-    RevoluteJoint,
-    SpatialInertia,
-    UnitInertia,
-)
-from pydrake.systems.framework import (
-    CacheEntry,
-    Context,
-    DependencyTicket,
-    DiscreteValues,
-    LeafSystem,
-    ValueProducer,
-)
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from sliceit_drake.configuration import ConfigurationError, choice, quantity, validate
-from sliceit_drake.systems.compliance_kernel import MODES
-from sliceit_drake.systems.compliance_update import (
-    ComplianceLaw,
-    ComplianceUpdate,
-    load_kernels,
-)
-from sliceit_drake.systems.ur5e_kinematics import KinematicChain
+from sliceit_drake.configuration import choice, quantity, validate
+from sliceit_drake.cutting.warp_start import start_warp
+from sliceit_drake.cutting.workspace import LAUNCH_LOCK
+from sliceit_drake.systems.compliance_kernel import MODES, mat34d, place_arm, update_arm
+from sliceit_drake.systems.declare import declare_cached, declare_output
+from sliceit_drake.systems.ur5e_kinematics import KinematicChain, virtual_bodies
+from sliceit_drake.systems.wrench_sensor import wrench_shift
 
-__all__ = ["ComplianceController", "ComplianceControllerConfig", "make_virtual_model"]
+__all__ = ["ComplianceController", "ComplianceControllerConfig", "ComplianceUpdate"]
 
-_END_EFFECTOR = "end_effector"
-
-# Virtual mass [kg] and moment of inertia [kg m2] of the end effector, moment of inertia of a link.
-_END_EFFECTOR_MASS = 1.0
-_END_EFFECTOR_INERTIA = 1.0
-_LINK_INERTIA = 1e-6
+_CPU = "cpu"
 
 # Threshold of KDL (orocos_kinematics_dynamics, frames.cpp): shorter vectors count as zero, and
 # rotation matrices whose opposite elements differ by less count as symmetric.
@@ -99,74 +81,112 @@ class ComplianceControllerConfig:
     axes of the base B. The default is that of the SliceIt! agent."""
 
 
-def make_virtual_model(chain: KinematicChain, link_mass: float) -> MultibodyPlant:
-    """Makes the arm that FDCC moves instead of the real one.
+def _load_kernels() -> None:
+    """Compiles the kernels, once a machine, and loads them, once a process."""
+    with LAUNCH_LOCK:
+        start_warp()
+        wp.load_module(update_arm.module, device=_CPU)
 
-    A point-like mass sits at the origin of every link that a joint moves, and 1 kg with 1 kg m2
-    about every axis at the end effector. There is no gravity. If the last link is itself the end
-    effector, it has the end effector's inertia alone.
+
+class ComplianceUpdate:
+    """Room for one update at a time: fill in inputs and state, `run`, read the state.
+
+    A call takes nothing from the calls before it. A deep copy is a new room for the same law.
+    Pairs of vectors have the translational one first and are in the axes of the arm's base B if
+    nothing else is said.
 
     Args:
-        chain: The arm; its base B is the plant's world frame.
-        link_mass: Mass [kg] of each moving link.
+        config: Mode and steps of the law; the values for input ports are not read.
+        chain: The arm of n joints.
+        R_EC: Rotation of the compliance reference C in the end effector E [3, 3].
 
-    Returns:
-        The finalized plant, one position [rad] per joint, with a body named ``end_effector``.
-
-    Raises:
-        ConfigurationError: If the chain has no joints, or a joint's limits are the wrong way round.
+    Attributes:
+        measured: Input: measured joint positions [n], rad.
+        target: Input: target pose X_BE [3, 4]; not used in force mode.
+        sensor_wrench: Input: about Co in C [2, 3]; not used in motion mode.
+        settings: Input: stiffness in C, selection, P gains times the error scale, D gains times the
+            error scale over the time step, target wrench [5, 2, 3].
+        q: State: joint positions of the virtual model [n], rad.
+        v: State: their velocities [n], rad per virtual second.
+        error: State: net force, or pose error in motion mode [2, 3].
+        u: The scaled error of the last step [2, 3].
     """
-    _check(chain)
-    plant = MultibodyPlant(0.0)
-    plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, 0.0])
-    parent = plant.world_body()
-    end_effector_inertia = _inertia(_END_EFFECTOR_MASS, _END_EFFECTOR_INERTIA)
-    for index, joint in enumerate(chain.joints):
-        is_end_effector = chain.X_LE is None and index == len(chain.joints) - 1
-        link = plant.AddRigidBody(
-            _END_EFFECTOR if is_end_effector else joint.name,
-            end_effector_inertia if is_end_effector else _inertia(link_mass, _LINK_INERTIA),
-        )
-        mount = FixedOffsetFrame(f"{joint.name}_mount", parent.body_frame(), joint.X_PL)
-        plant.AddJoint(
-            RevoluteJoint(
-                f"{joint.name}_joint", plant.AddFrame(mount), link.body_frame(), [0.0, 0.0, 1.0]
-            )
-        )
-        parent = link
-    if chain.X_LE is not None:
-        end_effector = plant.AddRigidBody(_END_EFFECTOR, end_effector_inertia)
-        plant.WeldFrames(parent.body_frame(), end_effector.body_frame(), chain.X_LE)
-    plant.Finalize()
-    return plant
 
+    def __init__(
+        self, config: ComplianceControllerConfig, chain: KinematicChain, R_EC: np.ndarray
+    ) -> None:
+        self._law = config, chain, R_EC
+        n = len(chain.joints)
+        self.measured, self.q, self.v = np.zeros((3, n))
+        self.target, self.settings = np.zeros((3, 4)), np.zeros((5, 2, 3))
+        self.sensor_wrench, self.error, self.u = np.zeros((3, 2, 3))
+        self._R_BL, self._p_BL = np.zeros((n + 1, 3, 3)), np.zeros((n + 1, 3))
+        self._failed = np.zeros(1, np.int32)
+        _load_kernels()
+        # What is launched during a capture in another thread would be taken for part of it.
+        with LAUNCH_LOCK:
+            self._capture(config, chain, R_EC)
 
-def _inertia(mass: float, moment: float) -> SpatialInertia:
-    """Returns the inertia of a body with equal moments [kg m2] about its origin."""
-    return SpatialInertia(mass, np.zeros(3), UnitInertia.TriaxiallySymmetric(moment / mass))
+    def __deepcopy__(self, memo: dict[int, Any]) -> "ComplianceUpdate":
+        return ComplianceUpdate(*self._law)
 
+    def run(self) -> bool:
+        """Advances the state by one update.
 
-def _check(chain: KinematicChain) -> None:
-    if not chain.joints:
-        raise ConfigurationError("the chain has no joints", field="chain.joints", fix="Give one.")
-    for index, joint in enumerate(chain.joints):
-        if not joint.lower <= joint.upper:
-            raise ConfigurationError(
-                f"the limits of {joint.name} are [{joint.lower:.6g}, {joint.upper:.6g}] rad",
-                field=f"chain.joints[{index}]",
-                fix="Give lower <= upper.",
-            )
+        Returns:
+            Whether all accelerations were finite; if not, q and u are those of the step that gave
+            one that was not.
+        """
+        wp.capture_launch(self._update)
+        return not self._failed[0]
 
+    def place(self) -> np.ndarray:
+        """Pose X_BE at q [3, 4]."""
+        wp.capture_launch(self._place)
+        return np.column_stack([self._R_BL[-1], self._p_BL[-1]])
 
-def _bodies(chain: KinematicChain, link_mass: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns masses [kg] and moments of inertia [kg m2] of the links and the end effector."""
-    n = len(chain.joints)
-    mass = np.array([link_mass] * n + [_END_EFFECTOR_MASS])
-    moment = np.array([_LINK_INERTIA] * n + [_END_EFFECTOR_INERTIA])
-    if chain.X_LE is None:
-        # The end effector stands for the last link.
-        mass[-2] = moment[-2] = 0.0
-    return mass, moment
+    def _capture(
+        self, config: ComplianceControllerConfig, chain: KinematicChain, R_EC: np.ndarray
+    ) -> None:
+        n, joints = len(self.q), chain.joints
+        poses = [joint.X_PL for joint in joints] + [chain.X_LE or RigidTransform()]
+        arm = [
+            _shared(self.q),
+            _shared(np.array([X.rotation().matrix() for X in poses]), wp.mat33d),
+            _shared(np.array([X.translation() for X in poses]), wp.vec3d),
+            _shared(self._R_BL, wp.mat33d),
+            _shared(self._p_BL, wp.vec3d),
+        ]
+        inputs = [
+            *arm,
+            *(_shared(values) for values in virtual_bodies(chain, config.link_mass)),
+            _shared(np.array([joint.lower for joint in joints])),
+            _shared(np.array([joint.upper for joint in joints])),
+            MODES.index(config.mode),
+            1 if config.mode == "force" else config.iterations,
+            config.virtual_time_step,
+            config.damping_factor,
+            _KDL_THRESHOLD if config.dead_zones else _ROUNDING_THRESHOLD,
+            config.hand_frame_control,
+            wp.mat33d(*R_EC.ravel()),
+            _shared(self.measured),
+            _shared(self.target[None], mat34d),
+            _shared(self.sensor_wrench, wp.vec3d),
+            *(_shared(setting, wp.vec3d) for setting in self.settings),
+            _shared(self.v),
+            _shared(self.error, wp.vec3d),
+            _shared(self.u, wp.vec3d),
+            wp.zeros((n, n), dtype=wp.float64, device=_CPU),
+            wp.zeros(n, dtype=wp.float64, device=_CPU),
+            _shared(self._failed, wp.int32),
+        ]
+        # The graphs hold addresses alone.
+        self._arrays = inputs
+        with wp.ScopedCapture(device=_CPU) as place:
+            wp.launch(place_arm, dim=1, inputs=arm, device=_CPU)
+        with wp.ScopedCapture(device=_CPU) as update:
+            wp.launch(update_arm, dim=1, inputs=inputs, device=_CPU)
+        self._place, self._update = place.graph, update.graph
 
 
 class ComplianceController(LeafSystem):
@@ -242,65 +262,51 @@ class ComplianceController(LeafSystem):
         """
         super().__init__()
         validate(config, "compliance_controller")
-        _check(chain)
-        mass, moment = _bodies(chain, config.link_mass)
-        self._law = ComplianceLaw(
-            chain=chain,
-            mass=mass,
-            moment=moment,
-            R_EC=(X_EC or RigidTransform()).rotation().matrix(),
-            mode=config.mode,
-            iterations=1 if config.mode == "force" else config.iterations,
-            time_step=config.virtual_time_step,
-            damping_factor=config.damping_factor,
-            threshold=_KDL_THRESHOLD if config.dead_zones else _ROUNDING_THRESHOLD,
-            hand_frame_control=config.hand_frame_control,
-        )
+        config = self._config = copy.deepcopy(config)
+        X_EC = X_EC or RigidTransform()
+        R_EC = X_EC.rotation().matrix()
 
         # Here, so that no robot waits for it.
-        load_kernels()
+        _load_kernels()
 
         self._X_WB = X_WB or RigidTransform()
         self._X_BW = self._X_WB.inverse().GetAsMatrix34()
         if X_ES is None:
             X_ES = RigidTransform() if chain.X_LE is None else chain.X_LE.inverse()
-        self._wrench_C_from_S = _wrench_transform((X_EC or RigidTransform()).InvertAndCompose(X_ES))
+        # A wrench of Drake's has the moment first, here the force is.
+        self._wrench_C_from_S = np.roll(wrench_shift(X_EC.InvertAndCompose(X_ES)), 3, axis=0)
 
         size = len(chain.joints)
         wrench = Value(SpatialForce.Zero())
         self._joint_positions = self.DeclareVectorInputPort("joint_positions", size)
-        self._sensor_wrench = self.DeclareAbstractInputPort("sensor_wrench", wrench).get_index()
+        self._sensor_wrench = self.DeclareAbstractInputPort("sensor_wrench", wrench)
         self._target_pose = self.DeclareAbstractInputPort("target_pose", Value(RigidTransform()))
-        self._target_wrench = self.DeclareAbstractInputPort("target_wrench", wrench).get_index()
-        self._stiffness = self._parameter_input("stiffness", config.stiffness)
-        self._p_gains = self._parameter_input("p_gains", config.p_gains)
-        self._d_gains = self._parameter_input("d_gains", config.d_gains)
-        self._selection = self._parameter_input("selection", config.selection)
-        self._error_scale = self._parameter_input("error_scale", [config.error_scale])
+        self._target_wrench = self.DeclareAbstractInputPort("target_wrench", wrench)
+        # Each with what it is while the port is not connected.
+        self._parameters = {
+            name: (self.DeclareVectorInputPort(name, len(default)), np.array(default, float))
+            for name, default in (
+                ("stiffness", config.stiffness),
+                ("p_gains", config.p_gains),
+                ("d_gains", config.d_gains),
+                ("selection", config.selection),
+                ("error_scale", [config.error_scale]),
+            )
+        }
 
         # Every use fills this room before it reads anything. It lies in the cache of this system's
         # own context, so that contexts do not disturb each other, in other threads either.
-        self._room = self._cache_entry(
+        self._room = declare_cached(
+            self,
             "room for an update",
-            lambda context: ComplianceUpdate(self._law),
+            lambda context: ComplianceUpdate(config, chain, R_EC),
             {self.nothing_ticket()},
         )
         # A policy changes these far less often than the controller runs, so they are read only when
         # they change (at every update if what feeds them depends on the time).
-        self._settings = self._cache_entry(
-            "settings",
-            self._calc_settings,
-            {
-                self.input_port_ticket(index)
-                for index in (
-                    self._target_wrench,
-                    self._stiffness[0],
-                    self._p_gains[0],
-                    self._d_gains[0],
-                    self._selection[0],
-                    self._error_scale[0],
-                )
-            },
+        setting_ports = [self._target_wrench, *(port for port, _ in self._parameters.values())]
+        self._settings = declare_cached(
+            self, "settings", self._calc_settings, {port.ticket() for port in setting_ports}
         )
 
         self._positions_state = self.DeclareDiscreteState(size)
@@ -308,31 +314,15 @@ class ComplianceController(LeafSystem):
         self._error_state = self.DeclareDiscreteState(6)
         self.DeclareStateOutputPort("joint_positions_command", self._positions_state)
         self.DeclareStateOutputPort("joint_velocities_command", self._velocities_state)
-        self.DeclareAbstractOutputPort(
+        declare_output(
+            self,
             "commanded_pose",
-            lambda: Value(RigidTransform()),
-            self._calc_commanded_pose,
+            Value(RigidTransform()),
+            self._commanded_pose,
             {self.discrete_state_ticket(self._positions_state)},
         )
         self.DeclareInitializationDiscreteUpdateEvent(self._activate)
         self.DeclarePeriodicDiscreteUpdateEvent(config.period, 0.0, self._update)
-
-    def _parameter_input(self, name: str, default: Sequence[float]) -> tuple[int, np.ndarray]:
-        """Declares an input port; returns its index, and its value while it is not connected."""
-        index = self.DeclareVectorInputPort(name, len(default)).get_index()
-        return index, np.array(default, dtype=float)
-
-    def _cache_entry(
-        self, name: str, calc: Callable[[Context], object], prerequisites: set[DependencyTicket]
-    ) -> CacheEntry:
-        return self.DeclareCacheEntry(
-            name,
-            ValueProducer(
-                allocate=lambda: Value(object()),
-                calc=lambda context, value: value.set_value(calc(context)),
-            ),
-            prerequisites,
-        )
 
     def _activate(self, context: Context, discrete_state: DiscreteValues) -> None:
         # The previous error is left alone, as in the reference implementation.
@@ -343,11 +333,14 @@ class ComplianceController(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         room: ComplianceUpdate = self._room.Eval(context)
         room.settings[:] = self._settings.Eval(context)
-        if self._law.mode != "force":
+        if self._config.mode != "force":
             target = self._target_pose.Eval(context).GetAsMatrix4()
             self._X_BW.dot(target, out=room.target)
-        if self._law.mode != "motion":
-            room.sensor_wrench[:] = self._eval_sensor_wrench(context)
+        if self._config.mode != "motion":
+            room.sensor_wrench[:] = 0.0
+            if self._sensor_wrench.HasValue(context):
+                wrench = self._sensor_wrench.Eval(context).get_coeffs()
+                self._wrench_C_from_S.dot(wrench, out=room.sensor_wrench.reshape(6))
         room.measured[:] = self._joint_positions.Eval(context)
         state = context.get_discrete_state()
         room.q[:] = state.value(self._positions_state)
@@ -366,49 +359,29 @@ class ComplianceController(LeafSystem):
 
     def _calc_settings(self, context: Context) -> np.ndarray:
         """Returns what `ComplianceUpdate.settings` takes [5, 2, 3]."""
-
-        def axes(port: tuple[int, np.ndarray]) -> np.ndarray:
-            return self._parameter(context, port).reshape(2, 3)
-
-        error_scale = self._parameter(context, self._error_scale)
+        value = {
+            name: port.Eval(context) if port.HasValue(context) else default
+            for name, (port, default) in self._parameters.items()
+        }
+        error_scale = value["error_scale"]
         settings = np.zeros((5, 2, 3))
-        settings[0] = axes(self._stiffness)
-        settings[1] = axes(self._selection)
-        settings[2] = error_scale * axes(self._p_gains)
-        settings[3] = error_scale * axes(self._d_gains) / self._law.time_step
-        value = self.EvalAbstractInput(context, self._target_wrench)
-        if value is not None:
+        settings[0] = value["stiffness"].reshape(2, 3)
+        settings[1] = value["selection"].reshape(2, 3)
+        settings[2] = error_scale * value["p_gains"].reshape(2, 3)
+        settings[3] = error_scale * value["d_gains"].reshape(2, 3) / self._config.virtual_time_step
+        if self._target_wrench.HasValue(context):
             # Drake's spatial forces have the moment first.
-            settings[4] = value.get_value().get_coeffs().reshape(2, 3)[::-1]
-            if not self._law.hand_frame_control:
+            settings[4] = self._target_wrench.Eval(context).get_coeffs().reshape(2, 3)[::-1]
+            if not self._config.hand_frame_control:
                 settings[4] = settings[4].dot(self._X_BW[:, :3].T)
         return settings
 
-    def _parameter(self, context: Context, port: tuple[int, np.ndarray]) -> np.ndarray:
-        index, default = port
-        vector = self.EvalVectorInput(context, index)
-        # The copy outlives the input's value, as a view of it would not.
-        return default if vector is None else vector.CopyToVector()
-
-    def _eval_sensor_wrench(self, context: Context) -> np.ndarray:
-        """Returns the sensor wrench [2, 3] about Co in C."""
-        value = self.EvalAbstractInput(context, self._sensor_wrench)
-        if value is None:
-            return np.zeros((2, 3))
-        return self._wrench_C_from_S.dot(value.get_value().get_coeffs()).reshape(2, 3)
-
-    def _calc_commanded_pose(self, context: Context, output: AbstractValue) -> None:
+    def _commanded_pose(self, context: Context) -> RigidTransform:
         room: ComplianceUpdate = self._room.Eval(context)
         room.q[:] = context.get_discrete_state(self._positions_state).value()
-        output.set_value(self._X_WB @ RigidTransform(room.place()))
+        return self._X_WB @ RigidTransform(room.place())
 
 
-def _wrench_transform(X_CS: RigidTransform) -> np.ndarray:
-    """Returns the matrix [6, 6] from a wrench about So in S, moment first, to one about Co in C.
-
-    The result has the force first: f_C = R f_S and tau_C = R tau_S + p x (R f_S).
-    """
-    R = X_CS.rotation().matrix()
-    x, y, z = X_CS.translation()
-    p_cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.block([[np.zeros((3, 3)), R], [R, p_cross @ R]])
+def _shared(values: np.ndarray, dtype: Any = wp.float64) -> wp.array:
+    """A Warp array in the memory of a NumPy array."""
+    return wp.array(values, dtype=dtype, device=_CPU, copy=False)

@@ -5,9 +5,10 @@ import dataclasses as dc
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.multibody.math import SpatialForce
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
 
 from sliceit_drake.configuration import quantity
+from sliceit_drake.systems.declare import declare_output
 from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig
 
 __all__ = ["UNSTABLE_GAINS", "ContactMonitor", "ContactMonitorConfig"]
@@ -100,13 +101,13 @@ class ContactMonitor(LeafSystem):
         initial = np.zeros(_STATE_SIZE)
         initial[:_AXES] = 1.0
         self._state = self.DeclareDiscreteState(initial)
-        self.DeclareVectorOutputPort(
-            "unstable_gains", 1, self._calc_alarm, {self.discrete_state_ticket(self._state)}
+        declare_output(
+            self, "unstable_gains", 1, self._alarm, {self.discrete_state_ticket(self._state)}
         )
         if config.enabled:
             self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus | None:
         x = discrete_state.get_mutable_vector(self._state).get_mutable_value()
         if not x[_ALARM]:
             # Upwards and downwards alike: how far each signal is, and has been, in its direction.
@@ -120,7 +121,7 @@ class ContactMonitor(LeafSystem):
                     self._turn(x, int(axis), s[axis], context.get_time())
         if x[_ALARM]:
             return EventStatus.ReachedTermination(self, self._message(x))
-        return EventStatus.Succeeded()
+        return None
 
     def _turn(self, x: np.ndarray, axis: int, value: float, time: float) -> None:
         """Takes the reach of a component as a turning point; `value` is in its old direction."""
@@ -149,6 +150,5 @@ class ContactMonitor(LeafSystem):
             "swings). Lower controller.error_scale or its gains, or soften the contact."
         )
 
-    def _calc_alarm(self, context: Context, output: BasicVector) -> None:
-        alarm = context.get_discrete_state(self._state).value()[_ALARM]
-        output.SetAtIndex(0, float(alarm > 0.0))
+    def _alarm(self, context: Context) -> list[float]:
+        return [float(context.get_discrete_state(self._state).value()[_ALARM] > 0.0)]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, State
+from pydrake.systems.framework import Context, DiagramBuilder, State
 
 from sliceit_drake.cutting.contact_response import contact_responses
 from sliceit_drake.cutting.coupling_steps import EnergyBalance
@@ -19,6 +19,7 @@ from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.simulate import check_clear, check_energies, check_in_plane
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
 from sliceit_drake.systems.cut_report import Columns, FoodBodyFrame, FoodPicture
+from sliceit_drake.systems.declare import declare_output
 from sliceit_drake.systems.food_visualizer import FoodVisualizer, frame_size
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 
@@ -99,13 +100,13 @@ class CuttingSystem(KnifeForceSystem):
         self.DeclareStateOutputPort("balance", self._balance)
         self.DeclareStateOutputPort("energy", self._energy)
         self.DeclareStateOutputPort("food_index", self._food_index)
-        corners = max(len(surface.ends) for surface in self.surfaces)
+        corners = self._corners = max(len(surface.ends) for surface in self.surfaces)
         state = {
             self.discrete_state_ticket(self._food),
             self.discrete_state_ticket(self._food_index),
         }
-        self.DeclareVectorOutputPort("surface_vertices", 3 * corners, self._calc_surface, state)
-        self.DeclareVectorOutputPort("surface_damage", corners, self._calc_damage, state)
+        declare_output(self, "surface_vertices", 3 * corners, self._surface_vertices, state)
+        declare_output(self, "surface_damage", corners, self._surface_damage, state)
 
     def recorded(self) -> dict[str, list[str]]:
         parts = ("edge", "flank", "friction")
@@ -167,18 +168,15 @@ class CuttingSystem(KnifeForceSystem):
         )
 
     def body(self, context: Context) -> FoodBodyFrame:
-        index, state = self.food_index(context), self.food_state(context)
-        solver, (body, rest) = self._solvers[index], self._bodies[index]
-        model = solver.model
-        edge_depth, cohesive_damage = (
-            solver.field(state, name) for name in ("edge_depth", "cohesive_damage")
-        )
+        index, solver = self.food_index(context), self.solver(context)
+        body, rest = self._bodies[index]
+        nodes = solver.positions(self.food_state(context))
         return FoodBodyFrame(
             index,
-            _in_world(self.X_WF(context), body.positions(model, solver.positions(state))),
+            _in_world(self.X_WF(context), body.positions(solver.model, nodes)),
             rest,
             body.tetrahedra,
-            body.damage(model, edge_depth, cohesive_damage),
+            body.damage(solver.model, *self._damage(context)),
             body.side,
         )
 
@@ -366,24 +364,20 @@ class CuttingSystem(KnifeForceSystem):
             new.set_value(self._energy, [check[name] for name in ENERGY_NAMES])
         return step.wrench.reshape(2, 3).dot(R_CW).ravel(), float(step.cut[-1])
 
-    def _calc_surface(self, context: Context, output: BasicVector) -> None:
-        index = self.food_index(context)
-        solver = self._solvers[index]
+    def _surface_vertices(self, context: Context) -> np.ndarray:
+        surface, solver = self.surfaces[self.food_index(context)], self.solver(context)
         nodes = solver.positions(self.food_state(context))
-        p_W = _in_world(self._X_WF[index], self.surfaces[index].positions(solver.model, nodes))
-        values = np.zeros(output.size())
-        values[: p_W.size] = p_W.ravel()
-        output.SetFromVector(values)
+        p_W = _in_world(self.X_WF(context), surface.positions(solver.model, nodes))
+        return self._padded(p_W.ravel(), 3 * self._corners)
 
-    def _calc_damage(self, context: Context, output: BasicVector) -> None:
-        index, state = self.food_index(context), self.food_state(context)
-        solver = self._solvers[index]
-        edge_depth, cohesive_damage = (
-            solver.field(state, "edge_depth"),
-            solver.field(state, "cohesive_damage"),
-        )
-        damage = self.surfaces[index].damage(solver.model, edge_depth, cohesive_damage)
-        output.SetFromVector(self._padded(damage, output.size()))
+    def _surface_damage(self, context: Context) -> np.ndarray:
+        surface, model = self.surfaces[self.food_index(context)], self.solver(context).model
+        return self._padded(surface.damage(model, *self._damage(context)), self._corners)
+
+    def _damage(self, context: Context) -> tuple[np.ndarray, np.ndarray]:
+        """Edge depth and cohesive damage at the food's cut points, as the solver has them."""
+        solver, state = self.solver(context), self.food_state(context)
+        return solver.field(state, "edge_depth"), solver.field(state, "cohesive_damage")
 
 
 def _in_world(X_WF: RigidTransform, p_F: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Context, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem
 
 from sliceit_drake.cutting.mesh.surface import FoodSurface
 
@@ -118,7 +118,7 @@ class FoodVisualizer(LeafSystem):
         """Whether frame `k` shows a slice that has been cut off by frame k + 1."""
         return half == "minus" and self._slices_stay and self._foods[k + 1] > self._foods[k]
 
-    def _publish(self, context: Context) -> EventStatus:
+    def _publish(self, context: Context) -> None:
         vertices = self._vertices.Eval(context).reshape(-1, 3)
         food = int(self._food_index.Eval(context)[0])
         surface = self._surfaces[food]
@@ -140,4 +140,3 @@ class FoodVisualizer(LeafSystem):
             if self._recording and k > 0 and not self._stays(half, k - 1):
                 # A live viewer shows the newest frame alone.
                 self._meshcat.SetProperty(self._frame_path(half, k - 1), "visible", False)
-        return EventStatus.Succeeded()

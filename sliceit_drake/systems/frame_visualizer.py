@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.geometry import Cylinder, Meshcat, Rgba
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.systems.framework import Context, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem
 
 __all__ = ["FrameVisualizer", "draw_over_everything"]
 
@@ -70,11 +70,10 @@ class FrameVisualizer(LeafSystem):
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
         self.DeclareForcedPublishEvent(self._publish)
 
-    def _publish(self, context: Context) -> EventStatus:
+    def _publish(self, context: Context) -> None:
         X_WK = self._pose.Eval(context)
         for path, X_KP in self._carried.items():
             self._meshcat.SetTransform(path, X_WK @ X_KP, context.get_time())
-        return EventStatus.Succeeded()
 
 
 def draw_over_everything(meshcat: Meshcat, path: str, order: int = 1) -> None:

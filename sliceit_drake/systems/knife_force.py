@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context, EventStatus, LeafSystem, State
 
 from sliceit_drake.cutting.motion import small_turn
 from sliceit_drake.systems.cut_report import ReportingSystem
+from sliceit_drake.systems.declare import declare_output
 
 __all__ = ["AppliedForce", "CuttingSetup", "KnifeForceSystem"]
 
@@ -61,10 +62,11 @@ class KnifeForceSystem(ReportingSystem):
         self._coupling = self.DeclareDiscreteState(1)
         self._last_pose = self.DeclareDiscreteState(12)
         self._start_time = self.DeclareDiscreteState(1)
-        self.DeclareAbstractOutputPort(
+        declare_output(
+            self,
             "food_wrench",
-            lambda: Value(SpatialForce.Zero()),
-            self._calc_food_wrench,
+            Value(SpatialForce.Zero()),
+            lambda context: SpatialForce(self.wrench(context)),
             {self.discrete_state_ticket(self._wrench)},
         )
         self.DeclareStateOutputPort("food_wrench_vector", self._wrench)
@@ -105,14 +107,13 @@ class KnifeForceSystem(ReportingSystem):
         """The held wrench F_K_W, moment and force [6]."""
         return context.get_discrete_state(self._wrench).value()
 
-    def _initialize(self, context: Context, state: State) -> EventStatus:
+    def _initialize(self, context: Context, state: State) -> None:
         X_WK = self._pose_input.Eval(context)
         self._set(state, self._last_pose, X_WK.GetAsMatrix34().ravel())
         self._set(state, self._start_time, [context.get_time()])
         self.start(context, state, X_WK)
-        return EventStatus.Succeeded()
 
-    def _update(self, context: Context, state: State) -> EventStatus:
+    def _update(self, context: Context, state: State) -> EventStatus | None:
         x = context.get_discrete_state()
         if context.get_time() <= x.value(self._start_time)[0]:
             return EventStatus.DidNothing()
@@ -127,15 +128,11 @@ class KnifeForceSystem(ReportingSystem):
         new.set_value(self._wrench, wrench)
         new.set_value(self._progress, [progress])
         new.set_value(self._last_pose, now.ravel())
-        return EventStatus.Succeeded()
+        return None
 
     @staticmethod
     def _set(state: State, index: int, value: np.ndarray | list[float]) -> None:
         state.get_mutable_discrete_state().set_value(index, value)
-
-    def _calc_food_wrench(self, context: Context, output: Value) -> None:
-        wrench = self.wrench(context)
-        output.set_value(SpatialForce(wrench[:3], wrench[3:]))
 
 
 class AppliedForce(LeafSystem):
@@ -155,16 +152,12 @@ class AppliedForce(LeafSystem):
         super().__init__()
         self._knife_body = knife_body
         self._wrench = self.DeclareAbstractInputPort("food_wrench", Value(SpatialForce.Zero()))
-        self.DeclareAbstractOutputPort(
-            "applied_force",
-            lambda: Value[list[ExternallyAppliedSpatialForce]](),
-            self._calc,
-            {self._wrench.ticket()},
-        )
+        forces = Value[list[ExternallyAppliedSpatialForce]]()
+        declare_output(self, "applied_force", forces, self._forces, {self._wrench.ticket()})
 
-    def _calc(self, context: Context, output: Value) -> None:
+    def _forces(self, context: Context) -> list[ExternallyAppliedSpatialForce]:
         force = ExternallyAppliedSpatialForce()
         force.body_index = self._knife_body
         force.p_BoBq_B = np.zeros(3)
         force.F_Bq_W = self._wrench.Eval(context)
-        output.set_value([force])
+        return [force]

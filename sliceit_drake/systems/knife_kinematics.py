@@ -6,7 +6,9 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce, SpatialVelocity
 from pydrake.multibody.plant import ContactResults
 from pydrake.multibody.tree import BodyIndex
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem
+
+from sliceit_drake.systems.declare import declare_output
 
 __all__ = ["BoardContact", "KnifeKinematics"]
 
@@ -30,27 +32,25 @@ class KnifeKinematics(LeafSystem):
 
     def __init__(self, knife_body: BodyIndex) -> None:
         super().__init__()
-        self._index = int(knife_body)
+        index = int(knife_body)
         poses = self.DeclareAbstractInputPort("body_poses", Value[list[RigidTransform]]())
         velocities = self.DeclareAbstractInputPort(
             "body_velocities", Value[list[SpatialVelocity]]()
         )
-        self._poses, self._velocities = poses, velocities
-        self.DeclareAbstractOutputPort(
-            "knife_pose", lambda: Value(RigidTransform()), self._calc_pose, {poses.ticket()}
+        declare_output(
+            self,
+            "knife_pose",
+            Value(RigidTransform()),
+            lambda context: poses.Eval(context)[index],
+            {poses.ticket()},
         )
-        self.DeclareAbstractOutputPort(
+        declare_output(
+            self,
             "knife_velocity",
-            lambda: Value(SpatialVelocity.Zero()),
-            self._calc_velocity,
+            Value(SpatialVelocity.Zero()),
+            lambda context: velocities.Eval(context)[index],
             {velocities.ticket()},
         )
-
-    def _calc_pose(self, context: Context, output: Value) -> None:
-        output.set_value(self._poses.Eval(context)[self._index])
-
-    def _calc_velocity(self, context: Context, output: Value) -> None:
-        output.set_value(self._velocities.Eval(context)[self._index])
 
 
 class BoardContact(LeafSystem):
@@ -80,25 +80,15 @@ class BoardContact(LeafSystem):
         self._near_height = board_height + NEAR_BOARD
         self._results = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
         self._pose = self.DeclareAbstractInputPort("knife_pose", Value(RigidTransform()))
-        self.DeclareAbstractOutputPort(
+        seen = {self._results.ticket(), self._pose.ticket()}
+        declare_output(
+            self,
             "board_wrench",
-            lambda: Value(SpatialForce.Zero()),
-            self._calc_wrench,
-            {self._results.ticket(), self._pose.ticket()},
+            Value(SpatialForce.Zero()),
+            lambda context: SpatialForce(self._wrench(context)),
+            seen,
         )
-        self.DeclareVectorOutputPort(
-            "board_wrench_vector",
-            6,
-            self._calc_vector,
-            {self._results.ticket(), self._pose.ticket()},
-        )
-
-    def _calc_wrench(self, context: Context, output: Value) -> None:
-        wrench = self._wrench(context)
-        output.set_value(SpatialForce(wrench[:3], wrench[3:]))
-
-    def _calc_vector(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._wrench(context))
+        declare_output(self, "board_wrench_vector", 6, self._wrench, seen)
 
     def _wrench(self, context: Context) -> np.ndarray:
         X_WK = self._pose.Eval(context).GetAsMatrix34()

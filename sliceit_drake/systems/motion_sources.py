@@ -1,11 +1,12 @@
 """A prescribed motion of the knife as a Drake system."""
 
-from pydrake.common.value import AbstractValue, Value
+from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.math import SpatialVelocity
 from pydrake.systems.framework import Context, LeafSystem
 
 from sliceit_drake.cutting.motion import Motion, MotionPlan, Pose
+from sliceit_drake.systems.declare import declare_output
 
 __all__ = ["MotionSource", "placed_motion"]
 
@@ -41,23 +42,15 @@ class MotionSource(LeafSystem):
         """
         super().__init__()
         self.motion = placed_motion(plan, X_WK)
-        self.DeclareAbstractOutputPort(
-            "target_pose",
-            lambda: Value(RigidTransform()),
-            self._calc_target_pose,
-            {self.time_ticket()},
-        )
-        self.DeclareAbstractOutputPort(
-            "target_velocity",
-            lambda: Value(SpatialVelocity.Zero()),
-            self._calc_target_velocity,
-            {self.time_ticket()},
-        )
+        pose, velocity = Value(RigidTransform()), Value(SpatialVelocity.Zero())
+        time = {self.time_ticket()}
+        declare_output(self, "target_pose", pose, self._target_pose, time)
+        declare_output(self, "target_velocity", velocity, self._target_velocity, time)
 
-    def _calc_target_pose(self, context: Context, output: AbstractValue) -> None:
+    def _target_pose(self, context: Context) -> RigidTransform:
         pose = self.motion.pose(context.get_time())
-        output.set_value(RigidTransform(RotationMatrix(pose.R), pose.p))
+        return RigidTransform(RotationMatrix(pose.R), pose.p)
 
-    def _calc_target_velocity(self, context: Context, output: AbstractValue) -> None:
+    def _target_velocity(self, context: Context) -> SpatialVelocity:
         velocity = self.motion.velocity(context.get_time())
-        output.set_value(SpatialVelocity(velocity.w, velocity.v))
+        return SpatialVelocity(velocity.w, velocity.v)

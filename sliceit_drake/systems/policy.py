@@ -13,13 +13,14 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from pydrake.common.value import AbstractValue, Value
+from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from sliceit_drake.configuration import ConfigurationError, quantity
 from sliceit_drake.cutting.motion import MotionPlan
+from sliceit_drake.systems.declare import declare_output
 from sliceit_drake.systems.envelope import envelope, envelope_time
 
 __all__ = [
@@ -31,10 +32,8 @@ __all__ = [
     "PressByForce",
 ]
 
-SIX = 6
-# Parts of the state.
+# Parts of the motion since the last decision.
 _OFFSET, _SPEED, _WANTED, _SINCE = slice(0, 2), slice(2, 4), slice(4, 6), 6
-_STIFFNESS, _GAINS, _HISTORY = slice(7, 13), slice(13, 19), 19
 
 
 class PolicyObservation(NamedTuple):
@@ -185,24 +184,22 @@ class PolicySystem(LeafSystem):
         self.watch: Callable[[], AbstractContextManager] = nullcontext
         wrench = Value(SpatialForce.Zero())
         self._wrench = self.DeclareAbstractInputPort("sensor_wrench", wrench)
-        state = np.zeros(_HISTORY + SIX * config.history)
-        state[_STIFFNESS], state[_GAINS] = self._configured
-        index = self.DeclareDiscreteState(state)
+        self._motion = self.DeclareDiscreteState(7)
+        self._wrenches = self.DeclareDiscreteState(6 * config.history)
+        self._settings = [self.DeclareDiscreteState(values) for values in self._configured]
         self.DeclarePeriodicDiscreteUpdateEvent(config.period, 0.0, self._decide)
-        moving = {self.time_ticket(), self.discrete_state_ticket(index)}
-        self.DeclareAbstractOutputPort(
-            "target_pose", lambda: Value(RigidTransform()), self._calc_target_pose, moving
-        )
-        self.DeclareVectorOutputPort("target_offset", 2, self._calc_offset, moving)
-        held = {self.discrete_state_ticket(index)}
-        for name, part in (("stiffness", _STIFFNESS), ("p_gains", _GAINS)):
-            self.DeclareVectorOutputPort(name, SIX, self._copier(part), held)
+        moving = {self.time_ticket(), self.discrete_state_ticket(self._motion)}
+        declare_output(self, "target_pose", Value(RigidTransform()), self._target_pose, moving)
+        declare_output(self, "target_offset", 2, lambda context: self._moved(context)[0], moving)
+        for name, state in zip(("stiffness", "p_gains"), self._settings, strict=True):
+            self.DeclareStateOutputPort(name, state)
 
     def _decide(self, context: Context, discrete_state: DiscreteValues) -> None:
-        x, config = context.get_discrete_state_vector().value().copy(), self._config
+        config = self._config
         offset, speed = self._moved(context)
         wrench = self._wrench.Eval(context).get_coeffs()
-        history = np.vstack([x[_HISTORY:].reshape(-1, SIX)[1:], wrench])
+        seen = context.get_discrete_state(self._wrenches).value().reshape(-1, 6)
+        history = np.vstack([seen[1:], wrench])
         with self.watch():
             action = config.decide.decide(PolicyObservation(context.get_time(), offset, history))
         wanted = np.array([action.draw, action.press], float)
@@ -211,17 +208,17 @@ class PolicySystem(LeafSystem):
                 f"{self.GetSystemPathname()}: at t = {context.get_time():.6g} s the policy decided "
                 f"for speeds of {wanted} m/s."
             )
-        x[_OFFSET], x[_SPEED], x[_SINCE] = offset, speed, context.get_time()
-        x[_WANTED] = wanted * min(1.0, config.speed / max(1e-12, math.hypot(*wanted)))
+        wanted *= min(1.0, config.speed / max(1e-12, math.hypot(*wanted)))
+        motion = [*offset, *speed, *wanted, context.get_time()]
+        discrete_state.set_value(self._motion, motion)
+        discrete_state.set_value(self._wrenches, history.ravel())
         given = (action.stiffness, action.p_gains)
-        for part, new, old in zip((_STIFFNESS, _GAINS), given, self._configured, strict=True):
-            x[part] = old if new is None else new
-        x[_HISTORY:] = history.ravel()
-        discrete_state.set_value(x)
+        for state, new, old in zip(self._settings, given, self._configured, strict=True):
+            discrete_state.set_value(state, old if new is None else new)
 
     def _moved(self, context: Context) -> tuple[np.ndarray, np.ndarray]:
         """Offset [2], m, and speeds [2], m/s, at the context's time."""
-        x = context.get_discrete_state_vector().value()
+        x = context.get_discrete_state(self._motion).value()
         t, before, change = context.get_time() - x[_SINCE], x[_SPEED], x[_WANTED] - x[_SPEED]
         duration = math.hypot(*change) / self._config.acceleration
         ramp = min(t, duration)
@@ -230,16 +227,6 @@ class PolicySystem(LeafSystem):
         inside = np.clip(offset, *self._far)
         return inside, np.where(inside == offset, speed, 0.0)
 
-    def _calc_target_pose(self, context: Context, output: AbstractValue) -> None:
+    def _target_pose(self, context: Context) -> RigidTransform:
         (x, z), _ = self._moved(context)
-        output.set_value(self._X_WK @ RigidTransform([x, 0.0, z]))
-
-    def _calc_offset(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._moved(context)[0])
-
-    @staticmethod
-    def _copier(part: slice) -> Callable[[Context, BasicVector], None]:
-        def calc(context: Context, output: BasicVector) -> None:
-            output.SetFromVector(context.get_discrete_state_vector().value()[part])
-
-        return calc
+        return self._X_WK @ RigidTransform([x, 0.0, z])

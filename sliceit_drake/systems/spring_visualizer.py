@@ -3,7 +3,7 @@
 import numpy as np
 from pydrake.geometry import Cylinder, Meshcat, Rgba
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem
 
 from sliceit_drake.cutting.foods.spring_food import SpringFood
 
@@ -51,10 +51,9 @@ class SpringVisualizer(LeafSystem):
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
         self.DeclareForcedPublishEvent(self._publish)
 
-    def _publish(self, context: Context) -> EventStatus:
+    def _publish(self, context: Context) -> None:
         top = self._height - self._compression.Eval(context)[0]
         heights = np.arange(1, PLATES + 1) * top / PLATES - 0.5 * THICKNESS
         for plate, z in zip(self._paths, heights, strict=True):
             X_WP = self._X_WF @ RigidTransform([0.0, 0.0, z])
             self._meshcat.SetTransform(plate, X_WP, context.get_time())
-        return EventStatus.Succeeded()

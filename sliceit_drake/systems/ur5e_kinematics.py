@@ -1,11 +1,23 @@
-"""Kinematic chains of revolute joints, and the chain of the UR5e."""
+"""Kinematic chains of revolute joints, that of the UR5e, and the virtual arm along a chain."""
 
 import dataclasses as dc
 import math
 
+import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, SpatialInertia, UnitInertia
 
-__all__ = ["ChainJoint", "KinematicChain", "ur5e_chain"]
+from sliceit_drake.configuration import ConfigurationError
+
+__all__ = ["ChainJoint", "KinematicChain", "make_virtual_model", "ur5e_chain", "virtual_bodies"]
+
+_END_EFFECTOR = "end_effector"
+
+# Virtual mass [kg] and moment of inertia [kg m2] of the end effector, moment of inertia of a link.
+_END_EFFECTOR_MASS = 1.0
+_END_EFFECTOR_INERTIA = 1.0
+_LINK_INERTIA = 1e-6
 
 
 @dc.dataclass(frozen=True)
@@ -34,10 +46,26 @@ class KinematicChain:
         joints: The joints, from base to tip.
         X_LE: Pose of the end effector E in the last link L, to which it is fixed; None if the last
             link itself is the end effector.
+
+    Raises:
+        ConfigurationError: If there are no joints, or a joint's limits are the wrong way round.
     """
 
     joints: tuple[ChainJoint, ...]
     X_LE: RigidTransform | None = None
+
+    def __post_init__(self) -> None:
+        if not self.joints:
+            raise ConfigurationError(
+                "the chain has no joints", field="chain.joints", fix="Give one."
+            )
+        for index, joint in enumerate(self.joints):
+            if not joint.lower <= joint.upper:
+                raise ConfigurationError(
+                    f"the limits of {joint.name} are [{joint.lower:.6g}, {joint.upper:.6g}] rad",
+                    field=f"chain.joints[{index}]",
+                    fix="Give lower <= upper.",
+                )
 
 
 def ur5e_chain(X_TE: RigidTransform) -> KinematicChain:
@@ -76,3 +104,57 @@ def ur5e_chain(X_TE: RigidTransform) -> KinematicChain:
         ),
         X_LE=X_TE,
     )
+
+
+def make_virtual_model(chain: KinematicChain, link_mass: float) -> MultibodyPlant:
+    """Makes the arm that FDCC moves instead of the real one.
+
+    A point-like mass sits at the origin of every link that a joint moves, and 1 kg with 1 kg m2
+    about every axis at the end effector. There is no gravity. If the last link is itself the end
+    effector, it has the end effector's inertia alone.
+
+    Args:
+        chain: The arm; its base B is the plant's world frame.
+        link_mass: Mass [kg] of each moving link.
+
+    Returns:
+        The finalized plant, one position [rad] per joint, with a body named ``end_effector``.
+    """
+    plant = MultibodyPlant(0.0)
+    plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, 0.0])
+    parent = plant.world_body()
+    end_effector_inertia = _inertia(_END_EFFECTOR_MASS, _END_EFFECTOR_INERTIA)
+    for index, joint in enumerate(chain.joints):
+        is_end_effector = chain.X_LE is None and index == len(chain.joints) - 1
+        link = plant.AddRigidBody(
+            _END_EFFECTOR if is_end_effector else joint.name,
+            end_effector_inertia if is_end_effector else _inertia(link_mass, _LINK_INERTIA),
+        )
+        mount = FixedOffsetFrame(f"{joint.name}_mount", parent.body_frame(), joint.X_PL)
+        plant.AddJoint(
+            RevoluteJoint(
+                f"{joint.name}_joint", plant.AddFrame(mount), link.body_frame(), [0.0, 0.0, 1.0]
+            )
+        )
+        parent = link
+    if chain.X_LE is not None:
+        end_effector = plant.AddRigidBody(_END_EFFECTOR, end_effector_inertia)
+        plant.WeldFrames(parent.body_frame(), end_effector.body_frame(), chain.X_LE)
+    plant.Finalize()
+    return plant
+
+
+def _inertia(mass: float, moment: float) -> SpatialInertia:
+    """Returns the inertia of a body with equal moments [kg m2] about its origin."""
+    return SpatialInertia(mass, np.zeros(3), UnitInertia.TriaxiallySymmetric(moment / mass))
+
+
+def virtual_bodies(chain: KinematicChain, link_mass: float) -> tuple[np.ndarray, np.ndarray]:
+    """Masses [n + 1], kg, and moments of inertia, kg m2, of the virtual links and end effector."""
+    n = len(chain.joints)
+    mass = np.array([link_mass] * n + [_END_EFFECTOR_MASS])
+    moment = np.array([_LINK_INERTIA] * n + [_END_EFFECTOR_INERTIA])
+    if chain.X_LE is None:
+        # The end effector stands for the last link.
+        mass[-2] = moment[-2] = 0.0
+    return mass, moment

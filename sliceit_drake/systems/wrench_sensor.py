@@ -6,21 +6,17 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from pydrake.common.value import AbstractValue, Value
+from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import WeldJoint
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteValues,
-    LeafSystem,
-)
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from sliceit_drake.configuration import ConfigurationError, quantity
+from sliceit_drake.systems.declare import declare_output
 
-__all__ = ["WrenchSensor", "WrenchSensorConfig"]
+__all__ = ["WrenchSensor", "WrenchSensorConfig", "wrench_shift"]
 
 # Parts of the state, one vector so that an update fetches it once.
 _SUM = slice(0, 6)  # Sum of the plant's reactions since the last coupling step.
@@ -168,7 +164,7 @@ class WrenchSensor(LeafSystem):
         self._index = int(weld.index())
         self._steps = steps
         # From the sum of reactions on the tool, at Jc in Jc, to the mean on the arm, at So in S.
-        self._on_arm = _shift_matrix(weld.X_FM()) / -steps
+        self._on_arm = wrench_shift(weld.X_FM()) / -steps
         self._bias = np.concatenate([config.moment_bias, config.force_bias])
         self._noise = np.repeat([config.moment_noise, config.force_noise], 3)
         self._is_noisy = bool(self._noise.any())
@@ -203,10 +199,11 @@ class WrenchSensor(LeafSystem):
         ).get_index()
         self._seed = self.DeclareNumericParameter(BasicVector([float(config.seed)]))
         state = self.DeclareDiscreteState(np.zeros(self._size))
-        self.DeclareAbstractOutputPort(
+        declare_output(
+            self,
             "sensor_wrench",
-            lambda: Value(SpatialForce.Zero()),
-            self._calc_sensor_wrench,
+            Value(SpatialForce.Zero()),
+            lambda context: SpatialForce(context.get_discrete_state_vector().value()[_READING]),
             {self.xd_ticket()},
         )
         self.DeclareStateOutputPort("state", state)
@@ -293,10 +290,6 @@ class WrenchSensor(LeafSystem):
             return line[-6:]
         return shown
 
-    def _calc_sensor_wrench(self, context: Context, output: AbstractValue) -> None:
-        reading = context.get_discrete_state_vector().value()[_READING]
-        output.set_value(SpatialForce(reading[:3], reading[3:]))
-
 
 @functools.lru_cache(maxsize=16)
 def _standard_noise(seed: int, block: int, stream: int) -> np.ndarray:
@@ -308,7 +301,7 @@ def _standard_noise(seed: int, block: int, stream: int) -> np.ndarray:
     return generator.standard_normal((_NOISE_BLOCK, 6))
 
 
-def _shift_matrix(X_SJ: RigidTransform) -> np.ndarray:
+def wrench_shift(X_SJ: RigidTransform) -> np.ndarray:
     """Matrix [6, 6] that turns a wrench at Jo in J into the same at So in S, moment first."""
     R, p = X_SJ.rotation().matrix(), X_SJ.translation()
     cross = np.array([[0.0, -p[2], p[1]], [p[2], 0.0, -p[0]], [-p[1], p[0], 0.0]])

@@ -7,7 +7,7 @@ from pydrake.common.value import Value
 from pydrake.geometry import Cylinder, Meshcat, MeshcatCone, Rgba
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.math import SpatialForce
-from pydrake.systems.framework import Context, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem
 
 from sliceit_drake.systems.frame_visualizer import draw_over_everything
 
@@ -157,7 +157,7 @@ class WrenchVisualizer(LeafSystem):
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
         self.DeclareForcedPublishEvent(self._publish)
 
-    def _publish(self, context: Context) -> EventStatus:
+    def _publish(self, context: Context) -> None:
         X_WK = self._pose.Eval(context)
         time, scale = context.get_time(), self._scale
         for name, (force, moment) in self._arrows.items():
@@ -170,4 +170,3 @@ class WrenchVisualizer(LeafSystem):
             per_N, per_Nm = 1.0 / scale.newtons_per_metre, 1.0 / scale.newton_metres_per_metre
             force.set(point, per_N * f, per_N * scale.min_force, time)
             moment.set(point, per_Nm * m, per_Nm * scale.min_moment, time)
-        return EventStatus.Succeeded()

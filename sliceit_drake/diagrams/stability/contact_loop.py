@@ -31,12 +31,9 @@ from scipy.linalg import block_diag, expm
 from sliceit_drake.diagrams.plant.robot_plant import Robot
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.simulated_station import SimulatedStation
-from sliceit_drake.systems.compliance_controller import (
-    ComplianceControllerConfig,
-    make_virtual_model,
-)
+from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
 from sliceit_drake.systems.servo import JOINTS
-from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
+from sliceit_drake.systems.ur5e_kinematics import make_virtual_model, ur5e_chain
 
 __all__ = ["ContactLoop", "Mode"]
 

@@ -1,0 +1,62 @@
+"""Declares output ports and cached values of Drake systems by functions that return the value."""
+
+from collections.abc import Callable
+from typing import Any
+
+from pydrake.common.value import AbstractValue, Value
+from pydrake.systems.framework import (
+    CacheEntry,
+    Context,
+    DependencyTicket,
+    LeafSystem,
+    OutputPort,
+    ValueProducer,
+)
+
+__all__ = ["declare_cached", "declare_output"]
+
+
+def declare_output(
+    system: LeafSystem,
+    name: str,
+    example: AbstractValue | int,
+    calc: Callable[[Context], Any],
+    prerequisites: set[DependencyTicket],
+) -> OutputPort:
+    """Declares an output port.
+
+    Args:
+        system: What has the port.
+        name: Name of the port.
+        example: A value of the port's type; of a vector port its size.
+        calc: From the system's context to the port's value.
+        prerequisites: What the value depends on.
+    """
+    if isinstance(example, int):
+        return system.DeclareVectorOutputPort(
+            name,
+            example,
+            lambda context, output: output.SetFromVector(calc(context)),
+            prerequisites,
+        )
+    return system.DeclareAbstractOutputPort(
+        name, example.Clone, lambda context, output: output.set_value(calc(context)), prerequisites
+    )
+
+
+def declare_cached(
+    system: LeafSystem,
+    name: str,
+    calc: Callable[[Context], object],
+    prerequisites: set[DependencyTicket],
+) -> CacheEntry:
+    """Declares a value of any type that is computed when it is asked for after a change.
+
+    Args:
+        system, name, calc, prerequisites: As for `declare_output`.
+    """
+    producer = ValueProducer(
+        allocate=lambda: Value(object()),
+        calc=lambda context, value: value.set_value(calc(context)),
+    )
+    return system.DeclareCacheEntry(name, producer, prerequisites)
