@@ -17,14 +17,14 @@ from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.learning import unseen_worlds
 from sliceit_drake.learning.ending import Limits
-from sliceit_drake.learning.evaluation import LIMITS, cut_slice
-from sliceit_drake.learning.metrics import bootstrap_ratio, slice_metrics
+from sliceit_drake.learning.evaluation import LIMITS, cut_slice, slice_metrics
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.agent import AgentConfig
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from studies.__main__ import main as studies
 from studies.learning import faster_draws
 from studies.learning.comparison import claim, compare, comparison_page, plot_boxes
+from studies.learning.ratio import bootstrap_ratio
 
 ROOT = Path(__file__).resolve().parent.parent
 

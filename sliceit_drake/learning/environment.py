@@ -110,8 +110,7 @@ class SlicingEnv(gymnasium.Env):
         shift = RigidTransform(RotationMatrix.MakeYRotation(turn), [along, 0.0, -up])
         station.begin(simulator, rng, shift)
         self._decisions = 0
-        error = station.GetOutputPort("error").Eval(simulator.get_context())
-        self._potential = self._calc_potential(float(error[1]))
+        self._potential = self._calc_potential(float(self._output("error")[1]))
         return self._observation(), {"food": food}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -137,14 +136,13 @@ class SlicingEnv(gymnasium.Env):
         except CuttingError as failure:
             end, guard, message = "guard", type(failure).__name__, str(failure)
         observation = self._observation()
-        error = station.GetOutputPort("error").Eval(context)
-        wrench = station.GetOutputPort("wrench").Eval(context)
+        error, wrench = self._output("error"), self._output("wrench")
         terms = reward_terms(config, float(error[1]), wrench[:2], observation[JERK])
         reward = float(reward_weights(config, self.progress) @ terms)
         before, self._potential = self._potential, self._calc_potential(float(error[1]))
         shaping = config.discount * self._potential - before
         reward += shaping
-        end = end or self._end(error)
+        end = end or self._end(context.get_time(), error)
         if end == "goal":
             reward += config.goal
         elif end:
@@ -152,7 +150,7 @@ class SlicingEnv(gymnasium.Env):
         info: dict[str, Any] = {
             "reward_terms": dict(zip(TERMS, terms.tolist(), strict=True)),
             "shaping": shaping,
-            "cut_progress": float(station.GetOutputPort("cut_progress").Eval(context)[0]),
+            "cut_progress": float(self._output("cut_progress")[0]),
             "height": float(error[1]),
             "force": self._force(),
         }
@@ -172,33 +170,26 @@ class SlicingEnv(gymnasium.Env):
             self._built[food] = station, simulator
         return self._built[food]
 
-    def _observation(self) -> np.ndarray:
+    def _output(self, port: str) -> Any:
+        """Value of an output port of the station."""
         assert self._current is not None
         station, simulator = self._current
-        values = station.GetOutputPort("observation").Eval(simulator.get_context())
-        return values.astype(np.float32)
+        return station.GetOutputPort(port).Eval(simulator.get_context())
+
+    def _observation(self) -> np.ndarray:
+        return self._output("observation").astype(np.float32)
 
     def _calc_potential(self, height: float) -> float:
-        assert self._current is not None
-        station, simulator = self._current
-        count = float(station.GetOutputPort("at_goal").Eval(simulator.get_context())[0])
-        share = count / max(self.task.agent.goal_decisions, 1)
+        share = float(self._output("at_goal")[0]) / max(self.task.agent.goal_decisions, 1)
         return reward_potential(self.task.reward, height, share)
 
     def _force(self) -> float:
-        assert self._current is not None
-        station, simulator = self._current
-        context = simulator.get_context()
-        food = station.GetOutputPort("food_wrench_vector").Eval(context)
-        board = station.GetOutputPort("board_wrench_vector").Eval(context)
+        food, board = self._output("food_wrench_vector"), self._output("board_wrench_vector")
         return float(np.linalg.norm(food[3:] + board[3:]))
 
-    def _end(self, error: np.ndarray) -> str:
+    def _end(self, time: float, error: np.ndarray) -> str:
         """Why the episode ends, or nothing."""
-        assert self._current is not None
-        station, simulator = self._current
-        context, agent = simulator.get_context(), self.task.agent
-        at_goal = station.GetOutputPort("at_goal").Eval(context)[0] > agent.goal_decisions
-        wrench = station.GetOutputPort("sensor_wrench").Eval(context).get_coeffs()
-        until = self._decisions * agent.period
-        return self.task.limits().end(at_goal, context.get_time(), until, wrench, error)
+        agent = self.task.agent
+        at_goal = self._output("at_goal")[0] > agent.goal_decisions
+        wrench = self._output("sensor_wrench").get_coeffs()
+        return self.task.limits().end(at_goal, time, self._decisions * agent.period, wrench, error)

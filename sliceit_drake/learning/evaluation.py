@@ -1,11 +1,15 @@
-"""Lets a policy cut a slice, and measures it."""
+"""Lets a policy cut a slice, and measures it.
+
+What counts was fixed before any policy was trained. The contact force is that of food and board on
+the knife, without the tool's weight and inertia.
+"""
 
 import dataclasses as dc
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
+from pydrake.systems.primitives import LogVectorOutput
 
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.agent_station import add_agent
@@ -13,16 +17,67 @@ from sliceit_drake.diagrams.prepared_food import OwnCutting
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.learning.ending import Limits
-from sliceit_drake.learning.metrics import SliceMetrics, slice_metrics
 from sliceit_drake.systems.agent import AgentConfig, Decide
 
-__all__ = ["LIMITS", "SliceTrace", "cut_slice"]
-
+__all__ = ["LIMITS", "SliceMetrics", "SliceTrace", "cut_slice", "slice_metrics"]
 
 LONGEST = 25.0
 """Longest slice, s: as many decisions as in training."""
 LIMITS = Limits(force=150.0, torque=30.0, workspace=(0.05, 0.1, 0.1745))
 """Greater than in training: what a policy does over its sensor's limit is measured too."""
+CONTACT = 0.5
+"""Force from which a sample counts as contact, N."""
+COMPLETE = 0.999
+"""Fraction of a section from which a slice counts as cut off."""
+
+
+@dc.dataclass(frozen=True)
+class SliceMetrics:
+    """One slice.
+
+    Attributes:
+        median_force: Median of |F| over contact samples, N.
+        peak_force: Greatest |F|, N.
+        board_peak: Greatest force of the board, N.
+        duration: From the start to the end of the slice, s.
+        completed: Whether the section was cut through and the policy brought the slice to its end.
+        cut: Fraction of the section that was cut.
+        end: Why the slice ended: goal, force, torque, shaking, workspace, guard or time.
+    """
+
+    median_force: float
+    peak_force: float
+    board_peak: float
+    duration: float
+    completed: bool
+    cut: float
+    end: str
+
+
+def slice_metrics(
+    time: np.ndarray, food: np.ndarray, board: np.ndarray, cut: np.ndarray, end: str
+) -> SliceMetrics:
+    """Metrics of a slice that has ended.
+
+    Args:
+        time: [n], s.
+        food: Force of the food on the knife [n, 3], N.
+        board: Likewise of the board.
+        cut: Fraction of the section that is cut [n].
+        end: Why it ended.
+    """
+    force = np.linalg.norm(food + board, axis=1)
+    contact = force[force >= CONTACT]
+    share = float(cut[-1]) if len(cut) else 0.0
+    return SliceMetrics(
+        median_force=float(np.median(contact)) if len(contact) else 0.0,
+        peak_force=float(force.max(initial=0.0)),
+        board_peak=float(np.linalg.norm(board, axis=1).max(initial=0.0)),
+        duration=float(time[-1] - time[0]) if len(time) else 0.0,
+        completed=end == "goal" and share >= COMPLETE,
+        cut=share,
+        end=end,
+    )
 
 
 @dc.dataclass
@@ -103,14 +158,9 @@ def cut_slice(
         end = limits.end(at_goal, context.get_time(), until, wrench, error)
         if not end and context.get_time() >= longest:
             end = "time"
-    time, food, board, cut = _logged(logs, simulator)
+    found = [log.FindLog(context) for log in logs]
+    time = np.array(found[0].sample_times())
+    food, board, cut = (np.array(log.data()) for log in found)
+    food, board, cut = food[3:].T, board[3:].T, cut[0]
     metrics = slice_metrics(time, food, board, cut, end)
     return SliceTrace(time, food, board, cut, np.array(heights), np.array(actions), metrics)
-
-
-def _logged(
-    logs: list[VectorLogSink], simulator: Simulator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    found = [log.FindLog(simulator.get_context()) for log in logs]
-    food, board, cut = (np.array(log.data()) for log in found)
-    return np.array(found[0].sample_times()), food[3:].T, board[3:].T, cut[0]

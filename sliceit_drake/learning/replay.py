@@ -97,17 +97,12 @@ class PrioritizedReplayBuffer(ReplayBuffer):
     ) -> None:
         """Keeps a transition of each environment [n_envs, ...]."""
         for k in range(self._environments):
-            one = slice(k, k + 1)
-            parts = obs[one], next_obs[one], action[one], reward[one], done[one], infos[one]
-            self._add_one(*parts)
-
-    def _add_one(self, *transition: Any) -> None:
-        place = self.pos
-        super().add(*transition)
-        self._filled.size = self.buffer_size if self.full else self.pos
-        # With the greatest priority so far, so that each is seen once.
-        self._sampler.extend(torch.tensor([place]))
-        self._sampler.mark_update(torch.tensor([place]), storage=self._filled)
+            one, place = slice(k, k + 1), torch.tensor([self.pos])
+            super().add(obs[one], next_obs[one], action[one], reward[one], done[one], infos[one])
+            self._filled.size = self.buffer_size if self.full else self.pos
+            # With the greatest priority so far, so that each is seen once.
+            self._sampler.extend(place)
+            self._sampler.mark_update(place, storage=self._filled)
 
     def sample_prioritized(self, batch_size: int) -> PrioritizedSamples:
         """Draws a batch."""

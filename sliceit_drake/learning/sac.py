@@ -117,7 +117,8 @@ class PrioritizedSAC(SAC):
         self.critic.optimizer.zero_grad(set_to_none=True)
         critic_loss.backward()
         self.critic.optimizer.step()
-        self.replay_buffer.update(places, self._size(errors))
+        sizes = torch.cat(errors, dim=1).detach().abs().mean(dim=1)
+        self.replay_buffer.update(places, sizes.numpy())
 
         for parameter in self.critic.parameters():
             parameter.requires_grad_(False)
@@ -132,13 +133,15 @@ class PrioritizedSAC(SAC):
         with torch.no_grad():
             targets = list(self.critic_target.parameters())
             torch._foreach_lerp_(targets, list(self.critic.parameters()), self.tau)
-        self._trace(
-            actor_loss=actor_loss.item(),
-            critic_loss=critic_loss.item(),
-            ent_coef=float(alpha),
-            entropy=-log_density.mean().item(),
-            value=worth.mean().item(),
-        )
+        for name, value in (
+            ("actor_loss", actor_loss),
+            ("critic_loss", critic_loss),
+            ("ent_coef", alpha),
+            ("entropy", -log_density.mean()),
+            ("value", worth.mean()),
+        ):
+            before = self.running.get(name, value.item())
+            self.running[name] = before + TRACE * (value.item() - before)
 
     def _act(self, observations: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """A random action [batch, 6] and the logarithm of its density [batch, 1]."""
@@ -159,16 +162,6 @@ class PrioritizedSAC(SAC):
         loss.backward()
         self.ent_coef_optimizer.step()
         return alpha
-
-    @staticmethod
-    def _size(errors: list[torch.Tensor]) -> np.ndarray:
-        stacked = torch.cat(errors, dim=1).detach()
-        return stacked.abs().mean(dim=1).numpy()
-
-    def _trace(self, **values: float) -> None:
-        for name, value in values.items():
-            before = self.running.get(name, value)
-            self.running[name] = before + TRACE * (value - before)
 
     def training_state(self) -> dict[str, Any]:
         """All that is needed to go on as if nothing had happened, but for the environments.

@@ -117,7 +117,11 @@ def station_scenario(task: TaskConfig, calibrated: CalibratedFood, food: str) ->
         numerics=Numerics(flank_stiffness=calibrated.flank_stiffness, time_step=task.time_step),
     )
     if task.simulator == "cutting":
-        scenario.food = _meshed(calibrated.apply_to(calibrated.food), task.refinement)
+        food_model = calibrated.apply_to(calibrated.food)
+        shape = food_model.shape
+        if isinstance(shape, Cylinder):
+            shape = dc.replace(shape, rings=max(2, round(shape.rings * task.refinement)))
+        scenario.food = dc.replace(food_model, shape=shape)
         return scenario
     if calibrated.spring is None:
         raise ConfigurationError(
@@ -163,13 +167,6 @@ def check_task(task: TaskConfig) -> None:
         make_agent_station(few, food, np.random.default_rng(0))
 
 
-def _meshed(food: Food, refinement: float) -> Food:
-    shape = food.shape
-    if isinstance(shape, Cylinder):
-        shape = dc.replace(shape, rings=max(2, round(shape.rings * refinement)))
-    return dc.replace(food, shape=shape)
-
-
 def _variants(
     task: TaskConfig, calibrated: CalibratedFood, scenario: Scenario, rng: np.random.Generator
 ) -> list:
@@ -183,12 +180,8 @@ def _variants(
             rng, randomization.variants
         )
     else:
-        names = VARIED
-        factors = 1.0 + randomization.noise * rng.uniform(
-            -1.0, 1.0, (randomization.variants, len(names))
-        )
-        at = {n: getattr(scenario.food.material, n.split(".")[1]) for n in names}
-        draws = [
-            {n: at[n] * f for n, f in zip(names, row, strict=True)} for row in factors.tolist()
-        ]
+        size = (randomization.variants, len(VARIED))
+        factors = 1.0 + randomization.noise * rng.uniform(-1.0, 1.0, size)
+        at = [getattr(scenario.food.material, name.split(".")[1]) for name in VARIED]
+        draws = [dict(zip(VARIED, row, strict=True)) for row in (factors * at).tolist()]
     return [with_parameters(model, draw) for draw in draws]

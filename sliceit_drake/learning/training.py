@@ -243,7 +243,7 @@ class _Watch(BaseCallback):
         self._saved_at = 0
         self._ends: Counter[str] = Counter()
         self._guards: Counter[str] = Counter()
-        self._sums: list[dict[str, float]] = [{} for _ in range(config.environments)]
+        self._sums: list[Counter] = [Counter() for _ in range(config.environments)]
         self._returns: deque[float] = deque(maxlen=SELECTION)
         self.best_return, self.best_steps = -math.inf, 0
         self.best_actor: dict[str, torch.Tensor] | None = None
@@ -253,7 +253,7 @@ class _Watch(BaseCallback):
         self.episodes, self._saved_at = state["episodes"], state["steps"]
         self._ends, self._guards = Counter(state["ends"]), Counter(state["guards"])
         self._returns.extend(state["returns"])
-        self._sums = state["sums"]
+        self._sums = [Counter(sums) for sums in state["sums"]]
         self.best_return, self.best_steps, self.best_actor = state["best"]
 
     def outcome(self, wall_time: float) -> Outcome:
@@ -278,16 +278,11 @@ class _Watch(BaseCallback):
     def _on_step(self) -> bool:
         each = (self.locals[name] for name in ("infos", "rewards", "dones"))
         for sums, info, reward, done in zip(self._sums, *each, strict=True):
-            for name, value in (
-                ("return", float(reward)),
-                ("length", 1.0),
-                ("force", info["force"]),
-                *((f"reward_{name}", value) for name, value in info["reward_terms"].items()),
-            ):
-                sums[name] = sums.get(name, 0.0) + value
-            sums["peak"] = max(sums.get("peak", 0.0), info["force"])
+            terms = {f"reward_{name}": value for name, value in info["reward_terms"].items()}
+            sums.update({"return": float(reward), "length": 1.0, "force": info["force"], **terms})
+            sums["peak"] = max(sums["peak"], info["force"])
             if done:
-                self._finish_episode(info, dict(sums))
+                self._finish_episode(info, sums)
                 sums.clear()
         if self._schedule:
             share = self.num_timesteps / self._config.steps
@@ -318,7 +313,7 @@ class _Watch(BaseCallback):
                 "ends": dict(self._ends),
                 "guards": dict(self._guards),
                 "returns": list(self._returns),
-                "sums": copy.deepcopy(self._sums),
+                "sums": [dict(sums) for sums in self._sums],
                 "best": (self.best_return, self.best_steps, self.best_actor),
             },
         }
@@ -327,7 +322,7 @@ class _Watch(BaseCallback):
         torch.save(state, part)
         os.replace(part, self._output / CHECKPOINT)
 
-    def _finish_episode(self, info: dict[str, Any], sums: dict[str, float]) -> None:
+    def _finish_episode(self, info: dict[str, Any], sums: Counter) -> None:
         self.episodes += 1
         self._ends[info["end"]] += 1
         if "guard_error" in info:

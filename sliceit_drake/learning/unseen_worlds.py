@@ -153,20 +153,12 @@ def results_table(file: Path, cases: Sequence[Case]) -> str:
             groups.setdefault(key, []).append(row)
     rows = []
     for (policy, world, board, food), found in groups.items():
-        mean = {
-            name: sum(row[name] for row in found) / len(found)
+        completed = f"{sum(row['completed'] for row in found)} of {len(found)}"
+        means = (
+            f"{sum(row[name] for row in found) / len(found):.2f}"
             for name in ("median_force", "peak_force", "board_peak", "duration")
-        }
-        rows.append(
-            [
-                policy,
-                world,
-                f"{board:g}",
-                food,
-                f"{sum(row['completed'] for row in found)} of {len(found)}",
-                *(f"{value:.2f}" for value in mean.values()),
-            ]
         )
+        rows.append([policy, world, f"{board:g}", food, completed, *means])
     head = ["policy", "world", "board [N/m]", "food", "completed", "median |F| [N]", "peak [N]"]
     head += ["board [N]", "duration [s]"]
     lines = [head, ["---"] * len(head), *rows]

@@ -19,9 +19,9 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.learning.evaluation import SliceTrace
-from sliceit_drake.learning.metrics import Ratio, bootstrap_ratio
 from sliceit_drake.learning.unseen_worlds import Case, trace
 from studies.figures import new_figure, save_figure
+from studies.learning.ratio import Ratio, bootstrap_ratio
 from studies.pages import publish, render
 
 __all__ = [

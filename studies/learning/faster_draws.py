@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sliceit_drake.learning.metrics import bootstrap_ratio
 from studies.learning.comparison import PAPER, Comparison, compare, interval, share
+from studies.learning.ratio import bootstrap_ratio
 from studies.marked_page import Place
 from studies.pages import table
 

@@ -21,8 +21,7 @@ from sliceit_drake.cutting.motion import Hold, MotionPlan, PressAndDraw
 from sliceit_drake.cutting.motion_optimization import MotionLimits, optimize_motion
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
-from sliceit_drake.learning.evaluation import cut_slice
-from sliceit_drake.learning.metrics import SliceMetrics, slice_metrics
+from sliceit_drake.learning.evaluation import SliceMetrics, cut_slice, slice_metrics
 from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.slicing_worlds import SLICING_FOODS, StandInWorld
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
