@@ -17,12 +17,13 @@ from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.stand_in.curve_laws import (
     CutState,
     EllipticSection,
+    FoodCurve,
     food_forces,
     measured_curve,
 )
 from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceTruth, Tissue
 from sliceit_drake.stand_in.protocol import Protocol, Specimen, section_size
-from sliceit_drake.stand_in.world import GRAVITY, Path, resampled
+from sliceit_drake.stand_in.world import Path, Run, resampled
 
 __all__ = ["CurveWorld"]
 
@@ -67,116 +68,87 @@ class CurveWorld:
             np.array([x + condition.offset, y, height + condition.clearance]),
         )
         path = Path.of(condition.motion, start, protocol.exchange_period)
-        section = EllipticSection(width, height)
-        series = self._along(path, specimen, facts, section, effects)
+        series = _CurveRun(protocol, self._curve, path, specimen, facts, effects).cut()
         for effect in effects:
             effect.respond(series)
         return series
 
-    def _along(
+
+class _CurveRun(Run):
+    """One slice by a measured curve."""
+
+    def __init__(
         self,
+        protocol: Protocol,
+        curve: FoodCurve,
         path: Path,
         specimen: Specimen,
         facts: SliceTruth,
-        section: EllipticSection,
         effects: Sequence[Effect],
-    ) -> Series:
-        timeless = not any(effect.every_coupling_step for effect in effects)
-        stretches = np.array(list(path.stretches(TRAVEL, LONGEST if timeless else 1, 0.0)))
-        size = facts.width / section_size(self.protocol.food, 1.0)[0]
-        curve = self._curve.scaled(specimen.toughness).scaled(size)
-        more = _EdgeEffects(section, facts, effects)
-        state, force = CutState(path.p[0]), np.zeros(3)
-        forces = np.zeros((len(stretches), 3, 3))
-        shifts = np.zeros((len(stretches), 2, 3))
-        depths = np.zeros(len(stretches))
-        for row, (a, b) in enumerate(stretches):
-            period = path.period * float(b - a)
-            v = (path.p[b] - path.p[a]) / period
-            press, draw = -float(v[2]), float(v @ path.R[b][:, 0])
-            now = Now(
-                time=float(path.time[a]),
-                period=period,
-                position=path.p[b],
-                press=press,
-                draw=draw,
-                depth=state.depth,
-                travel=state.travel,
-                swept=state.swept,
-                force=force,
-            )
-            for effect in effects:
-                effect.drive(now)
-            now.food_shift[2] += specimen.height
-            shifts[row] = now.knife_shift, now.food_shift
-            place = path.p[b] + now.knife_shift - now.food_shift
-            state.advance(period, path.R[b][:, 0], place, facts.height)
-            depths[row] = state.depth
-            if not specimen.condition.without_food:
-                forces[row] = food_forces(
-                    state, curve, section, now.toughness, now.friction, more.at(state.depth)
-                )
-                forces[row, 2] *= specimen.friction
-            board = self._board(path.p[b][2] + now.knife_shift[2], press)
-            force = forces[row].sum(0) + [0.0, 0.0, board]
-        return self._series(path, specimen, facts, section, stretches, forces, shifts, depths)
+    ) -> None:
+        super().__init__(path, specimen, facts, effects)
+        self._protocol = protocol
+        self._section = EllipticSection(facts.width, facts.height)
+        size = facts.width / section_size(protocol.food, 1.0)[0]
+        self._curve = curve.scaled(specimen.toughness).scaled(size)
+        self._more = _EdgeEffects(self._section, facts, effects)
+        self._state = CutState(path.p[0])
+        self._has_food = not specimen.condition.without_food
+
+    def reached(self) -> tuple[float, float, float]:
+        return self._state.depth, self._state.travel, self._state.swept
+
+    def advance(self, now: Now, row: int) -> tuple[np.ndarray, float]:
+        p, state = self.path.p[row] + now.knife_shift, self._state
+        state.advance(now.period, self.path.R[row][:, 0], p - now.food_shift, self.facts.height)
+        forces = np.zeros((3, 3))
+        if self._has_food:
+            more = self._more.at(state.depth)
+            factors = now.toughness, now.friction
+            forces = food_forces(state, self._curve, self._section, *factors, more)
+            forces[2] *= self.specimen.friction
+        self.force = forces.sum(0) + [0.0, 0.0, self._board(p[2], now.press)]
+        return forces, state.depth
 
     def _board(self, height: float, press: float) -> float:
-        board = self.protocol.board
+        board = self._protocol.board
         depth = max(-height, 0.0)
         law = board.stiffness / np.sqrt(BOARD_DEPTH) * depth**1.5
         return float(law * max(0.0, 1.0 + 1.5 * board.dissipation * press))
 
-    def _series(
-        self,
-        path: Path,
-        specimen: Specimen,
-        facts: SliceTruth,
-        section: EllipticSection,
-        stretches: np.ndarray,
-        forces: np.ndarray,
-        shifts: np.ndarray,
-        depths: np.ndarray,
-    ) -> Series:
+    def cut(self) -> Series:
+        """Cuts the slice; effects have not responded yet."""
+        path, section = self.path, self._section
+        stretches, forces, depths, shifts = self.drive(TRAVEL, LONGEST, 0.0)
         T, time = path.period, path.time[1:]
         ends = T * stretches[:, 1]
         force = resampled(forces, ends, time)
         knife, food = np.moveaxis(resampled(shifts, ends, time), 1, 0)
         p_true = path.p[1:] + knife
         depth = resampled(depths, ends, time)
-        there = not specimen.condition.without_food
-        buried = np.array([section.above(d) for d in depth]) * there
+        buried = np.array([section.above(d) for d in depth]) * self._has_food
         # The edge is pushed where the food is, the flanks in the middle of what is buried.
         arm = np.zeros((len(time), 3))
-        arm[:, 0] = self.protocol.food.cut_point[0] + food[:, 0] - p_true[:, 0]
+        arm[:, 0] = self._protocol.food.cut_point[0] + food[:, 0] - p_true[:, 0]
         raised = arm + np.array([0.0, 0.0, 0.5]) * np.maximum(depth, 0.0)[:, None]
-        wrenches = [
+        edge, normal, friction = (
             np.concatenate([np.cross(r, force[:, k]), force[:, k]], axis=1)
             for k, r in enumerate((arm, raised, raised))
-        ]
-        board, other = np.zeros((len(time), 6)), np.zeros((len(time), 6))
+        )
+        board = np.zeros((len(time), 6))
         heights = np.concatenate([path.p[:1, 2] + knife[:1, 2], p_true[:, 2]])
         sinking = -np.diff(heights) / T
         board[:, 5] = [self._board(z, s) for z, s in zip(heights[1:], sinking, strict=True)]
-        weighed = np.array([label == "weight" for label in path.phase])
-        other[weighed, 5] -= GRAVITY * specimen.condition.weight
-        return Series(
-            slice=facts,
-            time=time,
-            R=path.R[1:],
-            p=path.p[1:],
-            p_true=p_true,
-            v=path.v,
-            phase=path.phase,
+        return self.series(
+            p_true,
             depth=depth,
             flank=2.0 * section.area * buried,
             flank_arm=raised,
             cut=np.maximum.accumulate(buried),
-            edge=wrenches[0],
-            normal=wrenches[1],
-            friction=wrenches[2],
+            edge=edge,
+            normal=normal,
+            friction=friction,
             board=board,
-            other=other,
         )
 
 

@@ -27,7 +27,7 @@ from sliceit_drake.cutting.simulate import check_clear, check_energies, check_in
 from sliceit_drake.cutting.solver import CuttingSolver, SurfaceFactors
 from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceTruth, Tissue
 from sliceit_drake.stand_in.protocol import Protocol, Specimen, scaled_food, section_size
-from sliceit_drake.stand_in.world import GRAVITY, Path, resampled
+from sliceit_drake.stand_in.world import Path, Run, resampled
 
 __all__ = ["FiniteElementSettings", "FiniteElementWorld"]
 
@@ -173,17 +173,16 @@ class FiniteElementWorld:
             # The clearance is over the food, not over a mesh that conserves its volume.
             start.p[2] = section_size(food)[1] + condition.clearance
         path = Path.of(condition.motion, start, protocol.exchange_period)
-        if condition.without_food:
-            run = _Run(self, path, None, nominal, specimen, effects)
-        else:
+        model, section = None, nominal
+        if not condition.without_food:
             moved = mesh.vertices
             for effect in effects:
                 moved = effect.reshape(moved)
             section = self._section(food, TetrahedralMesh(moved, mesh.tetrahedra))
             model = _with_tissue(section, specimen, effects)
             check_clear(model, Pose(*_in_cut(model, path.R[0], path.p[0])))
-            run = _Run(self, path, model, section, specimen, effects)
-        series = run.series(facts)
+        run = _FiniteElementRun(self, path, specimen, facts, effects, section, model)
+        series = run.cut()
         for effect in effects:
             effect.respond(series)
         return series
@@ -223,143 +222,86 @@ def _with_tissue(section: _Section, specimen: Specimen, effects: Sequence[Effect
     return model
 
 
-class _Run:
-    """One slice while it is cut."""
+class _FiniteElementRun(Run):
+    """One slice of finite elements; without `model` there is none on the board."""
 
     def __init__(
         self,
         world: FiniteElementWorld,
         path: Path,
-        model: CuttingModel | None,
-        section: _Section,
         specimen: Specimen,
+        facts: SliceTruth,
         effects: Sequence[Effect],
+        section: _Section,
+        model: CuttingModel | None,
     ) -> None:
-        self.world, self.path, self.model = world, path, model
-        self.section, self.specimen, self.effects = section, specimen, effects
-        self.protocol = world.protocol
-        self.board = dc.replace(self.protocol.board, height=0.0)
-        geometry = section.model
-        self.R_FC, self.top = geometry.X_FC_rotation, geometry.top
+        super().__init__(path, specimen, facts, effects)
+        self.settings, self.knife = world.settings, world.protocol.knife
+        self.section, self.model = section, model
+        self.board = dc.replace(world.protocol.board, height=0.0)
         self.solver = None if model is None else CuttingSolver(model, path.period)
         self.state = np.zeros(0) if self.solver is None else self.solver.initial_state()
-        self.fed = Pose(*_in_cut(geometry, path.R[0], path.p[0]))
+        self.fed = Pose(*_in_cut(section.model, path.R[0], path.p[0]))
         self.spent = self.since_check = 0.0
-        self.cut = self.travel = self.swept = 0.0
-        self.force = np.zeros(3)
+        self.cut_fraction = self.travel = self.swept = 0.0
 
-    def series(self, facts: SliceTruth) -> Series:
-        """Drives the knife along the path."""
-        path, settings = self.path, self.world.settings
-        reach = 0.5 * self.protocol.knife.length
-        timeless = not any(effect.every_coupling_step for effect in self.effects)
-        rates = self.model is not None and (
-            self.model.material.static_friction > self.model.material.friction
-        )
-        longest = LONGEST if timeless and not rates else 1
-        stretches = list(path.stretches(settings.travel, longest, reach))
-        parts = np.zeros((len(stretches), 3, 6))
-        shifts = np.zeros((len(stretches), 2, 3))
-        cut = np.zeros(len(stretches))
-        for row, (a, b) in enumerate(stretches):
-            now = self._now(a, b)
-            for effect in self.effects:
-                effect.drive(now)
-            now.food_shift[2] += self.specimen.height
-            shifts[row] = now.knife_shift, now.food_shift
-            parts[row] = self._advance(now, b)
-            cut[row] = self.cut
-        return self._sampled(facts, np.array(stretches), parts, shifts, cut)
+    def reached(self) -> tuple[float, float, float]:
+        return self.section.model.top - float(self.fed.p[2]), self.travel, self.swept
 
-    def _now(self, a: int, b: int) -> Now:
-        path = self.path
-        period = path.period * (b - a)
-        v = (path.p[b] - path.p[a]) / period
-        return Now(
-            time=float(path.time[a]),
-            period=period,
-            position=path.p[b],
-            press=-float(v[2]),
-            draw=float(v @ path.R[b][:, 0]),
-            depth=self.top - float(self.fed.p[2]),
-            travel=self.travel,
-            swept=self.swept,
-            force=self.force,
-        )
-
-    def _advance(self, now: Now, b: int) -> np.ndarray:
-        """Advances food and board through a stretch; wrenches by mechanism, in F [3, 6]."""
-        path = self.path
+    def advance(self, now: Now, row: int) -> tuple[np.ndarray, float]:
+        path, geometry = self.path, self.section.model
         shift = now.knife_shift - now.food_shift
-        pose = Pose(*_in_cut(self.section.model, path.R[b], path.p[b] + shift))
-        reach = 0.5 * self.protocol.knife.length * abs(float(pose.R[2, 0]))
+        pose = Pose(*_in_cut(geometry, path.R[row], path.p[row] + shift))
+        reach = 0.5 * self.knife.length * abs(float(pose.R[2, 0]))
         lowest = min(float(pose.p[2]), float(self.fed.p[2])) - reach
         parts = np.zeros((3, 6))
-        if self.solver is not None and lowest < self.top + CLEAR:
+        if self.solver is not None and lowest < geometry.top + CLEAR:
             assert self.model is not None
             check_in_plane(self.model, pose, now.time + now.period)
             factors = SurfaceFactors(now.toughness, now.friction)
             step = self.solver.coupling_step(self.state, self.fed, pose, factors)
-            self.state, self.cut = step.state, float(step.cut[-1])
-            parts = (step.wrenches.reshape(3, 2, 3) @ self.R_FC.T).reshape(3, 6)
+            self.state, self.cut_fraction = step.state, float(step.cut[-1])
+            parts = (step.wrenches.reshape(3, 2, 3) @ geometry.X_FC_rotation.T).reshape(3, 6)
             self.spent += step.balance.edge + step.balance.opening + step.balance.friction
             moved = float(np.linalg.norm(pose.p - self.fed.p))
-            self._check(moved, pose, factors, now.time + now.period)
-            if pose.p[2] < self.top:
+            self.since_check += moved
+            if self.since_check > CHECK_TRAVEL:
+                self.since_check = 0.0
+                energies = self.solver.energies(self.state, pose, factors)
+                check_energies(energies, self.spent, self.model, now.time + now.period)
+            if pose.p[2] < geometry.top:
                 self.travel += moved
                 self.swept += 2.0 * moved * self.section.width(float(pose.p[2]))
         self.fed = pose
         self.force = parts[:, 3:].sum(0)
-        p = path.p[b] + now.knife_shift
+        p = path.p[row] + now.knife_shift
         if p[2] < reach:
             v, w = np.array([0.0, 0.0, -now.press]), np.zeros(3)
-            self.force += board_wrench(self.board, self.protocol.knife, path.R[b], p, v, w)[3:]
-        return parts
+            self.force += board_wrench(self.board, self.knife, path.R[row], p, v, w)[3:]
+        return parts, self.cut_fraction
 
-    def _check(self, moved: float, pose: Pose, factors: SurfaceFactors, time: float) -> None:
-        self.since_check += moved
-        if self.since_check > CHECK_TRAVEL:
-            assert self.solver is not None and self.model is not None
-            self.since_check = 0.0
-            energies = self.solver.energies(self.state, pose, factors)
-            check_energies(energies, self.spent, self.model, time)
-
-    def _sampled(
-        self,
-        facts: SliceTruth,
-        stretches: np.ndarray,
-        parts: np.ndarray,
-        shifts: np.ndarray,
-        cut: np.ndarray,
-    ) -> Series:
-        path, T = self.path, self.path.period
+    def cut(self) -> Series:
+        """Cuts the slice; effects have not responded yet."""
+        path, model = self.path, self.model
+        rates = model is not None and model.material.static_friction > model.material.friction
+        longest = 1 if rates else LONGEST
+        reach = 0.5 * self.knife.length
+        stretches, parts, cut, shifts = self.drive(self.settings.travel, longest, reach)
         # Forces are means over stretches; shifts and cuts are those at their ends.
+        T, time = path.period, path.time[1:]
         middle, ends = T * stretches.mean(1), T * stretches[:, 1]
-        time = path.time[1:]
         forces = resampled(parts, middle, time - 0.5 * T)
         knife, food = np.moveaxis(resampled(shifts, ends, time), 1, 0)
         p_true = path.p[1:] + knife
         geometry = self.section.model
         height = geometry.to_cut_frame(p_true - food)[:, 2]
         flank, arm = np.zeros(len(time)), np.zeros((len(time), 3))
-        if self.model is not None:
+        if model is not None:
             flank = 2.0 * self.section.above(height)
             arm = self.section.middle_above(height) + food - p_true
-        other = np.zeros((len(time), 6))
-        weighed = np.array([label == "weight" for label in path.phase])
-        other[weighed, 5] -= GRAVITY * self.specimen.condition.weight
-        start = path.p[:1] + knife[:1]
-        board = board_wrenches(
-            self.board, self.protocol.knife, path.R, np.concatenate([start, p_true]), T
-        )
-        return Series(
-            slice=facts,
-            time=time,
-            R=path.R[1:],
-            p=path.p[1:],
-            p_true=p_true,
-            v=path.v,
-            phase=path.phase,
+        p = np.concatenate([path.p[:1] + knife[:1], p_true])
+        return self.series(
+            p_true,
             depth=geometry.top - height,
             flank=flank,
             flank_arm=arm,
@@ -367,6 +309,5 @@ class _Run:
             edge=forces[:, 0],
             normal=forces[:, 1],
             friction=forces[:, 2],
-            board=board,
-            other=other,
+            board=board_wrenches(self.board, self.knife, path.R, p, T),
         )

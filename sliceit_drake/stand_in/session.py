@@ -261,12 +261,9 @@ def record_session(
     done = len(session) - len(left)
     if progress is not None:
         progress(done, len(session))
-    written = (
-        _written(session, effects, world, settings, output, left, workers)
-        if client is None
-        else _written_by_cluster(client, session, effects, world, settings, output, left)
-    )
-    for _ in written:
+    content = pickle.dumps((protocol, tuple(effects), world, seed, settings))
+    for files in _computed(content, left, workers, client):
+        keep_record(files, output)
         done += 1
         if progress is not None:
             progress(done, len(session))
@@ -292,107 +289,51 @@ def is_recorded(specimen: Specimen, folder: FilePath) -> bool:
     return True
 
 
-def _write(record: SliceRecord, output: FilePath, index: int) -> int:
-    with _moved_into(output) as folder:
-        write_record(record, folder / slice_name(index))
-    return index
+def keep_record(files: Mapping[str, bytes], output: FilePath) -> None:
+    """Writes the two files of a record.
 
-
-def keep_record(files: Mapping[str, bytes], output: FilePath, index: int) -> int:
-    """Writes the two files of a record that was made elsewhere; returns its index."""
-    with _moved_into(output) as folder:
-        for name, content in files.items():
-            (folder / name).write_bytes(content)
-    return index
-
-
-@contextlib.contextmanager
-def _moved_into(output: FilePath) -> Iterator[FilePath]:
-    """A folder whose files go to `output` at the end, the table before what describes it.
-
-    Two files make a record; a run that is killed must not leave half of one.
+    They go to `output` at the end, the table before what describes it: a run that is killed must
+    not leave half a record.
     """
-    with tempfile.TemporaryDirectory(dir=output, prefix=".writing_") as name:
-        folder = FilePath(name)
-        yield folder
-        for file in sorted(folder.iterdir()):
-            os.replace(file, output / file.name)
+    with tempfile.TemporaryDirectory(dir=output, prefix=".writing_") as folder:
+        for name, content in files.items():
+            (FilePath(folder) / name).write_bytes(content)
+        for name in sorted(files):
+            os.replace(FilePath(folder) / name, output / name)
 
 
-_worker: list[tuple[Session, FilePath]] = []
-
-
-def _start_worker(
-    protocol: Protocol,
-    effects: Sequence[str],
-    world: str,
-    seed: int,
-    settings: FiniteElementSettings | None,
-    output: FilePath,
-) -> None:
-    hidden = [make_effect(text) for text in effects]
-    _worker.append((Session(protocol, hidden, world, seed, settings), output))
-
-
-def _work(index: int) -> int:
-    session, output = _worker[0]
-    return _write(session.record(index), output, index)
-
-
-def _written(
-    session: Session,
-    effects: Sequence[str],
-    world: str,
-    settings: FiniteElementSettings | None,
-    output: FilePath,
-    left: Sequence[int],
-    workers: int,
-) -> Iterator[int]:
-    """Writes the slices that are left, and yields each when its files are there."""
-    if min(workers, len(left)) < 2:
+def _computed(
+    content: bytes, left: Sequence[int], workers: int, client: "Client | None"
+) -> Iterator[dict[str, bytes]]:
+    """The files of the slices that are left, each as it is done here, in processes or a cluster."""
+    if client is None and min(workers, len(left)) < 2:
         for index in left:
-            yield _write(session.record(index), output, index)
+            yield _record_files(content, index)
         return
-    # Effects travel by name: a class from a user's file is in no module that a process can import.
-    arguments = (session.protocol, tuple(effects), world, session.seed, settings, output)
-    with worker_processes(workers, "spawn", _start_worker, arguments) as pool:
-        for future in as_completed([pool.submit(_work, index) for index in left]):
+    with contextlib.ExitStack() as stack:
+        if client is None:
+            pool = stack.enter_context(worker_processes(workers))
+        else:
+            pool = client.get_executor(pure=False)
+            stack.callback(pool.shutdown, wait=False)
+        for future in as_completed([pool.submit(_record_files, content, k) for k in left]):
             yield future.result()
 
 
 _SESSIONS = threading.local()
 
 
-def _record_there(content: bytes, index: int) -> tuple[int, dict[str, bytes]]:
-    """The files of a slice, from a worker of a cluster whose threads keep the session.
+def _record_files(content: bytes, index: int) -> dict[str, bytes]:
+    """The files of a slice; the thread that computes it keeps the session.
 
     A record takes longer to turn into text than to send: whoever collects them only writes.
     """
     known: tuple[bytes, Session] | None = getattr(_SESSIONS, "known", None)
     if known is None or known[0] != content:
         protocol, effects, world, seed, settings = pickle.loads(content)
+        # Effects travel by name: one from a user's file is in no module that can be imported.
         hidden = [make_effect(text) for text in effects]
         known = _SESSIONS.known = (content, Session(protocol, hidden, world, seed, settings))
     with tempfile.TemporaryDirectory() as folder:
         made = write_record(known[1].record(index), FilePath(folder) / slice_name(index))
-        return index, {f.name: f.read_bytes() for f in (made, made.with_suffix(".yaml"))}
-
-
-def _written_by_cluster(
-    client: "Client",
-    session: Session,
-    effects: Sequence[str],
-    world: str,
-    settings: FiniteElementSettings | None,
-    output: FilePath,
-    left: Sequence[int],
-) -> Iterator[int]:
-    """Has the slices that are left cut by a cluster, and writes each as it comes."""
-    content = pickle.dumps((session.protocol, tuple(effects), world, session.seed, settings))
-    pool = client.get_executor(pure=False)
-    try:
-        for future in as_completed([pool.submit(_record_there, content, k) for k in left]):
-            index, files = future.result()
-            yield keep_record(files, output, index)
-    finally:
-        pool.shutdown(wait=False)
+        return {f.name: f.read_bytes() for f in (made, made.with_suffix(".yaml"))}

@@ -1,5 +1,6 @@
-"""The interface of a world, and what all share: the knife's path and the pieces it is cut into."""
+"""The interface of a world, and what all share: the knife's path, and how a slice follows it."""
 
+import abc
 import dataclasses as dc
 import typing
 from collections.abc import Iterator, Sequence
@@ -7,10 +8,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from sliceit_drake.cutting.motion import Motion, MotionPlan, Pose
-from sliceit_drake.stand_in.effect import Effect, Series
+from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceTruth
 from sliceit_drake.stand_in.protocol import Specimen
 
-__all__ = ["GRAVITY", "Path", "World", "resampled"]
+__all__ = ["GRAVITY", "Path", "Run", "World", "resampled"]
 
 GRAVITY = 9.81
 """m/s2."""
@@ -103,6 +104,100 @@ class Path:
             b = min(max(b, a + 1), a + max(most, 1))
             yield a, b
             a = b
+
+
+class Run(abc.ABC):
+    """One slice while it is cut, stretch by stretch of the knife's path.
+
+    Attributes:
+        force: Force of food and board on the knife in the last stretch, in F [3], N.
+    """
+
+    def __init__(
+        self, path: Path, specimen: Specimen, facts: SliceTruth, effects: Sequence[Effect]
+    ) -> None:
+        self.path, self.specimen, self.facts, self.effects = path, specimen, facts, effects
+        self.force = np.zeros(3)
+
+    @abc.abstractmethod
+    def reached(self) -> tuple[float, float, float]:
+        """Depth, travel and swept area so far, see `Now`."""
+
+    @abc.abstractmethod
+    def advance(self, now: Now, row: int) -> tuple[np.ndarray, float]:
+        """Advances food and board through a stretch, and sets `force`.
+
+        Args:
+            now: The stretch, as effects have changed it.
+            row: Row of the path at its end.
+
+        Returns:
+            Forces or wrenches by mechanism, in F [3, ...], and how far the cut has come.
+        """
+
+    def drive(
+        self, travel: float, longest: int, reach: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Drives the knife along the path.
+
+        Args:
+            travel, longest, reach: See `Path.stretches`; effects may want each coupling step.
+
+        Returns:
+            Rows of the path where the stretches begin and end [M, 2]; what `advance` returned of
+            each [M, 3, ...] and [M]; shifts of knife and food in each [M, 2, 3], metres.
+        """
+        path = self.path
+        if any(effect.every_coupling_step for effect in self.effects):
+            longest = 1
+        stretches = list(path.stretches(travel, longest, reach))
+        parts, cuts, shifts = [], [], []
+        for a, b in stretches:
+            period = path.period * (b - a)
+            v = (path.p[b] - path.p[a]) / period
+            depth, travelled, swept = self.reached()
+            now = Now(
+                time=float(path.time[a]),
+                period=period,
+                position=path.p[b],
+                press=-float(v[2]),
+                draw=float(v @ path.R[b][:, 0]),
+                depth=depth,
+                travel=travelled,
+                swept=swept,
+                force=self.force,
+            )
+            for effect in self.effects:
+                effect.drive(now)
+            now.food_shift[2] += self.specimen.height
+            shifts.append(np.array([now.knife_shift, now.food_shift]))
+            part, cut = self.advance(now, b)
+            parts.append(part)
+            cuts.append(cut)
+        return np.array(stretches), np.array(parts), np.array(cuts), np.array(shifts)
+
+    def series(self, p_true: np.ndarray, **own: np.ndarray) -> Series:
+        """The slice.
+
+        Args:
+            p_true: True positions of Ko after each coupling step [N, 3], metres.
+            own: Those fields of `Series` that are the world's own.
+        """
+        path = self.path
+        other = np.zeros((len(path), 6))
+        weighed = np.array([label == "weight" for label in path.phase])
+        other[weighed, 5] -= GRAVITY * self.specimen.condition.weight
+        return Series(
+            slice=self.facts,
+            time=path.time[1:],
+            R=path.R[1:],
+            p=path.p[1:],
+            p_true=p_true,
+            v=path.v,
+            phase=path.phase,
+            other=other,
+            **own,
+        )
 
 
 def resampled(values: np.ndarray, known: np.ndarray, wanted: np.ndarray) -> np.ndarray:

@@ -298,8 +298,8 @@ def measure_dask(slices: int, tasks: int, folder: Path) -> DaskRun:
     made = folder / "records_1"
     files = {file.name: file.read_bytes() for file in made.glob("slice_000.*")}
     begin = time.perf_counter()
-    for k in range(100):
-        keep_record(files, folder / "warm_1", k)
+    for _ in range(100):
+        keep_record(files, folder / "warm_1")
     write = (time.perf_counter() - begin) / 100
     return DaskRun(walls, slices, rate, write, sum(map(len, files.values())))
 
