@@ -17,7 +17,7 @@ from sliceit_drake.calibration.refine import Refinement, refine
 from sliceit_drake.calibration.result import Calibration
 from sliceit_drake.calibration.search import SearchResult, error_of, open_study, search
 from sliceit_drake.calibration.setup import CalibrationSetup
-from sliceit_drake.calibration.uncertainty import estimate_posterior
+from sliceit_drake.calibration.uncertainty import estimate
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
 from sliceit_drake.cutting.foods.food import make_food_model
@@ -113,7 +113,7 @@ def calibrate(
     rms, unit, predictions = best
     if not np.isfinite(rms):
         raise CuttingError("what the search found breaks down at the setup's sub-step")
-    posterior = estimate_posterior(predictor, unit)
+    posterior = estimate(predictor, unit).posterior
     blocks: list[float] = []
     held_out_rms = None
     if options.blocks:

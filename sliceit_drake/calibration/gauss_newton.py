@@ -2,11 +2,11 @@
 
 import dataclasses as dc
 from collections.abc import Sequence
-from typing import Any, Protocol
 
 import numpy as np
 from scipy.optimize import lsq_linear
 
+from sliceit_drake.calibration.prediction import Predictor
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.prediction.noise import NoiseModel
 
@@ -15,7 +15,6 @@ __all__ = [
     "PRIOR_VARIANCE",
     "Fit",
     "Linearisation",
-    "ResidualModel",
     "gauss_newton",
     "linearise",
     "residuals_at",
@@ -32,21 +31,6 @@ RETREAT = 1e3
 EASE = 1e-2
 """By which it falls at most after a step."""
 NUISANCE_FLOOR = 1e-9
-
-
-class ResidualModel(Protocol):
-    """What is fitted: `prediction.Predictor`, or anything that acts like it."""
-
-    used: np.ndarray
-
-    @property
-    def measured(self) -> np.ndarray: ...
-
-    def predict(self, units: Sequence[np.ndarray], /) -> Sequence[Sequence[Any]]: ...
-
-    def jacobian(self, unit: np.ndarray, /) -> tuple[np.ndarray, np.ndarray]: ...
-
-    def nuisance_jacobian(self, unit: np.ndarray, /) -> np.ndarray: ...
 
 
 @dc.dataclass
@@ -86,7 +70,7 @@ class Fit:
     linearisation: Linearisation
 
 
-def linearise(model: ResidualModel, unit: np.ndarray) -> Linearisation:
+def linearise(model: Predictor, unit: np.ndarray) -> Linearisation:
     """Residuals and derivatives at a place.
 
     Raises:
@@ -100,7 +84,7 @@ def linearise(model: ResidualModel, unit: np.ndarray) -> Linearisation:
     )
 
 
-def residuals_at(model: ResidualModel, units: Sequence[np.ndarray]) -> list[np.ndarray]:
+def residuals_at(model: Predictor, units: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Residuals [M] at several places, computed side by side.
 
     Entries that are not used are zero; NaN marks a slice that broke down.
@@ -113,7 +97,7 @@ def residuals_at(model: ResidualModel, units: Sequence[np.ndarray]) -> list[np.n
 
 
 def gauss_newton(
-    model: ResidualModel,
+    model: Predictor,
     start: np.ndarray,
     *,
     noise: NoiseModel | None = None,

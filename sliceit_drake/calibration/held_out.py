@@ -1,26 +1,16 @@
 """Error on data that were held out: blocks of depth."""
 
 import dataclasses as dc
-from typing import Protocol
 
 import numpy as np
 
 from sliceit_drake.calibration.gauss_newton import gauss_newton, residuals_at
-from sliceit_drake.calibration.uncertainty import RecordModel
+from sliceit_drake.calibration.prediction import Predictor
 
-__all__ = ["HeldOutError", "HeldOutModel", "blocked_error"]
+__all__ = ["HeldOutError", "blocked_error"]
 
 STEPS = 4
 """Most steps of a refit."""
-
-
-class HeldOutModel(RecordModel, Protocol):
-    """What can fit without some entries: `prediction.Predictor`, or anything that acts like it."""
-
-    @property
-    def depth(self) -> np.ndarray: ...
-
-    def holding_out(self, held_out: np.ndarray, /) -> "HeldOutModel": ...
 
 
 @dc.dataclass
@@ -43,7 +33,7 @@ class HeldOutError:
 
 
 def blocked_error(
-    model: HeldOutModel, unit: np.ndarray, blocks: int = 5, steps: int = STEPS
+    model: Predictor, unit: np.ndarray, blocks: int = 5, steps: int = STEPS
 ) -> HeldOutError:
     """Holds out contiguous blocks of depth in turn, in all records at once.
 
