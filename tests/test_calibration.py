@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses as dc
+import json
 import multiprocessing
 
 import numpy as np
@@ -377,6 +378,19 @@ def test_a_calibration_recovers_what_made_the_records_within_its_intervals(recor
     spread = [loaded.distribution.draw(np.random.default_rng(k), 1)[0] for k in range(50)]
     for name, value in TRUTH.items():
         assert np.mean([d[name] for d in spread]) == pytest.approx(value, rel=0.1)
+
+
+def test_a_strength_that_the_mesh_cannot_carry_stands_in_table_and_summary(records, tmp_path):
+    setup = coarse_setup()
+    setup.food.material.strength = 3e6
+    options = CalibrationOptions(blocks=0, start=TRUTH)
+    result = calibrate(setup, records[:1], tmp_path, options)
+    (warning,) = result.warnings
+    assert warning.startswith("material.strength = 3e+06 Pa is more than bonds of")
+    assert result.table().endswith(f"Warning: {warning}")
+    result.save(tmp_path)
+    summary = json.loads((tmp_path / "calibration.json").read_text(encoding="utf-8"))
+    assert summary["warnings"] == [warning]
 
 
 def test_a_toughness_for_each_cut_point_finds_a_layer_that_shared_parameters_lack(records):

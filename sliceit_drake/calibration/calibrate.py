@@ -1,6 +1,7 @@
 """A calibration from records to a food: search, refinement, polish, uncertainty, held-out error."""
 
 import dataclasses as dc
+import functools
 import hashlib
 import multiprocessing
 from collections.abc import Callable, Mapping, Sequence
@@ -141,8 +142,7 @@ def values_of(food: CalibratedFood) -> dict[str, float]:
     """The values of a calibrated food's parameters, for `CalibrationOptions.start`."""
     numerics = Numerics(flank_stiffness=food.flank_stiffness)
     model = make_food_model(food.food, food.knife, numerics)
-    values = {n: get_parameter(model, n) for n in food.distribution.names}
-    return {n: float(v) for n, v in values.items() if isinstance(v, int | float)}
+    return {name: float(get_parameter(model, name)) for name in food.distribution.names}
 
 
 def _given(predictor: Predictor, start: Mapping[str, float]) -> SearchResult:
@@ -202,7 +202,7 @@ def _refine(
         errors = [float(found.errors.min())] * len(starts)
         return [Refinement(u, e, []) for u, e in zip(starts, errors, strict=True)]
     jobs = [
-        _Start(setup, list(records), start, options.steps, directory / f"adam-{problem}-{k}.npz")
+        (setup, list(records), start, options.steps, directory / f"adam-{problem}-{k}.npz")
         for k, start in enumerate(starts)
     ]
     workers, total = min(options.workers, len(jobs)), options.steps * len(jobs)
@@ -213,12 +213,15 @@ def _refine(
             def note(done: int, error: float, before: int = k * options.steps) -> None:
                 show("Adam", before + done, total, error)
 
-            out.append(job.refine(note))
+            out.append(_refined(*job, note))
         return out
     spawned = multiprocessing.get_context("spawn")
     with spawned.Manager() as manager, worker_processes(workers) as pool:
         steps = manager.dict()
-        futures = [pool.submit(_refine_beside, job, steps, k) for k, job in enumerate(jobs)]
+        futures = [
+            pool.submit(_refined, *job, functools.partial(_note, steps, k))
+            for k, job in enumerate(jobs)
+        ]
         while not all(f.done() for f in futures):
             wait(futures, timeout=0.5)
             done = dict(steps)
@@ -228,28 +231,21 @@ def _refine(
         return [f.result() for f in futures]
 
 
-@dc.dataclass
-class _Start:
-    """Where Adam starts, for another process."""
-
-    setup: CalibrationSetup
-    records: list[SliceRecord]
-    unit: np.ndarray
-    steps: int
-    checkpoint: Path
-
-    def refine(self, progress: Callable[[int, float], None]) -> Refinement:
-        predictor = Predictor(self.setup, self.records, workers=1)
-        return refine(predictor, self.unit, self.steps, self.checkpoint, progress)
+def _refined(
+    setup: CalibrationSetup,
+    records: Sequence[SliceRecord],
+    start: np.ndarray,
+    steps: int,
+    checkpoint: Path,
+    progress: Callable[[int, float], None],
+) -> Refinement:
+    """Adam from a start, on one thread: here or in a process of its own."""
+    return refine(Predictor(setup, records, workers=1), start, steps, checkpoint, progress)
 
 
-def _refine_beside(start: _Start, steps: Any, k: int) -> Refinement:
-    """Refines in a process of its own and notes steps and error in the shared dict `steps`."""
-
-    def note(done: int, error: float) -> None:
-        steps[k] = (done, error)
-
-    return start.refine(note)
+def _note(shared: Any, k: int, done: int, error: float) -> None:
+    """Tells the process that shares a dict how far the k-th start is."""
+    shared[k] = (done, error)
 
 
 def _check_names(records: Sequence[SliceRecord], held_out: Sequence[SliceRecord]) -> None:
@@ -262,10 +258,6 @@ def _check_names(records: Sequence[SliceRecord], held_out: Sequence[SliceRecord]
         )
 
 
-def _mean(values: list[float] | None, otherwise: float) -> float:
-    return otherwise if values is None else float(np.mean(values))
-
-
 def _held_out(predictor: Predictor, fitted: Predictor, unit: np.ndarray) -> dict[str, float]:
     """Errors on other records, at the mean of the fitted records' own parameters, N."""
     values = fitted.values(unit)
@@ -273,15 +265,13 @@ def _held_out(predictor: Predictor, fitted: Predictor, unit: np.ndarray) -> dict
     for name, value in values.items():
         if ":" in name:
             own.setdefault(name.split(":")[0], []).append(value)
-    at = np.array(
-        [
-            # Of the fitted records perhaps none has such a parameter, as where speeds are known.
-            p.unit(values[p.name] if p.shared else _mean(own.get(p.name.split(":")[0]), p.start))
-            for p in predictor.parameters
-        ]
-    )
-    (row,) = predictor.predict([at])
-    errors = {}
-    for target, prediction in zip(predictor.targets, row, strict=True):
-        errors[target.record.name] = target.rms_error(prediction.predicted)
-    return errors
+    at = []
+    for p in predictor.parameters:
+        # Of the fitted records perhaps none has such a parameter, as where speeds are known.
+        mean = float(np.mean(own.get(p.name.split(":")[0], [p.start])))
+        at.append(p.unit(values[p.name] if p.shared else mean))
+    (row,) = predictor.predict([np.array(at)])
+    return {
+        target.record.name: target.rms_error(prediction.predicted)
+        for target, prediction in zip(predictor.targets, row, strict=True)
+    }

@@ -4,7 +4,7 @@ import dataclasses as dc
 
 import numpy as np
 
-from sliceit_drake.calibration.gauss_newton import gauss_newton, residuals_at
+from sliceit_drake.calibration.gauss_newton import gauss_newton
 from sliceit_drake.calibration.prediction import Predictor
 
 __all__ = ["HeldOutError", "blocked_error"]
@@ -18,18 +18,14 @@ class HeldOutError:
     """Errors on blocks of the data, each from a fit without it.
 
     Attributes:
-        names: Of the blocks.
         blocks: Root mean square error on each, N; NaN where the refitted slice broke down.
         counts: Entries in each.
         rms: On all of them, N.
-        fitted: Of the fit to all data on the same entries, N.
     """
 
-    names: list[str]
     blocks: list[float]
     counts: list[int]
     rms: float
-    fitted: float
 
 
 def blocked_error(
@@ -55,10 +51,8 @@ def blocked_error(
     edges = np.linspace(0.0, float(depth[model.used].max()), blocks + 1)
     block = np.clip(np.searchsorted(edges, depth, side="right") - 1, 0, blocks - 1)
     shared = np.array([p.shared for p in model.parameters])
-    (fit,) = residuals_at(model, [unit])
-    names, errors, counts = [], [], []
-    squares = fitted = 0.0
-    for k, (low, high) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    errors, counts, squares = [], [], 0.0
+    for k in range(blocks):
         held, rest = (block == k) & model.used, model.used & (block != k)
         if not held.any() or not rest.any():
             continue
@@ -66,12 +60,7 @@ def blocked_error(
         refit = gauss_newton(without, unit, free=shared, steps=steps).unit
         (row,) = without.predict([refit])
         error = (np.concatenate([p.predicted.ravel() for p in row]) - model.measured)[held]
-        names.append(f"{1e3 * low:.1f} to {1e3 * high:.1f} mm")
         errors.append(float(np.sqrt(np.mean(error**2))))
         counts.append(int(held.sum()))
         squares += float((error**2).sum())
-        fitted += float((fit[held] ** 2).sum())
-    total = max(sum(counts), 1)
-    return HeldOutError(
-        names, errors, counts, float(np.sqrt(squares / total)), float(np.sqrt(fitted / total))
-    )
+    return HeldOutError(errors, counts, float(np.sqrt(squares / max(sum(counts), 1))))

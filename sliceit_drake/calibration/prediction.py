@@ -136,10 +136,10 @@ class Predictor:
 
     def _list_parameters(self) -> list[Parameter]:
         model = next((t.model for t in self.targets if not t.facts.peeled), self.targets[0].model)
-        out = [
-            Parameter(p.name, p.low, p.high, p.scale == "log", max(p.low, _start(model, p.name)))
-            for p in self.setup.parameters
-        ]
+        out = []
+        for p in self.setup.parameters:
+            start = max(p.low, float(get_parameter(model, p.name)))
+            out.append(Parameter(p.name, p.low, p.high, p.scale == "log", start))
         low, high = self.setup.height_offset
         slow, fast = self.setup.speed_factor
         for target in self.targets:
@@ -450,12 +450,6 @@ class Predictor:
         slopes = [p.oscillation.derivatives(t.time) for p, t in zip(row, self.targets, strict=True)]
         by = [p.smooth[:, :, None] * d[:, None] for p, d in zip(row, slopes, strict=True)]
         return np.asarray(block_diag(*(x.reshape(-1, 3) for x in by)))
-
-
-def _start(model: CuttingModel, name: str) -> float:
-    value = get_parameter(model, name)
-    assert isinstance(value, int | float)
-    return float(value)
 
 
 def _slope(parameter: Parameter, unit: float) -> float:

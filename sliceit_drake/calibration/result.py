@@ -55,8 +55,15 @@ class Calibration:
     held_out_records: dict[str, float]
     failures: int
 
+    @property
+    def warnings(self) -> list[str]:
+        """Where the cuts depart from the calibrated values; see `CuttingModel.warnings`."""
+        values = self.predictor.values(self.unit)
+        models = [self.predictor.model(target, values) for target in self.predictor.targets]
+        return sorted({text for model in models for text in model.warnings})
+
     def table(self) -> str:
-        """Parameters with 90 % intervals, which of them are not determined, and errors."""
+        """Parameters with 90 % intervals, which of them are not determined, errors, warnings."""
         lines = [
             parameter_table(self.posterior, self.predictor.values(self.unit)),
             *self.posterior.remarks(),
@@ -68,6 +75,7 @@ class Calibration:
             lines.append(f"Held-out blocks of depth: {self.held_out_rms:.3f} N ({blocks})")
         for name, error in self.held_out_records.items():
             lines.append(f"Held-out record {name}: {error:.3f} N")
+        lines += [f"Warning: {text}" for text in self.warnings]
         return "\n".join(lines)
 
     def plot(self) -> "Figure":
@@ -117,6 +125,7 @@ class Calibration:
             "held_out_blocks_N": self.blocks,
             "held_out_records_N": self.held_out_records,
             "failed_trials": self.failures,
+            "warnings": self.warnings,
             "parameters": self.predictor.values(self.unit),
             "oscillation": [dc.asdict(p.oscillation) for p in self.predictions],
         }

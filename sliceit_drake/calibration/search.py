@@ -102,13 +102,13 @@ def search(
     space: dict[str, optuna.distributions.BaseDistribution] = {
         name: optuna.distributions.FloatDistribution(0.0, 1.0) for name in names
     }
-    proposals = _Proposals(space, predictor.start, seed)
     done = _finished(study)
     while len(done) < trials:
         # A database need not keep the order of a trial's parameters.
         known_units = {tuple(t.params[name] for name in names) for t in done[-GENERATION:]}
         # A generation that was cut short is proposed once more, and what it lacks is computed.
-        units = [u for u in proposals.generation(done) if tuple(u.tolist()) not in known_units]
+        proposed = _generation(space, predictor.start, seed, done)
+        units = [u for u in proposed if tuple(u.tolist()) not in known_units]
         for unit, row in zip(units, predictor.predict(units), strict=True):
             error, broken = error_of(predictor, row)
             params = dict(zip(names, unit.tolist(), strict=True))
@@ -130,53 +130,41 @@ def search(
     )
 
 
-class _Proposals:
-    """Proposes generations from finished trials, the same for the same trials and seed.
+def _generation(
+    space: dict[str, optuna.distributions.BaseDistribution],
+    start: np.ndarray,
+    seed: int,
+    done: list[optuna.trial.FrozenTrial],
+) -> list[np.ndarray]:
+    """Places of the next generation [d], the same for the same finished trials and seed; the first
+    generation begins with `start`.
 
     The sampler works on a study in memory, in which the storage's trials are repeated: what a
     worker that was killed had asked for is not in the way.
     """
-
-    def __init__(
-        self,
-        space: dict[str, optuna.distributions.BaseDistribution],
-        start: np.ndarray,
-        seed: int,
-    ) -> None:
-        self._space, self._start, self._seed = space, start, seed
-        self._history: list[optuna.trial.FrozenTrial] = []
-        self._memory = optuna.create_study()
-
-    def generation(self, done: list[optuna.trial.FrozenTrial]) -> list[np.ndarray]:
-        """Places of the next generation [d]; the first begins with the setup's values."""
-        base = len(done) - len(done) % GENERATION
-        if [t.number for t in done[: len(self._history)]] != [t.number for t in self._history]:
-            self._history, self._memory = [], optuna.create_study()
-        for trial in done[len(self._history) : base]:
-            self._memory.add_trial(
-                optuna.trial.create_trial(
-                    params={name: trial.params[name] for name in self._space},
-                    distributions=self._space,
-                    value=trial.value,
-                )
-            )
-        self._history = done[:base]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-            sampler = optuna.samplers.TPESampler(
-                n_startup_trials=max(20, 4 * len(self._space)),
-                multivariate=True,
-                constant_liar=True,
-                seed=(1000003 * self._seed + base) % 2**32,
-            )
-        trials = self._memory.get_trials(deepcopy=False)
-        study = optuna.create_study(sampler=sampler)
-        study.add_trials(trials)
-        asked = [study.ask(self._space) for _ in range(GENERATION)]
-        units = [np.array([t.params[name] for name in self._space]) for t in asked]
-        if base == 0:
-            units[0] = self._start.copy()
-        return units
+    base = len(done) - len(done) % GENERATION
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        sampler = optuna.samplers.TPESampler(
+            n_startup_trials=max(20, 4 * len(space)),
+            multivariate=True,
+            constant_liar=True,
+            seed=(1000003 * seed + base) % 2**32,
+        )
+    study = optuna.create_study(sampler=sampler)
+    study.add_trials(
+        optuna.trial.create_trial(
+            params={name: trial.params[name] for name in space},
+            distributions=space,
+            value=trial.value,
+        )
+        for trial in done[:base]
+    )
+    asked = [study.ask(space) for _ in range(GENERATION)]
+    units = [np.array([t.params[name] for name in space]) for t in asked]
+    if base == 0:
+        units[0] = start.copy()
+    return units
 
 
 def _finished(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:

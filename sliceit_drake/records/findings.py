@@ -7,7 +7,54 @@ import numpy as np
 
 from sliceit_drake.records.slice_record import SliceTable
 
-__all__ = ["Findings", "RecordFinding", "runs"]
+__all__ = ["KINDS", "MIN_ROWS", "Findings", "RecordFinding", "runs"]
+
+MIN_ROWS = 10
+"""A table with fewer is no record of a slice."""
+
+KINDS = {
+    "missing column": ("error", "Add it."),
+    "gap": ("error", "Remove these rows, or cut the record off before them."),
+    "short": ("error", f"Give at least {MIN_ROWS} rows."),
+    "time": ("error", "Remove repeated rows; split the record where the clock was set back."),
+    "quaternion": ("error", "Write a unit quaternion, w first."),
+    "unknown name": ("warning", "Name a field, as food.size."),
+    "missing fact": ("warning", "Give a value, or list the name under unknown."),
+    "phases": ("warning", "Give times of the record."),
+    "millimetres": ("error", "Is it in mm? Divide p_WK_x, p_WK_y, p_WK_z by 1000 to give metres."),
+    "milliseconds": ("error", "Is it in ms? Divide the column by 1000 to give seconds."),
+    "degrees": ("error", "Is it in degrees? Multiply q_1 .. q_6 by pi / 180."),
+    "jump": ("error", "Remove the wrong rows, or cut the record off before them."),
+    "dropout": ("warning", "Leave it if nothing happened then; else cut the record off before."),
+    "velocity": (
+        "warning",
+        "Give velocities of Ko in W, or remove the columns: they are then derived.",
+    ),
+    "below board": ("warning", "Correct board_height, or the knife's pose on the tool."),
+    "constant": ("error", "Record the sensor, not its command."),
+    "negative norm": ("error", "Give the components force_x..z, or the norm."),
+    "no air phase": (
+        "warning",
+        "Label the time before contact as air; record half a second of it.",
+    ),
+    "no tare": ("warning", "Apply the step tare, which subtracts that mean."),
+    "force unit": (
+        "error",
+        "Is it in mN, or in counts of the sensor? Convert it to newtons.",
+    ),
+    "kilonewtons": (
+        "error",
+        "Is it in kN? Multiply the force and torque columns by 1000 to give N and Nm.",
+    ),
+    "flipped sign": ("error", "Correct wrench.sign, or wrench.frame."),
+    "frame": ("warning", "Check wrench.frame, and the placement of the knife on the tool."),
+    "clipped": (
+        "warning",
+        "Leave these rows out of comparisons, or repeat the slice with a sensor of greater range.",
+    ),
+    "frozen": ("warning", "Check the sensor's connection; leave these rows out."),
+}
+"""What is looked for: how bad it is, and what to do where the record does not tell it better."""
 
 
 @dc.dataclass(frozen=True)
@@ -56,22 +103,23 @@ class Findings:
         self._table = table
         self.found: list[RecordFinding] = []
 
-    def error(
-        self, kind: str, column: str, problem: str, fix: str, rows: tuple[int, int] | None = None
+    def add(
+        self,
+        kind: str,
+        column: str,
+        problem: str,
+        rows: tuple[int, int] | None = None,
+        fix: str | None = None,
     ) -> None:
-        """Reports what makes the record unusable; `rows` are first and last index."""
-        self._add("error", kind, column, problem, fix, rows)
+        """Reports something about the table; `rows` are first and last index."""
+        lines = self._table.lines
+        place = None if rows is None else (int(lines[rows[0]]), int(lines[rows[1]]))
+        self._add(kind, self._table.file, column, place, problem, fix)
 
-    def warning(
-        self, kind: str, column: str, problem: str, fix: str, rows: tuple[int, int] | None = None
-    ) -> None:
-        """Reports what calls for care; `rows` are first and last index."""
-        self._add("warning", kind, column, problem, fix, rows)
-
-    def fact(self, severity: str, kind: str, field: str, problem: str, fix: str) -> None:
+    def fact(self, kind: str, field: str, problem: str, fix: str | None = None) -> None:
         """Reports something about a field of the YAML file."""
         file = str(Path(self._table.file).with_suffix(".yaml"))
-        self.found.append(RecordFinding(severity, kind, file, field, None, problem, fix))
+        self._add(kind, file, field, None, problem, fix)
 
     def has(self, *kinds: str) -> bool:
         """Whether something of these kinds was found."""
@@ -79,18 +127,15 @@ class Findings:
 
     def _add(
         self,
-        severity: str,
         kind: str,
+        file: str,
         column: str,
+        lines: tuple[int, int] | None,
         problem: str,
-        fix: str,
-        rows: tuple[int, int] | None,
+        fix: str | None,
     ) -> None:
-        lines = self._table.lines
-        place = None if rows is None else (int(lines[rows[0]]), int(lines[rows[1]]))
-        self.found.append(
-            RecordFinding(severity, kind, self._table.file, column, place, problem, fix)
-        )
+        severity, usual = KINDS[kind]
+        self.found.append(RecordFinding(severity, kind, file, column, lines, problem, fix or usual))
 
 
 def runs(mask: np.ndarray) -> list[tuple[int, int]]:

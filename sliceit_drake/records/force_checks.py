@@ -52,18 +52,11 @@ def check_force(table: SliceTable, record: SliceRecord, findings: Findings) -> N
     magnitude = record.force_magnitude
     name = fmt.FORCE[0] if record.force is not None else fmt.FORCE_NORM
     if np.ptp(magnitude) == 0.0:
-        text = f"is {magnitude[0]:.6g} N in every row"
-        findings.error("constant", name, text, "Record the sensor, not its command.")
+        findings.add("constant", name, f"is {magnitude[0]:.6g} N in every row")
         return
     if record.force_norm is not None and (record.force_norm < 0.0).any():
         k = int(record.force_norm.argmin())
-        findings.error(
-            "negative norm",
-            name,
-            f"a norm is {record.force_norm[k]:.4g} N",
-            "Give the components force_x..z, or the norm.",
-            (k, k),
-        )
+        findings.add("negative norm", name, f"a norm is {record.force_norm[k]:.4g} N", (k, k))
     air = record.first_phase("air")
     cut = record.phase("slice", "second_pass")
     if not record.metadata.motion.phases:
@@ -71,9 +64,7 @@ def check_force(table: SliceTable, record: SliceRecord, findings: Findings) -> N
     _check_tare(record, air, findings)
     if magnitude.max() > GREATEST_FORCE:
         k = int(magnitude.argmax())
-        text = f"the force reaches {magnitude[k]:.4g} N"
-        fix = "Is it in mN, or in counts of the sensor? Convert it to newtons."
-        findings.error("force unit", name, text, fix, (k, k))
+        findings.add("force unit", name, f"the force reaches {magnitude[k]:.4g} N", (k, k))
     elif cut.any():
         _check_units(record, air, cut, name, findings)
         if not findings.has("kilonewtons"):
@@ -98,19 +89,11 @@ def _known_offset(record: SliceRecord, air: np.ndarray) -> np.ndarray | None:
 def _check_tare(record: SliceRecord, air: np.ndarray, findings: Findings) -> None:
     facts = record.metadata.wrench
     if air.sum() < MIN_AIR_ROWS:
-        findings.fact(
-            "warning",
-            "no air phase",
-            "motion.phases",
-            f"the first phase labelled air has not {MIN_AIR_ROWS} rows: the sensor's zero and "
-            "noise are unknown",
-            "Label the time before contact as air; record half a second of it.",
-        )
+        text = f"the first phase labelled air has not {MIN_AIR_ROWS} rows: the sensor's zero and"
+        findings.fact("no air phase", "motion.phases", f"{text} noise are unknown")
         return
     if record.phase("air").all():
         return  # Such a record is there to show zero and drift; no force makes them large or small.
-    first = int(np.flatnonzero(air)[0])
-    last = int(np.flatnonzero(air)[-1])
     force = record.force if record.force is not None else record.force_magnitude[:, None]
     mean, scatter = force[air].mean(axis=0), force[air].std(axis=0)
     peak = float(record.force_magnitude.max())
@@ -120,14 +103,10 @@ def _check_tare(record: SliceRecord, air: np.ndarray, findings: Findings) -> Non
     axis = int((np.abs(mean) - allowed).argmax())
     weighs_tool = "gravity" in facts.includes and facts.tared != "yes"
     if abs(mean[axis]) > allowed[axis] and not weighs_tool:
-        findings.warning(
-            "no tare",
-            fmt.FORCE[axis] if record.force is not None else fmt.FORCE_NORM,
-            f"the force in the air is {mean[axis]:.3g} N in the mean, with a scatter of"
-            f" {scatter[axis]:.2g} N; wrench.tared is {facts.tared}",
-            "Apply the step tare, which subtracts that mean.",
-            (first, last),
-        )
+        name = fmt.FORCE[axis] if record.force is not None else fmt.FORCE_NORM
+        text = f"the force in the air is {mean[axis]:.3g} N in the mean, with a scatter of"
+        text += f" {scatter[axis]:.2g} N; wrench.tared is {facts.tared}"
+        findings.add("no tare", name, text, _ends(air))
 
 
 def _check_units(
@@ -139,7 +118,6 @@ def _check_units(
         return
     if record.force is not None:
         magnitude = np.linalg.norm(record.force - offset, axis=1)
-    rows = np.flatnonzero(cut)
     peak = float(np.percentile(magnitude[cut], 95.0))
     problem = ""
     if peak < MIN_FORCE:
@@ -156,13 +134,13 @@ def _check_units(
             problem = f"the work of slicing is {work / area:.2g} J per m2 of cut, expected at least"
             problem += f" {MIN_WORK:g} J/m2"
     if problem:
-        findings.error(
-            "kilonewtons",
-            name,
-            problem,
-            "Is it in kN? Multiply the force and torque columns by 1000 to give N and Nm.",
-            (int(rows[0]), int(rows[-1])),
-        )
+        findings.add("kilonewtons", name, problem, _ends(cut))
+
+
+def _ends(mask: np.ndarray) -> tuple[int, int]:
+    """Indices of the first and the last True."""
+    rows = np.flatnonzero(mask)
+    return int(rows[0]), int(rows[-1])
 
 
 def _noise(record: SliceRecord, air: np.ndarray) -> float:
@@ -197,28 +175,18 @@ def _check_sign(
     if scale <= 0.0:
         return
     # What the file says, not what the record has become by it.
-    facts, rows = table.metadata.wrench, np.flatnonzero(cut)
-    lines = (int(rows[0]), int(rows[-1]))
+    facts = table.metadata.wrench
     axis = int(np.abs(force[cut]).mean(axis=0).argmax())
     if work > ALONG * scale:
         other = "on_knife" if facts.sign == "by_knife" else "by_knife"
-        findings.error(
-            "flipped sign",
-            fmt.FORCE[axis],
-            f"the force on the knife drives it: work of {work:+.3g} J while slicing, expected"
-            " negative",
-            f'Write wrench.sign: {other}, or correct wrench.frame ("{facts.frame}").',
-            lines,
-        )
+        text = f"the force on the knife drives it: work of {work:+.3g} J while slicing, expected"
+        fix = f'Write wrench.sign: {other}, or correct wrench.frame ("{facts.frame}").'
+        findings.add("flipped sign", fmt.FORCE[axis], f"{text} negative", _ends(cut), fix)
     elif work > -ALONG * scale:
-        findings.warning(
-            "frame",
-            fmt.FORCE[axis],
-            f"the force is across the knife's motion: its work while slicing is {work:+.3g} J of"
-            f" {scale:.3g} J, were it along it",
-            f'Check wrench.frame ("{facts.frame}"), and the placement of the knife on the tool.',
-            lines,
-        )
+        text = f"the force is across the knife's motion: its work while slicing is {work:+.3g} J of"
+        text += f" {scale:.3g} J, were it along it"
+        fix = f'Check wrench.frame ("{facts.frame}"), and the placement of the knife on the tool.'
+        findings.add("frame", fmt.FORCE[axis], text, _ends(cut), fix)
 
 
 def _check_saturation(table: SliceTable, record: SliceRecord, findings: Findings) -> None:
@@ -270,13 +238,7 @@ def _check_flat_top(name: str, values: np.ndarray, findings: Findings, least: fl
 
 def _report_clipping(findings: Findings, name: str, text: str, at: np.ndarray) -> None:
     rows = max(runs(at), key=lambda run: run[1] - run[0])
-    findings.warning(
-        "clipped",
-        name,
-        text,
-        "Leave these rows out of comparisons, or repeat the slice with a sensor of greater range.",
-        rows,
-    )
+    findings.add("clipped", name, text, rows)
 
 
 def _check_frozen(table: SliceTable, cut: np.ndarray, findings: Findings) -> None:
@@ -285,11 +247,8 @@ def _check_frozen(table: SliceTable, cut: np.ndarray, findings: Findings) -> Non
     time = table.columns[fmt.TIME]
     for first, last in runs(same):
         if time[last + 1] - time[first] > FROZEN_TIME and not findings.has("clipped"):
-            findings.warning(
-                "frozen",
-                names[0],
-                f"the sensor shows the same for {time[last + 1] - time[first]:.2g} s of the slice",
-                "Check the sensor's connection; leave these rows out.",
-                (first, last + 1),
+            text = (
+                f"the sensor shows the same for {time[last + 1] - time[first]:.2g} s of the slice"
             )
+            findings.add("frozen", names[0], text, (first, last + 1))
             return

@@ -48,13 +48,8 @@ def check_motion(table: SliceTable, record: SliceRecord, findings: Findings) -> 
         low = record.position[:, 2] < board - BELOW_BOARD
         for first, last in runs(low)[:1]:
             depth = 1e3 * (board - record.position[low, 2].min())
-            findings.warning(
-                "below board",
-                "p_WK_z",
-                f"the edge is up to {depth:.0f} mm below the board at {board:g} m",
-                "Correct board_height, or the knife's pose on the tool.",
-                (first, last),
-            )
+            text = f"the edge is up to {depth:.0f} mm below the board at {board:g} m"
+            findings.add("below board", "p_WK_z", text, (first, last))
 
 
 def _check_units(record: SliceRecord, findings: Findings) -> None:
@@ -77,13 +72,8 @@ def _check_units(record: SliceRecord, findings: Findings) -> None:
         what = f"{record.position[row, axis]:.4g} m is beyond any arm's reach"
         if not is_far:
             what = f"the knife moves at {ratio:.0f} times the nominal {motion.speed:g} m/s"
-        findings.error(
-            "millimetres",
-            fmt.POSITION[axis],
-            what,
-            "Is it in mm? Divide p_WK_x, p_WK_y, p_WK_z by 1000 to give metres.",
-            (int(row), int(row)) if is_far else None,
-        )
+        rows = (int(row), int(row)) if is_far else None
+        findings.add("millimetres", fmt.POSITION[axis], what, rows)
     slow = ratio is not None and THOUSAND[0] < 1.0 / max(ratio, 1e-12) < THOUSAND[1]
     if slow_clock or (slow and not is_far):
         what = f"the rows are {period:.4g} s apart"
@@ -92,20 +82,14 @@ def _check_units(record: SliceRecord, findings: Findings) -> None:
         elif motion.speed is not None and ratio is not None:
             what += f" and the knife moves at {ratio * motion.speed:.2g} m/s"
             what += f", expected {motion.speed:g} m/s from motion.speed"
-        fix = "Is it in ms? Divide the column by 1000 to give seconds."
-        findings.error("milliseconds", fmt.TIME, what, fix)
+        findings.add("milliseconds", fmt.TIME, what)
 
 
 def _check_joints(joints: np.ndarray, findings: Findings) -> None:
     row, axis = np.unravel_index(int(np.abs(joints).argmax()), joints.shape)
     if abs(joints[row, axis]) > JOINT_LIMIT:
-        findings.error(
-            "degrees",
-            fmt.JOINTS[axis],
-            f"{joints[row, axis]:.4g} rad is more than one turn",
-            "Is it in degrees? Multiply q_1 .. q_6 by pi / 180.",
-            (int(row), int(row)),
-        )
+        text = f"{joints[row, axis]:.4g} rad is more than one turn"
+        findings.add("degrees", fmt.JOINTS[axis], text, (int(row), int(row)))
 
 
 def _check_jumps(record: SliceRecord, findings: Findings) -> None:
@@ -120,14 +104,9 @@ def _check_jumps(record: SliceRecord, findings: Findings) -> None:
     ):
         k = int(values.argmax())
         if values[k] > limit:
-            findings.error(
-                "jump",
-                name,
-                f"the pose jumps: {values[k]:.3g} {unit} between two rows, expected at most"
-                f" {limit:g} {unit} ({int((values > limit).sum())} such steps)",
-                "Remove the wrong rows, or cut the record off before them.",
-                (k, k + 1),
-            )
+            text = f"the pose jumps: {values[k]:.3g} {unit} between two rows, expected at most"
+            text += f" {limit:g} {unit} ({int((values > limit).sum())} such steps)"
+            findings.add("jump", name, text, (k, k + 1))
 
 
 def _check_sampling(record: SliceRecord, findings: Findings) -> None:
@@ -135,13 +114,8 @@ def _check_sampling(record: SliceRecord, findings: Findings) -> None:
     usual = float(np.median(step))
     k = int(step.argmax())
     if step[k] > max(6.0 * usual, 0.02):
-        findings.warning(
-            "dropout",
-            fmt.TIME,
-            f"{step[k]:.3g} s without a row, where rows are {usual:.3g} s apart",
-            "Leave it if nothing happened then; else cut the record off before.",
-            (k, k + 1),
-        )
+        text = f"{step[k]:.3g} s without a row, where rows are {usual:.3g} s apart"
+        findings.add("dropout", fmt.TIME, text, (k, k + 1))
 
 
 def _check_velocities(table: SliceTable, record: SliceRecord, findings: Findings) -> None:
@@ -162,10 +136,6 @@ def _check_velocities(table: SliceTable, record: SliceRecord, findings: Findings
         k = int(error.argmax())
         span = float(np.ptp(moved, axis=0).max())
         if error[k] > floor + 0.1 * span:
-            findings.warning(
-                "velocity",
-                names[0],
-                f"the velocities add up to a motion that is {error[k]:.3g} {unit} from the poses"
-                f" after {record.time[k + 1] - record.time[0]:.3g} s",
-                "Give velocities of Ko in W, or remove the columns: they are then derived.",
-            )
+            text = f"the velocities add up to a motion that is {error[k]:.3g} {unit} from the poses"
+            text += f" after {record.time[k + 1] - record.time[0]:.3g} s"
+            findings.add("velocity", names[0], text)

@@ -11,7 +11,7 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.records import slice_record as fmt
-from sliceit_drake.records.findings import Findings, RecordFinding, runs
+from sliceit_drake.records.findings import MIN_ROWS, Findings, RecordFinding, runs
 from sliceit_drake.records.force_checks import check_force
 from sliceit_drake.records.metadata import SliceMetadata
 from sliceit_drake.records.motion_checks import check_motion
@@ -25,8 +25,6 @@ __all__ = [
     "load_sessions",
     "record_files",
 ]
-
-MIN_ROWS = 10
 
 KEY_FACTS = (
     "provenance",
@@ -155,8 +153,8 @@ def check_table(table: SliceTable) -> list[RecordFinding]:
     try:
         record = fmt.record_from_table(table)
     except ConfigurationError as error:
-        findings.fact("error", "missing fact", error.field or "", error.problem, error.fix or "")
-        return findings.found
+        findings.fact("missing fact", error.field or "", error.problem, error.fix)
+        return [dc.replace(finding, severity="error") for finding in findings.found]
     _check_facts(table, findings)
     check_motion(table, record, findings)
     # Work and power need metres and seconds.
@@ -169,53 +167,37 @@ def _check_structure(table: SliceTable, findings: Findings) -> None:
     """Missing columns, gaps, time that does not increase, quaternions that are none."""
     for name in (fmt.TIME, *fmt.POSITION, *fmt.QUATERNION):
         if name not in table.columns:
-            findings.error("missing column", name, "the column is missing", "Add it.")
+            findings.add("missing column", name, "the column is missing")
     if not (table.has(fmt.FORCE) or fmt.FORCE_NORM in table.columns):
         fix = f"Add {', '.join(fmt.FORCE)}, or force_norm if only the norm is known."
-        findings.error("missing column", fmt.FORCE[0], "there is no force", fix)
+        findings.add("missing column", fmt.FORCE[0], "there is no force", fix=fix)
     for group in (fmt.FORCE, fmt.TORQUE, fmt.VELOCITY, fmt.ANGULAR_VELOCITY, fmt.JOINTS):
         absent = [name for name in group if name not in table.columns]
         if 0 < len(absent) < len(group):
             beside = next(name for name in group if name in table.columns)
             text = f"the column is missing beside {beside}"
-            findings.error("missing column", absent[0], text, "Add it.")
+            findings.add("missing column", absent[0], text)
     for name, values in table.columns.items():
         for first, last in runs(~np.isfinite(values)):
-            findings.error(
-                "gap",
-                name,
-                f"{last - first + 1} of {len(values)} rows have no finite number",
-                "Remove these rows, or cut the record off before them.",
-                (first, last),
-            )
+            text = f"{last - first + 1} of {len(values)} rows have no finite number"
+            findings.add("gap", name, text, (first, last))
     if findings.found:
         return
     time = table.columns[fmt.TIME]
     if len(time) < MIN_ROWS:
-        fix = f"Give at least {MIN_ROWS} rows."
-        findings.error("short", fmt.TIME, f"the table has {len(time)} rows", fix)
+        findings.add("short", fmt.TIME, f"the table has {len(time)} rows")
         return
     wrong = np.flatnonzero(np.diff(time) <= 0.0) + 1
     if wrong.size:
         k = int(wrong[0])
         how = "repeats" if time[k] == time[k - 1] else "goes back from"
         more = f" ({wrong.size} such rows)" if wrong.size > 1 else ""
-        findings.error(
-            "time",
-            fmt.TIME,
-            f"{time[k]:.9g} s {how} {time[k - 1]:.9g} s{more}; time must increase",
-            "Remove repeated rows; split the record where the clock was set back.",
-            (k, k),
-        )
+        text = f"{time[k]:.9g} s {how} {time[k - 1]:.9g} s{more}; time must increase"
+        findings.add("time", fmt.TIME, text, (k, k))
     length = np.linalg.norm(table.stack(fmt.QUATERNION), axis=1)
     for first, last in runs(np.abs(length - 1.0) > 1e-3):
-        findings.error(
-            "quaternion",
-            fmt.QUATERNION[0],
-            f"the quaternion has length {length[first]:.4g}, expected 1",
-            "Write a unit quaternion, w first.",
-            (first, last),
-        )
+        text = f"the quaternion has length {length[first]:.4g}, expected 1"
+        findings.add("quaternion", fmt.QUATERNION[0], text, (first, last))
 
 
 def _check_facts(table: SliceTable, findings: Findings) -> None:
@@ -225,9 +207,9 @@ def _check_facts(table: SliceTable, findings: Findings) -> None:
     for name in metadata.unknown:
         if name not in names and name not in fmt.COLUMNS:
             close = difflib.get_close_matches(name, [*names, *fmt.COLUMNS], n=1)
-            fix = f'Did you mean "{close[0]}"?' if close else "Name a field, as food.size."
+            fix = f'Did you mean "{close[0]}"?' if close else None
             text = f"{name!r} is no field and no column"
-            findings.fact("warning", "unknown name", "unknown", text, fix)
+            findings.fact("unknown name", "unknown", text, fix)
     phases = metadata.motion.phases
     # A record of the air, the board or a weight has no food.
     is_slice = not phases or any(phase.label == "slice" for phase in phases)
@@ -237,27 +219,20 @@ def _check_facts(table: SliceTable, findings: Findings) -> None:
         if _value(metadata, name) in (None, "", "unknown") and name not in metadata.unknown
     ]
     if forgotten:
-        findings.fact(
-            "warning",
-            "missing fact",
-            ", ".join(forgotten),
-            "not given",
-            "Give a value, or list the name under unknown.",
-        )
+        findings.fact("missing fact", ", ".join(forgotten), "not given")
     if table.has(fmt.TORQUE) and metadata.wrench.point == "unknown":
         text = "is unknown, so that the torque is not used"
-        findings.fact("warning", "missing fact", "wrench.point", text, "Give Ko or So.")
+        findings.fact("missing fact", "wrench.point", text, "Give Ko or So.")
     time = table.columns[fmt.TIME]
     if not phases:
         text = "no phase is labelled, so that the whole record counts as slice"
         fix = "Give label, start and end of the phases, in the time of the record."
-        findings.fact("warning", "phases", "motion.phases", text, fix)
+        findings.fact("phases", "motion.phases", text, fix)
     for k, phase in enumerate(phases):
         if phase.start >= time[-1] or phase.end <= time[0]:
             text = f"{phase.label} from {phase.start:g} to {phase.end:g} s is beside the record,"
             text += f" which has {time[0]:g} to {time[-1]:g} s"
-            fix = "Give times of the record."
-            findings.fact("warning", "phases", f"motion.phases[{k}]", text, fix)
+            findings.fact("phases", f"motion.phases[{k}]", text)
 
 
 def _value(metadata: SliceMetadata, name: str) -> Any:
