@@ -13,7 +13,7 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.food import Food
-from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid
+from sliceit_drake.cutting.foods.shapes import PlainShape
 from sliceit_drake.prediction.placement import is_bare
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.records.validation import check_record
@@ -228,13 +228,7 @@ def _height(record: SliceRecord, food: Food) -> float | None:
     size = record.metadata.food.size
     if size is not None:
         return size[2]
-    if isinstance(food.shape, Cylinder):
-        return food.shape.diameter
-    if isinstance(food.shape, Box):
-        return food.shape.size[2]
-    if isinstance(food.shape, Ellipsoid):
-        return food.shape.diameters[2]
-    return None
+    return food.shape.extent[2] if isinstance(food.shape, PlainShape) else None
 
 
 def _conditions(records: Sequence[SliceRecord]) -> list[str]:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.food import Food, start_pose
-from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid
+from sliceit_drake.cutting.foods.shapes import PlainShape
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.records.slice_record import SliceRecord
@@ -67,20 +67,15 @@ def food_of(food: Food, record: SliceRecord) -> Food:
         food.held_sides = "both" if facts.support == "clamped_slab" else "plus"
     if facts.size is None or facts.shape == "unknown":
         return food
-    shapes = {"cylinder": Cylinder, "box": Box, "ellipsoid": Ellipsoid}
-    if not isinstance(food.shape, shapes[facts.shape]):
+    shape, kind = food.shape, type(food.shape).__name__.lower()
+    if kind != facts.shape or not isinstance(shape, PlainShape):
         raise ConfigurationError(
-            f"is a {facts.shape}, the food of the setup is a {type(food.shape).__name__.lower()}",
+            f"is a {facts.shape}, the food of the setup is a {kind}",
             source=record.file or record.name,
             field="food.shape",
             fix="Calibrate it with a setup of that shape (--food FILE.yaml).",
         )
-    if isinstance(food.shape, Cylinder):
-        food.shape.diameter, food.shape.length = facts.size[2], facts.size[1]
-    elif isinstance(food.shape, Box):
-        food.shape.size = list(facts.size)
-    elif isinstance(food.shape, Ellipsoid):
-        food.shape.diameters = list(facts.size)
+    food.shape = shape.resized(facts.size)
     return food
 
 

@@ -8,7 +8,7 @@ from sliceit_drake.configuration import ConfigurationError, load_yaml, quantity,
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.cutting.foods.food import Food
-from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid
+from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid, PlainShape
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.diagrams.scenario import Placement, Preparation, Scenario
@@ -186,7 +186,7 @@ def section_size(food: Food, scale: float = 1.0) -> tuple[float, float]:
 
 
 def _plain_shape(food: Food) -> Cylinder | Box | Ellipsoid:
-    if isinstance(food.shape, Cylinder | Box | Ellipsoid):
+    if isinstance(food.shape, PlainShape):
         return food.shape
     raise ConfigurationError(
         "is no cylinder, box or ellipsoid",

@@ -13,6 +13,7 @@ from sliceit_drake.cutting.foods.shapes import (
     Cylinder,
     Ellipsoid,
     MeshFile,
+    PlainShape,
     Remainder,
     Tapered,
 )
@@ -114,12 +115,8 @@ def shape_facts(food: Food) -> tuple[str, list[float] | None]:
     """The shape of a food and its size, metres, as slice records say them (`FoodFacts`); "unknown"
     and None for a shape that records do not know."""
     shape = food.shape
-    if isinstance(shape, Cylinder):
-        return "cylinder", [shape.diameter, shape.length, shape.diameter]
-    if isinstance(shape, Box):
-        return "box", list(shape.size)
-    if isinstance(shape, Ellipsoid):
-        return "ellipsoid", list(shape.diameters)
+    if isinstance(shape, PlainShape):
+        return type(shape).__name__.lower(), shape.extent
     return "unknown", None
 
 

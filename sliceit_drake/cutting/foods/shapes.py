@@ -1,7 +1,9 @@
 """Shapes of foods, and the meshes that they are computed on."""
 
 import dataclasses as dc
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -16,7 +18,7 @@ from sliceit_drake.cutting.mesh.generators import (
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError, TetrahedralMesh
 from sliceit_drake.resources import file_or_resource
 
-__all__ = ["Box", "Cylinder", "Ellipsoid", "MeshFile", "Remainder", "Tapered"]
+__all__ = ["Box", "Cylinder", "Ellipsoid", "MeshFile", "PlainShape", "Remainder", "Tapered"]
 
 MIN_END_RADIUS = 0.3
 """Least radius of a flat end over the greatest, of sliced ellipsoids and tapered foods: towards a
@@ -27,8 +29,61 @@ MIN_LAYER = 0.2
 the layer, and with it the scaled mass, grow with the inverse square."""
 
 
+class _Body:
+    """A shape that is meshed in layers along y, graded towards y = 0."""
+
+    layers: list[float]
+
+    @property
+    def reach(self) -> float:
+        """Greatest y of a section that can be meshed, metres."""
+        raise NotImplementedError
+
+    @property
+    def section_edge(self) -> float:
+        """Edge length of the elements in the greatest section, metres."""
+        raise NotImplementedError
+
+    def between(self, y: np.ndarray, refinement: float) -> TetrahedralMesh:
+        """The part between the first and the last of the mesh layers `y` [L], metres."""
+        raise NotImplementedError
+
+    def mesh(self, refinement: float = 1.0) -> TetrahedralMesh:
+        """The mesh in F, with `refinement` times as many elements along each edge, rounded."""
+        near = _refined([d for d in self.layers if d < self.reach - 1e-6], refinement)
+        one_side = np.concatenate([near, [self.reach]])
+        return self.between(np.unique(np.concatenate([-one_side, one_side])), refinement)
+
+
+class PlainShape(_Body):
+    """A shape that its extents describe."""
+
+    @property
+    def extent(self) -> list[float]:
+        """Extents along x, y and z of F [3], metres."""
+        raise NotImplementedError
+
+    def resized(self, extent: Sequence[float]) -> Self:
+        """The same shape with other extents along x, y and z of F [3], metres."""
+        raise NotImplementedError
+
+    @property
+    def reach(self) -> float:
+        return 0.5 * self.extent[1]
+
+    @property
+    def section(self) -> tuple[float, float]:
+        """Width and height of the section through the middle, metres."""
+        return self.extent[0], self.extent[2]
+
+    def scaled(self, scale: float) -> Self:
+        """The same shape with another size of section."""
+        x, y, z = self.extent
+        return self.resized([scale * x, y, scale * z])
+
+
 @dc.dataclass
-class Cylinder:
+class Cylinder(PlainShape):
     """A cylinder along Fy that lies on the board, meshed in rings and graded layers."""
 
     diameter: float = quantity(0.027, "m", low=5e-3, high=0.3)
@@ -42,35 +97,22 @@ class Cylinder:
     beyond the food's end are left out."""
 
     @property
-    def section(self) -> tuple[float, float]:
-        """Width and height of the section through the middle, metres."""
-        return self.diameter, self.diameter
+    def extent(self) -> list[float]:
+        return [self.diameter, self.length, self.diameter]
 
-    def scaled(self, scale: float) -> "Cylinder":
-        """Another size of the section."""
-        return dc.replace(self, diameter=scale * self.diameter)
-
-    def mesh(self, refinement: float = 1.0) -> TetrahedralMesh:
-        """The mesh in F, with `refinement` times as many elements along each edge, rounded."""
-        return self.between(_both_sides(self.layers, 0.5 * self.length, refinement), refinement)
+    def resized(self, extent: Sequence[float]) -> "Cylinder":
+        return dc.replace(self, length=extent[1], diameter=extent[2])
 
     def between(self, y: np.ndarray, refinement: float) -> TetrahedralMesh:
-        """The part between the first and the last of the mesh layers `y` [L], metres."""
         return cylinder_mesh(self.diameter, y, max(2, round(self.rings * refinement)))
 
     @property
-    def reach(self) -> float:
-        """Greatest y of a section that can be meshed, metres."""
-        return 0.5 * self.length
-
-    @property
     def section_edge(self) -> float:
-        """Edge length of the elements in the section, metres."""
         return 0.5 * self.diameter / self.rings
 
 
 @dc.dataclass
-class Box:
+class Box(PlainShape):
     """A box with axes of F, centred in x, meshed on a grid."""
 
     size: list[float] = quantity([0.027, 0.12, 0.027], "m", low=2e-3, high=1.0, size=3)
@@ -82,38 +124,24 @@ class Box:
     beyond the food's end are left out."""
 
     @property
-    def section(self) -> tuple[float, float]:
-        """Width and height of the section through the middle, metres."""
-        return self.size[0], self.size[2]
+    def extent(self) -> list[float]:
+        return list(self.size)
 
-    def scaled(self, scale: float) -> "Box":
-        """Another size of the section."""
-        x, y, z = self.size
-        return dc.replace(self, size=[scale * x, y, scale * z])
-
-    def mesh(self, refinement: float = 1.0) -> TetrahedralMesh:
-        """The mesh in F, with `refinement` times as many elements along each edge, rounded."""
-        return self.between(_both_sides(self.layers, self.reach, refinement), refinement)
+    def resized(self, extent: Sequence[float]) -> "Box":
+        return dc.replace(self, size=list(extent))
 
     def between(self, y: np.ndarray, refinement: float) -> TetrahedralMesh:
-        """The part between the first and the last of the mesh layers `y` [L], metres."""
         half, height = 0.5 * self.size[0], self.size[2]
         nx, nz = (max(1, round(n * refinement)) for n in self.divisions)
         return box_mesh(np.linspace(-half, half, nx + 1), y, np.linspace(0.0, height, nz + 1))
 
     @property
-    def reach(self) -> float:
-        """Greatest y of a section that can be meshed, metres."""
-        return 0.5 * self.size[1]
-
-    @property
     def section_edge(self) -> float:
-        """Edge length of the elements in the section, metres."""
         return max(self.size[0] / self.divisions[0], self.size[2] / self.divisions[1])
 
 
 @dc.dataclass
-class Ellipsoid:
+class Ellipsoid(PlainShape):
     """An ellipsoid with axes of F, standing on the board."""
 
     diameters: list[float] = quantity([0.05, 0.05, 0.048], "m", low=5e-3, high=0.5, size=3)
@@ -122,14 +150,11 @@ class Ellipsoid:
     """Halvings of the 20 tetrahedra of an icosahedron."""
 
     @property
-    def section(self) -> tuple[float, float]:
-        """Width and height of the section through the middle, metres."""
-        return self.diameters[0], self.diameters[2]
+    def extent(self) -> list[float]:
+        return list(self.diameters)
 
-    def scaled(self, scale: float) -> "Ellipsoid":
-        """Another size of the section."""
-        x, y, z = self.diameters
-        return dc.replace(self, diameters=[scale * x, y, scale * z])
+    def resized(self, extent: Sequence[float]) -> "Ellipsoid":
+        return dc.replace(self, diameters=list(extent))
 
     def mesh(self, refinement: float = 1.0) -> TetrahedralMesh:
         """The mesh in F; `refinement` is rounded to a power of two."""
@@ -138,10 +163,7 @@ class Ellipsoid:
         return ellipsoid_mesh((x, y, z), max(0, steps))
 
     def between(self, y: np.ndarray, refinement: float) -> TetrahedralMesh:
-        """The part between the first and the last of the mesh layers `y` [L], metres.
-
-        Sections of 2^refinements rings of elements, each scaled to the ellipsoid's.
-        """
+        # Sections of 2^refinements rings of elements, each scaled to the ellipsoid's.
         half_x, half_y, half_z = 0.5 * np.array(self.diameters)
         unit = cylinder_mesh(2.0, y, max(2, round(2**self.refinements * refinement)))
         p = unit.vertices - [0.0, 0.0, 1.0]
@@ -150,17 +172,15 @@ class Ellipsoid:
 
     @property
     def reach(self) -> float:
-        """Greatest y of a section that can be meshed, metres: see `MIN_END_RADIUS`."""
         return 0.5 * self.diameters[1] * float(np.sqrt(1.0 - MIN_END_RADIUS**2))
 
     @property
     def section_edge(self) -> float:
-        """Edge length of the elements in the greatest section, metres."""
         return 0.5 * max(self.diameters[0], self.diameters[2]) / max(2, 2**self.refinements)
 
 
 @dc.dataclass
-class Tapered:
+class Tapered(_Body):
     """A straight tapered root along Fy, as a carrot: a cone's frustum, in rings and graded layers.
 
     It lies on the board along one line of its side. Each section y is a circle above that line, so
@@ -188,12 +208,7 @@ class Tapered:
                 fix=f"Give at least {least:.4g} m; the elements of a thinner tip are too small.",
             )
 
-    def mesh(self, refinement: float = 1.0) -> TetrahedralMesh:
-        """The mesh in F, with `refinement` times as many elements along each edge, rounded."""
-        return self.between(_both_sides(self.layers, self.reach, refinement), refinement)
-
     def between(self, y: np.ndarray, refinement: float) -> TetrahedralMesh:
-        """The part between the first and the last of the mesh layers `y` [L], metres."""
         first, last = (0.5 * self.diameter_at(float(y[k])) for k in (0, -1))
         return tapered_mesh((first, last), y, max(2, round(self.rings * refinement)))
 
@@ -203,12 +218,10 @@ class Tapered:
 
     @property
     def reach(self) -> float:
-        """Greatest y of a section that can be meshed, metres."""
         return 0.5 * self.length
 
     @property
     def section_edge(self) -> float:
-        """Edge length of the elements in the greatest section, metres."""
         return 0.5 * max(self.diameters) / self.rings
 
 
@@ -232,21 +245,6 @@ class MeshFile:
         if self.path and (folder / self.path).is_file():
             self.path = str((folder / self.path).resolve())
 
-    def file(self) -> Path:
-        """The file.
-
-        Raises:
-            MeshError: There is none.
-        """
-        file = file_or_resource(self.path)
-        if file is None:
-            raise MeshError(
-                f"food.shape.path: {self.path} cannot be read as a mesh: there is no such file, "
-                f"neither beside the scenario, nor in {Path.cwd()}, nor among the resources. "
-                "Correct the path."
-            )
-        return file
-
     def mesh(self, refinement: float = 1.0) -> TetrahedralMesh:
         """The mesh in F, without vertices that no tetrahedron uses.
 
@@ -264,7 +262,13 @@ class MeshFile:
                 f"food.shape.path: {self.path} cannot be made coarser by {refinement:g}; a mesh "
                 "from a file can only be refined. Export a coarser one."
             )
-        file = self.file()
+        file = file_or_resource(self.path)
+        if file is None:
+            raise MeshError(
+                f"food.shape.path: {self.path} cannot be read as a mesh: there is no such file, "
+                f"neither beside the scenario, nor in {Path.cwd()}, nor among the resources. "
+                "Correct the path."
+            )
         # meshio's readers end on a broken file with whatever went wrong first, some with an exit.
         try:
             content = meshio.read(file)
@@ -342,13 +346,6 @@ class Remainder:
         y = np.unique(np.concatenate([slab, near, rest]))
         mesh = self.body.between(self.position + y, refinement)
         return TetrahedralMesh(mesh.vertices - [0.0, self.position, 0.0], mesh.tetrahedra)
-
-
-def _both_sides(distances: list[float], half: float, refinement: float) -> np.ndarray:
-    """Layer coordinates from -half to half, mirrored in 0, with the given grading near it."""
-    near = _refined([d for d in distances if d < half - 1e-6], refinement)
-    one_side = np.concatenate([near, [half]])
-    return np.unique(np.concatenate([-one_side, one_side]))
 
 
 def _refined(distances: list[float], refinement: float) -> np.ndarray:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.cutting.foods.food import Food, make_food_model, shape_facts, start_pose
-from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid
+from sliceit_drake.cutting.foods.shapes import Box, Cylinder, PlainShape
 from sliceit_drake.cutting.motion import Motion, MotionPlan, Pose, Segment, Waypoints
 from sliceit_drake.cutting.planned_slice import PlannedSlice
 from sliceit_drake.diagnosis.experiments.designs import CLEARANCE, Experiment, Scale
@@ -240,7 +240,7 @@ def _start(plan: PlannedSlice, setup: CalibrationSetup) -> Pose:
 
 def _section(food: Food, setup: CalibrationSetup) -> tuple[float, float]:
     """Width and height of the section, metres."""
-    if isinstance(food.shape, Cylinder | Box | Ellipsoid):
+    if isinstance(food.shape, PlainShape):
         return food.shape.section
     model = make_food_model(food, setup.knife, setup.numerics, setup.refinement)
     low, high = model.span
@@ -250,7 +250,7 @@ def _section(food: Food, setup: CalibrationSetup) -> tuple[float, float]:
 def _scaled(food: Food, scale: float) -> Food:
     """A copy of another size of section; the same where the shape cannot be scaled."""
     food = copy.deepcopy(food)
-    if isinstance(food.shape, Cylinder | Box | Ellipsoid):
+    if isinstance(food.shape, PlainShape):
         food.shape = food.shape.scaled(scale)
     return food
 
