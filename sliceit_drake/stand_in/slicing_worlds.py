@@ -4,7 +4,7 @@ A world gives the slices of a food, one scenario each. Two stand for reality:
 
 - `StandInWorld`: finite elements, finer in mesh and step than a training's, with other parameters
   than the calibrated ones, which also differ from slice to slice, and with effects that no training
-  has (`HIDDEN`).
+  has.
 - `CurvesWorld`: measured curves of force over depth with laws of their own (`curve_cutter`). It
   shares no code with the finite elements or the spring; of a calibrated food it takes size and
   knife.
@@ -14,6 +14,7 @@ differs in size, and the wrench sensor has noise, bias and delay. All of it foll
 seed, the food and the slice's index alone. Both are simulated: a table made from them must say so.
 """
 
+import abc
 import copy
 import dataclasses as dc
 import math
@@ -24,7 +25,6 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError, quantity
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood, load_calibrated_food
-from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.diagrams.agent_gains import AgentGains
@@ -70,28 +70,6 @@ DELAY = 4e-3
 """Delay of the wrench sensor, s: two coupling steps."""
 
 
-@dc.dataclass(frozen=True)
-class _Hidden:
-    """Effects of the stand-in that no training has, in parameter groups of `cutting.foods.effects`.
-
-    Attributes:
-        rate: Exponent of the toughness by the edge's speed.
-        relaxing, time: Fraction of the modulus that relaxes, and with which time, s.
-        adhesion: Shear of food that sticks to the flanks, Pa; 300 Pa on a cucumber's 11 cm^2 of
-            flank are 0.3 N, on a tomato's 36 cm^2 1.1 N.
-        bluntness: Excess of the toughness where the edge enters, over the toughness.
-    """
-
-    rate: float = 0.06
-    relaxing: float = 0.15
-    time: float = 0.2
-    adhesion: float = 300.0
-    bluntness: float = 0.3
-
-
-HIDDEN = _Hidden()
-
-
 def paper_slices(food: str) -> int:
     """How many slices of a food the SliceIt! paper cuts in its evaluation.
 
@@ -124,8 +102,34 @@ class WorldSlice(typing.NamedTuple):
         return self.cutting or self.scenario.food
 
 
-class SlicingWorld(typing.Protocol):
+def _deviations(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Standard normal numbers [count], cut off at `LARGEST`."""
+    return np.clip(rng.normal(size=count), -LARGEST, LARGEST)
+
+
+def _diameter(calibrated: CalibratedFood, rng: np.random.Generator) -> float:
+    shape = calibrated.food.shape
+    assert isinstance(shape, Cylinder)
+    return shape.diameter * float(np.exp(SIZE_SPREAD * _deviations(rng, 1)[0]))
+
+
+SLICE, RUN = range(2)
+"""Independent streams of random numbers."""
+
+
+@dc.dataclass
+class SlicingWorld(abc.ABC):
     """Gives slices to be cut."""
+
+    name: typing.ClassVar[str]
+    seed: int = quantity(0, "", low=0, high=2**31 - 1)
+    """Seed of all deviations."""
+
+    @abc.abstractmethod
+    def _cut(
+        self, scenario: Scenario, calibrated: CalibratedFood, rng: np.random.Generator
+    ) -> CurveFood | None:
+        """Gives a scenario its food, or returns what is cut in its place."""
 
     def scenario(self, food: str, slice: int, board_stiffness: float | None = None) -> WorldSlice:
         """One slice; the same for the same food and index.
@@ -138,105 +142,66 @@ class SlicingWorld(typing.Protocol):
         Raises:
             ConfigurationError: The food or the index is none.
         """
-        ...
+        rng = self._random(food, slice, SLICE)
+        calibrated = load_calibrated_food(food)
+        start, placement = Start(), Placement()
+        along, up = (PLACE_SPREAD * _deviations(rng, 2)).tolist()
+        shifted = np.array(placement.position) + PLACE_SPREAD * _deviations(rng, 2)
+        placement.position = shifted.tolist()
+        bias = _deviations(rng, 6) * np.repeat([FORCE_BIAS, MOMENT_BIAS], 3)
+        scenario = Scenario(
+            name=f"{food}_{self.name}_{slice}",
+            controller=AgentGains().controller(),
+            knife=copy.deepcopy(calibrated.knife),
+            placement=placement,
+            start=Start(clearance=start.clearance + up, offset=start.offset + along),
+            sensor=WrenchSensorConfig(
+                force_bias=bias[:3].tolist(),
+                moment_bias=bias[3:].tolist(),
+                force_noise=FORCE_NOISE,
+                moment_noise=MOMENT_NOISE,
+                delay=DELAY,
+                seed=int(rng.integers(2**31)),
+            ),
+        )
+        if board_stiffness is not None:
+            board, robot, period = scenario.board, scenario.robot, scenario.exchange_period
+            # As many plant steps in an impact, whose duration goes with the root of the stiffness.
+            more = max(1.0, math.sqrt(board_stiffness / board.stiffness))
+            robot.plant_time_step = period / math.ceil(period / robot.plant_time_step * more)
+            board.stiffness = board_stiffness
+        return WorldSlice(scenario, self._cut(scenario, calibrated, rng))
 
     def rng(self, food: str, slice: int) -> np.random.Generator:
         """Random numbers of a slice while it is cut, as of the sensor's noise: give them to
         `AgentStation.begin`."""
-        ...
+        return self._random(food, slice, RUN)
 
-
-SLICE, RUN = range(2)
-"""Independent streams of random numbers."""
-
-
-def _rng(world: str, seed: int, food: str, slice: int, stream: int) -> np.random.Generator:
-    paper_slices(food)
-    if slice < 0:
-        raise ConfigurationError(f"is {slice}", field="slice", fix="Give 0 or more.")
-    names = (zlib.crc32(text.encode()) for text in (world, food))
-    return np.random.default_rng([seed, *names, slice, stream])
-
-
-def _deviations(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Standard normal numbers [count], cut off at `LARGEST`."""
-    return np.clip(rng.normal(size=count), -LARGEST, LARGEST)
-
-
-def _scenario(
-    name: str, calibrated: CalibratedFood, board_stiffness: float | None, rng: np.random.Generator
-) -> Scenario:
-    """All of a slice's scenario but its food."""
-    start = Start()
-    along, up = (PLACE_SPREAD * _deviations(rng, 2)).tolist()
-    placement = Placement()
-    shifted = np.array(placement.position) + PLACE_SPREAD * _deviations(rng, 2)
-    placement.position = shifted.tolist()
-    bias = _deviations(rng, 6) * np.repeat([FORCE_BIAS, MOMENT_BIAS], 3)
-    scenario = Scenario(
-        name=name,
-        controller=AgentGains().controller(),
-        knife=copy.deepcopy(calibrated.knife),
-        placement=placement,
-        start=Start(clearance=start.clearance + up, offset=start.offset + along),
-        sensor=WrenchSensorConfig(
-            force_bias=bias[:3].tolist(),
-            moment_bias=bias[3:].tolist(),
-            force_noise=FORCE_NOISE,
-            moment_noise=MOMENT_NOISE,
-            delay=DELAY,
-            seed=int(rng.integers(2**31)),
-        ),
-    )
-    if board_stiffness is not None:
-        _set_board(scenario, board_stiffness)
-    return scenario
-
-
-def _set_board(scenario: Scenario, stiffness: float) -> None:
-    """Gives a scenario a board, and the plant as many steps in an impact as the default has."""
-    board, robot = scenario.board, scenario.robot
-    # The duration of an impact goes with the root of the stiffness.
-    steps = scenario.exchange_period / robot.plant_time_step
-    steps *= max(1.0, math.sqrt(stiffness / board.stiffness))
-    robot.plant_time_step = scenario.exchange_period / math.ceil(steps)
-    board.stiffness = stiffness
-
-
-def _diameter(calibrated: CalibratedFood, rng: np.random.Generator) -> float:
-    shape = calibrated.food.shape
-    assert isinstance(shape, Cylinder)
-    return shape.diameter * float(np.exp(SIZE_SPREAD * _deviations(rng, 1)[0]))
+    def _random(self, food: str, slice: int, stream: int) -> np.random.Generator:
+        paper_slices(food)
+        if slice < 0:
+            raise ConfigurationError(f"is {slice}", field="slice", fix="Give 0 or more.")
+        names = (zlib.crc32(text.encode()) for text in (self.name, food))
+        return np.random.default_rng([self.seed, *names, slice, stream])
 
 
 @dc.dataclass
-class StandInWorld:
-    """Finite elements with hidden effects, finer than a training's; see `SlicingWorld`."""
+class StandInWorld(SlicingWorld):
+    """Finite elements with hidden effects, finer than a training's."""
 
-    seed: int = quantity(0, "", low=0, high=2**31 - 1)
-    """Seed of all deviations."""
+    name = "stand_in"
     refinement: float = quantity(1.25, "", low=0.3, high=4.0)
     """Elements along an edge, relative to the food's mesh."""
     time_step: float = quantity(1e-4, "s", low=1e-6, high=2e-3)
     """Sub-step of the food."""
 
-    def scenario(self, food: str, slice: int, board_stiffness: float | None = None) -> WorldSlice:
-        """One slice; see `SlicingWorld`."""
-        rng = _rng("stand_in", self.seed, food, slice, SLICE)
-        calibrated = load_calibrated_food(food)
-        scenario = _scenario(f"{food}_stand_in_{slice}", calibrated, board_stiffness, rng)
+    def _cut(
+        self, scenario: Scenario, calibrated: CalibratedFood, rng: np.random.Generator
+    ) -> None:
         scenario.numerics = Numerics(
             flank_stiffness=calibrated.flank_stiffness, time_step=self.time_step
         )
-        scenario.food = self._food(calibrated, rng)
-        return WorldSlice(scenario, None)
-
-    def rng(self, food: str, slice: int) -> np.random.Generator:
-        """See `SlicingWorld`."""
-        return _rng("stand_in", self.seed, food, slice, RUN)
-
-    def _food(self, calibrated: CalibratedFood, rng: np.random.Generator) -> Food:
-        food = calibrated.apply_to(copy.deepcopy(calibrated.food))
+        scenario.food = food = calibrated.apply_to(copy.deepcopy(calibrated.food))
         shape, material, effects = food.shape, food.material, food.effects
         assert isinstance(shape, Cylinder)
         shape.rings = round(self.refinement * shape.rings)
@@ -248,31 +213,23 @@ class StandInWorld:
         material.toughness *= TOUGHNESS * tough
         material.youngs_modulus *= MODULUS * stiff
         material.friction *= FRICTION * rub
-        effects.toughness_rate.exponent = HIDDEN.rate
-        effects.relaxation.shares, effects.relaxation.times = [HIDDEN.relaxing], [HIDDEN.time]
-        effects.adhesion.stress = HIDDEN.adhesion
-        effects.bluntness.initiation = HIDDEN.bluntness * material.toughness
-        return food
+        # What no training has.
+        effects.toughness_rate.exponent = 0.06
+        effects.relaxation.shares, effects.relaxation.times = [0.15], [0.2]
+        # 0.3 N on a cucumber's 11 cm^2 of flank, 1.1 N on a tomato's 36 cm^2.
+        effects.adhesion.stress = 300.0
+        effects.bluntness.initiation = 0.3 * material.toughness
 
 
 @dc.dataclass
-class CurvesWorld:
-    """Measured curves in place of the scenario's food; see `SlicingWorld` and `curve_cutter`."""
+class CurvesWorld(SlicingWorld):
+    """Measured curves in place of the scenario's food; see `curve_cutter`."""
 
-    seed: int = quantity(0, "", low=0, high=2**31 - 1)
-    """Seed of all deviations."""
+    name = "curves"
 
-    def scenario(self, food: str, slice: int, board_stiffness: float | None = None) -> WorldSlice:
-        """One slice; see `SlicingWorld`."""
-        rng = _rng("curves", self.seed, food, slice, SLICE)
-        calibrated = load_calibrated_food(food)
-        scenario = _scenario(f"{food}_curves_{slice}", calibrated, board_stiffness, rng)
+    def _cut(
+        self, scenario: Scenario, calibrated: CalibratedFood, rng: np.random.Generator
+    ) -> CurveFood:
         diameter = _diameter(calibrated, rng)
         tough, rub = np.exp(SPREAD * _deviations(rng, 2)).tolist()
-        cut = CurveFood(food, diameter, diameter, tough, rub)
-
-        return WorldSlice(scenario, cut)
-
-    def rng(self, food: str, slice: int) -> np.random.Generator:
-        """See `SlicingWorld`."""
-        return _rng("curves", self.seed, food, slice, RUN)
+        return CurveFood(calibrated.food.name, diameter, diameter, tough, rub)
