@@ -2,10 +2,10 @@
 
 import argparse
 import dataclasses as dc
-from collections.abc import Sequence
 from pathlib import Path
 
 from sliceit_drake.configuration import ConfigurationError
+from studies.pages import render_and_store
 
 __all__ = ["Place"]
 
@@ -80,12 +80,20 @@ class Place:
             page = self.put(file.read_text(encoding="utf-8"), text, str(file))
             file.write_text(page, encoding="utf-8")
 
-    def show(self, file: Path | None, lines: Sequence[str]) -> None:
-        """Prints lines and puts them there; None is no page.
+    def show(self, file: Path | None, text: str) -> None:
+        """Prints text and puts it there; None is no page.
 
         Raises:
             ConfigurationError: As `put`.
         """
-        text = "\n".join(lines)
         print(text)
         self.write(file, text)
+
+    def publish(self, file: Path | None, **values: object) -> None:
+        """Shows the template of this name with values, and stores these beside the page.
+
+        Raises:
+            ConfigurationError: As `put`.
+        """
+        text = render_and_store(self.name, file, values, whole=False)
+        self.show(file, text.rstrip("\n"))

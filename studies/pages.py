@@ -1,15 +1,17 @@
 """Writes Markdown pages: templates filled with results, and tables."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from studies.results import write_json
+from studies.results import plain, write_json
 
-__all__ = ["percent", "publish", "render", "table"]
+__all__ = ["RESULTS", "percent", "publish", "render", "render_and_store", "table"]
 
 TEMPLATES = Path(__file__).parent / "templates"
+RESULTS = "results"
+"""Folder beside the pages, for the values that they show."""
 
 
 def table(head: str, rows: Iterable[Iterable[object]], align: str = "") -> str:
@@ -59,6 +61,32 @@ def render(name: str, **values: object) -> str:
         jinja2.UndefinedError: The template asks for a value that is not given.
     """
     return ENVIRONMENT.get_template(f"{name}.md").render(values)
+
+
+def render_and_store(
+    name: str,
+    page: Path | None,
+    values: Mapping[str, object],
+    results: object = None,
+    whole: bool = True,
+) -> str:
+    """A page as `render`, or a part of one, whose values are stored as RESULTS/NAME.json.
+
+    `python -m studies pages` renders it anew from that file.
+
+    Args:
+        name: Of the template.
+        page: File that the text is for; None to store nothing.
+        values: Of the template, see `results.plain`.
+        results: What the values were made from, to be stored beside them; None for nothing.
+        whole: Whether the text is the page; if not, it has a marked place there.
+    """
+    shown = plain(values)
+    if page is not None:
+        facts = {"page": page.name, "whole": whole, "values": shown}
+        facts |= {} if results is None else {"results": results}
+        write_json(page.parent / RESULTS / f"{name}.json", facts)
+    return render(name, **shown)
 
 
 def publish(text: str, file: Path | None, results: object = None) -> None:

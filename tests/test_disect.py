@@ -24,6 +24,7 @@ from studies.disect import page as disect_page
 from studies.disect.case import load_case, load_reference, run_case
 from studies.disect.settings import SETTINGS
 from studies.disect.study import Curve, Difference, DisectStudy, MeasuredCurves
+from studies.pages import render
 
 ROOT = Path(__file__).resolve().parent.parent
 TOUGHNESS = 300.0
@@ -232,7 +233,7 @@ def test_page_and_figure_show_what_the_study_found(runs, tmp_path):
         differences=[Difference("a difference", "there", "here", "reason", "effect")],
         measured=[MeasuredCurves("cucumber", profile, 0.02, curves, 0.1)] * 3,
     )
-    page = disect_page.disect_page(study, "a command", 1.5)
+    page = render("disect", **disect_page.page_values(study, "a command", 1.5))
     assert f"| 88.6 / {ours.norms.max():.1f} |" in page
     assert "| cucumber | DiSECt, calibrated | sum of norms | 18.0 |" in page
     assert len(settings_rows(page)) == len(SETTINGS)

@@ -173,6 +173,9 @@ TESTED = {
     "tests/test_benchmarks_page.py::test_the_page_is_what_its_command_makes": [
         "python -m studies aims",
     ],
+    "tests/test_readme.py::test_every_page_of_a_study_is_rendered_from_its_stored_results": [
+        "python -m studies pages",
+    ],
     "tests/test_rosbag.py::test_the_command_cuts_a_slice_out_of_a_bag": [
         "sliceit records import rosbag",
     ],

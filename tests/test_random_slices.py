@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from sliceit_drake.cutting.foods.shapes import Box
+from studies.pages import render
 from studies.physics import random_slices
 from studies.physics.random_slices import (
     Outcome,
     cut_drawn,
     cut_random_slice,
     draw_slice,
-    random_slices_page,
+    page_values,
 )
 
 
@@ -85,6 +86,6 @@ def test_the_page_counts_all_and_quotes_a_reason_once():
         Outcome("stopped", "at 2.0 s it stands", "cylinder"),
         Outcome("unexplained", "KeyError: 'x'", "box"),
     ]
-    page = random_slices_page(outcomes, 3, "python -m studies random")
+    page = render("random_slices", **page_values(outcomes, 3, "python -m studies random"))
     assert "| box | 1 | 0 | 1 | 1 |" in page and "| all | 1 | 0 | 2 | 1 |" in page
     assert "| 2 | at 1.0 s it stands |" in page and "| 1 | KeyError: 'x' |" in page

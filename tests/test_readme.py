@@ -11,6 +11,7 @@ from sliceit_drake.cli.main import main
 from sliceit_drake.diagrams.ports import ports_as_markdown
 from sliceit_drake.resources import load_module
 from studies.calibration import coverage
+from studies.project.stored_pages import stored_pages
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "sliceit_drake"
@@ -116,6 +117,18 @@ def test_each_file_of_numbers_has_a_test_that_its_page_says_them():
     for test in COMPARED.values():
         file, _, name = test.partition("::")
         assert f"def {name}" in (ROOT / "tests" / file).read_text()
+
+
+def test_every_page_of_a_study_is_rendered_from_its_stored_results():
+    docs = ROOT / "docs"
+    pages = stored_pages(docs)
+    for name, text in pages.items():
+        shown = (docs / name).read_text(encoding="utf-8")
+        assert text.rstrip("\n") == shown.rstrip("\n"), f"{name}: python -m studies pages"
+    # All templates are among them, as a page or as a place of one.
+    shown = "\n".join((docs / name).read_text(encoding="utf-8") for name in pages)
+    for template in (ROOT / "studies/templates").glob("*.md"):
+        assert template.name in pages or f"<!-- {template.stem} -->" in shown
 
 
 def test_the_page_on_coverage_is_that_of_its_replicates(tmp_path, monkeypatch):

@@ -34,19 +34,29 @@ def test_a_session_is_as_fast_as_its_workers_the_scheduler_or_the_writer():
     assert 180 < scaling.saturation(lambda n: scaling.dask_rate(n, run)) < 220
 
 
-def test_tables_say_what_was_measured_and_go_between_the_marks():
+def test_tables_say_what_was_measured_and_go_between_the_marks(tmp_path):
     runs = [
         scaling.SearchRun(1, 100, 50.0, 0.4, 0.06, 0.04),
         scaling.SearchRun(2, 104, 28.0, 0.42, 0.07, 0.05),
     ]
     limits = {"PostgreSQL": scaling.StorageLimits({1: 150.0, 2: 200.0}, 1e-4, 20_000.0)}
-    lines = "\n".join(scaling.search_tables({"PostgreSQL": runs}, limits)).splitlines()
+    page = f"before\n{scaling.PLACE.begin}\nold\n{scaling.PLACE.end}\nafter\n"
+    file = tmp_path / "page.md"
+    file.write_text(page, encoding="utf-8")
+    scaling.PLACE.publish(
+        file,
+        searches=scaling.search_rows({"PostgreSQL": runs}),
+        limits=scaling.limit_rows(limits),
+        dask=None,
+        model=scaling.model_values({"PostgreSQL": runs}, limits, None),
+        command="a command",
+        machine="a machine",
+    )
+    text = file.read_text(encoding="utf-8")
+    lines = text.splitlines()
     assert "| PostgreSQL | 2 | 104 | 28.0 | 3.71 | 1.86 | 420.0 ms | 70.0 ms | 50.0 ms |" in lines
     assert "| PostgreSQL | 150 | 200 | 10000 | 20000 |" in lines
-    model = scaling.model_table({"PostgreSQL": runs}, limits, None)
-    assert "| 1 | 2 (100 %) |" in model[0].splitlines()
-    page = f"before\n{scaling.PLACE.begin}\nold\n{scaling.PLACE.end}\nafter\n"
-    text = scaling.PLACE.put(page, "\n".join(model), "page.md")
+    assert "| 1 | 2 (100 %) |" in lines
     assert "old" not in text and text.startswith("before\n") and text.endswith("\nafter\n")
     assert scaling.PLACE.put(text, "old", "page.md") == page
     with pytest.raises(ValueError, match="page.md has not the lines"):

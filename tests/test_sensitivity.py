@@ -28,7 +28,8 @@ from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.protocol import Condition, Protocol, load_protocol
 from studies.diagnosis.identifiability import study
-from studies.diagnosis.identifiability_page import Study, report
+from studies.diagnosis.identifiability_page import Study, page_values
+from studies.pages import render
 
 Z = 2
 EVEN = Clock(longest=1)
@@ -345,7 +346,7 @@ def test_confounded_causes_are_parted_by_the_experiments_that_should():
 
 def test_the_report_names_what_does_not_show_and_what_would_part_it():
     found = protocols()
-    text = report(found)
+    text = render("identifiability", **page_values(found))
     (line,) = [
         x for x in text.split("## rich")[0].splitlines() if x.startswith("| `toughness_rate`")
     ]

@@ -24,9 +24,9 @@ from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
 from sliceit_drake.stand_in.protocol import Protocol, load_protocol
 from sliceit_drake.stand_in.session import Session
 from studies.diagnosis.conditions import protocol_identifiability
-from studies.diagnosis.identifiability_page import Study, plot_angles, report
+from studies.diagnosis.identifiability_page import Study, page_values, plot_angles
 from studies.hidden_effects.quiet import records_of_conditions, without_noise
-from studies.pages import publish
+from studies.pages import publish, render_and_store
 
 __all__ = ["add_arguments", "nominal_records", "protocol_setup", "run", "study"]
 
@@ -142,7 +142,10 @@ def run(options: argparse.Namespace) -> int:
         found = study(
             protocols, causes, options.refinement, options.cache, options.workers, progress
         )
-    publish(report(found), options.output, found.results)
+    values = page_values(found)
+    publish(
+        render_and_store("identifiability", options.output, values, found.results), options.output
+    )
     if options.figure is not None:
         plot_angles(found, options.figure)
     return 0

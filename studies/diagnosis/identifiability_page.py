@@ -17,9 +17,8 @@ from sliceit_drake.diagnosis.experiments.identifiability import (
 )
 from studies.diagnosis.conditions import ProtocolIdentifiability
 from studies.figures import new_figure, save_figure
-from studies.pages import render
 
-__all__ = ["Study", "plot_angles", "report"]
+__all__ = ["Study", "page_values", "plot_angles"]
 
 
 @dc.dataclass
@@ -100,15 +99,16 @@ def _scan_angles(found: Sensitivities) -> dict[str, float]:
     return {name: float(np.median(values)) for name, values in out.items()}
 
 
-def report(study: Study, figure: str = "docs/figures/identifiability.png") -> str:
-    """The report as Markdown."""
+def page_values(
+    study: Study, figure: str = "docs/figures/identifiability.png"
+) -> dict[str, object]:
+    """What the page shows."""
     found = study.found
     base = ", ".join(c.name.rsplit(".", 1)[-1] for c in found.columns if c.kind == "base")
     bent, scanned = _nonlinearity(found), _scan_angles(found)
     own = [v for v in (*scanned.values(), *bent.values()) if v > 1.0]
     middle, most = np.percentile(own, [50.0, 75.0]) if own else (0.0, 0.0)
-    return render(
-        "identifiability",
+    return dict(
         figure=figure,
         base=base.replace("youngs_", ""),
         elements=found.elements,

@@ -28,9 +28,9 @@ from sliceit_drake.output_folder import check_folder
 from sliceit_drake.records.validation import load_record
 from sliceit_drake.resources import resource_path
 from studies.figures import save_figure
-from studies.pages import publish, render
+from studies.pages import publish, render_and_store
 
-__all__ = ["SIMULATIONS", "MeasuredSlice", "add_arguments", "draw", "page", "run"]
+__all__ = ["SIMULATIONS", "MeasuredSlice", "add_arguments", "draw", "page_values", "run"]
 
 FOODS = ("cucumber", "tomato", "potato")
 REPLICATES = 1000
@@ -121,7 +121,8 @@ def run(options: argparse.Namespace) -> int:
     if options.foods != list(FOODS):
         command += f" --foods {' '.join(options.foods)}"
     results = {i.food: {name: each.facts() for name, each in i.results.items()} for i in items}
-    publish(page(items, REPLICATES, command), file, results)
+    values = page_values(items, REPLICATES, command)
+    publish(render_and_store(file.stem, file, values, results), file)
     return 0
 
 
@@ -147,16 +148,15 @@ def draw(item: MeasuredSlice, folder: Path) -> Path:
     return file
 
 
-def page(items: Sequence[MeasuredSlice], replicates: int, command: str) -> str:
-    """The page in Markdown.
+def page_values(items: Sequence[MeasuredSlice], replicates: int, command: str) -> dict[str, object]:
+    """What the page shows.
 
     Args:
         items: One a food.
         replicates: Of the bootstrap.
         command: That wrote it.
     """
-    return render(
-        "what_the_simulation_gets_wrong",
+    return dict(
         command=command,
         replicates=replicates,
         level=LEVEL,

@@ -23,10 +23,10 @@ from studies.disect.case import Case, CaseResult
 from studies.disect.settings import SETTINGS
 from studies.disect.study import STEPS, Curve, DisectStudy, MeasuredCurves, disect_study
 from studies.figures import BLUE, ORANGE, PURPLE, new_figure, save_figure, tidy
-from studies.pages import publish, render
+from studies.pages import publish, render_and_store
 from studies.physics.measured_curves import load_measured_foods
 
-__all__ = ["add_arguments", "disect_page", "field_unit", "plot_disect", "run"]
+__all__ = ["add_arguments", "field_unit", "page_values", "plot_disect", "run"]
 
 FOODS = "calibration/verification_foods.yaml"
 
@@ -47,8 +47,9 @@ def run(options: argparse.Namespace) -> int:
     minutes = max(1.0, (time.monotonic() - begin) / 60.0)
     figure = options.output / "figures" / "disect.png"
     plot_disect(study, figure)
-    page = disect_page(study, "python -m studies disect --output docs", minutes)
-    publish(page, options.output / "disect.md", _numbers(study))
+    values = page_values(study, "python -m studies disect --output docs", minutes)
+    page = options.output / "disect.md"
+    publish(render_and_store("disect", page, values, _numbers(study)), page)
     return 0
 
 
@@ -71,8 +72,8 @@ def _numbers(study: DisectStudy) -> dict[str, Any]:
     }
 
 
-def disect_page(study: DisectStudy, command: str, minutes: float) -> str:
-    """The page in Markdown.
+def page_values(study: DisectStudy, command: str, minutes: float) -> dict[str, object]:
+    """What the page shows.
 
     Args:
         study: The results.
@@ -82,8 +83,7 @@ def disect_page(study: DisectStudy, command: str, minutes: float) -> str:
     toughness, strength = study.laws[0]
     nominal = study.reference.runs[0]
     assert nominal.break_delay is not None
-    return render(
-        "disect",
+    return dict(
         command=command,
         minutes=minutes,
         case=_case_rows(study),

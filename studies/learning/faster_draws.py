@@ -94,5 +94,5 @@ def run(options: argparse.Namespace) -> int:
     """Runs the study."""
     PLACE.check(options.output)
     lines = draws_table(options.evaluation, options.faster, options.command)
-    PLACE.show(options.output, lines)
+    PLACE.show(options.output, "\n".join(lines))
     return 0

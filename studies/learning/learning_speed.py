@@ -22,7 +22,6 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
 from studies.marked_page import Place
-from studies.pages import table
 from studies.results import add_json_argument, write_results
 
 __all__ = ["PLACE", "add_arguments", "run"]
@@ -136,8 +135,8 @@ class Watch:
         setattr(owner, name, watched)
 
 
-def shares(rounds: int) -> list[str]:
-    """Where the time of a decision goes, as a table. The last thing done: it changes methods."""
+def shares(rounds: int) -> list[tuple[str, ...]]:
+    """Where the time of a decision goes, in %. The last thing done: it changes methods."""
     from sliceit_drake.cutting.workspace import Workspace
     from sliceit_drake.learning.environment import SlicingEnv
     from sliceit_drake.systems.agent import AgentSystem
@@ -171,15 +170,8 @@ def shares(rounds: int) -> list[str]:
                 found[name].setdefault(part, []).append(spent / whole)
     rows = [(part, [np.median(found[name][part]) for name in SIMULATORS]) for part in watch.spent]
     return [
-        "Where the time of simulating goes, in fractions of it:",
-        "",
-        table(
-            " | ".join(["part", *SIMULATORS]),
-            (
-                (part, *(f"{100 * share:.0f} %" for share in both))
-                for part, both in sorted(rows, key=lambda row: -row[1][0])
-            ),
-        ),
+        (part, *(f"{100 * share:.0f} %" for share in both))
+        for part, both in sorted(rows, key=lambda row: -row[1][0])
     ]
 
 
@@ -240,20 +232,15 @@ def run(options: argparse.Namespace) -> int:
             f"{np.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f}) with {count}"
         )
     write_results(options, found)
-    lines = [
-        table(
-            "simulator | simulating a decision | an update | environments | training"
-            " | 80,000 decisions",
-            rows,
-        ),
-        "",
-        f"Medians of {options.rounds} rounds, least and greatest in brackets. The cutting "
-        f"simulator takes {' and '.join(taken)} times as long as the spring. A decision of the "
-        f"exported network takes {median:.3f} ms (99 %: {late:.3f} ms).",
-        "",
-        *shares(options.rounds),
-        "",
-        f"`{options.command}`, {os.cpu_count()} cores.",
-    ]
-    PLACE.show(options.output, lines)
+    PLACE.publish(
+        options.output,
+        rows=rows,
+        rounds=options.rounds,
+        taken=" and ".join(taken),
+        decision=median,
+        late=late,
+        parts=shares(options.rounds),
+        command=options.command,
+        cores=os.cpu_count(),
+    )
     return 0

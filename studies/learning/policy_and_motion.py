@@ -27,7 +27,6 @@ from sliceit_drake.stand_in.slicing_worlds import SLICING_FOODS, StandInWorld
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
 from sliceit_drake.systems.exported_network import load_network
 from studies.marked_page import Place
-from studies.pages import table
 
 __all__ = ["PLACE", "add_arguments", "run"]
 
@@ -116,12 +115,5 @@ def run(options: argparse.Namespace) -> int:
             f"{motion.frequency:.1f} Hz"
         )
         rows += [[food, *row("policy", agents)], ["", *row(what, planned)]]
-    lines = [
-        "A policy and such a motion beside each other:",
-        "",
-        table("food | by | completed | median force | peak | board's peak | duration", rows),
-        "",
-        f"`{options.command}`: means of {options.slices} slices of the stand-in world.",
-    ]
-    PLACE.show(options.output, lines)
+    PLACE.publish(options.output, rows=rows, command=options.command, slices=options.slices)
     return 0

@@ -15,7 +15,6 @@ import numpy as np
 
 from sliceit_drake.cli.main import main as sliceit
 from studies.marked_page import Place
-from studies.pages import table
 
 __all__ = ["PLACE", "add_arguments", "run"]
 
@@ -91,21 +90,15 @@ def run(options: argparse.Namespace) -> int:
     if code != 0:
         return code
     cuts = [json.loads(line) for line in evaluation.read_text(encoding="utf-8").splitlines()]
-    lines = [
-        f"What of the agent matters, one thing changed at a time; {options.steps} decisions where "
-        "no other number stands:",
-        "",
-        table(
-            "variant | return of the last slices | completed | cucumber | tomato | potato | carrot"
-            " | board's peak, cucumber",
-            (
-                row(variant, folder, [c for c in cuts if c["policy"] == str(folder)])
-                for variant, folder in folders.items()
-            ),
-        ),
-        "",
-        f"Means of the median force, {options.slices} slices of each food in the world of measured "
-        f"curves, seed {options.seed}. `{options.command}`",
-    ]
-    PLACE.show(options.output, lines)
+    PLACE.publish(
+        options.output,
+        rows=[
+            row(variant, folder, [c for c in cuts if c["policy"] == str(folder)])
+            for variant, folder in folders.items()
+        ],
+        steps=options.steps,
+        slices=options.slices,
+        seed=options.seed,
+        command=options.command,
+    )
     return 0

@@ -15,7 +15,6 @@ from tqdm import tqdm
 from sliceit_drake.learning.unseen_worlds import Case, trace
 from sliceit_drake.systems.agent import ACTIONS, AgentConfig
 from studies.marked_page import Place
-from studies.pages import table
 
 __all__ = ["PLACE", "add_arguments", "run"]
 
@@ -62,18 +61,12 @@ def run(options: argparse.Namespace) -> int:
     ]
     of_board = [r for r in rows if r["board_stiffness"] == options.board_stiffness]
     cases = [Case(**{name: r[name] for name in names}) for r in of_board if not r["completed"]]
-    lines = [
-        f"{len(cases)} of the {len(of_board)} slices on the board of "
-        f"{options.board_stiffness / 1e3:g} kN/m are unfinished. What happened in their last "
-        f"{LAST:g} s:",
-        "",
-        table(
-            "policy | world | slice | ended by | cut | edge over the board | draw"
-            " | mean of press and p_z | mean force along the board, up",
-            map(row, tqdm(cases, desc="slices")),
-        ),
-        "",
-        f"Actions go from -1 to 1; p_z is the gain downwards. `{options.command}`",
-    ]
-    PLACE.show(options.output, lines)
+    PLACE.publish(
+        options.output,
+        rows=list(map(row, tqdm(cases, desc="slices"))),
+        slices=len(of_board),
+        board=options.board_stiffness / 1e3,
+        last=LAST,
+        command=options.command,
+    )
     return 0

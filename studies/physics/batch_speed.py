@@ -21,7 +21,6 @@ from sliceit_drake.cutting.parameters import with_parameters
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.resources import resource_path
 from studies.marked_page import Place
-from studies.pages import table
 from studies.results import describe_machine
 
 __all__ = ["add_arguments", "run"]
@@ -84,12 +83,13 @@ def run(options: argparse.Namespace) -> int:
             first = forces if first is None else first
             difference = np.sqrt(((forces - first) ** 2).mean() / (first**2).mean())
             rows.append((device, count, f"{slices:.2f}", f"{100 * difference:.4f} %"))
-    lines = [
-        table("device | cuts in one call | slices a second | force against the CPU's, RMS", rows),
-        "",
-        f"{elements} tetrahedra; least of {options.repeats} times. `{options.command}`, {machine}.",
-    ]
-    if not wp.is_cuda_available():
-        lines.append("No CUDA device was at hand: the kernels have not been run on one.")
-    PLACE.show(options.output, lines)
+    PLACE.publish(
+        options.output,
+        rows=rows,
+        elements=elements,
+        repeats=options.repeats,
+        command=options.command,
+        machine=machine,
+        cuda=wp.is_cuda_available(),
+    )
     return 0

@@ -28,7 +28,7 @@ from sliceit_drake.resources import resource_path
 from studies.marked_page import Place
 from studies.pages import table
 
-__all__ = ["add_arguments", "cuts_table", "foods_table", "knives_table", "run"]
+__all__ = ["add_arguments", "cut_rows", "foods_table", "knives_table", "run"]
 
 PERIOD, SPEED, CLEARANCE = 2e-3, 0.02, 1e-3
 
@@ -41,14 +41,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
-    tables = {"foods": foods_table(), "knives": knives_table()}
+    cuts = Place("cuts")
     if options.cut:
-        tables["cuts"] = cuts_table(options.command)
-    for name in tables:
-        Place(name).check(options.output)
-    print("\n\n".join(tables.values()))
-    for name, text in tables.items():
-        Place(name).write(options.output, text)
+        cuts.check(options.output)
+    for name, text in {"foods": foods_table(), "knives": knives_table()}.items():
+        Place(name).show(options.output, text)
+    if options.cut:
+        cuts.publish(options.output, rows=cut_rows(), speed=SPEED, command=options.command)
     return 0
 
 
@@ -123,7 +122,8 @@ def bevel(knife: Knife) -> float:
     return float(np.degrees(np.arctan2(0.5 * knife.edge_thickness, knife.tip_height)))
 
 
-def cuts_table(command: str) -> str:
+def cut_rows() -> list[tuple[str, ...]]:
+    """What each knife does in foods that are held on one side and on both."""
     rows: list[tuple[str, ...]] = []
     for name in ("cucumber", "cucumber_end_slice", "apple"):
         scenario = load_scenario(resource_path(f"scenarios/{name}.yaml"))
@@ -131,12 +131,7 @@ def cuts_table(command: str) -> str:
         assert isinstance(food, Food)
         for sides in (food.held_sides,) if name != "apple" else ("plus", "both"):
             rows += _cuts(dc.replace(food, held_sides=sides), scenario.numerics)
-    how = (
-        f"`{command}`: pressed through at\n"
-        f"{SPEED:g} m/s without a robot. A knife that is lower than the food is left out."
-    )
-    head = "food | held | knife | peak [N] | work [J/m2] | of it friction"
-    return "\n".join([table(head, rows), "", how])
+    return rows
 
 
 def _cuts(food: Food, numerics: Numerics) -> Sequence[tuple[str, ...]]:

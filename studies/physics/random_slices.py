@@ -27,7 +27,7 @@ from sliceit_drake.cutting.motion import Hold, Motion, MotionPlan, PressAndDraw,
 from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
 from sliceit_drake.cutting.workers import worker_processes
-from studies.pages import publish, render
+from studies.pages import publish, render_and_store
 
 __all__ = [
     "Outcome",
@@ -36,7 +36,7 @@ __all__ = [
     "cut_drawn",
     "cut_random_slice",
     "draw_slice",
-    "random_slices_page",
+    "page_values",
     "run",
 ]
 
@@ -79,10 +79,9 @@ def run(options: argparse.Namespace) -> int:
         if not outcomes:
             raise
         interrupted = True  # What was asked for has no page then.
-    page = random_slices_page(outcomes, options.seed, options.command)
-    folder = None if interrupted else options.output
-    results = {"command": options.command, "seed": options.seed, "slices": outcomes}
-    publish(page, folder and folder / "random_slices.md", results)
+    values = page_values(outcomes, options.seed, options.command)
+    page = None if interrupted or options.output is None else options.output / "random_slices.md"
+    publish(render_and_store("random_slices", page, values, outcomes), page)
     if interrupted:
         print(f"Interrupted: this is of the first {len(outcomes)} of {options.count} slices.")
         return 130
@@ -240,8 +239,8 @@ def _wrong(result: SliceResult, model: CuttingModel) -> str:
     return ""
 
 
-def random_slices_page(outcomes: list[Outcome], seed: int, command: str) -> str:
-    """The page of a study."""
+def page_values(outcomes: list[Outcome], seed: int, command: str) -> dict[str, object]:
+    """What the page of a study shows."""
     shapes = sorted({outcome.shape for outcome in outcomes})
     counts = collections.Counter((o.shape, o.kind) for o in outcomes)
     peaks = [o.peak for o in outcomes if o.kind == "cut"]
@@ -253,8 +252,7 @@ def random_slices_page(outcomes: list[Outcome], seed: int, command: str) -> str:
                 groups.setdefault(_gist(outcome.reason), []).append(outcome.reason)
         most = sorted(groups.values(), key=len, reverse=True)
         reasons[kind] = [(len(group), group[0].replace("|", "/")) for group in most]
-    return render(
-        "random_slices",
+    return dict(
         command=command,
         slices=len(outcomes),
         seed=seed,

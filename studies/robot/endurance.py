@@ -25,7 +25,7 @@ from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.scenario_diagram import ScenarioDiagram
 from sliceit_drake.resources import resource_path
-from studies.pages import publish, render
+from studies.pages import publish, render_and_store
 
 __all__ = ["add_arguments", "run"]
 
@@ -109,8 +109,7 @@ def run(options: argparse.Namespace) -> int:
     for _ in range(BUILT):
         ScenarioDiagram(scenario)
     built = (memory() - before) / BUILT
-    page = render(
-        "endurance",
+    values = dict(
         command=options.command,
         station=count,
         prescribed=slices,
@@ -124,5 +123,5 @@ def run(options: argparse.Namespace) -> int:
         pydrake=version("drake"),
     )
     results = {"hours": hours, "held_MB": held, "growth_MB_an_hour": slope, "left_MB": built}
-    publish(page, options.output, results)
+    publish(render_and_store("endurance", options.output, values, results), options.output)
     return 0 if slope <= GROWTH else 1

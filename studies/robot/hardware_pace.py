@@ -35,7 +35,6 @@ from tqdm import tqdm
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.emulator.process import EmulatorError, EmulatorProcess
 from studies.marked_page import Place
-from studies.pages import table
 from studies.results import describe_machine
 
 __all__ = ["PLACE", "PacedRun", "add_arguments", "run"]
@@ -44,9 +43,6 @@ PERIOD = 0.002
 PLACE = Place("hardware_pace")
 SCENARIO = "scenarios/cucumber_spring.yaml"
 ROBOT = "hardware/emulated.yaml"
-HEAD = (
-    "pace | completed | cycles | missed | late, median | 99 % | max | emulator late | force | stops"
-)
 
 
 @dc.dataclass
@@ -219,5 +215,5 @@ def run(options: argparse.Namespace) -> int:
         rows = measure(options)
     except EmulatorError as error:
         raise ConfigurationError(str(error), field=options.scenario) from error
-    PLACE.show(options.output, [table(HEAD, rows), "", f"`{options.command}`, {machine}."])
+    PLACE.publish(options.output, rows=rows, command=options.command, machine=machine)
     return 0

@@ -30,7 +30,6 @@ from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.protocol import Protocol, load_protocol
 from sliceit_drake.stand_in.session import keep_record, record_session
 from studies.marked_page import Place
-from studies.pages import table
 from studies.results import describe_machine
 from studies.scaling.local_database import NoServerError, local_database
 
@@ -304,9 +303,9 @@ def measure_dask(slices: int, tasks: int, folder: Path) -> DaskRun:
     return DaskRun(walls, slices, rate, write, sum(map(len, files.values())))
 
 
-def search_tables(runs: dict[str, list[SearchRun]], limits: dict[str, StorageLimits]) -> list[str]:
+def search_rows(runs: dict[str, list[SearchRun]]) -> list[tuple[object, ...]]:
     """What was measured of searches."""
-    rows = []
+    rows: list[tuple[object, ...]] = []
     for name, of_storage in runs.items():
         alone = of_storage[0].trials / of_storage[0].wall
         for run in of_storage:
@@ -316,45 +315,38 @@ def search_tables(runs: dict[str, list[SearchRun]], limits: dict[str, StorageLim
                 (name, run.workers, run.trials, f"{run.wall:.1f}", f"{rate:.2f}")
                 + (f"{rate / alone:.2f}", *(f"{1e3 * part:.1f} ms" for part in parts))
             )
-    limit_rows = (
+    return rows
+
+
+def limit_rows(limits: dict[str, StorageLimits]) -> list[tuple[str, ...]]:
+    """What was measured of storages."""
+    return [
         (name, f"{each.writes[1]:.0f}", f"{each.writes[2]:.0f}", f"{1.0 / each.read:.0f}")
         + (f"{each.reads:.0f}",)
         for name, each in limits.items()
-    )
-    return [
-        table(
-            "storage | workers | trials | wall [s] | trials a second | speed-up | simulation"
-            " | storage | proposals",
-            rows,
-        ),
-        "",
-        table(
-            "storage | written a second, 1 process | 2 processes | read a second, 1 process | 2",
-            limit_rows,
-        ),
     ]
 
 
-def dask_table(run: DaskRun) -> list[str]:
+def dask_values(run: DaskRun) -> dict[str, object]:
     """What was measured of a cluster."""
-    rows = (
+    rows = [
         (workers, run.slices, f"{wall:.1f}", f"{run.slices / wall:.3f}")
         + (f"{run.walls[1] / wall:.2f}",)
         for workers, wall in run.walls.items()
-    )
-    return [
-        table("Dask workers | slices | wall [s] | slices a second | speed-up", rows),
-        "",
-        f"Scheduler: {run.tasks:.0f} empty tasks a second ({1e3 / run.tasks:.2f} ms a task). A"
-        f" record is {run.size / 1e3:.0f} kB, and takes {1e3 * run.write:.1f} ms to write where the"
-        " command runs.",
     ]
+    return {
+        "rows": rows,
+        "tasks": run.tasks,
+        "task_ms": 1e3 / run.tasks,
+        "record_kB": run.size / 1e3,
+        "write_ms": 1e3 * run.write,
+    }
 
 
-def model_table(
+def model_values(
     runs: dict[str, list[SearchRun]], limits: dict[str, StorageLimits], dask: DaskRun | None
-) -> list[str]:
-    """The extrapolation."""
+) -> dict[str, object]:
+    """The extrapolation: titles and rows of its table."""
     rates: dict[str, Callable[[int], float]] = {}
     for name, limit in limits.items():
 
@@ -375,7 +367,7 @@ def model_table(
     ]
     full = (str(saturation(rate)) for rate in rates.values())
     rows.append(("**more bring little from**", *full))
-    return [table(" | ".join(["workers", *rates]), rows)]
+    return {"titles": ["workers", *rates], "rows": rows}
 
 
 @contextmanager
@@ -398,8 +390,8 @@ def storages(folder: Path) -> Iterator[dict[str, Callable[[str], str]]]:
         yield found
 
 
-def measure(options: argparse.Namespace) -> list[str]:
-    """All tables."""
+def measure(options: argparse.Namespace) -> dict[str, object]:
+    """What all tables show."""
     runs: dict[str, list[SearchRun]] = {}
     limits: dict[str, StorageLimits] = {}
     dask = None
@@ -416,10 +408,12 @@ def measure(options: argparse.Namespace) -> list[str]:
             print(dask, flush=True)
         except ImportError as reason:
             print(f"Dask is left out: {reason}")
-    lines = search_tables(runs, limits)
-    if dask is not None:
-        lines += ["", *dask_table(dask)]
-    return [*lines, "", *model_table(runs, limits, dask)]
+    return {
+        "searches": search_rows(runs),
+        "limits": limit_rows(limits),
+        "dask": None if dask is None else dask_values(dask),
+        "model": model_values(runs, limits, dask),
+    }
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -435,5 +429,5 @@ def run(options: argparse.Namespace) -> int:
     """Runs the study."""
     PLACE.check(options.output)
     machine = describe_machine()
-    PLACE.show(options.output, [*measure(options), "", f"`{options.command}`: {machine}."])
+    PLACE.publish(options.output, **measure(options), command=options.command, machine=machine)
     return 0
