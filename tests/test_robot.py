@@ -26,7 +26,6 @@ from sliceit_drake.cutting.board import (
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.diagrams.plant.knife_body import blade_surface, effective_mass
 from sliceit_drake.diagrams.plant.robot_plant import (
-    JOINT_NAMES,
     ArmController,
     JointControlConfig,
     Robot,
@@ -34,9 +33,9 @@ from sliceit_drake.diagrams.plant.robot_plant import (
     add_plant,
     add_robot,
     connect_arm_controller,
-    set_joint_positions,
 )
 from sliceit_drake.diagrams.plant.surroundings import add_board, add_holder, add_table
+from sliceit_drake.records.rosbag import JOINT_NAMES
 from sliceit_drake.systems.servo import ServoConfig
 
 
@@ -448,9 +447,10 @@ def test_torques_stop_at_the_limits_of_the_joints():
     cell = make_cell()
     simulator = cell.simulator()
     context = simulator.get_mutable_context()
-    away = np.array(RobotConfig().joint_positions) + 0.5
-    cell.controller.set_positions(context, away)
-    plant_context = cell.plant_context(simulator)
+    here = np.array(RobotConfig().joint_positions)
+    cell.controller.set_positions(context, here + 0.5)
+    plant_context = cell.plant.GetMyMutableContextFromRoot(context)
+    cell.plant.SetPositions(plant_context, here)
     torques = cell.plant.get_net_actuation_output_port(cell.robot.arm).Eval(plant_context)
     np.testing.assert_allclose(torques, [150.0] * 3 + [28.0] * 3)
 
@@ -464,7 +464,7 @@ def test_the_arm_rests_where_it_is_put():
     simulator.AdvanceTo(0.05)
     context = simulator.get_mutable_context()
     context.SetTime(0.0)
-    set_joint_positions(context, cell.plant, cell.robot, cell.controller, elsewhere)
+    cell.controller.set_positions(context, elsewhere)
     simulator.Initialize()
     simulator.AdvanceTo(0.1)
     q = cell.plant.GetPositions(cell.plant_context(simulator))
@@ -501,7 +501,7 @@ def test_the_board_lies_under_the_food_frame_and_the_rest_is_only_drawn():
     plant, scene_graph = add_plant(builder, RobotConfig())
     X_WF = RigidTransform(RotationMatrix.MakeZRotation(0.4), [0.1, -0.5, 0.07])
     add_board(plant, board, X_WF)
-    add_holder(plant, board, X_WF, food_width=0.03, food_height=0.04, distance=0.02)
+    add_holder(plant, X_WF, food_width=0.03, food_height=0.04, distance=0.02)
     add_table(plant, (0.0, -0.3))
     inspector = scene_graph.model_inspector()
     (contact,) = inspector.GetAllGeometryIds(Role.kProximity)

@@ -9,7 +9,7 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.plant.start_joints import solve_start_joints
 from sliceit_drake.diagrams.randomize import randomize
 from sliceit_drake.diagrams.simulated_station import SimulatedStation
-from sliceit_drake.diagrams.station_interface import Station
+from sliceit_drake.diagrams.station_interface import Station, connect
 from sliceit_drake.systems.agent import AgentConfig, AgentSystem, Decide
 
 __all__ = ["AgentStation", "add_agent"]
@@ -57,9 +57,9 @@ def add_agent(
         ),
     )
     for name in ("sensor_wrench", "knife_pose"):
-        builder.Connect(station.GetOutputPort(name), agent.GetInputPort(name))
+        connect(builder, station.GetOutputPort(name), agent)
     for name in ("target_pose", "stiffness", "p_gains", "error_scale"):
-        builder.Connect(agent.GetOutputPort(name), station.GetInputPort(name))
+        connect(builder, agent.GetOutputPort(name), station)
     return agent
 
 

@@ -14,10 +14,15 @@ from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues
 from pydrake.systems.primitives import ConstantVectorSource
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.diagrams.ports import STATION_PORTS
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.simulated_station import SimulatedStation
-from sliceit_drake.diagrams.station_interface import OwnController, Station, make_controller
+from sliceit_drake.diagrams.station_interface import (
+    OwnController,
+    Station,
+    connect,
+    export_ports,
+    make_controller,
+)
 from sliceit_drake.hardware.client import RobotClient
 from sliceit_drake.hardware.edge_kinematics import EdgeKinematics
 from sliceit_drake.hardware.hardware_config import HardwareConfig
@@ -207,35 +212,26 @@ class HardwareStation(Station):
             "contact_monitor", ContactMonitor(scenario.monitor, PERIOD, scenario.sensor)
         )
         rtde = self.rtde
-        for source, targets in (
-            (rtde.GetOutputPort("joint_positions"), (commander, estimate)),
-            (rtde.GetOutputPort("joint_velocities"), (estimate,)),
-            (rtde.GetOutputPort("sensor_wrench"), (commander, estimate, monitor)),
-            (commander.GetOutputPort("joint_positions_command"), (rtde,)),
+        for source, *systems in (
+            (rtde.GetOutputPort("joint_positions"), commander, estimate),
+            (rtde.GetOutputPort("joint_velocities"), estimate),
+            (rtde.GetOutputPort("sensor_wrench"), commander, estimate, monitor),
+            (commander.GetOutputPort("joint_positions_command"), rtde),
         ):
-            for target in targets:
-                builder.Connect(source, target.GetInputPort(source.get_name()))
-        homes = {
-            "joint_positions": rtde,
-            "joint_velocities": rtde,
-            "sensor_wrench": rtde,
-            "joint_positions_command": commander,
-            "commanded_pose": commander,
+            connect(builder, source, *systems)
+        exported = {
+            rtde: ("joint_positions", "joint_velocities", "sensor_wrench", "period", "lateness")
+            + ("age", "missed_cycles", "latched", "stop_reason"),
+            commander: ("joint_positions_command", "commanded_pose"),
+            estimate: ("knife_pose", "knife_velocity", "food_wrench", "food_wrench_vector")
+            + ("board_wrench", "cut_progress"),
+            monitor: ("unstable_gains",),
         }
-        for port in STATION_PORTS:
-            if port.direction == "input":
-                builder.ExportInput(commander.GetInputPort(port.name), port.name)
-            else:
-                home = homes.get(port.name, estimate)
-                builder.ExportOutput(home.GetOutputPort(port.name), port.name)
-        for name in ("period", "lateness", "age", "missed_cycles", "latched", "stop_reason"):
-            builder.ExportOutput(rtde.GetOutputPort(name), name)
+        export_ports(builder, commander, exported)
         # For records: what the contract gives as typed values, as vectors.
         no_board = builder.AddNamedSystem("no_board", ConstantVectorSource(np.zeros(6)))
         builder.ExportOutput(no_board.get_output_port(), "board_wrench_vector")
-        builder.ExportOutput(estimate.GetOutputPort("food_wrench_vector"), "food_wrench_vector")
         builder.ExportOutput(rtde.GetOutputPort("wrench_vector"), "sensor_state")
-        builder.ExportOutput(monitor.GetOutputPort("unstable_gains"), "unstable_gains")
         builder.BuildInto(self)
         self.set_name("station")
 

@@ -10,7 +10,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer
 
-from sliceit_drake.diagrams.plant.holder_arm import add_holding_arm
+from sliceit_drake.diagrams.plant.holder_arm import HoldingArm
 from sliceit_drake.diagrams.plant.knife_body import check_plant_step, effective_mass
 from sliceit_drake.diagrams.plant.robot_plant import (
     ArmController,
@@ -18,14 +18,18 @@ from sliceit_drake.diagrams.plant.robot_plant import (
     add_plant,
     add_robot,
     connect_arm_controller,
-    set_joint_positions,
 )
 from sliceit_drake.diagrams.plant.start_joints import solve_start_joints
 from sliceit_drake.diagrams.plant.surroundings import add_board, add_holder, add_table
-from sliceit_drake.diagrams.ports import STATION_PORTS
 from sliceit_drake.diagrams.prepared_food import HeldFood, OwnCutting, food_to_cut
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.diagrams.station_interface import OwnController, Station, make_controller
+from sliceit_drake.diagrams.station_interface import (
+    OwnController,
+    Station,
+    connect,
+    export_ports,
+    make_controller,
+)
 from sliceit_drake.systems.contact_monitor import ContactMonitor
 from sliceit_drake.systems.cut_report import FrameRecorder
 from sliceit_drake.systems.frame_visualizer import FrameVisualizer
@@ -137,62 +141,42 @@ class SimulatedStation(Station):
 
         plant = self.plant
         for source, target in (
-            (plant.get_body_poses_output_port(), kinematics.GetInputPort("body_poses")),
             (
                 plant.get_body_spatial_velocities_output_port(),
                 kinematics.GetInputPort("body_velocities"),
             ),
-            (kinematics.GetOutputPort("knife_pose"), self.cutting.GetInputPort("knife_pose")),
-            (
-                kinematics.GetOutputPort("knife_velocity"),
-                self.cutting.GetInputPort("knife_velocity"),
-            ),
             (self.cutting.GetOutputPort("food_wrench"), applied_force.get_input_port()),
             (applied_force.get_output_port(), plant.get_applied_spatial_force_input_port()),
-            (
-                plant.get_contact_results_output_port(),
-                board_contact.GetInputPort("contact_results"),
-            ),
-            (kinematics.GetOutputPort("knife_pose"), board_contact.GetInputPort("knife_pose")),
-            (plant.get_reaction_forces_output_port(), sensor.GetInputPort("reaction_forces")),
-            (sensor.GetOutputPort("sensor_wrench"), self.controller.GetInputPort("sensor_wrench")),
-            (sensor.GetOutputPort("sensor_wrench"), monitor.GetInputPort("sensor_wrench")),
-            (
-                self.controller.GetOutputPort("joint_positions_command"),
-                self._arm.GetInputPort("joint_positions_command"),
-            ),
         ):
             builder.Connect(source, target)
+        for source, *systems in (
+            (plant.get_body_poses_output_port(), kinematics),
+            (plant.get_contact_results_output_port(), board_contact),
+            (plant.get_reaction_forces_output_port(), sensor),
+            (kinematics.GetOutputPort("knife_pose"), self.cutting, board_contact),
+            (kinematics.GetOutputPort("knife_velocity"), self.cutting),
+            (sensor.GetOutputPort("sensor_wrench"), self.controller, monitor),
+            (self.controller.GetOutputPort("joint_positions_command"), self._arm),
+        ):
+            connect(builder, source, *systems)
         joints = builder.AddNamedSystem("joints", Demultiplexer([JOINTS, JOINTS]))
         builder.Connect(plant.get_state_output_port(self.robot.arm), joints.get_input_port())
         builder.Connect(joints.get_output_port(0), self.controller.GetInputPort("joint_positions"))
 
-        outputs = {
-            "joint_positions": joints.get_output_port(0),
-            "joint_velocities": joints.get_output_port(1),
-            "joint_positions_command": self.controller.GetOutputPort("joint_positions_command"),
-            "commanded_pose": self.controller.GetOutputPort("commanded_pose"),
-            "knife_pose": kinematics.GetOutputPort("knife_pose"),
-            "knife_velocity": kinematics.GetOutputPort("knife_velocity"),
-            "sensor_wrench": sensor.GetOutputPort("sensor_wrench"),
-            "food_wrench": self.cutting.GetOutputPort("food_wrench"),
-            "board_wrench": board_contact.GetOutputPort("board_wrench"),
-            "cut_progress": self.cutting.GetOutputPort("cut_progress"),
-        }
-        for port in STATION_PORTS:
-            if port.direction == "input":
-                builder.ExportInput(self.controller.GetInputPort(port.name), port.name)
-            else:
-                builder.ExportOutput(outputs[port.name], port.name)
-        for name in self.cutting.recorded():
-            builder.ExportOutput(self.cutting.GetOutputPort(name), name)
-        # For records: what the contract gives as typed values, as vectors.
-        builder.ExportOutput(self.cutting.GetOutputPort("food_wrench_vector"), "food_wrench_vector")
-        builder.ExportOutput(
-            board_contact.GetOutputPort("board_wrench_vector"), "board_wrench_vector"
-        )
+        builder.ExportOutput(joints.get_output_port(0), "joint_positions")
+        builder.ExportOutput(joints.get_output_port(1), "joint_velocities")
         builder.ExportOutput(sensor.GetOutputPort("state"), "sensor_state")
-        builder.ExportOutput(monitor.GetOutputPort("unstable_gains"), "unstable_gains")
+        # A name that ends in "vector" is for records: what the contract gives as a typed value.
+        exported = {
+            self.controller: ("joint_positions_command", "commanded_pose"),
+            kinematics: ("knife_pose", "knife_velocity"),
+            sensor: ("sensor_wrench",),
+            self.cutting: ("food_wrench", "food_wrench_vector", "cut_progress")
+            + tuple(self.cutting.recorded()),
+            board_contact: ("board_wrench", "board_wrench_vector"),
+            monitor: ("unstable_gains",),
+        }
+        export_ports(builder, self.controller, exported)
 
         self.frame_period = self._frame_period()
         self.visualizer: MeshcatVisualizer | None = None
@@ -232,7 +216,7 @@ class SimulatedStation(Station):
             builder.GetSubsystemByName("board_contact").GetOutputPort("board_wrench"),
             self.sensor.GetOutputPort("sensor_wrench"),
         ):
-            builder.Connect(output, arrows.GetInputPort(output.get_name()))
+            connect(builder, output, arrows)
         fixed = {
             "W": (RigidTransform(), 0.15),
             "B": (self.scenario.robot.X_WB(), 0.15),
@@ -241,7 +225,7 @@ class SimulatedStation(Station):
         carried = {"K": (RigidTransform(), 0.035), "S": (X_KS, 0.06)}
         frames = FrameVisualizer(meshcat, fixed, carried, self.start_pose, CAMERA_OFFSET, period)
         builder.AddNamedSystem("frame_visualizer", frames)
-        builder.Connect(knife_pose, frames.GetInputPort("knife_pose"))
+        connect(builder, knife_pose, frames)
 
     def sensor_columns(self, reading: Sequence[str]) -> list[str]:
         """Names for the port `sensor_state`: `reading` [6] for the moment and force."""
@@ -255,7 +239,7 @@ class SimulatedStation(Station):
             joints: Joint positions [6], rad; None for `start_joints`.
         """
         start = self.start_joints if joints is None else joints
-        set_joint_positions(root_context, self.plant, self.robot, self._arm, start)
+        self._arm.set_positions(root_context, start)
 
 
 def _set_scene(meshcat: Meshcat, X_WK: RigidTransform) -> None:
@@ -272,11 +256,10 @@ def _add_holder(plant: MultibodyPlant, scenario: Scenario, held: HeldFood) -> No
     """Draws the scenario's holder."""
     if scenario.holder == "arm":
         grip = np.array([0.0, held.distance + FINGER, 0.5 * held.height])
-        add_holding_arm(plant, scenario.X_WF(), grip)
+        HoldingArm(scenario.X_WF(), grip).draw(plant)
         return
     add_holder(
         plant,
-        scenario.board,
         scenario.X_WF(),
         food_width=held.width,
         food_height=held.height,

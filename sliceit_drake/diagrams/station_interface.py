@@ -1,23 +1,31 @@
 """What all that surrounds a station may ask of it besides its ports, simulated or hardware."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import Context, Diagram, LeafSystem
+from pydrake.systems.framework import (
+    Context,
+    Diagram,
+    DiagramBuilder,
+    LeafSystem,
+    OutputPort,
+    System,
+)
 
 from sliceit_drake.cutting.discretization import DiscretizationError
 from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.diagrams.plant.robot_plant import Robot
+from sliceit_drake.diagrams.ports import STATION_PORTS
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.systems.compliance_controller import ComplianceController
 from sliceit_drake.systems.cut_report import FrameRecorder, ReportingSystem
 from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
 
-__all__ = ["OwnController", "Station", "make_controller"]
+__all__ = ["OwnController", "Station", "connect", "export_ports", "make_controller"]
 
 OwnController: TypeAlias = LeafSystem | Callable[[Scenario], LeafSystem]
 """What commands the joints in place of the compliance controller, or what makes it."""
@@ -70,6 +78,30 @@ class Station(Diagram):
         context = self.plant.CreateDefaultContext()
         frame_S = self.robot.sensor_weld.frame_on_parent()
         return frame_S.CalcPose(context, self.robot.knife.body_frame())
+
+
+def connect(builder: DiagramBuilder, output: OutputPort, *systems: System) -> None:
+    """Connects an output to the inputs of its name."""
+    for system in systems:
+        builder.Connect(output, system.GetInputPort(output.get_name()))
+
+
+def export_ports(
+    builder: DiagramBuilder, controller: LeafSystem, outputs: Mapping[System, Sequence[str]]
+) -> None:
+    """Exports the inputs of the port contract, which the controller has, and outputs by name.
+
+    Args:
+        builder: Of the station.
+        controller: What commands the joints.
+        outputs: Names of each system's outputs.
+    """
+    for port in STATION_PORTS:
+        if port.direction == "input":
+            builder.ExportInput(controller.GetInputPort(port.name), port.name)
+    for system, names in outputs.items():
+        for name in names:
+            builder.ExportOutput(system.GetOutputPort(name), name)
 
 
 def make_controller(scenario: Scenario, own: OwnController | None) -> LeafSystem:

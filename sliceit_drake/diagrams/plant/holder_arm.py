@@ -3,14 +3,14 @@
 import numpy as np
 from pydrake.geometry import GeometryInstance, SceneGraph
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex
 
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.diagrams.plant.robot_plant import add_arm_and_gripper
 from sliceit_drake.diagrams.plant.start_joints import solve_start_joints
-from sliceit_drake.resources import add_package_map
 
-__all__ = ["FINGERTIPS", "HoldingArm", "add_holding_arm"]
+__all__ = ["FINGERTIPS", "HoldingArm"]
 
 FINGERTIPS = 0.16
 """Distance of the grip from the gripper's mounting face, metres."""
@@ -44,10 +44,7 @@ class HoldingArm:
     def __init__(self, X_WF: RigidTransform, grip: np.ndarray) -> None:
         self.plant, self.scene_graph = MultibodyPlant(0.0), SceneGraph()
         self.plant.RegisterAsSourceForSceneGraph(self.scene_graph)
-        parser = Parser(self.plant)
-        add_package_map(parser)
-        (arm,) = parser.AddModelsFromUrl("package://sliceit_drake_models/ur5e/ur5e.urdf")
-        (gripper,) = parser.AddModelsFromUrl("package://sliceit_drake_models/gripper/gripper.sdf")
+        arm, gripper = add_arm_and_gripper(self.plant)
         p_WG = X_WF.multiply(grip)
         away = X_WF.rotation().matrix()[:, 1]
         base = [*(p_WG + BEHIND * away)[:2], 0.0]
@@ -76,34 +73,21 @@ class HoldingArm:
                 fix='Shorten the food, or write "holder: clamp".',
             ) from error
 
+    def draw(self, plant: MultibodyPlant) -> None:
+        """Draws arm and gripper in a plant that is not finalized, with a scene graph.
 
-def add_holding_arm(plant: MultibodyPlant, X_WF: RigidTransform, grip: np.ndarray) -> HoldingArm:
-    """Draws a second arm that holds the food.
-
-    It has neither mass nor contact nor joints in `plant`: what it does to the food is a boundary
-    condition of the food, and the plant keeps the joints of the cutting arm alone.
-
-    Args:
-        plant: Plant, not finalized, registered with a scene graph.
-        X_WF: Pose of the food frame.
-        grip: Point between the fingertips in F [3], metres.
-
-    Raises:
-        ConfigurationError: The arm cannot reach the grip.
-    """
-    arm = HoldingArm(X_WF, grip)
-    context = arm.plant.CreateDefaultContext()
-    arm.plant.SetPositions(context, arm.joints)
-    inspector = arm.scene_graph.model_inspector()
-    for index in arm.plant.GetBodyIndices(arm.plant.GetModelInstanceByName("ur5e")) + (
-        arm.plant.GetBodyIndices(arm.plant.GetModelInstanceByName("gripper"))
-    ):
-        body = arm.plant.get_body(index)
-        X_WL = arm.plant.EvalBodyPoseInWorld(context, body)
-        for k, geometry in enumerate(arm.plant.GetVisualGeometriesForBody(body)):
-            X_WG = X_WL @ inspector.GetPoseInFrame(geometry)
-            name = f"holding_{body.name()}_{k}"
-            drawn = GeometryInstance(X_WG, inspector.GetShape(geometry), name)
-            drawn.set_illustration_properties(inspector.GetIllustrationProperties(geometry))
-            plant.RegisterVisualGeometry(plant.world_body(), drawn)
-    return arm
+        They have neither mass nor contact nor joints there: what they do to the food is a boundary
+        condition of the food, and the plant keeps the joints of the cutting arm alone.
+        """
+        context = self.plant.CreateDefaultContext()
+        self.plant.SetPositions(context, self.joints)
+        inspector = self.scene_graph.model_inspector()
+        for index in range(self.plant.num_bodies()):
+            body = self.plant.get_body(BodyIndex(index))
+            X_WL = self.plant.EvalBodyPoseInWorld(context, body)
+            for k, geometry in enumerate(self.plant.GetVisualGeometriesForBody(body)):
+                X_WG = X_WL @ inspector.GetPoseInFrame(geometry)
+                name = f"holding_{body.name()}_{k}"
+                drawn = GeometryInstance(X_WG, inspector.GetShape(geometry), name)
+                drawn.set_illustration_properties(inspector.GetIllustrationProperties(geometry))
+                plant.RegisterVisualGeometry(plant.world_body(), drawn)

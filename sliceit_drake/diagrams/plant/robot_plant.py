@@ -8,7 +8,7 @@ from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import ModelInstanceIndex, RigidBody, WeldJoint
+from pydrake.multibody.tree import ModelInstanceIndex, RevoluteJoint, RigidBody, WeldJoint
 from pydrake.systems.controllers import InverseDynamics
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import LinearSystem, Multiplexer
@@ -21,25 +21,15 @@ from sliceit_drake.resources import add_package_map
 from sliceit_drake.systems.servo import JOINTS, Servo, ServoConfig
 
 __all__ = [
-    "JOINT_NAMES",
     "ArmController",
     "JointControlConfig",
     "Robot",
     "RobotConfig",
     "add_plant",
     "add_robot",
+    "add_arm_and_gripper",
     "connect_arm_controller",
-    "set_joint_positions",
 ]
-
-JOINT_NAMES = (
-    "shoulder_pan_joint",
-    "shoulder_lift_joint",
-    "elbow_joint",
-    "wrist_1_joint",
-    "wrist_2_joint",
-    "wrist_3_joint",
-)
 
 
 @dc.dataclass
@@ -143,10 +133,7 @@ def add_robot(plant: MultibodyPlant, config: RobotConfig, knife: Knife, board: B
     Returns:
         Handles of the robot.
     """
-    parser = Parser(plant)
-    add_package_map(parser)
-    (arm,) = parser.AddModelsFromUrl("package://sliceit_drake_models/ur5e/ur5e.urdf")
-    (gripper,) = parser.AddModelsFromUrl("package://sliceit_drake_models/gripper/gripper.sdf")
+    arm, gripper = add_arm_and_gripper(plant)
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", arm), config.X_WB())
     tool0 = plant.GetFrameByName("tool0", arm)
     gripper_frame = plant.GetFrameByName("gripper", gripper)
@@ -154,9 +141,20 @@ def add_robot(plant: MultibodyPlant, config: RobotConfig, knife: Knife, board: B
         WeldJoint("sensor_weld", tool0, gripper_frame, RigidTransform.Identity())
     )
     knife_body = add_knife(plant, knife, board, gripper_frame, config.X_TK())
-    for name, position in zip(JOINT_NAMES, config.joint_positions, strict=True):
-        plant.GetJointByName(name, arm).set_default_angle(position)
+    joints = map(plant.get_joint, plant.GetJointIndices(arm))
+    turning = (joint for joint in joints if isinstance(joint, RevoluteJoint))
+    for joint, position in zip(turning, config.joint_positions, strict=True):
+        joint.set_default_angle(position)
     return Robot(arm, knife_body, sensor_weld)
+
+
+def add_arm_and_gripper(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, ModelInstanceIndex]:
+    """Adds a UR5e and its gripper, welded to nothing."""
+    parser = Parser(plant)
+    add_package_map(parser)
+    (arm,) = parser.AddModelsFromUrl("package://sliceit_drake_models/ur5e/ur5e.urdf")
+    (gripper,) = parser.AddModelsFromUrl("package://sliceit_drake_models/gripper/gripper.sdf")
+    return arm, gripper
 
 
 class ArmController(Diagram):
@@ -203,6 +201,7 @@ class ArmController(Diagram):
                 f"expects the {JOINTS} of the arm alone."
             )
         _check_gains(plant, robot.arm, config.joint_control)
+        self._plant, self._arm = plant, robot.arm
         period = plant.time_step()
         builder = DiagramBuilder()
         self._servo = builder.AddNamedSystem(
@@ -228,23 +227,20 @@ class ArmController(Diagram):
         builder.ExportOutput(desired_state, "desired_state")
         builder.BuildInto(self)
 
-    def set_positions(self, context: Context, positions: ArrayLike) -> None:
-        """Sets servo and joint control at rest at `positions` [6], rad, in the root context."""
-        self._servo.set_positions(context, positions)
-        control = self._joint_control.GetMyMutableContextFromRoot(context)
+    def set_positions(self, root_context: Context, positions: ArrayLike) -> None:
+        """Puts arm and controller at rest at `positions` [6], rad, in the diagram's context."""
+        plant_context = self._plant.GetMyMutableContextFromRoot(root_context)
+        self._plant.SetPositions(plant_context, self._arm, np.asarray(positions, float))
+        self._plant.SetVelocities(plant_context, self._arm, np.zeros(JOINTS))
+        self._servo.set_positions(root_context, positions)
+        control = self._joint_control.GetMyMutableContextFromRoot(root_context)
         control.SetDiscreteState(np.zeros(JOINTS))
 
 
 def connect_arm_controller(
     builder: DiagramBuilder, plant: MultibodyPlant, robot: Robot, config: RobotConfig
 ) -> ArmController:
-    """Adds the arm's controller and connects it to the plant.
-
-    Args:
-        builder: Builder of the diagram with the plant.
-        plant: Finalized plant.
-        robot: The robot in it.
-        config: The robot's configuration.
+    """Adds the arm's controller and connects it to the finalized plant in the same diagram.
 
     Returns:
         The controller; its input ``joint_positions_command`` is left open.
@@ -255,20 +251,6 @@ def connect_arm_controller(
         controller.GetOutputPort("joint_torques"), plant.get_actuation_input_port(robot.arm)
     )
     return controller
-
-
-def set_joint_positions(
-    context: Context,
-    plant: MultibodyPlant,
-    robot: Robot,
-    controller: ArmController,
-    positions: ArrayLike,
-) -> None:
-    """Puts arm and controller at rest at `positions` [6], rad, in the context of the diagram."""
-    plant_context = plant.GetMyMutableContextFromRoot(context)
-    plant.SetPositions(plant_context, robot.arm, np.asarray(positions, float))
-    plant.SetVelocities(plant_context, robot.arm, np.zeros(JOINTS))
-    controller.set_positions(context, positions)
 
 
 def _joint_control(config: JointControlConfig, period: float) -> LinearSystem:

@@ -37,9 +37,17 @@ def solve_start_joints(
     Raises:
         ConfigurationError: The pose cannot be reached within the joint limits.
     """
-    ik = InverseKinematics(plant)
-    world, K = plant.world_frame(), knife.body_frame()
+    context, world, K = plant.CreateDefaultContext(), plant.world_frame(), knife.body_frame()
     p_WK = X_WK.translation()
+
+    def pose_error(q: np.ndarray) -> np.ndarray:
+        """Rotation vector and translation from the knife at q to X_WK, in W [6], rad and metres."""
+        plant.SetPositions(context, q)
+        found = plant.EvalBodyPoseInWorld(context, knife)
+        turn = (X_WK.rotation() @ found.rotation().inverse()).ToAngleAxis()
+        return np.concatenate([turn.angle() * turn.axis(), p_WK - found.translation()])
+
+    ik = InverseKinematics(plant)
     slack = np.full(3, 0.5 * POSITION_TOLERANCE)
     ik.AddPositionConstraint(K, np.zeros(3), world, p_WK - slack, p_WK + slack)
     ik.AddOrientationConstraint(
@@ -48,20 +56,23 @@ def solve_start_joints(
     program = ik.prog()
     program.AddQuadraticErrorCost(np.eye(6), guess, ik.q())
     result = Solve(program, guess)
-    q = result.GetSolution(ik.q())
-    _, missed = _misses(plant, knife, X_WK, q)
-    if result.is_success() and missed <= ACCEPTED:
-        return q
+    solution = result.GetSolution(ik.q())
+    if result.is_success() and np.linalg.norm(pose_error(solution)[3:]) <= ACCEPTED:
+        return solution
     # The solver gives up now and then beside a pose, or far from one, that the arm does reach.
     low, high = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
-    for begin in (q, guess):
-        q = _newton(plant, knife, X_WK, begin)
-        turned, missed = _misses(plant, knife, X_WK, q)
-        if (
-            missed <= POSITION_TOLERANCE
-            and turned <= ANGLE_TOLERANCE
-            and np.all((q >= low) & (q <= high))
-        ):
+    for q in (solution, guess):
+        for _ in range(NEWTON_STEPS):
+            error = pose_error(q)
+            J = plant.CalcJacobianSpatialVelocity(
+                context, JacobianWrtVariable.kQDot, K, np.zeros(3), world, world
+            )
+            step = np.linalg.lstsq(J, error, rcond=1e-6)[0]
+            q = q + step * min(1.0, LONGEST_STEP / max(float(np.abs(step).max()), 1e-12))
+        error = pose_error(q)
+        turned, missed = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
+        is_within = np.all((q >= low) & (q <= high))
+        if missed <= POSITION_TOLERANCE and turned <= ANGLE_TOLERANCE and is_within:
             return q
     raise ConfigurationError(
         f"the arm cannot put the knife at {np.round(p_WK, 4).tolist()} m; it comes "
@@ -70,37 +81,3 @@ def solve_start_joints(
         fix="Place the food nearer to the robot's base (reach of the knife: about 0.85 m), or "
         "give robot.joint_positions near a posture that reaches it.",
     )
-
-
-def _pose_error(
-    plant: MultibodyPlant, knife: RigidBody, X_WK: RigidTransform, q: np.ndarray
-) -> np.ndarray:
-    """Rotation vector and translation from the knife at q to X_WK, in W [6], rad and metres."""
-    context = plant.CreateDefaultContext()
-    plant.SetPositions(context, q)
-    found = plant.EvalBodyPoseInWorld(context, knife)
-    turn = (X_WK.rotation() @ found.rotation().inverse()).ToAngleAxis()
-    return np.concatenate([turn.angle() * turn.axis(), X_WK.translation() - found.translation()])
-
-
-def _misses(
-    plant: MultibodyPlant, knife: RigidBody, X_WK: RigidTransform, q: np.ndarray
-) -> tuple[float, float]:
-    """Angle and distance of the knife at q from X_WK, rad and metres."""
-    error = _pose_error(plant, knife, X_WK, q)
-    return float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
-
-
-def _newton(
-    plant: MultibodyPlant, knife: RigidBody, X_WK: RigidTransform, q: np.ndarray
-) -> np.ndarray:
-    """Joint positions that put the knife at X_WK, from ones near to it; else where it ends."""
-    context, world, K = plant.CreateDefaultContext(), plant.world_frame(), knife.body_frame()
-    for _ in range(NEWTON_STEPS):
-        plant.SetPositions(context, q)
-        J = plant.CalcJacobianSpatialVelocity(
-            context, JacobianWrtVariable.kQDot, K, np.zeros(3), world, world
-        )
-        step = np.linalg.lstsq(J, _pose_error(plant, knife, X_WK, q), rcond=1e-6)[0]
-        q = q + step * min(1.0, LONGEST_STEP / max(float(np.abs(step).max()), 1e-12))
-    return q

@@ -54,7 +54,6 @@ def add_table(plant: MultibodyPlant, centre: tuple[float, float]) -> None:
 
 def add_holder(
     plant: MultibodyPlant,
-    board: Board,
     X_WF: RigidTransform,
     food_width: float,
     food_height: float,
@@ -66,40 +65,22 @@ def add_holder(
 
     Args:
         plant: Plant, not finalized, registered with a scene graph.
-        board: The board that it stands on.
-        X_WF: Pose of the food frame.
+        X_WF: Pose of the food frame, on the board.
         food_width: Extent of the food along Fx between the jaws, metres.
         food_height: Height of the food, metres.
         distance: From the cut plane Fy = 0 to the near side of the jaws, along +Fy, metres.
     """
-    X_WF = _standing_at(X_WF, board.height)
     jaw = Box(0.008, 0.040, 0.75 * food_height + 0.012)
     y = distance + 0.5 * jaw.depth()
-    for side, name in ((-1.0, "left"), (1.0, "right")):
-        x = side * 0.5 * food_width
-        pad = Box(0.004, jaw.depth(), 0.6 * food_height)
-        _draw(
-            plant,
-            X_WF @ RigidTransform([x + side * 0.002, y, 0.5 * pad.height() + 0.003]),
-            pad,
-            f"holder_pad_{name}",
-            HOLDER_PADS,
-        )
-        _draw(
-            plant,
-            X_WF @ RigidTransform([x + side * 0.008, y, 0.5 * jaw.height()]),
-            jaw,
-            f"holder_jaw_{name}",
-            HOLDER,
-        )
-        foot = Box(0.045, jaw.depth(), 0.008)
-        _draw(
-            plant,
-            X_WF @ RigidTransform([x + side * 0.034, y, 0.004]),
-            foot,
-            f"holder_foot_{name}",
-            HOLDER,
-        )
+    pad, foot = Box(0.004, jaw.depth(), 0.6 * food_height), Box(0.045, jaw.depth(), 0.008)
+    for part, shape, beside, z, colour in (
+        ("pad", pad, 0.002, 0.5 * pad.height() + 0.003, HOLDER_PADS),
+        ("jaw", jaw, 0.008, 0.5 * jaw.height(), HOLDER),
+        ("foot", foot, 0.034, 0.004, HOLDER),
+    ):
+        for side, name in ((-1.0, "left"), (1.0, "right")):
+            X_FG = RigidTransform([side * (0.5 * food_width + beside), y, z])
+            _draw(plant, X_WF @ X_FG, shape, f"holder_{part}_{name}", colour)
     # The screw that closes the jaws passes behind the food.
     screw = Cylinder(0.004, food_width + 0.09)
     X_FS = RigidTransform(RotationMatrix.MakeYRotation(np.pi / 2), [0.0, y + 0.025, 0.010])
