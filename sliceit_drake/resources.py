@@ -20,6 +20,7 @@ __all__ = [
     "load_module",
     "named_yaml",
     "resource_path",
+    "shipped_names",
 ]
 
 _MODEL_PACKAGE = "sliceit_drake_models"
@@ -92,6 +93,11 @@ def named_yaml(name: str | Path, folder: str) -> Path | None:
         return file
     file = resource_path(folder) / f"{name}.yaml"
     return file if file.is_file() and file.parent == resource_path(folder) else None
+
+
+def shipped_names(folder: str) -> list[str]:
+    """Names of the YAML files that ship in a folder, as `named_yaml` takes them."""
+    return sorted(path.stem for path in resource_path(folder).glob("*.yaml"))
 
 
 def add_package_map(parser: "Parser") -> None:

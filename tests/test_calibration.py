@@ -21,12 +21,10 @@ from sliceit_drake.calibration.setup import (
     CalibrationSetup,
     ParameterRange,
     load_setup,
-    setup_names,
 )
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.foods.calibrated_food import (
     CalibratedFood,
-    calibrated_food_names,
     load_calibrated_food,
 )
 from sliceit_drake.cutting.foods.distribution import ParameterDistribution
@@ -39,6 +37,7 @@ from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.prediction.record_target import turning
 from sliceit_drake.records.preprocessing import low_pass
 from sliceit_drake.records.slice_record import SliceRecord
+from sliceit_drake.resources import shipped_names
 from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
 from sliceit_drake.stand_in.protocol import Condition, Protocol, Variation
 from sliceit_drake.stand_in.sensor_model import SensorModel
@@ -429,7 +428,7 @@ def test_an_oscillation_in_proportion_to_the_force_is_found():
 
 @pytest.mark.parametrize("name", ["cucumber", "potato", "tomato"])
 def test_each_setup_names_parameters_of_its_food_within_their_ranges(name):
-    assert name in setup_names()
+    assert name in shipped_names("calibration/setups")
     setup = load_setup(name)
     assert len(setup.parameters) + 2 + 3 * (setup.oscillation is not None) <= 14
     assert all(p.why for p in setup.parameters)
@@ -457,7 +456,7 @@ def test_draws_from_a_calibrated_food_stay_in_its_ranges_and_have_its_covariance
     assert max(draw["a"] for draw in near_end.draw(rng, 500)) <= 100.0
 
 
-@pytest.mark.parametrize("name", calibrated_food_names())
+@pytest.mark.parametrize("name", shipped_names("calibration/foods"))
 def test_a_scenario_loads_a_calibrated_food_by_name(name):
     calibrated = load_calibrated_food(name)
     scenario = load_scenario(Scenario(), f"{{calibration: {name}}}")

@@ -7,7 +7,7 @@ import pytest
 
 from sliceit_drake.calibration.setup import load_setup
 from sliceit_drake.cutting.foods.food import make_food_model
-from sliceit_drake.cutting.named_knife import load_knife
+from sliceit_drake.cutting.knife import load_knife
 from sliceit_drake.diagrams.scenario import load_scenario
 from studies.marked_page import Place
 from studies.physics.foods_page import foods_table, knives_table

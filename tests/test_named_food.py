@@ -3,19 +3,20 @@
 import numpy as np
 import pytest
 
-from sliceit_drake.calibration.setup import load_setup, setup_names
+from sliceit_drake.calibration.setup import load_setup
 from sliceit_drake.cli.main import main
-from sliceit_drake.cutting.foods.calibrated_food import calibrated_food_names, load_calibrated_food
-from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.named_knife import load_knife
+from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
+from sliceit_drake.cutting.knife import Knife, load_knife
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import load_scenario
-from sliceit_drake.resources import resource_path
+from sliceit_drake.resources import resource_path, shipped_names
+
+FOODS = shipped_names("calibration/foods")
 
 
 def test_the_foods_that_ship_each_have_a_setup_to_calibrate_them():
-    assert calibrated_food_names() == ["apple", "carrot", "cucumber", "potato", "tomato"]
-    assert setup_names() == calibrated_food_names()
+    assert FOODS == ["apple", "carrot", "cucumber", "potato", "tomato"]
+    assert shipped_names("calibration/setups") == FOODS
     setup = load_setup("apple")
     apple = load_calibrated_food("apple")
     assert setup.food.material == apple.food.material
@@ -23,7 +24,7 @@ def test_the_foods_that_ship_each_have_a_setup_to_calibrate_them():
         assert parameter.why
 
 
-@pytest.mark.parametrize("name", calibrated_food_names())
+@pytest.mark.parametrize("name", FOODS)
 def test_a_food_without_a_record_says_so_and_calls_nothing_determined(name):
     food = load_calibrated_food(name)
     assert food.records and food.command and food.date

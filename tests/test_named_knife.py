@@ -9,24 +9,24 @@ from sliceit_drake.configuration import ConfigurationError, dump_yaml, validate
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.foods.shapes import Box
-from sliceit_drake.cutting.knife import UNSUPPORTED, Knife
+from sliceit_drake.cutting.knife import UNSUPPORTED, Knife, NamedKnife, load_knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
-from sliceit_drake.cutting.named_knife import NamedKnife, knife_names, load_knife
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.scenario import load_scenario
-from sliceit_drake.resources import resource_path
+from sliceit_drake.resources import resource_path, shipped_names
 
 CUCUMBER = resource_path("scenarios/cucumber.yaml")
+KNIVES = shipped_names("calibration/knives")
 
 
 def test_the_knives_that_ship_are_the_default_and_four_of_the_kitchen():
-    assert knife_names() == ["chef", "cleaver", "gazebo", "nakiri", "paring"]
+    assert KNIVES == ["chef", "cleaver", "gazebo", "nakiri", "paring"]
     assert load_knife("gazebo").knife == Knife()
 
 
-@pytest.mark.parametrize("name", knife_names())
+@pytest.mark.parametrize("name", KNIVES)
 def test_every_measure_of_a_knife_that_ships_has_a_source_or_says_that_it_is_chosen(name):
     named = load_knife(name)
     validate(named, name)
@@ -35,7 +35,7 @@ def test_every_measure_of_a_knife_that_ships_has_a_source_or_says_that_it_is_cho
     assert all(len(text) > 10 for text in named.sources.values())
 
 
-@pytest.mark.parametrize("name", [n for n in knife_names() if n != "gazebo"])
+@pytest.mark.parametrize("name", [n for n in KNIVES if n != "gazebo"])
 def test_the_stiffness_of_a_blade_is_that_of_the_cantilever_it_says(name):
     knife = load_knife(name).knife
     thickness = 0.5 * (knife.spine_thickness + knife.edge_thickness)
@@ -105,7 +105,7 @@ def test_a_source_of_what_a_knife_does_not_have_is_refused():
 
 
 def test_sections_of_the_knives_that_ship_are_as_high_and_as_thick_as_their_sources_say():
-    total = {n: load_knife(n).knife.height + load_knife(n).knife.tip_height for n in knife_names()}
+    total = {n: load_knife(n).knife.height + load_knife(n).knife.tip_height for n in KNIVES}
     inch = 25.4e-3
     measured = {"chef": 0.038, "cleaver": 0.089, "nakiri": 0.05, "paring": 0.63 * inch}
     for name, height in measured.items():

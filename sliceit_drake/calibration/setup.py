@@ -11,9 +11,9 @@ from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.parameters import POINT_PARAMETERS, parameter_names
-from sliceit_drake.resources import named_yaml, resource_path
+from sliceit_drake.resources import named_yaml, shipped_names
 
-__all__ = ["CalibrationSetup", "Literature", "ParameterRange", "load_setup", "setup_names"]
+__all__ = ["CalibrationSetup", "Literature", "ParameterRange", "load_setup"]
 
 FOLDER = "calibration/setups"
 
@@ -112,16 +112,11 @@ class CalibrationSetup:
                 )
 
 
-def setup_names() -> list[str]:
-    """Foods for which a setup ships."""
-    return sorted(path.stem for path in resource_path(FOLDER).glob("*.yaml"))
-
-
 def load_setup(name: str | Path) -> CalibrationSetup:
     """Reads a setup and checks that its parameters exist.
 
     Args:
-        name: A food of `setup_names`, or a YAML file.
+        name: A food that a setup ships for, or a YAML file.
 
     Raises:
         ConfigurationError: Naming file, field and fix.
@@ -129,7 +124,7 @@ def load_setup(name: str | Path) -> CalibrationSetup:
     file = named_yaml(name, FOLDER)
     if file is None:
         raise ConfigurationError(
-            f"{name!r} is no food that a setup ships for: {', '.join(setup_names())}",
+            f"{name!r} is no food that a setup ships for: {', '.join(shipped_names(FOLDER))}",
             field="--food",
             fix="Name one of them, or give a YAML file of a setup.",
         )

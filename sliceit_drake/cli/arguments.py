@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from sliceit_drake.cluster import connected
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.resources import file_or_resource, resource_path
+from sliceit_drake.resources import file_or_resource, shipped_names
 
 if TYPE_CHECKING:
     from sliceit_drake.diagrams.scenario import Scenario
@@ -30,7 +30,7 @@ DASK = "dask"
 
 def add_scenario_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds SCENARIO and --set."""
-    shipped = ", ".join(sorted(file.stem for file in resource_path("scenarios").glob("*.yaml")))
+    shipped = ", ".join(shipped_names("scenarios"))
     parser.add_argument(
         "scenario",
         nargs="?",

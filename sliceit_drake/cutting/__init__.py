@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from sliceit_drake.cutting.foods.food import make_food_model as make_food_model
     from sliceit_drake.cutting.foods.food import start_pose as start_pose
     from sliceit_drake.cutting.gradient import SliceAdjoint as SliceAdjoint
+    from sliceit_drake.cutting.knife import load_knife as load_knife
     from sliceit_drake.cutting.knife_path import KnifePath as KnifePath
     from sliceit_drake.cutting.model import Numerics as Numerics
     from sliceit_drake.cutting.motion_optimization import optimize_motion as optimize_motion
-    from sliceit_drake.cutting.named_knife import load_knife as load_knife
 else:
     __getattr__, __dir__ = lazy_names(__name__)

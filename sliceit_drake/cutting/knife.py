@@ -1,12 +1,25 @@
-"""The knife: its section, its signed distance and the stiffness of its blade."""
+"""The knife: its section, its signed distance, the stiffness of its blade, and knives by name."""
 
 import dataclasses as dc
+import itertools
+from pathlib import Path
 
 import numpy as np
 
-from sliceit_drake.configuration import ConfigurationError, choice, quantity
+from sliceit_drake.configuration import ConfigurationError, choice, load_yaml, quantity
+from sliceit_drake.resources import named_yaml, shipped_names
 
-__all__ = ["STEEL_DENSITY", "UNSUPPORTED", "Knife", "section_distance", "signed_distance"]
+__all__ = [
+    "STEEL_DENSITY",
+    "UNSUPPORTED",
+    "Knife",
+    "NamedKnife",
+    "load_knife",
+    "section_distance",
+    "signed_distance",
+]
+
+FOLDER = "calibration/knives"
 
 STEEL_DENSITY = 7800.0
 """kg/m^3."""
@@ -131,65 +144,83 @@ def _outward_normals(section: np.ndarray) -> np.ndarray:
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
-def section_distance(
-    knife: Knife, y: np.ndarray, height: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Signed distance to the knife's section and its gradient.
+@dc.dataclass
+class NamedKnife:
+    """A knife and its sources.
+
+    Attributes:
+        knife: Measures of the knife.
+        sources: Source of each measure, by the field's name; a measure without is chosen freely.
+        note: What it cannot be used for.
+    """
+
+    knife: Knife = dc.field(default_factory=Knife)
+    sources: dict[str, str] = dc.field(default_factory=dict)
+    note: str = ""
+
+    def check(self, where: str) -> None:
+        fields = [field.name for field in dc.fields(Knife)]
+        for name in self.sources:
+            if name not in fields:
+                raise ConfigurationError(
+                    "is the source of nothing that a knife has",
+                    field=f"{where}.sources.{name}",
+                    fix=f"Known: {', '.join(fields)}.",
+                )
+
+
+def load_knife(name: str | Path, field: str = "knife_name") -> NamedKnife:
+    """Reads a knife.
+
+    Args:
+        name: A knife that ships, or a YAML file.
+        field: Dotted path of what names it, for errors.
+
+    Raises:
+        ConfigurationError: Naming file, field and fix.
+    """
+    file = named_yaml(name, FOLDER)
+    if file is None:
+        raise ConfigurationError(
+            f"there is no knife {str(name)!r}; there are {', '.join(shipped_names(FOLDER))}",
+            field=field,
+            fix="Name one of them, or give a YAML file (docs/foods.md).",
+        )
+    knife = load_yaml(NamedKnife, file)
+    assert isinstance(knife, NamedKnife)
+    return knife
+
+
+def section_distance(knife: Knife, y: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Signed distance to the knife's section [N], metres, negative inside.
 
     Args:
         knife: The knife.
         y: Coordinates along Ky [N], metres.
         height: Heights above the edge (-z_K) [N], metres.
-
-    Returns:
-        Distance [N], negative inside, and gradient [N, 2] with respect to (y, height).
     """
     section = knife.half_section()
-    mirror = np.where(np.asarray(y) < 0.0, -1.0, 1.0)
     p = np.stack([np.abs(y), np.asarray(height, float)], axis=-1)
     normals = np.concatenate([_outward_normals(section), [[0.0, 1.0]]])
-    planes = np.stack(
-        [(p - section[k]) @ n for k, n in zip((0, 1, 2), normals, strict=True)], axis=-1
-    )
-    face = planes.argmax(-1)
-    distance = planes.max(-1)
-    gradient = normals[face]
+    planes = [(p - corner) @ n for corner, n in zip(section, normals, strict=True)]
+    inside = np.max(planes, axis=0)
     corners = np.concatenate([section, [[0.0, section[2, 1]]]])
-    nearest = np.full(p.shape[:-1], np.inf)
-    for a, b in zip(corners[:-1], corners[1:], strict=True):
+    nearest = np.full(len(p), np.inf)
+    for a, b in itertools.pairwise(corners):
         along = np.clip(((p - a) @ (b - a)) / ((b - a) @ (b - a)), 0.0, 1.0)
-        offset = p - (a + along[..., None] * (b - a))
-        length = np.linalg.norm(offset, axis=-1)
-        use = (distance > 0.0) & (length < nearest) & (length > 0.0)
-        gradient = np.where(
-            use[..., None], offset / np.where(use, length, 1.0)[..., None], gradient
-        )
-        nearest = np.where(distance > 0.0, np.minimum(nearest, length), nearest)
-    distance = np.where(distance > 0.0, nearest, distance) - knife.edge_radius
-    return distance, gradient * np.stack([mirror, np.ones_like(mirror)], axis=-1)
+        offset = p - (a + along[:, None] * (b - a))
+        nearest = np.minimum(nearest, np.linalg.norm(offset, axis=-1))
+    return np.where(inside > 0.0, nearest, inside) - knife.edge_radius
 
 
-def signed_distance(knife: Knife, p_KP: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Signed distance to the knife, a prism of `length`, and its gradient.
+def signed_distance(knife: Knife, p_KP: np.ndarray) -> np.ndarray:
+    """Signed distance to the knife, a prism of `length` [N], metres, negative inside.
 
     Args:
         knife: The knife.
         p_KP: Points [N, 3] in the knife frame, metres.
-
-    Returns:
-        Distance [N], negative inside, and gradient [N, 3] in the knife frame.
     """
-    p_KP = np.asarray(p_KP, float)
-    section, slope = section_distance(knife, p_KP[:, 1], -p_KP[:, 2])
+    section = section_distance(knife, p_KP[:, 1], -p_KP[:, 2])
     beyond = np.abs(p_KP[:, 0]) - 0.5 * knife.length
-    out_section, out_end = np.maximum(section, 0.0), np.maximum(beyond, 0.0)
-    outside = np.hypot(out_section, out_end)
-    inside = np.minimum(np.maximum(section, beyond), 0.0)
-    both = np.where(outside > 0.0, outside, 1.0)
-    share_section = np.where(outside > 0.0, out_section / both, section >= beyond)
-    share_end = np.where(outside > 0.0, out_end / both, section < beyond)
-    end = np.where(p_KP[:, 0] < 0.0, -1.0, 1.0)
-    gradient = np.stack(
-        [end * share_end, slope[:, 0] * share_section, -slope[:, 1] * share_section], axis=-1
-    )
-    return outside + inside, gradient
+    outside = np.hypot(np.maximum(section, 0.0), np.maximum(beyond, 0.0))
+    return np.asarray(outside + np.minimum(np.maximum(section, beyond), 0.0))

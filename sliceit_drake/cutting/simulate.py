@@ -76,7 +76,7 @@ def check_clear(model: CuttingModel, X_CK: Pose) -> None:
         CuttingError: With how far to raise it.
     """
     nodes = model.split.nodes[model.split.node_is_material]
-    distance, _ = signed_distance(model.knife, (nodes - X_CK.p) @ X_CK.R)
+    distance = signed_distance(model.knife, (nodes - X_CK.p) @ X_CK.R)
     points = model.split.points - X_CK.p
     reached = np.abs(points @ X_CK.R[:, 0]) < 0.5 * model.knife.length
     depth = float((-(points @ X_CK.R[:, 2]))[reached].max(initial=-1.0))

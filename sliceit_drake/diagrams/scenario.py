@@ -15,13 +15,12 @@ from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
 from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.foods.spring_food import SpringFood
-from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.knife import Knife, load_knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import MotionPlan
-from sliceit_drake.cutting.named_knife import load_knife
 from sliceit_drake.diagrams.plant.robot_plant import RobotConfig
 from sliceit_drake.diagrams.sequence import SliceSequence
-from sliceit_drake.resources import file_or_resource, named_yaml, resource_path
+from sliceit_drake.resources import file_or_resource, named_yaml, shipped_names
 from sliceit_drake.systems.agent import AgentConfig
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
@@ -197,7 +196,7 @@ def load_scenario(
 def _scenario_file(name: str | Path) -> Path:
     file = file_or_resource(str(name)) or named_yaml(name, "scenarios")
     if file is None or not file.is_file():
-        shipped = ", ".join(sorted(each.stem for each in resource_path("scenarios").glob("*.yaml")))
+        shipped = ", ".join(shipped_names("scenarios"))
         raise ConfigurationError(
             "there is no such scenario, neither here nor in the package",
             source=str(name),

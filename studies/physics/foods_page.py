@@ -14,17 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
-from sliceit_drake.cutting.foods.calibrated_food import calibrated_food_names, load_calibrated_food
+from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid
-from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.knife import Knife, load_knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
-from sliceit_drake.cutting.named_knife import knife_names, load_knife
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.scenario import load_scenario
-from sliceit_drake.resources import resource_path
+from sliceit_drake.resources import resource_path, shipped_names
 from studies.marked_page import Place
 from studies.pages import table
 
@@ -66,7 +65,7 @@ def shape(food: Food) -> str:
 
 def foods_table() -> str:
     rows, notes = [], []
-    for name in calibrated_food_names():
+    for name in shipped_names("calibration/foods"):
         entry = load_calibrated_food(name)
         material = entry.food.material
         recorded = entry.rms_error is not None
@@ -94,7 +93,7 @@ def foods_table() -> str:
 
 def knives_table() -> str:
     rows, notes = [], []
-    for name in knife_names():
+    for name in shipped_names("calibration/knives"):
         entry = load_knife(name)
         knife = entry.knife
         rows.append(
@@ -136,7 +135,7 @@ def cut_rows() -> list[tuple[str, ...]]:
 
 def _cuts(food: Food, numerics: Numerics) -> Sequence[tuple[str, ...]]:
     rows = []
-    for name in knife_names():
+    for name in shipped_names("calibration/knives"):
         knife = load_knife(name).knife
         model = make_food_model(food, knife, numerics)
         if knife.height < model.top - model.bottom:

@@ -10,9 +10,9 @@ from sliceit_drake.cutting.foods.effects import Compliance
 from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.foods.spring_food import SpringFood
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.resources import named_yaml, resource_path
+from sliceit_drake.resources import named_yaml, shipped_names
 
-__all__ = ["CalibratedFood", "calibrated_food_names", "load_calibrated_food"]
+__all__ = ["CalibratedFood", "load_calibrated_food"]
 
 FOLDER = "calibration/foods"
 
@@ -55,16 +55,11 @@ class CalibratedFood:
         return dc.replace(food, material=copy.deepcopy(self.food.material), effects=effects)
 
 
-def calibrated_food_names() -> list[str]:
-    """Foods that ship calibrated."""
-    return sorted(path.stem for path in resource_path(FOLDER).glob("*.yaml"))
-
-
 def load_calibrated_food(name: str | Path) -> CalibratedFood:
     """Reads a calibrated food.
 
     Args:
-        name: A food of `calibrated_food_names`, or a YAML file.
+        name: A food that ships calibrated, or a YAML file.
 
     Raises:
         ConfigurationError: Naming file, field and fix.
@@ -72,7 +67,7 @@ def load_calibrated_food(name: str | Path) -> CalibratedFood:
     file = named_yaml(name, FOLDER)
     if file is None:
         raise ConfigurationError(
-            f"{name!r} is not calibrated; there are {', '.join(calibrated_food_names())}",
+            f"{name!r} is not calibrated; there are {', '.join(shipped_names(FOLDER))}",
             field="calibration",
             fix="Name one of them, or give the food.yaml of a calibration.",
         )
