@@ -9,7 +9,25 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
 
-__all__ = ["read_columns", "require_increasing"]
+__all__ = ["read_columns", "read_rows", "require_increasing"]
+
+
+def read_rows(file: str | Path) -> list[tuple[int, list[str]]]:
+    """Reads the rows of a CSV file, UTF-8, that have cells, each with the number of its line.
+
+    The first row is that of the names; spaces about cells are left out.
+
+    Raises:
+        ConfigurationError: If the file cannot be read.
+    """
+    try:
+        with open(file, newline="", encoding="utf-8") as stream:
+            rows = enumerate(csv.reader(stream), start=1)
+            return [(number, [cell.strip() for cell in row]) for number, row in rows if row]
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigurationError(
+            f"the table cannot be read ({error})", source=str(file), fix="Check the path."
+        ) from error
 
 
 def read_columns(file: str | Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
@@ -26,14 +44,8 @@ def read_columns(file: str | Path, columns: Sequence[str]) -> dict[str, np.ndarr
         ConfigurationError: If the file cannot be read, lacks a column or rows, or has a cell that
             is not a finite number.
     """
-    try:
-        with open(file, newline="", encoding="utf-8") as stream:
-            rows = list(csv.reader(stream))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(
-            f"the table cannot be read ({error})", source=str(file), fix="Check the path."
-        ) from error
-    header = [name.strip() for name in rows[0]] if rows else []
+    rows = read_rows(file)
+    header = rows[0][1] if rows else []
     for name in columns:
         if name not in header:
             close = difflib.get_close_matches(name, header, n=1)
@@ -43,8 +55,7 @@ def read_columns(file: str | Path, columns: Sequence[str]) -> dict[str, np.ndarr
                 source=str(file),
                 fix=fix,
             )
-    lines = [(number, row) for number, row in enumerate(rows[1:], start=2) if row]
-    if not lines:
+    if len(rows) < 2:
         raise ConfigurationError(
             "the table has no rows", source=str(file), fix="Add rows of numbers under the names."
         )
@@ -52,8 +63,8 @@ def read_columns(file: str | Path, columns: Sequence[str]) -> dict[str, np.ndarr
     for name in columns:
         index = header.index(name)
         values = []
-        for number, row in lines:
-            text = row[index].strip() if index < len(row) else ""
+        for number, row in rows[1:]:
+            text = row[index] if index < len(row) else ""
             try:
                 value = float(text)
             except ValueError:

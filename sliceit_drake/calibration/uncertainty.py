@@ -15,7 +15,7 @@ from sliceit_drake.calibration.gauss_newton import (
 )
 from sliceit_drake.calibration.posterior import Posterior
 from sliceit_drake.calibration.prediction import Predictor
-from sliceit_drake.prediction.noise import NoiseFit, NoiseModel, fit_noise, group_series
+from sliceit_drake.prediction.noise import NoiseModel, NoiseProblem, group_series
 
 __all__ = ["Estimate", "estimate"]
 
@@ -63,17 +63,20 @@ def estimate(model: Predictor, unit: np.ndarray, rounds: int = ROUNDS) -> Estima
         CuttingError: A slice breaks down near `unit`.
     """
     at = linearise(model, np.clip(unit, 0.0, 1.0))
-    found = _noise(model, at, None)
+    problem = _noise_problem(model, at)
+    noise = problem.fit()
     for _ in range(rounds):
         fit = gauss_newton(
-            model, at.unit, noise=found.model, steps=STEPS, tolerance=1e-5, linearisation=at
+            model, at.unit, noise=noise, steps=STEPS, tolerance=1e-5, linearisation=at
         )
-        moved = np.abs(fit.unit - at.unit) / np.sqrt(np.diag(found.covariance))
+        moved = np.abs(fit.unit - at.unit) / np.sqrt(np.diag(problem.covariance()))
         at = _at_end(model, fit)
-        found = _noise(model, at, found.model)
+        problem = _noise_problem(model, at)
+        noise = problem.fit(noise)
         if moved.max() < SETTLED:
             break
-    return _as_estimate(model, at, found, np.asarray(unit))
+    posterior = _posterior(model, at.unit, problem.averaged_covariance(), noise, unit)
+    return Estimate(at.unit, posterior, noise, problem.covariance())
 
 
 def _at_end(model: Predictor, fit: Fit) -> Linearisation:
@@ -87,7 +90,7 @@ def _at_end(model: Predictor, fit: Fit) -> Linearisation:
     return linearise(model, fit.unit)
 
 
-def _noise(model: Predictor, at: Linearisation, start: NoiseModel | None) -> NoiseFit:
+def _noise_problem(model: Predictor, at: Linearisation) -> NoiseProblem:
     measured, used, record_of = model.measured, model.used, model.record_of
     conditions = model.conditions
     channels = [part.shape[1] for part in model.split(measured)]
@@ -96,7 +99,7 @@ def _noise(model: Predictor, at: Linearisation, start: NoiseModel | None) -> Noi
     replicated = len(set(named)) < len(named)
     predicted = np.where(used, at.residuals + measured, 0.0)
     members = present if replicated else present[:0]
-    return fit_noise(
+    return NoiseProblem(
         group_series(used, model.time, record_of, channels, conditions),
         at.residuals,
         at.jacobian,
@@ -105,40 +108,40 @@ def _noise(model: Predictor, at: Linearisation, start: NoiseModel | None) -> Noi
         PRIOR_CENTER - at.unit,
         PRIOR_VARIANCE,
         float(np.sqrt(np.mean(measured[used] ** 2))),
-        start,
     )
 
 
-def _as_estimate(
-    model: Predictor, at: Linearisation, found: NoiseFit, least_squares: np.ndarray
-) -> Estimate:
+def _posterior(
+    model: Predictor,
+    unit: np.ndarray,
+    covariance: np.ndarray,
+    noise: NoiseModel,
+    least_squares: np.ndarray,
+) -> Posterior:
     parameters = model.parameters
     notes = []
-    scale = found.model.record_scale
-    if scale is None:
+    if noise.record_scale is None:
         notes.append(
             "no cut was repeated: how much slices differ is unknown, and the intervals hold for "
             "the slices that were measured"
         )
-    covariance = found.averaged_covariance()
     sd = np.sqrt(np.diag(covariance))
     for k, parameter in enumerate(parameters):
-        if abs(least_squares[k] - at.unit[k]) > ODDS * sd[k]:
+        if abs(least_squares[k] - unit[k]) > ODDS * sd[k]:
             notes.append(
                 f"{parameter.name}: least squares gives "
                 f"{parameter.value(float(least_squares[k])):.3g}, the fit weighted with the noise "
-                f"{parameter.value(float(at.unit[k])):.3g}: the model lacks something that noise "
+                f"{parameter.value(float(unit[k])):.3g}: the model lacks something that noise "
                 "does not explain"
             )
-    posterior = Posterior(
+    return Posterior(
         names=[p.name for p in parameters],
         low=[float(p.low) for p in parameters],
         high=[float(p.high) for p in parameters],
         log=[p.log for p in parameters],
-        mean=at.unit.tolist(),
+        mean=unit.tolist(),
         covariance=covariance.tolist(),
-        effective_samples=found.model.effective_samples,
-        record_variation=scale,
+        effective_samples=noise.effective_samples,
+        record_variation=noise.record_scale,
         notes=notes,
     )
-    return Estimate(at.unit, posterior, found.model, found.covariance)

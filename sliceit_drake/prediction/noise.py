@@ -11,6 +11,7 @@ and Thompson 1971), in which what the parameters can absorb of the noise is acco
 """
 
 import dataclasses as dc
+import functools
 
 import numpy as np
 from scipy.linalg import cholesky_banded, solve_banded, solveh_banded
@@ -18,10 +19,9 @@ from scipy.optimize import minimize
 
 __all__ = [
     "MarkovCovariance",
-    "NoiseFit",
     "NoiseModel",
+    "NoiseProblem",
     "SeriesGroup",
-    "fit_noise",
     "group_series",
 ]
 
@@ -201,42 +201,10 @@ def group_series(
     return out
 
 
-@dc.dataclass
-class NoiseFit:
-    """A noise model with the parameters' estimate that belongs to it.
-
-    Attributes:
-        model: The noise model.
-        shift: From the place of linearisation to the estimate [d].
-        covariance: Of the estimate if the noise model were known [d, d].
-    """
-
-    model: NoiseModel
-    shift: np.ndarray
-    covariance: np.ndarray
-    _problem: "_Problem"
-    _numbers: np.ndarray
-
-    def averaged_covariance(self) -> np.ndarray:
-        """Covariance of the estimate [d, d], averaged over the uncertainty of the noise model.
-
-        The average is over samples of a normal approximation in the logarithms of its numbers.
-        """
-        return self._problem.averaged(self._numbers)
-
-
-def fit_noise(
-    groups: list[SeriesGroup],
-    residuals: np.ndarray,
-    jacobian: np.ndarray,
-    nuisance: np.ndarray,
-    scales: np.ndarray,
-    prior_mean: np.ndarray,
-    prior_variance: float,
-    level: float,
-    start: NoiseModel | None = None,
-) -> NoiseFit:
+class NoiseProblem:
     """Fits the noise, with the parameters integrated out of the linear problem.
+
+    What is fitted are logarithms x: three a group, and that of the scale where cuts were repeated.
 
     Args:
         groups: From `group_series`.
@@ -248,25 +216,7 @@ def fit_noise(
         prior_mean: Of the parameters, from the place of linearisation [d].
         prior_variance: Of each parameter.
         level: Root mean square of the measurement, N.
-        start: A noise model of the same groups that is nearly right.
     """
-    problem = _Problem(
-        groups, residuals, jacobian, nuisance, scales, prior_mean, prior_variance, level
-    )
-    first = problem.first if start is None else problem.numbers_of(start)
-    found = minimize(
-        problem.objective,
-        first,
-        method="L-BFGS-B",
-        bounds=problem.bounds,
-        options={"maxiter": 60, "ftol": 1e-6},
-    )
-    covariance, shift = problem.estimate(found.x)
-    return NoiseFit(problem.model(found.x), shift, covariance, problem, found.x)
-
-
-class _Problem:
-    """Marginal likelihood of the noise's numbers x: three logarithms a group, that of the scale."""
 
     def __init__(
         self,
@@ -279,111 +229,124 @@ class _Problem:
         prior_variance: float,
         level: float,
     ) -> None:
-        self.groups, self.scales = groups, scales
-        self.d, self.q = jacobian.shape[1], nuisance.shape[1]
+        self._groups, self._scales = groups, scales
+        self._d, self._q = jacobian.shape[1], nuisance.shape[1]
         columns = np.column_stack([residuals, jacobian, nuisance, scales])
-        self.columns = [columns[g.rows] for g in groups]
-        self.prior_mean, self.prior_precision = prior_mean, 1.0 / prior_variance
+        self._columns = [columns[g.rows] for g in groups]
+        self._prior_mean, self._prior_precision = prior_mean, 1.0 / prior_variance
         least = MIN_SHARE * level
         rough = [float(np.sqrt(np.mean(residuals[g.rows] ** 2))) for g in groups]
-        self.spread = np.maximum(rough, 2.0 * least)
+        self._spread = np.maximum(rough, 2.0 * least)
         known = [g.gap[np.isfinite(g.gap)] for g in groups]
         step = np.array([np.median(gap) if gap.size else 1.0 for gap in known])
         # Of the records of a group together; only the order of magnitude matters.
         duration = np.array([max(gap.sum(), 3.0 * s) for gap, s in zip(known, step, strict=True)])
-        self.middle = np.sqrt(step * duration)
+        self._middle = np.sqrt(step * duration)
         first, bounds = [], []
         for g in range(len(groups)):
-            spread = (float(np.log(least)), float(np.log(10.0 * self.spread[g])))
-            first += [0.9 * self.spread[g], self.middle[g], 0.3 * self.spread[g]]
+            spread = (float(np.log(least)), float(np.log(10.0 * self._spread[g])))
+            first += [0.9 * self._spread[g], self._middle[g], 0.3 * self._spread[g]]
             bounds += [spread, (np.log(step[g] / 3.0), np.log(2.0 * duration[g])), spread]
-        self.replicated = scales.shape[1] > 0
-        if self.replicated:
+        self._replicated = scales.shape[1] > 0
+        if self._replicated:
             first.append(FIRST_SCALE)
             bounds.append((np.log(MIN_SCALE), np.log(LARGEST_SCALE)))
-        self.first, self.bounds = np.log(first), np.array(bounds)
-        self._pieces: dict[tuple, tuple[np.ndarray, float]] = {}
+        self._first, self._bounds = np.log(first), np.array(bounds)
+        self._piece = functools.lru_cache(KEPT * len(groups))(self._new_piece)
 
-    def numbers_of(self, model: NoiseModel) -> np.ndarray:
-        """The numbers of a noise model."""
+    def fit(self, start: NoiseModel | None = None) -> NoiseModel:
+        """The noise of largest marginal likelihood.
+
+        Args:
+            start: A noise model of the same groups that is nearly right.
+        """
+        self._numbers = minimize(
+            self._objective,
+            self._first if start is None else self._numbers_of(start),
+            method="L-BFGS-B",
+            bounds=self._bounds,
+            options={"maxiter": 60, "ftol": 1e-6},
+        ).x
+        ar, tau, white = np.exp(self._numbers[: 3 * len(self._groups)]).reshape(-1, 3).T
+        scale = float(np.exp(self._numbers[-1])) if self._replicated else None
+        return NoiseModel(self._groups, ar, tau, white, scale, self._scales)
+
+    def covariance(self) -> np.ndarray:
+        """Covariance of the parameters [d, d], if the noise were exactly what was fitted."""
+        return self._estimate(self._numbers)[0]
+
+    def _numbers_of(self, model: NoiseModel) -> np.ndarray:
         x = np.column_stack([model.ar, model.tau, model.white]).ravel()
         if model.record_scale is not None:
             x = np.append(x, model.record_scale)
-        return np.clip(np.log(x), self.bounds[:, 0], self.bounds[:, 1])
+        return np.clip(np.log(x), self._bounds[:, 0], self._bounds[:, 1])
 
-    def model(self, x: np.ndarray) -> NoiseModel:
-        """The noise model with these numbers."""
-        ar, tau, white = np.exp(x[: 3 * len(self.groups)]).reshape(-1, 3).T
-        scale = float(np.exp(x[-1])) if self.replicated else None
-        return NoiseModel(self.groups, ar, tau, white, scale, self.scales)
-
-    def _piece(self, group: int, numbers: tuple[float, ...]) -> tuple[np.ndarray, float]:
+    def _new_piece(self, group: int, numbers: tuple[float, ...]) -> tuple[np.ndarray, float]:
         """B' V^-1 B of a group's columns B, and log det V."""
-        key = (group, numbers)
-        if key not in self._pieces:
-            V = MarkovCovariance(self.groups[group].gap, *np.exp(numbers))
-            B = self.columns[group]
-            if len(self._pieces) > KEPT * len(self.groups):
-                self._pieces.clear()
-            self._pieces[key] = B.T @ V.solve(B), V.log_det()
-        return self._pieces[key]
+        V = MarkovCovariance(self._groups[group].gap, *np.exp(numbers))
+        B = self._columns[group]
+        return B.T @ V.solve(B), V.log_det()
 
     def _system(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, float]:
         """Precision A and right side b of all unknowns, rest of the cost, log det of the prior."""
         gram, log_det = np.zeros(()), 0.0
-        for g in range(len(self.groups)):
+        for g in range(len(self._groups)):
             piece, own = self._piece(g, tuple(x[3 * g : 3 * g + 3].tolist()))
             gram, log_det = gram + piece, log_det + own
         G = np.asarray(gram)
         A, b = G[1:, 1:].copy(), -G[1:, 0]
         precision = np.zeros(len(A))
-        precision[: self.d] = self.prior_precision
-        size = np.diag(A)[self.d : self.d + self.q]
-        precision[self.d : self.d + self.q] = np.where(size > 0.0, FLAT * size, 1.0)
+        precision[: self._d] = self._prior_precision
+        size = np.diag(A)[self._d : self._d + self._q]
+        precision[self._d : self._d + self._q] = np.where(size > 0.0, FLAT * size, 1.0)
         log_prior = 0.0
-        if self.replicated:
-            precision[self.d + self.q :] = np.exp(-2.0 * x[-1])
-            log_prior = -2.0 * x[-1] * self.scales.shape[1]
+        if self._replicated:
+            precision[self._d + self._q :] = np.exp(-2.0 * x[-1])
+            log_prior = -2.0 * x[-1] * self._scales.shape[1]
         A[np.diag_indices(len(A))] += precision
-        b[: self.d] += self.prior_precision * self.prior_mean
-        rest = G[0, 0] + self.prior_precision * float(self.prior_mean @ self.prior_mean)
+        b[: self._d] += self._prior_precision * self._prior_mean
+        rest = G[0, 0] + self._prior_precision * float(self._prior_mean @ self._prior_mean)
         return A, b, rest + log_det, log_prior
 
-    def objective(self, x: np.ndarray) -> float:
+    def _objective(self, x: np.ndarray) -> float:
         """-2 log of likelihood times weak priors."""
         A, b, rest, log_prior = self._system(x)
         factor = np.linalg.cholesky(A)
         y = np.linalg.solve(factor, b)
         value = rest - log_prior + 2.0 * np.log(np.diag(factor)).sum() - float(y @ y)
-        ar, tau, white = x[: 3 * len(self.groups)].reshape(-1, 3).T
-        value += (((ar - np.log(self.spread)) / SPREAD_PRIOR) ** 2).sum()
-        value += (((white - np.log(self.spread)) / SPREAD_PRIOR) ** 2).sum()
-        value += (((tau - np.log(self.middle)) / TIME_PRIOR) ** 2).sum()
-        if self.replicated:
+        ar, tau, white = x[: 3 * len(self._groups)].reshape(-1, 3).T
+        value += (((ar - np.log(self._spread)) / SPREAD_PRIOR) ** 2).sum()
+        value += (((white - np.log(self._spread)) / SPREAD_PRIOR) ** 2).sum()
+        value += (((tau - np.log(self._middle)) / TIME_PRIOR) ** 2).sum()
+        if self._replicated:
             # Keeps the scale from zero, where few records put it by chance (Chung et al. 2013).
             value -= 2.0 * x[-1]
         return float(value)
 
-    def estimate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _estimate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Covariance [d, d] and shift [d] of the parameters for this noise."""
         A, b, _, _ = self._system(x)
         covariance = np.linalg.inv(A)
-        return covariance[: self.d, : self.d], (covariance @ b)[: self.d]
+        return covariance[: self._d, : self._d], (covariance @ b)[: self._d]
 
-    def averaged(self, x: np.ndarray) -> np.ndarray:
-        """Covariance [d, d] averaged over the noise's own uncertainty."""
-        blocks = [list(range(3 * g, 3 * g + 3)) for g in range(len(self.groups))]
-        if self.replicated:
+    def averaged_covariance(self) -> np.ndarray:
+        """Covariance of the parameters [d, d], averaged over the uncertainty of what was fitted.
+
+        The average is over samples of a normal approximation in the logarithms of its numbers.
+        """
+        x = self._numbers
+        blocks = [list(range(3 * g, 3 * g + 3)) for g in range(len(self._groups))]
+        if self._replicated:
             blocks.append([len(x) - 1])
         rng = np.random.default_rng(0)
         sets = np.tile(x, (DRAWS, 1))
         for block in blocks:
             sets[:, block] += self._scatter(x, block, rng)
-        sets = np.clip(sets, self.bounds[:, 0], self.bounds[:, 1])
-        pairs = [self.estimate(s) for s in sets]
+        sets = np.clip(sets, self._bounds[:, 0], self._bounds[:, 1])
+        pairs = [self._estimate(s) for s in sets]
         shifts = np.array([shift for _, shift in pairs])
         within = np.mean([covariance for covariance, _ in pairs], axis=0)
-        center = self.estimate(x)[1]
+        center = self._estimate(x)[1]
         return np.asarray(within + (shifts - center).T @ (shifts - center) / DRAWS)
 
     def _scatter(self, x: np.ndarray, block: list[int], rng: np.random.Generator) -> np.ndarray:
@@ -391,14 +354,14 @@ class _Problem:
         n = len(block)
         steps = np.zeros((n, len(x)))
         steps[np.arange(n), block] = STEP
-        middle = self.objective(x)
+        middle = self._objective(x)
         H = np.zeros((n, n))
         for i in range(n):
-            up, down = self.objective(x + steps[i]), self.objective(x - steps[i])
+            up, down = self._objective(x + steps[i]), self._objective(x - steps[i])
             H[i, i] = (up - 2.0 * middle + down) / STEP**2
             for j in range(i):
                 corners = [
-                    self.objective(x + a * steps[i] + b * steps[j])
+                    self._objective(x + a * steps[i] + b * steps[j])
                     for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1))
                 ]
                 mixed = (corners[0] - corners[1] - corners[2] + corners[3]) / (4.0 * STEP**2)

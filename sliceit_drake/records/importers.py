@@ -6,7 +6,6 @@ record whose `processing` says what was done. None of them checks the result:
 """
 
 import copy
-import csv
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from sliceit_drake.records.slice_record import (
     record_from_table,
     velocities,
 )
-from sliceit_drake.tables import read_columns, require_increasing
+from sliceit_drake.tables import read_columns, read_rows, require_increasing
 
 __all__ = [
     "import_force",
@@ -258,13 +257,8 @@ def imported_facts(metadata: SliceMetadata, file: str | Path) -> SliceMetadata:
 
 
 def _header(file: str | Path) -> list[str]:
-    try:
-        with open(file, newline="", encoding="utf-8") as stream:
-            return [name.strip() for name in next(csv.reader(stream), [])]
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(
-            f"the table cannot be read ({error})", source=str(file), fix="Check the path."
-        ) from error
+    rows = read_rows(file)
+    return rows[0][1] if rows else []
 
 
 def _two_columns(file: str | Path) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,6 @@ the wrench on the knife about Ko in W, whatever frame, sign and point the files 
 """
 
 import copy
-import csv
 import dataclasses as dc
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml, load_yaml
 from sliceit_drake.records.metadata import Phase, ProcessingStep, SliceMetadata
+from sliceit_drake.tables import read_rows
 
 __all__ = [
     "COLUMNS",
@@ -215,18 +215,12 @@ def read_table(file: str | Path) -> SliceTable:
 
 
 def _read_csv(file: Path) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    try:
-        with open(file, newline="", encoding="utf-8") as stream:
-            rows = [(number, row) for number, row in enumerate(csv.reader(stream), 1) if row]
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(
-            f"the table cannot be read ({error})", source=str(file), fix="Check the path."
-        ) from error
+    rows = read_rows(file)
     if len(rows) < 2:
         raise ConfigurationError(
             "the table has no rows", source=str(file), fix="Add rows of numbers under the names."
         )
-    header = [name.strip() for name in rows[0][1]]
+    header = rows[0][1]
     for name in header:
         if name not in COLUMNS or header.count(name) > 1:
             problem = "is there twice" if name in COLUMNS else "is not a column of a slice record"
@@ -245,12 +239,12 @@ def _read_csv(file: Path) -> tuple[dict[str, np.ndarray], np.ndarray]:
                 fix="Give one cell for each column; leave a cell empty where there is no reading.",
             )
         for j, text in enumerate(row):
-            if text.strip():
+            if text:
                 try:
                     values[k, j] = float(text)
                 except ValueError:
                     raise ConfigurationError(
-                        f"is {text.strip()!r}, which is not a number",
+                        f"is {text!r}, which is not a number",
                         source=f"{file}, line {number}",
                         field=header[j],
                         fix="Write a decimal point, no unit, no thousands separator.",
