@@ -9,6 +9,7 @@ from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
 from sliceit_drake.diagnosis.cause import Cause
+from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.own_values import at_own_values
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
@@ -116,17 +117,16 @@ def diagnose(
 
     verdict = reach_verdict(problem, replicates, seed, count)
     show("bootstrap", steps, steps)
-    named = [(f.evidence.name, f.evidence.scan) for f in verdict.findings]
     result = Diagnosis(
         verdict=verdict,
         problem=problem,
         setup=setup,
         causes={c.name: c for c in causes},
-        shifts=_shifts(problem, named),
+        shifts=_shifts(problem, verdict.named),
         gain=None,
         remarks=remarks,
     )
-    if named:
+    if verdict.findings:
         runs = None if cache is None else cache / "slices"
         predictor = SlicePredictor(setup, records, (Meshing(),), Clock(), runs, workers)
         result.confirm(predictor, seed, lambda done, total: show("confirmation", done, total))
@@ -136,17 +136,12 @@ def diagnose(
 
 
 def _shifts(
-    problem: LinearProblem, causes: Sequence[tuple[str, float | None]]
+    problem: LinearProblem, causes: Sequence[CauseAtScan]
 ) -> dict[str, tuple[float, float]]:
     """Factors of the base parameters and their relative standard errors, causes in the model."""
     found = problem.found
-    shared = [
-        k
-        for name, scan in causes
-        for k in found.index("cause", name, scan)
-        if not found.columns[k].per_record
-    ]
-    columns = [*problem.base, *problem.numerical, *problem.spline, *problem.usual, *shared]
+    shared = [k for k in found.of_causes(causes) if not found.columns[k].per_record]
+    columns = [*problem.baseline, *shared]
     own, variance = problem.own_prior()
     total = problem.reduced(own, variance).sum(0)
     theta, covariance = problem.fit_shared(total, columns)

@@ -29,12 +29,10 @@ def records_figure(problem: LinearProblem, verdict: Verdict) -> "Figure":
 
     found = problem.found
     picked = [members[0] for members in problem.conditions.values()][:SHOWN]
-    channels = found.records[0].channels
-    channel = channels.index("force_z") if "force_z" in channels else 0
+    channel = found.records[0].shown
     figure = Figure(figsize=(11.0, 2.6 * len(picked)), layout="constrained")
     axes = figure.subplots(len(picked), 2, squeeze=False)
-    named = [(f.evidence.name, f.evidence.scan) for f in verdict.findings]
-    changes = fitted_changes(problem, named)
+    changes = fitted_changes(problem, verdict.named)
     for (left, right), r in zip(axes, picked, strict=True):
         record = found.records[r]
         left.plot(record.time, record.measured[:, channel], color=MEASURED, lw=1.0)
@@ -55,7 +53,7 @@ def records_figure(problem: LinearProblem, verdict: Verdict) -> "Figure":
     axes[0, 0].plot([], [], color=MEASURED, label="measured")
     axes[0, 0].plot([], [], "--", color=PREDICTED, label="simulated")
     axes[0, 0].legend(frameon=False, fontsize=8)
-    what = "refitted with the causes" if named else "refitted"
+    what = "refitted with the causes" if verdict.named else "refitted"
     axes[0, 1].plot([], [], color=EXTENDED, label=f"what the model changes, {what}")
     axes[0, 1].legend(frameon=False, fontsize=8)
     return figure

@@ -68,7 +68,6 @@ class Diagnosis:
     ) -> None:
         """Simulates the records with what is named, and measures its worth from there."""
         findings = self.verdict.findings
-        named = [(f.evidence.name, f.evidence.scan) for f in findings]
         shared = [f for f in findings if not f.evidence.per_record]
         if shared:
             chosen = [(self.causes[f.evidence.name], self.values(f)) for f in shared]
@@ -83,7 +82,7 @@ class Diagnosis:
                 "A simulation with the cause in it gains less than half of what its derivatives "
                 "promise: take the values for a direction."
             )
-        self.gain = held_out_gain(self.problem, named, seed, simulated)
+        self.gain = held_out_gain(self.problem, self.verdict.named, seed, simulated)
 
     @property
     def sensitivities(self) -> Sensitivities:
@@ -248,7 +247,7 @@ class Diagnosis:
                     "expected": e.expected,
                     "limit": e.limit,
                     "scan": e.scan,
-                    "held_out_share": held_out_share(self.problem, [(e.name, e.scan)]),
+                    "held_out_share": held_out_share(self.problem, [e.cause]),
                 }
                 for e in v.screening.causes
             ],

@@ -149,11 +149,10 @@ class FoodSlip(Cause):
         assert self.scan is not None
         out = FoodSlip()
         for r, rest in zip(records, unlike_others(records), strict=True):
-            forces = [k for k, name in enumerate(r.channels) if name.startswith("force")]
-            calm = (r.kinks()[:, forces] < CALM).all(1)
+            calm = (r.kinks()[:, r.forces] < CALM).all(1)
             inside = r.in_contact & (r.depth > 0.0) & calm
             if inside.any():
-                moment = largest_jump(r.time, rest[:, forces], inside, self.scan.values[1])
+                moment = largest_jump(r.time, rest[:, r.forces], inside, self.scan.values[1])
                 out._moments[r.name] = moment
         return out
 

@@ -78,8 +78,7 @@ class Vibration(Cause):
         series = []
         for r in records:
             moving = np.gradient(r.path, r.time) > REST
-            forces = [k for k, name in enumerate(r.channels) if name.startswith("force")]
-            series.append((r.time[moving], r.residual[moving][:, forces]))
+            series.append((r.time[moving], r.residual[moving][:, r.forces]))
         return _at(self, strongest_frequencies(series, *self.range))
 
     def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:

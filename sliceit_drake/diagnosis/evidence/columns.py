@@ -1,16 +1,28 @@
 """The sensitivities of records, as data: what was measured, what is predicted, how that changes."""
 
 import dataclasses as dc
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-__all__ = ["MESH", "Column", "RecordSensitivity", "Sensitivities"]
+__all__ = [
+    "MESH",
+    "CauseAtScan",
+    "Column",
+    "RecordSensitivity",
+    "Sensitivities",
+    "at_times",
+    "replicates",
+]
 
 NOT_COMPARED = 1e4
 """Standard deviation of a row that does not count, N and Nm."""
 KINK_TIME = 0.02
 """By which the time of a jump of the force may be wrong, s."""
+
+CauseAtScan = tuple[str, float | None]
+"""Name of a cause, and the value of its scan; None without one."""
 
 
 @dc.dataclass(frozen=True)
@@ -95,6 +107,16 @@ class RecordSensitivity:
         """Measured less predicted [m, c]."""
         return self.measured - self.predicted
 
+    @property
+    def forces(self) -> list[int]:
+        """Numbers of the channels that are forces."""
+        return [k for k, name in enumerate(self.channels) if name.startswith("force")]
+
+    @property
+    def shown(self) -> int:
+        """Number of the channel that figures and tables show."""
+        return self.channels.index("force_z") if "force_z" in self.channels else 0
+
     def kinks(self) -> np.ndarray:
         """Largest second difference of the prediction within `KINK_TIME` of each row [m, c];
         `NOT_COMPARED` where a row does not count.
@@ -134,6 +156,10 @@ class Sensitivities:
             if c.kind == kind and name in (None, c.name) and scan in (None, c.scan)
         ]
 
+    def of_causes(self, causes: Sequence[CauseAtScan]) -> list[int]:
+        """Numbers of the columns of causes, one cause after the other."""
+        return [k for name, scan in causes for k in self.index("cause", name, scan)]
+
     @property
     def causes(self) -> list[str]:
         """Names of the causes."""
@@ -150,3 +176,27 @@ class Sensitivities:
     def scans(self, cause: str) -> list[float | None]:
         """Values of a cause's scan; [None] for one without."""
         return list(dict.fromkeys(self.columns[k].scan for k in self.index("cause", cause)))
+
+
+def replicates(records: Sequence[RecordSensitivity]) -> dict[str, list[int]]:
+    """Numbers of the records of each condition."""
+    out: dict[str, list[int]] = {}
+    for k, record in enumerate(records):
+        out.setdefault(record.condition or record.name, []).append(k)
+    return out
+
+
+def at_times(values: np.ndarray, time: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Rows at other times, between those that there are.
+
+    Args:
+        values: Of the rows [m, ...].
+        time: Of the rows [m], s.
+        wanted: Times [n], s.
+
+    Returns:
+        [n, ...].
+    """
+    flat = values.reshape(len(values), -1)
+    out = np.column_stack([np.interp(wanted, time, column) for column in flat.T])
+    return out.reshape(len(wanted), *values.shape[1:])

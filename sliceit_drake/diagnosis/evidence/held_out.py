@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 
 __all__ = ["HeldOutGain", "fitted_changes", "held_out_gain", "held_out_share", "own_coefficients"]
@@ -42,7 +43,7 @@ class HeldOutGain:
 
 def held_out_gain(
     problem: LinearProblem,
-    causes: Sequence[tuple[str, float | None]],
+    causes: Sequence[CauseAtScan],
     seed: int = 0,
     simulated: LinearProblem | None = None,
 ) -> HeldOutGain:
@@ -76,7 +77,7 @@ def held_out_gain(
     )
 
 
-def held_out_share(problem: LinearProblem, causes: Sequence[tuple[str, float | None]]) -> float:
+def held_out_share(problem: LinearProblem, causes: Sequence[CauseAtScan]) -> float:
     """Fraction of the held-out mean square above the noise floor that causes remove."""
     total = max(int(problem.moments.force_rows.sum()), 1)
     return _share(_both(problem, causes).sum(1) / total, _noise(problem))
@@ -84,11 +85,11 @@ def held_out_share(problem: LinearProblem, causes: Sequence[tuple[str, float | N
 
 def _both(
     problem: LinearProblem,
-    causes: Sequence[tuple[str, float | None]],
+    causes: Sequence[CauseAtScan],
     simulated: LinearProblem | None = None,
 ) -> np.ndarray:
     """Squared errors of the records without and with causes [2, R], N^2."""
-    named = [k for name, scan in causes for k in problem.found.index("cause", name, scan)]
+    named = problem.found.of_causes(causes)
     without = _errors(problem, (), named)
     return np.array([without, _errors(simulated or problem, causes, named)])
 
@@ -102,9 +103,7 @@ def _share(mean: np.ndarray, noise: float) -> float:
     return float((mean[0] - mean[1]) / max(mean[0] - noise, MIN_REDUCIBLE * noise))
 
 
-def fitted_changes(
-    problem: LinearProblem, causes: Sequence[tuple[str, float | None]]
-) -> list[np.ndarray]:
+def fitted_changes(problem: LinearProblem, causes: Sequence[CauseAtScan]) -> list[np.ndarray]:
     """Change of each record's prediction by causes and all that is refitted with them [m, c]."""
     linear = _Linear(problem, causes)
     theta = linear.shared(linear.reduced.sum(0))
@@ -128,7 +127,7 @@ def own_coefficients(problem: LinearProblem, own: Sequence[int]) -> list[np.ndar
 
 
 def _errors(
-    problem: LinearProblem, causes: Sequence[tuple[str, float | None]], not_usual: Sequence[int]
+    problem: LinearProblem, causes: Sequence[CauseAtScan], not_usual: Sequence[int]
 ) -> np.ndarray:
     """Sum of squared force errors in contact of each record when it is left out [R], N^2.
 
@@ -156,22 +155,18 @@ class _Linear:
     def __init__(
         self,
         problem: LinearProblem,
-        causes: Sequence[tuple[str, float | None]],
+        causes: Sequence[CauseAtScan],
         not_usual: Sequence[int] = (),
     ) -> None:
         found = problem.found
-        shared: list[int] = []
-        own: list[int] = []
-        for name, scan in causes:
-            columns = found.index("cause", name, scan)
-            (own if found.columns[columns[0]].per_record else shared).extend(columns)
+        columns = found.of_causes(causes)
+        shared = [k for k in columns if not found.columns[k].per_record]
         self.problem, self.flat = problem, shared
-        mine = {*shared, *own, *not_usual}
+        mine = {*columns, *not_usual}
         usual = [k for k in problem.usual if k not in mine]
         self.columns = [*problem.base, *problem.numerical, *usual, *shared]
-        known, variance = problem.own_prior(without=tuple(mine))
-        self.own = [*known, *own]
-        self.variance = np.concatenate([variance, np.full(len(own), FLAT)])
+        free = {k: FLAT for k in columns if k not in shared}
+        self.own, self.variance = problem.own_prior(tuple(mine), free)
         self.reduced = problem.reduced(self.own, self.variance)
 
     def shared(self, total: np.ndarray) -> np.ndarray:

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
-from sliceit_drake.diagnosis.evidence.replicates import at_times, replicates
+from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, at_times, replicates
 
 __all__ = ["largest_jump", "unlike_others"]
 

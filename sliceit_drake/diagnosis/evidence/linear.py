@@ -10,16 +10,15 @@ Gram matrix weighted with the inverse of the noise's covariance.
 
 import copy
 import dataclasses as dc
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
-from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, Sensitivities
+from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, Sensitivities, replicates
 from sliceit_drake.diagnosis.evidence.noise_levels import ChannelNoise, differences, estimate_noise
-from sliceit_drake.diagnosis.evidence.replicates import replicates
 
 __all__ = ["USUAL", "LinearProblem", "Moments", "integrate_out", "scaled_inverse"]
 
@@ -139,7 +138,7 @@ class LinearProblem:
             self.discretisation[c * count : (c + 1) * count] = scale[c]
         gram = np.zeros((len(found.records), self.size + 1, self.size + 1))
         force_gram, force_rows = np.zeros_like(gram), np.zeros(len(found.records), int)
-        self.forces = [c for c, name in enumerate(channels) if name.startswith("force")]
+        self.forces = found.records[0].forces
         for r, record in enumerate(found.records):
             X = self._table(record)
             gram[r] = self._weighted(record.time, X, self.model_error(record))
@@ -219,16 +218,25 @@ class LinearProblem:
             count += int(inside.sum())
         return DISCRETISATION * np.sqrt(squares / max(count, 1)) + RIDGE
 
-    def own_prior(self, without: Sequence[int] = ()) -> tuple[list[int], np.ndarray]:
+    @property
+    def baseline(self) -> list[int]:
+        """Numbers of the columns that all records share and that are fitted in any case."""
+        return [*self.base, *self.numerical, *self.spline, *self.usual]
+
+    def own_prior(
+        self, without: Sequence[int] = (), free: Mapping[int, float] | None = None
+    ) -> tuple[list[int], np.ndarray]:
         """Numbers of the columns that are each record's own, and the variances of their
         coefficients.
 
         Args:
             without: Columns to leave out.
+            free: Columns to add, and the variances of their coefficients.
         """
+        free = free or {}
         usual = {k: deviation for k, deviation in self.usual_own.items() if k not in without}
         deviations = np.concatenate([self.variation, np.array(list(usual.values()))])
-        return [*self.own, *usual], deviations**2
+        return [*self.own, *usual, *free], np.concatenate([deviations**2, list(free.values())])
 
     def fit_shared(
         self, total: np.ndarray, columns: list[int], flat: Sequence[int] = ()

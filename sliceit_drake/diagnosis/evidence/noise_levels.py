@@ -11,8 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import least_squares
 
-from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
-from sliceit_drake.diagnosis.evidence.replicates import at_times, replicates
+from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, at_times, replicates
 from sliceit_drake.prediction.noise import MarkovCovariance
 
 __all__ = ["ChannelNoise", "differences", "estimate_noise"]

@@ -26,6 +26,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem, scaled_inverse
 
 __all__ = ["CauseEvidence", "Screening", "screen"]
@@ -86,6 +87,11 @@ class CauseEvidence:
     presence: float = 1.0
 
     @property
+    def cause(self) -> CauseAtScan:
+        """The cause at the best value of its scan."""
+        return self.name, self.scan
+
+    @property
     def score(self) -> float:
         """Gain beyond what chance gives in 95 % of cases."""
         return self.gain - self.limit
@@ -134,7 +140,7 @@ class Screening:
         both ways.
         """
         G = self.projected
-        own = problem.found.index("cause", effect.name, effect.scan)
+        own = problem.found.of_causes([effect.cause])
         e = np.array(effect.coefficients)
         norm = float(e @ G[np.ix_(own, own)] @ e)
         best = 0.0
@@ -154,24 +160,20 @@ class _Statistics:
 
     Attributes:
         baseline, own: Numbers of the columns F and E of the module's formulas.
-        unpenalised: Those of E that belong to causes that are assumed.
+        free: Those of E that belong to causes that are assumed, and their variance.
         options: Of each cause and value of its scan the numbers of its columns.
         reduced: A_r of each record [K, K].
         projected: A beside the baseline [K, K].
     """
 
-    def __init__(self, problem: LinearProblem, assumed: Sequence[tuple[str, float | None]]) -> None:
+    def __init__(self, problem: LinearProblem, assumed: Sequence[CauseAtScan]) -> None:
         self.problem = problem
         found = problem.found
         self.prior = problem.prior()
-        self.baseline = [*problem.base, *problem.numerical, *problem.spline, *problem.usual]
-        self.unpenalised: list[int] = []
-        for name, scan in assumed:
-            columns = found.index("cause", name, scan)
-            if found.columns[columns[0]].per_record:
-                self.unpenalised += columns
-            else:
-                self.baseline += columns
+        taken = found.of_causes(assumed)
+        shared = [k for k in taken if not found.columns[k].per_record]
+        self.baseline = [*problem.baseline, *shared]
+        self.free = {k: FLAT for k in taken if k not in shared}
         # At another value of its scan an assumed cause may still add something.
         self.options: list[tuple[str, float | None, list[int]]] = [
             (name, scan, found.index("cause", name, scan))
@@ -180,13 +182,8 @@ class _Statistics:
             if (name, scan) not in assumed
         ]
         self.names = list(dict.fromkeys(name for name, _, _ in self.options))
-        self.per_record = {
-            name: any(found.columns[k].per_record for k in found.index("cause", name))
-            for name in self.names
-        }
-        own, variance = problem.own_prior()
-        variance = np.concatenate([variance, np.full(len(self.unpenalised), FLAT)])
-        self.own = [*own, *self.unpenalised]
+        self.per_record = {n: found.columns[c[0]].per_record for n, _, c in self.options}
+        self.own, variance = problem.own_prior(free=self.free)
         K = problem.size
         self.reduced, self.own_weights = [], []
         for G in problem.moments.gram:
@@ -194,34 +191,22 @@ class _Statistics:
             self.reduced.append(A)
             self.own_weights.append(weights)
         total = np.sum(self.reduced, axis=0)
-        self.baseline_covariance = self._baseline_covariance(total)
+        self.baseline_covariance = self.covariance_of_baseline(total)
         self.baseline_weights = total[:, self.baseline] @ self.baseline_covariance
         self.projected = total - self.baseline_weights @ total[self.baseline]
+        each = [[r] for r in range(len(self.reduced))]
         self._eliminated = {
-            columns[0]: self._eliminate([[r] for r in range(len(self.reduced))], columns, FLAT)
+            columns[0]: _Eliminated(self, each, columns, FLAT)
             for name, _, columns in self.options
             if self.per_record[name]
         }
-        self._corrected = self._eliminate(
-            list(problem.conditions.values()), problem.correction, CORRECTION_VARIANCE
-        )
+        conditions = list(problem.conditions.values())
+        self._corrected = _Eliminated(self, conditions, problem.correction, CORRECTION_VARIANCE)
 
-    def _baseline_covariance(self, total: np.ndarray) -> np.ndarray:
+    def covariance_of_baseline(self, total: np.ndarray) -> np.ndarray:
         """(A[F, F] + P)^-1 of a summed Gram matrix [F, F]."""
         F = self.baseline
         return scaled_inverse(total[np.ix_(F, F)] + np.diag(self.prior[F]))
-
-    def _eliminate(
-        self, groups: Sequence[Sequence[int]], columns: list[int], variance: float
-    ) -> "_Eliminated":
-        weights, inverses, total = [], [], np.zeros_like(self.projected)
-        for members in groups:
-            A = np.sum([self.reduced[r] for r in members], axis=0)
-            A, weight, inverse = _integrated(A, columns, np.full(len(columns), variance))
-            total += A
-            weights.append(weight)
-            inverses.append(inverse)
-        return _Eliminated(groups, columns, weights, inverses, self._baseline_covariance(total))
 
     def reduce(self, products: np.ndarray) -> np.ndarray:
         """Products with what is each record's own integrated out [n, R, K]."""
@@ -247,7 +232,7 @@ class _Statistics:
         out: dict[str, tuple[np.ndarray, list[float | None]]] = {}
         for name, scan, columns in self.options:
             if self.per_record[name]:
-                gain = self._eliminated[columns[0]].gain(reduced, self.baseline) - of_baseline
+                gain = self._eliminated[columns[0]].gain(reduced) - of_baseline
             else:
                 gain = self._bounded(projected, columns)[0]
             if name not in out:
@@ -257,7 +242,7 @@ class _Statistics:
             better = gain > before
             scans = [scan if new else old for new, old in zip(better, scans, strict=True)]
             out[name] = np.where(better, gain, before), scans
-        return out, self._corrected.gain(reduced, self.baseline) - of_baseline, projected
+        return out, self._corrected.gain(reduced) - of_baseline, projected
 
     def _bounded(
         self, projected: np.ndarray, columns: list[int]
@@ -293,9 +278,7 @@ class _Statistics:
         mine = set(columns)
         if not mine & {*problem.usual, *problem.usual_own}:
             return 0.0
-        own, variance = problem.own_prior(without=columns)
-        variance = np.concatenate([variance, np.full(len(self.unpenalised), FLAT)])
-        own = [*own, *self.unpenalised]
+        own, variance = problem.own_prior(columns, self.free)
         baseline = [k for k in self.baseline if k not in mine]
         prior = self.prior.copy()
         prior[columns] = 0.0
@@ -341,32 +324,42 @@ class _Statistics:
         return out, gains
 
 
-@dc.dataclass
 class _Eliminated:
     """Columns of which each group of records has coefficients of its own, integrated out.
 
-    Attributes:
+    Args:
+        statistics: Of the records.
         groups: Numbers of records.
         columns: Numbers of the columns.
-        weights: Of each group [K, c].
-        inverses: Of each group [c, c].
-        covariance: Of the baseline's coefficients with these integrated out [F, F].
+        variance: Of their coefficients.
     """
 
-    groups: Sequence[Sequence[int]]
-    columns: list[int]
-    weights: list[np.ndarray]
-    inverses: list[np.ndarray]
-    covariance: np.ndarray
+    def __init__(
+        self,
+        statistics: _Statistics,
+        groups: Sequence[Sequence[int]],
+        columns: list[int],
+        variance: float,
+    ) -> None:
+        self.groups, self.columns, self.baseline = groups, columns, statistics.baseline
+        self.weights, self.inverses = [], []
+        total = np.zeros_like(statistics.projected)
+        for members in groups:
+            A = np.sum([statistics.reduced[r] for r in members], axis=0)
+            A, weight, inverse = _integrated(A, columns, np.full(len(columns), variance))
+            total += A
+            self.weights.append(weight)
+            self.inverses.append(inverse)
+        self.covariance = statistics.covariance_of_baseline(total)
 
-    def gain(self, reduced: np.ndarray, baseline: list[int]) -> np.ndarray:
+    def gain(self, reduced: np.ndarray) -> np.ndarray:
         """By these columns and the baseline together [n]."""
         gain, total = np.zeros(len(reduced)), np.zeros((len(reduced), reduced.shape[2]))
         for members, weight, inverse in zip(self.groups, self.weights, self.inverses, strict=True):
             b = reduced[:, members].sum(1)
             gain += _squares(b[:, self.columns], inverse)
             total += b - b[:, self.columns] @ weight.T
-        return gain + _squares(total[:, baseline], self.covariance)
+        return gain + _squares(total[:, self.baseline], self.covariance)
 
 
 def _squares(b: np.ndarray, inverse: np.ndarray) -> np.ndarray:
@@ -389,7 +382,7 @@ def screen(
     problem: LinearProblem,
     replicates: int = 200,
     seed: int = 0,
-    assumed: Sequence[tuple[str, float | None]] = (),
+    assumed: Sequence[CauseAtScan] = (),
     progress: Callable[[int], None] | None = None,
 ) -> Screening:
     """Tests all causes against the records.

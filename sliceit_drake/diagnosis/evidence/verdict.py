@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
 from sliceit_drake.diagnosis.evidence.effect_size import effect_in_noise
 from sliceit_drake.diagnosis.evidence.held_out import HeldOutGain
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
@@ -116,6 +117,11 @@ class Verdict:
     slices_needed: int = 0
 
     @property
+    def named(self) -> list[CauseAtScan]:
+        """The causes of the findings."""
+        return [f.evidence.cause for f in self.findings]
+
+    @property
     def names(self) -> list[list[str]]:
         """Classes that are named."""
         named = self.kind in ("cause", "causes", "too_few_replicates")
@@ -148,7 +154,7 @@ def checked_out_of_sample(verdict: Verdict, gain: HeldOutGain, problem: LinearPr
 
 def _counted(problem: LinearProblem, evidence: CauseEvidence) -> float:
     """Fraction of a cause's doing, squared, at the rows that the held-out error counts."""
-    columns = problem.found.index("cause", evidence.name, evidence.scan)
+    columns = problem.found.of_causes([evidence.cause])
     inside = counted = 0.0
     for record in problem.found.records:
         change = record.columns[:, problem.forces][:, :, columns] @ np.array(evidence.coefficients)
@@ -190,9 +196,7 @@ def reach_verdict(
         reason = "nothing beyond the noise and what the simulation itself is unsure of"
         return Verdict("nothing", [], first, None, misfit, reason, needed)
     best = max(large, key=lambda f: f.evidence.score)
-    second = screen(
-        problem, replicates, seed + 1, ((best.evidence.name, best.evidence.scan),), progress
-    )
+    second = screen(problem, replicates, seed + 1, [best.evidence.cause], progress)
     gain = max(best.evidence.gain - best.evidence.expected, 0.0)
     left = max(
         second.misfit - second.expected_misfit, *(e.gain - e.expected for e in second.causes), 0.0
@@ -241,7 +245,7 @@ def reach_verdict(
 def _finding(
     problem: LinearProblem, screening: Screening, evidence: CauseEvidence, total: float
 ) -> Finding:
-    columns = problem.found.index("cause", evidence.name, evidence.scan)
+    columns = problem.found.of_causes([evidence.cause])
     coefficients = np.array(evidence.by_record if evidence.per_record else evidence.coefficients)
     size, _ = effect_in_noise(problem, columns, coefficients)
     spread, _ = effect_in_noise(problem, columns, coefficients, refit_slices=False)

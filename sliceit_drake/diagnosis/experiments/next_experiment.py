@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from sliceit_drake.cutting.foods.shapes import MeshFile, Remainder, Tapered
+from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
 from sliceit_drake.diagnosis.evidence.screen import CauseEvidence
 from sliceit_drake.diagnosis.evidence.sensitivity import Progress
 from sliceit_drake.diagnosis.evidence.verdict import CLASS_ANGLE, MIN_REPLICATES
@@ -146,7 +147,7 @@ def _classes(diagnosis: Diagnosis) -> list[CauseClass]:
     that are nearly so, or would be taken for it if they were the ones that act."""
     verdict, problem = diagnosis.verdict, diagnosis.problem
     out = []
-    assumed: tuple[tuple[str, float | None], ...] = ()
+    assumed: tuple[CauseAtScan, ...] = ()
     for finding, screening in zip(
         verdict.findings, (verdict.screening, verdict.second), strict=False
     ):
@@ -168,7 +169,7 @@ def _classes(diagnosis: Diagnosis) -> list[CauseClass]:
             if len(names) > 1:
                 evidence = [_within_range(diagnosis, screening.evidence(n)) for n in names]
                 out.append(CauseClass(evidence, screening, assumed))
-        assumed = (*assumed, (best.name, best.scan))
+        assumed = (*assumed, best.cause)
     return out
 
 

@@ -7,7 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, Sensitivities
+from sliceit_drake.diagnosis.evidence.columns import (
+    CauseAtScan,
+    RecordSensitivity,
+    Sensitivities,
+)
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem, integrate_out, scaled_inverse
 from sliceit_drake.diagnosis.evidence.screen import CauseEvidence, Screening
 from sliceit_drake.diagnosis.evidence.sensitivity import Progress, sensitivities
@@ -42,7 +46,7 @@ class CauseClass:
 
     evidence: list[CauseEvidence]
     screening: Screening
-    assumed: tuple[tuple[str, float | None], ...]
+    assumed: tuple[CauseAtScan, ...]
 
 
 @dc.dataclass
@@ -115,15 +119,10 @@ class ExperimentSearch:
         self.new = reduced[count:]
         self._before = self._angles(self.old)
 
-    def _projected(
-        self, total: np.ndarray, assumed: Sequence[tuple[str, float | None]]
-    ) -> np.ndarray:
+    def _projected(self, total: np.ndarray, assumed: Sequence[CauseAtScan]) -> np.ndarray:
         """What is left of a summed Gram matrix beside what is fitted in any case."""
         problem = self.problem
-        baseline = [*problem.base, *problem.numerical, *problem.spline, *problem.usual]
-        for name, scan in assumed:
-            baseline += problem.found.index("cause", name, scan)
-        baseline = list(dict.fromkeys(baseline))
+        baseline = list(dict.fromkeys([*problem.baseline, *problem.found.of_causes(assumed)]))
         inverse = scaled_inverse(
             total[np.ix_(baseline, baseline)] + np.diag(problem.prior()[baseline])
         )
@@ -137,7 +136,7 @@ class ExperimentSearch:
                 members.screening, projected=self._projected(total, members.assumed)
             )
             for a, b in itertools.permutations(members.evidence, 2):
-                own = self.problem.found.index("cause", a.name, a.scan)
+                own = self.problem.found.of_causes([a.cause])
                 e = np.array(a.coefficients)
                 square = float(e @ screening.projected[np.ix_(own, own)] @ e)
                 angle = screening.angle_to(self.problem, a, b.name) if square > 0.0 else 0.0

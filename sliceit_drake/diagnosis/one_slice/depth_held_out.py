@@ -21,13 +21,12 @@ class HeldOutDepth:
     def error(self, options: Sequence[list[int]]) -> float:
         """RMS over all left-out rows, N; the rest chooses between the options of a cause."""
         record = self.problem.record
-        keep = [k for k, c in enumerate(record.channels) if c.startswith("force")]
         left = np.zeros_like(record.residual)
         for k in np.unique(self.block):
             rows = self.block == k
             trials = [self._predicted(columns, rows) for columns in options]
             left[rows] = min(trials, key=lambda t: t[0])[1]
-        return float(np.sqrt((left[:, keep] ** 2).sum(1).mean()))
+        return float(np.sqrt((left[:, record.forces] ** 2).sum(1).mean()))
 
     def _predicted(self, columns: list[int], rows: np.ndarray) -> tuple[float, np.ndarray]:
         """Squares on the other rows, and what is left on these."""

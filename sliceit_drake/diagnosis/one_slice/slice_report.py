@@ -35,7 +35,7 @@ def slice_figure(results: Sequence["OneSlice"], titles: Sequence[str]) -> "Figur
         2, count, squeeze=False, sharex="col", sharey="row", height_ratios=(3.0, 2.0)
     )
     for (top, bottom), result, title in zip(axes.T, results, titles, strict=True):
-        record, channel = result.record, result.shown
+        record, channel = result.record, result.record.shown
         depth = 1e3 * record.depth
         measured = record.measured[:, channel]
         top.plot(depth, measured, color=MEASURED, lw=1.8, label="measured")
@@ -78,7 +78,7 @@ def slice_figure(results: Sequence["OneSlice"], titles: Sequence[str]) -> "Figur
         bottom.legend(frameon=False, fontsize=9, loc="lower left")
     rest = np.concatenate(
         [
-            (r.record.measured - p)[:, r.shown]
+            (r.record.measured - p)[:, r.record.shown]
             for r in results
             for p in (r.fit.predicted, r.fit.held_out)
         ]

@@ -71,16 +71,9 @@ class OneSlice:
             and c.without_best <= 1.0 - MIN_GAIN
         ]
 
-    @property
-    def shown(self) -> int:
-        """Number of the channel that figures and tables show."""
-        channels = self.record.channels
-        return channels.index("force_z") if "force_z" in channels else 0
-
     def error(self, predicted: np.ndarray, rows: np.ndarray | None = None) -> float:
         """RMS error of the forces of a prediction, N."""
-        keep = [k for k, c in enumerate(self.record.channels) if c.startswith("force")]
-        rest = (self.record.measured - predicted)[:, keep]
+        rest = (self.record.measured - predicted)[:, self.record.forces]
         compared = self.record.compared
         rest = rest[compared if rows is None else compared & rows]
         return float(np.sqrt((rest**2).sum(1).mean())) if len(rest) else 0.0
@@ -96,10 +89,9 @@ class OneSlice:
             if rows.any():
                 low, high = 1e3 * depth[rows].min(), 1e3 * depth[rows].max()
                 parts.append((f"{low:.1f} to {high:.1f} mm", rows))
-        channel = self.shown
         for name, rows in parts:
             if rows.any():
-                rest = (record.measured - self.fit.predicted)[rows, channel]
+                rest = (record.measured - self.fit.predicted)[rows, record.shown]
                 errors = self.error(self.fit.predicted, rows), self.error(self.fit.held_out, rows)
                 out.append((name, int(rows.sum()), float(rest.mean()), *errors))
         return out
