@@ -17,7 +17,7 @@ from sliceit_drake.diagnosis.causes import BUILT_IN
 from sliceit_drake.diagnosis.causes.mounting import FoodSlip
 from sliceit_drake.diagnosis.causes.robot import StickSlip, Vibration
 from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, Sensitivities
-from sliceit_drake.diagnosis.evidence.jumps import unlike_others
+from sliceit_drake.diagnosis.evidence.searches import unlike_others
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.diagnosis.registry import all_causes, load_cause, open_causes

@@ -18,8 +18,7 @@ from sliceit_drake.diagnosis import diagnose as diagnosis_module
 from sliceit_drake.diagnosis.cause import Cause, CauseParameter
 from sliceit_drake.diagnosis.causes import BUILT_IN
 from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
-from sliceit_drake.diagnosis.registry import load_cause
-from sliceit_drake.diagnosis.rehearsal import dry_run
+from sliceit_drake.diagnosis.registry import dry_run, load_cause
 from sliceit_drake.records.slice_record import SliceRecord, write_record
 
 CUCUMBER = Food(name="cucumber")

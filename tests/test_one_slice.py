@@ -19,9 +19,13 @@ from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.causes.material import SkinToughness
 from sliceit_drake.diagnosis.evidence.columns import Column, Sensitivities
-from sliceit_drake.diagnosis.one_slice.slice_evidence import LEVEL, SliceEvidence, slice_evidence
+from sliceit_drake.diagnosis.one_slice.slice_evidence import (
+    LEVEL,
+    SliceEvidence,
+    estimate_slice_noise,
+    slice_evidence,
+)
 from sliceit_drake.diagnosis.one_slice.slice_fit import depth_blocks, fit_slice
-from sliceit_drake.diagnosis.one_slice.slice_problem import estimate_slice_noise
 from sliceit_drake.diagnosis.one_slice.slice_result import KIND
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.prediction.noise import MarkovCovariance

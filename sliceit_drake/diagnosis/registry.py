@@ -1,4 +1,7 @@
-"""Causes by name, and causes that a user wrote."""
+"""Causes by name, and causes that a user wrote.
+
+A user's cause is tried on a made-up slice, so that its mistakes show before any simulation.
+"""
 
 import inspect
 import traceback
@@ -6,19 +9,19 @@ from collections.abc import Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 
+import numpy as np
+
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.foods.food import Food, make_food_model
+from sliceit_drake.cutting.foods.shapes import Cylinder
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.diagnosis.cause import Cause, check_cause
 from sliceit_drake.diagnosis.causes import BUILT_IN
-from sliceit_drake.diagnosis.rehearsal import dry_run
+from sliceit_drake.prediction.series import ForceSeries, SliceFacts
 from sliceit_drake.resources import load_module
 
-__all__ = [
-    "ENTRY_POINTS",
-    "all_causes",
-    "is_users",
-    "load_cause",
-    "open_causes",
-]
+__all__ = ["ENTRY_POINTS", "all_causes", "dry_run", "is_users", "load_cause", "open_causes"]
 
 ENTRY_POINTS = "sliceit_drake.causes"
 """Group of entry points that name classes of causes."""
@@ -128,4 +131,95 @@ def _broken(file: Path, error: Exception, what: str) -> ConfigurationError:
         source=f"{file}, line {line}" if line else str(file),
         field="--cause",
         fix="Correct the file (docs/causes.md has a complete example).",
+    )
+
+
+ROWS = 200
+PERIOD = 2e-3
+HEIGHT = 0.027
+
+
+def dry_run(cause: Cause, source: str = "") -> None:
+    """Calls the hooks of a cause at its nulls and at its size.
+
+    Args:
+        cause: Complete, as `check_cause` has it.
+        source: File, for messages.
+
+    Raises:
+        ConfigurationError: A hook gives what cannot be used, or changes something at the nulls.
+        Exception: Whatever a hook raises.
+    """
+    facts = SliceFacts("rehearsal", "press", height=HEIGHT, width=HEIGHT, speed=0.02)
+    nulls = cause.nulls()
+    if cause.scan is not None:
+        nulls[cause.scan.name] = cause.scan.values[0]
+    full = dict(nulls)
+    for number in cause.parameters:
+        sign = -1.0 if number.null == number.high else 1.0
+        full[number.name] = number.null + sign * number.size
+
+    def refuse(hook: str, problem: str, fix: str) -> ConfigurationError:
+        return ConfigurationError(
+            problem, source=source, field=f"{type(cause).__name__}.{hook}", fix=fix
+        )
+
+    adds = "Multiply all that it adds by a parameter whose null is 0."
+    series = _made_up_slice()
+    before = series.wrench.copy()
+    for values, name in ((nulls, "nulls"), (full, "size")):
+        out = cause.wrench(series, values, facts)
+        if not np.array_equal(series.wrench, before):
+            fix = "Begin with out = series.wrench.copy(), change out and return it."
+            raise refuse("wrench", "changes series.wrench itself", fix)
+        if np.shape(out) != before.shape:
+            problem = f"gives an array {list(np.shape(out))}, expected {list(before.shape)}"
+            fix = "Return moments and forces of all rows [N, 6]."
+            raise refuse("wrench", problem, fix)
+        if not np.isfinite(out).all():
+            fix = "Mind divisions by a speed or depth of zero."
+            raise refuse("wrench", f"is not finite at its {name}", fix)
+        if values is nulls and not np.allclose(out, before, rtol=0.0, atol=1e-9):
+            raise refuse("wrench", "changes the force at its nulls", adds)
+    t = np.concatenate([[series.time[0] - PERIOD], series.time])
+    R, p = (np.concatenate([v[:1], v]) for v in (series.R, series.p))
+    for values in (nulls, full):
+        moved = cause.motion(R.copy(), p.copy(), t, values, facts, series.wrench[:, 3:])
+        shapes, expected = ([list(np.shape(v)) for v in pair] for pair in (moved, (R, p)))
+        if shapes != expected:
+            fix = "Return R [N + 1, 3, 3] and p [N + 1, 3]."
+            raise refuse("motion", f"gives arrays {shapes}, expected {expected}", fix)
+        if values is nulls and not (np.allclose(moved[0], R) and np.allclose(moved[1], p)):
+            raise refuse("motion", "changes the motion at its nulls", adds)
+    if cause.changes_model:
+        food = Food(shape=Cylinder(HEIGHT, 0.06, 2, [0.0, 0.004, 0.012]), hold_distance=0.0119)
+        model = make_food_model(food, Knife(), Numerics(time_step=1e-3))
+        for values in (nulls, full):
+            if not isinstance(cause.model(model, values, facts), CuttingModel):
+                raise refuse("model", "gives no CuttingModel", "Return one.")
+
+
+def _made_up_slice() -> ForceSeries:
+    """A press into food, a stop and a withdrawal, with a force that goes with the depth."""
+    time = PERIOD * np.arange(1, ROWS + 1)
+    turn = 0.6 * time[-1]
+    depth = 0.1 * np.minimum(time, turn) - 0.005 - 0.1 * np.maximum(time - 0.7 * time[-1], 0.0)
+    v = np.zeros((ROWS, 3))
+    v[:, 2] = -np.gradient(depth, PERIOD)
+    p = np.zeros((ROWS, 3))
+    p[:, 2] = HEIGHT - depth
+    names = ("edge", "normal", "friction", "board", "weight")
+    parts = {name: np.zeros((ROWS, 6)) for name in names}
+    parts["edge"][:, 5] = 500.0 * np.clip(depth, 0.0, None)
+    parts["friction"][:, 5] = -50.0 * np.sign(v[:, 2]) * np.clip(depth, 0.0, None)
+    return ForceSeries(
+        time=time,
+        R=np.broadcast_to(np.diag([1.0, -1.0, -1.0]), (ROWS, 3, 3)).copy(),
+        p=p,
+        v=v,
+        w=np.zeros((ROWS, 3)),
+        parts=parts,
+        depth=depth,
+        in_contact=depth > 0.0,
+        wrench=np.asarray(sum(parts.values())),
     )

@@ -1,7 +1,12 @@
-"""Figures of a diagnosis, and its report as one HTML page. They take the diagnosis's parts, so that
-the result can call them."""
+"""Figures of a diagnosis, and HTML pages: text, with figures in it.
 
+They take the diagnosis's parts, so that the result can call them.
+"""
+
+import base64
 import html
+import io
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,12 +15,37 @@ from sliceit_drake.diagnosis.evidence.held_out import HeldOutGain, fitted_change
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.screen import Screening
 from sliceit_drake.diagnosis.evidence.verdict import Verdict
-from sliceit_drake.diagnosis.html_page import html_page, image
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["evidence_figure", "records_figure", "report_html"]
+__all__ = ["evidence_figure", "html_page", "image", "records_figure", "report_html"]
+
+STYLE = """
+body{font:15px/1.5 system-ui,sans-serif;color:#111827;
+max-width:62rem;margin:2rem auto;padding:0 1rem}
+h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}
+pre{background:#f3f4f6;padding:1rem;overflow-x:auto;font-size:13px}
+img{max-width:100%}
+"""
+
+
+def html_page(title: str, parts: Sequence[str]) -> str:
+    """A page with a title and parts, which are HTML."""
+    head = [
+        f"<!doctype html><html lang=en><meta charset=utf-8><title>{title}</title>",
+        f"<style>{STYLE}</style>",
+    ]
+    return "\n".join([*head, *parts, "</html>", ""])
+
+
+def image(figure: "Figure") -> str:
+    """A figure as an element of a page."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=110)
+    code = base64.b64encode(stream.getvalue()).decode()
+    return f'<img alt="figure" src="data:image/png;base64,{code}">'
+
 
 MEASURED, PREDICTED, EXTENDED = "#111827", "#2563eb", "#c2410c"
 SHOWN = 8

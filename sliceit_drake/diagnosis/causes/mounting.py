@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 from sliceit_drake.cutting.model import CuttingModel, PointScales
 from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan, Values
 from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
-from sliceit_drake.diagnosis.evidence.jumps import largest_jump, unlike_others
+from sliceit_drake.diagnosis.evidence.searches import largest_jump, unlike_others
 from sliceit_drake.prediction.series import ForceSeries, SliceFacts
 
 __all__ = [

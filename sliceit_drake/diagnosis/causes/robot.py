@@ -9,7 +9,7 @@ import numpy as np
 from sliceit_drake.cutting.model import GRAVITY
 from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan, Values
 from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
-from sliceit_drake.diagnosis.evidence.periodicity import strongest_frequencies
+from sliceit_drake.diagnosis.evidence.searches import strongest_frequencies
 from sliceit_drake.prediction.series import ForceSeries, SliceFacts
 
 __all__ = ["StickSlip", "ToolWeight", "Vibration"]

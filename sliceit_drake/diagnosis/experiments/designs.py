@@ -217,7 +217,7 @@ def _cuts(scale: Scale) -> list[Experiment]:
 
 def _in_air(scale: Scale) -> Experiment:
     usual, fast = scale.times(1.0), scale.times(3.0)
-    segments = [
+    segments: list[Segment] = [
         _rest(0.5),
         _press(0.02, usual, "air"),
         _retract(0.02, fast, "air"),
@@ -234,7 +234,7 @@ def _by_hand(scale: Scale) -> list[Experiment]:
     narrow = dc.replace(scale, height=NARROW * scale.height, width=NARROW * scale.width)
     # Down to a clearance's height over the board, then slowly.
     press = CLEARANCE + BOARD_PRESS
-    hung = [_rest(0.5), _rest(1.0, "weight")]
+    hung: list[Segment] = [_rest(0.5), _rest(1.0, "weight")]
     return [
         Experiment(
             "board",

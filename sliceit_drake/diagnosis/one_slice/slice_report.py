@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sliceit_drake.diagnosis.html_page import html_page, image
 from sliceit_drake.diagnosis.one_slice.slice_evidence import LEVEL
+from sliceit_drake.diagnosis.report import html_page, image
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
