@@ -70,7 +70,7 @@ def without_lone_torques(records: Sequence[SliceRecord]) -> list[SliceRecord]:
 
 def _torques(records: Sequence[SliceRecord]) -> list[str]:
     lack = [r.name for r in records if r.torque is None]
-    if len(lack) == len(records) or not lack:
+    if not 0 < len(lack) < len(records):
         return []
     return [
         f"{_some(lack)}: no torque, so that the torques of the other records are not used either."

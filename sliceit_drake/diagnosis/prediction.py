@@ -138,38 +138,36 @@ class SlicePredictor:
             For each point a series a record; None for those that it does not name. One that broke
             down is not finite.
         """
-        plan, results = self._simulated(points, progress)
         return [
             [
-                None if planned is None else self._series(point, target, planned, results)
-                for target, planned in zip(self.targets, row, strict=True)
+                None if simulated is None else self._series(point, target, simulated)
+                for target, simulated in zip(self.targets, row, strict=True)
             ]
-            for point, row in zip(points, plan, strict=True)
+            for point, row in zip(points, self.simulate(points, progress), strict=True)
         ]
+
+    def series(self, point: Point, number: int) -> ForceSeries:
+        """Predicts one record at a point."""
+        series = self.predict([dc.replace(point, only=(number,))])[0][number]
+        assert series is not None
+        return series
 
     def simulate(
         self, points: Sequence[Point], progress: Callable[[int, int], None] | None = None
-    ) -> None:
+    ) -> "list[list[_Slice | None]]":
         """Simulates what `predict` will need, so that points can be predicted one by one."""
-        self._simulated(points, progress)
-
-    def _simulated(
-        self, points: Sequence[Point], progress: Callable[[int, int], None] | None
-    ) -> tuple[list[list["_Planned | None"]], list[JobResult]]:
-        jobs: list[Job] = []
-        plan: list[list[_Planned | None]] = []
-        for point in points:
-            row: list[_Planned | None] = []
-            for k in range(len(self.targets)):
-                if point.only is not None and k not in point.only:
-                    row.append(None)
-                    continue
-                job, R, p = self._job(point, k)
-                row.append(_Planned(None if job is None else len(jobs), R, p))
-                if job is not None:
-                    jobs.append(job)
-            plan.append(row)
-        return plan, self.simulator.run(jobs, progress)
+        plan = [
+            [
+                self._slice(point, k) if point.only is None or k in point.only else None
+                for k in range(len(self.targets))
+            ]
+            for point in points
+        ]
+        some = [s for row in plan for s in row if s is not None and s.job is not None]
+        results = self.simulator.run([s.job for s in some if s.job is not None], progress)
+        for simulated, result in zip(some, results, strict=True):
+            simulated.result = result
+        return plan
 
     def model(self, point: Point, target: RecordTarget) -> CuttingModel:
         """The cut of a record at a point."""
@@ -186,8 +184,8 @@ class SlicePredictor:
             model = active.cause.model(model, active.values, active.cause.visible(target.facts))
         return target.as_cut(model)
 
-    def _job(self, point: Point, number: int) -> tuple[Job | None, np.ndarray, np.ndarray]:
-        """What must be simulated, and the poses of the knife over the board at the grid."""
+    def _slice(self, point: Point, number: int) -> "_Slice":
+        """What must be simulated."""
         target = self.targets[number]
         own = point.records.get(target.facts.name, {})
         R, p = target.R, target.p
@@ -198,42 +196,26 @@ class SlicePredictor:
         for k, active in enumerate(point.causes):
             values, force = active.values, None
             if active.cause.uses_force:
-                before = dc.replace(point, causes=point.causes[:k], only=(number,))
-                series = self.predict([before])[0][number]
-                assert series is not None
-                force = series.wrench[:, 3:]
+                before = dc.replace(point, causes=point.causes[:k])
+                force = self.series(before, number).wrench[:, 3:]
             R, p = active.cause.motion(
                 R, p, target.grid, values, active.cause.visible(target.facts), force
             )
         if target.stretches is None:
-            return None, R, p
+            return _Slice(None, R, p)
         at_food = p if target.height_unknown else p - np.array([0.0, 0.0, height])
-        return (
-            Job(
-                self.model(point, target),
-                *target.poses(target.stretches, R, at_food),
-                target.stretches,
-                target.facts.name,
-            ),
-            R,
-            p,
-        )
+        poses = target.poses(target.stretches, R, at_food)
+        job = Job(self.model(point, target), *poses, target.stretches, target.facts.name)
+        return _Slice(job, R, p)
 
-    def _series(
-        self,
-        point: Point,
-        target: RecordTarget,
-        planned: "_Planned",
-        results: Sequence[JobResult],
-    ) -> ForceSeries:
-        result = None if planned.job is None else results[planned.job]
-        p = planned.p
+    def _series(self, point: Point, target: RecordTarget, simulated: "_Slice") -> ForceSeries:
+        R, p, result = simulated.R, simulated.p, simulated.result
         rise = target.rise(result)
         if rise.any():
             p = p + rise[:, None] * [0.0, 0.0, 1.0]
-        key = planned.R.tobytes() + p.tobytes()
+        key = R.tobytes() + p.tobytes()
         if key not in self._boards:
-            self._boards[key] = target.board(self.board, planned.R, p)
+            self._boards[key] = target.board(self.board, R, p)
         series = target.series(result, self._boards[key])
         for active in point.causes:
             facts = active.cause.visible(target.facts)
@@ -242,7 +224,10 @@ class SlicePredictor:
 
 
 @dc.dataclass
-class _Planned:
-    job: int | None
+class _Slice:
+    """A job, none without food; the poses of the knife over the board at the grid; its result."""
+
+    job: Job | None
     R: np.ndarray
     p: np.ndarray
+    result: JobResult | None = None

@@ -44,7 +44,6 @@ from sliceit_drake.diagnosis.evidence.columns import MESH, Column, RecordSensiti
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.prediction.clock import Clock
 from sliceit_drake.prediction.record_target import Meshing, RecordTarget
-from sliceit_drake.prediction.series import ForceSeries
 from sliceit_drake.prediction.simulator import Workers
 from sliceit_drake.records.slice_record import SliceRecord
 
@@ -274,11 +273,11 @@ class _Computation:
         """A record, and labels of the columns whose slices broke down."""
         failed: list[str] = []
         target = self.predictor.targets[number]
-        base = self._series(self.point, number)
+        base = self.predictor.series(self.point, number)
         wrenches, places = [base.wrench], []
         for change in self.changes:
             if change.cause is None:
-                moved = [self._series(p, number).wrench for p in change.ends]
+                moved = [self.predictor.series(p, number).wrench for p in change.ends]
             else:
                 facts = change.cause.visible(target.facts)
                 moved = [change.cause.wrench(base, v, facts) for v in change.values]
@@ -308,12 +307,6 @@ class _Computation:
             arrays = {name: getattr(record, name) for name in STORED}
             self.store.save(self._key(target), arrays | {"failed": np.array(failed, np.str_)})
         return record, failed
-
-    def _series(self, point: Point, number: int) -> ForceSeries:
-        (row,) = self.predictor.predict([dc.replace(point, only=(number,))])
-        series = row[number]
-        assert series is not None
-        return series
 
     def _load(self, target: RecordTarget) -> tuple[RecordSensitivity, list[str]] | None:
         arrays = None if self.common is None else self.store.load(self._key(target))

@@ -42,36 +42,22 @@ def slice_figure(results: Sequence["OneSlice"], titles: Sequence[str]) -> "Figur
         top.plot(
             depth, result.fit.predicted[:, channel], "--", color=FITTED, lw=1.6, label="fitted"
         )
-        best = next(iter(result.supported), None)
+        fit = result.fit
+        rests = [
+            (fit.predicted, "--", FITTED, 1.4, "fitted to all depth ({:.2f} N RMS)"),
+            (fit.held_out, "-", LEFT_OUT, 1.4, "each block left out ({:.2f} N)"),
+        ]
+        for best in result.supported[:1]:
+            own = result.fits[best.name].held_out
+            rests.append((own, ":", CAUSE, 1.8, f"left out, with {best.name} ({{:.2f}} N)"))
         bottom.axhline(0.0, color="0.6", lw=0.8)
         for axis in (top, bottom):
             _blocks(axis, result)
             axis.grid(alpha=0.25)
-        bottom.plot(
-            depth,
-            measured - result.fit.predicted[:, channel],
-            "--",
-            color=FITTED,
-            lw=1.4,
-            label=f"fitted to all depth ({result.error(result.fit.predicted):.2f} N RMS)",
-        )
-        bottom.plot(
-            depth,
-            measured - result.fit.held_out[:, channel],
-            color=LEFT_OUT,
-            lw=1.4,
-            label=f"each block left out ({result.error(result.fit.held_out):.2f} N)",
-        )
-        if best is not None:
-            own = result.fits[best.name]
-            bottom.plot(
-                depth,
-                measured - own.held_out[:, channel],
-                ":",
-                color=CAUSE,
-                lw=1.8,
-                label=f"left out, with {best.name} ({result.error(own.held_out):.2f} N)",
-            )
+        for predicted, style, color, width, label in rests:
+            label = label.format(result.error(predicted))
+            left = measured - predicted[:, channel]
+            bottom.plot(depth, left, style, color=color, lw=width, label=label)
         top.set_title(title, loc="left", fontsize=11)
         bottom.set_xlabel("depth of the edge, as the record says [mm]")
         top.legend(frameon=False, fontsize=9, loc="upper left")
