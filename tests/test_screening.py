@@ -162,7 +162,7 @@ def test_what_is_usual_counts_beyond_the_usual_unless_it_is_unusual(amount):
 
 
 def test_a_cause_that_never_gains_by_chance_is_not_proved_by_next_to_nothing():
-    evidence = CauseEvidence("x", 0.4, 0.0, 0.0, 0.0, None, ["x"], [1.0], [1.0], [1.0], [""], False)
+    evidence = CauseEvidence("x", 0.4, 0.0, 0.0, 0.0, None, [Column("cause", "x")], [1.0], [1.0])
     assert evidence.deviations == pytest.approx(0.8)
     found = sensitivities(plain=0.02)
     without = screened(found)[1]

@@ -78,6 +78,10 @@ class CauseParameter:
         """Whether the null is a bound, so that the cause can act in one direction alone."""
         return self.null in (self.low, self.high)
 
+    def within(self, value: float) -> float:
+        """The value in the range that is nearest to another."""
+        return float(np.clip(value, self.low, self.high))
+
 
 @dc.dataclass(frozen=True)
 class Scan:
@@ -157,6 +161,10 @@ class Cause:
     def visible(self, facts: SliceFacts) -> SliceFacts:
         """Facts of a slice, without those that the cause does not go by."""
         return facts if self.by_slice else SharedFacts.of(facts)
+
+    def parameter(self, name: str) -> CauseParameter:
+        """One of its parameters."""
+        return next(p for p in self.parameters if p.name == name)
 
     def nulls(self) -> dict[str, float]:
         """Values at which it is absent."""

@@ -9,7 +9,7 @@ import numpy as np
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.model import CuttingModel
-from sliceit_drake.cutting.parameters import with_parameters
+from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.prediction.clock import Clock
 from sliceit_drake.prediction.jobs import Job, JobResult
@@ -29,17 +29,19 @@ class RecordEffect:
         name: Its name.
         unit: Its unit; "" for the logarithm of a factor.
         size: Plausible standard deviation, and the step of the derivative.
+        parameter: Of the cut that it multiplies; "" for none.
     """
 
     name: str
     unit: str
     size: float
+    parameter: str = ""
 
 
 RECORD_EFFECTS = (
-    RecordEffect("toughness", "", 0.05),
-    RecordEffect("stiffness", "", 0.05),
-    RecordEffect("friction", "", 0.05),
+    RecordEffect("toughness", "", 0.05, "material.toughness"),
+    RecordEffect("stiffness", "", 0.05, "material.youngs_modulus"),
+    RecordEffect("friction", "", 0.05, "material.friction"),
     RecordEffect("height", "m", 3e-4),
 )
 """Logarithms of factors on toughness, modulus and friction of the slice; by how much its food is
@@ -47,12 +49,6 @@ higher (where heights are only known from the force: by how much its knife is lo
 
 SPEED = RecordEffect("speed", "", 0.05)
 """Logarithm of a factor on the speed, of a record whose speed is not known."""
-
-MATERIAL = {
-    "toughness": "material.toughness",
-    "stiffness": "material.youngs_modulus",
-    "friction": "material.friction",
-}
 
 
 @dc.dataclass(frozen=True)
@@ -175,9 +171,9 @@ class SlicePredictor:
         model = with_parameters(model, dict(point.values)) if point.values else model
         own = point.records.get(target.facts.name, {})
         factors = {
-            name: getattr(model.material, name.split(".")[1]) * float(np.exp(own[kind]))
-            for kind, name in MATERIAL.items()
-            if own.get(kind)
+            e.parameter: get_parameter(model, e.parameter) * float(np.exp(own[e.name]))
+            for e in RECORD_EFFECTS
+            if e.parameter and own.get(e.name)
         }
         model = with_parameters(model, factors) if factors else model
         for active in point.causes:

@@ -97,10 +97,9 @@ class Diagnosis:
         values = cause.nulls()
         if cause.scan is not None and e.scan is not None:
             values[cause.scan.name] = e.scan
-        by_name = {p.name: p for p in cause.parameters}
-        for name, coefficient, size in zip(e.parameters, e.coefficients, e.sizes, strict=True):
-            p = by_name[name]
-            values[name] = float(np.clip(p.null + coefficient * size, p.low, p.high))
+        for column, coefficient in zip(e.columns, e.coefficients, strict=True):
+            p = cause.parameter(column.parameter)
+            values[p.name] = p.within(p.null + coefficient * column.size)
         return values
 
     def table(self) -> str:
@@ -156,9 +155,9 @@ class Diagnosis:
         e, cause = finding.evidence, self.causes[finding.evidence.name]
         values = self.values(finding)
         parts = []
-        for name, size, error, unit in zip(e.parameters, e.sizes, e.errors, e.units, strict=True):
-            spread = f" +- {abs(error * size):.2g}" if np.isfinite(error) else ""
-            parts.append(f"{name} = {values[name]:.3g}{spread} {unit}".rstrip())
+        for c, error in zip(e.columns, e.errors, strict=True):
+            spread = f" +- {abs(error * c.size):.2g}" if np.isfinite(error) else ""
+            parts.append(f"{c.parameter} = {values[c.parameter]:.3g}{spread} {c.unit}".rstrip())
         head = "Supported" if named else "Nearest"
         lines = [
             f"  {head}: {e.name} ({cause.family}), {', '.join(parts)}; "

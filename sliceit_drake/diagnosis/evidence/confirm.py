@@ -91,9 +91,8 @@ def confirm(
                 logs[k] += float(np.clip(change, -3.0, 3.0)) * column.size
                 continue
             cause = next(c for c, _ in causes if c.name == column.name)
-            parameter = next(p for p in cause.parameters if p.name == column.parameter)
             value = at[column.name][column.parameter] + float(change) * column.size
-            at[column.name][column.parameter] = float(np.clip(value, parameter.low, parameter.high))
+            at[column.name][column.parameter] = cause.parameter(column.parameter).within(value)
     assert best is not None
     chi_square, moved, at, logs = best
     return Confirmation(

@@ -26,7 +26,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
+from sliceit_drake.diagnosis.evidence.columns import CauseAtScan, Column
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem, scaled_inverse
 
 __all__ = ["CauseEvidence", "Screening", "screen"]
@@ -60,12 +60,10 @@ class CauseEvidence:
         expected, deviation: Mean and standard deviation of `gain` where nothing is wrong.
         limit: Its 95 % quantile there.
         scan: The best value of the scan, or None.
-        parameters: Names of its parameters.
-        coefficients: Of its columns, in their sizes; mean over the records where each has its own.
+        columns: Of its parameters there: a coefficient times the size of its column is the
+            parameter's distance from null.
+        coefficients: Of the columns, in their sizes; mean over the records where each has its own.
         errors: Standard errors of the coefficients.
-        sizes: Of the columns: a coefficient times its size is the parameter's distance from null.
-        units: Of the parameters.
-        per_record: Whether each record has coefficients of its own.
         by_record: These [R, n]; empty where they are shared.
         presence: Fraction of the records that it could show in in which it does; 1 where
             coefficients are shared.
@@ -77,12 +75,9 @@ class CauseEvidence:
     deviation: float
     limit: float
     scan: float | None
-    parameters: list[str]
+    columns: list[Column]
     coefficients: list[float]
     errors: list[float]
-    sizes: list[float]
-    units: list[str]
-    per_record: bool
     by_record: list[list[float]] = dc.field(default_factory=list)
     presence: float = 1.0
 
@@ -90,6 +85,11 @@ class CauseEvidence:
     def cause(self) -> CauseAtScan:
         """The cause at the best value of its scan."""
         return self.name, self.scan
+
+    @property
+    def per_record(self) -> bool:
+        """Whether each record has coefficients of its own."""
+        return self.columns[0].per_record
 
     @property
     def score(self) -> float:
@@ -435,12 +435,9 @@ def screen(
                 deviation=float(by_chance.std()),
                 limit=float(np.quantile(by_chance, 0.95)),
                 scan=scan,
-                parameters=[c.parameter for c in kinds],
+                columns=kinds,
                 coefficients=value.tolist(),
                 errors=error.tolist(),
-                sizes=[c.size for c in kinds],
-                units=[c.unit for c in kinds],
-                per_record=statistics.per_record[name],
                 by_record=fits.tolist(),
                 presence=presence,
             )

@@ -17,8 +17,6 @@ import dataclasses as dc
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from sliceit_drake.cutting.foods.shapes import MeshFile, Remainder, Tapered
 from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
 from sliceit_drake.diagnosis.evidence.screen import CauseEvidence
@@ -175,11 +173,8 @@ def _classes(diagnosis: Diagnosis) -> list[CauseClass]:
 
 def _within_range(diagnosis: Diagnosis, evidence: CauseEvidence) -> CauseEvidence:
     """Evidence whose coefficients give values that the cause may have."""
-    by_name = {p.name: p for p in diagnosis.causes[evidence.name].parameters}
     coefficients = []
-    for name, x, size in zip(
-        evidence.parameters, evidence.coefficients, evidence.sizes, strict=True
-    ):
-        p = by_name[name]
-        coefficients.append(float(np.clip(p.null + x * size, p.low, p.high) - p.null) / size)
+    for column, x in zip(evidence.columns, evidence.coefficients, strict=True):
+        p = diagnosis.causes[evidence.name].parameter(column.parameter)
+        coefficients.append((p.within(p.null + x * column.size) - p.null) / column.size)
     return dc.replace(evidence, coefficients=coefficients)
