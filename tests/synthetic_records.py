@@ -57,10 +57,6 @@ def record(
     return RecordSensitivity(
         name=name,
         condition=f"press at {speed}",
-        slice_index=0,
-        knife_slices=0,
-        speed=speed,
-        draw_ratio=0.0,
         channels=("force_z",),
         time=time,
         phase=np.full(ROWS, "slice"),

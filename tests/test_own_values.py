@@ -31,10 +31,6 @@ def record(number: int, height: float, rng: np.random.Generator) -> RecordSensit
     return RecordSensitivity(
         name=f"slice_{number}",
         condition="press",
-        slice_index=number,
-        knife_slices=number,
-        speed=0.02,
-        draw_ratio=0.0,
         channels=("force_z",),
         time=depth / 0.02,
         phase=np.full(len(depth), "slice"),

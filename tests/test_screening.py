@@ -63,10 +63,6 @@ def record(number: int, hidden: dict[str, float]) -> RecordSensitivity:
     return RecordSensitivity(
         name=f"slice {number}",
         condition=f"condition {sign}",
-        slice_index=number,
-        knife_slices=number,
-        speed=0.02,
-        draw_ratio=0.0,
         channels=("force_z",),
         time=TIME,
         phase=np.full(ROWS, "slice"),

@@ -18,7 +18,7 @@ from sliceit_drake.diagnosis.causes.mounting import BoardLaw
 from sliceit_drake.diagnosis.causes.sensor import SensorGain
 from sliceit_drake.diagnosis.evidence.columns import Column, Sensitivities
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
-from sliceit_drake.diagnosis.experiments.identifiability import ANGLE, Evidence, NoiseLevel
+from sliceit_drake.diagnosis.experiments.identifiability import ANGLE, Evidence
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.diagnosis.registry import load_cause
 from sliceit_drake.prediction.clock import BLOCK, Clock
@@ -357,9 +357,8 @@ def test_the_report_names_what_does_not_show_and_what_would_part_it():
 def test_what_is_integrated_out_takes_no_part_in_an_angle():
     found = protocols()
     s = found.found
-    noise = NoiseLevel()
     record = dc.replace(s.records[0])
-    evidence = Evidence(dc.replace(s, records=[record]), noise)
+    evidence = Evidence(dc.replace(s, records=[record]))
     (k,) = s.index("base", "material.toughness")
     # With one slice its toughness is known to 5 % at best: the column is a standard deviation.
     assert evidence.gram([k], [0])[0, 0] < 1.0

@@ -7,10 +7,13 @@ import numpy as np
 
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.experiments.identifiability import (
+    CORRELATED,
     FLAT,
+    WHITE,
     Evidence,
     Identifiability,
     identifiability,
+    noise_scale,
     shift_sizes,
 )
 
@@ -114,10 +117,9 @@ def _remaining(
 ) -> np.ndarray:
     """A combination of columns in a record, less what differs from slice to slice, in standard
     deviations of a row's noise [m, c]."""
-    record, noise = evidence.found.records[number], evidence.noise
+    record = evidence.found.records[number]
     at = [evidence.kept.index(k) for k in columns]
     slices = evidence.taken[number][: len(evidence.random), at] @ weights
     total = record.columns[:, :, list(columns)] @ weights
     total = total - record.columns[:, :, evidence.random] @ slices
-    scale = np.array([noise.scale(name) for name in record.channels])
-    return np.asarray(total / (scale * np.hypot(noise.correlated, noise.white)))
+    return np.asarray(total / (noise_scale(record) * np.hypot(CORRELATED, WHITE)))

@@ -67,8 +67,6 @@ class RecordSensitivity:
 
     Attributes:
         name, condition: Of the record.
-        slice_index, knife_slices: Its place in the session and in the life of the edge.
-        speed, draw_ratio: Of the press, m/s, and the draw over it; 0 where none is given.
         channels: Names of the channels [c].
         time: Of the rows [m], s.
         phase: Label at the rows [m].
@@ -85,10 +83,6 @@ class RecordSensitivity:
 
     name: str
     condition: str
-    slice_index: int
-    knife_slices: int
-    speed: float
-    draw_ratio: float
     channels: tuple[str, ...]
     time: np.ndarray
     phase: np.ndarray

@@ -13,7 +13,6 @@ import numpy as np
 
 from sliceit_drake.cutting.parameters import get_parameter
 from sliceit_drake.diagnosis.cause import Cause
-from sliceit_drake.diagnosis.evidence.columns import MESH
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 
@@ -65,15 +64,9 @@ def confirm(
     """
     found = problem.found
     causes = [(cause, values) for cause, values in causes if not cause.per_record]
-    columns = {
-        cause.name: [
-            k
-            for k in found.index("cause", cause.name)
-            if found.columns[k].scan in (None, _scan(cause, values))
-        ]
-        for cause, values in causes
-    }
-    shared = [k for ks in columns.values() for k in ks]
+    shared = found.of_causes(
+        [(c.name, None if c.scan is None else values.get(c.scan.name)) for c, values in causes]
+    )
     _, start = _fit(problem, problem.base, shared)
     theta, end = _fit(problem, [*problem.base, *shared], shared)
     promised = start - end
@@ -102,10 +95,6 @@ def confirm(
         promised=promised,
         gained=start - chi_square,
     )
-
-
-def _scan(cause: Cause, values: Mapping[str, float]) -> float | None:
-    return None if cause.scan is None else values.get(cause.scan.name)
 
 
 def _fit(
@@ -137,7 +126,6 @@ def _at_point(
     values = {n: float(get_parameter(model, n)) * float(np.exp(x)) for n, x in names.items()}
     active = tuple(ActiveCause(cause, at[cause.name]) for cause, _ in causes)
     before, after = predictor.predict([Point(), Point(values=values, causes=active)], progress)
-    mesh = next((k for k in problem.numerical if found.columns[k] == MESH), None)
     moved = []
     for record, target, first, second in zip(
         found.records, predictor.targets, before, after, strict=True
@@ -145,8 +133,8 @@ def _at_point(
         assert first is not None and second is not None
         seen = target.compare(np.stack([first.wrench, second.wrench], axis=2))
         predicted = seen[:, :, 1]
-        if mesh is not None:
+        if problem.mesh is not None:
             # Of the finer mesh, as the prediction is; its difference is taken from the base model.
-            predicted = predicted - record.columns[:, :, mesh]
+            predicted = predicted - record.columns[:, :, problem.mesh]
         moved.append(predicted)
     return problem.predicting(moved)

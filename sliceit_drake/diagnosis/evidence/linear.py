@@ -17,7 +17,12 @@ from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
-from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, Sensitivities, replicates
+from sliceit_drake.diagnosis.evidence.columns import (
+    MESH,
+    RecordSensitivity,
+    Sensitivities,
+    replicates,
+)
 from sliceit_drake.diagnosis.evidence.noise_levels import ChannelNoise, differences, estimate_noise
 
 __all__ = ["USUAL", "LinearProblem", "Moments", "integrate_out", "scaled_inverse"]
@@ -26,15 +31,14 @@ KNOT = 4e-3
 """Spacing of the splines of depth in which the discretisation's error is taken to vary, metres."""
 PHASE_KNOTS = 20
 """Splines over the time of each condition's record, for the nonparametric correction."""
-USUAL = (
-    ("sensor_delay", 1.0, "delay", 1.5e-3, False),
-    ("sensor_delay", 4.0, "delay", 1.5e-3, False),
-    *(("sensor_zero", None, f"bias_{a}", 0.1, True) for a in "xyz"),
-    *(("sensor_zero", None, f"drift_{a}", 0.02, True) for a in "xyz"),
-)
-"""What every sensor has: cause, value of its scan, parameter, usual standard deviation in its unit,
-and whether that differs from record to record. Only more than that is a finding, or what should
-differ and is the same in all records."""
+USUAL = {
+    ("sensor_delay", "delay"): (1.5e-3, False),
+    **{("sensor_zero", f"bias_{a}"): (0.1, True) for a in "xyz"},
+    **{("sensor_zero", f"drift_{a}"): (0.02, True) for a in "xyz"},
+}
+"""What every sensor has, by cause and parameter: usual standard deviation in its unit, and whether
+that differs from record to record. Only more than that is a finding, or what should differ and is
+the same in all records."""
 DISCRETISATION = 0.5
 """Standard deviation of the discretisation's error as a function of depth, in that of the mesh
 column."""
@@ -77,6 +81,7 @@ class LinearProblem:
         repeated: Whether the noise is from replicates.
         conditions: Numbers of the records of each condition.
         base, own, numerical: Numbers of columns.
+        mesh: Number of the column of the mesh; None without one.
         usual: Numbers of columns of `USUAL` that all records share, and their standard deviations.
         usual_own: The same of those that are each record's own.
         spline: Numbers of the columns appended for the discretisation's error.
@@ -100,6 +105,7 @@ class LinearProblem:
         self.base = found.index("base")
         self.own = found.index("record")
         self.numerical = found.index("numerical")
+        self.mesh = next(iter(found.index("numerical", MESH.name)), None)
         self.conditions = replicates(found.records)
         if noise is None:
             self.noise, self.repeated = estimate_noise(found.records, self.own)
@@ -115,9 +121,9 @@ class LinearProblem:
         shared: dict[int, float] = {}
         own: dict[int, float] = {}
         for k, column in enumerate(self.found.columns):
-            for cause, scan, parameter, deviation, differs in USUAL:
-                if (column.name, column.scan, column.parameter) == (cause, scan, parameter):
-                    (own if differs else shared)[k] = deviation / column.size
+            if (column.name, column.parameter) in USUAL:
+                deviation, differs = USUAL[column.name, column.parameter]
+                (own if differs else shared)[k] = deviation / column.size
         return shared, own
 
     def _make_moments(self) -> None:
@@ -132,8 +138,7 @@ class LinearProblem:
         self.correction = list(range(K + S, K + S + N))
         self.size = K + S + N
         self.discretisation = np.zeros(S)
-        mesh = [k for k in self.numerical if found.columns[k].name == "mesh"]
-        scale = self._mesh_scale(mesh, len(channels))
+        scale = self._mesh_scale(len(channels))
         for c in range(len(channels)):
             self.discretisation[c * count : (c + 1) * count] = scale[c]
         gram = np.zeros((len(found.records), self.size + 1, self.size + 1))
@@ -207,14 +212,14 @@ class LinearProblem:
             self._reduced[key] = np.array([integrate_out(G, list(own), variance) for G in gram])
         return self._reduced[key]
 
-    def _mesh_scale(self, mesh: list[int], channels: int) -> np.ndarray:
+    def _mesh_scale(self, channels: int) -> np.ndarray:
         """Standard deviation of the discretisation's error by channel [c]."""
-        if not mesh:
+        if self.mesh is None:
             return np.full(channels, RIDGE)
         squares, count = np.zeros(channels), 0
         for record in self.found.records:
             inside = record.in_contact
-            squares += (record.columns[inside][:, :, mesh[0]] ** 2).sum(0)
+            squares += (record.columns[inside][:, :, self.mesh] ** 2).sum(0)
             count += int(inside.sum())
         return DISCRETISATION * np.sqrt(squares / max(count, 1)) + RIDGE
 
@@ -305,9 +310,8 @@ class LinearProblem:
         """Standard deviation of what the model is unsure of at each row by itself [m, c]: when a
         force jumps, and what a finer mesh still may change."""
         out = record.kinks()
-        for k in self.numerical:
-            if self.found.columns[k].name == "mesh":
-                out = np.hypot(out, FINE_MESH * record.columns[:, :, k])
+        if self.mesh is not None:
+            out = np.hypot(out, FINE_MESH * record.columns[:, :, self.mesh])
         if record.bent is not None:
             out = np.hypot(out, SECOND_ORDER * record.bent)
         return np.asarray(out)

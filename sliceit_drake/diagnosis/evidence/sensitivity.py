@@ -330,17 +330,12 @@ class _Computation:
     def _empty(
         self, target: RecordTarget, in_contact: np.ndarray, predicted: np.ndarray
     ) -> RecordSensitivity:
-        facts = target.facts
         moved = np.linalg.norm(np.diff(target.p, axis=0), axis=1)
         way = np.concatenate([[0.0], np.cumsum(moved)])
         nothing = np.zeros((*predicted.shape, len(self.changes)), np.float32)
         return RecordSensitivity(
-            name=facts.name,
-            condition=facts.condition,
-            slice_index=facts.slice_index,
-            knife_slices=facts.knife_slices,
-            speed=facts.speed,
-            draw_ratio=facts.draw_ratio,
+            name=target.facts.name,
+            condition=target.facts.condition,
             channels=target.channels,
             time=target.time,
             phase=target.phase,

@@ -17,14 +17,16 @@ from sliceit_drake.prediction.noise import MarkovCovariance
 
 __all__ = [
     "ANGLE",
+    "CORRELATED",
     "FLAT",
     "SHIFT",
     "SHOWS",
+    "WHITE",
     "Evidence",
     "Identifiability",
-    "NoiseLevel",
     "classes",
     "identifiability",
+    "noise_scale",
     "shift_sizes",
     "short",
 ]
@@ -39,27 +41,15 @@ FLAT = 1e-9
 """Precision of base parameters before any data, relative to what the data say of them."""
 
 
-@dc.dataclass(frozen=True)
-class NoiseLevel:
-    """Noise that is taken for plausible: of a good sensor, and of food that is not even.
-
-    Attributes:
-        correlated, white: Standard deviations of the force, N, of a part that is correlated over
-            `time`, s, and one that is not.
-        torque: Of the torque's noise over the force's, m.
-        bias, drift: What taring leaves, N, and how far it wanders in a record, N/s.
-    """
-
-    correlated: float = 0.08
-    time: float = 0.1
-    white: float = 0.035
-    torque: float = 0.08
-    bias: float = 0.05
-    drift: float = 0.01
-
-    def scale(self, channel: str) -> float:
-        """Ratio of a channel's noise to that of a force."""
-        return self.torque if channel.startswith("torque") else 1.0
+CORRELATED, WHITE = 0.08, 0.035
+"""Standard deviations of a force, N, of a part that is correlated over `TIME` and one that is not:
+a good sensor, and food that is not even."""
+TIME = 0.1
+"""Correlation time of the noise, s."""
+TORQUE = 0.08
+"""Noise of a torque over that of a force, m."""
+BIAS, DRIFT = 0.05, 0.01
+"""What taring leaves, N, and how far it wanders in a record, N/s."""
 
 
 class Evidence:
@@ -68,18 +58,15 @@ class Evidence:
     Differences from slice to slice and the sensor's zero are integrated out with their plausible
     spread; columns with a coefficient for each record stand side by side.
 
-    Args:
-        found: Sensitivities.
-        noise: Of the records.
-
     Attributes:
+        found: Sensitivities.
         random, kept: Numbers of the columns that differ from slice to slice, and of the others.
         grams: Scalar products of the kept columns in each record [K', K'].
         taken: How much of each difference the kept columns look like, by record [n, K'].
     """
 
-    def __init__(self, found: Sensitivities, noise: NoiseLevel | None = None) -> None:
-        self.found, self.noise = found, noise or NoiseLevel()
+    def __init__(self, found: Sensitivities) -> None:
+        self.found = found
         K = len(found.columns)
         self.random = found.index("record")
         self.kept = [k for k in range(K) if k not in set(self.random)]
@@ -92,18 +79,16 @@ class Evidence:
     def _add(self, record: RecordSensitivity) -> None:
         """Reduces one record to `grams` and `taken`."""
         m, c, _ = record.columns.shape
-        scale = np.array([self.noise.scale(name) for name in record.channels])
-        columns = record.columns / scale[:, None]
+        columns = record.columns / noise_scale(record)[:, None]
         since = record.time - record.time[0]
         zero = np.zeros((m, c, 2 * c))
         for channel in range(c):
-            zero[:, channel, channel] = self.noise.bias
-            zero[:, channel, c + channel] = self.noise.drift * since
+            zero[:, channel, channel] = BIAS
+            zero[:, channel, c + channel] = DRIFT * since
         columns = np.concatenate(
             [columns[:, :, self.kept], columns[:, :, self.random], zero], axis=2
         )
-        noise = self.noise
-        V = MarkovCovariance(np.diff(record.time), noise.correlated, noise.time, noise.white)
+        V = MarkovCovariance(np.diff(record.time), CORRELATED, TIME, WHITE)
         solved = np.stack([V.solve(columns[:, channel]) for channel in range(c)], axis=1)
         G = columns.reshape(m * c, -1).T @ solved.reshape(m * c, -1)
         n = len(self.kept)
@@ -179,6 +164,11 @@ class Evidence:
             if one and G[at.start, other.start] <= 0.0:
                 return 0.0
         return _share_explained(G, at, other)
+
+
+def noise_scale(record: RecordSensitivity) -> np.ndarray:
+    """Ratio of each channel's noise to that of a force [c]."""
+    return np.array([TORQUE if c.startswith("torque") else 1.0 for c in record.channels])
 
 
 def _share_explained(G: np.ndarray, a: slice, b: slice) -> float:

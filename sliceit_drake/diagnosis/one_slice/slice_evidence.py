@@ -306,10 +306,9 @@ def _known(found: Sensitivities) -> tuple[list[int], np.ndarray]:
     """Columns whose coefficient is known but for a plausible spread, and their precision."""
     columns, precision = list(found.index("numerical")), [1.0] * len(found.index("numerical"))
     for k, c in enumerate(found.columns):
-        for cause, scan, parameter, deviation, _ in USUAL:
-            if (c.name, c.scan, c.parameter) == (cause, scan, parameter):
-                columns.append(k)
-                precision.append((c.size / deviation) ** 2)
+        if (c.name, c.parameter) in USUAL:
+            columns.append(k)
+            precision.append((c.size / USUAL[c.name, c.parameter][0]) ** 2)
     return columns, np.array(precision)
 
 
