@@ -129,7 +129,8 @@ def test_a_cause_that_foretells_no_other_record_is_unknown():
         checked_out_of_sample(verdict, dc.replace(poor, before=0.9 * poor.floor), found) is verdict
     )
     # Nor what differs from record to record.
-    finding.evidence.per_record = True
+    evidence = finding.evidence
+    evidence.columns = [dc.replace(c, per_record=True) for c in evidence.columns]
     assert checked_out_of_sample(verdict, poor, found) is verdict
 
 

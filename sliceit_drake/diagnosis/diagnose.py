@@ -64,11 +64,10 @@ def diagnose(
 
     Args:
         setup: The model: food at its calibrated values, base parameters.
-        records: Slice records.
+        records: At least two.
         extra: Causes of the user's, beside the built-in ones.
         cache: Folder for sensitivities.
-        replicates: Of the bootstrap.
-        seed: Of the bootstrap.
+        replicates, seed: Of the bootstrap.
         workers: What simulates.
         progress: See `Progress`.
         other_food: Whether records of a food of another name than the model's are meant.

@@ -37,7 +37,7 @@ OBVIOUS = ("missing fact", "phases", "unknown name")
 def check_records(
     records: Sequence[SliceRecord], food: Food, other_food: bool = False
 ) -> list[str]:
-    """Refuses records that do not belong together or to the model.
+    """Refuses records that do not belong together or to the model's food.
 
     Args:
         records: Of the diagnosis.

@@ -52,11 +52,7 @@ def all_causes() -> list[Cause]:
 
 
 def open_causes(base: Sequence[str], extra: Sequence[Cause] = ()) -> list[Cause]:
-    """All causes that are more than a shift of a base parameter, and some of a user's.
-
-    Args:
-        base: Names of the free base parameters.
-        extra: A user's.
+    """All causes that are more than a shift of a free base parameter, and some of a user's.
 
     Raises:
         ConfigurationError: A name is there twice.
@@ -140,11 +136,7 @@ HEIGHT = 0.027
 
 
 def dry_run(cause: Cause, source: str = "") -> None:
-    """Calls the hooks of a cause at its nulls and at its size.
-
-    Args:
-        cause: Complete, as `check_cause` has it.
-        source: File, for messages.
+    """Calls the hooks of a complete cause at its nulls and at its size.
 
     Raises:
         ConfigurationError: A hook gives what cannot be used, or changes something at the nulls.

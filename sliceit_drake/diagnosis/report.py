@@ -115,14 +115,8 @@ def evidence_figure(screening: Screening) -> "Figure":
 def report_html(
     table: str, problem: LinearProblem, verdict: Verdict, gain: HeldOutGain | None
 ) -> str:
-    """The report as one self-contained page.
-
-    Args:
-        table: The result as text.
-        problem: The records' moments.
-        verdict: The decision and the evidence.
-        gain: Error on records that were left out; None if nothing is named.
-    """
+    """The report as one self-contained page: the result as text, figures, and the error on records
+    that were left out, if anything is named."""
     rows = []
     if gain is not None:
         for record, (before, after) in zip(problem.found.records, gain.by_record, strict=True):

@@ -181,16 +181,7 @@ def replicates(records: Sequence[RecordSensitivity]) -> dict[str, list[int]]:
 
 
 def at_times(values: np.ndarray, time: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Rows at other times, between those that there are.
-
-    Args:
-        values: Of the rows [m, ...].
-        time: Of the rows [m], s.
-        wanted: Times [n], s.
-
-    Returns:
-        [n, ...].
-    """
+    """Rows [m, ...] at times [m] interpolated to wanted times [n], s: [n, ...]."""
     flat = values.reshape(len(values), -1)
     out = np.column_stack([np.interp(wanted, time, column) for column in flat.T])
     return out.reshape(len(wanted), *values.shape[1:])

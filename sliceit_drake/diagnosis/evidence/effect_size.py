@@ -21,7 +21,7 @@ def effect_in_noise(
 
     Args:
         problem: The records' moments.
-        columns: Of the effect.
+        columns: Numbers of the effect's columns [n].
         coefficients: Of the columns [n], or of each record [R, n].
         refit_slices: Whether what is each record's own is refitted as well. Without, an effect that
             differs between records as slices may differ keeps its size.

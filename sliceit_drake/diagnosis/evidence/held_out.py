@@ -111,15 +111,8 @@ def fitted_changes(problem: LinearProblem, causes: Sequence[CauseAtScan]) -> lis
 
 
 def own_coefficients(problem: LinearProblem, own: Sequence[int]) -> list[np.ndarray]:
-    """Coefficients of columns that are each record's own, where no cause is at work.
-
-    Args:
-        problem: The records' moments.
-        own: Numbers of columns [n].
-
-    Returns:
-        Of each record [n], in the columns' sizes.
-    """
+    """Coefficients of columns [n] that are each record's own, where no cause is at work: of each
+    record [n], in the columns' sizes."""
     linear = _Linear(problem, ())
     theta = linear.shared(linear.reduced.sum(0))
     at = [linear.own.index(k) for k in own]
@@ -129,13 +122,8 @@ def own_coefficients(problem: LinearProblem, own: Sequence[int]) -> list[np.ndar
 def _errors(
     problem: LinearProblem, causes: Sequence[CauseAtScan], not_usual: Sequence[int]
 ) -> np.ndarray:
-    """Sum of squared force errors in contact of each record when it is left out [R], N^2.
-
-    Args:
-        problem: The records' moments.
-        causes: What is fitted.
-        not_usual: Columns of which nothing is taken for usual.
-    """
+    """Sum of squared force errors in contact of each record when it is left out [R], N^2; of the
+    columns `not_usual` nothing is taken for usual."""
     linear = _Linear(problem, causes, not_usual)
     total = linear.reduced.sum(0)
     out = np.zeros(len(linear.reduced))

@@ -68,12 +68,7 @@ class Moments:
 
 
 class LinearProblem:
-    """Moments of records, and the levels of noise and variation.
-
-    Args:
-        found: Sensitivities.
-        noise: Of each channel; estimated by default.
-        variation: Standard deviations of what differs from slice to slice; estimated by default.
+    """Moments of records, and the levels of noise and variation, which are estimated by default.
 
     Attributes:
         found: Sensitivities.
@@ -172,11 +167,7 @@ class LinearProblem:
         return np.asarray(record.in_contact & (record.kinks() < deviation).all(1))
 
     def predicting(self, predicted: Sequence[np.ndarray]) -> "LinearProblem":
-        """The same problem, weights included, about other predictions.
-
-        Args:
-            predicted: Of each record [m, c].
-        """
+        """The same problem, weights included, about another prediction of each record [m, c]."""
         out = copy.copy(self)
         out._reduced = {}
         gram, force_gram = self.moments.gram.copy(), self.moments.force_gram.copy()
@@ -198,12 +189,8 @@ class LinearProblem:
         return out
 
     def reduced(self, own: Sequence[int], variance: np.ndarray) -> np.ndarray:
-        """Gram matrices with normal coefficients of these columns integrated out [R, K + 1, K + 1].
-
-        Args:
-            own: Numbers of columns [n].
-            variance: Of their coefficients [n].
-        """
+        """Gram matrices with normal coefficients of these columns [n], of variance [n], integrated
+        out [R, K + 1, K + 1]."""
         key = (tuple(own), variance.tobytes())
         if key not in self._reduced:
             if len(self._reduced) > KEPT:

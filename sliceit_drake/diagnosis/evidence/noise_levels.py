@@ -44,13 +44,8 @@ class ChannelNoise:
     def solve(
         self, time: np.ndarray, columns: np.ndarray, model_error: np.ndarray | float = 0.0
     ) -> np.ndarray:
-        """The inverse covariance at increasing times [m] times columns [m, k].
-
-        Args:
-            time: Times [m], s.
-            columns: [m, k].
-            model_error: Standard deviation of what the model is unsure of at each row [m].
-        """
+        """The inverse covariance at increasing times [m], s, times columns [m, k]; `model_error` is
+        the standard deviation of what the model is unsure of at each row [m]."""
         white = np.hypot(self.white, model_error)
         return MarkovCovariance(np.diff(time), self.ar, self.tau, white).solve(columns)
 
@@ -86,12 +81,8 @@ def differences(
 
     Replicates whose rows are not at the same times are interpolated to those of the first.
 
-    Args:
-        members: Records of one condition.
-        own: Numbers of columns.
-
     Returns:
-        Of each the times since its start [m], the difference [m, c] and those columns [m, c, k].
+        Of each the times since its start [m], the difference [m, c], the columns `own` [m, c, k].
     """
     count = min(len(r.time) for r in members)
     since = np.array([r.time[:count] - r.time[0] for r in members])

@@ -17,15 +17,13 @@ __all__ = ["at_own_values"]
 
 
 def at_own_values(problem: LinearProblem) -> Sensitivities:
-    """The sensitivities of a problem with the columns of each record's own at their values.
+    """The sensitivities of a problem about the mean slice, with the columns of each record's own at
+    their values.
 
     To second order in them: a change c b + e b^2 is linearised at the b that fits the record best,
     less the mean over all records, which may be another cause's doing. For what e does where that
     mean is the slices' own, there is a numerical column of each. Beyond the step of the derivative
     e b^2 goes on in a straight line, as it does past a sharp bend.
-
-    Args:
-        problem: About the mean slice.
     """
     found, own = problem.found, problem.own
     values = np.array(own_coefficients(problem, own)).reshape(-1, len(own))

@@ -325,14 +325,7 @@ class _Statistics:
 
 
 class _Eliminated:
-    """Columns of which each group of records has coefficients of its own, integrated out.
-
-    Args:
-        statistics: Of the records.
-        groups: Numbers of records.
-        columns: Numbers of the columns.
-        variance: Of their coefficients.
-    """
+    """Columns of which each group of records has coefficients of its own, integrated out."""
 
     def __init__(
         self,
@@ -393,8 +386,7 @@ def screen(
 
     Args:
         problem: The records' moments.
-        replicates: Of the bootstrap.
-        seed: Of the bootstrap.
+        replicates, seed: Of the bootstrap.
         assumed: Causes, each at a value of its scan, that are part of the model already.
         progress: Called with a number of replicates each time that these are done.
     """
@@ -417,8 +409,8 @@ def screen(
     for name in statistics.names:
         gain, (scan,) = gains[name]
         columns = problem.found.index("cause", name, scan)
-        value, error = statistics.coefficients(measured, columns)
         kinds = [problem.found.columns[c] for c in columns]
+        value, error = statistics.coefficients(measured, columns)
         fits, presence = np.zeros((0, 0)), 1.0
         if statistics.per_record[name]:
             fits, own_gains = statistics.own_fits(measured, columns)

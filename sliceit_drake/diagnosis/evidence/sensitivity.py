@@ -1,17 +1,5 @@
 """How each cause would change the prediction of slice records.
 
-In short:
-
-    setup = load_setup("cucumber.yaml")         # food at its calibrated values, base parameters
-    found = sensitivities(setup, records, open_causes([p.name for p in setup.parameters]),
-                          cache=Path("cache"), progress=lambda done, of: ...)
-    for record in found.records:                # one a record, all its rows, air included
-        record.measured, record.predicted       # [m, c], channels record.channels: force_x, ...
-        record.columns                          # [m, c, K], change of the prediction
-    for k, column in enumerate(found.columns):  # what column k is
-        column.kind                             # base, record, numerical or cause
-        column.name, column.parameter, column.scan, column.size
-
 A column is the change of the prediction when the parameter goes from its null (or the point) by
 `size`: for one that can go both ways (f(+size) - f(-size)) / 2, with the even part
 (f(+size) + f(-size)) / 2 - f(0) in `even`, which a linear model does not have: their sum is the

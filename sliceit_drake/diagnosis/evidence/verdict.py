@@ -170,14 +170,7 @@ def reach_verdict(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> Verdict:
-    """Screens, and decides.
-
-    Args:
-        problem: The records' moments.
-        replicates: Of the bootstrap.
-        seed: Of the bootstrap.
-        progress: Called with a number of replicates each time that these are done.
-    """
+    """Screens, and decides; see `screen`."""
     first = screen(problem, replicates, seed, progress=progress)
     counts = [len(m) for m in problem.conditions.values()]
     needed = max(0, MIN_REPLICATES - min(counts)) if max(counts) < MIN_REPLICATES else 0

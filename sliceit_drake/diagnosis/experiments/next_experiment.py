@@ -53,12 +53,12 @@ def next_experiment(
     workers: Workers = None,
     progress: Progress | None = None,
 ) -> NextExperiment:
-    """What to cut next.
+    """What to cut next, after the diagnosis of these records.
 
     Args:
-        diagnosis: Of the records.
-        records: The records at hand.
-        cache: Folder for finished simulations.
+        diagnosis: What was found in the records.
+        records: At hand.
+        cache: Folder for finished simulations; None for none.
         workers: What simulates.
         progress: See `sensitivity.Progress`.
     """

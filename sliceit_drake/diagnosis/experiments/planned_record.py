@@ -64,13 +64,9 @@ def planned_slice(
     template: SliceRecord,
     knife_slices: int = 0,
 ) -> PlannedSlice:
-    """A slice of an experiment, of the model's food as the records have it.
+    """A slice of an experiment: the model's food, with knife and place as a record has them.
 
-    Args:
-        experiment: The experiment.
-        setup: The model.
-        template: Record with the food, the knife and the place.
-        knife_slices: Slices since sharpening, before the first.
+    `knife_slices` have been cut since sharpening.
     """
     food = _scaled(food_of(setup.food, template), experiment.size)
     if experiment.peeled:
@@ -97,14 +93,8 @@ def planned_slice(
 def planned_record(
     plan: PlannedSlice, setup: CalibrationSetup, template: SliceRecord, index: int
 ) -> SliceRecord:
-    """The record that a planned slice would give, but with a force of zero.
-
-    Args:
-        plan: From `planned_slice`.
-        setup: The model.
-        template: Record whose sensor and columns it has.
-        index: Place in the session.
-    """
+    """The record that a slice would give at some place in the session, but with a force of zero;
+    sensor and columns are those of the template."""
     p_WF = np.array([0.0, 0.0, plan.board.height] if plan.position is None else plan.position)
     c, s = np.cos(plan.yaw), np.sin(plan.yaw)
     R_WF = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

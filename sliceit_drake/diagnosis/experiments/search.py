@@ -70,17 +70,7 @@ class _Choice:
 
 
 class ExperimentSearch:
-    """The motions of the menu against the classes of a verdict.
-
-    Args:
-        diagnosis: Of the records.
-        experiments: The menu.
-        classes: To be told apart.
-        records: The records at hand.
-        cache: Folder for finished simulations; None for none.
-        workers: What simulates.
-        progress: See `sensitivity.Progress`.
-    """
+    """The motions of a menu against classes that are to be told apart; see `next_experiment`."""
 
     def __init__(
         self,
@@ -93,8 +83,7 @@ class ExperimentSearch:
         progress: Progress | None,
     ) -> None:
         self.experiments, self.classes = experiments, classes
-        setup, template = diagnosis.setup, template_of(records)
-        knife = next_knife_slice(records)
+        setup, template, knife = diagnosis.setup, template_of(records), next_knife_slice(records)
         self.plans = [planned_slice(e, setup, template, knife) for e in self.experiments]
         first = 1 + max(r.metadata.slice_index for r in records)
         planned = [planned_record(plan, setup, template, first) for plan in self.plans]
@@ -102,15 +91,7 @@ class ExperimentSearch:
         names = {e.name for c in self.classes for e in c.evidence} | set(USUAL)
         names |= {name for c in self.classes for name, _ in c.assumed}
         causes = [diagnosis.causes[n] for n in found.causes if n in names]
-        new = sensitivities(
-            setup,
-            planned,
-            causes,
-            cache=cache,
-            workers=workers,
-            progress=progress,
-        )
-        self.warnings = new.warnings
+        new = sensitivities(setup, planned, causes, cache=cache, workers=workers, progress=progress)
         self.problem = _joined(diagnosis.problem, new, names)
         own, variance = self.problem.own_prior()
         reduced = [integrate_out(G, own, variance) for G in self.problem.moments.gram]

@@ -99,8 +99,7 @@ def diagnose_slice(
         record: The slice.
         extra: Causes of the user's, beside the built-in ones.
         cache: Folder for simulations.
-        replicates: Of the bootstrap.
-        seed: Of the bootstrap.
+        replicates, seed: Of the bootstrap.
         workers: What simulates.
         progress: See `diagnose.Progress`.
         remarks: What is known already that a reader must know.

@@ -262,8 +262,7 @@ def slice_evidence(
         free: Change of the prediction by each unknown of the fit [m, c, n].
         precision: Of these unknowns before the data [n].
         block: Number of each row's block of depth [m].
-        replicates: Of the bootstrap.
-        seed: Of the bootstrap.
+        replicates, seed: Of the bootstrap.
         own: Numbers of the unknowns that stay as fitted when depth is left out.
     """
     (record,) = found.records

@@ -21,12 +21,8 @@ MEASURED, FITTED, LEFT_OUT, CAUSE = "#111827", "#2563eb", "#c2410c", "#047857"
 
 
 def slice_figure(results: Sequence["OneSlice"], titles: Sequence[str]) -> "Figure":
-    """Force over depth, what the fit leaves, and what is left of depth that was left out.
-
-    Args:
-        results: Of one slice, by simulations that differ; one column each.
-        titles: Of the columns.
-    """
+    """Force over depth, what the fit leaves, and what is left of depth that was left out: a column
+    for each result of one slice, by simulations that differ."""
     from matplotlib.figure import Figure
 
     count = len(results)
