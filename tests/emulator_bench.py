@@ -3,6 +3,7 @@
 import itertools
 import os
 import socket
+import time
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from sliceit_drake.emulator.control_script import ControlScript
 from sliceit_drake.emulator.controller import Controller, ControllerConfig
 from sliceit_drake.emulator.emulator import Emulator
 from sliceit_drake.emulator.frames import PackageType, Recipe, encode_frame, take_frames
+from sliceit_drake.emulator.process import PendantClient
 from sliceit_drake.emulator.robot_model import KinematicRobot
 
 _number = itertools.count(1)
@@ -19,6 +21,15 @@ def free_address() -> str:
     """A loopback address that no other test of this run, and no other run, uses."""
     pid = os.getpid()
     return f"127.{20 + pid % 200}.{pid // 200 % 250}.{next(_number)}"
+
+
+def wait_until(pendant: PendantClient, moment: float, timeout: float = 30.0) -> dict:
+    """Waits for a controller time, s, within `timeout` s of wall time; the status then."""
+    end = time.monotonic() + timeout
+    while (status := pendant.status())["time"] < moment:
+        assert time.monotonic() < end, f"{status['time']} s after {timeout} s, not {moment} s"
+        time.sleep(0.002)
+    return status
 
 
 class Bench:

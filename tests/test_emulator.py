@@ -295,8 +295,8 @@ def moving_bench(config: ControllerConfig | None = None) -> ScriptBench:
     [
         (SafetyMode.PROTECTIVE_STOP, "pause", RuntimeState.PAUSED, 1 << 2 | 1 << 10),
         (SafetyMode.PROTECTIVE_STOP, "stop", RuntimeState.STOPPED, 1 << 2 | 1 << 10),
-        (SafetyMode.SAFEGUARD_STOP, None, RuntimeState.PAUSED, 1 << 4 | 1 << 10),
-        (SafetyMode.ROBOT_EMERGENCY_STOP, None, RuntimeState.STOPPED, 1 << 6 | 1 << 7 | 1 << 10),
+        (SafetyMode.SAFEGUARD_STOP, "", RuntimeState.PAUSED, 1 << 4 | 1 << 10),
+        (SafetyMode.ROBOT_EMERGENCY_STOP, "", RuntimeState.STOPPED, 1 << 6 | 1 << 7 | 1 << 10),
     ],
 )
 def test_a_stop_shows_in_the_bits_and_the_arm_brakes(mode, variant, runtime, bits):

@@ -12,7 +12,7 @@ import pytest
 import rtde_control
 import rtde_io
 import rtde_receive
-from emulator_bench import free_address
+from emulator_bench import free_address, wait_until
 from pydrake.systems.analysis import Simulator
 from urpy.rtde import rtde as universal_robots
 
@@ -164,7 +164,7 @@ def test_the_watchdog_stops_the_arm_when_the_client_falls_silent(ending):
             child.send_signal(ending)
             silent = emulator.pendant.status()
             wait_for(lambda: emulator.pendant.status()["runtime_state"] == "STOPPED")
-            status = emulator.pendant.wait_until(silent["time"] + 0.5)
+            status = wait_until(emulator.pendant, silent["time"] + 0.5)
             stops = [when for when, text in status["log"] if "RTDE watchdog: no" in text]
             # What the child had sent before it fell silent may still have been on its way.
             assert stops[0] - silent["time"] < 0.1 + 0.05
@@ -178,9 +178,9 @@ def test_the_watchdog_stops_the_arm_when_the_client_falls_silent(ending):
 def test_silence_freezes_the_timestamp_and_a_cut_socket_is_seen():
     with arm_alone() as emulator, receiver(emulator) as receive:
         emulator.pendant.inject("silence:0.3")
-        emulator.pendant.wait_until(emulator.pendant.status()["time"] + 0.05)
+        wait_until(emulator.pendant, emulator.pendant.status()["time"] + 0.05)
         frozen = receive.getTimestamp()
-        status = emulator.pendant.wait_until(frozen + 0.15)
+        status = wait_until(emulator.pendant, frozen + 0.15)
         assert receive.getTimestamp() == frozen < status["time"] - 0.1
         assert receive.isConnected()
         wait_for(lambda: receive.getTimestamp() > frozen + 0.3)

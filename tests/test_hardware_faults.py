@@ -9,6 +9,7 @@ import time
 
 import numpy as np
 import pytest
+from emulator_bench import wait_until
 from hardware_bench import emulated, run_hardware
 
 from sliceit_drake.resources import resource_path
@@ -62,7 +63,7 @@ def test_it_stops_the_robot_for_good(fault, said, tmp_path, monkeypatch, capsys)
         at = next(when for when, text in log if text.startswith("injected"))
         # When the network is there again nothing moves; after 4 s it did not either, in a minute.
         silence = float(fault.partition(":")[2]) if fault.startswith("silence") else 0.0
-        status = emulator.pendant.wait_until(at + min(silence, 1.0) + 0.2, timeout=120.0)
+        status = wait_until(emulator.pendant, at + min(silence, 1.0) + 0.2, timeout=120.0)
         stopped = re.search(r"STOPPED: \w+ at controller time ([\d.]+) s", printed)
     assert status["runtime_state"] == "STOPPED" and status["safety_mode"] == "NORMAL"
     assert np.abs(status["velocities"]).max() < 1e-3

@@ -41,14 +41,11 @@ class ControllerConfig:
         version: Software version: major, minor, bugfix, build.
         serial_number: Digits only, as a UR's.
         model: Answer to the dashboard's ``get robot model``.
-        protective_stop: Whether a protective stop pauses ("pause") or stops ("stop") the program;
-            which one a real PolyScope does was not checked.
         unlock_delay: Controller time before a protective stop can be unlocked, s.
         deceleration: Deceleration of the arm when its program stops, rad/s2; of the order of what
             Universal Robots publish as stopping times.
         speed_limit: Joint speed that raises a protective stop, rad/s; 191 degrees a second.
         position_limit: Joint position that raises a protective stop, rad; 363 degrees.
-        force_limit: Force of the tool that raises a protective stop, N; None for no limit.
         payload: Mass that is set on the pendant, kg.
         payload_cog: Its centre in the flange [3], m.
         is_zeroed: Whether the sensor shows zero at first, with that payload set.
@@ -57,12 +54,10 @@ class ControllerConfig:
     version: tuple[int, ...] = (5, 11, 1, 108318)
     serial_number: str = "20205500001"
     model: str = "UR5"
-    protective_stop: str = "pause"
     unlock_delay: float = 5.0
     deceleration: float = 10.0
     speed_limit: float = 3.3336
     position_limit: float = 6.3355
-    force_limit: float | None = None
     payload: float = 0.0
     payload_cog: tuple[float, float, float] = (0.0, 0.0, 0.0)
     is_zeroed: bool = False
@@ -231,14 +226,14 @@ class Controller:
         self.runtime = RuntimeState.PLAYING
         return True
 
-    def set_safety(self, mode: SafetyMode, why: str, program: str | None = None) -> None:
+    def set_safety(self, mode: SafetyMode, why: str, program: str = "pause") -> None:
         """Enters a safety mode, with what it does to program and power.
 
         Args:
             mode: The new mode.
             why: Reason, for the log.
-            program: Fate of the program in a protective stop, "pause" or "stop"; None for
-                `ControllerConfig`'s.
+            program: Fate of the program in a protective stop, "pause" or "stop"; which one a real
+                PolyScope chooses was not checked.
         """
         if mode == self.safety:
             return
@@ -249,10 +244,8 @@ class Controller:
         self.messages.append((MessageLevel.ERROR, f"{mode.name}: {why}"))
         self._stopped_at = self.time
         if mode == SafetyMode.PROTECTIVE_STOP:
-            if (program or self.config.protective_stop) == "stop":
-                self.stop_program("protective stop")
-            else:
-                self.pause("protective stop")
+            end = self.stop_program if program == "stop" else self.pause
+            end("protective stop")
         elif mode == SafetyMode.SAFEGUARD_STOP:
             self.pause("safeguard stop")
         else:
@@ -339,15 +332,12 @@ class Controller:
             return
         state, config = self.robot.state, self.config
         speed, reach = np.abs(state.velocities), np.abs(state.positions)
-        force = float(self.outputs["tcp_force_scalar"])  # type: ignore[arg-type]
         if speed.max() > config.speed_limit:
             joint = int(speed.argmax())
             why = f"joint {joint} at {speed[joint]:.2f} rad/s, limit {config.speed_limit:.2f}"
         elif reach.max() > config.position_limit:
             joint = int(reach.argmax())
             why = f"joint {joint} at {state.positions[joint]:.2f} rad"
-        elif config.force_limit is not None and force > config.force_limit:
-            why = f"force of {force:.0f} N at the tool, limit {config.force_limit:.0f}"
         else:
             return
         self.set_safety(SafetyMode.PROTECTIVE_STOP, why)

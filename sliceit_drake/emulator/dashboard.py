@@ -26,7 +26,7 @@ class Dashboard(Service):
             "robotmode": lambda: f"Robotmode: {controller.mode.name}",
             "safetymode": lambda: f"Safetymode: {controller.safety.name}",
             "safetystatus": lambda: f"Safetystatus: {controller.safety.name}",
-            "running": lambda: f"Program running: {str(self._is_playing()).lower()}",
+            "running": self._is_running,
             "programstate": self._program_state,
             "get loaded program": lambda: f"Loaded program: /programs/{_PROGRAM}",
             "isprogramsaved": lambda: f"true {_PROGRAM}",
@@ -83,8 +83,9 @@ class Dashboard(Service):
     def _version(self) -> str:
         return f"URSoftware {'.'.join(map(str, self._controller.config.version))} (Mar 03 2022)"
 
-    def _is_playing(self) -> bool:
-        return self._controller.runtime == RuntimeState.PLAYING
+    def _is_running(self) -> str:
+        is_playing = self._controller.runtime == RuntimeState.PLAYING
+        return f"Program running: {str(is_playing).lower()}"
 
     def _program_state(self) -> str:
         runtime = self._controller.runtime

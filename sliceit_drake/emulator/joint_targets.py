@@ -40,10 +40,8 @@ class JointTargets(LeafSystem):
             if port.direction == "input":
                 if isinstance(port.type, int):
                     self.DeclareVectorInputPort(port.name, port.type)
-                elif port.type is RigidTransform:
-                    self.DeclareAbstractInputPort(port.name, Value(RigidTransform()))
                 else:
-                    self.DeclareAbstractInputPort(port.name, Value(SpatialForce.Zero()))
+                    self.DeclareAbstractInputPort(port.name, Value[port.type]())
         self._command = self.DeclareDiscreteState(JOINTS)
         self._next = self.DeclareDiscreteState(JOINTS)
         self.DeclareStateOutputPort("joint_positions_command", self._command)

@@ -77,22 +77,6 @@ class PendantClient:
         """
         self.request(fresh_food=True if scenario is None else scenario)
 
-    def wait_until(self, time_: float, timeout: float = 30.0) -> dict:
-        """Waits for a controller time, s, and returns the status then.
-
-        Raises:
-            EmulatorError: It is not reached within `timeout` s of wall time.
-        """
-        end = time.monotonic() + timeout
-        while (status := self.status())["time"] < time_:
-            if time.monotonic() > end:
-                raise EmulatorError(
-                    f"controller time {time_:.3f} s was not reached in {timeout:.3g} s; it is "
-                    f"{status['time']:.3f} s"
-                )
-            time.sleep(0.002)
-        return status
-
     def close(self) -> None:
         """Closes the connection."""
         self._file.close()
@@ -152,8 +136,7 @@ class EmulatorProcess:
         end = time.monotonic() + timeout
         while True:
             if self._process.poll() is not None:
-                assert self._process.stdout is not None
-                said = self._process.stdout.read().decode("utf-8", "replace").strip()
+                said = self._process.communicate()[0].decode("utf-8", "replace").strip()
                 raise EmulatorError(f"the emulator did not start: {said}")
             # An emulator that had the address before may answer too.
             with contextlib.suppress(OSError, EmulatorError):
@@ -191,13 +174,11 @@ class EmulatorProcess:
         self._end()
 
     def _end(self) -> None:
-        for stream in (self._process.stdin, self._process.stdout):
-            if stream is not None:
-                stream.close()
         try:
-            self._process.wait(5.0)
+            self._process.communicate(timeout=5.0)
         except subprocess.TimeoutExpired:
             self.kill()
+            self._process.communicate()
 
     def __enter__(self) -> "EmulatorProcess":
         return self

@@ -121,8 +121,11 @@ class RtdeServer(Service):
                     session.ready.append((controller.time + self.delay, data))
             has_sent = False
             while session.ready and session.ready[0][0] <= controller.time:
-                self._send_data(connection, session, session.ready.popleft()[1])
-                has_sent = True
+                data, has_sent = session.ready.popleft()[1], True
+                if connection.backlog > _FULL:
+                    session.skipped += 1
+                else:
+                    connection.send(data)
             self.has_reached_all &= has_sent
 
     def statistics(self) -> dict[str, object]:
@@ -138,12 +141,6 @@ class RtdeServer(Service):
 
     def _is_lost(self) -> bool:
         return self.drop_share > 0.0 and self._random.random() < self.drop_share
-
-    def _send_data(self, connection: Connection, session: _Session, data: bytes) -> None:
-        if connection.backlog > _FULL:
-            session.skipped += 1
-        else:
-            connection.send(data)
 
     def _answer(self, connection: Connection, session: _Session, kind: int, payload: bytes) -> None:
         if kind == PackageType.DATA:

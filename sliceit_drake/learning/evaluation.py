@@ -16,7 +16,7 @@ from sliceit_drake.diagrams.agent_station import add_agent
 from sliceit_drake.diagrams.prepared_food import OwnCutting
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.station import MakeStation
-from sliceit_drake.learning.ending import Limits
+from sliceit_drake.learning.task import Limits
 from sliceit_drake.systems.agent import AgentConfig, Decide
 
 __all__ = ["LIMITS", "SliceMetrics", "SliceTrace", "cut_slice", "slice_metrics"]

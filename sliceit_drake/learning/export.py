@@ -13,17 +13,6 @@ from sliceit_drake.systems.exported_network import LAYOUT, layout_of
 __all__ = ["export_policy"]
 
 
-class _Deterministic(nn.Module):
-    """The actor's decision without its randomness: the middle of the distribution."""
-
-    def __init__(self, actor: Actor) -> None:
-        super().__init__()
-        self.features, self.latent, self.mean = actor.features_extractor, actor.latent_pi, actor.mu
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        return torch.tanh(self.mean(self.latent(self.features(observation))))
-
-
 def export_policy(actor: Actor, config: AgentConfig, file: Path) -> None:
     """Writes the actor's decisions, without its randomness, as ONNX with the layout it needs.
 
@@ -32,7 +21,9 @@ def export_policy(actor: Actor, config: AgentConfig, file: Path) -> None:
         config: The agent's configuration.
         file: File to write.
     """
-    network = _Deterministic(actor).eval()
+    # The middle of the distribution.
+    parts = (actor.features_extractor, actor.latent_pi, actor.mu, nn.Tanh())
+    network = nn.Sequential(*parts).eval()
     example = torch.zeros(1, config.observation_size())
     torch.onnx.export(
         network,

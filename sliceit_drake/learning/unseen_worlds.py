@@ -5,6 +5,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 
 from sliceit_drake.cutting.workers import worker_processes
@@ -73,10 +74,7 @@ def cases_of(
         _policy(str(policy))
     return [
         Case(str(policy), world, food, k, board, seed)
-        for policy in policies
-        for world in worlds
-        for board in board_stiffness
-        for food in foods
+        for policy, world, board, food in product(policies, worlds, board_stiffness, foods)
         for k in range(slices or paper_slices(food))
     ]
 
