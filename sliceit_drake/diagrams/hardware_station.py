@@ -202,10 +202,9 @@ class HardwareStation(Station):
         builder = DiagramBuilder()
         self.rtde = builder.AddNamedSystem("robot", RtdeSystem(self.link, robot.pace))
         commander = builder.AddNamedSystem("controller", make_controller(scenario, controller))
-        top = float(twin.start_pose.translation()[2]) - scenario.start.clearance
         estimate = builder.AddNamedSystem(
             "knife_estimate",
-            KnifeEstimate(twin.plant, twin.robot.knife, top, scenario.board.height),
+            KnifeEstimate(twin.plant, twin.robot.knife, twin.food_top(), scenario.board.height),
         )
         self.cutting = estimate
         monitor = builder.AddNamedSystem(

@@ -268,16 +268,12 @@ def _figure(run: Run, record: Record, comparison: Comparison | None) -> "Figure"
     if areas := _slice_areas(run):
         board = run.scenario.board.height
         return plot_sequence(record, areas, title, board, caption, run.snapshot)
-    return plot_force(record, title, _top_height(run), comparison, caption, run.snapshot)
+    return plot_force(record, title, run.station.food_top(), comparison, caption, run.snapshot)
 
 
 def _cut_progress(run: Run) -> float:
     context = run.station.GetMyContextFromRoot(run.simulator.get_context())
     return float(run.station.GetOutputPort("cut_progress").Eval(context)[0])
-
-
-def _top_height(run: Run) -> float:
-    return float(run.station.start_pose.translation()[2] - run.scenario.start.clearance)
 
 
 def measured_profile(scenario: Scenario) -> ForceProfile | None:
@@ -300,7 +296,7 @@ def measured_profile(scenario: Scenario) -> ForceProfile | None:
 
 def _descent(run: Run, record: Record) -> tuple[np.ndarray, np.ndarray]:
     """Depth [k], increasing, and norm of the force [k] until the deepest point."""
-    depth = _top_height(run) - record["knife_pose_p_z"]
+    depth = run.station.food_top() - record["knife_pose_p_z"]
     force = record.vector("food_wrench_f") + record.vector("board_wrench_f")
     norm = np.linalg.norm(force, axis=1)
     deepest = int(np.argmax(depth)) + 1
@@ -400,16 +396,15 @@ def _summary(run: Run, record: Record, comparison: Comparison | None) -> dict:
         summary["slices"] = [dc.asdict(report) for report in slice_reports(record, areas)]
     if station.estimate_error is not None:
         summary["discretization_error"] = _discretization_error(run)
-    if comparison is not None:
+    measurement = scenario.measurement
+    if comparison is not None and measurement is not None:
         summary["measurement"] = {
-            "file": scenario.measurement.file if scenario.measurement else None,
+            "file": measurement.file,
             "rms_N": comparison.rms,
             "measured_peak_N": comparison.measured_peak,
             "simulated_peak_N": comparison.simulated_peak,
             "fitted_contact_time_s": comparison.contact_time,
-            "height_offset_mm": 1e3 * comparison.contact_time * scenario.measurement.speed
-            if scenario.measurement
-            else None,
+            "height_offset_mm": 1e3 * comparison.contact_time * measurement.speed,
         }
     return summary
 

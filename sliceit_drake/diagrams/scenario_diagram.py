@@ -109,13 +109,7 @@ class ScenarioDiagram(Diagram):
 
 
 def _policy_system(own: OwnPolicy, station: Station, duration: float) -> LeafSystem:
-    """The system of a user's own policy.
-
-    Args:
-        own: What the user gave.
-        station: What it drives.
-        duration: Of the run, s.
-    """
+    """The system of a user's own policy, for a run of a duration in seconds."""
     if isinstance(own, LeafSystem):
         return own
     if callable(own):

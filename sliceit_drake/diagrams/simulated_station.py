@@ -66,17 +66,9 @@ class SimulatedStation(Station):
         ConfigurationError, MeshError, TimeStepError: The scenario cannot be built.
 
     Attributes:
-        scenario: What it was made from.
-        plant: The arm with gripper and knife, and the board.
         cutting: The food, or what was put in its place.
         controller: The compliance controller, or what was given in its place.
         sensor: The wrench sensor.
-        motion_plan: The scenario's segments, those of its sequence, or the bounds of its policy.
-        start_pose: X_WK at the start.
-        start_joints: Joint positions there [6], rad.
-        board_peak_loss: Estimated fraction of an impact's peak force on the board that the plant's
-            steps take, see `check_plant_step`.
-        meshcat: The viewer, or None.
         frame_period: Time between the frames that are drawn, s: longer where the run's replay
             would be too large.
     """

@@ -73,6 +73,10 @@ class Station(Diagram):
         """Height of the edge over the board at the start, metres."""
         return float(self.start_pose.translation()[2]) - self.scenario.board.height
 
+    def food_top(self) -> float:
+        """Height of the food's top at the cut in the world, metres."""
+        return float(self.start_pose.translation()[2]) - self.scenario.start.clearance
+
     def X_KS(self) -> RigidTransform:
         """Pose of the wrench sensor's frame in the knife's; rigid, so the same in any context."""
         context = self.plant.CreateDefaultContext()

@@ -4,6 +4,7 @@ import csv
 import dataclasses as dc
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ from sliceit_drake.cutting.motion import Motion
 from sliceit_drake.cutting.parameters import with_parameters
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.cutting.workers import worker_processes
+from sliceit_drake.diagrams.outputs.run_log import Record
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 
@@ -97,7 +99,6 @@ class Sweep:
     def plot(self) -> "Figure":
         """Force over depth, coloured by the first field, and the peak over that field."""
         from matplotlib import colormaps
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
         first, *others = self.parameters
@@ -106,7 +107,6 @@ class Sweep:
         at = np.array(values, float) if is_number else np.arange(len(values), dtype=float)
         colours = colormaps["viridis"](np.linspace(0.0, 0.92, len(values)))
         figure = Figure(figsize=(10.0, 4.2), layout="constrained")
-        FigureCanvasAgg(figure)
         over_depth, over_value = figure.subplots(1, 2)
         shown = {0, len(values) // 2, len(values) - 1} if len(values) > 6 else range(len(values))
         for each in self.slices:
@@ -157,14 +157,7 @@ class Sweep:
             np.column_stack([np.full(len(s.time), k), s.time, s.depth, s.force, s.cut])
             for k, s in enumerate(self.slices)
         ]
-        np.savetxt(
-            folder / "curves.csv",
-            np.concatenate(table),
-            fmt="%.8g",
-            delimiter=",",
-            header=",".join(columns),
-            comments="",
-        )
+        Record(columns, np.concatenate(table)).write_csv(folder / "curves.csv")
         self.plot().savefig(folder / "sweep.png", dpi=150)
 
 
@@ -228,24 +221,21 @@ def _in_stations(
     client: "Client | None",
     progress: Callable[[int, int], None] | None,
 ) -> list[SweptSlice]:
-    if client is not None:
-        futures = client.map(_in_station, points, scenarios, pure=False)
-        return _collected((future.result() for future in futures), len(points), progress)
-    if workers == 1:
-        return _collected(map(_in_station, points, scenarios), len(points), progress)
-    with worker_processes(workers) as pool:
-        return _collected(pool.map(_in_station, points, scenarios), len(points), progress)
-
-
-def _collected(
-    slices: Iterable[SweptSlice], count: int, progress: Callable[[int, int], None] | None
-) -> list[SweptSlice]:
-    done = []
-    for each in slices:
-        done.append(each)
-        if progress is not None:
-            progress(len(done), count)
-    return done
+    with worker_processes(workers) if client is None and workers > 1 else nullcontext() as pool:
+        slices: Iterable[SweptSlice]
+        if client is not None:
+            futures = client.map(_in_station, points, scenarios, pure=False)
+            slices = (future.result() for future in futures)
+        elif pool is not None:
+            slices = pool.map(_in_station, points, scenarios)
+        else:
+            slices = map(_in_station, points, scenarios)
+        done = []
+        for each in slices:
+            done.append(each)
+            if progress is not None:
+                progress(len(done), len(points))
+        return done
 
 
 def _in_station(values: dict, scenario: Scenario) -> SweptSlice:
@@ -256,11 +246,10 @@ def _in_station(values: dict, scenario: Scenario) -> SweptSlice:
         return SweptSlice(values, stopped=str(error))
     run.advance()
     record = run.record()
-    top = run.station.start_pose.translation()[2] - scenario.start.clearance
     return SweptSlice(
         values,
         record["time"],
-        top - record["knife_pose_p_z"],
+        run.station.food_top() - record["knife_pose_p_z"],
         record.vector("food_wrench_f"),
         record["cut_progress"],
         run.stopped,

@@ -41,7 +41,6 @@ def plot_force(
         caption: Conditions and provenance, below the plots.
         snapshot: Knife and food at some instant, or None to leave that panel out.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     time = record["time"]
@@ -51,7 +50,6 @@ def plot_force(
     depth = 1e3 * (top_height - record["knife_pose_p_z"])
 
     figure = Figure(figsize=(9.0 if snapshot is None else 12.0, 4.6), layout="constrained")
-    FigureCanvasAgg(figure)
     widths = [1.5, 1.0] if snapshot is None else [1.0, 1.5, 1.0]
     grid = figure.add_gridspec(1, len(widths), width_ratios=widths)
     over_time = figure.add_subplot(grid[-2])

@@ -120,7 +120,6 @@ def plot_sequence(
         snapshot: Knife and food at some instant, or None to leave that panel out.
     """
     from matplotlib import colormaps
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     time = record["time"]
@@ -131,7 +130,6 @@ def plot_sequence(
     reports = slice_reports(record, section_areas)
 
     figure = Figure(figsize=(12.0, 7.0), layout="constrained")
-    FigureCanvasAgg(figure)
     rows = figure.add_gridspec(2, 1, height_ratios=[1.0, 1.15])
     over_time = figure.add_subplot(rows[0])
     widths = [1.0, 1.2] if snapshot is None else [0.8, 1.0, 1.2]

@@ -25,13 +25,12 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from pydrake.multibody.tree import BodyIndex, JacobianWrtVariable
+from pydrake.math import VectorToSkewSymmetric
+from pydrake.multibody.tree import JacobianWrtVariable
 from scipy.linalg import block_diag, expm
 
-from sliceit_drake.diagrams.plant.robot_plant import Robot
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.simulated_station import SimulatedStation
-from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
 from sliceit_drake.systems.servo import JOINTS
 from sliceit_drake.systems.ur5e_kinematics import make_virtual_model, ur5e_chain
 
@@ -94,15 +93,17 @@ class ContactLoop:
         self._M = plant.CalcMassMatrix(context)
 
         R_WK = plant.EvalBodyPoseInWorld(context, robot.knife).rotation().matrix()
-        inertia = plant.CalcSpatialInertia(context, K, _tool_bodies(station, robot))
+        welded = plant.GetBodiesWeldedTo(robot.knife)
+        tool = [body.index() for body in welded if body.model_instance() != robot.arm]
+        inertia = plant.CalcSpatialInertia(context, K, tool)
         R = block_diag(R_WK, R_WK)
         self._tool = R @ _swap(_swap(inertia.CopyToFullMatrix6()).T) @ R.T
         weight = inertia.get_mass() * plant.gravity_field().gravity_vector()
         arm_K = R_WK @ inertia.get_com()
         # The sensor turns with the tool: a turn by w changes the weight it sees by -w x weight.
         tilt = np.zeros((6, 6))
-        tilt[:3, 3:] = _cross(weight)
-        tilt[3:, 3:] = _cross(arm_K) @ _cross(weight)
+        tilt[:3, 3:] = VectorToSkewSymmetric(weight)
+        tilt[3:, 3:] = VectorToSkewSymmetric(arm_K) @ VectorToSkewSymmetric(weight)
         self._tilt = tilt
 
         self._linearise_controller(scenario, q, R_WK)
@@ -208,7 +209,7 @@ class ContactLoop:
     ) -> np.ndarray:
         """Matrix of one cycle on the loop's state; arguments as `least_stable_mode`."""
         G = np.zeros((1, 6, 6)) if response is None else np.reshape(response, (-1, 6, 6))
-        config, h, J = self._config, self._step, self._J
+        h, J = self._step, self._J
         history, delay = len(G) - 1, self._delay_steps
         parts = _PARTS + history + delay + self._line
         size = parts * JOINTS
@@ -261,7 +262,7 @@ class ContactLoop:
                 line = [reading_next if is_new else line[0], *line[:-1]] if line else []
                 total_next = 0.0 * total
             if i % self._control_steps == 0:
-                command, v_c, error = self._control(config, q, command, v_c, error, shown)
+                command, v_c, error = self._control(q, command, v_c, error, shown)
             q, v, q_d, v_d, torque = q_next, v_next, q_d_next, v_d_next, torque_next
             total, reading = total_next, reading_next
         parts_after = [q, v, q_d, v_d, torque, command, v_c, error, reading, wrench]
@@ -276,7 +277,6 @@ class ContactLoop:
 
     def _control(
         self,
-        config: ComplianceControllerConfig,
         q: np.ndarray,
         command: np.ndarray,
         v: np.ndarray,
@@ -284,6 +284,7 @@ class ContactLoop:
         reading: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Command, virtual velocity and error after an update of the controller."""
+        config = self._config
         dt = config.virtual_time_step
         p = config.error_scale * np.array(config.p_gains)[:, None]
         d = config.error_scale * np.array(config.d_gains)[:, None] / dt
@@ -297,17 +298,6 @@ class ContactLoop:
         return q, v, last_error
 
 
-def _tool_bodies(station: SimulatedStation, robot: Robot) -> list[BodyIndex]:
-    """What hangs on the sensor."""
-    plant = station.plant
-    welded = plant.GetBodiesWeldedTo(robot.knife)
-    return [body.index() for body in welded if body.model_instance() != robot.arm]
-
-
 def _swap(matrix: np.ndarray) -> np.ndarray:
     """Rows with rotations first, as Drake has them, to translations first."""
     return np.concatenate([matrix[3:], matrix[:3]])
-
-
-def _cross(v: np.ndarray) -> np.ndarray:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
