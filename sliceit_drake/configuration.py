@@ -259,19 +259,13 @@ def _range_text(rule: _Quantity, lead: str) -> str:
 
 
 def load_yaml(
-    schema: type,
-    file: str | Path | None,
-    child_name: str | None = None,
-    defaults: Any = None,
-    overrides_text: str | None = None,
+    schema: type, file: str | Path | None, defaults: Any = None, overrides_text: str | None = None
 ) -> Any:
     """Reads a configuration from a YAML file, and validates it.
 
     Args:
         schema: Dataclass to read.
         file: YAML file; None to start from the defaults alone.
-        child_name: If given, the file holds several configurations, each under a name at its top
-            level, and this is the name of the one to read.
         defaults: Instance of `schema` that holds the values for fields which the file leaves out;
             None for the defaults of `schema`.
         overrides_text: YAML text merged over the file, such as ``"{food: {height: 0.03}}"``. A
@@ -282,19 +276,17 @@ def load_yaml(
 
     Raises:
         ConfigurationError: If a file is missing, or its text is not YAML, or names an unknown
-            field, tag or configuration, or a value has the wrong type or is out of range.
+            field or tag, or a value has the wrong type or is out of range.
     """
     config = schema() if defaults is None else copy.deepcopy(defaults)
-    root = child_name or schema.__name__.lower()
     # Where each field was written, so that an error found after loading can name the line.
     origins: dict[str, str] = {}
     if file is not None:
-        text = _read_text(Path(file))
-        config = _merge_text(schema, config, text, str(file), root, child_name, origins)
+        config = _merge_text(config, _read_text(Path(file)), str(file), origins)
     if overrides_text is not None and overrides_text.strip():
-        config = _merge_text(schema, config, overrides_text, "overrides", root, None, origins)
+        config = _merge_text(config, overrides_text, "overrides", origins)
     try:
-        validate(config, root)
+        validate(config, _root(config))
     except ConfigurationError as error:
         source = origins.get(error.field or "", None if file is None else str(file))
         raise ConfigurationError(
@@ -303,19 +295,12 @@ def load_yaml(
     return config
 
 
-def dump_yaml(
-    config: Any,
-    file: str | Path | None = None,
-    *,
-    child_name: str | None = None,
-    defaults: Any = None,
-) -> str:
+def dump_yaml(config: Any, file: str | Path | None = None, *, defaults: Any = None) -> str:
     """Writes a configuration as YAML that `load_yaml` reads back to the same values.
 
     Args:
         config: Dataclass instance.
         file: If given, the text is also written there.
-        child_name: If given, the configuration is nested under this name.
         defaults: If given, only what differs from this instance is written.
 
     Returns:
@@ -323,7 +308,7 @@ def dump_yaml(
     """
     from pydrake.common.yaml import yaml_dump_typed
 
-    text = yaml_dump_typed(config, schema=type(config), child_name=child_name, defaults=defaults)
+    text = yaml_dump_typed(config, schema=type(config), defaults=defaults)
     if file is not None:
         Path(file).write_text(text, encoding="utf-8")
     return text
@@ -345,15 +330,11 @@ def _read_text(file: Path) -> str:
         ) from error
 
 
-def _merge_text(
-    schema: type,
-    config: Any,
-    text: str,
-    source: str,
-    root: str,
-    child_name: str | None,
-    origins: dict[str, str],
-) -> Any:
+def _root(config: Any) -> str:
+    return type(config).__name__.lower()
+
+
+def _merge_text(config: Any, text: str, source: str, origins: dict[str, str]) -> Any:
     """Returns `config` with the YAML `text` merged over it, and notes origins of the fields."""
     import yaml
     from pydrake.common.yaml import yaml_load_typed
@@ -378,23 +359,14 @@ def _merge_text(
         ) from None
     finally:
         loader.dispose()
-    tree = _TreeCheck(loader, source, origins)
     if not isinstance(node, yaml.MappingNode):
         raise ConfigurationError(
             "the file holds no fields", source=source, fix='Write "field: value" lines.'
         )
-    if child_name is None:
-        tree.mapping(node, schema, root, is_root=True)
-    else:
-        children = tree.items(node, "")
-        names = [name for name in children if not name.startswith("_")]
-        if child_name not in names:
-            raise ConfigurationError(
-                f'there is no "{child_name}"', source=source, fix=_suggestion(child_name, names)
-            )
-        tree.value(children[child_name], schema, root)
+    tree = _TreeCheck(loader, source, origins)
+    tree.mapping(node, type(config), _root(config), is_root=True)
     try:
-        return yaml_load_typed(schema=schema, data=text, child_name=child_name, defaults=config)
+        return yaml_load_typed(schema=type(config), data=text, defaults=config)
     except (RuntimeError, ValueError, TypeError) as error:
         # Fields of Drake's own bound types are checked by Drake alone.
         raise ConfigurationError(

@@ -115,11 +115,9 @@ def test_a_file_sets_the_fields_that_it_names_and_leaves_the_others_at_their_def
 
 
 def test_overrides_win_over_the_file_and_the_file_over_the_defaults(tmp_path):
-    file = write(tmp_path, "First: {tilt: 0.1}\nSecond: {tilt: 0.2, name: two}\n")
+    file = write(tmp_path, "{tilt: 0.2, name: two}")
     defaults = Station(board=Board(height=0.5), tilt=0.3, name="none")
-    station = load_yaml(
-        Station, file, "Second", defaults=defaults, overrides_text="board: {spheres: 3}"
-    )
+    station = load_yaml(Station, file, defaults=defaults, overrides_text="board: {spheres: 3}")
     assert (station.board.height, station.board.spheres) == (0.5, 3)
     assert (station.tilt, station.name) == (0.2, "two")
     assert (defaults.tilt, defaults.board.spheres) == (0.3, 7)
@@ -142,9 +140,9 @@ def test_a_written_configuration_reads_back_to_the_same_values(tmp_path):
         mass=0.5,
     )
     file = tmp_path / "out.yaml"
-    text = dump_yaml(station, file, child_name="Mine")
+    text = dump_yaml(station, file)
     assert file.read_text(encoding="utf-8") == text
-    loaded = load_yaml(Station, file, "Mine")
+    loaded = load_yaml(Station, file)
     np.testing.assert_array_equal(loaded.gains, station.gains)
     loaded.gains = station.gains
     assert loaded == station
@@ -206,16 +204,12 @@ def test_a_file_without_fields_is_refused(tmp_path, text):
         load_yaml(Station, write(tmp_path, text))
 
 
-def test_a_missing_file_and_an_unknown_name_suggest_what_exists(tmp_path):
-    file = write(tmp_path, "Cucumber: {}\n_hidden: {}\n")
+def test_a_missing_file_suggests_what_exists(tmp_path):
+    write(tmp_path, "")
     with pytest.raises(ConfigurationError, match='does not exist. Did you mean "station.yaml"'):
         load_yaml(Station, tmp_path / "sation.yaml")
     with pytest.raises(ConfigurationError, match="has no YAML files"):
         load_yaml(Station, tmp_path / "nowhere" / "a.yaml")
-    with pytest.raises(ConfigurationError, match='no "Cucumbr". Did you mean "Cucumber"'):
-        load_yaml(Station, file, "Cucumbr")
-    with pytest.raises(ConfigurationError, match="Known: Cucumber.$"):
-        load_yaml(Station, file, "x")
     with pytest.raises(ConfigurationError, match="the file cannot be read"):
         load_yaml(Station, tmp_path)
 

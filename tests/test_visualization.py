@@ -35,7 +35,11 @@ from sliceit_drake.systems.food_visualizer import (
     damage_colours,
 )
 from sliceit_drake.systems.frame_visualizer import FrameVisualizer
-from sliceit_drake.systems.wrench_visualizer import ArrowScale, WrenchVisualizer, arrow_rotation
+from sliceit_drake.systems.wrench_visualizer import (
+    NEWTON_METRES_PER_METRE,
+    NEWTONS_PER_METRE,
+    WrenchVisualizer,
+)
 
 SMALL_FOOD = "{food: {shape: !Cylinder {rings: 3, layers: [0.0, 0.004, 0.012]}}}"
 
@@ -94,7 +98,8 @@ def watched() -> tuple[Run, Meshcat]:
     "vector", [[1, 0, 0], [0, 0, 3], [0, 0, -2], [-0.3, 0.5, 0.2], [1e-9, 0, -1], [2, -1, -5]]
 )
 def test_arrow_turns_its_axis_to_the_vector(vector):
-    R = arrow_rotation(np.array(vector, float))
+    drawn = draw_wrenches(RigidTransform(), RigidTransform(), food=(np.zeros(3), vector))
+    R = drawn.transforms["/wrench/food/force"].rotation()
     np.testing.assert_allclose(R.matrix() @ R.matrix().T, np.eye(3), atol=1e-12)
     assert np.linalg.det(R.matrix()) == pytest.approx(1.0)
     axis = np.array(vector) / np.linalg.norm(vector)
@@ -103,8 +108,7 @@ def test_arrow_turns_its_axis_to_the_vector(vector):
 
 def draw_wrenches(X_WK: RigidTransform, X_KS: RigidTransform, **wrenches) -> FakeMeshcat:
     meshcat = FakeMeshcat()
-    scale = ArrowScale(newtons_per_metre=100.0, newton_metres_per_metre=10.0)
-    system = WrenchVisualizer(meshcat, X_KS, 0.1, scale)
+    system = WrenchVisualizer(meshcat, X_KS, 0.1)
     context = system.CreateDefaultContext()
     context.SetTime(0.7)
     system.GetInputPort("knife_pose").FixValue(context, X_WK)
@@ -127,13 +131,14 @@ def test_force_and_moment_arrows_end_at_the_scaled_vector(size):
     f, m = size * np.array([2.0, -1.0, 4.0]), 0.1 * size * np.array([-1.0, 3.0, 1.0])
     meshcat = draw_wrenches(X_WK, RigidTransform(), food=(m, f))
     p = X_WK.translation()
-    np.testing.assert_allclose(arrow_tip(meshcat, "/wrench/food/force"), p + f / 100, atol=1e-12)
-    np.testing.assert_allclose(arrow_tip(meshcat, "/wrench/food/moment"), p + m / 10, atol=1e-12)
+    f, m = f / NEWTONS_PER_METRE, m / NEWTON_METRES_PER_METRE
+    np.testing.assert_allclose(arrow_tip(meshcat, "/wrench/food/force"), p + f, atol=1e-12)
+    np.testing.assert_allclose(arrow_tip(meshcat, "/wrench/food/moment"), p + m, atol=1e-12)
     # The shaft runs from the point to where the head begins.
     middle = meshcat.properties["/wrench/food/force/shaft", "position"][2]
     length = meshcat.properties["/wrench/food/force/shaft", "scale"][2]
     assert middle == pytest.approx(0.5 * length)
-    assert 0.0 < length < np.linalg.norm(f) / 100
+    assert 0.0 < length < np.linalg.norm(f)
     # All that changes is in the recording.
     assert meshcat.times == {0.7}
 
@@ -143,7 +148,7 @@ def test_sensor_arrow_stands_at_the_sensor_and_is_turned_from_its_frame_to_the_w
     X_KS = RigidTransform([0.0, 0.02, -0.2])
     meshcat = draw_wrenches(X_WK, X_KS, sensor=(np.zeros(3), np.array([0.0, 0.0, -10.0])))
     tip = arrow_tip(meshcat, "/wrench/sensor/force")
-    np.testing.assert_allclose(tip, [0.0, -0.02, 0.3 + 0.1], atol=1e-12)
+    np.testing.assert_allclose(tip, [0.0, -0.02, 0.3 + 10.0 / NEWTONS_PER_METRE], atol=1e-12)
 
 
 def test_arrows_without_a_force_are_hidden():

@@ -11,7 +11,6 @@ import re
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
 
 from sliceit_drake.hardware.client import RobotFacts, RobotUnavailableError
 from sliceit_drake.hardware.robot_state import PLAYING, RobotState
@@ -37,22 +36,13 @@ class UrClient:
         host: Name or address.
         lookahead_time: Argument of servoj, s, 0.03 to 0.2.
         gain: Argument of servoj, 100 to 2000.
-        controls: Whether to take control; else it only reads, and `servo` refuses.
         pace: Controller seconds in a second; 1 for all robots.
 
     Raises:
         RobotUnavailableError: Nothing answers there, or it refuses, or ur_rtde is not installed.
     """
 
-    def __init__(
-        self,
-        host: str,
-        lookahead_time: float,
-        gain: float,
-        *,
-        controls: bool = True,
-        pace: float = 1.0,
-    ) -> None:
+    def __init__(self, host: str, lookahead_time: float, gain: float, *, pace: float = 1.0) -> None:
         try:
             import dashboard_client
             import rtde_control
@@ -62,10 +52,8 @@ class UrClient:
                 f"ur_rtde is not installed ({error}). Install sliceit_drake[hardware]."
             ) from None
         self._host, self._lookahead, self._gain = host, lookahead_time, gain
-        self._control: Any = None
-        self._is_moving = False
+        self._is_moving = self._is_stopped = False
         self._stop_time, self._attempt = (t / max(pace, SLOWEST) for t in (STOP_TIME, ATTEMPT))
-        self._is_stopped = not controls
         step = "the dashboard server (port 29999)"
         try:
             self._dashboard = dashboard_client.DashboardClient(host)
@@ -74,11 +62,10 @@ class UrClient:
             self._receive = rtde_receive.RTDEReceiveInterface(host, RATE)
             if not self._receive.isConnected():
                 raise RuntimeError("it refuses to stream at 500 Hz; is it an e-Series robot?")
-            if controls:
-                self._refuse_stopped_robot()
-                self._refuse_running_program()
-                step = "taking control (ports 30003 and 30004)"
-                self._control = rtde_control.RTDEControlInterface(host, RATE)
+            self._refuse_stopped_robot()
+            self._refuse_running_program()
+            step = "taking control (ports 30003 and 30004)"
+            self._control = rtde_control.RTDEControlInterface(host, RATE)
         except RuntimeError as error:
             if isinstance(error, RobotUnavailableError):
                 raise
@@ -135,24 +122,18 @@ class UrClient:
         return state
 
     def is_connected(self) -> bool:
-        control = self._control
-        return self._receive.isConnected() and (control is None or control.isConnected())
+        return self._receive.isConnected() and self._control.isConnected()
 
     def servo(self, q: list[float]) -> bool:
-        if self._control is None:
-            return False
         return self._control.servoJ(q, 0.0, 0.0, 1.0 / RATE, self._lookahead, self._gain)
 
     def kick(self) -> None:
-        if self._control is not None:
-            self._control.kickWatchdog()
+        self._control.kickWatchdog()
 
     def set_watchdog(self, frequency: float) -> bool:
-        return self._control is not None and self._control.setWatchdog(frequency)
+        return self._control.setWatchdog(frequency)
 
     def stop(self) -> None:
-        if self._control is None:
-            return
         self._is_stopped = True
         before, errors = self._receive.getTimestamp(), []
 
@@ -203,9 +184,6 @@ class UrClient:
         # CB3 and old software do not know the question.
         with contextlib.suppress(RuntimeError):
             remote = dashboard.isInRemoteControl()
-        tcp = [float("nan")] * 6
-        if self._control is not None:
-            tcp = self._control.getTCPOffset()
         return RobotFacts(
             model=dashboard.getRobotModel().strip(),
             serial=dashboard.getSerialNumber().strip(),
@@ -215,21 +193,21 @@ class UrClient:
             remote_control=remote,
             payload=receive.getPayload(),
             payload_cog=receive.getPayloadCog(),
-            tcp=tcp,
+            tcp=self._control.getTCPOffset(),
             speed_scaling=receive.getSpeedScaling(),
         )
 
     def zero_sensor(self) -> None:
-        if self._control is None or not self._control.zeroFtSensor():
+        if not self._control.zeroFtSensor():
             raise RobotUnavailableError(f"{self._host}: the force sensor cannot be zeroed")
         time.sleep(0.1)  # The next readings are of after it.
 
     def allows_joints(self, q: list[float]) -> bool:
-        return self._control is not None and self._control.isJointsWithinSafetyLimits(q)
+        return self._control.isJointsWithinSafetyLimits(q)
 
     def start_move(self, q: list[float], speed: float, acceleration: float) -> bool:
-        self._is_moving = self._control is not None
-        return self._is_moving and self._control.moveJ(q, speed, acceleration, True)
+        self._is_moving = True
+        return self._control.moveJ(q, speed, acceleration, True)
 
     def close(self) -> None:
         if not self._is_stopped:
@@ -237,7 +215,6 @@ class UrClient:
             with contextlib.suppress(RuntimeError):
                 self.stop()
         for part in (self._control, self._receive, self._dashboard):
-            if part is not None:
-                # A link that is gone already cannot be closed better.
-                with contextlib.suppress(RuntimeError):
-                    part.disconnect()
+            # A link that is gone already cannot be closed better.
+            with contextlib.suppress(RuntimeError):
+                part.disconnect()

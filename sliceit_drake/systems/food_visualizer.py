@@ -15,6 +15,7 @@ FLESH = (0.84, 0.91, 0.68)
 INTACT = (0.42, 0.09, 0.36)
 HALF_CUT = (0.93, 0.47, 0.22)
 
+PATH = "/drake/food"
 HALVES = ("minus", "plus")
 
 
@@ -42,7 +43,7 @@ def frame_size(surfaces: Sequence[FoodSurface]) -> float:
 class FoodVisualizer(LeafSystem):
     """Publishes the food's surface at a fixed rate: skin, and cut faces coloured by their damage.
 
-    The halves on the two sides of the cut are `minus` and `plus` under the path: hiding one in
+    The halves on the two sides of the cut are drake/food/minus and drake/food/plus: hiding one in
     Meshcat's tree shows the cut face of the other.
 
     Meshcat's recordings animate transforms and properties, not vertices, so while a recording is on
@@ -62,21 +63,14 @@ class FoodVisualizer(LeafSystem):
         slices_stay: Whether each food lies beside the one before it.
         meshcat: Viewer.
         period: Time between frames, s.
-        path: Path in Meshcat's tree.
     """
 
     def __init__(
-        self,
-        surfaces: Sequence[FoodSurface],
-        slices_stay: bool,
-        meshcat: Meshcat,
-        period: float,
-        path: str = "/drake/food",
+        self, surfaces: Sequence[FoodSurface], slices_stay: bool, meshcat: Meshcat, period: float
     ) -> None:
         super().__init__()
         self._surfaces, self._slices_stay = tuple(surfaces), slices_stay
         self._meshcat = meshcat
-        self._path = path
         size = max(len(surface.ends) for surface in surfaces)
         self._vertices = self.DeclareVectorInputPort("surface_vertices", 3 * size)
         self._damage = self.DeclareVectorInputPort("surface_damage", size)
@@ -91,7 +85,7 @@ class FoodVisualizer(LeafSystem):
         """Keeps every frame from now on, for `Meshcat.StaticHtml`."""
         self._recording = True
         self._frames, self._foods = [], []
-        self._meshcat.Delete(self._path)
+        self._meshcat.Delete(PATH)
 
     def PublishRecording(self) -> None:
         """Writes when each kept frame is visible into the recording, and stops keeping them."""
@@ -108,11 +102,11 @@ class FoodVisualizer(LeafSystem):
         self._recording = False
 
     def _frame_path(self, half: str, k: int) -> str:
-        return f"{self._path}/{half}/frame_{k:04d}"
+        return f"{PATH}/{half}/frame_{k:04d}"
 
     def _live_path(self, half: str, food: int) -> str:
         slices = half == "minus" and self._slices_stay
-        return f"{self._path}/{half}" + (f"/slice_{food + 1:02d}" if slices else "")
+        return f"{PATH}/{half}" + (f"/slice_{food + 1:02d}" if slices else "")
 
     def _stays(self, half: str, k: int) -> bool:
         """Whether frame `k` shows a slice that has been cut off by frame k + 1."""

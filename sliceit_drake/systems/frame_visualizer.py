@@ -29,8 +29,9 @@ STROKE_WIDTH = 0.3
 class FrameVisualizer(LeafSystem):
     """Publishes triads (x red, y green, z blue) with the letter of each frame at its origin.
 
-    They are drawn over everything, also from inside of the food. An I/O system: what is drawn lies
-    in the Meshcat instance.
+    They are drawn over everything, also from inside of the food, and hidden at first: Meshcat's
+    tree shows them, each at frames/LETTER. An I/O system: what is drawn lies in the Meshcat
+    instance.
 
     Input ports:
         knife_pose: RigidTransform X_WK.
@@ -42,8 +43,6 @@ class FrameVisualizer(LeafSystem):
         X_WK: Pose of the knife at the start, where its letters face the viewer.
         towards_viewer: Horizontal direction in which letters face [3], in W.
         period: Time between frames, s.
-        visible: Whether they are shown at first; Meshcat's tree shows and hides them.
-        path: Path in Meshcat's tree; a frame is PATH/LETTER.
     """
 
     def __init__(
@@ -54,19 +53,18 @@ class FrameVisualizer(LeafSystem):
         X_WK: RigidTransform,
         towards_viewer: np.ndarray,
         period: float,
-        visible: bool = False,
-        path: str = "/frames",
     ) -> None:
         super().__init__()
         self._meshcat = meshcat
-        self._carried = {f"{path}/{letter}": X_KP for letter, (X_KP, _) in carried.items()}
+        self._carried = {f"/frames/{letter}": X_KP for letter, (X_KP, _) in carried.items()}
         self._pose = self.DeclareAbstractInputPort("knife_pose", Value(RigidTransform()))
         at_start = dict(fixed) | {k: (X_WK @ X_KP, length) for k, (X_KP, length) in carried.items()}
         for letter, (X_WP, length) in at_start.items():
-            _draw_triad(meshcat, f"{path}/{letter}", length)
-            _draw_letter(meshcat, f"{path}/{letter}", letter, X_WP, towards_viewer, length)
-            meshcat.SetTransform(f"{path}/{letter}", X_WP)
-        meshcat.SetProperty(path, "visible", visible)
+            path = f"/frames/{letter}"
+            _draw_triad(meshcat, path, length)
+            _draw_letter(meshcat, path, letter, X_WP, towards_viewer, length)
+            meshcat.SetTransform(path, X_WP)
+        meshcat.SetProperty("/frames", "visible", False)
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
         self.DeclareForcedPublishEvent(self._publish)
 

@@ -1,7 +1,5 @@
 """Draws the forces and moments on the knife in Meshcat, live and in a recording."""
 
-import dataclasses as dc
-
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.geometry import Cylinder, Meshcat, MeshcatCone, Rgba
@@ -11,11 +9,18 @@ from pydrake.systems.framework import Context, LeafSystem
 
 from sliceit_drake.systems.frame_visualizer import draw_over_everything
 
-__all__ = ["ArrowScale", "WrenchVisualizer", "arrow_rotation"]
+__all__ = ["NEWTONS_PER_METRE", "NEWTON_METRES_PER_METRE", "WrenchVisualizer"]
 
 SHAFT_RADIUS = 0.0015
 HEAD_RADIUS = 0.0042
 HEAD_LENGTH = 0.012
+
+NEWTONS_PER_METRE = 200.0
+"""Force of an arrow of one metre, N/m."""
+NEWTON_METRES_PER_METRE = 20.0
+"""Moment of an arrow of one metre, N."""
+MIN_FORCE, MIN_MOMENT = 0.2, 0.1
+"""What is too small to draw, N and Nm."""
 
 # From the palette of Okabe and Ito, distinct in colour blindness; moments are lighter.
 COLOURS = {
@@ -23,34 +28,6 @@ COLOURS = {
     "board": (0.84, 0.37, 0.00),
     "sensor": (0.60, 0.25, 0.55),
 }
-
-
-@dc.dataclass(frozen=True)
-class ArrowScale:
-    """Lengths of arrows, and what is too small to draw.
-
-    Attributes:
-        newtons_per_metre: Force of an arrow of one metre, N/m.
-        newton_metres_per_metre: Moment of an arrow of one metre, N.
-        min_force: Hidden below, N.
-        min_moment: Hidden below, Nm.
-    """
-
-    newtons_per_metre: float = 200.0
-    newton_metres_per_metre: float = 20.0
-    min_force: float = 0.2
-    min_moment: float = 0.1
-
-
-def arrow_rotation(vector: np.ndarray) -> RotationMatrix:
-    """The shortest rotation that turns +z to the direction of a vector [3] that is not zero."""
-    x, y, z = vector / np.linalg.norm(vector)
-    if z < -1.0 + 1e-9:
-        return RotationMatrix(np.diag([1.0, -1.0, -1.0]))
-    a = 1.0 / (1.0 + z)
-    return RotationMatrix(
-        np.array([[1.0 - a * x * x, -a * x * y, x], [-a * x * y, 1.0 - a * y * y, y], [-x, -y, z]])
-    )
 
 
 class _Arrow:
@@ -95,7 +72,8 @@ class _Arrow:
         meshcat.SetProperty(self._path, "visible", shown, time)
         if not shown:
             return
-        meshcat.SetTransform(self._path, RigidTransform(arrow_rotation(vector), point), time)
+        R = RotationMatrix.MakeFromOneVector(vector, axis_index=2)
+        meshcat.SetTransform(self._path, RigidTransform(R, point), time)
         # A short arrow has a smaller head.
         size = min(1.0, 0.5 * length / HEAD_LENGTH)
         shaft = length - size * HEAD_LENGTH
@@ -114,7 +92,7 @@ class WrenchVisualizer(LeafSystem):
     (purple) start at So; moments are about these points, lighter. All are drawn over everything,
     for Ko lies inside of the food. Arrows change by transforms and properties, so that recordings
     animate them. An I/O system: what is drawn lies in the Meshcat instance. Hide what you do not
-    want in Meshcat's tree: PATH/food, PATH/board, PATH/sensor, each with force and moment.
+    want in Meshcat's tree: wrench/food, wrench/board, wrench/sensor, each with force and moment.
 
     Input ports:
         knife_pose: RigidTransform X_WK.
@@ -126,21 +104,11 @@ class WrenchVisualizer(LeafSystem):
         meshcat: Viewer.
         X_KS: Pose of the sensor's frame in the knife's.
         period: Time between frames, s.
-        scale: Lengths of the arrows.
-        path: Path in Meshcat's tree.
     """
 
-    def __init__(
-        self,
-        meshcat: Meshcat,
-        X_KS: RigidTransform,
-        period: float,
-        scale: ArrowScale = ArrowScale(),
-        path: str = "/wrench",
-    ) -> None:
+    def __init__(self, meshcat: Meshcat, X_KS: RigidTransform, period: float) -> None:
         super().__init__()
         self._X_KS = X_KS
-        self._scale = scale
         self._pose = self.DeclareAbstractInputPort("knife_pose", Value(RigidTransform()))
         self._wrenches = {
             name: self.DeclareAbstractInputPort(f"{name}_wrench", Value(SpatialForce.Zero()))
@@ -151,15 +119,15 @@ class WrenchVisualizer(LeafSystem):
         for order, (name, colour) in enumerate(COLOURS.items(), start=2):
             light = (0.5 + 0.5 * colour[0], 0.5 + 0.5 * colour[1], 0.5 + 0.5 * colour[2])
             self._arrows[name] = (
-                _Arrow(meshcat, f"{path}/{name}/force", colour, 1, order),
-                _Arrow(meshcat, f"{path}/{name}/moment", light, 2, order),
+                _Arrow(meshcat, f"/wrench/{name}/force", colour, 1, order),
+                _Arrow(meshcat, f"/wrench/{name}/moment", light, 2, order),
             )
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
         self.DeclareForcedPublishEvent(self._publish)
 
     def _publish(self, context: Context) -> None:
         X_WK = self._pose.Eval(context)
-        time, scale = context.get_time(), self._scale
+        time = context.get_time()
         for name, (force, moment) in self._arrows.items():
             wrench = self._wrenches[name].Eval(context)
             f, m, point = wrench.translational(), wrench.rotational(), X_WK.translation()
@@ -167,6 +135,6 @@ class WrenchVisualizer(LeafSystem):
                 X_WS = X_WK @ self._X_KS
                 f, m = X_WS.rotation() @ f, X_WS.rotation() @ m
                 point = X_WS.translation()
-            per_N, per_Nm = 1.0 / scale.newtons_per_metre, 1.0 / scale.newton_metres_per_metre
-            force.set(point, per_N * f, per_N * scale.min_force, time)
-            moment.set(point, per_Nm * m, per_Nm * scale.min_moment, time)
+            force.set(point, f / NEWTONS_PER_METRE, MIN_FORCE / NEWTONS_PER_METRE, time)
+            least = MIN_MOMENT / NEWTON_METRES_PER_METRE
+            moment.set(point, m / NEWTON_METRES_PER_METRE, least, time)
