@@ -241,15 +241,16 @@ def _worst(result: OneSlice) -> str:
     noise = result.evidence.noise[0]
     span = float(result.record.time[-1] - result.record.time[0])
     text = (
-        f"The fit leaves most at {fit[0]} ({fit[3]:.2f} N RMS, mean {fit[2]:+.2f} N); left out,"
-        f" most is wrong at {out[0]} ({out[4]:.2f} N). What is left goes with itself over "
-        f"{1e3 * noise.tau:.0f} ms ({noise.ar:.2f} N; without memory {noise.white:.2f} N): a model "
-        "error or the slice's own structure, not noise of the sensor."
+        f"The residual of the fit is largest at {fit[0]} ({fit[3]:.2f} N RMS, mean {fit[2]:+.2f}"
+        f" N), and the error where depth was left out at {out[0]} ({out[4]:.2f} N). The residual"
+        f" is correlated over {1e3 * noise.tau:.0f} ms ({noise.ar:.2f} N; {noise.white:.2f} N are"
+        " white). It is therefore an error of the model or structure of this slice, not noise of"
+        " the sensor."
     )
     if noise.tau > 0.45 * span:
         text += (
-            " That is the longest time that was allowed: what is left is no process with a level of"
-            " its own, and p is not to be trusted here."
+            " This is the longest time that was allowed. The residual is then not stationary, and p"
+            " cannot be trusted here."
         )
     return text
 
@@ -274,9 +275,9 @@ def _fitted(result: OneSlice) -> str:
     own = result.fit.values("own")
     text = "Fitted: " + ", ".join(f"{k} {v:.3g}" for k, v in base.items())
     if "height" in own:
-        text += f"; knife {1e3 * own['height']:+.2f} mm lower than the onset of the force says"
+        text += f"; knife {1e3 * own['height']:+.2f} mm lower than the onset of the force suggests"
     if "speed" in own:
-        text += f", {100 * (np.exp(own['speed']) - 1.0):+.0f} % faster than nominal"
+        text += f", speed {100 * (np.exp(own['speed']) - 1.0):+.0f} % from nominal"
     return text + (f". With a cause: {'; '.join(shown)}." if shown else ".")
 
 
