@@ -19,6 +19,7 @@ from sliceit_drake.cutting.motion import (
 )
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
+from studies.disect.contact_sums import contact_forces
 
 SHAPE = Cylinder(rings=3, layers=[0.0, 0.004, 0.012])
 LOSSES = ("edge", "opening", "friction", "board_friction", "blade")
@@ -127,7 +128,7 @@ def parted():
         moved = state.copy()
         x = solver.field(moved, "x").reshape(-1, 3)
         x[np.unique(model.point_nodes[:, 2:])] += shift
-        return solver.contact_forces(moved, pose, pose), solver.energies(moved, pose).interface
+        return contact_forces(solver, moved, pose, pose), solver.energies(moved, pose).interface
 
     return at
 

@@ -22,6 +22,7 @@ from sliceit_drake.resources import resource_path
 from studies.disect import case as disect
 from studies.disect import page as disect_page
 from studies.disect.case import load_case, load_reference, run_case
+from studies.disect.contact_sums import contact_forces, contact_sums
 from studies.disect.settings import SETTINGS
 from studies.disect.study import Curve, Difference, DisectStudy, MeasuredCurves
 from studies.pages import render
@@ -41,38 +42,36 @@ def bar(knife=None, share=1.0, friction=0.2, **numerics):
     return make_food_model(food, knife or Knife(length=0.4), Numerics(**numerics))
 
 
-def cut(model, depth=0.012, direction=(0.0, 0.0, 1.0), period=2e-3, **rest):
-    solver = CuttingSolver(model, period)
+def along(model, depth=0.012, direction=(0.0, 0.0, 1.0)):
     way = ConstantSpeed(distance=depth, speed=0.05, direction=list(direction))
-    return simulate_slice(solver, Motion(MotionPlan([way]), start_pose(model, 5e-4)), **rest)
+    return Motion(MotionPlan([way]), start_pose(model, 5e-4))
 
 
-@pytest.fixture(scope="module")
-def drawn():
-    return cut(bar(), direction=(1.0, 0.0, 1.0), contact_sum=True)
+def cut(model, depth=0.012):
+    return simulate_slice(CuttingSolver(model, 2e-3), along(model, depth))
 
 
-def test_the_sum_of_norms_is_never_less_than_the_resultant(drawn):
-    touching = drawn.contact_sum > 0.0
-    assert touching[-1] and not touching[0]
-    resultant = np.linalg.norm(drawn.food_wrench[:, 3:], axis=1)
+def both_measures(model, motion):
+    """Norms of the resultants of a slice and sums of norms, each coupling step."""
+    solver = CuttingSolver(model, 2e-3)
+    force = simulate_slice(solver, motion).food_wrench[:, 3:]
+    return np.linalg.norm(force, axis=1), contact_sums(solver, motion)
+
+
+def test_the_sum_of_norms_is_never_less_than_the_resultant():
+    model = bar()
+    resultant, norms = both_measures(model, along(model, direction=(1.0, 0.0, 1.0)))
+    assert norms[-1] > 0.0 and norms[0] == 0.0
     # Two percent, for one is the coupling step's mean and the other its end.
-    assert np.all(drawn.contact_sum >= 0.98 * resultant)
-    assert drawn.contact_sum[-1] > 1.5 * resultant[-1]
-
-
-def test_recording_the_sum_of_norms_changes_no_force(drawn):
-    again = cut(bar(), direction=(1.0, 0.0, 1.0))
-    assert again.contact_sum is None
-    np.testing.assert_array_equal(again.food_wrench, drawn.food_wrench)
+    assert np.all(norms >= 0.98 * resultant)
+    assert norms[-1] > 1.5 * resultant[-1]
 
 
 def test_parallel_contacts_have_a_sum_of_norms_that_is_their_resultant():
     model = bar(RAZOR, friction=0.0, flank_stiffness=0.01)
-    result = cut(model, contact_sum=True)
-    resultant = np.linalg.norm(result.food_wrench[:, 3:], axis=1)
+    resultant, norms = both_measures(model, along(model))
     assert resultant[-1] == pytest.approx(TOUGHNESS * 0.02, rel=0.1)
-    assert result.contact_sum[-1] == pytest.approx(resultant[-1], rel=0.01)
+    assert norms[-1] == pytest.approx(resultant[-1], rel=0.01)
 
 
 def test_contact_forces_add_up_to_the_force_on_the_knife():
@@ -83,7 +82,7 @@ def test_contact_forces_add_up_to_the_force_on_the_knife():
     for _ in range(600):
         after = pose._replace(p=pose.p + 2e-4 * np.array([0.03, 0.0, -0.05]))
         step = solver.coupling_step(state, pose, after)
-        forces = solver.contact_forces(step.state, pose, after)
+        forces = contact_forces(solver, step.state, pose, after)
         state, pose = step.state, after
     assert forces.shape == (len(model.point_nodes), 2, 3)
     total = forces.sum((0, 1))

@@ -75,7 +75,7 @@ def test_estimated_error_of_the_default_mesh_is_at_most_three_percent_and_honest
     plan = MotionPlan([ConstantSpeed(distance=0.027, speed=0.02, acceleration=None)])
     motion = Motion(plan, start_pose(model, clearance=5e-4))
     estimate = estimate_discretization_error(
-        cucumber.food, cucumber.knife, cucumber.numerics, 2e-3, motion, None
+        cucumber.food, cucumber.knife, cucumber.numerics, 2e-3, motion
     )
     assert 0.0 < estimate.relative_rms <= 0.03
 

@@ -4,7 +4,6 @@ import dataclasses as dc
 
 import numpy as np
 
-from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.foods.food import Food, make_food_model
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
@@ -13,6 +12,12 @@ from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 
 __all__ = ["DiscretizationError", "estimate_discretization_error"]
+
+
+REFINEMENT = 0.5
+"""Elements along an edge of the coarse mesh, relative to the given one."""
+ORDER = 1.5
+"""Order of convergence that is assumed."""
 
 
 @dc.dataclass
@@ -36,22 +41,17 @@ def estimate_discretization_error(
     numerics: Numerics,
     exchange_period: float,
     motion: Motion,
-    board: Board | None,
-    refinement: float = 0.5,
-    order: float = 1.5,
 ) -> DiscretizationError:
     """Richardson's estimate from the given mesh and a coarser one, on a prescribed motion.
 
-    The order that is assumed, 1.5, lies below the 1.6 to 1.9 seen with cucumbers between the meshes
-    of half and of full fineness: flanks and bonds, whose stiffness goes with E/h, are of first
-    order, the bulk of second. The step's error is not in it (docs/stepping.md).
+    The error is the difference over `REFINEMENT`^-`ORDER` - 1. The order lies below the 1.6 to 1.9
+    seen with cucumbers between the meshes of half and of full fineness: flanks and bonds, whose
+    stiffness goes with E/h, are of first order, the bulk of second. The step's error is not in it
+    (docs/stepping.md).
 
     Args:
         food, knife, numerics, exchange_period: The cut.
         motion: Poses X_FK of the knife.
-        board: Board under the knife, or None.
-        refinement: Elements along an edge of the coarse mesh, relative to the given one.
-        order: Order p of convergence: the error is the difference over refinement^-p - 1.
 
     Raises:
         MeshError, CuttingError: The food cannot be meshed or cut at the coarser refinement.
@@ -59,16 +59,16 @@ def estimate_discretization_error(
 
     def force(scale: float) -> tuple[SliceResult, int]:
         model = make_food_model(food, knife, numerics, scale)
-        result = simulate_slice(CuttingSolver(model, exchange_period), motion, board)
+        result = simulate_slice(CuttingSolver(model, exchange_period), motion)
         return result, model.element_count
 
-    coarse, coarse_count = force(refinement)
+    coarse, coarse_count = force(REFINEMENT)
     given, count = force(1.0)
     norms = [np.linalg.norm(r.food_wrench[:, 3:], axis=1) for r in (coarse, given)]
     contact = norms[1] > 0.05
     if not contact.any():
-        return DiscretizationError(0.0, order, [coarse_count, count])
+        return DiscretizationError(0.0, ORDER, [coarse_count, count])
     difference = np.sqrt(np.mean((norms[0] - norms[1])[contact] ** 2))
     scale = np.sqrt(np.mean(norms[1][contact] ** 2))
-    error = float(difference / scale / (refinement**-order - 1.0))
-    return DiscretizationError(error, order, [coarse_count, count])
+    error = float(difference / scale / (REFINEMENT**-ORDER - 1.0))
+    return DiscretizationError(error, ORDER, [coarse_count, count])

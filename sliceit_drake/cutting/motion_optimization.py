@@ -128,17 +128,15 @@ def mean_force(adjoint: SliceAdjoint, motion: PressAndDraw) -> tuple[float, np.n
 def optimize_motion(
     model: CuttingModel,
     limits: MotionLimits,
-    start: PressAndDraw | None = None,
     period: float = 0.002,
     iterations: int = 30,
     progress: Callable[[int, float, PressAndDraw], None] | None = None,
 ) -> Optimum:
-    """The press and draw with the least mean force.
+    """The press and draw with the least mean force, from the middle of what the limits allow.
 
     Args:
         model: The cut.
         limits: What the motion may be.
-        start: Motion to begin with; None for half of what the limits allow.
         period: Coupling step period, s.
         iterations: Most of the optimiser.
         progress: Called with the number of slices, the best force so far, N, and its motion.
@@ -157,8 +155,7 @@ def optimize_motion(
             field="press_speed",
             fix="Allow more time or a greater speed.",
         )
-    if start is None:
-        start = _fitting(low, high, limits, height)
+    start = _fitting(low, high, limits, height)
     # All three of the order of one.
     scale = high
     best: list = [np.inf, start]

@@ -49,8 +49,6 @@ class SliceResult:
         balance: Work and dissipation.
         energies: Energies at the end.
         energy_ratio: Largest kinetic over internal energy.
-        contact_sum: Sum of the norms of all contact forces of the food on the knife at time[k] [n],
-            N, by cut point and face; None if not asked for.
     """
 
     time: np.ndarray
@@ -66,7 +64,6 @@ class SliceResult:
     balance: EnergyBalance
     energies: Energies
     energy_ratio: float
-    contact_sum: np.ndarray | None = None
 
 
 def check_clear(model: CuttingModel, X_CK: Pose) -> None:
@@ -87,26 +84,6 @@ def check_clear(model: CuttingModel, X_CK: Pose) -> None:
         )
 
 
-def _check_ends(model: CuttingModel, X_CK: Pose, time: float) -> None:
-    """Refuses an end of the edge inside the section: the model cuts with the edge, not with an end.
-
-    Raises:
-        CuttingError: With the end and the remedy.
-    """
-    low, high = model.span
-    px, _, pz = X_CK.p.tolist()
-    ax, _, az = X_CK.R[:, 0].tolist()
-    for end in (-0.5 * model.knife.length, 0.5 * model.knife.length):
-        x, z = px + end * ax, pz + end * az
-        if low < x < high and z < model.top:
-            raise CuttingError(
-                f"at {time:.4g} s an end of the knife is over the cut, {1e3 * (x - low):.3g} mm "
-                "from its side: only the edge between the ends cuts. Use a longer knife "
-                f"(knife.length = {model.knife.length:.4g} m), a shorter draw, or start it nearer "
-                "to the other end."
-            )
-
-
 def check_in_plane(model: CuttingModel, X_CK: Pose, time: float) -> None:
     """Refuses a knife that left the plane that the model can cut.
 
@@ -114,8 +91,8 @@ def check_in_plane(model: CuttingModel, X_CK: Pose, time: float) -> None:
         CuttingError: The edge is in the food and the blade is off the plane, turned out of it, or
             drawn so far that one of its ends is over the cut.
     """
-    _, y, z = X_CK.p.tolist()
-    if z > model.top or z < model.bottom - model.knife.height:
+    px, y, pz = X_CK.p.tolist()
+    if pz > model.top or pz < model.bottom - model.knife.height:
         return
     turn, _, lean = np.abs(X_CK.R[1]).tolist()
     offset = abs(y)
@@ -126,7 +103,18 @@ def check_in_plane(model: CuttingModel, X_CK: Pose, time: float) -> None:
             f"up to {1e3 * LATERAL_LIMIT:g} mm and {TILT_LIMIT:g} rad. Give the knife's path the "
             "plane of the cut."
         )
-    _check_ends(model, X_CK, time)
+    # The model cuts with the edge, not with an end of it.
+    low, high = model.span
+    ax, _, az = X_CK.R[:, 0].tolist()
+    for end in (-0.5 * model.knife.length, 0.5 * model.knife.length):
+        x, z = px + end * ax, pz + end * az
+        if low < x < high and z < model.top:
+            raise CuttingError(
+                f"at {time:.4g} s an end of the knife is over the cut, {1e3 * (x - low):.3g} mm "
+                "from its side: only the edge between the ends cuts. Use a longer knife "
+                f"(knife.length = {model.knife.length:.4g} m), a shorter draw, or start it nearer "
+                "to the other end."
+            )
 
 
 def energy_ratio(energies: Energies, dissipated: float, model: CuttingModel) -> float:
@@ -183,7 +171,6 @@ def simulate_slice(
     motion: Motion,
     board: Board | None = None,
     check_period: float = 0.05,
-    contact_sum: bool = False,
 ) -> SliceResult:
     """Drives the knife along `motion` through the food.
 
@@ -193,7 +180,6 @@ def simulate_slice(
         board: Board under the knife, its height in F; None for none.
         check_period: Interval of the energy and inversion checks, s; shorter where the knife moves
             more than `CHECK_TRAVEL` in it.
-        contact_sum: Whether to record `SliceResult.contact_sum`, which takes longer.
 
     Raises:
         CuttingError: The knife starts in the food, or the cut became unphysical.
@@ -205,13 +191,12 @@ def simulate_slice(
     check_clear(model, path.pose(0))
     balance = EnergyBalance()
     food_wrench, mechanisms = np.zeros((count, 6)), np.zeros((count, 3, 3))
-    cut, norms = np.zeros(count), np.zeros(count)
+    cut = np.zeros(count)
     ratio = travel = 0.0
     last_check = 0
 
     def launches() -> Iterator[Launch]:
-        singly = (Launch(k, 1) for k in range(count))
-        for launch in singly if contact_sum else even_launches([path]):
+        for launch in even_launches([path]):
             for m in range(launch.first + 1, launch.first + launch.coupling_steps + 1):
                 check_in_plane(model, path.pose(m), m * T)
             yield launch
@@ -225,9 +210,6 @@ def simulate_slice(
         food_wrench[at] = parts.sum(1).reshape(block, 6)
         mechanisms[at] = parts[:, :, 1]
         cut[at] = step.cut
-        if contact_sum:
-            forces = solver.contact_forces(state, path.pose(k), path.pose(k + 1))
-            norms[k] = np.linalg.norm(forces, axis=-1).sum()
         end = k + block
         moved = np.diff(path.p_FK[k : end + 1], axis=0)
         travel += float(np.linalg.norm(moved, axis=1).sum())
@@ -253,5 +235,4 @@ def simulate_slice(
         balance=balance,
         energies=energies,
         energy_ratio=ratio,
-        contact_sum=norms if contact_sum else None,
     )

@@ -9,7 +9,7 @@ import numpy as np
 from sliceit_drake.cutting.coupling_steps import CouplingSteps, Energies, run_coupling_steps
 from sliceit_drake.cutting.driver import Driver
 from sliceit_drake.cutting.model import CuttingModel
-from sliceit_drake.cutting.motion import Pose, small_turn
+from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.workspace import Workspace, parameter_row
 
 __all__ = ["NOT_FINITE", "CuttingError", "CuttingSolver", "SurfaceFactors"]
@@ -124,42 +124,15 @@ class CuttingSolver:
             raise CuttingError(NOT_FINITE)
         return step
 
-    def _place(self, state: np.ndarray, pose: Pose, factors: SurfaceFactors = UNCHANGED) -> None:
+    def _place(self, state: np.ndarray, pose: Pose, factors: SurfaceFactors) -> None:
         """Puts food and knife, at rest at `pose`, into the workspace for launches with k = 0."""
-        self._take_factors(factors)
-        self._workspace.write(self._workspace.states[0], state[None])
-        self._place_knife(pose, np.zeros(3), np.zeros(3))
-
-    def _place_knife(self, pose: Pose, v: np.ndarray, w: np.ndarray) -> None:
         ws = self._workspace
+        self._take_factors(factors)
+        ws.write(ws.states[0], state[None])
         motion = np.zeros(ws.motion.shape)
-        knife = {"R_CK": pose.R.ravel(), "p_CK": pose.p, "v_CK": v, "w_CK": w}
-        for name, values in knife.items():
+        for name, values in (("R_CK", pose.R.ravel()), ("p_CK", pose.p)):
             motion[0, ws.motion_layout[name].start :][: len(values)] = values
         ws.write(ws.motion, motion)
-
-    def contact_forces(self, state: np.ndarray, start: Pose, end: Pose) -> np.ndarray:
-        """Forces on the knife at the end of a coupling step, by cut point and face [P, 2, 3], N, in
-        C.
-
-        Half of the edge's force, the flank's pressure and its friction. The sum of their norms is
-        what DiSECt records as the knife's force; their sum is the resultant.
-
-        Args:
-            state: The food's state after the coupling step [state_size].
-            start, end: Knife poses in C between which it moved.
-        """
-        T, ws = self.exchange_period, self._workspace
-        v, w = (end.p - start.p) / T, small_turn(start.R, end.R) / T
-        away = end._replace(p=end.p + 10.0 * end.R[:, 0])
-        with self._lock:
-            self._place(state, end)
-            self._place_knife(end, v, w)
-            both = ws.point_forces()
-            # What is left with the knife beyond the food are the bonds, in the same state.
-            self._place_knife(away, np.zeros(3), np.zeros(3))
-            bonds = ws.point_forces()
-        return bonds - both
 
     def energies(
         self, state: np.ndarray, pose: Pose, factors: SurfaceFactors = UNCHANGED

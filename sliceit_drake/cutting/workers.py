@@ -13,12 +13,7 @@ __all__ = ["children_without_interrupts", "start_worker", "worker_processes"]
 
 
 @contextmanager
-def worker_processes(
-    count: int,
-    method: str = "spawn",
-    initializer: Callable[..., None] | None = None,
-    arguments: tuple[Any, ...] = (),
-) -> Iterator[ProcessPoolExecutor]:
+def worker_processes(count: int, method: str = "spawn") -> Iterator[ProcessPoolExecutor]:
     """Processes that end with the context.
 
     What leaves the context by an error, Ctrl-C included, ends the tasks that run by a SystemExit
@@ -27,15 +22,8 @@ def worker_processes(
     Args:
         count: How many.
         method: How they start, "spawn" or "forkserver".
-        initializer: Called in each at its start.
-        arguments: Arguments of `initializer`.
     """
-    pool = _Pool(
-        count,
-        get_context(method),
-        initializer=start_worker,
-        initargs=(initializer, arguments),
-    )
+    pool = _Pool(count, get_context(method), initializer=start_worker)
     try:
         yield pool
     except BaseException:
@@ -58,14 +46,10 @@ def children_without_interrupts() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def start_worker(
-    initializer: Callable[..., None] | None = None, arguments: tuple[Any, ...] = ()
-) -> None:
+def start_worker() -> None:
     """Readies a process: Ctrl-C, which a terminal sends to all, is for the one that started it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _end)
-    if initializer is not None:
-        initializer(*arguments)
 
 
 class _Pool(ProcessPoolExecutor):

@@ -186,7 +186,7 @@ def _(food: Food, scenario: Scenario) -> PreparedFood:
             one = sequence.motion([cut.top], start.clearance)
         motion = Motion(one, start_pose(cut, start.clearance, start.offset))
         return estimate_discretization_error(
-            foods[middle], scenario.knife, numerics, scenario.exchange_period, motion, None
+            foods[middle], scenario.knife, numerics, scenario.exchange_period, motion
         )
 
     return PreparedFood(

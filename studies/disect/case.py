@@ -18,6 +18,7 @@ from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.resources import resource_path
+from studies.disect.contact_sums import contact_sums
 
 __all__ = [
     "MIDDLE",
@@ -310,8 +311,7 @@ def run_case(case: Case, whole_copies: bool = False) -> CaseResult:
         model = _with_whole_copies(model)
     solver = CuttingSolver(model, case.period)
     motion = Motion(case.motion, start_pose(model, case.clearance))
-    result = simulate_slice(solver, motion, contact_sum=True)
-    assert result.contact_sum is not None
+    result = simulate_slice(solver, motion)
     parted = np.asarray(solver.field(result.state, "cohesive_damage"), float)
     p = model.parameters
     failure = 2.0 * model.toughness / p["strength"]
@@ -322,7 +322,7 @@ def run_case(case: Case, whole_copies: bool = False) -> CaseResult:
     slope, offset = np.polyfit(above, opening, 1)
     return CaseResult(
         height=result.position[:, 2],
-        norms=result.contact_sum,
+        norms=contact_sums(solver, motion),
         resultant=np.linalg.norm(result.food_wrench[:, 3:], axis=1),
         vertical=result.food_wrench[:, 5],
         broken=float(1.0 - (1.0 - passed) * np.mean(parted < 1.0)),
@@ -340,7 +340,7 @@ def _with_whole_copies(model: CuttingModel) -> CuttingModel:
     whole = 1.0 / (6.0 * np.linalg.det(model.inverse))
     node_volume = np.zeros(len(model.nodes))
     np.add.at(node_volume, model.tetrahedra, np.repeat(0.25 * whole[:, None], 4, axis=1))
-    return dc.replace(model, stiff_volume=whole, node_volume=node_volume).derive()
+    return dc.replace(model, stiff_volume=whole, node_volume=node_volume)
 
 
 def with_contact(case: Case, factor: float, name: str = "flank_stiffness") -> Case:

@@ -16,6 +16,7 @@ from sliceit_drake.diagrams.outputs.measurement_comparison import compare_with_m
 from sliceit_drake.records.force_profile import ForceProfile
 from studies.disect import case as disect
 from studies.disect.case import Case, CaseResult, Reference, ReferenceRun
+from studies.disect.contact_sums import contact_sums
 from studies.physics.measured_curves import MeasuredFood
 
 __all__ = ["STEPS", "Curve", "Difference", "DisectStudy", "MeasuredCurves", "disect_study"]
@@ -345,10 +346,10 @@ def _measured_curves(case: MeasuredFood, reference: Reference) -> MeasuredCurves
     def cut(food: MeasuredFood) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         model = make_food_model(food.food, Knife(), food.numerics)
         solver = CuttingSolver(model, PERIOD)
-        result = simulate_slice(solver, food.motion(model, profile), contact_sum=True)
-        assert result.contact_sum is not None
+        motion = food.motion(model, profile)
+        result = simulate_slice(solver, motion)
         force = np.linalg.norm(result.food_wrench[:, 3:], axis=1)
-        return case.diameter - result.position[:, 2], force, result.contact_sum
+        return case.diameter - result.position[:, 2], force, contact_sums(solver, motion)
 
     def over_time(depth: np.ndarray, force: np.ndarray, contact: float) -> np.ndarray:
         return np.interp(speed * (profile.time - contact), depth, force, left=0.0)

@@ -72,28 +72,23 @@ class SpringFood:
         return dc.replace(self, stiffness=erp / (self.time_step * cfm), damping=(1.0 - erp) / cfm)
 
 
-def calibrate_spring(
-    force: Sequence[float] | np.ndarray,
-    height: float,
-    erp: float = DEFAULT_ERP,
-    food: SpringFood | None = None,
-) -> SpringFood:
+def calibrate_spring(force: Sequence[float] | np.ndarray, height: float) -> SpringFood:
     """The spring whose force at full compression is the largest of a measured profile, as SliceIt!.
+
+    Its damping is that of `DEFAULT_ERP` at its time step.
 
     Args:
         force: Measured force over one slice [n], N.
         height: Height of the food, metres: the spring's travel.
-        erp: ODE's ERP at the food's `time_step`, which gives the damping.
-        food: Other values; None for the defaults.
 
     Raises:
-        ConfigurationError: The profile has no force, or ERP is not within (0, 1].
+        ConfigurationError: The profile has no force.
     """
     largest = float(np.max(force))
     if not (math.isfinite(largest) and largest > 0.0):
         raise ConfigurationError(
             f"the largest force is {largest} N", field="force", fix="Give a profile of a slice."
         )
-    food = dc.replace(food or SpringFood(), height=height)
+    food = SpringFood(height=height)
     stiffness = largest / height
-    return food.with_erp_cfm(erp, erp / (food.time_step * stiffness))
+    return food.with_erp_cfm(DEFAULT_ERP, DEFAULT_ERP / (food.time_step * stiffness))

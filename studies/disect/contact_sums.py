@@ -1,0 +1,48 @@
+"""Sums of the norms of all contact forces on the knife, which DiSECt records as its force."""
+
+import numpy as np
+
+from sliceit_drake.cutting.driver import Launch
+from sliceit_drake.cutting.knife_path import KnifePath
+from sliceit_drake.cutting.motion import Motion, Pose, small_turn
+from sliceit_drake.cutting.solver import CuttingSolver
+
+__all__ = ["contact_forces", "contact_sums"]
+
+
+def contact_forces(solver: CuttingSolver, state: np.ndarray, start: Pose, end: Pose) -> np.ndarray:
+    """Forces on the knife at the end of a coupling step, by cut point and face [P, 2, 3], N, in C.
+
+    Half of the edge's force, the flank's pressure and its friction. Their sum is the resultant.
+
+    Args:
+        solver: The cut.
+        state: The food's state after the coupling step [state_size].
+        start, end: Knife poses in C between which it moved.
+    """
+    T, ws = solver.exchange_period, solver._workspace
+
+    def forces(pose: Pose, v: np.ndarray, w: np.ndarray) -> np.ndarray:
+        motion = np.zeros(ws.motion.shape)
+        knife = {"R_CK": pose.R.ravel(), "p_CK": pose.p, "v_CK": v, "w_CK": w}
+        for name, values in knife.items():
+            motion[0, ws.motion_layout[name].start :][: len(values)] = values
+        ws.write(ws.motion, motion)
+        return ws.point_forces()
+
+    ws.write(ws.states[0], state[None])
+    both = forces(end, (end.p - start.p) / T, small_turn(start.R, end.R) / T)
+    # What is left with the knife beyond the food are the bonds, in the same state.
+    away = end._replace(p=end.p + 10.0 * end.R[:, 0])
+    return forces(away, np.zeros(3), np.zeros(3)) - both
+
+
+def contact_sums(solver: CuttingSolver, motion: Motion) -> np.ndarray:
+    """Sum of the norms of `contact_forces` at the end of each coupling step of a slice [n], N."""
+    path = KnifePath(solver.model, motion, solver.exchange_period)
+    launches = (Launch(k, 1) for k in range(path.coupling_steps))
+    forces = [
+        contact_forces(solver, step.state, path.pose(k), path.pose(k + 1))
+        for (k, _, _), (step,) in solver.driver.run([path], launches)
+    ]
+    return np.linalg.norm(forces, axis=-1).sum((1, 2))
