@@ -9,7 +9,7 @@ from pydrake.systems.analysis import InitializeParams, Simulator
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.foods.shapes import Ellipsoid, Remainder
 from sliceit_drake.diagrams.outputs.sequence_report import slice_reports
-from sliceit_drake.diagrams.plant.holder_arm import FINGERTIPS, HoldingArm
+from sliceit_drake.diagrams.plant.surroundings import FINGERTIPS, HoldingArm
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.scenario_diagram import ScenarioDiagram

@@ -24,18 +24,18 @@ Examples
 """
 
 import argparse
+import contextlib
+import functools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sliceit_drake.cli.arguments import SCENARIO, add_protocol_argument, protocol_file
 from sliceit_drake.cli.hardware import add_robot_arguments, robot_of
-from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.hardware.client import is_loopback
 from sliceit_drake.output_folder import check_folder
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from sliceit_drake.diagrams.scenario import Scenario
 
 __all__ = ["add_arguments", "run"]
@@ -86,6 +86,9 @@ def run(options: argparse.Namespace) -> int:
     station = load_scenario(options.station)
     options.output = directory = options.output or Path("output") / protocol.name
     check_folder(directory, "--output")
+    port, put_fresh_food = options.emulator_pendant, None
+    if port is not None:
+        put_fresh_food = functools.partial(_put_fresh_food, options.host, port)
     collection = Collection(
         protocol,
         station,
@@ -94,7 +97,7 @@ def run(options: argparse.Namespace) -> int:
         robot,
         move_to_start=options.move_to_start,
         touch=options.touch,
-        put_fresh_food=_fresh_food(options),
+        put_fresh_food=put_fresh_food,
     )
     return 0 if collection.cut(options.first) else 1
 
@@ -120,30 +123,21 @@ def _check(options: argparse.Namespace) -> None:
             )
 
 
-def _fresh_food(options: argparse.Namespace) -> "Callable[[Scenario], None] | None":
-    """Renews the food under the knife of an emulated robot; None where somebody does that by hand.
+def _put_fresh_food(host: str, port: int, scenario: "Scenario") -> None:
+    """Renews the food under the knife of an emulated robot.
 
-    What it returns raises a ConfigurationError where no emulator answers, or it refuses.
+    Raises:
+        ConfigurationError: No emulator answers there, or it refuses.
     """
-    port = options.emulator_pendant
-    if port is None:
-        return None
-    from sliceit_drake.configuration import dump_yaml
     from sliceit_drake.emulator.process import EmulatorError, PendantClient
 
-    def put_fresh_food(scenario: "Scenario") -> None:
-        try:
-            pendant = PendantClient(options.host, PREPARATION, port)
-            try:
-                pendant.put_fresh_food(dump_yaml(scenario))
-            finally:
-                pendant.close()
-        except (OSError, EmulatorError) as error:
-            raise ConfigurationError(
-                f"{options.host}:{port} puts no fresh food there: {error}",
-                field="--emulator-pendant",
-                fix="Give the own port of a running `sliceit emulate`, 30099.",
-            ) from error
-        print("The emulator has put it there.")
-
-    return put_fresh_food
+    try:
+        with contextlib.closing(PendantClient(host, PREPARATION, port)) as pendant:
+            pendant.put_fresh_food(dump_yaml(scenario))
+    except (OSError, EmulatorError) as error:
+        raise ConfigurationError(
+            f"{host}:{port} puts no fresh food there: {error}",
+            field="--emulator-pendant",
+            fix="Give the own port of a running `sliceit emulate`, 30099.",
+        ) from error
+    print("The emulator has put it there.")

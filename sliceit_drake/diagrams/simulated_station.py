@@ -10,7 +10,6 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer
 
-from sliceit_drake.diagrams.plant.holder_arm import HoldingArm
 from sliceit_drake.diagrams.plant.knife_body import check_plant_step, effective_mass
 from sliceit_drake.diagrams.plant.robot_plant import (
     ArmController,
@@ -20,7 +19,7 @@ from sliceit_drake.diagrams.plant.robot_plant import (
     connect_arm_controller,
 )
 from sliceit_drake.diagrams.plant.start_joints import solve_start_joints
-from sliceit_drake.diagrams.plant.surroundings import add_board, add_holder, add_table
+from sliceit_drake.diagrams.plant.surroundings import HoldingArm, add_board, add_holder, add_table
 from sliceit_drake.diagrams.prepared_food import HeldFood, OwnCutting, food_to_cut
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.station_interface import (

@@ -197,24 +197,18 @@ def add_recorder(
         "record_row", Multiplexer([len(columns) for columns in vectors.values()])
     )
     for i, name in enumerate(vectors):
-        builder.Connect(_vector_source(builder, station, sources, name), row.get_input_port(i))
+        if name in sources:
+            source = sources[name]
+        elif name in _COMMANDS:
+            value = np.atleast_1d(np.array(getattr(station.scenario.controller, name), float))
+            constant = builder.AddNamedSystem(f"configured_{name}", ConstantVectorSource(value))
+            source = constant.get_output_port()
+        else:
+            source = station.GetOutputPort(name)
+        builder.Connect(source, row.get_input_port(i))
     log = LogVectorOutput(
         row.get_output_port(), builder, publish_period=station.scenario.exchange_period
     )
     log.set_name("record")
     columns = [column for group in vectors.values() for column in group]
     return Recorder(log, columns, station, motion)
-
-
-def _vector_source(
-    builder: DiagramBuilder, station: Station, sources: Mapping[str, OutputPort], name: str
-) -> OutputPort:
-    """Where a recorded vector comes from: the station, a command source, or the configuration."""
-    if name in sources:
-        return sources[name]
-    if name not in _COMMANDS:
-        return station.GetOutputPort(name)
-    constant = np.atleast_1d(np.asarray(getattr(station.scenario.controller, name), float))
-    return builder.AddNamedSystem(
-        f"configured_{name}", ConstantVectorSource(constant)
-    ).get_output_port()

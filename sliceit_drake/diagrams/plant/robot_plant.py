@@ -124,14 +124,8 @@ def add_plant(builder: DiagramBuilder, config: RobotConfig) -> tuple[MultibodyPl
 def add_robot(plant: MultibodyPlant, config: RobotConfig, knife: Knife, board: Board) -> Robot:
     """Adds the arm, the gripper and the knife, at their initial positions.
 
-    Args:
-        plant: Plant, not finalized, registered with a scene graph.
-        config: The robot.
-        knife: The blade in the gripper.
-        board: The board that the knife may touch.
-
-    Returns:
-        Handles of the robot.
+    The plant is not finalized, and registered with a scene graph; `board` is what the knife may
+    touch.
     """
     arm, gripper = add_arm_and_gripper(plant)
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", arm), config.X_WB())
@@ -183,12 +177,7 @@ class ArmController(Diagram):
     """
 
     def __init__(self, plant: MultibodyPlant, robot: Robot, config: RobotConfig) -> None:
-        """Builds the controller of the arm, at rest at the initial positions.
-
-        Args:
-            plant: Finalized plant whose only degrees of freedom are the arm's.
-            robot: The robot in it.
-            config: The robot's configuration.
+        """Builds the controller, at rest at the initial positions, of a robot in a finalized plant.
 
         Raises:
             ConfigurationError: If the gains are unstable at the plant's time step.
