@@ -12,8 +12,7 @@ from sliceit_drake.cli.main import main
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.records.validation import load_record
 from sliceit_drake.resources import resource_path
-from sliceit_drake.stand_in.protocol import load_protocol, schedule
-from sliceit_drake.stand_in.station_cuts import scenario_of_cut
+from sliceit_drake.stand_in.protocol import load_protocol, scenario_of_cut, schedule
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 
 pytestmark = pytest.mark.second_tier

@@ -26,12 +26,11 @@ from sliceit_drake.emulator.frames import (
     split_names,
     take_frames,
 )
-from sliceit_drake.emulator.joint_targets import JointTargets
 from sliceit_drake.emulator.kinematics import Posture, forward, inverse, pose_of_matrix
 from sliceit_drake.emulator.modes import RobotMode, RuntimeState, SafetyMode
 from sliceit_drake.emulator.process import PendantClient
 from sliceit_drake.emulator.robot_model import CYCLE, START, KinematicRobot, SimulationStopped
-from sliceit_drake.emulator.station_robot import StationRobot
+from sliceit_drake.emulator.station_robot import JointTargets, StationRobot
 from sliceit_drake.emulator.variables import INPUTS, OUTPUTS, TYPES
 from sliceit_drake.hardware.hardware_config import load_hardware_config
 from sliceit_drake.resources import resource_path

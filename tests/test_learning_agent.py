@@ -22,8 +22,11 @@ from sliceit_drake.configuration import ConfigurationError  # noqa: E402
 from sliceit_drake.cutting.solver import CuttingError  # noqa: E402
 from sliceit_drake.diagrams.scenario import Start  # noqa: E402
 from sliceit_drake.learning import training  # noqa: E402
-from sliceit_drake.learning.export import export_policy  # noqa: E402
-from sliceit_drake.learning.network import HistoryExtractor, TemporalConvolution  # noqa: E402
+from sliceit_drake.learning.network import (  # noqa: E402
+    HistoryExtractor,
+    TemporalConvolution,
+    export_policy,
+)
 from sliceit_drake.learning.replay import PrioritizedReplayBuffer  # noqa: E402
 from sliceit_drake.learning.reward import RewardConfig, reward_potential  # noqa: E402
 from sliceit_drake.learning.sac import OverlapVecEnv, PrioritizedSAC  # noqa: E402

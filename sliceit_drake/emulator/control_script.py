@@ -52,8 +52,6 @@ COMMAND_NAMES = {
 }  # fmt: skip
 """ur_rtde's name of each command of the protocol."""
 
-_ASYNC_STARTED, _ASYNC_FINISHED = 0, -1
-
 # What stopL brakes a joint with, for want of its Cartesian meaning: a fifth of a metre of arm.
 _RADIANS_PER_METRE = 5.0
 _TOLERANCE = 1e-6
@@ -105,7 +103,7 @@ class ControlScript:
 
     def _main_loop(self) -> Iterator[None]:
         is_executing = False
-        self._report_async(_ASYNC_FINISHED)
+        self._report_async(False)
         self._answer(_READY)
         while True:
             command = self._integer(0)
@@ -155,14 +153,11 @@ class ControlScript:
     def _answer(self, state: int) -> None:
         self._controller.write_integer(self._offset, state)
 
-    def _report_async(self, progress: int) -> None:
+    def _report_async(self, is_running: bool) -> None:
         """Status word of asynchronous motions: running flag, number of operation and of writes."""
         self._async_writes = (self._async_writes + 1) % 128
-        if progress == _ASYNC_STARTED:
-            self._async_operation = (self._async_operation + 1) % 128
-        word = self._async_writes << 16 | self._async_operation << 24
-        if progress >= 0:
-            word |= 1 << 15 | min(progress, 0x7FFF)
+        self._async_operation = (self._async_operation + is_running) % 128
+        word = is_running << 15 | self._async_writes << 16 | self._async_operation << 24
         self._controller.write_integer(self._offset + 2, word)
 
     # Motions.
@@ -173,14 +168,14 @@ class ControlScript:
     def _end_motion(self) -> None:
         if self._motion is not None:
             self._motion = None
-            self._report_async(_ASYNC_FINISHED)
+            self._report_async(False)
 
     def _move(self, motion: Iterator[np.ndarray]) -> Iterator[np.ndarray] | None:
         """Runs a motion now, or beside the main loop if it is asynchronous."""
         self._end_motion()
         if self._integer(1):
             self._motion = motion
-            self._report_async(_ASYNC_STARTED)
+            self._report_async(True)
             return None
         return motion
 

@@ -83,7 +83,7 @@ class PendantClient:
         self._socket.close()
 
 
-class EmulatorProcess:
+class EmulatorProcess(contextlib.AbstractContextManager["EmulatorProcess"]):
     """An emulated controller: ``sliceit emulate`` as a child process; a context manager.
 
     The child ends with this process, however that ends.
@@ -179,9 +179,6 @@ class EmulatorProcess:
         except subprocess.TimeoutExpired:
             self.kill()
             self._process.communicate()
-
-    def __enter__(self) -> "EmulatorProcess":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -1,11 +1,21 @@
-"""The networks of the agent: a temporal convolution over the readings, beside all the rest."""
+"""The networks of the agent: a temporal convolution over the readings, beside all the rest.
+
+`export_policy` writes an actor as a network that runs without the library that trained it.
+"""
+
+from pathlib import Path
 
 import gymnasium
+import onnx
 import torch
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.sac.policies import Actor
 from torch import nn
 
-__all__ = ["HistoryExtractor", "TemporalConvolution"]
+from sliceit_drake.systems.agent import AgentConfig
+from sliceit_drake.systems.exported_network import LAYOUT, layout_of
+
+__all__ = ["HistoryExtractor", "TemporalConvolution", "export_policy"]
 
 READING = 3
 
@@ -79,3 +89,28 @@ class HistoryExtractor(BaseFeaturesExtractor):
             return dense
         history = observations[:, self.rest :].reshape(-1, self.history, READING)
         return torch.cat([self.convolution(history), dense], dim=1)
+
+
+def export_policy(actor: Actor, config: AgentConfig, file: Path) -> None:
+    """Writes the actor's decisions, without its randomness, as ONNX with the layout it needs.
+
+    Args:
+        actor: Actor of a Stable-Baselines3 SAC.
+        config: The agent's configuration.
+        file: File to write.
+    """
+    # The middle of the distribution.
+    parts = (actor.features_extractor, actor.latent_pi, actor.mu, nn.Tanh())
+    network = nn.Sequential(*parts).eval()
+    example = torch.zeros(1, config.observation_size())
+    torch.onnx.export(
+        network,
+        (example,),
+        str(file),
+        input_names=["observation"],
+        output_names=["action"],
+        dynamo=False,
+    )
+    model = onnx.load(str(file))
+    onnx.helper.set_model_props(model, {LAYOUT: layout_of(config)})
+    onnx.save(model, str(file))

@@ -24,8 +24,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.workers import children_without_interrupts, start_worker
 from sliceit_drake.learning.environment import SlicingEnv
-from sliceit_drake.learning.export import export_policy
-from sliceit_drake.learning.network import HistoryExtractor
+from sliceit_drake.learning.network import HistoryExtractor, export_policy
 from sliceit_drake.learning.reward import HEIGHT, RewardConfig
 from sliceit_drake.learning.sac import OverlapVecEnv, PrioritizedSAC
 from sliceit_drake.learning.task import TaskConfig, check_task
@@ -200,21 +199,14 @@ def _load(file: Path, described: str) -> dict[str, Any] | None:
         return None
     try:
         saved = torch.load(file, weights_only=True)
+        if saved["config"] == described:
+            return saved
+        problem = "is of a training with other settings"
     except (pickle.UnpicklingError, RuntimeError) as error:
-        raise ConfigurationError(
-            f"is no checkpoint of this version ({str(error).splitlines()[0]})",
-            field="output",
-            source=str(file),
-            fix="Give another folder, or delete it.",
-        ) from error
-    if saved["config"] != described:
-        raise ConfigurationError(
-            "is of a training with other settings",
-            field="output",
-            source=str(file),
-            fix="Give another folder, or delete it.",
-        )
-    return saved
+        problem = f"is no checkpoint of this version ({str(error).splitlines()[0]})"
+    raise ConfigurationError(
+        problem, field="output", source=str(file), fix="Give another folder, or delete it."
+    )
 
 
 def _cut_log(file: Path, episodes: int) -> None:

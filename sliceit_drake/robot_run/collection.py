@@ -13,9 +13,14 @@ from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.records.metadata import slice_name
 from sliceit_drake.records.slice_record import write_record
 from sliceit_drake.robot_run.operated_robot import OperatedRobot
-from sliceit_drake.stand_in.protocol import Condition, Protocol, Specimen, schedule
+from sliceit_drake.stand_in.protocol import (
+    Condition,
+    Protocol,
+    Specimen,
+    scenario_of_cut,
+    schedule,
+)
 from sliceit_drake.stand_in.session import is_recorded
-from sliceit_drake.stand_in.station_cuts import scenario_of_cut
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 
 __all__ = ["Collection"]

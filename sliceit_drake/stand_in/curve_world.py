@@ -17,7 +17,6 @@ from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.stand_in.curve_laws import (
     CutState,
     EllipticSection,
-    FoodCurve,
     food_forces,
     measured_curve,
 )
@@ -45,7 +44,7 @@ class CurveWorld:
 
     def __init__(self, protocol: Protocol) -> None:
         self.protocol = protocol
-        self._curve = measured_curve(protocol.food.name)
+        self.curve = measured_curve(protocol.food.name)
 
     def cut(
         self, specimen: Specimen, effects: Sequence[Effect], rng: np.random.Generator
@@ -58,7 +57,7 @@ class CurveWorld:
             peeled=condition.peeled,
             height=height,
             width=width,
-            toughness=float(np.mean(self._curve.force)) / (0.25 * np.pi * width),
+            toughness=float(np.mean(self.curve.force)) / (0.25 * np.pi * width),
         )
         for effect in effects:
             effect.begin(facts, rng)
@@ -68,10 +67,7 @@ class CurveWorld:
             np.array([x + condition.offset, y, height + condition.clearance]),
         )
         path = Path.of(condition.motion, start, protocol.exchange_period)
-        series = _CurveRun(protocol, self._curve, path, specimen, facts, effects).cut()
-        for effect in effects:
-            effect.respond(series)
-        return series
+        return _CurveRun(self, path, specimen, facts, effects).cut()
 
 
 class _CurveRun(Run):
@@ -79,19 +75,18 @@ class _CurveRun(Run):
 
     def __init__(
         self,
-        protocol: Protocol,
-        curve: FoodCurve,
+        world: CurveWorld,
         path: Path,
         specimen: Specimen,
         facts: SliceTruth,
         effects: Sequence[Effect],
     ) -> None:
         super().__init__(path, specimen, facts, effects)
-        self._protocol = protocol
+        self._protocol = world.protocol
         self._section = EllipticSection(facts.width, facts.height)
-        size = facts.width / section_size(protocol.food, 1.0)[0]
-        self._curve = curve.scaled(specimen.toughness).scaled(size)
-        self._more = _EdgeEffects(self._section, facts, effects)
+        size = facts.width / section_size(self._protocol.food, 1.0)[0]
+        self._curve = world.curve.scaled(specimen.toughness).scaled(size)
+        self._excess = _edge_excess(self._section, facts, effects)
         self._state = CutState(path.p[0])
         self._has_food = not specimen.condition.without_food
 
@@ -103,7 +98,7 @@ class _CurveRun(Run):
         state.advance(now.period, self.path.R[row][:, 0], p - now.food_shift, self.facts.height)
         forces = np.zeros((3, 3))
         if self._has_food:
-            more = self._more.at(state.depth)
+            more = float(np.interp(state.depth, self._section.depth, self._excess))
             factors = now.toughness, now.friction
             forces = food_forces(state, self._curve, self._section, *factors, more)
             forces[2] *= self.specimen.friction
@@ -117,7 +112,7 @@ class _CurveRun(Run):
         return float(law * max(0.0, 1.0 + 1.5 * board.dissipation * press))
 
     def cut(self) -> Series:
-        """Cuts the slice; effects have not responded yet."""
+        """Cuts the slice."""
         path, section = self.path, self._section
         stretches, forces, depths, shifts = self.drive(TRAVEL, LONGEST, 0.0)
         T, time = path.period, path.time[1:]
@@ -152,37 +147,30 @@ class _CurveRun(Run):
         )
 
 
-class _EdgeEffects:
-    """The edge's force in a section, as effects change it."""
-
-    def __init__(
-        self, section: EllipticSection, facts: SliceTruth, effects: Sequence[Effect]
-    ) -> None:
-        a, b, up, half = section.a, section.b, section.up, section.half
-        self._depth = section.depth
-        across = np.linspace(-1.0, 1.0, 17)
-        across = 0.5 * (across[1:] + across[:-1])
-        x = np.outer(half, across).ravel()
-        z = np.repeat(b * up, len(across))
-        # Distance from an ellipse, to first order in its level function.
-        level = np.sqrt((x / a) ** 2 + (z / b) ** 2)
-        slope = np.sqrt((x / a**2) ** 2 + (z / b**2) ** 2) / np.maximum(level, 1e-9)
-        distance = np.clip((1.0 - level) / np.maximum(slope, 1.0 / max(a, b)), 0.0, min(a, b))
-        top = b * np.sqrt(np.maximum(1.0 - (x / a) ** 2, 0.0))
-        tissue = Tissue(x=x, height=z + b, depth=np.maximum(top - z, 0.0), distance=distance)
-        factor = np.ones((len(up), len(across)))
-        for effect in effects:
-            given = np.broadcast_to(np.asarray(effect.toughness(tissue), float), x.shape)
-            factor *= given.reshape(factor.shape)
-        sides = np.zeros((2 * len(half), 3))
-        sides[:, 0] = np.concatenate([half, -half])
-        sides[:, 2] = np.tile(b * up + b, 2)
-        for effect in effects:
-            sides = effect.reshape(sides)
-        wide = 0.5 * (sides[: len(half), 0] - sides[len(half) :, 0])
-        stretch = np.divide(wide, half, out=np.ones_like(half), where=half > 1e-6)
-        self._more = facts.toughness * 2.0 * half * (factor.mean(1) * stretch - 1.0)
-
-    def at(self, depth: float) -> float:
-        """Force that effects add to the edge's at a depth, N."""
-        return float(np.interp(depth, self._depth, self._more))
+def _edge_excess(
+    section: EllipticSection, facts: SliceTruth, effects: Sequence[Effect]
+) -> np.ndarray:
+    """Force that effects add to the edge's at the depths of a section [n], N."""
+    a, b, up, half = section.a, section.b, section.up, section.half
+    across = np.linspace(-1.0, 1.0, 17)
+    across = 0.5 * (across[1:] + across[:-1])
+    x = np.outer(half, across).ravel()
+    z = np.repeat(b * up, len(across))
+    # Distance from an ellipse, to first order in its level function.
+    level = np.sqrt((x / a) ** 2 + (z / b) ** 2)
+    slope = np.sqrt((x / a**2) ** 2 + (z / b**2) ** 2) / np.maximum(level, 1e-9)
+    distance = np.clip((1.0 - level) / np.maximum(slope, 1.0 / max(a, b)), 0.0, min(a, b))
+    top = b * np.sqrt(np.maximum(1.0 - (x / a) ** 2, 0.0))
+    tissue = Tissue(x=x, height=z + b, depth=np.maximum(top - z, 0.0), distance=distance)
+    factor = np.ones((len(up), len(across)))
+    for effect in effects:
+        given = np.broadcast_to(np.asarray(effect.toughness(tissue), float), x.shape)
+        factor *= given.reshape(factor.shape)
+    sides = np.zeros((2 * len(half), 3))
+    sides[:, 0] = np.concatenate([half, -half])
+    sides[:, 2] = np.tile(b * up + b, 2)
+    for effect in effects:
+        sides = effect.reshape(sides)
+    wide = 0.5 * (sides[: len(half), 0] - sides[len(half) :, 0])
+    stretch = np.divide(wide, half, out=np.ones_like(half), where=half > 1e-6)
+    return facts.toughness * 2.0 * half * (factor.mean(1) * stretch - 1.0)

@@ -10,19 +10,10 @@ from sliceit_drake.stand_in import (
     mounting_effects,
     sensor_effects,
     tissue_effects,
-    unlisted_effects,
 )
 from sliceit_drake.stand_in.effect import Effect
 
-__all__ = ["EFFECTS", "UNLISTED", "effects_as_markdown", "make_effect"]
-
-UNLISTED: dict[str, type[Effect]] = {
-    "magnetic_board": unlisted_effects.MagneticBoard,
-    "juice_film": unlisted_effects.JuiceFilm,
-    "serrated_edge": unlisted_effects.SerratedEdge,
-    "warm_wrist": unlisted_effects.WarmWrist,
-}
-"""Effects that stand in no list of causes."""
+__all__ = ["EFFECTS", "effects_as_markdown", "make_effect"]
 
 EFFECTS: dict[str, type[Effect]] = {
     "bulk_relaxation": tissue_effects.BulkRelaxation,
@@ -49,7 +40,10 @@ EFFECTS: dict[str, type[Effect]] = {
     "tool_weight": sensor_effects.ToolWeight,
     "drive_vibration": sensor_effects.DriveVibration,
     "stick_slip": sensor_effects.StickSlip,
-    **UNLISTED,
+    "magnetic_board": mounting_effects.MagneticBoard,
+    "juice_film": knife_effects.JuiceFilm,
+    "serrated_edge": knife_effects.SerratedEdge,
+    "warm_wrist": mounting_effects.WarmWrist,
 }
 """All effects by name."""
 

@@ -181,11 +181,7 @@ class FiniteElementWorld:
             section = self._section(food, TetrahedralMesh(moved, mesh.tetrahedra))
             model = _with_tissue(section, specimen, effects)
             check_clear(model, Pose(*_in_cut(model, path.R[0], path.p[0])))
-        run = _FiniteElementRun(self, path, specimen, facts, effects, section, model)
-        series = run.cut()
-        for effect in effects:
-            effect.respond(series)
-        return series
+        return _FiniteElementRun(self, path, specimen, facts, effects, section, model).cut()
 
     def _section(self, food: Food, mesh: TetrahedralMesh) -> _Section:
         key = mesh.vertices.tobytes()
@@ -281,7 +277,7 @@ class _FiniteElementRun(Run):
         return parts, self.cut_fraction
 
     def cut(self) -> Series:
-        """Cuts the slice; effects have not responded yet."""
+        """Cuts the slice."""
         path, model = self.path, self.model
         rates = model is not None and model.material.static_friction > model.material.friction
         longest = 1 if rates else LONGEST

@@ -1,10 +1,17 @@
-"""Effects between knife and food: friction, adhesion, a blunt and dulling edge."""
+"""Effects between knife and food: friction, adhesion, juice, a blunt, dulling or nicked edge."""
 
 import numpy as np
 
 from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceTruth
 
-__all__ = ["BluntEdge", "DullingEdge", "FlankAdhesion", "FlankFriction"]
+__all__ = [
+    "BluntEdge",
+    "DullingEdge",
+    "FlankAdhesion",
+    "FlankFriction",
+    "JuiceFilm",
+    "SerratedEdge",
+]
 
 
 class FlankFriction(Effect):
@@ -83,3 +90,36 @@ class DullingEdge(BluntEdge):
     def begin(self, facts: SliceTruth, rng: np.random.Generator) -> None:
         super().begin(facts, rng)
         self.size *= facts.index / (facts.index + self.half)
+
+
+class JuiceFilm(Effect):
+    """Juice that wets the flanks and takes the share `size` of friction and a third of that of the
+    toughness, the more the knife has swept; it runs off while nothing moves."""
+
+    typical = 0.8
+    area = 6e-4
+    drying = 4.0
+
+    _wet = 0.0
+    _swept = 0.0
+
+    def drive(self, now: Now) -> None:
+        if now.speed < 1e-6:
+            self._wet *= np.exp(-now.period / self.drying)
+        self._wet += now.swept - self._swept
+        self._swept = now.swept
+        film = 1.0 - np.exp(-self._wet / self.area)
+        now.friction *= 1.0 - self.size * film
+        now.toughness *= 1.0 - self.size / 3.0 * film
+
+
+class SerratedEdge(Effect):
+    """A nicked edge: where it lies along itself, not how deep, makes the food tougher, by the share
+    `size` once in `pitch`."""
+
+    typical = 0.3
+    pitch = 9e-3
+
+    def drive(self, now: Now) -> None:
+        along = float(now.position[0]) / self.pitch
+        now.toughness *= 1.0 + self.size * np.sin(2.0 * np.pi * along) ** 2

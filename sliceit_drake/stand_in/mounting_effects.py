@@ -1,10 +1,18 @@
-"""Effects of what holds knife and food: board, arm, holder, slips."""
+"""Effects of what holds knife and food: board, arm, wrist, holder, slips."""
 
 import numpy as np
 
 from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceTruth
 
-__all__ = ["ArmCompliance", "BoardHeight", "BoardLaw", "FoodSlip", "HolderCompliance"]
+__all__ = [
+    "ArmCompliance",
+    "BoardHeight",
+    "BoardLaw",
+    "FoodSlip",
+    "HolderCompliance",
+    "MagneticBoard",
+    "WarmWrist",
+]
 
 STIFFEST = 3e6
 """Greatest stiffness that arm and holder can meet, N/m."""
@@ -122,3 +130,30 @@ class FoodSlip(Effect):
             knock = np.where(late > 0.0, np.exp(-np.maximum(late, 0.0) / 0.05), 0.0)
             # The blade is knocked sideways, in proportion to how far the food slipped.
             series.other[:, 4] += 500.0 * self.size * self._side * knock
+
+
+class MagneticBoard(Effect):
+    """A magnet under the board pulls at the blade, `size` at the board, less by the square of
+    the distance over `reach`, and a third of that sideways."""
+
+    unit = "N"
+    typical = 2.5
+    reach = 0.012
+
+    def respond(self, series: Series) -> None:
+        above = np.maximum(series.p_true[:, 2], 0.0)
+        pull = self.size / (1.0 + above / self.reach) ** 2
+        series.other[:, 5] -= pull
+        series.other[:, 4] += pull / 3.0
+
+
+class WarmWrist(Effect):
+    """A wrist that leans the more slices were cut: a sideways force of `size` times the square of
+    the slice's number over ten, while anything presses."""
+
+    unit = "N"
+    typical = 0.4
+
+    def respond(self, series: Series) -> None:
+        pressed = np.tanh(np.abs(series.force[:, 2]) / 2.0)
+        series.other[:, 4] += self.size * (0.1 * self.facts.index) ** 2 * pressed

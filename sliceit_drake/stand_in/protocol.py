@@ -1,5 +1,6 @@
 """A protocol: the slices of one session at the bench, in YAML, and in which order they are cut."""
 
+import copy
 import dataclasses as dc
 
 import numpy as np
@@ -11,9 +12,9 @@ from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid, PlainShape
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.motion import MotionPlan
-from sliceit_drake.diagrams.scenario import Placement, Preparation, Scenario
+from sliceit_drake.diagrams.scenario import Placement, Preparation, Scenario, Start
 from sliceit_drake.stand_in.sensor_model import SensorModel
-from sliceit_drake.systems.analytic_cutter import is_no_food
+from sliceit_drake.systems.analytic_cutter import is_no_food, no_food
 
 __all__ = [
     "Condition",
@@ -23,6 +24,7 @@ __all__ = [
     "load_protocol",
     "protocol_of_scenario",
     "scaled_food",
+    "scenario_of_cut",
     "schedule",
     "section_size",
 ]
@@ -246,3 +248,52 @@ def protocol_of_scenario(scenario: Scenario, replicates: int = 1) -> Protocol:
     )
     validate(protocol, "protocol")
     return protocol
+
+
+def scenario_of_cut(protocol: Protocol, specimen: Specimen, station: Scenario) -> Scenario:
+    """One cut of a session as a scenario.
+
+    Args:
+        protocol: The session whose food, knife, board and placement are used.
+        specimen: The slice; its deviations from the mean slice go into the simulated material (a
+            deviation of height does not). A real food brings its own, and they change nothing.
+        station: What the protocol does not say: robot, controller, sensor, numerics.
+
+    Raises:
+        ConfigurationError: The cut makes no scenario.
+    """
+    condition = specimen.condition
+    food = scaled_food(protocol.food, condition.width_scale)
+    _, height = section_size(food)
+    material = dc.replace(
+        food.material,
+        toughness=food.material.toughness * specimen.toughness,
+        youngs_modulus=food.material.youngs_modulus * specimen.stiffness,
+        friction=food.material.friction * specimen.friction,
+    )
+    food = dc.replace(food, material=material)
+    if condition.peeled:
+        food.effects.skin.toughness = 0.0
+    scenario = dc.replace(
+        copy.deepcopy(station),
+        name=condition.label,
+        knife=protocol.knife,
+        board=copy.deepcopy(protocol.board),
+        placement=protocol.placement,
+        exchange_period=protocol.exchange_period,
+        # What offers no resistance stands for no food: the start is over where its top would be.
+        food=no_food(height) if condition.without_food else food,
+        calibration=None,
+        start=Start(clearance=condition.clearance, offset=condition.offset),
+        motion=condition.motion,
+        measurement=None,
+        sequence=None,
+        preparation=Preparation(
+            peeled=condition.peeled,
+            weight=condition.weight,
+            knife_slices=protocol.knife_slices,
+        ),
+    )
+    scenario.sensor.seed = specimen.index
+    validate(scenario, f"scenario of {condition.label}")
+    return scenario

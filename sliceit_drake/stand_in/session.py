@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError, load_yaml
-from sliceit_drake.cutting.foods.food import shape_facts
 from sliceit_drake.cutting.workers import worker_processes
-from sliceit_drake.diagrams.outputs.record_facts import food_support, knife_facts
+from sliceit_drake.diagrams.outputs.record_facts import food_facts, knife_facts
 from sliceit_drake.records.metadata import (
     PHASE_LABELS,
     FoodFacts,
@@ -101,8 +100,10 @@ class Session:
             CuttingError: The motion cannot be computed, or the cut broke down.
         """
         effects = copy.deepcopy(list(self.effects))
-        rng = self._random(WORLD, index)
-        return self.world.cut(self.specimens[index], effects, rng), effects
+        series = self.world.cut(self.specimens[index], effects, self._random(WORLD, index))
+        for effect in effects:
+            effect.respond(series)
+        return series, effects
 
     def record(self, index: int) -> SliceRecord:
         """One slice as it is recorded.
@@ -147,10 +148,14 @@ def _food_pose(protocol: Protocol) -> tuple[np.ndarray, np.ndarray]:
 def _metadata(protocol: Protocol, specimen: Specimen, series: Series) -> SliceMetadata:
     """The facts that the person at the bench knows."""
     condition, sensor = specimen.condition, protocol.sensor
+    food = FoodFacts(name="none")
+    if not condition.without_food:
+        cut, position = scaled_food(protocol.food, condition.width_scale), _food_pose(protocol)[1]
+        food = food_facts(cut, condition.peeled, position, protocol.placement.yaw)
     metadata = SliceMetadata(
         name=slice_name(specimen.index),
         provenance=PROVENANCE,
-        food=_food_facts(protocol, specimen),
+        food=food,
         board_height=protocol.board.height,
         knife=knife_facts(protocol.knife),
         motion=_nominal_motion(series),
@@ -176,23 +181,6 @@ def _metadata(protocol: Protocol, specimen: Specimen, series: Series) -> SliceMe
     else:
         metadata.unknown += ["tool.mass", "tool.center_of_mass"]
     return metadata
-
-
-def _food_facts(protocol: Protocol, specimen: Specimen) -> FoodFacts:
-    condition = specimen.condition
-    if condition.without_food:
-        return FoodFacts(name="none")
-    food = scaled_food(protocol.food, condition.width_scale)
-    shape, size = shape_facts(food)
-    return FoodFacts(
-        name=food.name,
-        shape=shape,
-        size=size,
-        support=food_support(food),
-        peeled=condition.peeled,
-        position=_food_pose(protocol)[1].tolist(),
-        yaw=protocol.placement.yaw,
-    )
 
 
 def _nominal_motion(series: Series) -> NominalMotion:

@@ -27,7 +27,8 @@ class World(typing.Protocol):
 
         Args:
             specimen: The slice.
-            effects: What is hidden; fresh copies, which the world begins.
+            effects: What is hidden; fresh copies, which the world begins, and which have not
+                responded yet.
             rng: Random numbers for what differs from slice to slice.
         """
         ...

@@ -112,6 +112,4 @@ class _Replay:
         series.slice = dc.replace(series.slice, index=specimen.index)
         for effect in effects:
             effect.begin(series.slice, rng)
-        for effect in effects:
-            effect.respond(series)
         return series

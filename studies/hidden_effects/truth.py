@@ -1,6 +1,6 @@
 """What a diagnosis would have to say of an effect: the names of both worlds side by side."""
 
-from sliceit_drake.stand_in.effect_registry import UNLISTED
+from sliceit_drake.stand_in.effect_registry import EFFECTS
 
 __all__ = ["BASE_OF", "CAUSE_OF", "UNKNOWN"]
 
@@ -36,5 +36,5 @@ BASE_OF: dict[str, str] = {
 }
 """Effects that are a shift of a base parameter, and its name."""
 
-UNKNOWN: tuple[str, ...] = tuple(UNLISTED)
+UNKNOWN = tuple(name for name, kind in EFFECTS.items() if not kind.cause)
 """Effects that stand in no list."""

@@ -1,10 +1,12 @@
-"""What a slice record says of the knife and of the food's support, from their descriptions."""
+"""What a slice record says of knife and food, from their descriptions."""
 
-from sliceit_drake.cutting.foods.food import Food
+import numpy as np
+
+from sliceit_drake.cutting.foods.food import Food, shape_facts
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.records.metadata import KnifeFacts
+from sliceit_drake.records.metadata import FoodFacts, KnifeFacts
 
-__all__ = ["food_support", "knife_facts"]
+__all__ = ["food_facts", "knife_facts"]
 
 
 def knife_facts(knife: Knife) -> KnifeFacts:
@@ -20,6 +22,15 @@ def knife_facts(knife: Knife) -> KnifeFacts:
     )
 
 
-def food_support(food: Food) -> str:
-    """`FoodFacts.support` of a food."""
-    return "clamped_slab" if food.held_sides == "both" else "end_slice"
+def food_facts(food: Food, peeled: bool, position: np.ndarray, yaw: float) -> FoodFacts:
+    """Size, support and place of a food; `position` [3], m, and `yaw`, rad, are those of F in W."""
+    shape, size = shape_facts(food)
+    return FoodFacts(
+        name=food.name,
+        shape=shape,
+        size=size,
+        support="clamped_slab" if food.held_sides == "both" else "end_slice",
+        peeled=peeled,
+        position=position.tolist(),
+        yaw=yaw,
+    )

@@ -5,8 +5,8 @@ import datetime
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sliceit_drake.cutting.foods.food import Food, shape_facts
-from sliceit_drake.diagrams.outputs.record_facts import food_support, knife_facts
+from sliceit_drake.cutting.foods.food import Food
+from sliceit_drake.diagrams.outputs.record_facts import food_facts, knife_facts
 from sliceit_drake.diagrams.run import Run
 from sliceit_drake.records.metadata import (
     PHASE_LABELS,
@@ -103,14 +103,5 @@ def _food_facts(run: Run) -> FoodFacts:
         return FoodFacts(name=own)
     if not isinstance(food, Food):
         return FoodFacts(name="none")
-    shape, size = shape_facts(food)
-    prepared = scenario.preparation
-    return FoodFacts(
-        name=food.name,
-        shape=shape,
-        size=size,
-        support=food_support(food),
-        peeled=prepared.peeled if prepared else False,
-        position=scenario.X_WF().translation().tolist(),
-        yaw=scenario.placement.yaw,
-    )
+    peeled = scenario.preparation.peeled if scenario.preparation else False
+    return food_facts(food, peeled, scenario.X_WF().translation(), scenario.placement.yaw)
