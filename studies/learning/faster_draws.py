@@ -70,16 +70,18 @@ def draws_table(evaluation: Path, faster: Path, command: str) -> list[str]:
     ]
     return [
         table(
-            "world | food | ours: as it is, faster | ratio | baseline: as it is, faster"
-            " | ours over baseline: as it is, faster | paper's | board's peak likewise"
-            " | ours completed, faster",
+            "world | food | force, ours: default, faster draws | ratio of the two"
+            " | force, baseline: default, faster draws | ours over baseline: default, faster draws"
+            " | ours over baseline in the paper"
+            " | peak on the board, ours over baseline: default, faster draws"
+            " | completed by ours with faster draws",
             (row(slow[key], each) for key, each in fast.items() if key in slow),
         ),
         "",
-        f"Means of the slices' median force over {policies[0]['cutting']} and "
-        f"{policies[0]['spring']} policies as they are, {policies[1]['cutting']} and "
-        f"{policies[1]['spring']} with faster draws; intervals of 95 %. "
-        f"`{command}`",
+        "Forces are means of the median force over all slices, of "
+        f"{policies[0]['cutting']} and {policies[0]['spring']} policies with the default draws, and"
+        f" of {policies[1]['cutting']} and {policies[1]['spring']} with faster draws. Intervals are"
+        f" of 95 %. `{command}`",
     ]
 
 
