@@ -123,7 +123,6 @@ def calibrate(
         blocks, held_out_rms = result.blocks, result.rms
         show("held-out blocks", options.blocks, options.blocks, rms)
     return Calibration(
-        setup,
         predictor,
         unit,
         predictions,

@@ -1,6 +1,6 @@
 """A food from published levels of force: what its parameters may be, and no more."""
 
-import copy
+import dataclasses as dc
 from collections.abc import Callable
 
 import numpy as np
@@ -10,7 +10,7 @@ from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.batch import simulate_batch
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
-from sliceit_drake.cutting.foods.distribution import ParameterDistribution, from_unit
+from sliceit_drake.cutting.foods.distribution import ParameterDistribution
 from sliceit_drake.cutting.foods.food import make_food_model, start_pose
 from sliceit_drake.cutting.foods.spring_food import calibrate_spring
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
@@ -56,17 +56,16 @@ def food_from_literature(
     model = make_food_model(setup.food, setup.knife, setup.numerics, setup.refinement)
     plan = MotionPlan([ConstantSpeed(distance=model.top + CLEARANCE, speed=literature.speed)])
     ranges = setup.parameters
+    distribution = ParameterDistribution(
+        names=[p.name for p in ranges],
+        low=[p.low for p in ranges],
+        high=[p.high for p in ranges],
+        log=[p.scale == "log" for p in ranges],
+    )
     sampler = qmc.Sobol(len(ranges), seed=seed)
     places = sampler.random_base2(int(np.ceil(np.log2(max(cuts, 2)))))
-    values = [
-        {
-            p.name: float(from_unit(u, p.low, p.high, p.scale == "log"))
-            for p, u in zip(ranges, place, strict=True)
-        }
-        for place in places
-    ]
     slices = simulate_batch(
-        [with_parameters(model, v) for v in values],
+        [with_parameters(model, distribution.values(place)) for place in places],
         [Motion(plan, start_pose(model, CLEARANCE))],
         EXCHANGE_PERIOD,
         progress=progress,
@@ -87,20 +86,11 @@ def food_from_literature(
             field="literature.peak_force",
             fix="Widen the ranges of the parameters, or try more cuts (--trials).",
         )
-    mean, covariance = places[kept].mean(0), np.cov(places[kept].T)
-    distribution = ParameterDistribution(
-        names=[p.name for p in ranges],
-        low=[p.low for p in ranges],
-        high=[p.high for p in ranges],
-        log=[p.scale == "log" for p in ranges],
-        mean=mean.tolist(),
-        covariance=np.atleast_2d(covariance).tolist(),
-    )
+    distribution.mean = places[kept].mean(0).tolist()
+    distribution.covariance = np.atleast_2d(np.cov(places[kept].T)).tolist()
     central = with_parameters(model, distribution.values())
-    food = copy.deepcopy(setup.food)
-    food.material, food.effects = central.material, central.effects
     return CalibratedFood(
-        food=food,
+        food=dc.replace(setup.food, material=central.material, effects=central.effects),
         knife=setup.knife,
         flank_stiffness=central.numerics.flank_stiffness,
         distribution=distribution,

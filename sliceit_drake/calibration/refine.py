@@ -19,7 +19,6 @@ RIDGE = 1e-3
 """Least curvature that is told apart, relative to the greatest."""
 EPSILON = 1e-8
 BACK_OFF = 0.5
-MIN_RATE = 1e-6
 
 
 @dc.dataclass
@@ -59,38 +58,53 @@ def refine(
         progress: Called with the steps done and the best error so far, N.
     """
     axes = _principal_axes(predictor, start, checkpoint)
-    state = _State(start.copy(), Adam.of(len(start)), 1.0)
-    best, errors, last = (start.copy(), np.inf), [], start.copy()
+    zero = np.zeros(len(start))
+    state = _State(unit=start, m=zero, v=zero, best=start, last=start)
     if checkpoint is not None and checkpoint.exists():
         with np.load(checkpoint) as saved:
-            adam = Adam(saved["m"], saved["v"])
-            state = _State(saved["unit"], adam, float(saved["factor"]))
-            best, errors = (saved["best"], float(saved["error"])), saved["errors"].tolist()
-            last = saved["last"]
-    while len(errors) < steps:
-        k = len(errors)
+            state = _State(**(dict(saved) | {"errors": saved["errors"].tolist()}))
+    while len(state.errors) < steps:
+        k = len(state.errors)
         try:
             square, gradient = predictor.mean_square_and_gradient(state.unit)
             error = float(np.sqrt(square))
         except CuttingError:
             error = np.inf
         if np.isfinite(error) and np.isfinite(gradient).all():
-            if error < best[1]:
-                best = (state.unit.copy(), error)
-            last = state.unit.copy()
-            slope = axes.T @ gradient
+            if error < state.error:
+                state.best, state.error = state.unit, error
+            state.last = state.unit
+            adam = Adam(state.m, state.v)
             rate = state.factor * RATE * (0.1 if 4 * k >= 3 * steps else 1.0)
-            move = rate * axes @ state.adam.descent(slope, k, EPSILON)
-            state.unit = np.clip(last + move, 0.0, 1.0)
+            move = rate * axes @ adam.descent(axes.T @ gradient, k, EPSILON)
+            state.unit = np.clip(state.last + move, 0.0, 1.0)
+            state.m, state.v = adam.m, adam.v
         else:
             state.factor *= BACK_OFF
-            state.unit = last + BACK_OFF * (state.unit - last)
-        errors.append(error)
+            state.unit = state.last + BACK_OFF * (state.unit - state.last)
+        state.errors.append(error)
         if checkpoint is not None:
-            _save(checkpoint, state, best, errors, last)
+            partial = checkpoint.with_suffix(".partial.npz")
+            np.savez(partial, **vars(state))
+            partial.replace(checkpoint)
         if progress is not None:
-            progress(len(errors), best[1])
-    return Refinement(best[0], best[1], errors)
+            progress(len(state.errors), float(state.error))
+    return Refinement(state.best, float(state.error), state.errors)
+
+
+@dc.dataclass
+class _State:
+    """Where a refinement stands, as a checkpoint holds it: the next place, Adam's means, the best
+    place, the last that did not break down, the best error, the factor on steps, their errors."""
+
+    unit: np.ndarray
+    m: np.ndarray
+    v: np.ndarray
+    best: np.ndarray
+    last: np.ndarray
+    error: float = np.inf
+    factor: float = 1.0
+    errors: list[float] = dc.field(default_factory=list)
 
 
 def _principal_axes(predictor: Predictor, start: np.ndarray, checkpoint: Path | None) -> np.ndarray:
@@ -112,28 +126,3 @@ def _principal_axes(predictor: Predictor, start: np.ndarray, checkpoint: Path | 
     if file is not None:
         np.save(file, axes)
     return np.asarray(axes)
-
-
-@dc.dataclass
-class _State:
-    unit: np.ndarray
-    adam: Adam
-    factor: float
-
-
-def _save(
-    file: Path, state: _State, best: tuple[np.ndarray, float], errors: list[float], last: np.ndarray
-) -> None:
-    partial = file.with_suffix(".partial.npz")
-    np.savez(
-        partial,
-        unit=state.unit,
-        m=state.adam.m,
-        v=state.adam.v,
-        factor=state.factor,
-        best=best[0],
-        error=best[1],
-        errors=np.array(errors),
-        last=last,
-    )
-    partial.replace(file)

@@ -1,6 +1,5 @@
 """The result of a calibration: what was found, as a table, a figure, a food and files."""
 
-import copy
 import dataclasses as dc
 import datetime
 import json
@@ -11,16 +10,19 @@ import numpy as np
 
 from sliceit_drake.calibration.posterior import Posterior
 from sliceit_drake.calibration.prediction import Prediction, Predictor
-from sliceit_drake.calibration.report import force_figure, parameter_table
-from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import dump_yaml
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
 from sliceit_drake.cutting.foods.spring_food import calibrate_spring
+from sliceit_drake.prediction.record_target import RecordTarget
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["Calibration"]
+
+MEASURED, PREDICTED = "#111827", "#c2410c"
+CHANNELS = ("force x", "force y", "force z")
 
 
 @dc.dataclass
@@ -28,7 +30,6 @@ class Calibration:
     """What a calibration found; prints as a table, plots itself, saves to a folder.
 
     Attributes:
-        setup: What was searched.
         predictor: Of the records that were fitted, at the setup's sub-step.
         unit: Places of the parameters in their ranges [d].
         predictions: One a record.
@@ -42,7 +43,6 @@ class Calibration:
         failures: Trials that broke down.
     """
 
-    setup: CalibrationSetup
     predictor: Predictor
     unit: np.ndarray
     predictions: list[Prediction]
@@ -65,7 +65,7 @@ class Calibration:
     def table(self) -> str:
         """Parameters with 90 % intervals, which of them are not determined, errors, warnings."""
         lines = [
-            parameter_table(self.posterior, self.predictor.values(self.unit)),
+            self.posterior.table(self.predictor.values(self.unit)),
             *self.posterior.remarks(),
             f"RMS error: search {self.search_rms:.3f}, Adam {self.refined_rms:.3f}, "
             f"polished {self.rms:.3f} N",
@@ -80,15 +80,25 @@ class Calibration:
 
     def plot(self) -> "Figure":
         """Measured and predicted force of the first three records, and what is left."""
-        return force_figure(self.predictor.targets, self.predictions)
+        from matplotlib.figure import Figure
 
-    def calibrated_food(self, date: str = "", command: str = "", note: str = "") -> CalibratedFood:
+        shown = self.predictor.targets[:3]
+        sheet = Figure(figsize=(5.2 * len(shown), 4.2), layout="constrained")
+        axes = sheet.subplots(
+            2, len(shown), squeeze=False, sharex="col", gridspec_kw={"height_ratios": (3, 1)}
+        )
+        for target, prediction, (upper, lower) in zip(
+            shown, self.predictions, axes.T, strict=False
+        ):
+            _plot_record(target, prediction.predicted, upper, lower)
+        return sheet
+
+    def calibrated_food(self, date: str = "", command: str = "") -> CalibratedFood:
         """The food as scenarios load it."""
         values = self.predictor.values(self.unit)
         target = self.predictor.targets[0]
         model = self.predictor.model(target, values)
-        food = copy.deepcopy(self.setup.food)
-        food.material, food.effects = model.material, model.effects
+        food = dc.replace(self.predictor.setup.food, material=model.material, effects=model.effects)
         force = np.concatenate([t.record.force_magnitude for t in self.predictor.targets])
         spring = calibrate_spring(force, float(model.top - model.bottom))
         return CalibratedFood(
@@ -102,7 +112,6 @@ class Calibration:
             records=[t.record.name for t in self.predictor.targets],
             date=date,
             command=command,
-            note=note,
         )
 
     def save(self, directory: Path, command: str = "") -> None:
@@ -116,7 +125,7 @@ class Calibration:
         dump_yaml(food, directory / "food.yaml")
         self.plot().savefig(directory / "fit.png", dpi=150)
         content = {
-            "food": self.setup.food.name,
+            "food": self.predictor.setup.food.name,
             "records": [t.record.name for t in self.predictor.targets],
             "rms_N": self.rms,
             "search_rms_N": self.search_rms,
@@ -131,3 +140,35 @@ class Calibration:
         }
         text = json.dumps(content, indent=2) + "\n"
         (directory / "calibration.json").write_text(text, encoding="utf-8")
+
+
+def _plot_record(target: RecordTarget, predicted: np.ndarray, upper: "Axes", lower: "Axes") -> None:
+    channels = ("force",) if len(target.channels) == 1 else CHANNELS
+    for c, name in enumerate(channels):
+        # The press, which is nearly all of the force, stands out.
+        style = (":", "--", "-")[c] if len(channels) > 1 else "-"
+        upper.plot(target.time, target.measured[:, c], style, color=MEASURED, lw=1.2)
+        upper.plot(target.time, predicted[:, c], style, color=PREDICTED, lw=1.2)
+        rest = target.measured[:, c] - predicted[:, c]
+        lower.plot(target.time, rest, style, color="#475569", lw=1.0, label=name)
+    rms = target.rms_error(predicted)
+    upper.set(title=f"{target.record.name}: RMS {rms:.2f} N", ylabel="force on the knife [N]")
+    upper.plot([], [], color=MEASURED, label="measured")
+    upper.plot([], [], color=PREDICTED, label="calibrated")
+    lower.set(xlabel="time [s]", ylabel="rest [N]")
+    for axis in (upper, lower):
+        axis.grid(alpha=0.25)
+        axis.fill_between(
+            target.time,
+            0.0,
+            1.0,
+            where=(~target.compared).tolist(),
+            transform=axis.get_xaxis_transform(),
+            color="#94a3b8",
+            alpha=0.35,
+            lw=0.0,
+            label="" if target.compared.all() or axis is lower else "turns round: not compared",
+        )
+    upper.legend(frameon=False)
+    if len(channels) > 1:
+        lower.legend(frameon=False, fontsize=7, ncols=3)

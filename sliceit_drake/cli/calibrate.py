@@ -107,7 +107,6 @@ def _from_literature(options: argparse.Namespace) -> int:
     import datetime
 
     from sliceit_drake.calibration.literature import food_from_literature
-    from sliceit_drake.calibration.report import parameter_table
     from sliceit_drake.calibration.setup import load_setup
     from sliceit_drake.configuration import dump_yaml
 
@@ -124,20 +123,19 @@ def _from_literature(options: argparse.Namespace) -> int:
     )
     options.output.mkdir(parents=True, exist_ok=True)
     dump_yaml(food, options.output / "food.yaml")
-    print(parameter_table(food.distribution))
+    print(food.distribution.table())
     print(food.note)
     print(f"Results in {options.output}/")
     return 0
 
 
 def _show(name: str) -> int:
-    from sliceit_drake.calibration.report import parameter_table
     from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
 
     food = load_calibrated_food(name)
     print(f"{food.food.name}, from {', '.join(food.records)} ({food.date})")
     print(food.command)
-    print(parameter_table(food.distribution))
+    print(food.distribution.table())
     for label, value in (("on the records", food.rms_error), ("held out", food.held_out_error)):
         if value is not None:
             print(f"RMS error {label}: {value:.3f} N")

@@ -174,7 +174,9 @@ def compare(calibration: Calibration, profile: ForceProfile, minutes: float) -> 
         rows.append(_row(name, time, force, measured, shift, speed))
     ours = prediction.predicted[:, 0]
     rows.append(_row("ours", time, ours, measured, 0.0, speed))
-    return FoodComparison(calibration.setup.food.name, time, measured, rows, calibration, minutes)
+    return FoodComparison(
+        calibration.predictor.setup.food.name, time, measured, rows, calibration, minutes
+    )
 
 
 def _best_shift(
@@ -218,7 +220,7 @@ def comparison_tables(comparisons: Sequence[FoodComparison]) -> str:
             count = held = ""
             if row.name == "ours":
                 name, shift = "**ours**", "fitted"
-                count = str(len(k.unit) + 3 * (k.setup.oscillation is not None))
+                count = str(len(k.unit) + 3 * (k.predictor.setup.oscillation is not None))
                 held = f"{k.held_out_rms:.2f}" if k.held_out_rms is not None else ""
             rows.append(
                 (c.food, name, f"{row.rms:.2f}", f"{row.peak:.1f}", f"{row.work:.3f}", shift)

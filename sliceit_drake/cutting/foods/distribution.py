@@ -1,6 +1,7 @@
 """Knowledge of parameters after a calibration: a normal distribution within their ranges."""
 
 import dataclasses as dc
+from collections.abc import Mapping
 
 import numpy as np
 from scipy.special import ndtri
@@ -99,6 +100,18 @@ class ParameterDistribution:
         """
         inside = self.deviation < DETERMINED * PRIOR_DEVIATION
         return {name: bool(d) for name, d in zip(self.names, inside, strict=True)}
+
+    def table(self, values: Mapping[str, float] | None = None) -> str:
+        """Parameters with values, their means by default, and 90 % intervals, and which of them the
+        records do not determine."""
+        values = self.values() if values is None else values
+        intervals, determined = self.intervals(0.9), self.determined()
+        width = max(len(name) for name in self.names)
+        lines = [f"{'parameter':{width}}  {'value':>10}  {'90 % interval':>23}"]
+        for name, (low, high) in intervals.items():
+            line = f"{name:{width}}  {values[name]:10.4g}  {low:10.4g} to {high:9.4g}"
+            lines.append(line + ("" if determined[name] else "  not determined by these records"))
+        return "\n".join(lines)
 
     def draw_places(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """A sample of places [n, d], all within the ranges.
