@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sliceit_drake.calibration.adam import Adam
+from sliceit_drake.calibration.refine import Adam
 
 
 def test_a_steady_gradient_gives_unit_steps_against_it():

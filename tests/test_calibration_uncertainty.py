@@ -10,9 +10,8 @@ import pytest
 
 from sliceit_drake.calibration.gauss_newton import gauss_newton, residuals_at
 from sliceit_drake.calibration.held_out import blocked_error
-from sliceit_drake.calibration.posterior import Posterior
 from sliceit_drake.calibration.prediction import Parameter
-from sliceit_drake.calibration.uncertainty import estimate
+from sliceit_drake.calibration.uncertainty import Posterior, estimate
 from sliceit_drake.configuration import ConfigurationError, dump_yaml, load_yaml
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.prediction.noise import NoiseModel, group_series

@@ -11,7 +11,7 @@ import pytest
 from sliceit_drake.content_store import ContentStore, content_key, source_files, source_key
 
 PACKAGE = Path(__file__).resolve().parent.parent / "sliceit_drake"
-ENTRIES = ["prediction/jobs.py", "diagnosis/evidence/sensitivity.py"]
+ENTRIES = ["prediction/simulator.py", "diagnosis/evidence/sensitivity.py"]
 """Modules whose results are kept."""
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sliceit_drake.calibration.adam import Adam
 from sliceit_drake.calibration.prediction import Predictor
+from sliceit_drake.calibration.refine import Adam
 from sliceit_drake.cutting.solver import CuttingError
 
 __all__ = ["PointFit", "fit_points"]

@@ -18,10 +18,9 @@ from sliceit_drake.cutting.model import CuttingModel, TimeStepError
 from sliceit_drake.cutting.parameters import get_parameter, pull_back, with_parameters
 from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError
 from sliceit_drake.prediction.clock import EXCHANGE_PERIOD, Clock
-from sliceit_drake.prediction.jobs import Job, JobResult
 from sliceit_drake.prediction.placement import is_bare
 from sliceit_drake.prediction.record_target import Meshing, RecordTarget, make_targets
-from sliceit_drake.prediction.simulator import Simulator
+from sliceit_drake.prediction.simulator import Job, JobResult, Simulator
 from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = ["Parameter", "Prediction", "Predictor"]

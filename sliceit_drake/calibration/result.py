@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sliceit_drake.calibration.posterior import Posterior
 from sliceit_drake.calibration.prediction import Prediction, Predictor
+from sliceit_drake.calibration.uncertainty import Posterior
 from sliceit_drake.configuration import dump_yaml
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
 from sliceit_drake.cutting.foods.spring_food import calibrate_spring

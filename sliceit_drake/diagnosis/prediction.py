@@ -12,10 +12,9 @@ from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.prediction.clock import Clock
-from sliceit_drake.prediction.jobs import Job, JobResult
 from sliceit_drake.prediction.record_target import Meshing, RecordTarget, make_targets
 from sliceit_drake.prediction.series import ForceSeries
-from sliceit_drake.prediction.simulator import Simulator, Workers
+from sliceit_drake.prediction.simulator import Job, JobResult, Simulator, Workers
 from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = ["RECORD_EFFECTS", "ActiveCause", "Point", "RecordEffect", "SlicePredictor"]

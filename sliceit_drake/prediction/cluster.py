@@ -21,7 +21,7 @@ from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.driver import Driver
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.prediction.clock import Stretches
-from sliceit_drake.prediction.jobs import Executor, Job, JobResult, run_job
+from sliceit_drake.prediction.simulator import Executor, Job, JobResult, run_job
 
 if TYPE_CHECKING:
     from distributed import Client
