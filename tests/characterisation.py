@@ -139,7 +139,7 @@ def stand_in(world: str) -> Facts:
 
 
 def bench_setup() -> CalibrationSetup:
-    """Of a coarse food."""
+    """Calibration setup of a coarse food."""
     return CalibrationSetup(
         food=Food(
             shape=SHAPE, material=Material(youngs_modulus=1.6e6, toughness=300.0, friction=0.1)
@@ -237,7 +237,7 @@ def slices() -> Facts:
 
 
 def gradient() -> Facts:
-    """Of a mean force by parameters and by the knife's path."""
+    """Gradient of a mean force by parameters and by the knife's path."""
     model = make_food_model(effects_food(), Knife(), Numerics(time_step=5e-4, precision="float64"))
     k = np.arange(61)
     p = np.array([0.0, 0.0, model.top + 1e-4]) + np.stack([1e-4 * k, 0 * k, -4.2e-4 * k], axis=1)

@@ -19,7 +19,7 @@ HEIGHT = 0.027
 
 
 def example_metadata() -> SliceMetadata:
-    """Of a press-and-draw slice of a cylinder, nothing left out."""
+    """Metadata of a press-and-draw slice of a cylinder, nothing left out."""
     phases = [
         Phase("air", 0.0, 0.5),
         Phase("slice", 0.5, 1.85),

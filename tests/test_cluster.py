@@ -45,7 +45,7 @@ def local():
 
 
 def points() -> list[Point]:
-    """Of two meshes, with other materials and another food."""
+    """Points of two meshes, with other materials and another food."""
     finer = Meshing(refinement=1.0)
     skin = ActiveCause(SkinToughness(), {"toughness": 1.0, "thickness": 1.2e-3})
     return [

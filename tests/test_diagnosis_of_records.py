@@ -20,7 +20,7 @@ from sliceit_drake.stand_in.session import Session
 PROTOCOL = load_protocol(str(resource_path("calibration/protocols/poor.yaml")))
 WORLD = FiniteElementSettings(refinement=0.85, time_step=2e-4, travel=2e-4)
 REFINEMENT = 0.75
-"""Of the diagnosis: coarser than the world, as a simulation is coarser than reality."""
+"""Refinement of the diagnosis: coarser than the world, as a simulation is coarser than reality."""
 REPLICATES = 100
 
 
@@ -30,7 +30,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def diagnosis_of(cache: Path, seed: int, *effects: str, slices: int = 6) -> Diagnosis:
-    """Of slices in which effects are hidden."""
+    """Diagnosis of slices in which effects are hidden."""
     session = Session(PROTOCOL, [make_effect(e) for e in effects], seed=seed, settings=WORLD)
     records = [session.record(k) for k in range(slices)]
     setup = setup_of_food(CalibratedFood(food=PROTOCOL.food, knife=PROTOCOL.knife), REFINEMENT)

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.second_tier
 
 REPLICATES = 100
 MIN_RIGHT = 10
-"""Of the twelve runs."""
+"""Fewest of the twelve runs that must be right."""
 SINGLE = (
     "skin",
     "bulk_relaxation",

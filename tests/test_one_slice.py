@@ -36,7 +36,7 @@ BROAD = Column("cause", "broad", "size", size=1.0)
 
 
 def evidence(seed: int, replicates: int = 60, broad: float = 0.0, **hidden: float) -> SliceEvidence:
-    """Of one synthetic record; `broad` is a cause that all depths tell of."""
+    """Evidence of one synthetic record; `broad` is a cause that all depths tell of."""
     own = record("only", 0.04, np.random.default_rng(seed), hidden, 0.0)
     shape = (np.sin(own.depth / 3e-3) * own.in_contact)[:, None, None]
     own.columns = np.concatenate([own.columns, shape], axis=2)

@@ -78,7 +78,7 @@ def record(number: int, hidden: dict[str, float]) -> RecordSensitivity:
 
 
 def sensitivities(mesh: bool = True, **hidden: float) -> Sensitivities:
-    """Of two conditions; without the mesh's column the simulation is exact."""
+    """Sensitivities of two conditions; without the mesh's column the simulation is exact."""
     kept = [k for k, c in enumerate(COLUMNS) if mesh or c.name != "mesh"]
     records = [record(k, hidden) for k in range(2 * SLICES)]
     records = [

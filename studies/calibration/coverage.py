@@ -48,8 +48,8 @@ LEAST, MOST = 0.80, 0.98
 MIN_SQUARES_STEPS = 5
 """Before the weighted fit."""
 CLEARANCE, REST = 2.5e-3, 6e-3
-"""Of the knife above the food at the start, and above the board at the end, m: no record's height
-brings it to the board, where the force has a kink that no normal distribution describes."""
+"""Height of the knife above the food at the start and above the board at the end, m. No record's
+height brings it to the board, where the force has a kink that no normal distribution describes."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

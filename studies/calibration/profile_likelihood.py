@@ -14,7 +14,7 @@ from sliceit_drake.cutting.solver import CuttingError
 __all__ = ["Profile", "profile_likelihood"]
 
 STEPS = 3
-"""Of each refit."""
+"""Most steps of each refit."""
 DISAGREEMENT = 0.3
 """Relative difference of a reach from that of the normal approximation that is reported."""
 

@@ -56,11 +56,11 @@ class Springs:
     count: int = quantity(113, "", low=1, high=100000)
     """Springs in the section."""
     stiffness: float = quantity(200.0, "N/m", low=0.0, high=1e6)
-    """Of a spring."""
+    """Stiffness of a spring."""
     rest_length: float = quantity(5e-5, "m", low=0.0, high=1e-2)
     """Opening it begins to pull at."""
     contact_stiffness: float = quantity(1430.0, "N/m", low=0.0, high=1e6)
-    """Of the knife on each face of a spring."""
+    """Contact stiffness of the knife on each face of a spring."""
     section: float = quantity(1.08e-3, "m2", low=1e-6, high=1.0)
     """Area that they share."""
     friction: float = quantity(0.5, "", low=0.0, high=2.0)
@@ -83,7 +83,7 @@ class ReferenceRun:
 
     name: str = "nominal"
     speed: float = quantity(0.05, "m/s", low=1e-4, high=1.0)
-    """Of the knife."""
+    """Speed of the knife."""
     time_step: float = quantity(1e-5, "s", low=1e-7, high=1e-3)
     """Its sub-step."""
     spring_factor: float = quantity(1.0, "", low=0.0, high=1e3)
@@ -137,7 +137,7 @@ class Case:
     knife: Knife = dc.field(default_factory=Knife)
     numerics: Numerics = dc.field(default_factory=Numerics)
     clearance: float = quantity(2e-3, "m", low=0.0, high=0.1)
-    """Of the edge above the food at the start."""
+    """Height of the edge above the food at the start."""
     motion: MotionPlan = dc.field(default_factory=MotionPlan)
     period: float = quantity(5e-3, "s", low=1e-5, high=0.1)
     """Between recorded forces; the sum of norms is sampled."""
@@ -180,7 +180,7 @@ class CaseResult:
     result: SliceResult
 
     def at(self, height: float, values: np.ndarray) -> float:
-        """Of `values` [n] when the edge passed a height."""
+        """Interpolates `values` [n] to the time at which the edge passed a height."""
         return float(np.interp(-height, -self.height, values))
 
     def work(self, values: np.ndarray) -> float:

@@ -27,9 +27,9 @@ FINER = 3
 MASS = 51.7e-3
 """Mass that moves in DiSECt's reference case, kg."""
 SLAB_MASS = 18.5e-3
-"""Of the food that moves there, kg."""
+"""Mass of the food that moves there, kg."""
 FLANK_RANGE = (0.01, 4.0)
-"""Of the contact stiffness that is fitted to DiSECt's curves, E/h."""
+"""Range of the contact stiffness that is fitted to DiSECt's curves, E/h."""
 PERIOD = 5e-3
 
 

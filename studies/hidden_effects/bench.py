@@ -28,11 +28,11 @@ __all__ = [
 PROTOCOLS = ("poor", "rich", "full")
 
 DIAGNOSIS_REFINEMENT = 0.75
-"""Of the diagnosis. On a mesh of half the elements a skin does what a core or another section does,
-and is 38 degrees from the stand-in's where all cuts are alike; here 11."""
+"""Refinement of the diagnosis's mesh. On a mesh of half the elements a skin does what a core or
+another section does, and is 38 degrees from the stand-in's where all cuts are alike; here 11."""
 
 WORLD = FiniteElementSettings(refinement=0.85, time_step=2e-4, travel=2e-4)
-"""Of the stand-in: neither a mesh nor a step of the diagnosis."""
+"""Mesh and step of the stand-in, which differ from those of the diagnosis."""
 
 PER_SLICE = ("dulling_edge", "food_slip", "warm_wrist")
 """Effects that differ between slices of one condition."""

@@ -20,7 +20,7 @@ from studies.hidden_effects.bench import (
 __all__ = ["ProtocolClasses", "protocol_classes"]
 
 SEED = 21
-"""Of the order of slices."""
+"""Seed of the order of slices."""
 
 
 @dc.dataclass(frozen=True)

@@ -25,7 +25,7 @@ NOT_ITSELF = 60.0
 Near = Mapping[str, Mapping[str, Mapping[str, float]]]
 Classes = Mapping[str, Mapping[str, Sequence[str]]]
 Z = 1.6448536269514722
-"""Of a one-sided bound of 95 %."""
+"""Normal quantile of a one-sided bound of 95 %."""
 
 
 @dc.dataclass(frozen=True)

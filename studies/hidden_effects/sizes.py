@@ -63,7 +63,7 @@ DELTAS = (0.5, 1.0, 2.0, 2.5, 3.0, 4.0)
 """Strengths that a table shows."""
 
 SEED = 20
-"""Of the session that noise and variation are taken from."""
+"""Seed of the session that noise and variation are taken from."""
 
 LARGEST = 8.0
 """Largest size, of the typical one."""

@@ -31,7 +31,7 @@ VARIANTS = {
     "two environments, 60,000 decisions": "{environments: 2}",
 }
 STEPS = {"two environments, 60,000 decisions": 60_000}
-"""Of a training that is not as long as the others."""
+"""Decisions of a training that is not as long as the others."""
 PLACE = Place("slicing_ablations")
 LAST = 20
 """Slices at the end of a training whose return is given."""

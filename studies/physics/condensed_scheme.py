@@ -48,7 +48,7 @@ POINT_COST = 3.0
 """Cost of a point's force and tangent over that of its force in the solver's kernel; assumed."""
 
 TOLERANCE = 1e-3
-"""Of the residual, by the force on the knife or `MIN_FORCE`, N."""
+"""Largest residual, relative to the force on the knife or to `MIN_FORCE`, N."""
 
 MIN_FORCE = 0.1
 MOST_ITERATIONS = 60

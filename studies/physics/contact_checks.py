@@ -27,9 +27,9 @@ __all__ = [
 ]
 
 PERIOD = 2e-3
-"""Of a coupling step, s."""
+"""Length of a coupling step, s."""
 SPEED = 0.02
-"""Of the press, m/s."""
+"""Speed of the press, m/s."""
 
 
 def _press(

@@ -16,7 +16,7 @@ from sliceit_drake.cutting.solver import CuttingSolver
 __all__ = ["CutBudget", "Refinement", "cut_budget", "refine_mesh", "refine_step"]
 
 PERIOD = 2e-3
-"""Of a coupling step, s."""
+"""Length of a coupling step, s."""
 
 
 @dc.dataclass

@@ -61,7 +61,7 @@ more, between which one press cut hardly tells."""
 STEPS = 5
 """Most steps from each start."""
 STEP = 0.02
-"""Of the differences, relative to the logarithm of the bounds."""
+"""Step of the finite differences, relative to the logarithm of the bounds."""
 
 
 @dc.dataclass
@@ -84,7 +84,7 @@ class MeasuredFood:
 
     @property
     def diameter(self) -> float:
-        """Of the section, metres."""
+        """Diameter of the section, metres."""
         assert isinstance(self.food.shape, Cylinder)
         return self.food.shape.diameter
 

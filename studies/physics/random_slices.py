@@ -43,15 +43,15 @@ __all__ = [
 EXCHANGE_PERIOD = 2e-3
 CLEARANCE = 2e-3
 OVERTRAVEL = 5e-4
-"""Of the edge into the board, metres: under the blade a soft food sinks into it."""
+"""Travel of the edge into the board, metres: under the blade a soft food sinks into it."""
 KINDS = ("cut", "refused", "stopped", "unexplained")
 IMBALANCE = 0.02
 """Greatest work that the energy balance may lack, over the work of the knife."""
 LEFT = 0.01
 """Fraction of the section that the last elements may keep."""
 YIELDS = 2.0
-"""Of toughness over modulus, the way that a food gives before it parts: as much may be left at the
-board, into which the edge presses it."""
+"""Multiple of toughness over modulus, the way that a food gives before it parts: as much may be
+left at the board, into which the edge presses it."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -32,7 +32,7 @@ __all__ = ["add_arguments", "run"]
 GROWTH = 10.0
 """Allowed, MB an hour."""
 STATION_SECONDS = 0.8
-"""Of a station's run: into the food."""
+"""Duration of a station's run, into the food."""
 BUILT = 10
 """Stations that are built and dropped."""
 
