@@ -20,6 +20,11 @@ PARALLEL = wp.constant(MODES.index("parallel"))
 ZERO = wp.constant(wp.float64(0.0))
 ONE = wp.constant(wp.float64(1.0))
 
+Numbers = wp.array(dtype=wp.float64)
+Vectors = wp.array(dtype=wp.vec3d)
+Rotations = wp.array(dtype=wp.mat33d)
+Matrix = wp.array2d(dtype=wp.float64)
+
 mat34d = wp.types.matrix((3, 4), wp.float64)
 """Three rows of a rigid transform, in doubles."""
 
@@ -29,13 +34,7 @@ MAX_ANGLE = wp.constant(wp.float64(1.0))
 
 
 @wp.func
-def place_links(
-    q: wp.array(dtype=wp.float64),
-    R_PL: wp.array(dtype=wp.mat33d),
-    p_PL: wp.array(dtype=wp.vec3d),
-    R_BL: wp.array(dtype=wp.mat33d),
-    p_BL: wp.array(dtype=wp.vec3d),
-):
+def place_links(q: Numbers, R_PL: Rotations, p_PL: Vectors, R_BL: Rotations, p_BL: Vectors):
     """Poses of the bodies at joint positions q, from those in their parents at zero."""
     R = wp.identity(n=3, dtype=wp.float64)
     p = wp.vec3d()
@@ -52,19 +51,13 @@ def place_links(
 
 
 @wp.func
-def joint_axis(R_BL: wp.array(dtype=wp.mat33d), i: wp.int32):
+def joint_axis(R_BL: Rotations, i: wp.int32):
     R = R_BL[i]
     return wp.vec3d(R[0, 2], R[1, 2], R[2, 2])
 
 
 @wp.func
-def mass_matrix(
-    R_BL: wp.array(dtype=wp.mat33d),
-    p_BL: wp.array(dtype=wp.vec3d),
-    mass: wp.array(dtype=wp.float64),
-    moment: wp.array(dtype=wp.float64),
-    H: wp.array2d(dtype=wp.float64),
-):
+def mass_matrix(R_BL: Rotations, p_BL: Vectors, mass: Numbers, moment: Numbers, H: Matrix):
     """Sum of J^T M J over the bodies, each with equal moments of inertia about its origin.
 
     The lower triangle of H alone is written.
@@ -83,13 +76,7 @@ def mass_matrix(
 
 
 @wp.func
-def joint_torques(
-    R_BL: wp.array(dtype=wp.mat33d),
-    p_BL: wp.array(dtype=wp.vec3d),
-    force: wp.vec3d,
-    moment: wp.vec3d,
-    tau: wp.array(dtype=wp.float64),
-):
+def joint_torques(R_BL: Rotations, p_BL: Vectors, force: wp.vec3d, moment: wp.vec3d, tau: Numbers):
     """J^T of a force and a moment that act at the end effector's origin."""
     p_BE = p_BL[tau.shape[0]]
     for i in range(tau.shape[0]):
@@ -98,7 +85,7 @@ def joint_torques(
 
 
 @wp.func
-def solve(H: wp.array2d(dtype=wp.float64), x: wp.array(dtype=wp.float64)):
+def solve(H: Matrix, x: Numbers):
     """Puts H^-1 x in place of x, and the Cholesky factor in place of the lower triangle of H.
 
     Returns: whether the result is finite, which it is not if H is not positive definite.
@@ -168,28 +155,22 @@ def rotation_vector(R: wp.mat33d, threshold: wp.float64):
 
 
 @wp.kernel(enable_backward=False)
-def place_arm(
-    q: wp.array(dtype=wp.float64),
-    R_PL: wp.array(dtype=wp.mat33d),
-    p_PL: wp.array(dtype=wp.vec3d),
-    R_BL: wp.array(dtype=wp.mat33d),
-    p_BL: wp.array(dtype=wp.vec3d),
-):
+def place_arm(q: Numbers, R_PL: Rotations, p_PL: Vectors, R_BL: Rotations, p_BL: Vectors):
     """Poses of the bodies in B, see `place_links`."""
     place_links(q, R_PL, p_PL, R_BL, p_BL)
 
 
 @wp.kernel(enable_backward=False)
 def update_arm(
-    q: wp.array(dtype=wp.float64),
-    R_PL: wp.array(dtype=wp.mat33d),
-    p_PL: wp.array(dtype=wp.vec3d),
-    R_BL: wp.array(dtype=wp.mat33d),
-    p_BL: wp.array(dtype=wp.vec3d),
-    mass: wp.array(dtype=wp.float64),
-    moment: wp.array(dtype=wp.float64),
-    lower: wp.array(dtype=wp.float64),
-    upper: wp.array(dtype=wp.float64),
+    q: Numbers,
+    R_PL: Rotations,
+    p_PL: Vectors,
+    R_BL: Rotations,
+    p_BL: Vectors,
+    mass: Numbers,
+    moment: Numbers,
+    lower: Numbers,
+    upper: Numbers,
     mode: wp.int32,
     iterations: wp.int32,
     dt: wp.float64,
@@ -197,19 +178,19 @@ def update_arm(
     threshold: wp.float64,
     hand_frame_control: wp.bool,
     R_EC: wp.mat33d,
-    measured: wp.array(dtype=wp.float64),
+    measured: Numbers,
     target: wp.array(dtype=mat34d),
-    sensor_wrench: wp.array(dtype=wp.vec3d),
-    stiffness: wp.array(dtype=wp.vec3d),
-    selection: wp.array(dtype=wp.vec3d),
-    proportional: wp.array(dtype=wp.vec3d),
-    derivative: wp.array(dtype=wp.vec3d),
-    target_wrench: wp.array(dtype=wp.vec3d),
-    v: wp.array(dtype=wp.float64),
-    error: wp.array(dtype=wp.vec3d),
-    u: wp.array(dtype=wp.vec3d),
-    H: wp.array2d(dtype=wp.float64),
-    acceleration: wp.array(dtype=wp.float64),
+    sensor_wrench: Vectors,
+    stiffness: Vectors,
+    selection: Vectors,
+    proportional: Vectors,
+    derivative: Vectors,
+    target_wrench: Vectors,
+    v: Numbers,
+    error: Vectors,
+    u: Vectors,
+    H: Matrix,
+    acceleration: Numbers,
     failed: wp.array(dtype=wp.int32),
 ):
     """Advances q, v and the error by one update, in one thread.

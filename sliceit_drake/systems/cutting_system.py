@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, State
 from sliceit_drake.cutting.contact_response import contact_responses
 from sliceit_drake.cutting.coupling_steps import EnergyBalance
 from sliceit_drake.cutting.mesh.body import FoodBody, food_body
-from sliceit_drake.cutting.mesh.surface import FoodSurface, food_surface
+from sliceit_drake.cutting.mesh.surface import food_surface
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.simulate import check_clear, check_energies, check_in_plane
@@ -68,6 +68,9 @@ class CuttingSystem(KnifeForceSystem):
         X_WF: Pose of the food frame, or one for each of the foods.
         check_period: Interval of the energy and inversion checks, s.
         in_sequence: Whether each food follows the one before it once that is cut.
+
+    Attributes:
+        solvers, surfaces, food_poses: Solver, surface and X_WF of each of the prepared foods.
     """
 
     def __init__(
@@ -78,18 +81,20 @@ class CuttingSystem(KnifeForceSystem):
         in_sequence: bool = False,
     ) -> None:
         super().__init__(solvers[0].exchange_period)
-        self._solvers = tuple(solvers)
-        self.surfaces: tuple[FoodSurface, ...] = tuple(food_surface(s.model) for s in solvers)
+        self.solvers = tuple(solvers)
+        self.surfaces = tuple(food_surface(s.model) for s in solvers)
         self._in_sequence = in_sequence
-        self._X_WF = (X_WF,) * len(solvers) if isinstance(X_WF, RigidTransform) else tuple(X_WF)
+        self.food_poses = (
+            (X_WF,) * len(solvers) if isinstance(X_WF, RigidTransform) else tuple(X_WF)
+        )
         self._R_CW, self._offset = [], []
-        for solver, X in zip(self._solvers, self._X_WF, strict=True):
+        for solver, X in zip(self.solvers, self.food_poses, strict=True):
             R_WC = X.rotation().matrix() @ solver.model.X_FC_rotation
             self._R_CW.append(R_WC.T)
             self._offset.append(R_WC.T @ X.multiply(solver.model.X_FC_position))
         self._check_every = max(1, round(check_period / self.exchange_period))
-        size = max(s.state_size for s in self._solvers)
-        self._food = self.DeclareDiscreteState(self._padded(self._solvers[0].initial_state(), size))
+        size = max(s.state_size for s in self.solvers)
+        self._food = self.DeclareDiscreteState(self._padded(self.solvers[0].initial_state(), size))
         self._food_index = self.DeclareDiscreteState(1)
         self._components = self.DeclareDiscreteState(9)
         self._balance = self.DeclareDiscreteState(len(BALANCE_NAMES))
@@ -120,7 +125,7 @@ class CuttingSystem(KnifeForceSystem):
 
     def _middle_model(self) -> CuttingModel:
         """The cut; of a sequence, its middle slice, which stands for all."""
-        return self._solvers[len(self._solvers) // 2].model
+        return self.solvers[len(self.solvers) // 2].model
 
     def describe(self) -> str:
         model = self._middle_model()
@@ -136,7 +141,7 @@ class CuttingSystem(KnifeForceSystem):
         work = float(record["energy_work"][-1])
         area = sum(self.section_areas()[: int(record["food_index"][-1]) + 1])
         return {
-            "warnings": sorted({text for s in self._solvers for text in s.model.warnings}),
+            "warnings": sorted({text for s in self.solvers for text in s.model.warnings}),
             "elements": model.element_count,
             "cut_points": len(model.point_nodes),
             "sub_step_s": model.numerics.time_step,
@@ -154,7 +159,7 @@ class CuttingSystem(KnifeForceSystem):
         }
 
     def section_areas(self) -> list[float]:
-        return [solver.model.section_area for solver in self._solvers]
+        return [solver.model.section_area for solver in self.solvers]
 
     def picture(self, context: Context) -> FoodPicture:
         surface, X_WF = self.surfaces[self.food_index(context)], self.X_WF(context)
@@ -184,7 +189,7 @@ class CuttingSystem(KnifeForceSystem):
     def _bodies(self) -> list[tuple[FoodBody, np.ndarray]]:
         """The solid of each prepared food, and its corners at rest in W [V, 3], metres."""
         found = []
-        for solver, X_WF in zip(self._solvers, self._X_WF, strict=True):
+        for solver, X_WF in zip(self.solvers, self.food_poses, strict=True):
             body = food_body(solver.model)
             rest = body.positions(solver.model, solver.model.nodes)
             found.append((body, _in_world(X_WF, rest)))
@@ -192,7 +197,7 @@ class CuttingSystem(KnifeForceSystem):
 
     def contact_responses(self, offset: float) -> list[np.ndarray]:
         """Responses of the food with the largest section; see `ReportingSystem`."""
-        solver = max(self._solvers, key=lambda each: each.model.section_area)
+        solver = max(self.solvers, key=lambda each: each.model.section_area)
         return contact_responses(solver, offset)
 
     def frame_size(self) -> float:
@@ -201,7 +206,7 @@ class CuttingSystem(KnifeForceSystem):
     def add_visualizer(
         self, builder: DiagramBuilder, meshcat: Meshcat, period: float
     ) -> FoodVisualizer:
-        slices_stay = not self._X_WF[0].IsExactlyEqualTo(self._X_WF[-1])
+        slices_stay = not self.food_poses[0].IsExactlyEqualTo(self.food_poses[-1])
         visualizer = builder.AddNamedSystem(
             "food_visualizer", FoodVisualizer(self.surfaces, slices_stay, meshcat, period)
         )
@@ -221,58 +226,36 @@ class CuttingSystem(KnifeForceSystem):
 
     def food_state(self, context: Context) -> np.ndarray:
         """State of the food as its solver reads it."""
-        size = self._solvers[self.food_index(context)].state_size
+        size = self.solvers[self.food_index(context)].state_size
         return context.get_discrete_state(self._food).value()[:size]
 
     def solver(self, context: Context) -> CuttingSolver:
         """Solver of the food that this context cuts."""
-        return self._solvers[self.food_index(context)]
+        return self.solvers[self.food_index(context)]
 
     def X_WF(self, context: Context) -> RigidTransform:
         """Pose of the frame of the food that this context cuts."""
-        return self._X_WF[self.food_index(context)]
-
-    @property
-    def solvers(self) -> tuple[CuttingSolver, ...]:
-        """Solvers of the prepared foods."""
-        return self._solvers
-
-    @property
-    def food_poses(self) -> tuple[RigidTransform, ...]:
-        """X_WF of each of the prepared foods."""
-        return self._X_WF
+        return self.food_poses[self.food_index(context)]
 
     def SetFood(self, context: Context, index: int) -> None:
-        """Puts an uncut food into the context.
-
-        Args:
-            context: This system's context.
-            index: Into the prepared foods.
+        """Puts the uncut food of an index into the context.
 
         Raises:
             IndexError: There is no such food.
         """
-        if not 0 <= index < len(self._solvers):
-            raise IndexError(f"food {index}: {len(self._solvers)} foods are prepared.")
+        if not 0 <= index < len(self.solvers):
+            raise IndexError(f"food {index}: {len(self.solvers)} foods are prepared.")
         size = len(context.get_discrete_state(self._food).value())
-        state = self._padded(self._solvers[index].initial_state(), size)
+        state = self._padded(self.solvers[index].initial_state(), size)
         context.SetDiscreteState(self._food, state)
         context.SetDiscreteState(self._food_index, [index])
         # A new food has given no force and cost no work yet.
-        for part, value in (
-            (self._wrench, np.zeros(6)),
-            (self._progress, np.zeros(1)),
-            (self._coupling, np.zeros(1)),
-            (self._components, np.zeros(9)),
-            (self._balance, np.zeros(len(BALANCE_NAMES))),
-            (self._energy, np.array(NO_ENERGY)),
-            (self._spent_before, np.zeros(1)),
-        ):
-            context.SetDiscreteState(part, value)
+        self.set_to_zero(context, self._components, self._balance, self._spent_before)
+        context.SetDiscreteState(self._energy, NO_ENERGY)
 
     def randomize_context(self, context: Context, rng: np.random.Generator) -> None:
         """Puts an uncut food, drawn from the prepared ones, into the context."""
-        self.SetFood(context, int(rng.integers(len(self._solvers))))
+        self.SetFood(context, int(rng.integers(len(self.solvers))))
 
     def _in_cut_frame(self, index: int, X_WK: np.ndarray) -> Pose:
         """X_CK from X_WK [3, 4]."""
@@ -280,8 +263,7 @@ class CuttingSystem(KnifeForceSystem):
         return Pose(X_CK[:, :3], X_CK[:, 3] - self._offset[index])
 
     def _index_to_cut(self, context: Context, index: int, X_WK: np.ndarray) -> int:
-        """The food that the next coupling step cuts: the one after this, if the knife is ready for
-        it.
+        """The food that the next coupling step cuts: this, or the next if the knife is there.
 
         Args:
             context: This system's context.
@@ -291,9 +273,9 @@ class CuttingSystem(KnifeForceSystem):
         Raises:
             CuttingError: The knife is in the next plane and has not cut the last section through.
         """
-        if not self._in_sequence or index + 1 == len(self._solvers):
+        if not self._in_sequence or index + 1 == len(self.solvers):
             return index
-        model = self._solvers[index + 1].model
+        model = self.solvers[index + 1].model
         # The coupling step goes from the last pose to this one; tables blur by one spacing.
         clear = model.top + model.tables.spacing
         poses = (self.last_pose(context), X_WK)
@@ -314,8 +296,8 @@ class CuttingSystem(KnifeForceSystem):
 
     def start(self, context: Context, state: State, X_WK: RigidTransform) -> None:
         index = self.food_index(context)
-        self._solvers[index].compile()
-        check_clear(self._solvers[index].model, self._in_cut_frame(index, X_WK.GetAsMatrix34()))
+        self.solvers[index].compile()
+        check_clear(self.solvers[index].model, self._in_cut_frame(index, X_WK.GetAsMatrix34()))
 
     def advance(
         self, context: Context, state: State, X_WK: RigidTransform
@@ -324,7 +306,7 @@ class CuttingSystem(KnifeForceSystem):
         before, time = int(x.value(self._food_index)[0]), context.get_time()
         now = X_WK.GetAsMatrix34()
         index = self._index_to_cut(context, before, now)
-        solver = self._solvers[index]
+        solver = self.solvers[index]
         old_balance = x.value(self._balance)
         if index == before:
             old = x.value(self._food)[: solver.state_size]
@@ -351,15 +333,13 @@ class CuttingSystem(KnifeForceSystem):
             energies = solver.energies(step.state, pose)
             spent = float(balance[SPENT].sum() - new.value(self._spent_before)[0])
             ratio = check_energies(energies, spent, solver.model, time)
-            last_check = dict(zip(ENERGY_NAMES, new.value(self._energy).tolist(), strict=True))
+            *_, largest_ratio, least_volume_ratio = new.value(self._energy).tolist()
             check = {
                 "elastic": energies.elastic,
                 "interface": energies.interface,
                 "kinetic": energies.kinetic,
-                "largest_energy_ratio": max(ratio, last_check["largest_energy_ratio"]),
-                "least_volume_ratio": min(
-                    energies.least_volume_ratio, last_check["least_volume_ratio"]
-                ),
+                "largest_energy_ratio": max(ratio, largest_ratio),
+                "least_volume_ratio": min(energies.least_volume_ratio, least_volume_ratio),
             }
             new.set_value(self._energy, [check[name] for name in ENERGY_NAMES])
         return step.wrench.reshape(2, 3).dot(R_CW).ravel(), float(step.cut[-1])

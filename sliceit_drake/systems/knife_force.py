@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce, SpatialVelocity
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce
 from pydrake.multibody.tree import BodyIndex
-from pydrake.systems.framework import Context, EventStatus, LeafSystem, State
+from pydrake.systems.framework import Context, DiscreteStateIndex, EventStatus, LeafSystem, State
 
 from sliceit_drake.cutting.motion import small_turn
 from sliceit_drake.systems.cut_report import ReportingSystem
@@ -106,6 +106,11 @@ class KnifeForceSystem(ReportingSystem):
     def wrench(self, context: Context) -> np.ndarray:
         """The held wrench F_K_W, moment and force [6]."""
         return context.get_discrete_state(self._wrench).value()
+
+    def set_to_zero(self, context: Context, *parts: DiscreteStateIndex) -> None:
+        """Sets wrench, progress, coupling error and a subclass's parts in the context to zero."""
+        for part in (self._wrench, self._progress, self._coupling, *parts):
+            context.SetDiscreteState(part, np.zeros(context.get_discrete_state(part).size()))
 
     def _initialize(self, context: Context, state: State) -> None:
         X_WK = self._pose_input.Eval(context)

@@ -71,8 +71,7 @@ class SpringCutter(KnifeForceSystem):
     def SetSpring(self, context: Context, stiffness: float, damping: float) -> None:
         """Puts a released button with another spring into the context; N/m and Ns/m."""
         context.get_mutable_numeric_parameter(self._spring).SetFromVector([stiffness, damping])
-        for part in (self._button, self._wrench, self._progress, self._coupling):
-            context.SetDiscreteState(part, np.zeros(context.get_discrete_state(part).size()))
+        self.set_to_zero(context, self._button)
 
     def randomize_context(self, context: Context, rng: np.random.Generator) -> None:
         """Puts a released button into the context, ERP drawn within `erp_noise` at constant CFM.
