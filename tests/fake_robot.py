@@ -3,8 +3,7 @@
 import threading
 import time as clock
 
-from sliceit_drake.hardware.client import RobotFacts
-from sliceit_drake.hardware.robot_state import PLAYING, RobotState
+from sliceit_drake.hardware.client import PLAYING, RobotFacts, RobotState
 from sliceit_drake.systems.servo import ServoConfig, ServoLaw
 
 

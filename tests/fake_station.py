@@ -1,7 +1,7 @@
 """The hardware station's scenario and configuration for tests on a fake robot."""
 
 from sliceit_drake.diagrams.scenario import load_scenario
-from sliceit_drake.hardware.limits import SafetyLimits
+from sliceit_drake.hardware.hardware_config import SafetyLimits
 from sliceit_drake.resources import resource_path
 
 PACE = 0.15

@@ -10,7 +10,7 @@ from fake_robot import FakeRobot
 
 from sliceit_drake.hardware.client import RobotUnavailableError
 from sliceit_drake.hardware.edge_kinematics import EdgeKinematics
-from sliceit_drake.hardware.limits import SafetyLimits
+from sliceit_drake.hardware.hardware_config import SafetyLimits
 from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.hardware.rtde_system import RtdeSystem
 from sliceit_drake.hardware.safety import SafetyLayer

@@ -10,10 +10,9 @@ from arm_at_start import BOARD, LENGTH, START, X_TK, X_WB, chain_pose
 from scipy.optimize import brentq
 
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.hardware.client import PLAYING, RobotState
 from sliceit_drake.hardware.edge_kinematics import EdgeKinematics
-from sliceit_drake.hardware.hardware_config import load_hardware_config
-from sliceit_drake.hardware.limits import SafetyLimits, loosened
-from sliceit_drake.hardware.robot_state import PLAYING, RobotState
+from sliceit_drake.hardware.hardware_config import SafetyLimits, load_hardware_config, loosened
 from sliceit_drake.hardware.safety import LatchedError, SafetyLayer
 
 PERIOD = 0.002

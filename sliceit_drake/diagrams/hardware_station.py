@@ -25,8 +25,7 @@ from sliceit_drake.diagrams.station_interface import (
 )
 from sliceit_drake.hardware.client import RobotClient
 from sliceit_drake.hardware.edge_kinematics import EdgeKinematics
-from sliceit_drake.hardware.hardware_config import HardwareConfig
-from sliceit_drake.hardware.limits import SafetyLimits
+from sliceit_drake.hardware.hardware_config import HardwareConfig, SafetyLimits
 from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.hardware.rtde_system import RtdeSystem
 from sliceit_drake.hardware.safety import SafetyLayer

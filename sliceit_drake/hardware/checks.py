@@ -4,9 +4,8 @@ import dataclasses as dc
 import math
 from collections.abc import Sequence
 
-from sliceit_drake.hardware.client import RobotFacts
+from sliceit_drake.hardware.client import RobotFacts, RobotState
 from sliceit_drake.hardware.hardware_config import HardwareConfig
-from sliceit_drake.hardware.robot_state import RobotState
 
 __all__ = ["Check", "check_facts", "check_payload", "check_sensor", "check_start"]
 

@@ -1,15 +1,72 @@
 """Interface of a robot as the link needs it, so that tests and other libraries can stand in."""
 
 import dataclasses as dc
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
-from sliceit_drake.hardware.robot_state import RobotState
+__all__ = [
+    "PLAYING",
+    "RUNTIME_STATES",
+    "SAFE_BITS",
+    "RobotClient",
+    "RobotFacts",
+    "RobotState",
+    "RobotUnavailableError",
+    "is_loopback",
+    "safety_text",
+]
 
-__all__ = ["RobotClient", "RobotFacts", "RobotUnavailableError", "is_loopback"]
+PLAYING = 2
+RUNTIME_STATES = ("stopping", "stopped", "playing", "pausing", "paused", "resuming")
+
+SAFETY_BITS = (
+    "normal",
+    "reduced mode",
+    "protective stop",
+    "recovery mode",
+    "safeguard stop",
+    "system emergency stop",
+    "robot emergency stop",
+    "emergency stop",
+    "safety violation",
+    "safety fault",
+    "stopped due to safety",
+)
+SAFE_BITS = 0b11
+"""Normal and reduced mode: in all others the controller moves nothing."""
 
 
 class RobotUnavailableError(RuntimeError):
     """There is no robot to talk to, or it refuses; the message says what to do."""
+
+
+class RobotState(NamedTuple):
+    """One cycle of the controller.
+
+    Attributes:
+        time: The controller's clock, s: the only evidence that the data are fresh.
+        q: Joint positions [6], rad.
+        qd: Joint velocities [6], rad/s.
+        wrench: Force of the environment on the tool, then the torque, at the flange in the axes of
+            the base [6], N and Nm (the controller's "TCP force" while its TCP is the flange).
+        runtime_state: Index into `RUNTIME_STATES`.
+        safety_bits: The controller's safety_status_bits.
+        payload: Mass that the controller subtracts, kg, and its centre in the flange, m [4]; None
+            where it is not read.
+    """
+
+    time: float
+    q: list[float]
+    qd: list[float]
+    wrench: list[float]
+    runtime_state: int
+    safety_bits: int
+    payload: tuple[float, ...] | None = None
+
+
+def safety_text(bits: int) -> str:
+    """Names of the safety bits that are set."""
+    names = [name for k, name in enumerate(SAFETY_BITS) if bits >> k & 1]
+    return ", ".join(names) or "no safety bit"
 
 
 @dc.dataclass

@@ -11,8 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from sliceit_drake.hardware.client import RobotClient, RobotUnavailableError
-from sliceit_drake.hardware.robot_state import RobotState
+from sliceit_drake.hardware.client import RobotClient, RobotState, RobotUnavailableError
 from sliceit_drake.hardware.safety import SafetyLayer, Stop
 
 __all__ = ["LinkStatus", "RobotLink"]

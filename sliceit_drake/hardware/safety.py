@@ -9,15 +9,15 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from sliceit_drake.configuration import ConfigurationError, validate
-from sliceit_drake.hardware.edge_kinematics import EdgeKinematics, EdgePose
-from sliceit_drake.hardware.limits import SafetyLimits
-from sliceit_drake.hardware.robot_state import (
+from sliceit_drake.hardware.client import (
     PLAYING,
     RUNTIME_STATES,
     SAFE_BITS,
     RobotState,
     safety_text,
 )
+from sliceit_drake.hardware.edge_kinematics import EdgeKinematics, EdgePose
+from sliceit_drake.hardware.hardware_config import SafetyLimits
 
 __all__ = ["Decision", "LatchedError", "SafetyLayer", "Stop", "robot_fault"]
 

@@ -12,8 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from sliceit_drake.hardware.client import RobotFacts, RobotUnavailableError
-from sliceit_drake.hardware.robot_state import PLAYING, RobotState
+from sliceit_drake.hardware.client import PLAYING, RobotFacts, RobotState, RobotUnavailableError
 
 __all__ = ["UrClient"]
 

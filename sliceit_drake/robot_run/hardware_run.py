@@ -13,11 +13,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 
 from sliceit_drake.cutting.motion import Motion
-from sliceit_drake.diagrams.hardware_station import (
-    PERIOD,
-    HardwareStation,
-    RobotConnection,
-)
+from sliceit_drake.diagrams.hardware_station import PERIOD, HardwareStation, RobotConnection
 from sliceit_drake.diagrams.run import Run, measured_profile
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.scenario_diagram import ScenarioDiagram
@@ -31,10 +27,9 @@ from sliceit_drake.hardware.checks import (
     check_sensor,
     check_start,
 )
-from sliceit_drake.hardware.client import RobotClient
+from sliceit_drake.hardware.client import RobotClient, RobotState
 from sliceit_drake.hardware.hardware_config import HardwareConfig
 from sliceit_drake.hardware.interruption import raise_if_interrupted
-from sliceit_drake.hardware.robot_state import RobotState
 from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.robot_run.plan_check import JointPlan, check_plan, plan_joints
 from sliceit_drake.systems.agent import AgentSystem

@@ -8,9 +8,9 @@ import timeit
 
 import numpy as np
 
+from sliceit_drake.hardware.client import PLAYING, RobotState
 from sliceit_drake.hardware.edge_kinematics import EdgeKinematics
-from sliceit_drake.hardware.limits import SafetyLimits
-from sliceit_drake.hardware.robot_state import PLAYING, RobotState
+from sliceit_drake.hardware.hardware_config import SafetyLimits
 from sliceit_drake.hardware.safety import SafetyLayer
 
 __all__ = ["add_arguments", "run"]
