@@ -4,7 +4,7 @@ import dataclasses as dc
 
 import numpy as np
 
-from sliceit_drake.cutting.mesh.surface import FoodCorners, heights_over_cut
+from sliceit_drake.cutting.mesh.surface import CornerList, FoodCorners
 from sliceit_drake.cutting.model import CuttingModel
 
 __all__ = ["FoodBody", "food_body"]
@@ -28,37 +28,24 @@ def food_body(model: CuttingModel) -> FoodBody:
     on each side only the part with material on that side is drawn.
     """
     split = model.split
-    y, source = heights_over_cut(split), split.node_source
-    point_of: dict[tuple[int, int], int] = {}
-    for k, ends in enumerate(source[split.point_nodes[:, 0, :]].tolist()):
-        alone = split.point_weights[k, 1] == 0.0
-        point_of[(ends[0], ends[0]) if alone else (min(ends), max(ends))] = k
-
-    corner_ends: list[tuple[int, int]] = []
-    corner_weights: list[tuple[float, float]] = []
-    sides: list[int] = []
-    cut_point: list[int] = []
+    corners = CornerList(split)
+    y = corners.heights[split.node_source]
+    point_of = {
+        (min(ends), max(ends)): k
+        for k, sides in enumerate(split.point_nodes.tolist())
+        for ends in sides
+    }
     tetrahedra: list[tuple[int, ...]] = []
-    known: dict[tuple[int, int], int] = {}
 
     def corner(a: int, b: int) -> int:
-        """The corner at a node, or between two on both sides of the plane."""
-        a, b = min(a, b), max(a, b)
-        if (a, b) not in known:
-            ends = int(source[a]), int(source[b])
-            w = 1.0 if a == b else y[ends[1]] / (y[ends[1]] - y[ends[0]])
-            known[a, b] = len(corner_ends)
-            corner_ends.append((a, b))
-            corner_weights.append((w, 1.0 - w))
-            sides.append(int(split.node_side[a]))
-            cut_point.append(point_of.get((min(ends), max(ends)), -1))
-        return known[a, b]
+        ends = min(a, b), max(a, b)
+        return corners.number(*ends, point_of.get(ends, -1))
 
     for nodes in split.tetrahedra.tolist():
         sign = 1.0 if split.node_side[nodes[0]] else -1.0
-        inside = [n for n in nodes if sign * y[source[n]] > 0.0]
-        beyond = [n for n in nodes if sign * y[source[n]] < 0.0]
-        level = [n for n in nodes if y[source[n]] == 0.0]
+        inside = [n for n in nodes if sign * y[n] > 0.0]
+        beyond = [n for n in nodes if sign * y[n] < 0.0]
+        level = [n for n in nodes if y[n] == 0.0]
         if not beyond:
             tetrahedra.append(tuple(corner(n, n) for n in nodes))
             continue
@@ -70,19 +57,12 @@ def food_body(model: CuttingModel) -> FoodBody:
         if len(inside) == 1:
             tetrahedra.append(tuple(ways[0]))
         elif len(inside) == 2:
-            (a, *ends), (b, *others) = ways
-            tetrahedra += _wedge([a, *ends], [b, *others])
+            tetrahedra += _wedge(*ways)
         else:
             tops = [way[0] for way in ways]
             tetrahedra += _wedge(tops, [way[1] for way in ways])
     cells = np.array([t for t in tetrahedra if len(set(t)) == 4])
-    body = FoodBody(
-        ends=np.array(corner_ends),
-        weights=np.array(corner_weights),
-        side=np.array(sides),
-        cut_point=np.array(cut_point),
-        tetrahedra=cells,
-    )
+    body = FoodBody(**corners.fields(), tetrahedra=cells)
     x = body.positions(model, model.nodes)[cells]
     volume = np.linalg.det(x[:, 1:] - x[:, :1])
     cells[volume < 0.0] = cells[volume < 0.0][:, [0, 2, 1, 3]]

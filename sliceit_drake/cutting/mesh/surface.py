@@ -2,6 +2,7 @@
 
 import dataclasses as dc
 import functools
+import itertools
 
 import numpy as np
 
@@ -9,7 +10,7 @@ from sliceit_drake.cutting.mesh.split import SplitMesh
 from sliceit_drake.cutting.mesh.tetrahedra import boundary_faces
 from sliceit_drake.cutting.model import CuttingModel
 
-__all__ = ["FoodCorners", "FoodSurface", "food_surface", "heights_over_cut"]
+__all__ = ["CornerList", "FoodCorners", "FoodSurface", "food_surface"]
 
 
 @dc.dataclass
@@ -92,12 +93,40 @@ class FoodSurface(FoodCorners):
         return tuple(halves)
 
 
-def heights_over_cut(split: SplitMesh) -> np.ndarray:
-    """Height of each original vertex over the cut plane [V], metres; 0 if it counts as on it."""
-    y = split.vertex_position[:, 1].copy()
-    single = split.point_weights[:, 1] == 0.0
-    y[split.node_source[split.point_nodes[single, 0, 0]]] = 0.0
-    return np.asarray(y)
+class CornerList:
+    """Corners of a drawing, each once, in the order in which they are asked for.
+
+    Attributes:
+        heights: Height of each original vertex over the cut plane [V], metres; 0 if it counts as
+            on it.
+    """
+
+    def __init__(self, split: SplitMesh) -> None:
+        self._split = split
+        self._number: dict[tuple[int, int, int], int] = {}
+        self._rows: list[tuple[int, int, int]] = []
+        self.heights = split.vertex_position[:, 1].copy()
+        single = split.point_weights[:, 1] == 0.0
+        self.heights[split.node_source[split.point_nodes[single, 0, 0]]] = 0.0
+
+    def number(self, a: int, b: int, cut_point: int = -1) -> int:
+        """Number of the corner at a node a = b, or on the plane between two nodes."""
+        key = (min(a, b), max(a, b), cut_point)
+        if key not in self._number:
+            self._number[key] = len(self._rows)
+            self._rows.append((a, b, cut_point))
+        return self._number[key]
+
+    def fields(self) -> dict[str, np.ndarray]:
+        """The fields of `FoodCorners`."""
+        rows = np.array(self._rows)
+        ends, cut_point = rows[:, :2], rows[:, 2]
+        y = self.heights[self._split.node_source[ends]]
+        apart = ends[:, 0] != ends[:, 1]
+        w = np.divide(y[:, 1], y[:, 1] - y[:, 0], out=np.ones(len(rows)), where=apart)
+        weights = np.stack([w, 1.0 - w], axis=1)
+        side = self._split.node_side[ends[:, 0]]
+        return {"ends": ends, "weights": weights, "side": side, "cut_point": cut_point}
 
 
 def food_surface(model: CuttingModel) -> FoodSurface:
@@ -106,63 +135,28 @@ def food_surface(model: CuttingModel) -> FoodSurface:
     Outer faces that the plane crosses are clipped, so that each side keeps its own part.
     """
     split = model.split
-    node_of: dict[tuple[int, int], int] = {
-        (int(v), int(s)): i
-        for i, (v, s) in enumerate(zip(split.node_source, split.node_side, strict=True))
-    }
-    y = heights_over_cut(split)
-    ends = split.point_nodes
-    single = split.point_weights[:, 1] == 0.0
-
-    corner_ends: list[tuple[int, int]] = []
-    corner_weights: list[tuple[float, float]] = []
-    sides: list[int] = []
-    cut_point: list[int] = []
-    triangles: list[tuple[int, int, int]] = []
-    known: dict[tuple, int] = {}
-
-    def corner(a: int, b: int, side: int, point: int = -1) -> int:
-        key = (min(a, b), max(a, b), side, point)
-        if key not in known:
-            w = 1.0 if a == b else y[b] / (y[b] - y[a])
-            known[key] = len(corner_ends)
-            corner_ends.append((node_of[a, side], node_of[b, side]))
-            corner_weights.append((w, 1.0 - w))
-            sides.append(side)
-            cut_point.append(point)
-        return known[key]
-
+    corners = CornerList(split)
+    y = corners.heights.tolist()
+    sides = zip(split.node_source.tolist(), split.node_side.tolist(), strict=True)
+    node_of = {vertex_and_side: node for node, vertex_and_side in enumerate(sides)}
+    triangles: list[tuple[int, ...]] = []
     faces, _ = boundary_faces(split.source_tetrahedra)
     for face in faces.tolist():
         for side, sign in ((0, -1.0), (1, 1.0)):
-            height = [sign * y[v] for v in face]
-            if max(height) <= 0.0:
+            if max(sign * y[v] for v in face) <= 0.0:
                 continue
             polygon = []
-            for k in range(3):
-                a, b = face[k], face[(k + 1) % 3]
-                ha, hb = height[k], height[(k + 1) % 3]
-                if ha >= 0.0:
-                    polygon.append(corner(a, a, side))
-                if ha * hb < 0.0:
-                    polygon.append(corner(a, b, side))
-            triangles += [
-                (polygon[0], polygon[k], polygon[k + 1]) for k in range(1, len(polygon) - 1)
-            ]
+            for a, b in zip(face, [*face[1:], face[0]], strict=True):
+                if sign * y[a] >= 0.0:
+                    polygon.append(corners.number(node_of[a, side], node_of[a, side]))
+                if y[a] * y[b] < 0.0:
+                    polygon.append(corners.number(node_of[a, side], node_of[b, side]))
+            triangles += [(polygon[0], *pair) for pair in itertools.pairwise(polygon[1:])]
 
-    source = split.node_source[ends[:, 0, :]]
+    minus, plus = split.point_nodes.transpose(1, 0, 2).tolist()
     for triangle in split.triangles.tolist():
-        for side in (0, 1):
-            p, q, r = (
-                corner(int(source[i, 0]), int(source[i, 1 if not single[i] else 0]), side, i)
-                for i in triangle
-            )
+        for side, ends in enumerate((minus, plus)):
+            p, q, r = (corners.number(ends[i][0], ends[i][1], i) for i in triangle)
             # Section triangles face +y, which is outward on the minus side.
             triangles.append((p, q, r) if side == 0 else (p, r, q))
-    return FoodSurface(
-        ends=np.array(corner_ends),
-        weights=np.array(corner_weights),
-        side=np.array(sides),
-        cut_point=np.array(cut_point),
-        triangles=np.array(triangles),
-    )
+    return FoodSurface(**corners.fields(), triangles=np.array(triangles))
