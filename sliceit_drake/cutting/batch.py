@@ -5,13 +5,13 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from sliceit_drake.cutting.board import Board, board_wrenches
+from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.driver import Driver, DriverPool
 from sliceit_drake.cutting.knife_path import KnifePath, PosedMotion
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.solver import NOT_FINITE
 
-__all__ = ["BatchSimulator", "BatchSlice", "cut_together", "simulate_batch"]
+__all__ = ["BatchSlice", "cut_together", "simulate_batch"]
 
 
 @dc.dataclass
@@ -43,80 +43,50 @@ def simulate_batch(
     workers: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[BatchSlice]:
-    """Simulates slices with parameters and motions of their own; see `BatchSimulator.run`.
+    """Simulates slices with parameters and motions of their own.
+
+    Energies are not balanced and the knife's start is not checked, as in `simulate_slice`; a slice
+    that breaks down is reported and does not disturb the others. Results do not depend on the
+    number of workers.
 
     Args:
-        models, motions, progress: As `BatchSimulator.run`.
-        exchange_period, board, workers: As `BatchSimulator`.
+        models: The cuts [C]. Those derived from one model share their device arrays.
+        motions: Poses X_FK of the knife [C], or one for all.
+        exchange_period: s.
+        board: Board under the knife, its height in F; None for none.
+        workers: Threads on a CPU; the number of processors by default.
+        progress: Called with the number of slices done.
 
     Raises:
         ValueError: The numbers of models and motions differ.
     """
-    return BatchSimulator(exchange_period, board, workers).run(models, motions, progress)
+    if len(motions) == 1:
+        motions = [motions[0]] * len(models)
+    if len(motions) != len(models):
+        raise ValueError(f"{len(models)} models and {len(motions)} motions")
+    groups: dict[object, list[int]] = {}
+    for c, model in enumerate(models):
+        key: object = c
+        if model.numerics.device != "cpu":
+            # Cuts that advance side by side share the skin's tables.
+            thickness = model.effects.skin.thickness
+            key = (id(model.split), len(model.relaxing), thickness, *dc.astuple(model.numerics))
+        groups.setdefault(key, []).append(c)
 
+    def run(driver: Driver, members: list[int]) -> list[BatchSlice]:
+        some = [models[c] for c in members]
+        return cut_together(driver, some, [motions[c] for c in members], board)
 
-class BatchSimulator:
-    """Simulates many slices, keeping device arrays and captured graphs from one call to the next.
-
-    Not to be called from several threads at once.
-
-    Args:
-        exchange_period: s.
-        board: Board under the knife, its height in F; None for none.
-        workers: Threads on a CPU; the number of processors by default.
-    """
-
-    def __init__(
-        self, exchange_period: float, board: Board | None = None, workers: int | None = None
-    ) -> None:
-        self._pool, self._board = DriverPool(exchange_period, workers), board
-
-    def run(
-        self,
-        models: Sequence[CuttingModel],
-        motions: Sequence[PosedMotion],
-        progress: Callable[[int], None] | None = None,
-    ) -> list[BatchSlice]:
-        """Simulates slices with parameters and motions of their own.
-
-        Energies are not balanced and the knife's start is not checked, as in `simulate_slice`; a
-        slice that breaks down is reported and does not disturb the others. Results do not depend on
-        the number of workers.
-
-        Args:
-            models: The cuts [C]. Those derived from one model share their device arrays.
-            motions: Poses X_FK of the knife [C], or one for all.
-            progress: Called with the number of slices done.
-
-        Raises:
-            ValueError: The numbers of models and motions differ.
-        """
-        if len(motions) == 1:
-            motions = [motions[0]] * len(models)
-        if len(motions) != len(models):
-            raise ValueError(f"{len(models)} models and {len(motions)} motions")
-        groups: dict[object, list[int]] = {}
-        for c, model in enumerate(models):
-            key: object = c
-            if model.numerics.device != "cpu":
-                # Cuts that advance side by side share the skin's tables.
-                thickness = model.effects.skin.thickness
-                key = (id(model.split), len(model.relaxing), thickness, *dc.astuple(model.numerics))
-            groups.setdefault(key, []).append(c)
-        # A GPU is busy with one group.
-        threads = None if all(model.numerics.device == "cpu" for model in models) else 1
-        results: dict[int, BatchSlice] = {}
-
-        def run(driver: Driver, members: list[int]) -> list[BatchSlice]:
-            some = [models[c] for c in members]
-            return cut_together(driver, some, [motions[c] for c in members], self._board)
-
-        jobs = list(groups.values())
-        for members, slices in zip(jobs, self._pool.map(run, jobs, threads), strict=True):
-            results |= zip(members, slices, strict=True)
-            if progress is not None:
-                progress(len(results))
-        return [results[c] for c in range(len(models))]
+    # A GPU is busy with one group.
+    threads = workers if all(model.numerics.device == "cpu" for model in models) else 1
+    jobs = list(groups.values())
+    results: dict[int, BatchSlice] = {}
+    pool = DriverPool(exchange_period, threads)
+    for members, slices in zip(jobs, pool.map(run, jobs), strict=True):
+        results |= zip(members, slices, strict=True)
+        if progress is not None:
+            progress(len(results))
+    return [results[c] for c in range(len(models))]
 
 
 def cut_together(
@@ -136,23 +106,15 @@ def cut_together(
         for c, step in enumerate(steps):
             wrenches[c, at] = step.wrenches.sum(1) if step.finite else np.nan
             cut[c, at] = step.cut
-    return [
-        _slice(path, wrench, share, T, board)
-        for path, wrench, share in zip(paths, wrenches, cut, strict=True)
-    ]
-
-
-def _slice(
-    path: KnifePath, wrench: np.ndarray, cut: np.ndarray, T: float, board: Board | None
-) -> BatchSlice:
-    n = path.coupling_steps
-    food = (wrench[:n].reshape(n, 2, 3) @ path.model.X_FC_rotation.T).reshape(n, 6)
-    on_board = np.zeros((n, 6))
-    if board is not None:
-        on_board = board_wrenches(board, path.model.knife, path.R_FK, path.p_FK, T)
-    finite = np.isfinite(food).all(1)
-    failure = None
-    if not finite.all():
-        failure = f"at {(int(finite.argmin()) + 1) * T:.4g} s {NOT_FINITE}"
-    time = np.arange(1, n + 1) * T
-    return BatchSlice(time, path.p_FK[1:], food, on_board, cut[:n], failure)
+    slices = []
+    for c, path in enumerate(paths):
+        n = path.coupling_steps
+        food = (wrenches[c, :n].reshape(n, 2, 3) @ path.model.X_FC_rotation.T).reshape(n, 6)
+        finite = np.isfinite(food).all(1)
+        failure = None
+        if not finite.all():
+            failure = f"at {(int(finite.argmin()) + 1) * T:.4g} s {NOT_FINITE}"
+        time = np.arange(1, n + 1) * T
+        on_board = path.board_wrenches(board)
+        slices.append(BatchSlice(time, path.p_FK[1:], food, on_board, cut[c, :n], failure))
+    return slices

@@ -2,7 +2,6 @@
 
 import dataclasses as dc
 import os
-import queue
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, TypeVar
@@ -135,7 +134,7 @@ class DriverPool:
     def __init__(self, exchange_period: float, threads: int | None = None) -> None:
         self.exchange_period = exchange_period
         self.threads = threads or os.cpu_count() or 1
-        self._drivers: list[Driver] = []
+        self._idle: list[Driver] = []
 
     def map(
         self,
@@ -145,19 +144,15 @@ class DriverPool:
     ) -> Iterator[Result]:
         """Does work on items, in their order, at most as many at once as there are threads."""
         threads = max(1, min(threads or self.threads, len(items)))
-        while len(self._drivers) < threads:
-            self._drivers.append(Driver(self.exchange_period))
-        # The first come first, as their arrays are those most likely to be there.
-        spare: queue.LifoQueue[Driver] = queue.LifoQueue()
-        for driver in reversed(self._drivers):
-            spare.put(driver)
+        # The last are taken first: those that have device arrays.
+        self._idle[:0] = [Driver(self.exchange_period) for _ in range(len(self._idle), threads)]
 
         def one(item: Item) -> Result:
-            driver = spare.get()
+            driver = self._idle.pop()
             try:
                 return work(driver, item)
             finally:
-                spare.put(driver)
+                self._idle.append(driver)
 
         with ThreadPoolExecutor(threads) as pool:
             yield from pool.map(one, items)

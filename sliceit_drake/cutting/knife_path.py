@@ -5,7 +5,7 @@ import typing
 
 import numpy as np
 
-from sliceit_drake.cutting.board import Board
+from sliceit_drake.cutting.board import Board, board_wrenches
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.mounting import Mounting
@@ -39,6 +39,7 @@ class KnifePath:
     """
 
     def __init__(self, model: CuttingModel, motion: PosedMotion, period: float) -> None:
+        self._period = period
         self.coupling_steps = max(1, round(motion.duration / period))
         poses = [motion.pose(k * period) for k in range(self.coupling_steps + 1)]
         self.R_FK = np.array([X_FK.R for X_FK in poses])
@@ -53,6 +54,13 @@ class KnifePath:
     def pose(self, k: int) -> Pose:
         """X_CK after k coupling steps."""
         return Pose(self.R_CK[k], self.p_CK[k])
+
+    def board_wrenches(self, board: Board | None) -> np.ndarray:
+        """Wrench of the board, its height in F, on the knife at the end of each coupling step
+        [E, 6], in F."""
+        if board is None:
+            return np.zeros((self.coupling_steps, 6))
+        return board_wrenches(board, self.model.knife, self.R_FK, self.p_FK, self._period)
 
     def block(self, k: int) -> int:
         """How many coupling steps from the k-th can be advanced at once, without a check."""

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sliceit_drake.cutting.board import Board, board_wrenches
+from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.coupling_steps import Energies, EnergyBalance
 from sliceit_drake.cutting.driver import Launch, even_launches
 from sliceit_drake.cutting.knife import signed_distance
@@ -218,14 +218,11 @@ def simulate_slice(
             energies = solver.energies(state, path.pose(end))
             spent = balance.edge + balance.opening + balance.friction
             ratio = max(ratio, check_energies(energies, spent, model, end * T))
-    on_board = np.zeros((count, 6))
-    if board is not None:
-        on_board = board_wrenches(board, model.knife, path.R_FK, path.p_FK, T)
     return SliceResult(
         time=np.arange(1, count + 1) * T,
         position=path.p_FK[1:],
         food_wrench=food_wrench,
-        board_wrench=on_board,
+        board_wrench=path.board_wrenches(board),
         edge=mechanisms[:, 0],
         normal=mechanisms[:, 1],
         friction=mechanisms[:, 2],

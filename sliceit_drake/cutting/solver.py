@@ -124,7 +124,7 @@ class CuttingSolver:
             raise CuttingError(NOT_FINITE)
         return step
 
-    def _place(self, state: np.ndarray, pose: Pose, factors: SurfaceFactors) -> None:
+    def _place(self, state: np.ndarray, pose: Pose, factors: SurfaceFactors = UNCHANGED) -> None:
         """Puts food and knife, at rest at `pose`, into the workspace for launches with k = 0."""
         ws = self._workspace
         self._take_factors(factors)
