@@ -93,9 +93,11 @@ class SliceAdjoint:
         self._backward: Any = None
         ws, B = self._w, len(model.blocks)
         self._forward = Workspace([model], exchange_period)
-        self._strain = wp.zeros((1, B, 22), dtype=ws.kernels.lanes, device=ws.device)
-        self._adj_mu = wp.zeros((1, B), dtype=ws.real, device=ws.device)
-        self._adj_lam = wp.zeros((1, B), dtype=ws.real, device=ws.device)
+        self._strain = wp.zeros((1, B, 6), dtype=ws.kernels.Vectors, device=ws.device)
+        self._factors = wp.zeros((1, B, 4), dtype=ws.kernels.lanes, device=ws.device)
+        self._adj_mu, self._adj_lam = (
+            wp.zeros((1, B), dtype=ws.real, device=ws.device) for _ in range(2)
+        )
 
     def run(
         self,
@@ -148,7 +150,7 @@ class SliceAdjoint:
         """
         ws, count, give = self._w, len(run.wrenches), _give(run.model)
         ws.set_models([run.model])
-        adj_state, row = np.zeros(ws.state_size), np.zeros(ws.parameters.shape[1])
+        adj_state, row = np.zeros(ws.state_size), np.zeros(ws.parameter_rows.shape[1])
         adj_p, adj_R = np.zeros_like(run.p), np.zeros_like(run.R)
         of_give, axes = np.zeros(3), np.flatnonzero(give)
         for e in reversed(range(count)):
@@ -189,12 +191,12 @@ class SliceAdjoint:
         adj_p, adj_R = np.zeros((2, 3)), np.zeros((2, 3, 3))
         adj_sums, adj_R[1, :, 1] = self._adjoint_of_sums(weights, run.R[e + 1])
         self._capture_backward()
-        for array in (ws.parameters.grad, self._adj_mu, self._adj_lam):
+        for array in (ws.parameter_rows.grad, self._adj_mu, self._adj_lam):
             array.zero_()
         ws.write(ws.states[-1].grad, adj_state[None])
-        ws.write(ws.sums.grad, adj_sums[None])
+        ws.write(ws.sum_rows.grad, adj_sums[None])
         wp.capture_launch(self._backward)
-        motion = ws.read(ws.motion.grad)[0].astype(np.float64)
+        motion = ws.read(ws.motion_rows.grad)[0].astype(np.float64)
         by = {name: motion[where].reshape(n, -1) for name, where in ws.motion_layout.items()}
         of_velocity = by["v_CK"].sum(0) / T
         adj_p[1] = share @ by["p_CK"] + of_velocity
@@ -203,7 +205,7 @@ class SliceAdjoint:
         of_turn = np.array([[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]])
         adj_R[1] += (share @ by["R_CK"]).reshape(3, 3) + of_turn @ run.R[e]
         adj_R[0] = ((1.0 - share) @ by["R_CK"]).reshape(3, 3) + of_turn.T @ run.R[e + 1]
-        row = ws.read(ws.parameters.grad)[0].astype(np.float64)
+        row = ws.read(ws.parameter_rows.grad)[0].astype(np.float64)
         scalars = ws.parameter_layout["P"].start
         for name, adjoint in (("mu", self._adj_mu), ("lam", self._adj_lam)):
             row[scalars + PARAMETERS.index(name)] += adjoint.numpy().astype(np.float64).sum()
@@ -220,14 +222,14 @@ class SliceAdjoint:
         middle = sums["buried_moment"] / area if area > 0.0 else np.zeros(3)
         of_lateral = of_force + _cross(of_moment, middle)
         of_middle = _cross(lateral, of_moment)
-        adjoint = np.zeros(ws.sums.shape[1])
+        adjoint = np.zeros(ws.sum_rows.shape[1])
         total, bending = np.zeros(1, POINT_SUMS), np.zeros(1, BLADE_SUMS)
         total["forces"], total["moments"] = of_force / n, of_moment / n
         points = len(self.model.point_nodes)
         adjoint[ws.sum_layout["total"]] = np.tile(total.view(float)[:ACCUMULATED], points)
         along = float(of_lateral @ R[:, 1]) / n
         bending["on_knife"], bending["on_blade"] = along, -along
-        adjoint[ws.sum_layout["blade_sums"]] = bending.view(float)
+        adjoint[ws.sum_layout["blade"]] = bending.view(float)
         if area > 0.0:
             of_immersed = np.concatenate([of_middle, [-(of_middle @ middle)]]) / area
             adjoint[ws.sum_layout["immersed"]] = np.tile(of_immersed, points)
@@ -240,9 +242,9 @@ class SliceAdjoint:
         with LAUNCH_LOCK, wp.ScopedCapture(device=ws.device) as capture:
             for slot in ws.states[:-1]:
                 slot.grad.zero_()
-            for ahead in ws.ahead:
-                ahead.grad.zero_()
-            ws.motion.grad.zero_()
+            for slot in ws.slots:
+                slot.ahead.grad.zero_()
+            ws.motion_rows.grad.zero_()
             for k in reversed(range(ws.steps)):
                 self._launch_substep_adjoint(k)
             nodes = len(self.model.nodes)
@@ -250,7 +252,8 @@ class SliceAdjoint:
         self._backward = capture.graph
 
     def _launch_adjoint(self, kernel: Any, dim: Any, arguments: list[Any]) -> None:
-        adjoints = [a.grad if isinstance(a, wp.array) else None for a in arguments]
+        """Launches an adjoint; an empty struct stands for the adjoints that arrays bring along."""
+        adjoints = [type(a)() if hasattr(a, "assign") else None for a in arguments]
         wp.launch(
             kernel,
             dim=dim,
@@ -267,30 +270,32 @@ class SliceAdjoint:
 
     def _launch_substep_adjoint(self, k: int) -> None:
         ws, m = self._w, self.model
-        w, kern, points = ws.w, ws.kernels, len(m.point_nodes)
-        w["lateral"].grad.zero_()
-        for passed_on in (ws.push, ws.from_elements, ws.from_bulk, ws.from_points):
-            passed_on[k].grad.zero_()
+        kern, points, ahead, forces = (
+            ws.kernels,
+            len(m.point_nodes),
+            ws.slots[k].ahead,
+            ws.forces[k],
+        )
+        for name in ("lateral", "push", "from_elements", "from_bulk", "from_points"):
+            getattr(forces, name).grad.zero_()
         self._launch_adjoint(kern.bend_blade, 1, ws.blade_arguments(k))
-        self._launch_adjoint(kern.push_blade, 1, [w["lateral"], ws.push[k]])
+        self._launch_adjoint(kern.push_blade, 1, [forces])
         self._launch_adjoint_many(kern.step_nodes, len(m.moving), ws.step_arguments(k))
         if len(m.relaxing):
             self._launch_adjoint_many(kern.relax_nodes, len(m.moving), ws.relax_arguments(k))
-        spread = [w["point_nodes"], w["point_weights"], ws.from_points[k].grad]
-        spread.append(w["point_force"].grad)
+        spread = [ws.points, forces.from_points.grad, forces.points.grad]
         ws.launch(kern.spread_adjoint, points, spread)
         arguments = ws.point_arguments(k, ws.substep_time())
-        self._launch_adjoint_many(kern.points, points, arguments)
-        strain, direction = self._strain, ws.from_elements[k].grad
-        adjoints = [w["stiff_volume"].grad, self._adj_mu, self._adj_lam]
+        self._launch_adjoint_many(kern.step_points, points, arguments)
+        strain, factors, direction = self._strain, self._factors, forces.from_elements.grad
+        adjoints = [ws.parameters.stiff_volume.grad, self._adj_mu, self._adj_lam]
         for kernel, arguments in (
-            (kern.strains, [ws.ahead[k], direction, w["nodes"], w["shape"], strain]),
-            (kern.stresses, [w["stiff_volume"], w["P"], strain, *adjoints]),
-            (kern.elements_adjoint, [w["shape"], strain, w["element_force"]]),
+            (kern.strains, [ahead, direction, ws.mesh, strain]),
+            (kern.stresses, [ws.parameters, strain, factors, *adjoints]),
+            (kern.elements_adjoint, [ws.mesh, strain, factors, forces.elements]),
         ):
             ws.launch(kernel, len(m.blocks), arguments)
-        gathered = [w["moving"], w["node_force"], w["element_start"], w["element_entry"]]
-        ws.launch_many(kern.gather_adjoint, len(m.moving), [*gathered, ws.ahead[k].grad])
+        ws.launch_many(kern.gather_adjoint, len(m.moving), [ws.mesh, forces, ahead.grad])
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -78,7 +78,7 @@ class CuttingSolver:
         row[ws.parameter_layout["friction_scale"]] *= factors.friction
         # The retreat of a tougher edge must not return more energy than its advance took.
         row[ws.parameter_layout["unloading"]] *= max(1.0, factors.toughness)
-        ws.write(ws.parameters, row[None])
+        ws.write(ws.parameter_rows, row[None])
         self._held_factors = factors
 
     def positions(self, state: np.ndarray) -> np.ndarray:
@@ -129,10 +129,10 @@ class CuttingSolver:
         ws = self._workspace
         self._take_factors(factors)
         ws.write(ws.states[0], state[None])
-        motion = np.zeros(ws.motion.shape)
+        motion = np.zeros(ws.motion_rows.shape)
         for name, values in (("R_CK", pose.R.ravel()), ("p_CK", pose.p)):
             motion[0, ws.motion_layout[name].start :][: len(values)] = values
-        ws.write(ws.motion, motion)
+        ws.write(ws.motion_rows, motion)
 
     def energies(
         self, state: np.ndarray, pose: Pose, factors: SurfaceFactors = UNCHANGED

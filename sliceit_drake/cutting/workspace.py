@@ -20,9 +20,6 @@ LAUNCH_LOCK = threading.RLock()
 """Held while kernels are made, in a capture, which takes in the launches of all threads, and in
 launches outside of one."""
 
-PER_POINT = ("toughness", "flank_scale", "friction_scale", "unloading")
-"""Parameters that each cut point has for itself, in the order of the kernels' arguments."""
-
 
 class Workspace:
     """Advances cuts that share a mesh by `coupling_steps` coupling steps a launch.
@@ -76,189 +73,185 @@ class Workspace:
         self._skin_thickness = model.effects.skin.thickness
         self.set_models(models)
 
-    def array(self, shape: int | tuple[int, ...]) -> wp.array:
+    def array(self, shape: int | tuple[int, ...], dtype: Any = None) -> wp.array:
         """Zeros on the device, with room for their adjoint if gradients are kept."""
-        return wp.zeros(shape, dtype=self.real, device=self.device, requires_grad=self._gradients)
+        dtype = dtype or self.real
+        return wp.zeros(shape, dtype=dtype, device=self.device, requires_grad=self._gradients)
 
-    def _constant(self, values: np.ndarray, dtype: Any) -> wp.array:
-        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
-
-    def _rows(
-        self, base: wp.array, fields: Sequence[tuple[str, tuple[int, ...], Any, int]]
-    ) -> tuple[dict[str, wp.array], dict[str, slice]]:
-        """Splits rows of numbers [C, size] into named arrays [C, ...] of vectors.
+    def _view(
+        self, rows: wp.array, start: int, dtype: Any, shape: tuple[int, ...], step: int = 0
+    ) -> wp.array:
+        """A view of rows of numbers [C, size] as an array [C, *shape].
 
         Args:
-            base: Array [C, size].
-            fields: Name, shape without the first axis, type and numbers in one of that type.
+            rows: The rows.
+            start: First number in a row.
+            dtype: Type of the array.
+            shape: Its shape without the first axis.
+            step: Numbers from one entry to the next; an entry's own by default.
+        """
+        item = wp.types.type_size_in_bytes(rows.dtype)
+        last = step * item or wp.types.type_size_in_bytes(dtype)
+        inner = np.cumprod([last, *shape[:0:-1]])[::-1].tolist()
+        return wp.array(
+            ptr=rows.ptr + start * item,
+            dtype=dtype,
+            shape=(self.cuts, *shape),
+            strides=(rows.strides[0], *inner),
+            device=self.device,
+            grad=None if rows.grad is None else self._view(rows.grad, start, dtype, shape, step),
+        )
+
+    def _rows(
+        self, kind: Any, shapes: dict[str, tuple[int, ...]], dtype: Any = None
+    ) -> tuple[wp.array, Any, dict[str, slice]]:
+        """Rows of numbers [C, size] that hold the named arrays of a struct side by side.
+
+        Args:
+            kind: The struct.
+            shapes: Shapes of the arrays without the first axis.
+            dtype: Type of the numbers, the kernels' by default.
 
         Returns:
-            The arrays, and where each stands in a row.
+            The rows, a struct of views of them, and where each array stands in a row.
         """
-        item = wp.types.type_size_in_bytes(base.dtype)
-        arrays, layout, start = {}, {}, 0
-        for name, shape, dtype, width in fields:
-            strides = [width * item]
-            for extent in shape[:0:-1]:
-                strides.insert(0, strides[0] * extent)
+        item = wp.types.type_size_in_bytes(dtype or self.real)
+        layout, end = {}, 0
+        for name, shape in shapes.items():
+            width = wp.types.type_size_in_bytes(kind.vars[name].type.dtype) // item
+            layout[name] = slice(end, end := end + int(np.prod(shape)) * width)
+        rows, struct = self.array((self.cuts, end), dtype), kind()
+        for name, shape in shapes.items():
+            view = self._view(rows, layout[name].start, kind.vars[name].type.dtype, shape)
+            setattr(struct, name, view)
+        return rows, struct, layout
 
-            def view(values: wp.array, grad: wp.array | None) -> wp.array:
-                return wp.array(
-                    ptr=values.ptr + start * item,  # noqa: B023
-                    dtype=dtype,  # noqa: B023
-                    shape=(self.cuts, *shape),  # noqa: B023
-                    strides=(values.strides[0], *strides),  # noqa: B023
-                    device=self.device,
-                    grad=grad,
-                )
-
-            arrays[name] = view(base, None if base.grad is None else view(base.grad, None))
-            size = int(np.prod(shape)) * width
-            layout[name] = slice(start, start + size)
-            start += size
-        assert start == base.shape[1]
-        return arrays, layout
+    def _constants(self, kind: Any, **values: Any) -> Any:
+        """A struct of constant arrays and numbers."""
+        struct = kind()
+        for name, value in values.items():
+            if isinstance(value, np.ndarray):
+                dtype = kind.vars[name].type.dtype
+                value = wp.array(np.ascontiguousarray(value), dtype=dtype, device=self.device)
+            setattr(struct, name, value)
+        return struct
 
     def _make_arrays(self) -> None:
         m, k, C, K = self.model, self.kernels, self.cuts, self.steps
         N, P, B, E = len(m.nodes), len(m.point_nodes), len(m.blocks), self.coupling_steps
         M = len(m.relaxing)
-        real, vec3 = self.real, k.vec3
-
-        fields = [
-            ("x", (N,), vec3, 3),
-            ("v", (N,), vec3, 3),
-            ("edge_depth", (P,), real, 1),
-            ("cohesive_damage", (P,), real, 1),
-            ("edge_force", (P,), real, 1),
-            ("edge_direction", (P,), vec3, 3),
-            ("slip", (P, 2), vec3, 3),
-            ("board_slip", (N,), vec3, 3),
-            ("overstress", (M, N), vec3, 3),
-            ("blade", (2,), real, 1),
-        ]
-        self.state_size = sum(int(np.prod(shape)) * width for _, shape, _, width in fields)
-        # With gradients, sub-step k reads slot k and writes slot k + 1; otherwise all are one.
-        slots = K + 1 if self._gradients else 1
-        self.states = [self.array((C, self.state_size)) for _ in range(slots)]
-        split = [self._rows(state, fields) for state in self.states]
-        self.slots = [arrays for arrays, _ in split]
-        self.layout = split[0][1]
-        kept = K + 1 if self._gradients else 1
-        self.ahead = [self._vectors(N, k.vec4) for _ in range(kept)]
-        # What each sub-step's nodes got from elements, bulk (elements after relaxation) and points.
-        self.from_elements, self.from_bulk, self.from_points = (
-            [self._vectors(N, vec3) for _ in range(K if self._gradients else 0)] for _ in range(3)
-        )
-
-        if M == 0:
-            self.from_bulk = self.from_elements
-
-        self.motion = self.array((C, 18 * K))
-        motion = [("R_CK", k.mat33, 9), ("p_CK", vec3, 3), ("v_CK", vec3, 3), ("w_CK", vec3, 3)]
-        self.w, self.motion_layout = self._rows(
-            self.motion, [(name, (K,), dtype, width) for name, dtype, width in motion]
-        )
-        # At the ends of the coupling steps, as they are given.
-        self.w["R"] = wp.zeros((C, E + 1), dtype=wp.mat33d, device=self.device)
-        self.w["p"] = wp.zeros((C, E + 1), dtype=wp.vec3d, device=self.device)
-        # Padded with a row of zeros, which fills up the nodes' lists of entries.
-        self.force = wp.zeros((C, (B * 12 + 3) * LANES), dtype=real, device=self.device)
-        item = np.dtype(self.dtype).itemsize
-        row = self.force.strides[0]
-        self.w["element_force"] = wp.array(
-            ptr=self.force.ptr,
-            dtype=k.lanes,
-            shape=(C, B, 12),
-            strides=(row, 12 * LANES * item, LANES * item),
-            device=self.device,
-        )
-        self.w["node_force"] = wp.array(
-            ptr=self.force.ptr,
-            dtype=k.strided,
-            shape=(C, B * 12 * LANES + 1),
-            strides=(row, item),
-            device=self.device,
-        )
-        sums = [
-            ("total", (E, P, layouts.ACCUMULATED), real, 1),
-            ("immersed", (E, P), k.vec4, 4),
-            ("blade_sums", (E, layouts.numbers(layouts.BLADE_SUMS)), real, 1),
-            ("board_force", (N,), vec3, 3),
-            ("board_loss", (N,), real, 1),
-            ("internal_work", (N,), real, 1),
-        ]
-        size = sum(int(np.prod(shape)) * width for _, shape, _, width in sums)
-        self.sums = self.array((C, size))
-        arrays, self.sum_layout = self._rows(self.sums, sums)
-        self.w |= arrays
-        double = wp.float64
-        self._result_type = layouts.results(E)
-        size = layouts.numbers(self._result_type)
-        self._result_rows = wp.zeros((C, size), dtype=double, device=self.device)
-        arrays, _ = self._rows(
-            self._result_rows,
-            [
-                (name, layouts.field_shape(self._result_type, name), double, 1)
-                for name in self._result_type.names or ()
-            ],
-        )
-        self.w |= arrays
-        self.w["point_force"] = wp.zeros(
-            (C, P, 2), dtype=vec3, device=self.device, requires_grad=self._gradients
-        )
-        # The same as one list, two entries a point.
-        self.w["listed_force"] = self.w["point_force"].reshape((C, 2 * P))
-        self.w["lateral"] = self.array((C, P))
-        self.push = [self.array(C) for _ in range(K if self._gradients else 1)]
-        self.w["energy"] = wp.zeros((C, B, LANES), dtype=real, device=self.device)
-        self.w["volume_ratio"] = wp.zeros((C, B, LANES), dtype=real, device=self.device)
-        self.w["point_energy"] = wp.zeros((C, P), dtype=real, device=self.device)
 
         element_start, element_entry = _element_gather(m.blocks, m.element_count, N)
         point_start, point_entry, point_weight = _point_gather(m.point_nodes, m.point_weights, N)
-        constants: dict[str, tuple[np.ndarray, Any]] = {
-            "nodes": (m.blocks.astype(np.int32), k.indices),
-            "shape": (m.shape, k.lanes),
-            "moving": (m.moving.astype(np.int32), wp.int32),
-            "element_start": (element_start, wp.int32),
-            "element_entry": (element_entry, k.entries),
-            "point_start": (point_start, wp.int32),
-            "point_entry": (point_entry, wp.int32),
-            "point_weight": (point_weight, real),
-            "board_area": (m.board_area, real),
-            "board": (m.board, real),
-            "point_nodes": (m.point_nodes.astype(np.int32), wp.int32),
-            "point_weights": (m.point_weights, k.vec2),
-            "area": (m.tables.area, real),
-            "width": (m.tables.width, real),
-            "fraction": (m.tables.fraction, real),
-            "centroid": (m.tables.rise, real),
-            "outline": (m.outline, real),
-            "surface": (m.point_depth, real),
-        }
-        for name, (values, dtype) in constants.items():
-            self.w[name] = self._constant(values, dtype)
-        parameters = [
-            ("P", (len(PARAMETERS),), real, 1),
-            ("knife", (layouts.numbers(layouts.KNIFE),), real, 1),
-            *((name, (P,), real, 1) for name in PER_POINT),
-            ("inverse_mass", (N,), real, 1),
-            ("local_damping", (N,), real, 1),
-            ("weight", (N,), vec3, 3),
-            ("relaxing", (M,), real, 1),
-            ("keep", (M,), real, 1),
-            ("stiff_volume", (B,), k.lanes, LANES),
-        ]
-        size = sum(int(np.prod(shape)) * width for _, shape, _, width in parameters)
-        self.parameters = self.array((C, size))
-        arrays, self.parameter_layout = self._rows(self.parameters, parameters)
-        self.w |= arrays
-
-    def _vectors(self, count: int, dtype: Any) -> wp.array:
-        return wp.zeros(
-            (self.cuts, count), dtype=dtype, device=self.device, requires_grad=self._gradients
+        self.mesh = self._constants(
+            k.Mesh,
+            nodes=m.blocks.astype(np.int32),
+            shape=m.shape,
+            moving=m.moving.astype(np.int32),
+            element_start=element_start,
+            element_entry=element_entry,
+            point_start=point_start,
+            point_entry=point_entry,
+            point_weight=point_weight,
+            board_area=m.board_area,
+            board=m.board,
         )
+        self.points = self._constants(
+            k.Points,
+            nodes=m.point_nodes.astype(np.int32),
+            weights=m.point_weights,
+            area=m.tables.area,
+            width=m.tables.width,
+            fraction=m.tables.fraction,
+            centroid=m.tables.rise,
+            outline=m.outline,
+            depth=m.point_depth,
+            reach=m.tables.reach,
+            per_spacing=1.0 / m.tables.spacing,
+        )
+        parameters = {
+            "P": (len(PARAMETERS),),
+            "knife": (layouts.numbers(layouts.KNIFE),),
+            "toughness": (P,),
+            "flank_scale": (P,),
+            "friction_scale": (P,),
+            "unloading": (P,),
+            "inverse_mass": (N,),
+            "local_damping": (N,),
+            "weight": (N,),
+            "relaxing": (M,),
+            "keep": (M,),
+            "stiff_volume": (B,),
+        }
+        self.parameter_rows, self.parameters, self.parameter_layout = self._rows(
+            k.Parameters, parameters
+        )
+
+        motion = dict.fromkeys(("R_CK", "p_CK", "v_CK", "w_CK"), (K,))
+        self.motion_rows, self.motion, self.motion_layout = self._rows(k.Motion, motion)
+        # At the ends of the coupling steps, as they are given.
+        self.motion.R = wp.zeros((C, E + 1), dtype=wp.mat33d, device=self.device)
+        self.motion.p = wp.zeros((C, E + 1), dtype=wp.vec3d, device=self.device)
+        self.motion.substeps, self.motion.period = self.substeps, self.exchange_period
+
+        state = {
+            "x": (N,),
+            "v": (N,),
+            "edge_depth": (P,),
+            "cohesive_damage": (P,),
+            "edge_force": (P,),
+            "edge_direction": (P,),
+            "slip": (P, 2),
+            "board_slip": (N,),
+            "overstress": (M, N),
+            "blade": (2,),
+        }
+        # With gradients, sub-step k reads slot k and writes slot k + 1; otherwise all are one.
+        slots = [self._rows(k.State, state) for _ in range(K + 1 if self._gradients else 1)]
+        self.states, self.slots = [slot[0] for slot in slots], [slot[1] for slot in slots]
+        self.layout = slots[0][2]
+        self.state_size = self.states[0].shape[1]
+        for slot in self.slots:
+            slot.ahead = self.array((C, N), k.vec4)
+
+        # Padded with a row of zeros, which fills up the nodes' lists of entries.
+        size = B * 12 * LANES
+        self.force = wp.zeros((C, size + 3 * LANES), dtype=self.real, device=self.device)
+        # With gradients, what each sub-step gave the nodes is kept.
+        forces = k.Forces()
+        forces.elements = self._view(self.force, 0, k.Vectors, (B, 4))
+        forces.rows = self._view(self.force, 0, k.strided, (size + 1,), step=1)
+        forces.points = self.array((C, P, 2), k.vec3)
+        # The same as one list, two entries a point.
+        forces.listed = forces.points.reshape((C, 2 * P))
+        forces.lateral = self.array((C, P))
+        self.forces = [k.Forces() for _ in range(K if self._gradients else 1)]
+        for kept in self.forces:
+            kept.assign(forces)
+            kept.push = self.array(C)
+            if self._gradients:
+                kept.from_elements = self.array((C, N), k.vec3)
+                kept.from_bulk = self.array((C, N), k.vec3) if M else kept.from_elements
+                kept.from_points = self.array((C, N), k.vec3)
+        sums = {
+            "total": (E, P, layouts.ACCUMULATED),
+            "immersed": (E, P),
+            "blade": (E, layouts.numbers(layouts.BLADE_SUMS)),
+            "board_force": (N,),
+            "board_loss": (N,),
+            "internal_work": (N,),
+        }
+        self.sum_rows, self.sums, self.sum_layout = self._rows(k.Sums, sums)
+        self._result_type = layouts.results(E)
+        shapes = {
+            name: layouts.field_shape(self._result_type, name)
+            for name in self._result_type.names or ()
+        }
+        self._result_rows, self._results, _ = self._rows(k.Results, shapes, wp.float64)
+        self._energies = k.Energies()
+        self._energies.elastic = self.array((C, B, LANES))
+        self._energies.volume_ratio = self.array((C, B, LANES))
+        self._energies.points = self.array((C, P))
 
     def set_models(self, models: Sequence[CuttingModel]) -> None:
         """Takes the parameters of other cuts of the same mesh, one for each row."""
@@ -278,9 +271,9 @@ class Workspace:
         if thickness != self._skin_thickness:
             self._skin_thickness = thickness
             with LAUNCH_LOCK:
-                self.w["outline"].assign(models[0].outline.astype(self.dtype))
+                self.points.outline.assign(models[0].outline.astype(self.dtype))
         self.models = tuple(models)
-        self.write(self.parameters, np.array([parameter_row(m) for m in models]))
+        self.write(self.parameter_rows, np.array([parameter_row(m) for m in models]))
 
     def initial_state(self) -> np.ndarray:
         """The food at rest, to be cut downwards [state_size]."""
@@ -332,100 +325,59 @@ class Workspace:
 
     def look_ahead_arguments(self, k: int = 0) -> list[Any]:
         """Arguments of `look_ahead` from the first sub-step to the k-th."""
-        return [self.slots[0]["x"], self.slots[0]["v"], self.w["P"], self.ahead[k]]
+        return [self.slots[0], self.parameters, self.slots[k]]
 
     def launch_elements(self, k: int) -> None:
         """Forces of the elements at the beginning of sub-step k."""
-        w, ahead = self.w, self.ahead[k if self._gradients else 0]
-        inputs = [ahead, w["nodes"], w["shape"], w["stiff_volume"], w["P"], w["element_force"]]
+        now, _, forces = self._substep(k)
+        inputs = [now, self.mesh, self.parameters, forces.elements]
         self.launch_many(self.kernels.elements, len(self.model.blocks), inputs)
 
+    def _substep(self, k: int) -> tuple[Any, Any, Any]:
+        """State before and after sub-step k, and its forces."""
+        if self._gradients:
+            return self.slots[k], self.slots[k + 1], self.forces[k]
+        return self.slots[0], self.slots[0], self.forces[0]
+
     def point_arguments(self, k: int, dt: Any) -> list[Any]:
-        """Arguments of `points` in sub-step k."""
-        w, tables = self.w, self.model.tables
-        now, after = self._slots(k)
-        history = ("edge_depth", "cohesive_damage", "edge_force", "edge_direction", "slip")
-        return (
-            [now["x"], now["v"], w["point_nodes"], w["point_weights"]]
-            + [w[name] for name in ("area", "width", "fraction", "centroid", "outline", "surface")]
-            + [self.real(tables.reach), self.real(1.0 / tables.spacing)]
-            + [w[name] for name in PER_POINT]
-            + [w["P"], w["knife"], k, k // self.substeps, dt]
-            + [w[name] for name in ("R_CK", "p_CK", "v_CK", "w_CK")]
-            + [now["blade"], *(now[name] for name in history)]
-            + [after[name] for name in history]
-            + [w["point_force"], w["lateral"], w["immersed"], w["total"]]
-        )
-
-    def _slots(self, k: int) -> tuple[dict[str, wp.array], dict[str, wp.array]]:
-        return (self.slots[k], self.slots[k + 1]) if self._gradients else (self.slots[0],) * 2
-
-    def _push(self, k: int) -> wp.array:
-        return self.push[k if self._gradients else 0]
+        """Arguments of `step_points` in sub-step k."""
+        given = [self.points, self.parameters, self.motion]
+        return [k, dt, *given, *self._substep(k), self.sums]
 
     def relax_arguments(self, k: int) -> list[Any]:
         """Arguments of `relax_nodes` in sub-step k."""
-        w = self.w
-        now, after = self._slots(k)
-        head = [w["moving"], self.from_elements[k], w["relaxing"], w["keep"]]
-        return [*head, now["overstress"], after["overstress"], self.from_bulk[k]]
+        return [self.mesh, self.parameters, *self._substep(k)]
 
     def step_arguments(self, k: int) -> list[Any]:
         """Arguments of `step_nodes` in sub-step k."""
-        w = self.w
-        now, after = self._slots(k)
-        return (
-            [now["x"], now["v"], w["moving"], self.from_bulk[k], self.from_points[k]]
-            + [
-                w["inverse_mass"],
-                w["local_damping"],
-                w["weight"],
-                w["board_area"],
-                w["board"],
-                w["P"],
-            ]
-            + [self.substep_time(), now["board_slip"], after["board_slip"]]
-            + [w["board_force"], w["board_loss"], w["internal_work"]]
-            + [after["x"], after["v"], self.ahead[k + 1]]
-        )
+        given = [self.mesh, self.parameters]
+        return [self.substep_time(), *given, *self._substep(k), self.sums]
 
     def blade_arguments(self, k: int) -> list[Any]:
         """Arguments of `bend_blade` in sub-step k."""
-        w = self.w
-        now, after = self._slots(k)
-        head = [self._push(k), w["P"], k // self.substeps, self.substep_time()]
-        return [*head, now["blade"], after["blade"], w["blade_sums"]]
+        head = [k // self.substeps, self.substep_time(), self.parameters]
+        return [*head, *self._substep(k), self.sums]
 
     def launch_substep(self, k: int) -> None:
         """One sub-step."""
-        w, kern, m, C = self.w, self.kernels, self.model, self.cuts
+        kern, nodes = self.kernels, len(self.model.moving)
+        now, _, forces = self._substep(k)
         self.launch_elements(k)
         points = self.point_arguments(k, self.substep_time())
-        self.launch_many(kern.points, len(m.point_nodes), points)
-        gathered = [w["node_force"], w["element_start"], w["element_entry"], w["listed_force"]]
-        gathered += [w["point_start"], w["point_entry"], w["point_weight"]]
+        self.launch_many(kern.step_points, len(self.model.point_nodes), points)
         if self._gradients:
-            outputs = [self.from_elements[k], self.from_points[k]]
-            self.launch_many(kern.gather, len(m.moving), [w["moving"], *gathered, *outputs])
-            if len(m.relaxing):
-                self.launch_many(kern.relax_nodes, len(m.moving), self.relax_arguments(k))
-            self.launch_many(kern.step_nodes, len(m.moving), self.step_arguments(k))
+            self.launch_many(kern.gather, nodes, [self.mesh, forces])
+            if len(self.model.relaxing):
+                self.launch_many(kern.relax_nodes, nodes, self.relax_arguments(k))
+            self.launch_many(kern.step_nodes, nodes, self.step_arguments(k))
         else:
-            now = self.slots[0]
-            self.launch_many(
-                kern.move_nodes,
-                len(m.moving),
-                [now["x"], now["v"], w["moving"], *gathered]
-                + [w["inverse_mass"], w["local_damping"], w["weight"], w["relaxing"], w["keep"]]
-                + [w["board_area"], w["board"], w["P"], self.substep_time()]
-                + [now["overstress"], now["board_slip"]]
-                + [w["board_force"], w["board_loss"], w["internal_work"], self.ahead[0]],
-            )
+            given = [self.substep_time(), self.mesh, self.parameters]
+            self.launch_many(kern.move_nodes, nodes, [*given, now, forces, self.sums])
         for kernel, arguments in (
-            (kern.push_blade, [w["lateral"], self._push(k)]),
+            (kern.push_blade, [forces]),
             (kern.bend_blade, self.blade_arguments(k)),
         ):
-            wp.launch(kernel, dim=C, inputs=arguments, device=self.device)
+            wp.launch(kernel, dim=self.cuts, inputs=arguments, device=self.device)
 
     def capture(self) -> None:
         """Compiles the kernels, once a machine, and captures a launch as a graph."""
@@ -435,41 +387,27 @@ class Workspace:
             self._graph = self._captured()
 
     def _captured(self) -> Any:
-        wp.load_module(self.kernels.module, device=self.device)
+        kern, C, E = self.kernels, self.cuts, self.coupling_steps
+        wp.load_module(kern.module, device=self.device)
         with wp.ScopedCapture(device=self.device) as capture:
-            self.sums.zero_()
-            self._launch_motion()
+            self.sum_rows.zero_()
+            self.launch(kern.move_knife, self.steps, [self.motion])
             # Later sub-steps need it for held nodes only, which never move.
-            for k in range(len(self.ahead)):
-                arguments = self.look_ahead_arguments(k)
-                self.launch(self.kernels.look_ahead, len(self.model.nodes), arguments)
+            for k in range(len(self.slots)):
+                nodes = len(self.model.nodes)
+                self.launch(kern.look_ahead, nodes, self.look_ahead_arguments(k))
             for k in range(self.steps):
                 self.launch_substep(k)
-            self._launch_results()
+            wp.launch(
+                kern.add_points,
+                dim=(C, E, layouts.numbers(layouts.POINT_SUMS)),
+                inputs=[self.sums, self._results],
+                device=self.device,
+            )
+            numbers = layouts.numbers(layouts.NODE_SUMS)
+            self.launch(kern.add_nodes, numbers, [self.sums, self._results])
+            self.launch(kern.knife_wrenches, E, [self.sums, self.motion, self._results])
         return capture.graph
-
-    def _timing(self) -> list[Any]:
-        return [self.substeps, wp.float64(self.exchange_period)]
-
-    def _launch_motion(self) -> None:
-        """The knife's motion, from its poses at the ends of the coupling steps."""
-        w, motion = self.w, [self.w[name] for name in ("R_CK", "p_CK", "v_CK", "w_CK")]
-        self.launch(self.kernels.move_knife, self.steps, [w["R"], w["p"], *self._timing(), *motion])
-
-    def _launch_results(self) -> None:
-        """Launches the sums of the coupling steps."""
-        w, kern, C, E = self.w, self.kernels, self.cuts, self.coupling_steps
-        outputs = [w["blade"], w["wrenches"], w["work"]]
-        wp.launch(
-            kern.add_points,
-            dim=(C, E, layouts.numbers(layouts.POINT_SUMS)),
-            inputs=[w["total"], w["immersed"], w["point_sums"]],
-            device=self.device,
-        )
-        at_nodes = [w["board_force"], w["board_loss"], w["internal_work"], w["node_sums"]]
-        self.launch(kern.add_nodes, layouts.numbers(layouts.NODE_SUMS), at_nodes)
-        sums = [w["point_sums"], w["blade_sums"], w["R"], w["p"]]
-        self.launch(kern.knife_wrenches, E, [*sums, *self._timing(), *outputs])
 
     def advance(self, states: np.ndarray, R: np.ndarray, p: np.ndarray) -> None:
         """Advances all cuts by the workspace's coupling steps.
@@ -485,8 +423,8 @@ class Workspace:
         # Held nodes are never written, so every slot needs them.
         for state in self.states:
             self.write(state, states)
-        self.write(self.w["R"], R)
-        self.write(self.w["p"], p)
+        self.write(self.motion.R, R)
+        self.write(self.motion.p, p)
         wp.capture_launch(self._graph)
 
     def stored_energies(self) -> tuple[float, np.ndarray, float]:
@@ -495,29 +433,20 @@ class Workspace:
             with LAUNCH_LOCK:
                 self._energy_graph = self._captured_energies()
         wp.capture_launch(self._energy_graph)
-        elastic = self.read(self.w["energy"])[0].sum(dtype=np.float64)
-        ratio = self.read(self.w["volume_ratio"])[0].ravel()[: self.model.element_count].copy()
-        interface = self.read(self.w["point_energy"])[0].sum(dtype=np.float64)
+        elastic = self.read(self._energies.elastic)[0].sum(dtype=np.float64)
+        ratio = self.read(self._energies.volume_ratio)[0].ravel()[: self.model.element_count].copy()
+        interface = self.read(self._energies.points)[0].sum(dtype=np.float64)
         return float(elastic), ratio, float(interface)
 
     def _captured_energies(self) -> Any:
-        w, now, tables, C = self.w, self.slots[0], self.model.tables, self.cuts
-        B, P = len(self.model.blocks), len(self.model.point_nodes)
-        elements = [now["x"], w["nodes"], w["shape"], w["stiff_volume"], w["P"]]
-        elements += [w["energy"], w["volume_ratio"]]
-        points = (
-            [now["x"], w["point_nodes"], w["point_weights"], w["area"], w["fraction"]]
-            + [w["centroid"], self.real(tables.reach), self.real(1.0 / tables.spacing)]
-            + [w["toughness"], w["flank_scale"], w["unloading"], w["P"], w["knife"]]
-            + [w["R_CK"], w["p_CK"], 0, now["blade"]]
-            + [now[name] for name in ("edge_depth", "cohesive_damage", "edge_force", "slip")]
-            + [w["point_energy"]]
-        )
-        energy, device = self.kernels.element_energy, self.device
-        wp.load_module(self.kernels.module, device=device)
+        kern, device, state = self.kernels, self.device, self.slots[0]
+        elements = [state, self.mesh, self.parameters, self._energies]
+        points = [self.points, self.parameters, self.motion, state, self._energies]
+        dim = (self.cuts, len(self.model.blocks), LANES)
+        wp.load_module(kern.module, device=device)
         with wp.ScopedCapture(device=device) as capture:
-            wp.launch(energy, dim=(C, B, LANES), inputs=elements, device=device)
-            self.launch(self.kernels.point_energy, P, points)
+            wp.launch(kern.element_energy, dim=dim, inputs=elements, device=device)
+            self.launch(kern.point_energy, len(self.model.point_nodes), points)
         return capture.graph
 
     def point_forces(self) -> np.ndarray:
@@ -525,8 +454,8 @@ class Workspace:
         # A step of no duration changes no history that another call reads.
         points = self.point_arguments(0, self.real(0.0))
         with LAUNCH_LOCK:
-            self.launch_many(self.kernels.points, len(self.model.point_nodes), points)
-        return np.array(self.w["point_force"].numpy()[0], np.float64)
+            self.launch_many(self.kernels.step_points, len(self.model.point_nodes), points)
+        return np.array(self.forces[0].points.numpy()[0], np.float64)
 
 
 def parameter_row(model: CuttingModel) -> np.ndarray:

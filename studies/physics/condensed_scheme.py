@@ -691,7 +691,7 @@ def point_time(solver: CuttingSolver) -> float:
     """Time of all cut points in the solver's kernel, s."""
     ws, count = solver._workspace, len(solver.model.point_nodes)
     arguments = ws.point_arguments(0, ws.substep_time())
-    return kernel_time(solver, lambda: ws.launch_many(ws.kernels.points, count, arguments))
+    return kernel_time(solver, lambda: ws.launch_many(ws.kernels.step_points, count, arguments))
 
 
 def sparse_rate() -> float:

@@ -1,5 +1,7 @@
 """Names of the numbers that the kernels read and write in rows: one layout for them and readers."""
 
+import enum
+
 import numpy as np
 
 __all__ = [
@@ -8,8 +10,11 @@ __all__ = [
     "KNIFE",
     "NODE_SUMS",
     "POINT_SUMS",
+    "BladeSum",
+    "NodeSum",
+    "PointSum",
+    "Section",
     "field_shape",
-    "first",
     "numbers",
     "results",
 ]
@@ -63,13 +68,18 @@ def results(coupling_steps: int) -> np.dtype:
     )
 
 
-def first(layout: np.dtype, *names: str) -> list[int]:
-    """Places of the first number of each named field."""
+def places(name: str, layout: np.dtype) -> enum.IntEnum:
+    """Places of the first number of each field."""
     assert layout.fields is not None
-    return [layout.fields[name][1] // 8 for name in names]
+    return enum.IntEnum(name, {k.upper(): at[1] // 8 for k, at in layout.fields.items()})
 
 
-ACCUMULATED = first(POINT_SUMS, "buried_moment")[0]
+Section = places("Section", KNIFE)
+PointSum = places("PointSum", POINT_SUMS)
+NodeSum = places("NodeSum", NODE_SUMS)
+BladeSum = places("BladeSum", BLADE_SUMS)
+
+ACCUMULATED = int(PointSum.BURIED_MOMENT)
 """Numbers that each cut point keeps in `total`; those of `immersed` follow in the sums."""
 
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import warp as wp
 
-from sliceit_drake.cutting.kernels.layouts import BLADE_SUMS, first
-from sliceit_drake.cutting.kernels.types import LANES, kernel_types
+from sliceit_drake.cutting.kernels.layouts import BladeSum
+from sliceit_drake.cutting.kernels.types import LANES, Scalar, kernel_types
 
 __all__ = ["node_kernels"]
 
@@ -14,80 +14,58 @@ __all__ = ["node_kernels"]
 def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespace:
     """The kernels for scalars `real`, in the Warp module `module`, with adjoints if `gradients`."""
     t = kernel_types(real)
-    vec2, vec3, vec4, strided, entries = t.vec2, t.vec3, t.vec4, t.strided, t.entries
-    slide, padded = t.slide, t.padded
-    DAMPING_TIME, BOARD_STIFFNESS = t.DAMPING_TIME, t.BOARD_STIFFNESS
-    BOARD_FRICTION, BOARD_DAMPING_TIME = t.BOARD_FRICTION, t.BOARD_DAMPING_TIME
-    BLADE_STIFFNESS, BLADE_DAMPING, BLADE_MASS = t.BLADE_STIFFNESS, t.BLADE_DAMPING, t.BLADE_MASS
-
-    LOSS, ON_KNIFE, ON_BLADE = map(wp.constant, first(BLADE_SUMS, "loss", "on_knife", "on_blade"))
+    vec3, vec4, slide, padded = t.vec3, t.vec4, t.slide, t.padded
+    Mesh, Points, Parameters, State = t.Mesh, t.Points, t.Parameters, t.State
+    Forces, Sums = t.Forces, t.Sums
 
     # Nodes slower than this, in m/s, count as at rest.
     REST = wp.constant(real(1.0e-5))
 
     @wp.func
-    def gather_elements(
-        cut: wp.int32,
-        i: wp.int32,
-        force: wp.array2d(dtype=strided),
-        start: wp.array(dtype=wp.int32),
-        entry: wp.array(dtype=entries),
-    ):
+    def gather_elements(cut: wp.int32, i: wp.int32, mesh: Mesh, forces: Forces):
         """Sum of the element forces on node i.
 
-        Row k of `force` begins at the k-th number of the elements' forces. Entries come in fours,
-        filled up with a row of zeros.
+        Row k of `forces.rows` begins at the k-th number of the elements' forces. Entries come in
+        fours, filled up with a row of zeros.
         """
         fx = real(0.0)
         fy = real(0.0)
         fz = real(0.0)
-        for e in range(start[i], start[i + 1]):
-            four = entry[e]
-            a = force[cut, four[0]]
-            b = force[cut, four[1]]
-            c = force[cut, four[2]]
-            d = force[cut, four[3]]
+        for e in range(mesh.element_start[i], mesh.element_start[i + 1]):
+            four = mesh.element_entry[e]
+            a = forces.rows[cut, four[0]]
+            b = forces.rows[cut, four[1]]
+            c = forces.rows[cut, four[2]]
+            d = forces.rows[cut, four[3]]
             fx += (a[0] + b[0]) + (c[0] + d[0])
             fy += (a[LANES] + b[LANES]) + (c[LANES] + d[LANES])
             fz += (a[2 * LANES] + b[2 * LANES]) + (c[2 * LANES] + d[2 * LANES])
         return vec3(fx, fy, fz)
 
     @wp.func
-    def gather_points(
-        cut: wp.int32,
-        i: wp.int32,
-        force: wp.array2d(dtype=vec3),
-        start: wp.array(dtype=wp.int32),
-        entry: wp.array(dtype=wp.int32),
-        weight: wp.array(dtype=real),
-    ):
+    def gather_points(cut: wp.int32, i: wp.int32, mesh: Mesh, forces: Forces):
         """Sum of the forces of the cut points on node i."""
         f = vec3()
-        for e in range(start[i], start[i + 1]):
-            f += force[cut, entry[e]] * weight[e]
+        for e in range(mesh.point_start[i], mesh.point_start[i + 1]):
+            f += forces.listed[cut, mesh.point_entry[e]] * mesh.point_weight[e]
         return f
 
     @wp.func
     def relax(
-        cut: wp.int32,
-        i: wp.int32,
-        force: vec3,
-        share: wp.array2d(dtype=real),
-        keep: wp.array2d(dtype=real),
-        overstress: wp.array3d(dtype=vec3),
-        overstress_next: wp.array3d(dtype=vec3),
+        cut: wp.int32, i: wp.int32, force: vec3, parameters: Parameters, now: State, after: State
     ):
         """Force of the bulk on node i after relaxation, from that of the instantaneous moduli.
 
         Each Maxwell branch carries its fraction of the force less what has relaxed: `overstress`,
         the force filtered with the branch's time."""
         f = force
-        for m in range(share.shape[1]):
-            new_overstress = (
-                keep[cut, m] * overstress[cut, m, i] + (real(1.0) - keep[cut, m]) * force
+        for m in range(parameters.relaxing.shape[1]):
+            overstress = (
+                parameters.keep[cut, m] * now.overstress[cut, m, i]
+                + (real(1.0) - parameters.keep[cut, m]) * force
             )
-            overstress_next[cut, m, i] = new_overstress
-            f = f - share[cut, m] * new_overstress
+            after.overstress[cut, m, i] = overstress
+            f = f - parameters.relaxing[cut, m] * overstress
         return f
 
     @wp.func
@@ -96,57 +74,58 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         i: wp.int32,
         internal: vec3,
         external: vec3,
-        xi: vec3,
-        vi: vec3,
-        inverse_mass: real,
-        local_damping: real,
-        board_area: real,
-        board: wp.array(dtype=real),
-        P: wp.array2d(dtype=real),
         dt: real,
-        board_slip: wp.array2d(dtype=vec3),
-        board_slip_next: wp.array2d(dtype=vec3),
-        board_force: wp.array2d(dtype=vec3),
-        board_loss: wp.array2d(dtype=real),
-        internal_work: wp.array2d(dtype=real),
+        mesh: Mesh,
+        parameters: Parameters,
+        now: State,
+        after: State,
+        sums: Sums,
     ):
-        """Velocity after the sub-step; board contact, sums over the launch.
+        """One node, semi-implicit Euler; board contact, sums over the launch.
 
         A fraction of the unbalanced force opposes the node's motion (Cundall's local damping): none
         in equilibrium, however fast the motion, and the more the larger the inertia."""
+        P = parameters.P
+        xi = now.x[cut, i]
+        vi = now.v[cut, i]
+        inverse_mass = parameters.inverse_mass[cut, i]
+        board_area = mesh.board_area[i]
         f = internal + external
         pressed = real(0.0)
         on_food = vec3()
         loss = real(0.0)
-        n = vec3(board[0], board[1], board[2])
+        n = vec3(mesh.board[0], mesh.board[1], mesh.board[2])
         if board_area > real(0.0):
-            depth = board[3] - wp.dot(n, xi)
-            stiffness = P[cut, BOARD_STIFFNESS] * board_area
-            old = board_slip[cut, i]
+            depth = mesh.board[3] - wp.dot(n, xi)
+            stiffness = P[cut, Scalar.BOARD_STIFFNESS] * board_area
+            old = now.board_slip[cut, i]
             new_slip = vec3()
             loss = real(0.5) * stiffness * wp.dot(old, old)
             if depth > real(0.0):
                 sliding = (vi - wp.dot(vi, n) * n) * dt
-                limit = P[cut, BOARD_FRICTION] * stiffness * depth
+                limit = P[cut, Scalar.BOARD_FRICTION] * stiffness * depth
                 anchored, lost = slide(old, sliding, stiffness, limit)
                 new_slip = anchored
                 loss = lost
                 pressed = stiffness * depth
                 on_food = pressed * n - stiffness * anchored
-            board_slip_next[cut, i] = new_slip
+            after.board_slip[cut, i] = new_slip
         resultant = f + on_food
         speed = wp.length(vi)
         drag = vec3()
         if speed > real(0.0):
-            drag = vi * (-local_damping * wp.length(resultant) / (speed + REST))
+            damping = parameters.local_damping[cut, i]
+            drag = vi * (-damping * wp.length(resultant) / (speed + REST))
         v1 = vi + (resultant + drag) * (inverse_mass * dt)
         if pressed > real(0.0):
             # The board damps the normal motion, implicitly, and does not pull.
             per_force = inverse_mass * dt
-            damping = P[cut, BOARD_STIFFNESS] * board_area * P[cut, BOARD_DAMPING_TIME]
+            viscosity = (
+                P[cut, Scalar.BOARD_STIFFNESS] * board_area * P[cut, Scalar.BOARD_DAMPING_TIME]
+            )
             normal = wp.dot(v1, n)
             damped = wp.max(
-                normal / (real(1.0) + damping * per_force), normal - pressed * per_force
+                normal / (real(1.0) + viscosity * per_force), normal - pressed * per_force
             )
             v1 = v1 + (damped - normal) * n
             force = (damped - normal) / per_force
@@ -154,245 +133,147 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
             moved = real(0.5) * (wp.dot(vi, n) + damped) * dt
             loss = loss + wp.max(-force * moved, real(0.0))
         if board_area > real(0.0):
-            board_force[cut, i] += on_food
-            board_loss[cut, i] += loss
+            sums.board_force[cut, i] += on_food
+            sums.board_loss[cut, i] += loss
         # Trapezoidal rule for the work along the path, summed by parts.
-        internal_work[cut, i] += real(0.5) * wp.dot(internal + drag, vi + v1) * dt
-        return v1
+        sums.internal_work[cut, i] += real(0.5) * wp.dot(internal + drag, vi + v1) * dt
+        x1 = xi + v1 * dt
+        after.v[cut, i] = v1
+        after.x[cut, i] = x1
+        after.ahead[cut, i] = padded(x1 + P[cut, Scalar.DAMPING_TIME] * v1)
 
     @wp.kernel(enable_backward=False, module=module)
     def move_nodes(
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        moving: wp.array(dtype=wp.int32),
-        element_force: wp.array2d(dtype=strided),
-        element_start: wp.array(dtype=wp.int32),
-        element_entry: wp.array(dtype=entries),
-        point_force: wp.array2d(dtype=vec3),
-        point_start: wp.array(dtype=wp.int32),
-        point_entry: wp.array(dtype=wp.int32),
-        point_weight: wp.array(dtype=real),
-        inverse_mass: wp.array2d(dtype=real),
-        local_damping: wp.array2d(dtype=real),
-        weight: wp.array2d(dtype=vec3),
-        relaxing: wp.array2d(dtype=real),
-        keep: wp.array2d(dtype=real),
-        board_area: wp.array(dtype=real),
-        board: wp.array(dtype=real),
-        P: wp.array2d(dtype=real),
         dt: real,
-        overstress: wp.array3d(dtype=vec3),
-        board_slip: wp.array2d(dtype=vec3),
-        board_force: wp.array2d(dtype=vec3),
-        board_loss: wp.array2d(dtype=real),
-        internal_work: wp.array2d(dtype=real),
-        ahead: wp.array2d(dtype=vec4),
+        mesh: Mesh,
+        parameters: Parameters,
+        state: State,
+        forces: Forces,
+        sums: Sums,
         per_thread: wp.int32,
     ):
-        """Gathers the forces of each moving node and steps it in place, semi-implicit Euler."""
+        """Gathers the forces of each moving node and steps it in place."""
         cut, chunk = wp.tid()
-        for entry in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, moving.shape[0])):
-            i = moving[entry]
-            force = gather_elements(cut, i, element_force, element_start, element_entry)
-            internal = relax(cut, i, force, relaxing, keep, overstress, overstress)
-            external = weight[cut, i] + gather_points(
-                cut, i, point_force, point_start, point_entry, point_weight
-            )
-            xi = x[cut, i]
-            v1 = step_node(
-                cut,
-                i,
-                internal,
-                external,
-                xi,
-                v[cut, i],
-                inverse_mass[cut, i],
-                local_damping[cut, i],
-                board_area[i],
-                board,
-                P,
-                dt,
-                board_slip,
-                board_slip,
-                board_force,
-                board_loss,
-                internal_work,
-            )
-            x1 = xi + v1 * dt
-            v[cut, i] = v1
-            x[cut, i] = x1
-            ahead[cut, i] = padded(x1 + P[cut, DAMPING_TIME] * v1)
+        end = wp.min((chunk + 1) * per_thread, mesh.moving.shape[0])
+        for entry in range(chunk * per_thread, end):
+            i = mesh.moving[entry]
+            force = gather_elements(cut, i, mesh, forces)
+            internal = relax(cut, i, force, parameters, state, state)
+            external = parameters.weight[cut, i] + gather_points(cut, i, mesh, forces)
+            step_node(cut, i, internal, external, dt, mesh, parameters, state, state, sums)
 
     # Sums in loops have kernels of their own: an adjoint would not know their value after the loop.
     @wp.kernel(enable_backward=gradients, module=module)
-    def push_blade(lateral: wp.array2d(dtype=real), push: wp.array(dtype=real)):
+    def push_blade(forces: Forces):
         """Force of the flanks on the blade."""
         cut = wp.tid()
         F = real(0.0)
-        for i in range(lateral.shape[1]):
-            F += lateral[cut, i]
-        push[cut] = F
+        for i in range(forces.lateral.shape[1]):
+            F += forces.lateral[cut, i]
+        forces.push[cut] = F
 
     @wp.kernel(enable_backward=gradients, module=module)
     def bend_blade(
-        push: wp.array(dtype=real),
-        P: wp.array2d(dtype=real),
         coupling_step: wp.int32,
         dt: real,
-        blade: wp.array2d(dtype=real),
-        blade_next: wp.array2d(dtype=real),
-        blade_sums: wp.array3d(dtype=real),
+        parameters: Parameters,
+        now: State,
+        after: State,
+        forces: Forces,
+        sums: Sums,
     ):
         """Steps the blade's lateral deflection and its rate, pushed by the flanks.
 
-        Adds to `blade_sums`, see `BLADE_SUMS`.
+        Adds to `sums.blade`, see `BLADE_SUMS`.
         """
         cut = wp.tid()
-        F = push[cut]
-        m = P[cut, BLADE_MASS]
-        c = P[cut, BLADE_DAMPING]
-        k = P[cut, BLADE_STIFFNESS]
-        pushed = blade[cut, 1] + dt * (F - k * blade[cut, 0]) / m
+        F = forces.push[cut]
+        m = parameters.P[cut, Scalar.BLADE_MASS]
+        c = parameters.P[cut, Scalar.BLADE_DAMPING]
+        k = parameters.P[cut, Scalar.BLADE_STIFFNESS]
+        pushed = now.blade[cut, 1] + dt * (F - k * now.blade[cut, 0]) / m
         rate = pushed / (real(1.0) + dt * c / m)
-        deflection = blade[cut, 0] + dt * rate
-        blade_next[cut, 1] = rate
-        blade_next[cut, 0] = deflection
-        blade_sums[cut, coupling_step, LOSS] += c * rate * rate * dt
-        blade_sums[cut, coupling_step, ON_KNIFE] += k * deflection + c * rate
-        blade_sums[cut, coupling_step, ON_BLADE] += F
+        deflection = now.blade[cut, 0] + dt * rate
+        after.blade[cut, 1] = rate
+        after.blade[cut, 0] = deflection
+        sums.blade[cut, coupling_step, BladeSum.LOSS] += c * rate * rate * dt
+        sums.blade[cut, coupling_step, BladeSum.ON_KNIFE] += k * deflection + c * rate
+        sums.blade[cut, coupling_step, BladeSum.ON_BLADE] += F
 
     out = types.SimpleNamespace(move_nodes=move_nodes, push_blade=push_blade, bend_blade=bend_blade)
     if not gradients:
         return out
 
     @wp.kernel(enable_backward=False, module=module)
-    def gather(
-        moving: wp.array(dtype=wp.int32),
-        element_force: wp.array2d(dtype=strided),
-        element_start: wp.array(dtype=wp.int32),
-        element_entry: wp.array(dtype=entries),
-        point_force: wp.array2d(dtype=vec3),
-        point_start: wp.array(dtype=wp.int32),
-        point_entry: wp.array(dtype=wp.int32),
-        point_weight: wp.array(dtype=real),
-        from_elements: wp.array2d(dtype=vec3),
-        from_points: wp.array2d(dtype=vec3),
-        per_thread: wp.int32,
-    ):
+    def gather(mesh: Mesh, forces: Forces, per_thread: wp.int32):
         """Gathers the forces of each moving node, for `step_nodes`."""
         cut, chunk = wp.tid()
-        for entry in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, moving.shape[0])):
-            i = moving[entry]
-            from_elements[cut, i] = gather_elements(
-                cut, i, element_force, element_start, element_entry
-            )
-            from_points[cut, i] = gather_points(
-                cut, i, point_force, point_start, point_entry, point_weight
-            )
+        end = wp.min((chunk + 1) * per_thread, mesh.moving.shape[0])
+        for entry in range(chunk * per_thread, end):
+            i = mesh.moving[entry]
+            forces.from_elements[cut, i] = gather_elements(cut, i, mesh, forces)
+            forces.from_points[cut, i] = gather_points(cut, i, mesh, forces)
 
     @wp.kernel(enable_backward=gradients, module=module)
     def relax_nodes(
-        moving: wp.array(dtype=wp.int32),
-        from_elements: wp.array2d(dtype=vec3),
-        relaxing: wp.array2d(dtype=real),
-        keep: wp.array2d(dtype=real),
-        overstress: wp.array3d(dtype=vec3),
-        overstress_next: wp.array3d(dtype=vec3),
-        internal: wp.array2d(dtype=vec3),
+        mesh: Mesh,
+        parameters: Parameters,
+        now: State,
+        after: State,
+        forces: Forces,
         per_thread: wp.int32,
     ):
         """Force of the bulk on each moving node after relaxation, for `step_nodes`."""
         cut, chunk = wp.tid()
-        for entry in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, moving.shape[0])):
-            i = moving[entry]
-            force = from_elements[cut, i]
-            internal[cut, i] = relax(cut, i, force, relaxing, keep, overstress, overstress_next)
+        end = wp.min((chunk + 1) * per_thread, mesh.moving.shape[0])
+        for entry in range(chunk * per_thread, end):
+            i = mesh.moving[entry]
+            force = forces.from_elements[cut, i]
+            forces.from_bulk[cut, i] = relax(cut, i, force, parameters, now, after)
 
     @wp.kernel(enable_backward=gradients, module=module)
     def step_nodes(
-        x: wp.array2d(dtype=vec3),
-        v: wp.array2d(dtype=vec3),
-        moving: wp.array(dtype=wp.int32),
-        from_bulk: wp.array2d(dtype=vec3),
-        from_points: wp.array2d(dtype=vec3),
-        inverse_mass: wp.array2d(dtype=real),
-        local_damping: wp.array2d(dtype=real),
-        weight: wp.array2d(dtype=vec3),
-        board_area: wp.array(dtype=real),
-        board: wp.array(dtype=real),
-        P: wp.array2d(dtype=real),
         dt: real,
-        board_slip: wp.array2d(dtype=vec3),
-        board_slip_next: wp.array2d(dtype=vec3),
-        board_force: wp.array2d(dtype=vec3),
-        board_loss: wp.array2d(dtype=real),
-        internal_work: wp.array2d(dtype=real),
-        x_next: wp.array2d(dtype=vec3),
-        v_next: wp.array2d(dtype=vec3),
-        ahead_next: wp.array2d(dtype=vec4),
+        mesh: Mesh,
+        parameters: Parameters,
+        now: State,
+        after: State,
+        forces: Forces,
+        sums: Sums,
         per_thread: wp.int32,
     ):
         """Steps the nodes as `move_nodes` does, into other arrays, so that it has an adjoint."""
         cut, chunk = wp.tid()
-        for entry in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, moving.shape[0])):
-            i = moving[entry]
-            internal = from_bulk[cut, i]
-            external = weight[cut, i] + from_points[cut, i]
-            xi = x[cut, i]
-            v1 = step_node(
-                cut,
-                i,
-                internal,
-                external,
-                xi,
-                v[cut, i],
-                inverse_mass[cut, i],
-                local_damping[cut, i],
-                board_area[i],
-                board,
-                P,
-                dt,
-                board_slip,
-                board_slip_next,
-                board_force,
-                board_loss,
-                internal_work,
-            )
-            x1 = xi + v1 * dt
-            v_next[cut, i] = v1
-            x_next[cut, i] = x1
-            ahead_next[cut, i] = padded(x1 + P[cut, DAMPING_TIME] * v1)
+        end = wp.min((chunk + 1) * per_thread, mesh.moving.shape[0])
+        for entry in range(chunk * per_thread, end):
+            i = mesh.moving[entry]
+            internal = forces.from_bulk[cut, i]
+            external = parameters.weight[cut, i] + forces.from_points[cut, i]
+            step_node(cut, i, internal, external, dt, mesh, parameters, now, after, sums)
 
     @wp.kernel(enable_backward=False, module=module)
     def gather_adjoint(
-        moving: wp.array(dtype=wp.int32),
-        change: wp.array2d(dtype=strided),
-        element_start: wp.array(dtype=wp.int32),
-        element_entry: wp.array(dtype=entries),
-        adj_ahead: wp.array2d(dtype=vec4),
-        per_thread: wp.int32,
+        mesh: Mesh, forces: Forces, adj_ahead: wp.array2d(dtype=vec4), per_thread: wp.int32
     ):
-        """Adds the elements' adjoints of `ahead` to those of moving nodes."""
+        """Adds the elements' adjoints of `ahead`, in `forces`, to those of moving nodes."""
         cut, chunk = wp.tid()
-        for entry in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, moving.shape[0])):
-            i = moving[entry]
-            adjoint = gather_elements(cut, i, change, element_start, element_entry)
+        end = wp.min((chunk + 1) * per_thread, mesh.moving.shape[0])
+        for entry in range(chunk * per_thread, end):
+            i = mesh.moving[entry]
+            adjoint = gather_elements(cut, i, mesh, forces)
             adj_ahead[cut, i] = adj_ahead[cut, i] + padded(adjoint)
 
     @wp.kernel(enable_backward=False, module=module)
     def spread_adjoint(
-        nodes: wp.array2d(dtype=wp.int32),
-        weights: wp.array(dtype=vec2),
-        adj_from_points: wp.array2d(dtype=vec3),
-        adj_force: wp.array3d(dtype=vec3),
+        points: Points, adj_from_points: wp.array2d(dtype=vec3), adj_force: wp.array3d(dtype=vec3)
     ):
         """Adjoint of the forces of the cut points, from those of the nodes that gather them."""
         cut, i = wp.tid()
-        w = weights[i]
+        w = points.weights[i]
         for side in range(2):
             adj_force[cut, i, side] = (
-                adj_from_points[cut, nodes[i, 2 * side]] * w[0]
-                + adj_from_points[cut, nodes[i, 2 * side + 1]] * w[1]
+                adj_from_points[cut, points.nodes[i, 2 * side]] * w[0]
+                + adj_from_points[cut, points.nodes[i, 2 * side + 1]] * w[1]
             )
 
     out.gather, out.relax_nodes, out.step_nodes = gather, relax_nodes, step_nodes

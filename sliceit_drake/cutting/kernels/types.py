@@ -1,12 +1,13 @@
 """Types, constants and small functions that the kernels share."""
 
+import enum
 import functools
 import types
 from typing import Any
 
 import warp as wp
 
-__all__ = ["GATHER", "LANES", "PARAMETERS", "kernel_types"]
+__all__ = ["GATHER", "LANES", "PARAMETERS", "Scalar", "kernel_types"]
 
 LANES = 8
 """Elements that a thread handles."""
@@ -46,12 +47,162 @@ PARAMETERS = (
 )
 """Scalars of a cut that the kernels read, in the order of their array."""
 
+Scalar = enum.IntEnum("Scalar", [name.upper() for name in PARAMETERS], start=0)
+"""Places of the scalars in their array."""
+
 
 @functools.cache
 def kernel_types(real: Any) -> types.SimpleNamespace:
-    """Types for `real` = wp.float32 or wp.float64, `slide`, `padded`, `place`, `table`."""
-    vec3, vec4 = wp.types.vector(3, real), wp.types.vector(4, real)
+    """Types and structs for `real` = wp.float32 or wp.float64, `slide`, `padded`.
+
+    The first index of all arrays but those of `Mesh` and `Points` is the cut.
+    """
+    vec2, vec3, vec4 = (wp.types.vector(n, real) for n in (2, 3, 4))
+    mat33 = wp.types.matrix((3, 3), real)
+    lanes, indices = wp.types.vector(LANES, real), wp.types.vector(LANES, wp.int32)
+    # From the x component of a nodal force in `elements` to its z component.
+    strided = wp.types.vector(2 * LANES + 1, real)
+    entries = wp.types.vector(GATHER, wp.int32)
     tiny = wp.constant(real(1.0e-20))
+
+    @wp.struct
+    class Vectors:
+        """A vector in each lane."""
+
+        x: lanes
+        y: lanes
+        z: lanes
+
+    @wp.struct
+    class Mesh:
+        """Elements in blocks of `LANES`, and what acts on each node; see `Workspace`."""
+
+        nodes: wp.array2d(dtype=indices)
+        shape: wp.array2d(dtype=lanes)
+        moving: wp.array(dtype=wp.int32)
+        element_start: wp.array(dtype=wp.int32)
+        element_entry: wp.array(dtype=entries)
+        point_start: wp.array(dtype=wp.int32)
+        point_entry: wp.array(dtype=wp.int32)
+        point_weight: wp.array(dtype=real)
+        board_area: wp.array(dtype=real)
+        board: wp.array(dtype=real)
+
+    @wp.struct
+    class Points:
+        """The cut points and their tables over [-reach, reach]; see `EdgeTables`."""
+
+        nodes: wp.array2d(dtype=wp.int32)
+        weights: wp.array(dtype=vec2)
+        area: wp.array(dtype=real)
+        width: wp.array2d(dtype=real)
+        fraction: wp.array2d(dtype=real)
+        centroid: wp.array2d(dtype=real)
+        outline: wp.array2d(dtype=real)
+        depth: wp.array(dtype=real)
+        reach: real
+        per_spacing: real
+
+    @wp.struct
+    class Parameters:
+        """What cuts of one mesh may differ in; see `parameter_row`."""
+
+        P: wp.array2d(dtype=real)
+        knife: wp.array2d(dtype=real)
+        toughness: wp.array2d(dtype=real)
+        flank_scale: wp.array2d(dtype=real)
+        friction_scale: wp.array2d(dtype=real)
+        unloading: wp.array2d(dtype=real)
+        inverse_mass: wp.array2d(dtype=real)
+        local_damping: wp.array2d(dtype=real)
+        weight: wp.array2d(dtype=vec3)
+        relaxing: wp.array2d(dtype=real)
+        keep: wp.array2d(dtype=real)
+        stiff_volume: wp.array2d(dtype=lanes)
+
+    @wp.struct
+    class Motion:
+        """Poses of the knife at the ends of the coupling steps, and in each sub-step its pose at
+        the end, velocity of Ko and angular velocity."""
+
+        R: wp.array2d(dtype=wp.mat33d)
+        p: wp.array2d(dtype=wp.vec3d)
+        R_CK: wp.array2d(dtype=mat33)
+        p_CK: wp.array2d(dtype=vec3)
+        v_CK: wp.array2d(dtype=vec3)
+        w_CK: wp.array2d(dtype=vec3)
+        substeps: wp.int32
+        period: wp.float64
+
+    @wp.struct
+    class State:
+        """The food.
+
+        Positions, velocities; at the cut points the largest depth of the edge below the point, the
+        fraction of the surface energy spent by opening, the edge's force on the food, its
+        direction, and the slip from the friction anchors of both faces; that of the nodes on the
+        board; the force that each Maxwell branch has relaxed; the blade's deflection and its rate.
+        `ahead` holds the positions at which the elements are evaluated, padded to fours, which are
+        loaded faster than threes.
+        """
+
+        x: wp.array2d(dtype=vec3)
+        v: wp.array2d(dtype=vec3)
+        edge_depth: wp.array2d(dtype=real)
+        cohesive_damage: wp.array2d(dtype=real)
+        edge_force: wp.array2d(dtype=real)
+        edge_direction: wp.array2d(dtype=vec3)
+        slip: wp.array3d(dtype=vec3)
+        board_slip: wp.array2d(dtype=vec3)
+        overstress: wp.array3d(dtype=vec3)
+        blade: wp.array2d(dtype=real)
+        ahead: wp.array2d(dtype=vec4)
+
+    @wp.struct
+    class Forces:
+        """Forces in a sub-step: of the elements on their corners, also as the rows in which a node
+        finds its entries; on both faces at the cut points, also as one list; of the flanks along
+        Ky, by point and summed. With gradients, what each node got from elements, from the bulk
+        (elements after relaxation) and from points."""
+
+        elements: wp.array3d(dtype=Vectors)
+        rows: wp.array2d(dtype=strided)
+        points: wp.array3d(dtype=vec3)
+        listed: wp.array2d(dtype=vec3)
+        lateral: wp.array2d(dtype=real)
+        push: wp.array(dtype=real)
+        from_elements: wp.array2d(dtype=vec3)
+        from_bulk: wp.array2d(dtype=vec3)
+        from_points: wp.array2d(dtype=vec3)
+
+    @wp.struct
+    class Sums:
+        """What the sub-steps add up at points and nodes and of the blade; see `layouts`."""
+
+        total: wp.array4d(dtype=real)
+        immersed: wp.array3d(dtype=vec4)
+        blade: wp.array3d(dtype=real)
+        board_force: wp.array2d(dtype=vec3)
+        board_loss: wp.array2d(dtype=real)
+        internal_work: wp.array2d(dtype=real)
+
+    @wp.struct
+    class Results:
+        """See `layouts.results`."""
+
+        point_sums: wp.array3d(dtype=wp.float64)
+        node_sums: wp.array2d(dtype=wp.float64)
+        blade: wp.array3d(dtype=wp.float64)
+        wrenches: wp.array4d(dtype=wp.float64)
+        work: wp.array2d(dtype=wp.float64)
+
+    @wp.struct
+    class Energies:
+        """Elastic energy and volume ratio of the elements, recoverable energy of the points."""
+
+        elastic: wp.array3d(dtype=real)
+        volume_ratio: wp.array3d(dtype=real)
+        points: wp.array2d(dtype=real)
 
     @wp.func
     def slide(slip: vec3, step: vec3, stiffness: real, limit: real):
@@ -75,33 +226,27 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
     def padded(a: vec3):
         return vec4(a[0], a[1], a[2], real(0.0))
 
-    @wp.func
-    def place(s: real, reach: real, per_spacing: real, size: wp.int32):
-        """Interval of a table with `size` entries over [-reach, reach] and the fraction of its
-        end."""
-        u = (s + reach) * per_spacing
-        k = wp.clamp(wp.int32(wp.floor(u)), 0, size - 2)
-        return k, wp.clamp(u - real(k), real(0.0), real(1.0))
-
-    @wp.func
-    def table(values: wp.array2d(dtype=real), row: wp.int32, k: wp.int32, w: real):
-        return values[row, k] * (real(1.0) - w) + values[row, k + 1] * w
-
     return types.SimpleNamespace(
         real=real,
-        vec2=wp.types.vector(2, real),
+        vec2=vec2,
         vec3=vec3,
         vec4=vec4,
-        mat33=wp.types.matrix((3, 3), real),
-        lanes=wp.types.vector(LANES, real),
-        indices=wp.types.vector(LANES, wp.int32),
-        # From the x component of a nodal force in `elements` to its z component.
-        strided=wp.types.vector(2 * LANES + 1, real),
-        entries=wp.types.vector(GATHER, wp.int32),
+        mat33=mat33,
+        lanes=lanes,
+        indices=indices,
+        strided=strided,
+        entries=entries,
         TINY=tiny,
         slide=slide,
         padded=padded,
-        place=place,
-        table=table,
-        **{name.upper(): wp.constant(k) for k, name in enumerate(PARAMETERS)},
+        Vectors=Vectors,
+        Mesh=Mesh,
+        Points=Points,
+        Parameters=Parameters,
+        Motion=Motion,
+        State=State,
+        Forces=Forces,
+        Sums=Sums,
+        Results=Results,
+        Energies=Energies,
     )
