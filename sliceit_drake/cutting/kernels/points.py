@@ -90,7 +90,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         upside down in C."""
         return wp.where((R[1, 1] < real(0.0)) == (face == 0), real(1.0), real(-1.0))
 
-    @wp.func
+    @wp.func(inline=True)
     def flank_contact(
         cut: wp.int32,
         i: wp.int32,
@@ -174,7 +174,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
                 )
         return normal_force, friction_force, new_slip, lost, wp.where(between, area, real(0.0))
 
-    @wp.func
+    @wp.func(inline=True)
     def advance_point(
         cut: wp.int32,
         i: wp.int32,
