@@ -97,7 +97,7 @@ class CuttingModel(CutGeometry):
         element_volume: Stiff volume of the elements times their modulus over the material's [T].
         relaxing: Fractions of the modulus that relax [M].
         keep: What a sub-step leaves of each branch's force [M].
-        parameters: Scalars by name, see `kernel_types.PARAMETERS`.
+        parameters: Scalars by name, see `PARAMETERS`.
         critical_time_step: Stability limit with the true masses, including the margin, s. Slivers
             do not count: nodes with less than `SLIVER` of their vertex's mass get what they need.
     """

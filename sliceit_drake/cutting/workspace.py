@@ -1,7 +1,7 @@
 """Device arrays of one or many cuts of one mesh, and the launches that advance them."""
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -103,7 +103,7 @@ class Workspace:
         )
 
     def _rows(
-        self, kind: Any, shapes: dict[str, tuple[int, ...]], dtype: Any = None
+        self, kind: Any, shapes: Mapping[str, tuple[int, ...]], dtype: Any = None
     ) -> tuple[wp.array, Any, dict[str, slice]]:
         """Rows of numbers [C, size] that hold the named arrays of a struct side by side.
 

@@ -1,6 +1,7 @@
 """Names of the numbers that the kernels read and write in rows: one layout for them and readers."""
 
 import enum
+from typing import Any
 
 import numpy as np
 
@@ -68,16 +69,16 @@ def results(coupling_steps: int) -> np.dtype:
     )
 
 
-def places(name: str, layout: np.dtype) -> enum.IntEnum:
+def _places(name: str, layout: np.dtype) -> Any:
     """Places of the first number of each field."""
     assert layout.fields is not None
     return enum.IntEnum(name, {k.upper(): at[1] // 8 for k, at in layout.fields.items()})
 
 
-Section = places("Section", KNIFE)
-PointSum = places("PointSum", POINT_SUMS)
-NodeSum = places("NodeSum", NODE_SUMS)
-BladeSum = places("BladeSum", BLADE_SUMS)
+Section = _places("Section", KNIFE)
+PointSum = _places("PointSum", POINT_SUMS)
+NodeSum = _places("NodeSum", NODE_SUMS)
+BladeSum = _places("BladeSum", BLADE_SUMS)
 
 ACCUMULATED = int(PointSum.BURIED_MOMENT)
 """Numbers that each cut point keeps in `total`; those of `immersed` follow in the sums."""
