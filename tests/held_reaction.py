@@ -4,14 +4,14 @@ import numpy as np
 
 from sliceit_drake.cutting.kernels.types import LANES
 from sliceit_drake.cutting.motion import Pose
-from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.cutting.solver import CuttingSolver, SurfaceFactors
 from sliceit_drake.cutting.workspace import LAUNCH_LOCK
 
 
 def held_reaction(solver: CuttingSolver, state: np.ndarray, pose: Pose) -> np.ndarray:
     """Force of what holds the food on the food [3], N, in C, with the knife at `pose`."""
     m, ws, blocks = solver.model, solver._workspace, len(solver.model.blocks)
-    solver._place(state, pose)
+    solver._place(state, pose, SurfaceFactors())
     with LAUNCH_LOCK:
         ws.launch(ws.kernels.look_ahead, len(m.nodes), ws.look_ahead_arguments())
         ws.launch_elements(0)

@@ -129,10 +129,7 @@ class CuttingSolver:
         ws = self._workspace
         self._take_factors(factors)
         ws.write(ws.states[0], state[None])
-        motion = np.zeros(ws.motion_rows.shape)
-        for name, values in (("R_CK", pose.R.ravel()), ("p_CK", pose.p)):
-            motion[0, ws.motion_layout[name].start :][: len(values)] = values
-        ws.write(ws.motion_rows, motion)
+        ws.place_knife(pose.R, pose.p)
 
     def energies(
         self, state: np.ndarray, pose: Pose, factors: SurfaceFactors = UNCHANGED

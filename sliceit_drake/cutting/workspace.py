@@ -66,7 +66,7 @@ class Workspace:
         self._gradients = gradients
         self._graph: Any = None
         self._energy_graph: Any = None
-        self._views: dict[int, np.ndarray] = {}
+        self._views: dict[tuple, np.ndarray] = {}
         # What is allocated during a capture in another thread would be taken for part of it.
         with LAUNCH_LOCK:
             self._make_arrays()
@@ -298,10 +298,10 @@ class Workspace:
         """An array in host memory; on the CPU a view, made once."""
         if not self.device.is_cpu:
             return array.numpy()
-        view = self._views.get(array.ptr)
-        if view is None:
-            view = self._views[array.ptr] = array.numpy()
-        return view
+        key = (array.ptr, array.shape)
+        if key not in self._views:
+            self._views[key] = array.numpy()
+        return self._views[key]
 
     def launch(self, kernel: Any, dim: int, inputs: list[Any]) -> None:
         """Launches `kernel` over cuts and `dim` entries of each."""
@@ -448,6 +448,14 @@ class Workspace:
             wp.launch(kern.element_energy, dim=dim, inputs=elements, device=device)
             self.launch(kern.point_energy, len(self.model.point_nodes), points)
         return capture.graph
+
+    def place_knife(
+        self, R: Any, p: Any, v: Any = (0.0, 0.0, 0.0), w: Any = (0.0, 0.0, 0.0)
+    ) -> None:
+        """Gives all knives one pose in C, velocity of Ko and angular velocity."""
+        for name, value in zip(("R_CK", "p_CK", "v_CK", "w_CK"), (R, p, v, w), strict=True):
+            array = getattr(self.motion, name)
+            self.write(array, np.broadcast_to(value, (*array.shape, *np.shape(value))))
 
     def point_forces(self) -> np.ndarray:
         """Forces on both faces at the cut points of the first cut [P, 2, 3], N."""

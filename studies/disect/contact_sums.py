@@ -22,19 +22,12 @@ def contact_forces(solver: CuttingSolver, state: np.ndarray, start: Pose, end: P
     """
     T, ws = solver.exchange_period, solver._workspace
 
-    def forces(pose: Pose, v: np.ndarray, w: np.ndarray) -> np.ndarray:
-        motion = np.zeros(ws.motion.shape)
-        knife = {"R_CK": pose.R.ravel(), "p_CK": pose.p, "v_CK": v, "w_CK": w}
-        for name, values in knife.items():
-            motion[0, ws.motion_layout[name].start :][: len(values)] = values
-        ws.write(ws.motion, motion)
-        return ws.point_forces()
-
     ws.write(ws.states[0], state[None])
-    both = forces(end, (end.p - start.p) / T, small_turn(start.R, end.R) / T)
+    ws.place_knife(*end, (end.p - start.p) / T, small_turn(start.R, end.R) / T)
+    both = ws.point_forces()
     # What is left with the knife beyond the food are the bonds, in the same state.
-    away = end._replace(p=end.p + 10.0 * end.R[:, 0])
-    return forces(away, np.zeros(3), np.zeros(3)) - both
+    ws.place_knife(end.R, end.p + 10.0 * end.R[:, 0])
+    return ws.point_forces() - both
 
 
 def contact_sums(solver: CuttingSolver, motion: Motion) -> np.ndarray:
