@@ -11,7 +11,7 @@ from sliceit_drake.hardware.checks import Check
 from sliceit_drake.hardware.guarded_touch import GuardedTouch, Touch, TouchError
 from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.robot_run.hardware_run import HardwareRun, steady_python
-from sliceit_drake.robot_run.plan_check import JointPlan, check_plan, plan_joints
+from sliceit_drake.robot_run.plan_check import check_plan, plan_joints
 from sliceit_drake.systems.motion_sources import placed_motion
 
 __all__ = ["BoardTouch", "check_height"]
@@ -20,34 +20,28 @@ SAMPLE = 1e-3
 """Distance between the postures that the path is made of, m."""
 
 
-@dc.dataclass
 class BoardTouch:
     """A touch that finds the board straight under the start of a scenario.
 
+    Args:
+        hardware: Whose robot, start and limits are used.
+
     Attributes:
-        hardware: Whose robot, start and limits are used; the height of its scenario's board is the
-            one that is expected.
+        expected: Height of the board that is expected, that of the scenario's, m.
         depth: Farthest way down, m.
         plan: The way down to there in joint space.
         link: Link to the robot, once it ran.
     """
 
-    hardware: HardwareRun
-    depth: float = dc.field(init=False)
-    plan: JointPlan = dc.field(init=False)
-    link: RobotLink | None = dc.field(init=False, default=None)
-
-    def __post_init__(self) -> None:
-        twin, touch = self.hardware.twin, self.hardware.config.touch
+    def __init__(self, hardware: HardwareRun) -> None:
+        self.hardware = hardware
+        self.link: RobotLink | None = None
+        self.expected = hardware.scenario.board.height
+        twin, touch = hardware.twin, hardware.config.touch
         start = twin.start_pose
         self.depth = float(start.translation()[2]) - self.expected + touch.below
         way = MotionPlan([ConstantSpeed(distance=self.depth, speed=touch.speed)])
         self.plan = plan_joints(twin, placed_motion(way, start), SAMPLE / touch.speed)
-
-    @property
-    def expected(self) -> float:
-        """Height of the board that is expected, m."""
-        return self.hardware.scenario.board.height
 
     def checks(self) -> list[Check]:
         """The checks of the way down; under the board it goes on purpose."""

@@ -1,13 +1,12 @@
 """Moves the joints straight to the start of a run, watched, and never faster than the limits."""
 
-import dataclasses as dc
 import time as clock
 
 import numpy as np
 
 from sliceit_drake.diagrams.hardware_station import make_edge_kinematics
 from sliceit_drake.hardware.checks import Check
-from sliceit_drake.hardware.client import RobotState, RobotUnavailableError
+from sliceit_drake.hardware.client import RobotUnavailableError
 from sliceit_drake.hardware.interruption import raise_if_interrupted
 from sliceit_drake.hardware.safety import robot_fault
 from sliceit_drake.robot_run.hardware_run import HardwareRun
@@ -30,15 +29,16 @@ ARRIVED = 1e-3
 """Distance of each joint from the start, rad: less than a short motion begins with."""
 
 
-@dc.dataclass
 class MoveToStart:
     """The way from where the arm is to the start of a run: a line in joint space.
 
     Nothing looks for obstacles, but for the board: the edge may not go below it, nor lower than it
     is at the beginning, if that is below it already.
 
-    Attributes:
+    Args:
         hardware: Whose robot, start and limits are used.
+
+    Attributes:
         begin: Where the arm is.
         speed: Speed of the fastest joint, rad/s.
         knife_speed: Speed of the faster end of the edge then, m/s.
@@ -46,22 +46,16 @@ class MoveToStart:
         floor: Least height that is allowed, m.
     """
 
-    hardware: HardwareRun
-    begin: RobotState = dc.field(init=False)
-    speed: float = dc.field(init=False)
-    knife_speed: float = dc.field(init=False)
-    lowest: float = dc.field(init=False)
-    floor: float = dc.field(init=False)
-
-    def __post_init__(self) -> None:
-        self.begin = self.hardware.client.read()
-        limits = self.hardware.config.limits
-        kinematics = make_edge_kinematics(self.hardware.twin)
-        q, turn = np.array(self.begin.q), self._turn
+    def __init__(self, hardware: HardwareRun) -> None:
+        self.hardware, self.begin = hardware, hardware.client.read()
+        limits = hardware.config.limits
+        kinematics = make_edge_kinematics(hardware.twin)
+        q = np.array(self.begin.q)
+        turn = self._turn = hardware.twin.start_joints - q
         shares = np.linspace(0.0, 1.0, SAMPLES)
         ends = np.array([kinematics.edge((q + s * turn).tolist())[:2] for s in shares])
         self.lowest = float(ends[:, :, 2].min())
-        board = self.hardware.scenario.board.height
+        board = hardware.scenario.board.height
         self.floor = min(board - limits.board_depth, float(ends[0, :, 2].min()) - 1e-4)
         # Way of the knife's faster end for each radian of the fastest joint.
         way = np.linalg.norm(np.diff(ends, axis=0), axis=2).max() * (SAMPLES - 1)
@@ -71,10 +65,6 @@ class MoveToStart:
         if ratio > 0.0:
             self.speed = min(self.speed, limits.knife_speed / ratio)
         self.knife_speed = ratio * self.speed
-
-    @property
-    def _turn(self) -> np.ndarray:
-        return np.array(self.hardware.twin.start_joints) - self.begin.q
 
     def checks(self) -> list[Check]:
         """What must be true of the way."""

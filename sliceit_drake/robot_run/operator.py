@@ -58,12 +58,12 @@ def plan_text(hardware: HardwareRun, duration: float) -> str:
     policy = scenario.policy
     if policy is not None:
         phases = f"{policy.describe()}; up to there"
+    low, high = plan.edge_low[2] - board, plan.edge_high[2] - board
     lines = [
         "",
         f"PLAN: {scenario.name}, {duration:.2f} s: {phases}",
         f"  knife up to {1e3 * plan.fastest:.0f} mm/s; edge between "
-        f"{1e3 * (plan.lowest - board):+.2f} and {1e3 * (plan.edge_high[2] - board):+.1f} mm over "
-        f"the board at {board:.4f} m",
+        f"{1e3 * low:+.2f} and {1e3 * high:+.1f} mm over the board at {board:.4f} m",
         f"  stops at {limits.force:g} N, {limits.torque:g} Nm, {limits.knife_speed:g} m/s of the "
         f"knife, {1e3 * limits.board_depth:g} mm below the board, {limits.tracking_error:g} rad "
         "off the target",

@@ -32,7 +32,6 @@ class JointPlan:
         q: Joint positions [n, 6], rad.
         miss: Greatest distance of the knife from its target, m.
         singular_value: Least singular value of the knife's Jacobian on the way (rad, m).
-        lowest: Least height of an end of the edge, m.
         fastest: Greatest speed of an end of the edge, m/s.
         tilt: Greatest tilt of the blade, rad.
         edge_low, edge_high: Box that the ends of the edge stay in [3], m.
@@ -42,7 +41,6 @@ class JointPlan:
     q: np.ndarray
     miss: float
     singular_value: float
-    lowest: float
     fastest: float
     tilt: float
     edge_low: np.ndarray
@@ -93,7 +91,6 @@ def plan_joints(
         q=np.array(path),
         miss=miss,
         singular_value=least,
-        lowest=float(edges[:, :, 2].min()),
         fastest=float(speed.max()),
         tilt=tilt,
         edge_low=edges.min(axis=(0, 1)),
@@ -164,8 +161,8 @@ def check_plan(
         ),
         Check(
             "depth at the board",
-            plan.lowest >= board - limits.board_depth,
-            f"edge down to {1e3 * (plan.lowest - board):+.2f} mm over the board, allowed "
+            bool(plan.edge_low[2] >= board - limits.board_depth),
+            f"edge down to {1e3 * (plan.edge_low[2] - board):+.2f} mm over the board, allowed "
             f"{-1e3 * limits.board_depth:+.2f}",
             change,
         ),

@@ -38,14 +38,14 @@ def load_network(config: AgentConfig) -> Decide:
     """
     import onnxruntime
 
-    field = "scenario.policy.network"
+    def refusal(
+        problem: str, fix: str = "Give the policy.onnx of a training."
+    ) -> ConfigurationError:
+        return ConfigurationError(problem, field="scenario.policy.network", fix=fix)
+
     file = file_or_resource(config.network)
     if file is None:
-        raise ConfigurationError(
-            f"there is no file {config.network!r}, neither here nor in the package",
-            field=field,
-            fix="Give the policy.onnx of a training.",
-        )
+        raise refusal(f"there is no file {config.network!r}, neither here nor in the package")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     try:
@@ -53,17 +53,12 @@ def load_network(config: AgentConfig) -> Decide:
             str(file), options, providers=["CPUExecutionProvider"]
         )
     except Exception as error:  # ONNX Runtime's errors have no common class.
-        raise ConfigurationError(
-            f"{file} is no network that can be run ({error})",
-            field=field,
-            fix="Give the policy.onnx of a training.",
-        ) from error
+        raise refusal(f"{file} is no network that can be run ({error})") from error
     found = session.get_modelmeta().custom_metadata_map.get(LAYOUT)
     if found != layout_of(config):
-        raise ConfigurationError(
+        raise refusal(
             f"{file} {_difference(found, layout_of(config))}",
-            field=field,
-            fix="Give the agent the values of the training's training.yaml.",
+            "Give the agent the values of the training's training.yaml.",
         )
     name = session.get_inputs()[0].name
 
@@ -74,11 +69,7 @@ def load_network(config: AgentConfig) -> Decide:
     try:
         decide(np.zeros(config.observation_size()))
     except Exception as error:
-        raise ConfigurationError(
-            f"{file} is a network, but none that decides ({error})",
-            field=field,
-            fix="Give the policy.onnx of a training.",
-        ) from error
+        raise refusal(f"{file} is a network, but none that decides ({error})") from error
     return decide
 
 
