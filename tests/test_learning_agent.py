@@ -2,7 +2,9 @@
 
 import dataclasses as dc
 import io
+import itertools
 import json
+import math
 import multiprocessing
 
 import numpy as np
@@ -372,6 +374,12 @@ def one_process(monkeypatch):
     monkeypatch.setattr(training, "SubprocVecEnv", lambda makers, _: DummyVecEnv(makers))
 
 
+def after(decisions):
+    """What says to a training that it shall stop after so many decisions."""
+    count = itertools.count()
+    return lambda: next(count) >= decisions
+
+
 def lines(folder):
     return [json.loads(line) for line in (folder / training.EPISODES).read_text().splitlines()]
 
@@ -385,12 +393,11 @@ def test_a_training_that_was_stopped_goes_on_as_if_it_had_not(
     config = training_of(checkpoint_interval=25, environments=environments)
     straight = train(config, tmp_path / "straight")
     assert straight.best_return is not None
-    asked: list[None] = []
     # In the midst of a slice.
-    stopped = lambda: asked.append(None) or len(asked) > 7  # noqa: E731
-    first = train(config, tmp_path / "halves", is_stopped=stopped)
+    first = train(config, tmp_path / "halves", is_stopped=after(7))
     assert first.episodes == 0 and first.steps == 7 * environments
-    half = train(config, tmp_path / "halves", stop_after=50)
+    left = math.ceil((50 - first.steps) / environments)
+    half = train(config, tmp_path / "halves", is_stopped=after(left))
     assert 50 <= half.steps < 50 + environments
     assert not (tmp_path / "halves" / training.POLICY).exists()
     # What was logged after the checkpoint is dropped.
@@ -413,13 +420,13 @@ def test_another_seed_gives_another_policy(tmp_path, one_process):
 
 
 def test_a_stop_at_the_last_step_is_the_end(tmp_path, one_process):
-    outcome = train(training_of(steps=30, warm_up=20), tmp_path, stop_after=30)
+    outcome = train(training_of(steps=30, warm_up=20), tmp_path, is_stopped=after(30))
     assert outcome.steps == 30
     assert (tmp_path / training.POLICY).exists()
 
 
 def test_a_checkpoint_of_another_training_is_refused(tmp_path, one_process):
-    train(training_of(steps=60), tmp_path, stop_after=15)
+    train(training_of(steps=60), tmp_path, is_stopped=after(15))
     before = (tmp_path / training.CONFIGURATION).read_text()
     with pytest.raises(ConfigurationError, match="other settings") as caught:
         train(training_of(steps=60, learning_rate=2e-3), tmp_path)

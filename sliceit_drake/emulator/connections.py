@@ -35,15 +35,13 @@ class Connection:
 
     def send(self, data: bytes) -> None:
         """Sends all of `data`, now or when the client reads again."""
-        if not self.is_open:
-            return
-        self._unsent += data
-        if not self._hub.is_silent:
+        if self.is_open:
+            self._unsent += data
             self.flush()
 
     def flush(self) -> None:
         """Sends what the network takes now."""
-        while self._unsent and self.is_open:
+        while self._unsent and self.is_open and not self._hub.is_silent:
             try:
                 sent = self._socket.send(self._unsent)
             except BlockingIOError:
@@ -104,24 +102,13 @@ class SocketHub:
         selector: What waits for all sockets; the data of a key is its `Connection`, if it is none
             of the ports.
         refuses: While set, new clients are turned away.
+        is_silent: While set, nothing is read, sent or accepted: a network that is cut.
     """
 
     def __init__(self, address: str) -> None:
-        self.refuses = self._is_silent = False
+        self.refuses = self.is_silent = False
         self._address = address
         self.selector = selectors.DefaultSelector()
-
-    @property
-    def is_silent(self) -> bool:
-        """While set, nothing is read, sent or accepted: a network that is cut."""
-        return self._is_silent
-
-    @is_silent.setter
-    def is_silent(self, value: bool) -> None:
-        self._is_silent = value
-        if not value:
-            for connection in self.connections():
-                connection.flush()
 
     def listen(self, port: int, service: Service) -> None:
         """Opens a port.

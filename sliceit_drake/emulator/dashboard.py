@@ -32,6 +32,8 @@ class Dashboard(Service):
             "isprogramsaved": lambda: f"true {_PROGRAM}",
             "close safety popup": lambda: "closing safety popup",
             "close popup": lambda: "closing popup",
+            "quit": lambda: "Disconnected",
+            "shutdown": lambda: "Shutting down",
         }
         # Only in remote control.
         self._commands: dict[str, Callable[[], str]] = {
@@ -67,10 +69,6 @@ class Dashboard(Service):
             if not self._controller.is_remote:
                 return f"Command '{line}' is not allowed in local control mode"
             return self._commands[command]()
-        if command == "quit":
-            return "Disconnected"
-        if command == "shutdown":
-            return "Shutting down"
         if command.startswith("popup"):
             return "showing popup"
         if command.startswith("addtolog"):

@@ -8,7 +8,7 @@ import time
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError, load_yaml
-from sliceit_drake.emulator.connections import Service, SocketHub
+from sliceit_drake.emulator.connections import SocketHub
 from sliceit_drake.emulator.control_script import SERVO_COMMAND
 from sliceit_drake.emulator.controller import Controller, ControllerConfig
 from sliceit_drake.emulator.dashboard import Dashboard
@@ -101,11 +101,7 @@ class Emulator:
         self._hub, self._own_hub = SocketHub(address), SocketHub(address)
         self.rtde = RtdeServer(controller)
         dashboard, script = Dashboard(controller), ScriptServer(controller)
-        services: dict[str, Service] = {
-            "rtde": self.rtde,
-            "dashboard": dashboard,
-            "script": script,
-        }
+        services = {"rtde": self.rtde, "dashboard": dashboard, "script": script}
         self.faults = FaultInjector(controller, self._hub, self.rtde, services)
         pendant = Pendant(self.faults, self.status, self.stop, self.put_fresh_food)
         try:

@@ -3,7 +3,7 @@
 import heapq
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -31,7 +31,7 @@ class FaultInjector:
         controller: Controller,
         hub: SocketHub,
         rtde: RtdeServer,
-        services: dict[str, Service],
+        services: Mapping[str, Service],
     ) -> None:
         """Prepares.
 

@@ -43,18 +43,17 @@ class Pendant(Service):
             if "inject" in request:
                 at = request.get("at")
                 self._faults.inject(str(request["inject"]), None if at is None else float(at))
-                return {"ok": True}
-            if "status" in request:
+            elif "status" in request:
                 return {"ok": True, **self._status()}
-            if "stop" in request:
+            elif "stop" in request:
                 self._stop()
-                return {"ok": True}
-            if "fresh_food" in request:
+            elif "fresh_food" in request:
                 food = request["fresh_food"]
                 if food is not True and not isinstance(food, str):
                     raise ValueError("fresh_food is true or a scenario as text")
                 self._put_fresh_food(None if food is True else food)
-                return {"ok": True}
-            raise ValueError("a request has one of inject, status, fresh_food, stop")
+            else:
+                raise ValueError("a request has one of inject, status, fresh_food, stop")
+            return {"ok": True}
         except (ValueError, TypeError, ConfigurationError) as error:
             return {"ok": False, "error": str(error)}

@@ -107,7 +107,6 @@ class StationRobot:
         station.SetStart(simulator.get_mutable_context())
         simulator.Initialize()
         self._use(station, simulator)
-        self._servo = scenario.robot.servo
         tool = station.plant.CalcSpatialInertia(
             self._plant_context,
             station.robot.sensor_weld.frame_on_parent(),
@@ -119,12 +118,8 @@ class StationRobot:
         self.is_zeroed = scenario.sensor.tare_at_start
         self._cycles = 0
         self._other_servo: ServoConfig | None = None
-        self.gravity = (
-            scenario.robot.X_WB()
-            .rotation()
-            .inverse()
-            .multiply(station.plant.gravity_field().gravity_vector())
-        )
+        R_BW = scenario.robot.X_WB().rotation().inverse()
+        self.gravity = R_BW.multiply(station.plant.gravity_field().gravity_vector())
         self.warnings: list[str] = []
         self.state = self._read()
 
@@ -244,7 +239,7 @@ class StationRobot:
         """Says once that the station's servo is not what a client asks for."""
         if servo is None or servo == self._other_servo:
             return
-        ours = self._servo
+        ours = self._scenario.robot.servo
         if (servo.lookahead_time, servo.gain) != (ours.lookahead_time, ours.gain):
             self._other_servo = servo
             self.warnings.append(

@@ -70,8 +70,7 @@ def train(
     config: TrainingConfig,
     output: Path,
     progress: Callable[[int, str], None] | None = None,
-    stop_after: int | None = None,
-    is_stopped: Callable[[], bool] | None = None,
+    is_stopped: Callable[[], bool] = lambda: False,
 ) -> Outcome:
     """Trains, or goes on where the checkpoint in `output` is.
 
@@ -81,7 +80,6 @@ def train(
         config: Training; of a run that goes on, that which it was begun with.
         output: Folder for checkpoint, training.yaml, episodes.jsonl, TensorBoard and policy.onnx.
         progress: Called with the steps so far and a line about the last episodes.
-        stop_after: Ends at the first checkpoint after so many steps; None to go on to the end.
         is_stopped: Asked at each decision whether to end with a checkpoint there.
 
     Raises:
@@ -103,7 +101,7 @@ def train(
         model = make_model(config, environments)
         model.set_logger(configure(str(output), ["tensorboard"]))
         environments.meanwhile = model.update
-        callback = _Watch(config, output, described, progress, stop_after, is_stopped)
+        callback = _Watch(config, output, described, progress, is_stopped)
         if saved is not None:
             model.set_training_state(saved["model"])
             if config.task.reward.schedule != "constant":
@@ -225,12 +223,11 @@ class _Watch(BaseCallback):
         output: Path,
         described: str,
         progress: Callable[[int, str], None] | None,
-        stop_after: int | None,
-        is_stopped: Callable[[], bool] | None,
+        is_stopped: Callable[[], bool],
     ) -> None:
         super().__init__()
         self._config, self._output, self._described = config, output, described
-        self._progress, self._stop_after, self._is_stopped = progress, stop_after, is_stopped
+        self._progress, self._is_stopped = progress, is_stopped
         self.episodes, self.was_stopped = 0, False
         self._saved_at = 0
         self._ends: Counter[str] = Counter()
@@ -283,13 +280,13 @@ class _Watch(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         # Only here the last transitions are in the buffer.
-        is_enough = (self._stop_after is not None and self.num_timesteps >= self._stop_after) or (
-            self._is_stopped is not None and self._is_stopped()
-        )
-        if is_enough or self.num_timesteps - self._saved_at >= self._config.checkpoint_interval:
+        self.was_stopped = self._is_stopped()
+        if (
+            self.was_stopped
+            or self.num_timesteps - self._saved_at >= self._config.checkpoint_interval
+        ):
             self._save()
-        if is_enough:
-            self.was_stopped = True
+        if self.was_stopped:
             raise _Stopped
 
     def _save(self) -> None:

@@ -50,9 +50,7 @@ def load_training(file: str | Path | None, overrides: str | None = None) -> Trai
     Raises:
         ConfigurationError: Naming file, field and fix.
     """
-    config = load_yaml(TrainingConfig, file, overrides_text=overrides)
-    assert isinstance(config, TrainingConfig)
-    return config
+    return load_yaml(TrainingConfig, file, overrides_text=overrides)
 
 
 def load_policy_folder(folder: Path) -> TrainingConfig:

@@ -22,10 +22,7 @@ from sliceit_drake.systems.exported_network import load_network
 
 __all__ = ["WORLDS", "Case", "cases_of", "cut", "evaluate", "results_table", "trace"]
 
-WORLDS: dict[str, Callable[[int], SlicingWorld]] = {
-    "stand_in": StandInWorld,
-    "curves": CurvesWorld,
-}
+WORLDS: dict[str, type[SlicingWorld]] = {world.name: world for world in (StandInWorld, CurvesWorld)}
 SLICES = 25
 """Slices that a process cuts: pydrake frees no station that it has built
 (studies/robot/endurance.py)."""

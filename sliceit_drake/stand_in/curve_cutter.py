@@ -84,9 +84,7 @@ class CurveFood:
         return CurveCutter(self, setup.X_WF(), setup.exchange_period)
 
 
-@functools.lru_cache(maxsize=64)
-def _section(width: float, height: float) -> EllipticSection:
-    return EllipticSection(width, height)
+_section = functools.lru_cache(maxsize=64)(EllipticSection)
 
 
 class CurveCutter(KnifeForceSystem):

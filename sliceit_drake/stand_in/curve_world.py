@@ -14,12 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sliceit_drake.cutting.motion import Pose
-from sliceit_drake.stand_in.curve_laws import (
-    CutState,
-    EllipticSection,
-    food_forces,
-    measured_curve,
-)
+from sliceit_drake.stand_in.curve_laws import CutState, EllipticSection, food_forces, measured_curve
 from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceTruth, Tissue
 from sliceit_drake.stand_in.protocol import Protocol, Specimen, section_size
 from sliceit_drake.stand_in.world import Path, Run, resampled

@@ -5,12 +5,7 @@ from pathlib import Path
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.resources import load_module
-from sliceit_drake.stand_in import (
-    knife_effects,
-    mounting_effects,
-    sensor_effects,
-    tissue_effects,
-)
+from sliceit_drake.stand_in import knife_effects, mounting_effects, sensor_effects, tissue_effects
 from sliceit_drake.stand_in.effect import Effect
 
 __all__ = ["EFFECTS", "effects_as_markdown", "make_effect"]

@@ -203,9 +203,7 @@ def load_protocol(file: str) -> Protocol:
     Raises:
         ConfigurationError: Naming file, field and fix.
     """
-    protocol = load_yaml(Protocol, file)
-    validate(protocol, "protocol")
-    return protocol
+    return load_yaml(Protocol, file)
 
 
 def protocol_of_scenario(scenario: Scenario, replicates: int = 1) -> Protocol:
