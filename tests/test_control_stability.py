@@ -15,8 +15,7 @@ from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagrams.agent_gains import ERROR_FACTOR, AgentGains
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
-from sliceit_drake.diagrams.stability.contact_loop import ContactLoop
-from sliceit_drake.diagrams.stability.contact_margin import check_contact_margin
+from sliceit_drake.diagrams.stability import ContactLoop, check_contact_margin
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
@@ -123,7 +122,7 @@ def test_that_blade_would_shake_and_the_run_ends_by_name(monkeypatch):
     scenario.motion = MotionPlan(
         [ConstantSpeed(distance=0.0345, speed=0.1, acceleration=2.0), Hold(duration=0.2)]
     )
-    monkeypatch.setattr("sliceit_drake.diagrams.stability.contact_margin.MIN_MARGIN", 0.0)
+    monkeypatch.setattr("sliceit_drake.diagrams.stability.MIN_MARGIN", 0.0)
     run = prepare_run(scenario)
     assert run.contact_margin.food < 1.0
     run.advance()

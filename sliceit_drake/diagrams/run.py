@@ -32,7 +32,7 @@ from sliceit_drake.diagrams.outputs.snapshot import Snapshot, take_snapshot
 from sliceit_drake.diagrams.prepared_food import OwnCutting
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.scenario_diagram import OwnPolicy, ScenarioDiagram
-from sliceit_drake.diagrams.stability.contact_margin import ContactMargin, check_contact_margin
+from sliceit_drake.diagrams.stability import ContactMargin, check_contact_margin
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.diagrams.station_interface import OwnController, Station
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile

@@ -18,7 +18,7 @@ from sliceit_drake.diagrams.run import Run, measured_profile
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.scenario_diagram import ScenarioDiagram
 from sliceit_drake.diagrams.simulated_station import FRAMES_PER_SECOND, SimulatedStation
-from sliceit_drake.diagrams.stability.contact_margin import check_contact_margin
+from sliceit_drake.diagrams.stability import check_contact_margin
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.hardware.checks import (
     Check,

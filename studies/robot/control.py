@@ -24,8 +24,7 @@ from sliceit_drake.cutting.board import Board
 from sliceit_drake.diagrams.agent_gains import AgentGains
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.simulated_station import SimulatedStation
-from sliceit_drake.diagrams.stability.contact_loop import ContactLoop
-from sliceit_drake.diagrams.stability.contact_margin import board_stiffness
+from sliceit_drake.diagrams.stability import ContactLoop, board_stiffness
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sliceit_drake.diagrams.stability.contact_loop import ContactLoop
+from sliceit_drake.diagrams.stability import ContactLoop
 
 __all__ = ["directional_stiffness", "stiffness_limit"]
 

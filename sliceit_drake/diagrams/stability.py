@@ -1,7 +1,8 @@
-"""The linear loop of a station in contact: arm, servo, sensor, compliance control and a contact.
+"""Stability of a station in contact: the linear loop, and how much stiffer the contact could be.
 
 At rest everything in a station is discrete and, for small motions, linear. `ContactLoop` writes
-down one cycle of it in the order in which the station's events run, with the same periods:
+down one cycle of arm, servo, sensor, compliance control and a contact, in the order in which the
+station's events run, with the same periods:
 
 - coupling step: the food takes the knife's pose x = J q and holds its force ``f = -G x`` on the
   knife;
@@ -18,6 +19,10 @@ down one cycle of it in the order in which the station's events run, with the sa
 The loop is stable if the matrix of a cycle has no eigenvalue outside the unit circle.
 
 Poses and wrenches are translations first, rotations in the axes of W, at Ko.
+
+At a start-up the prepared food is pressed, on the side, by the blade; small motions in six
+directions then give its response, coupling step by coupling step, with the blade's bending in it.
+Put into the loop, that response times a factor leaves it stable up to the margin.
 """
 
 import dataclasses as dc
@@ -29,16 +34,28 @@ from pydrake.math import VectorToSkewSymmetric
 from pydrake.multibody.tree import JacobianWrtVariable
 from scipy.linalg import block_diag, expm
 
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.board import Board, edge_contact_positions
+from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.simulated_station import SimulatedStation
 from sliceit_drake.systems.servo import JOINTS
 from sliceit_drake.systems.ur5e_kinematics import make_virtual_model, ur5e_chain
 
-__all__ = ["ContactLoop", "Mode"]
+__all__ = [
+    "MIN_MARGIN",
+    "ContactLoop",
+    "ContactMargin",
+    "Mode",
+    "board_stiffness",
+    "check_contact_margin",
+]
 
 # Eigenvalues of free drift are 1 up to rounding; a growth of 1e-6 a cycle takes 2,000 s for e.
 NEUTRAL = 1e-6
 GREATEST_MARGIN = 20.0
+MIN_MARGIN = 2.0
+DIRECTIONS = ("x", "y", "z", "rotation x", "rotation y", "rotation z")
 
 # The state: q, v, q_d, v_d, integral, command, virtual velocity, error, reading, food's wrench;
 # then past poses, targets and readings on their way.
@@ -296,6 +313,61 @@ class ContactLoop:
             v = config.damping_factor * (v + dt * self._virtual_acceleration @ u)
             pose, last_error = q, error
         return q, v, last_error
+
+
+@dc.dataclass(frozen=True)
+class ContactMargin:
+    """Margins of a station at rest in contact.
+
+    Attributes:
+        food: Factor on the food's response at which the loop becomes unstable; None where the
+            response is not known. At most `GREATEST_MARGIN`.
+        board: The same for the board's stiffness.
+        stiffness: The food's stiffness along and about the axes of K [6], N/m and Nm/rad, the
+            greatest of all depths; empty where it is not known.
+    """
+
+    food: float | None
+    board: float
+    stiffness: tuple[float, ...]
+
+
+def check_contact_margin(station: SimulatedStation) -> ContactMargin:
+    """Margins of a station at its start; one that is too close to instability is refused.
+
+    Raises:
+        ConfigurationError: The margin of the food is below `MIN_MARGIN`.
+    """
+    loop, scenario = ContactLoop(station), station.scenario
+    R_WK = station.start_pose.rotation().matrix()
+    board = loop.margin(board=board_stiffness(scenario.board, scenario.knife, R_WK))
+    responses = station.cutting.contact_responses(scenario.start.offset)
+    if not responses:
+        return ContactMargin(None, board, ())
+    turn = np.kron(np.eye(2), R_WK)
+    food = min(loop.margin(turn @ response @ turn.T) for response in responses)
+    stiffness = np.max([np.diag(response[-1]) for response in responses], axis=0)
+    if food < MIN_MARGIN:
+        names = ", ".join(
+            f"{name} {value:.3g}" for name, value in zip(DIRECTIONS, stiffness, strict=True)
+        )
+        raise ConfigurationError(
+            f"knife and food would shake each other: the loop is stable up to {food:.2g} "
+            f"times the food's stiffness ({names} N/m and Nm/rad in the knife's axes), at least "
+            f"{MIN_MARGIN:g} is asked",
+            field="scenario.exchange_period, scenario.controller and scenario.knife",
+            fix="Shorten exchange_period, lower controller.error_scale or controller.p_gains, or "
+            "lower knife.lateral_stiffness (the blade's bending).",
+        )
+    return ContactMargin(food, board, tuple(float(k) for k in stiffness))
+
+
+def board_stiffness(board: Board, knife: Knife, R_WK: np.ndarray) -> np.ndarray:
+    """Stiffness [6, 6] of the board under the whole edge, about Ko in W, translations first."""
+    x = edge_contact_positions(knife)
+    up = np.array([0.0, 0.0, 1.0])
+    rows = np.column_stack([np.tile(up, (len(x), 1)), np.cross(np.outer(x, R_WK[:, 0]), up)])
+    return board.stiffness / len(x) * rows.T @ rows
 
 
 def _swap(matrix: np.ndarray) -> np.ndarray:
