@@ -48,23 +48,14 @@ def add_scenario_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def scenario_of(options: argparse.Namespace) -> "Scenario":
-    """Loads the scenario that the options name.
-
-    Raises:
-        ConfigurationError: It is missing or invalid.
-    """
+    """Loads the scenario that the options name; refused where it is missing or invalid."""
     from sliceit_drake.diagrams.scenario import load_scenario
 
     return load_scenario(options.scenario, options.set)
 
 
 def add_protocol_argument(parser: argparse.ArgumentParser, kind: str = "a protocol") -> None:
-    """Adds PROTOCOL.
-
-    Args:
-        parser: Parser of the command.
-        kind: What it may be, for the help.
-    """
+    """Adds PROTOCOL; `kind` is what it may be, for the help."""
     parser.add_argument(
         "protocol",
         nargs="?",
@@ -75,11 +66,7 @@ def add_protocol_argument(parser: argparse.ArgumentParser, kind: str = "a protoc
 
 
 def protocol_file(options: argparse.Namespace) -> Path:
-    """The file that PROTOCOL names.
-
-    Raises:
-        ConfigurationError: There is none.
-    """
+    """The file that PROTOCOL names; refused where there is none."""
     return find_file(options.protocol, "protocol", PROTOCOL)
 
 

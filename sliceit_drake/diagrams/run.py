@@ -15,6 +15,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml, validate
+from sliceit_drake.cutting.discretization import DiscretizationError
 from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError
 from sliceit_drake.cutting.motion import Motion, MotionPlan
@@ -96,17 +97,20 @@ class Run:
         gc.collect()
         gc.freeze()
         begin = clock.perf_counter()
+        context, station = self.simulator.get_context(), self.station
+        own = station.GetMyContextFromRoot(context)
+        cut_progress = station.GetOutputPort("cut_progress")
         try:
-            while (now := self.simulator.get_context().get_time()) < end - 1e-9:
+            while (now := context.get_time()) < end - 1e-9:
                 if self.controls is not None and not self.controls.apply(self.simulator):
                     self.stopped = "stopped in the viewer"
                     break
                 status = self.simulator.AdvanceTo(min(now + CHUNK, end))
-                if self.snapshot is None and _cut_progress(self) > SNAPSHOT_PROGRESS:
-                    self.snapshot = take_snapshot(self.station, self.simulator.get_context())
+                if self.snapshot is None and cut_progress.Eval(own)[0] > SNAPSHOT_PROGRESS:
+                    self.snapshot = take_snapshot(station, context)
                 self.wall_time = clock.perf_counter() - begin
                 if progress is not None:
-                    progress(self.simulator.get_context().get_time(), self.wall_time)
+                    progress(context.get_time(), self.wall_time)
                 if status.reason() == SimulatorStatus.ReturnReason.kReachedTerminationCondition:
                     self.stopped = status.message()
                     break
@@ -271,11 +275,6 @@ def _figure(run: Run, record: Record, comparison: Comparison | None) -> "Figure"
     return plot_force(record, title, run.station.food_top(), comparison, caption, run.snapshot)
 
 
-def _cut_progress(run: Run) -> float:
-    context = run.station.GetMyContextFromRoot(run.simulator.get_context())
-    return float(run.station.GetOutputPort("cut_progress").Eval(context)[0])
-
-
 def measured_profile(scenario: Scenario) -> ForceProfile | None:
     """The measured force that a scenario names, or None.
 
@@ -395,7 +394,7 @@ def _summary(run: Run, record: Record, comparison: Comparison | None) -> dict:
     if areas := _slice_areas(run):
         summary["slices"] = [dc.asdict(report) for report in slice_reports(record, areas)]
     if station.estimate_error is not None:
-        summary["discretization_error"] = _discretization_error(run)
+        summary["discretization_error"] = _discretization_error(run, station.estimate_error)
     measurement = scenario.measurement
     if comparison is not None and measurement is not None:
         summary["measurement"] = {
@@ -422,14 +421,15 @@ def _slice_areas(run: Run) -> list[float]:
     return run.station.cutting.section_areas() if run.scenario.sequence is not None else []
 
 
-def _discretization_error(run: Run) -> dict | None:
-    """What `PreparedFood.estimate_error` says; None where the run ended early or a policy led."""
+def _discretization_error(
+    run: Run, estimate: Callable[[], DiscretizationError | None]
+) -> dict | None:
+    """What the estimate says; None where the run ended early or a policy led."""
     # Of a policy the prescribed motion is not known.
-    unknown = run.stopped is not None or run.diagram.policy is not None
-    if unknown or run.station.estimate_error is None:
+    if run.stopped is not None or run.diagram.policy is not None:
         return None
     try:
-        error = run.station.estimate_error()
+        error = estimate()
         return None if error is None else dc.asdict(error)
     except (CuttingError, MeshError) as problem:
         return {"relative_rms": None, "problem": str(problem)}

@@ -4,7 +4,6 @@ import dataclasses as dc
 from collections.abc import Callable
 from typing import TypeAlias
 
-from pydrake.geometry import Meshcat
 from pydrake.systems.framework import (
     Context,
     Diagram,
@@ -42,7 +41,6 @@ class ScenarioDiagram(Diagram):
 
     Args:
         scenario: What to simulate.
-        meshcat: Viewer to draw in, or None.
         station: What to drive; None for a simulated station of the scenario.
         policy: Drives the station in place of the scenario's motion or policy: a system with an
             output port `target_pose`, what makes such a system for a station, or an object that
@@ -60,15 +58,12 @@ class ScenarioDiagram(Diagram):
     def __init__(
         self,
         scenario: Scenario,
-        meshcat: Meshcat | None = None,
         station: Station | None = None,
         policy: OwnPolicy | None = None,
     ) -> None:
         super().__init__()
         builder = DiagramBuilder()
-        self.station: Station = builder.AddNamedSystem(
-            "station", station or MakeStation(scenario, meshcat)
-        )
+        self.station: Station = builder.AddNamedSystem("station", station or MakeStation(scenario))
         plan, start = self.station.motion_plan, self.station.start_pose
         self.motion: Motion = placed_motion(plan, start)
         self.policy: LeafSystem | None = None

@@ -177,25 +177,20 @@ class SimulatedStation(Station):
         builder.BuildInto(self)
         self.set_name("station")
 
-    def _add_visualization(
-        self, builder: DiagramBuilder, scene_graph: SceneGraph, meshcat: Meshcat
-    ) -> None:
-        period = self.frame_period
-        self.visualizer = MeshcatVisualizer.AddToBuilder(
-            builder, scene_graph, meshcat, MeshcatVisualizerParams(publish_period=period)
-        )
-        self.food_visualizer = self.cutting.add_visualizer(builder, meshcat, period)
-        self._add_arrows_and_frames(builder, meshcat)
-        _set_scene(meshcat, self.start_pose)
-
     def _frame_period(self) -> float:
         size = SCENE_FRAME_SIZE + self.cutting.frame_size()
         frames = FRAMES_PER_SECOND * placed_motion(self.motion_plan, self.start_pose).duration
         return math.ceil(frames * size / REPLAY_SIZE) / FRAMES_PER_SECOND
 
-    def _add_arrows_and_frames(self, builder: DiagramBuilder, meshcat: Meshcat) -> None:
-        """Wrenches on knife and sensor as arrows; triads of W, B, F, S, K."""
+    def _add_visualization(
+        self, builder: DiagramBuilder, scene_graph: SceneGraph, meshcat: Meshcat
+    ) -> None:
+        """Bodies and food; wrenches on knife and sensor as arrows; triads of W, B, F, S, K."""
         period = self.frame_period
+        self.visualizer = MeshcatVisualizer.AddToBuilder(
+            builder, scene_graph, meshcat, MeshcatVisualizerParams(publish_period=period)
+        )
+        self.food_visualizer = self.cutting.add_visualizer(builder, meshcat, period)
         X_KS = self.X_KS()
         knife_pose = builder.GetSubsystemByName("kinematics").GetOutputPort("knife_pose")
         arrows = builder.AddNamedSystem(
@@ -217,6 +212,7 @@ class SimulatedStation(Station):
         frames = FrameVisualizer(meshcat, fixed, carried, self.start_pose, CAMERA_OFFSET, period)
         builder.AddNamedSystem("frame_visualizer", frames)
         connect(builder, knife_pose, frames)
+        _set_scene(meshcat, self.start_pose)
 
     def sensor_columns(self, reading: Sequence[str]) -> list[str]:
         """Names for the port `sensor_state`: `reading` [6] for the moment and force."""

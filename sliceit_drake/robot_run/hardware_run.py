@@ -142,7 +142,7 @@ class HardwareRun:
         return self.run
 
     def _prepare(self, station: HardwareStation) -> Run:
-        diagram = ScenarioDiagram(self.scenario, None, station)
+        diagram = ScenarioDiagram(self.scenario, station)
         simulator = Simulator(diagram)
         diagram.SetStart(simulator.get_mutable_context())
         margin = check_contact_margin(self.twin)

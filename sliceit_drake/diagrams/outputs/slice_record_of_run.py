@@ -24,12 +24,7 @@ __all__ = ["slice_record_of"]
 
 
 def slice_record_of(
-    run: Run,
-    provenance: str,
-    *,
-    index: int = 0,
-    condition: str = "",
-    sensor: str = "wrist sensor",
+    run: Run, provenance: str, *, index: int = 0, condition: str = ""
 ) -> SliceRecord:
     """Makes the record of what the wrist sensor and the joints showed.
 
@@ -41,7 +36,6 @@ def slice_record_of(
         provenance: Where the numbers come from.
         index: Order in a session.
         condition: Records with the same label were nominally the same cut.
-        sensor: The sensor's name.
     """
     table, scenario = run.record(), run.scenario
     time, p = table["time"], table.vector("knife_pose_p")
@@ -74,7 +68,7 @@ def slice_record_of(
         motion=motion,
         wrench=WrenchFacts(includes=["food", "board", "inertia"], tared="yes"),
         sensor=SensorFacts(
-            name=sensor,
+            name="wrist sensor",
             rate=1.0 / scenario.exchange_period,
             position=X_KS.translation().tolist(),
             rotation=Rotation.from_matrix(X_KS.rotation().matrix()).as_euler("xyz").tolist(),
