@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from sliceit_drake.calibration.calibrate import blocked_error
 from sliceit_drake.calibration.gauss_newton import gauss_newton, residuals_at
-from sliceit_drake.calibration.held_out import blocked_error
 from sliceit_drake.calibration.prediction import Parameter
 from sliceit_drake.calibration.uncertainty import Posterior, estimate
 from sliceit_drake.configuration import ConfigurationError, dump_yaml, load_yaml

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from sliceit_drake.calibration.gauss_newton import gauss_newton
-from sliceit_drake.calibration.held_out import blocked_error
 from sliceit_drake.calibration.prediction import Prediction, Predictor
 from sliceit_drake.calibration.refine import Refinement, refine
 from sliceit_drake.calibration.result import Calibration
@@ -28,7 +27,17 @@ from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.cutting.workers import worker_processes
 from sliceit_drake.records.slice_record import SliceRecord
 
-__all__ = ["CalibrationOptions", "Progress", "calibrate", "values_of"]
+__all__ = [
+    "CalibrationOptions",
+    "HeldOutError",
+    "Progress",
+    "blocked_error",
+    "calibrate",
+    "values_of",
+]
+
+HELD_OUT_STEPS = 4
+"""Most steps of a refit without a block of depth."""
 
 Progress = Callable[[str, int, int, float], None]
 """Called with what is done, steps done, steps in all, best error so far in N."""
@@ -90,7 +99,13 @@ def calibrate(
     show = progress or (lambda *_: None)
     directory.mkdir(parents=True, exist_ok=True)
     # Before anything is computed: what is wrong with a record shall not show after hours.
-    _check_names(records, held_out)
+    twice = {r.name for r in records} & {r.name for r in held_out}
+    if twice:
+        raise ConfigurationError(
+            f"{', '.join(sorted(twice))} is fitted and held out",
+            field="--hold-out",
+            fix="Name a record once.",
+        )
     others = Predictor(setup, held_out, workers=options.workers) if held_out else None
     predictor = Predictor(setup, records, workers=options.workers)
     if options.start is not None:
@@ -98,7 +113,14 @@ def calibrate(
         refinements = [Refinement(found.units[0], float(found.errors[0]), [])]
     else:
         problem = _fingerprint(setup, records)
-        found = _search(setup, records, directory, options, problem, show)
+        storage = options.storage or directory / "trials.log"
+        found = search(
+            Predictor(setup, records, setup.search_time_step, workers=options.workers),
+            open_study(storage, f"{setup.food.name}-{problem}"),
+            options.trials,
+            options.seed,
+            lambda done, error: show("search", done, options.trials, error),
+        )
         if not np.isfinite(found.errors).any():
             raise CuttingError("no trial of the search could be cut; widen the setup's ranges")
         refinements = _refine(setup, records, directory, options, found, problem, show)
@@ -168,25 +190,6 @@ def _fingerprint(setup: CalibrationSetup, records: Sequence[SliceRecord]) -> str
     return digest.hexdigest()[:12]
 
 
-def _search(
-    setup: CalibrationSetup,
-    records: Sequence[SliceRecord],
-    directory: Path,
-    options: CalibrationOptions,
-    problem: str,
-    show: Progress,
-) -> SearchResult:
-    predictor = Predictor(setup, records, setup.search_time_step, workers=options.workers)
-    study = open_study(options.storage or directory / "trials.log", f"{setup.food.name}-{problem}")
-    return search(
-        predictor,
-        study,
-        options.trials,
-        options.seed,
-        lambda done, error: show("search", done, options.trials, error),
-    )
-
-
 def _refine(
     setup: CalibrationSetup,
     records: Sequence[SliceRecord],
@@ -247,14 +250,54 @@ def _note(shared: Any, k: int, done: int, error: float) -> None:
     shared[k] = (done, error)
 
 
-def _check_names(records: Sequence[SliceRecord], held_out: Sequence[SliceRecord]) -> None:
-    names = {r.name for r in records} & {r.name for r in held_out}
-    if names:
-        raise ConfigurationError(
-            f"{', '.join(sorted(names))} is fitted and held out",
-            field="--hold-out",
-            fix="Name a record once.",
-        )
+@dc.dataclass
+class HeldOutError:
+    """Errors on blocks of the data, each from a fit without it.
+
+    Attributes:
+        blocks: Root mean square error on each, N; NaN where the refitted slice broke down.
+        counts: Entries in each.
+        rms: On all of them, N.
+    """
+
+    blocks: list[float]
+    counts: list[int]
+    rms: float
+
+
+def blocked_error(model: Predictor, unit: np.ndarray, blocks: int = 5) -> HeldOutError:
+    """Holds out contiguous blocks of depth in turn, in all records at once.
+
+    Neighbouring samples share their error, so that samples held out one by one would be predicted
+    by their neighbours; a block must be predicted by the physics. What lies above the food belongs
+    to the first block. What is a record's own (its height, its speed) stays as fitted: where the
+    knife was is not what is predicted.
+
+    Args:
+        model: Of the records.
+        unit: The fit to all data [d]; each refit starts there.
+        blocks: Number of blocks of equal depth.
+
+    Raises:
+        CuttingError: A slice breaks down near `unit`.
+    """
+    depth = model.depth
+    edges = np.linspace(0.0, float(depth[model.used].max()), blocks + 1)
+    block = np.clip(np.searchsorted(edges, depth, side="right") - 1, 0, blocks - 1)
+    shared = np.array([p.shared for p in model.parameters])
+    errors, counts, squares = [], [], 0.0
+    for k in range(blocks):
+        held, rest = (block == k) & model.used, model.used & (block != k)
+        if not held.any() or not rest.any():
+            continue
+        without = model.holding_out(~rest)
+        refit = gauss_newton(without, unit, free=shared, steps=HELD_OUT_STEPS).unit
+        (row,) = without.predict([refit])
+        error = (np.concatenate([p.predicted.ravel() for p in row]) - model.measured)[held]
+        errors.append(float(np.sqrt(np.mean(error**2))))
+        counts.append(int(held.sum()))
+        squares += float((error**2).sum())
+    return HeldOutError(errors, counts, float(np.sqrt(squares / max(sum(counts), 1))))
 
 
 def _held_out(predictor: Predictor, fitted: Predictor, unit: np.ndarray) -> dict[str, float]:

@@ -7,7 +7,6 @@ import numpy as np
 import torch
 
 from sliceit_drake.cutting.gradient import SliceAdjoint
-from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.parameters import POINT_PARAMETERS, pull_back, with_parameters
 
 __all__ = ["slice_force"]
@@ -20,7 +19,6 @@ class _SliceForce(torch.autograd.Function):
     def forward(  # type: ignore[override, unused-ignore]
         ctx: Any,
         adjoint: SliceAdjoint,
-        model: CuttingModel,
         names: Sequence[str],
         R: torch.Tensor,
         p: torch.Tensor,
@@ -30,9 +28,8 @@ class _SliceForce(torch.autograd.Function):
             name: value.detach().numpy() if name in POINT_PARAMETERS else float(value)
             for name, value in zip(names, values, strict=True)
         }
-        run = adjoint.run(
-            R.detach().double().numpy(), p.detach().double().numpy(), with_parameters(model, given)
-        )
+        model = with_parameters(adjoint.model, given)
+        run = adjoint.run(R.detach().double().numpy(), p.detach().double().numpy(), model)
         ctx.adjoint, ctx.run, ctx.names = adjoint, run, names
         ctx.types = [value.dtype for value in values]
         return torch.from_numpy(run.wrenches.copy())
@@ -46,7 +43,7 @@ class _SliceForce(torch.autograd.Function):
             for name, kind in zip(ctx.names, ctx.types, strict=True)
         ]
         path = [torch.from_numpy(gradient.rotation), torch.from_numpy(gradient.position)]
-        return None, None, None, *path, *values
+        return None, None, *path, *values
 
 
 def slice_force(
@@ -54,7 +51,6 @@ def slice_force(
     R: torch.Tensor,
     p: torch.Tensor,
     values: dict[str, torch.Tensor],
-    model: CuttingModel | None = None,
 ) -> torch.Tensor:
     """Mean wrench of each coupling step on the knife, moment about Ko and force in C [E, 6], Nm and
     N.
@@ -67,16 +63,12 @@ def slice_force(
         R: Rotations of the knife in C at the ends of the coupling steps [E + 1, 3, 3], double.
         p: Positions of Ko in C there [E + 1, 3], metres, double.
         values: Parameters by name (`cutting.parameters`): scalars, or [P] for those of cut points.
-        model: A cut derived from that of `adjoint`; None for that.
 
     Raises:
         CuttingError: A force is not finite.
         KeyError: There is no such parameter.
         ValueError: The food may slip, which has no gradient.
     """
-    names = tuple(values)
-    out = _SliceForce.apply(
-        adjoint, model or adjoint.model, names, R, p, *(values[name] for name in names)
-    )
+    out = _SliceForce.apply(adjoint, tuple(values), R, p, *values.values())
     assert isinstance(out, torch.Tensor)
     return out

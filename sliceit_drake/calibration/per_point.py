@@ -58,7 +58,6 @@ def fit_points(
     Args:
         predictor: Of records of one food.
         unit: The shared parameters, which stay.
-        steps: Number of steps.
         progress: Called with the steps done and the best error so far, N.
 
     Raises:
@@ -73,7 +72,7 @@ def fit_points(
     for k in range(steps):
         trial = predictor.with_point_factors({NAME: np.exp(x)})
         try:
-            square, gradient = trial.mean_square_and_point_gradient(unit, NAME)
+            square, by_name = trial.mean_square_by(unit, [NAME])
         except CuttingError:
             if k == 0:
                 raise
@@ -81,7 +80,7 @@ def fit_points(
             continue
         if square < best:
             best, best_x = square, x.copy()
-        slope = gradient * np.exp(x) + 2.0 * weight * x
+        slope = by_name[NAME] * np.exp(x) + 2.0 * weight * x
         rate = RATE * (MIN_RATE / RATE) ** (k / max(steps - 1, 1))
         x = x + rate * adam.descent(slope, k, EPSILON)
         if progress is not None:

@@ -63,6 +63,12 @@ class Parameter:
         """The value at a place in the range."""
         return float(from_unit(unit, self.low, self.high, self.log))
 
+    def slope(self, unit: float) -> float:
+        """Derivative of the value by its place in the range."""
+        if self.log:
+            return float(self.value(unit) * np.log(self.high / self.low))
+        return self.high - self.low
+
     def unit(self, value: float) -> float:
         """Place of a value in the range, within 0 and 1."""
         return float(np.clip(to_unit(value, self.low, self.high, self.log), 0.0, 1.0))
@@ -99,6 +105,13 @@ class Predictor:
 
     Raises:
         ConfigurationError: A record cannot be predicted, naming file and field.
+
+    Attributes:
+        targets: The records.
+        parameters: What is searched.
+        used, record_of, time, depth: Of each entry of `measured` [M]: whether it counts, index of
+            its record, time in it, s, and depth of the edge, metres.
+        conditions: Of each record. Records of one condition are replicates; "" is none.
     """
 
     def __init__(
@@ -128,7 +141,10 @@ class Predictor:
         self.targets = make_targets(setup, forces, [meshing], clock, near_food=True)
         self.board = dc.replace(setup.board, height=0.0)
         self.parameters = self._list_parameters()
-        self.used = self._by_entry("compared")
+        sizes = [t.measured.size for t in self.targets]
+        self.record_of = np.repeat(np.arange(len(sizes)), sizes)
+        self.used, self.time, self.depth = map(self._by_entry, ("compared", "time", "depth"))
+        self.conditions = [t.record.metadata.condition for t in self.targets]
         self.point_factors: dict[str, np.ndarray] = {}
         self._simulator = Simulator(clock, self.board, workers=workers, kept=KEPT)
         self._adjoints: dict[int, SliceAdjoint] = {}
@@ -163,30 +179,10 @@ class Predictor:
         """All measured channels of all records, in a row [M], N."""
         return np.concatenate([t.measured.ravel() for t in self.targets])
 
-    @property
-    def record_of(self) -> np.ndarray:
-        """Index of the record of each entry of `measured` [M]."""
-        return np.concatenate([np.full(t.measured.size, k) for k, t in enumerate(self.targets)])
-
-    @property
-    def depth(self) -> np.ndarray:
-        """Depth of the edge at each entry of `measured` [M], metres."""
-        return self._by_entry("depth")
-
-    @property
-    def time(self) -> np.ndarray:
-        """Time in its record of each entry of `measured` [M], s."""
-        return self._by_entry("time")
-
     def _by_entry(self, name: str) -> np.ndarray:
         return np.concatenate(
             [np.repeat(getattr(t, name), t.measured.shape[1]) for t in self.targets]
         )
-
-    @property
-    def conditions(self) -> list[str]:
-        """Condition of each record. Records of one condition are replicates; "" is none."""
-        return [t.record.metadata.condition for t in self.targets]
 
     def values(self, unit: np.ndarray) -> dict[str, float]:
         """Values of the parameters by name, from places in their ranges [d]."""
@@ -308,32 +304,28 @@ class Predictor:
         Raises:
             CuttingError: A slice broke down.
         """
-        square, gradient = self._gradient(unit, list(self.values(unit)))
+        square, gradient = self.mean_square_by(unit, list(self.values(unit)))
         slopes = np.array(
-            [gradient[p.name] * _slope(p, u) for p, u in zip(self.parameters, unit, strict=True)]
+            [gradient[p.name] * p.slope(u) for p, u in zip(self.parameters, unit, strict=True)]
         )
         for k, parameter in enumerate(self.parameters):
             if parameter.name in NO_ADJOINT:
                 slopes[k] = self._difference(unit, k)
         return square, slopes
 
-    def mean_square_and_point_gradient(
-        self, unit: np.ndarray, name: str
-    ) -> tuple[float, np.ndarray]:
-        """As `mean_square_and_gradient`, by a factor of each cut point [P].
+    def mean_square_by(
+        self, unit: np.ndarray, names: Sequence[str]
+    ) -> tuple[float, dict[str, float | np.ndarray]]:
+        """Mean square of the used residuals [N^2], and its derivatives in the parameters' units.
 
         Args:
             unit: Places in the ranges [d].
-            name: One of `cutting.parameters.POINT_PARAMETERS`.
-        """
-        square, gradient = self._gradient(unit, [name])
-        return square, np.asarray(gradient[name])
+            names: Of `parameters` and `cutting.parameters.POINT_PARAMETERS`; the derivative by one
+                of the latter is by the factor of each cut point [P], that by `NO_ADJOINT` 0.
 
-    def _gradient(
-        self, unit: np.ndarray, names: Sequence[str]
-    ) -> tuple[float, dict[str, float | np.ndarray]]:
-        """Mean square of the used residuals and its derivatives by name, in the parameters' units;
-        0 for `NO_ADJOINT`."""
+        Raises:
+            CuttingError: A slice broke down.
+        """
         values = self.values(unit)
         gradient: dict[str, float | np.ndarray] = dict.fromkeys(names, 0.0)
         total, scale = 0.0, float(self.used.sum())
@@ -449,11 +441,3 @@ class Predictor:
         slopes = [p.oscillation.derivatives(t.time) for p, t in zip(row, self.targets, strict=True)]
         by = [p.smooth[:, :, None] * d[:, None] for p, d in zip(row, slopes, strict=True)]
         return np.asarray(block_diag(*(x.reshape(-1, 3) for x in by)))
-
-
-def _slope(parameter: Parameter, unit: float) -> float:
-    """Derivative of the value by its place in the range."""
-    span = parameter.high - parameter.low
-    if parameter.log:
-        return float(parameter.value(unit) * np.log(parameter.high / parameter.low))
-    return span

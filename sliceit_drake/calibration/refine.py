@@ -83,9 +83,7 @@ def refine(
     down, it is taken back and halved.
 
     Args:
-        predictor: Of the records.
         start: Places in the ranges [d].
-        steps: Number of steps.
         checkpoint: File (.npz) from which to go on and to which each step is written.
         progress: Called with the steps done and the best error so far, N.
     """

@@ -36,12 +36,12 @@ class SearchResult:
     errors: np.ndarray
     failures: int
 
-    def best(self, count: int, distance: float = 0.1) -> list[np.ndarray]:
-        """The best places, `distance` apart from each other in at least one parameter."""
+    def best(self, count: int) -> list[np.ndarray]:
+        """The best places, a tenth of its range apart in at least one parameter."""
         chosen: list[np.ndarray] = []
         for k in np.argsort(self.errors, kind="stable"):
             unit = self.units[k]
-            if all(np.abs(unit - other).max() >= distance for other in chosen):
+            if all(np.abs(unit - other).max() >= 0.1 for other in chosen):
                 chosen.append(unit)
             if len(chosen) == count:
                 break

@@ -64,14 +64,9 @@ class Posterior(ParameterDistribution):
             covariance=np.array(self.covariance)[np.ix_(own, own)].tolist(),
         )
 
-    def correlation(self) -> np.ndarray:
-        """Correlation of the parameters, in their unit ranges [d, d]."""
-        sd = self.deviation
-        return np.asarray(np.array(self.covariance) / np.outer(sd, sd))
-
     def correlated_pairs(self) -> list[tuple[str, str, float]]:
         """Pairs of parameters with a correlation beyond 0.9 either way, strongest first."""
-        C = self.correlation()
+        C = np.array(self.covariance) / np.outer(self.deviation, self.deviation)
         rows, columns = np.triu_indices(len(C), 1)
         pairs = [
             (self.names[i], self.names[j], float(C[i, j]))

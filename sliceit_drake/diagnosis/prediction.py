@@ -199,8 +199,10 @@ class SlicePredictor:
         if target.stretches is None:
             return _Slice(None, R, p)
         at_food = p if target.height_unknown else p - np.array([0.0, 0.0, height])
-        poses = target.poses(target.stretches, R, at_food)
-        job = Job(self.model(point, target), *poses, target.stretches, target.facts.name)
+        # A knife whose record is over rests.
+        ends = np.minimum(target.stretches.ends, len(p) - 1)
+        model, name = self.model(point, target), target.facts.name
+        job = Job(model, R[ends], at_food[ends], target.stretches, name)
         return _Slice(job, R, p)
 
     def _series(self, point: Point, target: RecordTarget, simulated: "_Slice") -> ForceSeries:

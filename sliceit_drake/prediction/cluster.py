@@ -14,13 +14,10 @@ import threading
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from sliceit_drake.cluster import CONNECT, connected
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.driver import Driver
 from sliceit_drake.cutting.model import CuttingModel
-from sliceit_drake.prediction.clock import Stretches
 from sliceit_drake.prediction.simulator import Executor, Job, JobResult, run_job
 
 if TYPE_CHECKING:
@@ -64,7 +61,7 @@ def _run_jobs(
             for f in dc.fields(model)
             if getattr(model, f.name) is not getattr(shared, f.name)
         }
-        rest = (job.R, job.p, job.stretches, job.name, job.precision)
+        rest = {name: value for name, value in vars(job).items() if name != "model"}
         work.append(joblib.delayed(_run_there)(number, shared, own, rest, period, board))
     # What is scattered travels to a worker once, however many calls name it.
     with joblib.parallel_config(backend="dask", client=client, scatter=meshes):
@@ -87,11 +84,11 @@ def _run_there(
     number: int,
     shared: CuttingModel,
     own: dict[str, Any],
-    rest: tuple[np.ndarray, np.ndarray, Stretches, str, str],
+    rest: dict[str, Any],
     period: float,
     board: Board,
 ) -> tuple[int, JobResult]:
     """Runs a job on a worker, which keeps what it needs from one to the next."""
     drivers: dict[float, Driver] = _THREAD.__dict__.setdefault("drivers", {})
     driver = drivers.setdefault(period, Driver(period))
-    return number, run_job(driver, Job(_rebuilt(shared, own), *rest), board)
+    return number, run_job(driver, Job(_rebuilt(shared, own), **rest), board)

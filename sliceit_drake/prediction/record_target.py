@@ -216,13 +216,6 @@ class RecordTarget:
         last = min(int(low[-1]) + 1, len(self.p) - 1)
         return self.clock.stretches(way, max(int(low[0]) - 1, 0), last)
 
-    def poses(
-        self, stretches: Stretches, R: np.ndarray, p: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Poses at the ends of coupling steps; a knife whose record is over rests."""
-        rows = np.minimum(stretches.ends, len(p) - 1)
-        return R[rows], p[rows]
-
     def as_cut(self, model: CuttingModel) -> CuttingModel:
         """A cut of the record's food, without its skin where it was peeled."""
         if self.facts.peeled and model.effects.skin.toughness > 0.0:

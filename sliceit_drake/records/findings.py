@@ -110,32 +110,26 @@ class Findings:
         problem: str,
         rows: tuple[int, int] | None = None,
         fix: str | None = None,
+        file: str | None = None,
     ) -> None:
         """Reports something about the table; `rows` are first and last index."""
+        severity, usual = KINDS[kind]
         lines = self._table.lines
         place = None if rows is None else (int(lines[rows[0]]), int(lines[rows[1]]))
-        self._add(kind, self._table.file, column, place, problem, fix)
+        self.found.append(
+            RecordFinding(
+                severity, kind, file or self._table.file, column, place, problem, fix or usual
+            )
+        )
 
     def fact(self, kind: str, field: str, problem: str, fix: str | None = None) -> None:
         """Reports something about a field of the YAML file."""
         file = str(Path(self._table.file).with_suffix(".yaml"))
-        self._add(kind, file, field, None, problem, fix)
+        self.add(kind, field, problem, fix=fix, file=file)
 
     def has(self, *kinds: str) -> bool:
         """Whether something of these kinds was found."""
         return any(finding.kind in kinds for finding in self.found)
-
-    def _add(
-        self,
-        kind: str,
-        file: str,
-        column: str,
-        lines: tuple[int, int] | None,
-        problem: str,
-        fix: str | None,
-    ) -> None:
-        severity, usual = KINDS[kind]
-        self.found.append(RecordFinding(severity, kind, file, column, lines, problem, fix or usual))
 
 
 def runs(mask: np.ndarray) -> list[tuple[int, int]]:

@@ -42,13 +42,7 @@ ALONG = 0.2
 
 
 def check_force(table: SliceTable, record: SliceRecord, findings: Findings) -> None:
-    """Reports what is wrong with the force.
-
-    Args:
-        table: The files.
-        record: The table's record, as series in W.
-        findings: Collector of what is found.
-    """
+    """Adds to the findings what is wrong with the force, of a table and its record in W."""
     magnitude = record.force_magnitude
     name = fmt.FORCE[0] if record.force is not None else fmt.FORCE_NORM
     if np.ptp(magnitude) == 0.0:

@@ -37,9 +37,6 @@ def load_force_profile(file: str | Path) -> ForceProfile:
         file: CSV file with the columns time_s, F_ground_truth_N, F_disect_calibrated_N, F_gazebo_N
             and gt_from_drawn_dash (0 or 1).
 
-    Returns:
-        The profile.
-
     Raises:
         ConfigurationError: If the file is missing, lacks a column, has a cell that is not a finite
             number, times that do not increase or a mark other than 0 and 1.

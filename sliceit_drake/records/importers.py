@@ -61,18 +61,14 @@ def import_ur_rtde(
     vector of the tool frame T in the robot's base B), actual_TCP_speed_0 .. _5 and
     actual_TCP_force_0 .. _5 (force on the tool and torque about To, both in B), actual_q_0 .. _5
     (left out if not recorded). Numbers have six decimals. The library writes at the pace of the
-    computer, not of the controller: rows that repeat a time are dropped.
+    computer, not of the controller: rows that repeat a time are dropped. Time starts at 0.
 
     Args:
-        file: The recording.
         metadata: Facts. `wrench.frame` and `wrench.point` do not matter, the format fixes them;
             `wrench.sign` should be on_knife, which the controller reports. Phases, if given, count
             from the first row; if not, they are labelled from the motion where the food is placed.
         X_TK: Pose of the knife in the tool frame that the controller was set to [4, 4].
         X_WB: Pose of the robot's base in W [4, 4]; None if B is W.
-
-    Returns:
-        The record; time starts at 0.
 
     Raises:
         ConfigurationError: If the file cannot be read, or lacks a column.
@@ -132,10 +128,7 @@ def import_profile(
     Rows where no line was drawn are left out. The motion is nominal: see `import_force`.
 
     Args:
-        file: The profile.
-        metadata: Facts, `motion.speed` and `food.size` among them.
-        contact: Time at which the force rises, s, which ends the air phase; None to take the
-            phases of `metadata`.
+        metadata, contact: As `import_force`.
 
     Raises:
         ConfigurationError: As `load_force_profile`, and as `import_force`.
@@ -166,7 +159,6 @@ def import_force(
     thereby known up to a constant, and listed under `unknown`.
 
     Args:
-        file: The file.
         metadata: Facts, `motion.speed` and `food.size` among them.
         component: "norm" if the force is the norm of the force; "vertical" if it is the vertical
             component, positive upwards for `wrench.sign` on_knife.

@@ -1,6 +1,7 @@
 """Checks of the motion in a slice record: units, jumps, gaps in time, velocities, board."""
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from sliceit_drake.records import slice_record as fmt
 from sliceit_drake.records.findings import Findings, runs
@@ -28,13 +29,8 @@ BELOW_BOARD = 0.02
 
 
 def check_motion(table: SliceTable, record: SliceRecord, findings: Findings) -> None:
-    """Reports what is wrong with poses, velocities, joints and sampling.
-
-    Args:
-        table: The files.
-        record: The table's record, as series in W.
-        findings: Collector of what is found.
-    """
+    """Adds to the findings what is wrong with poses, velocities, joints and sampling, of a table
+    and its record in W."""
     _check_units(record, findings)
     if record.joints is not None:
         _check_joints(record.joints, findings)
@@ -120,19 +116,16 @@ def _check_sampling(record: SliceRecord, findings: Findings) -> None:
 
 def _check_velocities(table: SliceTable, record: SliceRecord, findings: Findings) -> None:
     """Integrals of the velocity columns against the poses: noise of a difference does not count."""
-    step = np.diff(record.time)[:, None]
-
-    def travelled(rate: np.ndarray) -> np.ndarray:
-        return np.cumsum(0.5 * (rate[1:] + rate[:-1]) * step, axis=0)
-
     _, turn_rate = fmt.velocities(record.time, record.position, record.rotation)
+    turned = cumulative_trapezoid(turn_rate, record.time, axis=0)
     for names, values, moved, floor, unit in (
         (fmt.VELOCITY, record.velocity, record.position[1:] - record.position[0], 2e-3, "m"),
-        (fmt.ANGULAR_VELOCITY, record.angular_velocity, travelled(turn_rate), 0.02, "rad"),
+        (fmt.ANGULAR_VELOCITY, record.angular_velocity, turned, 0.02, "rad"),
     ):
         if not table.has(names):
             continue
-        error = np.linalg.norm(travelled(values) - moved, axis=1)
+        travelled = cumulative_trapezoid(values, record.time, axis=0)
+        error = np.linalg.norm(travelled - moved, axis=1)
         k = int(error.argmax())
         span = float(np.ptp(moved, axis=0).max())
         if error[k] > floor + 0.1 * span:

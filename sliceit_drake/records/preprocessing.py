@@ -29,6 +29,7 @@ __all__ = [
 ]
 
 GRAVITY = 9.81
+"""Along -Wz, m/s2."""
 MIN_AIR_ROWS = 10
 """Fewest samples of the first air phase whose mean is a zero and whose scatter is the noise."""
 
@@ -68,9 +69,7 @@ def tare(record: SliceRecord) -> SliceRecord:
     return result
 
 
-def compensate_tool(
-    record: SliceRecord, *, gravity: float = GRAVITY, cutoff: float | None = 20.0
-) -> SliceRecord:
+def compensate_tool(record: SliceRecord, *, cutoff: float | None = 20.0) -> SliceRecord:
     """Removes the weight and the inertia of the tool beyond the sensor, those that it measured.
 
     The tool obeys Newton and Euler: what the sensor measures is the environment's wrench plus the
@@ -82,8 +81,6 @@ def compensate_tool(
     that a constant remains: apply `tare` afterwards.
 
     Args:
-        record: The record.
-        gravity: m/s2, along -Wz.
         cutoff: Velocities pass a zero-phase filter of this cutoff, Hz, before they are
             differentiated; None for no filter.
 
@@ -100,13 +97,13 @@ def compensate_tool(
             source=record.file or record.name,
             fix="Leave the step compensate_tool out, or give what is missing.",
         )
-    numbers = {"gravity": gravity} | ({} if cutoff is None else {"cutoff": cutoff})
+    numbers = {"gravity": GRAVITY} | ({} if cutoff is None else {"cutoff": cutoff})
     result = _with_step(record, "compensate_tool", numbers)
     R = record.rotation
     r = R @ np.array(tool.center_of_mass)
     force, torque = np.zeros_like(record.position), np.zeros_like(record.position)
     if "gravity" in facts.includes:
-        weight = np.array([0.0, 0.0, -tool.mass * gravity])
+        weight = np.array([0.0, 0.0, -tool.mass * GRAVITY])
         force += weight
         torque += np.cross(r, weight)
     if "inertia" in facts.includes:
@@ -114,14 +111,14 @@ def compensate_tool(
         if cutoff is not None:
             v, w = (_filtered(record.time, x, cutoff, 2, zero_phase=True) for x in (v, w))
         momentum = tool.mass * (v + np.cross(w, r))
-        change = _rate(record.time, momentum)
+        change = np.gradient(momentum, record.time, axis=0)
         force -= change
         torque -= np.cross(r, change)
         if tool.inertia is not None:
             Ixx, Iyy, Izz, Ixy, Ixz, Iyz = tool.inertia
             I_K = np.array([[Ixx, Ixy, Ixz], [Ixy, Iyy, Iyz], [Ixz, Iyz, Izz]])
             spin = np.einsum("nij,jk,nlk,nl->ni", R, I_K, R, w)
-            torque -= _rate(record.time, spin)
+            torque -= np.gradient(spin, record.time, axis=0)
     result.force = record.force - force
     if record.torque is not None:
         result.torque = record.torque - torque
@@ -138,7 +135,6 @@ def low_pass(
     """Filters force and torque with a Butterworth filter.
 
     Args:
-        record: The record.
         cutoff: Hz, where one pass has lost 3 dB.
         order: Order of one pass.
         zero_phase: Filter forward and backward, without delay and with twice the attenuation;
@@ -163,7 +159,6 @@ def resample(record: SliceRecord, rate: float) -> SliceRecord:
     the rate falls. All is then interpolated linearly, orientations along the shortest turn.
 
     Args:
-        record: The record.
         rate: Rows a second, Hz.
 
     Raises:
@@ -297,10 +292,6 @@ def _resampled(
     if ANTI_ALIASING * rate < 0.5 / period and rate * period < 0.999:
         values = _filtered(time, values, ANTI_ALIASING * rate, 4, zero_phase=True)
     return _interpolated(_grid(rate, start, end), time, values)
-
-
-def _rate(time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return np.gradient(values, time, axis=0)
 
 
 def _filtered(

@@ -61,7 +61,6 @@ def import_rosbag(
     tool_frame: str | None = None,
     between: tuple[float, float] | None = None,
     clock: str = "header",
-    largest_gap: float = LARGEST_GAP,
 ) -> SliceRecord:
     """Reads one slice from a bag.
 
@@ -88,7 +87,6 @@ def import_rosbag(
         between: Begin and end of the slice in the bag, s from its first wrench; None for all.
         clock: "header" for the messages' stamps, "received" for the times at which they were
             recorded, which have the network's delay in them.
-        largest_gap: Time without a message that is bridged, s.
 
     Raises:
         ConfigurationError: The file is no bag, the clock none; a topic is missing, of another type
@@ -102,9 +100,9 @@ def import_rosbag(
     force, moving = series[wrench], series[motion]
     if between is not None:
         force = force.between(*between)
-        moving = moving.between(between[0] - largest_gap, between[1] + largest_gap)
+        moving = moving.between(between[0] - LARGEST_GAP, between[1] + LARGEST_GAP)
     for part, topic in ((force, wrench), (moving, motion)):
-        _check_gaps(part, topic, file, largest_gap)
+        _check_gaps(part, topic, file)
     kept = (force.time >= moving.time[0]) & (force.time <= moving.time[-1])
     if kept.sum() < 2:
         raise ConfigurationError(
@@ -138,16 +136,15 @@ def import_rosbag(
     if not facts.motion.phases:
         facts.motion.phases = phases_from_motion(facts, time, position[:, 2])
     quaternion = Rotation.from_matrix(R_WK).as_quat(scalar_first=True)
-    columns = {fmt.TIME: time}
-    for group, rows in (
-        (fmt.POSITION, position),
-        (fmt.QUATERNION, quaternion),
-        (fmt.FORCE, placed[:, :3]),
-        (fmt.TORQUE, placed[:, 3:]),
-        (fmt.JOINTS, joints),
-    ):
-        if rows is not None:
-            columns |= dict(zip(group, rows.T, strict=True))
+    columns = {fmt.TIME: time} | fmt.columns_of(
+        {
+            fmt.POSITION: position,
+            fmt.QUATERNION: quaternion,
+            fmt.FORCE: placed[:, :3],
+            fmt.TORQUE: placed[:, 3:],
+            fmt.JOINTS: joints,
+        }
+    )
     lines = np.arange(2, len(time) + 2)
     return record_from_table(SliceTable(facts, columns, str(file), lines))
 
@@ -309,7 +306,7 @@ def _joints(message: Any, file: Path, topic: str) -> list[float]:
     return angles
 
 
-def _check_gaps(part: _Series, topic: str, file: str | Path, largest: float) -> None:
+def _check_gaps(part: _Series, topic: str, file: str | Path) -> None:
     if len(part.time) < 2:
         raise ConfigurationError(
             f"{topic} has no messages there",
@@ -319,13 +316,13 @@ def _check_gaps(part: _Series, topic: str, file: str | Path, largest: float) -> 
         )
     step = np.diff(part.time)
     k = int(step.argmax())
-    if step[k] > largest:
+    if step[k] > LARGEST_GAP:
         raise ConfigurationError(
             f"{topic} has no message for {step[k]:.3g} s, from {part.time[k]:.3f} to "
             f"{part.time[k + 1]:.3f} s after the first wrench",
             source=str(file),
             field="--between",
-            fix=f"Give a part without a gap longer than {largest:g} s, or record again.",
+            fix=f"Give a part without a gap longer than {LARGEST_GAP:g} s, or record again.",
         )
 
 

@@ -8,6 +8,7 @@ the wrench on the knife about Ko in W, whatever frame, sign and point the files 
 
 import copy
 import dataclasses as dc
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ __all__ = [
     "COLUMNS",
     "SliceRecord",
     "SliceTable",
+    "columns_of",
     "read_table",
     "record_from_table",
     "sensor_rotation",
@@ -124,39 +126,20 @@ class SliceRecord:
         assert self.force_norm is not None, "a record has force or force_norm"
         return self.force_norm
 
-    @property
-    def wrench(self) -> np.ndarray:
-        """Torque about Ko and force on the knife in W [n, 6], in Drake's order; Nm, N.
-
-        Raises:
-            ConfigurationError: If the record lacks components or torque.
-        """
-        if self.force is None or self.torque is None:
-            raise ConfigurationError(
-                "has no torque" if self.force is not None else "has the norm of the force alone",
-                source=self.file or self.name,
-                fix="Use a record with the columns force_x..z and torque_x..z.",
-            )
-        return np.column_stack([self.torque, self.force])
-
     def phase(self, *labels: str) -> np.ndarray:
         """Bool mask [n] of the rows in phases with any of these labels."""
-        mask = np.zeros(len(self), bool)
-        for phase in self.metadata.motion.phases:
-            if phase.label in labels:
-                mask |= self._rows_of(phase)
-        return mask
+        return self._rows_of([p for p in self.metadata.motion.phases if p.label in labels])
 
     def first_phase(self, label: str) -> np.ndarray:
         """Bool mask [n] of the rows in the first phase with this label; none if there is none."""
-        for phase in self.metadata.motion.phases:
-            if phase.label == label:
-                return self._rows_of(phase)
-        return np.zeros(len(self), bool)
+        return self._rows_of([p for p in self.metadata.motion.phases if p.label == label][:1])
 
-    def _rows_of(self, phase: Phase) -> np.ndarray:
-        last = (self.time == phase.end) & (phase.end >= self.time[-1])
-        return (self.time >= phase.start) & (self.time < phase.end) | last
+    def _rows_of(self, phases: list[Phase]) -> np.ndarray:
+        mask = np.zeros(len(self), bool)
+        for phase in phases:
+            last = (self.time == phase.end) & (phase.end >= self.time[-1])
+            mask |= (self.time >= phase.start) & (self.time < phase.end) | last
+        return mask
 
     def rows(self, select: np.ndarray | slice) -> "SliceRecord":
         """The rows that a mask [n], indices or a slice selects; metadata are copied."""
@@ -174,42 +157,47 @@ class SliceRecord:
     def table(self) -> SliceTable:
         """The record as columns of the file format."""
         quaternion = Rotation.from_matrix(self.rotation).as_quat(canonical=True, scalar_first=True)
-        columns = {TIME: self.time}
-        for names, values in (
-            (POSITION, self.position),
-            (QUATERNION, quaternion),
-            (VELOCITY, self.velocity),
-            (ANGULAR_VELOCITY, self.angular_velocity),
-            (FORCE, self.force),
-            (TORQUE, self.torque),
-            (JOINTS, self.joints),
-        ):
-            if values is not None:
-                columns.update(zip(names, values.T, strict=True))
+        columns = {TIME: self.time} | columns_of(
+            {
+                POSITION: self.position,
+                QUATERNION: quaternion,
+                VELOCITY: self.velocity,
+                ANGULAR_VELOCITY: self.angular_velocity,
+                FORCE: self.force,
+                TORQUE: self.torque,
+                JOINTS: self.joints,
+            }
+        )
         if self.force_norm is not None:
             columns[FORCE_NORM] = self.force_norm
         lines = np.arange(2, len(self) + 2)
         return SliceTable(self.metadata, columns, self.file or self.name, lines)
 
 
+def columns_of(series: Mapping[tuple[str, ...], np.ndarray | None]) -> dict[str, np.ndarray]:
+    """Columns [n] by name, from series [n, k] by the names of their columns; those of None are left
+    out."""
+    known = ((names, values.T) for names, values in series.items() if values is not None)
+    return {name: column for pair in known for name, column in zip(*pair, strict=True)}
+
+
+def _files(file: str | Path) -> tuple[Path, Path]:
+    """NAME.csv and NAME.yaml, of either or of NAME."""
+    path = Path(file)
+    base = path.with_suffix("") if path.suffix in (".csv", ".yaml", ".yml") else path
+    return base.with_name(f"{base.name}.csv"), base.with_name(f"{base.name}.yaml")
+
+
 def read_table(file: str | Path) -> SliceTable:
-    """Reads the two files of a record as they are.
-
-    Args:
-        file: NAME.csv, NAME.yaml or NAME.
-
-    Returns:
-        The table; not checked but for cells that are no numbers and columns that are not known.
+    """Reads the two files of a record as they are, given NAME.csv, NAME.yaml or NAME.
 
     Raises:
         ConfigurationError: If a file is missing or unreadable, a field or column is unknown, or a
             cell holds text.
     """
-    path = Path(file)
-    base = path.with_suffix("") if path.suffix in (".csv", ".yaml", ".yml") else path
-    table = base.with_name(f"{base.name}.csv")
-    metadata = load_yaml(SliceMetadata, base.with_name(f"{base.name}.yaml"))
-    metadata.name = metadata.name or base.name
+    table, facts = _files(file)
+    metadata = load_yaml(SliceMetadata, facts)
+    metadata.name = metadata.name or table.stem
     columns, lines = _read_csv(table)
     return SliceTable(metadata, columns, str(table), lines)
 
@@ -260,16 +248,11 @@ def sensor_rotation(metadata: SliceMetadata) -> np.ndarray | None:
 
 
 def record_from_table(table: SliceTable) -> SliceRecord:
-    """Turns the columns of the files into series in W.
+    """Turns the columns of a table without errors (`validation.check_table`) into series in W.
 
-    The wrench becomes that on the knife, in W, about Ko; a torque about an unknown point is
-    dropped. Velocities that are not there are derived from the poses.
-
-    Args:
-        table: A table that `validation.check_table` has found no errors in.
-
-    Returns:
-        The record. If sign, frame or point changed, its metadata say so in `processing`.
+    The wrench becomes that on the knife, in W, about Ko; if sign, frame or point changed, the
+    metadata say so in `processing`. A torque about an unknown point is dropped. Velocities that are
+    not there are derived from the poses.
 
     Raises:
         ConfigurationError: If the frame or the point of the wrench needs a fact that is not given.
@@ -374,11 +357,9 @@ def write_record(record: SliceRecord, file: str | Path) -> Path:
     Returns:
         The CSV file.
     """
-    path = Path(file)
-    base = path.with_suffix("") if path.suffix in (".csv", ".yaml", ".yml") else path
-    base.parent.mkdir(parents=True, exist_ok=True)
+    output, facts = _files(file)
+    output.parent.mkdir(parents=True, exist_ok=True)
     table = record.table()
-    output = base.with_name(f"{base.name}.csv")
     names = [name for name in COLUMNS if name in table.columns]
     np.savetxt(
         output,
@@ -388,5 +369,5 @@ def write_record(record: SliceRecord, file: str | Path) -> Path:
         header=",".join(names),
         comments="",
     )
-    dump_yaml(record.metadata, base.with_name(f"{base.name}.yaml"))
+    dump_yaml(record.metadata, facts)
     return output

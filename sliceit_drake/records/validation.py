@@ -44,13 +44,10 @@ KEY_FACTS = (
 
 
 def load_record(file: str | Path) -> SliceRecord:
-    """Reads a record and refuses one that cannot be used.
+    """Reads a record and refuses one that cannot be used; `check_record` has the warnings.
 
     Args:
         file: NAME.csv, NAME.yaml or NAME of the pair.
-
-    Returns:
-        The record; `check_record` has the warnings.
 
     Raises:
         ConfigurationError: If a file is missing or unreadable, or at the first error found.
@@ -65,13 +62,7 @@ def load_record(file: str | Path) -> SliceRecord:
 
 
 def load_records(folder: str | Path) -> list[SliceRecord]:
-    """Reads all records of a folder.
-
-    Args:
-        folder: Folder with pairs NAME.csv and NAME.yaml.
-
-    Returns:
-        The records, by slice index, then name.
+    """Reads all records of a folder with pairs NAME.csv and NAME.yaml, by slice index, then name.
 
     Raises:
         ConfigurationError: If there are none, or one cannot be used.
@@ -81,13 +72,10 @@ def load_records(folder: str | Path) -> list[SliceRecord]:
 
 
 def load_sessions(folders: Sequence[str | Path]) -> list[SliceRecord]:
-    """Reads the records of folders that are sessions one after the other, as one.
+    """Reads the records of folders, in the order of the sessions that they are, as one.
 
     Slices are numbered through, and where there are several folders a record's name has its
     folder's before it.
-
-    Args:
-        folders: Folders in the order of the sessions.
 
     Raises:
         ConfigurationError: As `load_records`, or a folder is there twice.
@@ -138,13 +126,9 @@ def check_record(record: SliceRecord) -> list[RecordFinding]:
 
 
 def check_table(table: SliceTable) -> list[RecordFinding]:
-    """Errors and warnings of a record as its files have it.
+    """Errors and warnings of a record as its files have it, or in memory.
 
-    Args:
-        table: What `read_table` returned, or a record's in memory.
-
-    Returns:
-        Errors and warnings. If the columns cannot be read as series, only the errors that say so.
+    If the columns cannot be read as series, only the errors that say so.
     """
     findings = Findings(table)
     _check_structure(table, findings)
