@@ -5,6 +5,7 @@ import functools
 import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
+from split_measures import area_of_section, material_volumes
 
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.knife import Knife
@@ -69,8 +70,8 @@ def test_random_planes_conserve_volume_and_section_and_give_two_bodies(name):
             continue
         done += 1
         split = split_mesh(mesh, plane)
-        assert split.volumes().sum() == pytest.approx(whole, rel=1e-12)
-        assert split.section_area() == pytest.approx(
+        assert material_volumes(split).sum() == pytest.approx(whole, rel=1e-12)
+        assert area_of_section(split) == pytest.approx(
             hull_section_area(mesh, plane), rel=1e-6, abs=1e-4 * size**2
         )
         assert np.unique(bodies(split.tetrahedra)).size == 2
@@ -84,7 +85,7 @@ def test_each_side_holds_the_volume_and_centroid_of_the_clipped_body(name):
         plane = random_plane(mesh, rng)
         plane.point = mesh.vertices.mean(0)
         split = split_mesh(mesh, plane)
-        volume = split.volumes()
+        volume = material_volumes(split)
         corners = split.nodes[split.tetrahedra]
         centroid = (corners * split.centroid[..., None]).sum(1)
         side = split.node_side[split.tetrahedra[:, 0]]
@@ -155,7 +156,7 @@ def test_plane_through_a_layer_of_faces_copies_nothing():
     )
     assert len(split.tetrahedra) == len(mesh.tetrahedra)
     np.testing.assert_array_equal(split.fraction, 1.0)
-    assert split.section_area() == pytest.approx(0.04 * 0.025, rel=1e-12)
+    assert area_of_section(split) == pytest.approx(0.04 * 0.025, rel=1e-12)
     assert len(split.points) == 16 and (split.point_weights == [1.0, 0.0]).all()
     assert np.unique(bodies(split.tetrahedra)).size == 2
 
@@ -180,8 +181,8 @@ def test_planes_exactly_through_vertices_edges_and_faces_split_cleanly(name, thr
             continue
         plane = CutPlane(point, normal, np.cross(normal, rng.normal(size=3)))
         split = split_mesh(mesh, plane)
-        assert split.volumes().sum() == pytest.approx(mesh.volumes().sum(), rel=1e-5)
-        assert split.section_area() == pytest.approx(hull_section_area(mesh, plane), rel=1e-5)
+        assert material_volumes(split).sum() == pytest.approx(mesh.volumes().sum(), rel=1e-5)
+        assert area_of_section(split) == pytest.approx(hull_section_area(mesh, plane), rel=1e-5)
         assert np.unique(bodies(split.tetrahedra)).size == 2
         np.testing.assert_allclose(split.points[:, 1], 0.0, atol=2e-6 * size)
 

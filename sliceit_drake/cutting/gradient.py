@@ -122,7 +122,7 @@ class SliceAdjoint:
         _give(model)
         ws = self._forward
         ws.set_models([model])
-        mounting = Mounting.of(model.effects, tolerance=1e-12)
+        mounting = Mounting(model.effects, tolerance=1e-12)
         state = ws.initial_state() if state is None else np.asarray(state, ws.dtype)
         count = len(p) - 1
         run = SliceRun(model, np.empty((count, 6)), [state], np.array(R), np.array(p))

@@ -48,7 +48,7 @@ class KnifePath:
         self.model = model
         self.R_CK = model.X_FC_rotation.T @ self.R_FK
         self.p_CK = model.to_cut_frame(self.p_FK)
-        self._mounting = Mounting.of(model.effects)
+        self._mounting = Mounting(model.effects)
         self.rigid = self._mounting.rigid
 
     def pose(self, k: int) -> Pose:

@@ -74,24 +74,7 @@ def small_turn(R0: np.ndarray, R1: np.ndarray) -> np.ndarray:
         """Element of R1 R0^T."""
         return b[i][0] * a[j][0] + b[i][1] * a[j][1] + b[i][2] * a[j][2]
 
-    return 0.5 * np.array(
-        [
-            element(2, 1) - element(1, 2),
-            element(0, 2) - element(2, 0),
-            element(1, 0) - element(0, 1),
-        ]
-    )
-
-
-class _Path(typing.Protocol):
-    """Motion of K relative to S, the knife frame at the start of a segment."""
-
-    @property
-    def duration(self) -> float: ...
-
-    def pose(self, t: float) -> Pose: ...
-
-    def velocity(self, t: float) -> Velocity: ...
+    return 0.5 * np.array([element(i, j) - element(j, i) for i, j in ((2, 1), (0, 2), (1, 0))])
 
 
 @dc.dataclass
@@ -133,7 +116,7 @@ class ConstantSpeed:
                 fix="Lengthen it, raise acceleration, or give distance.",
             )
 
-    def build(self) -> _Path:
+    def build(self) -> "_Translation":
         """Returns the motion as a function of time."""
         ramp = _ramp_time(self.speed, self.acceleration)
         if self.distance is not None:
@@ -166,7 +149,7 @@ class PressAndDraw:
     """Acceleration of the ramps at start and stop; if not given, the velocity steps."""
     label: str = "slice"
 
-    def build(self) -> _Path:
+    def build(self) -> "_Translation":
         """Returns the motion as a function of time."""
         omega = 2.0 * math.pi * self.frequency
 
@@ -182,8 +165,7 @@ class PressAndDraw:
         # The sinusoid starts at its fastest, so that the ramps see the greatest speed.
         draw_speed = abs(self.draw_ratio) * self.press_speed + self.amplitude * omega
         ramp = _ramp_time(math.hypot(draw_speed, self.press_speed), self.acceleration)
-        scale = _TimeScale(self.distance / self.press_speed, ramp)
-        return _Translation(position, derivative, scale)
+        return _Translation(position, derivative, self.distance / self.press_speed, ramp)
 
 
 @dc.dataclass
@@ -194,7 +176,7 @@ class Hold:
     """Duration."""
     label: str = "hold"
 
-    def build(self) -> _Path:
+    def build(self) -> "_Translation":
         """Returns the motion as a function of time."""
         return _line([0.0, 0.0, 1.0], 0.0, self.duration, 0.0)
 
@@ -211,7 +193,7 @@ class Retract:
     """Acceleration of the ramps at start and stop; if not given, the velocity steps."""
     label: str = "retract"
 
-    def build(self) -> _Path:
+    def build(self) -> "_Translation":
         """Returns the motion as a function of time."""
         ramp = _ramp_time(self.speed, self.acceleration)
         return _line([0.0, 0.0, -1.0], self.speed, self.distance / self.speed, ramp)
@@ -258,7 +240,7 @@ class Waypoints:
                         fix="Give 3 values.",
                     )
 
-    def build(self) -> _Path:
+    def build(self) -> "_Legs":
         """Returns the motion as a function of time."""
         angles = np.array(self.rotations) if self.rotations else np.zeros((len(self.times), 3))
         rotations = Rotation.from_euler("xyz", np.vstack([np.zeros(3), angles]))
@@ -287,7 +269,7 @@ class Recorded:
                 "is empty", field=f"{where}.file", fix="Give the path of a CSV file."
             )
 
-    def build(self) -> _Path:
+    def build(self) -> "_Legs":
         """Returns the motion as a function of time.
 
         Raises:
@@ -466,21 +448,36 @@ class Motion:
         return min(max(index, 0), len(self._paths) - 1)
 
 
-class _TimeScale:
-    """Time tau of the path without ramps, as a function of time.
+class _Translation:
+    """Translation along a path given by position and derivative as functions of tau.
 
-    The rate of tau rises linearly from 0 to 1 during `ramp` and falls likewise at the end; on a
-    path too short for that it turns back at half way.
+    tau is the time of the path without ramps. Its rate rises linearly from 0 to 1 during `ramp` and
+    falls likewise at the end; on a path too short for that it turns back at half way.
     """
 
-    def __init__(self, ideal_duration: float, ramp: float) -> None:
+    def __init__(
+        self,
+        position: Callable[[float], np.ndarray],
+        derivative: Callable[[float], np.ndarray],
+        ideal_duration: float,
+        ramp: float,
+    ) -> None:
+        self._position, self._derivative = position, derivative
         self._ideal_duration = ideal_duration
         self._slope = np.inf if ramp == 0.0 else 1.0 / ramp
         self._ramp = min(ramp, math.sqrt(ideal_duration * ramp))
         self._peak = 1.0 if ramp == 0.0 else self._ramp / ramp
         self.duration = ideal_duration / self._peak + self._ramp
 
-    def at(self, t: float) -> tuple[float, float]:
+    def pose(self, t: float) -> Pose:
+        tau, _ = self._at(t)
+        return Pose(_NO_TURN, self._position(tau))
+
+    def velocity(self, t: float) -> Velocity:
+        tau, rate = self._at(t)
+        return Velocity(np.zeros(3), rate * self._derivative(tau))
+
+    def _at(self, t: float) -> tuple[float, float]:
         """Returns tau and its rate at the time `t` in [0, duration]."""
         left = self.duration - t
         if t < self._ramp:
@@ -490,27 +487,6 @@ class _TimeScale:
         return self._peak * (t - 0.5 * self._ramp), self._peak
 
 
-@dc.dataclass(frozen=True)
-class _Translation:
-    """Translation along a path given by position and derivative as functions of tau."""
-
-    position: Callable[[float], np.ndarray]
-    derivative: Callable[[float], np.ndarray]
-    scale: _TimeScale
-
-    @property
-    def duration(self) -> float:
-        return self.scale.duration
-
-    def pose(self, t: float) -> Pose:
-        tau, _ = self.scale.at(t)
-        return Pose(_NO_TURN, self.position(tau))
-
-    def velocity(self, t: float) -> Velocity:
-        tau, rate = self.scale.at(t)
-        return Velocity(np.zeros(3), rate * self.derivative(tau))
-
-
 class _Legs:
     """Legs between poses: straight lines, and rotations about the fixed axis of each leg."""
 
@@ -518,16 +494,13 @@ class _Legs:
         self, times: np.ndarray, positions: np.ndarray, rotations: Rotation, *, smooth: bool
     ) -> None:
         self._times: list[float] = times.tolist()
+        self.duration = self._times[-1]
         self._p = positions
         self._dp = np.diff(positions, axis=0)
         self._R = rotations.as_matrix()
         # Rotation vector of each leg, in the axes at the beginning of the leg.
         self._angle = (rotations[:-1].inv() * rotations[1:]).as_rotvec()
         self._smooth = smooth
-
-    @property
-    def duration(self) -> float:
-        return self._times[-1]
 
     def pose(self, t: float) -> Pose:
         leg, share, _ = self._at(t)
@@ -551,11 +524,11 @@ class _Legs:
         return leg, u**3 * (10.0 - 15.0 * u + 6.0 * u * u), 30.0 * (u * (1.0 - u)) ** 2 / period
 
 
-def _line(direction: Sequence[float], speed: float, ideal_duration: float, ramp: float) -> _Path:
+def _line(
+    direction: Sequence[float], speed: float, ideal_duration: float, ramp: float
+) -> _Translation:
     velocity = speed * np.array(direction, float) / np.linalg.norm(direction)
-    return _Translation(
-        lambda tau: velocity * tau, lambda tau: velocity, _TimeScale(ideal_duration, ramp)
-    )
+    return _Translation(lambda tau: velocity * tau, lambda tau: velocity, ideal_duration, ramp)
 
 
 def _ramp_time(speed: float, acceleration: float | None) -> float:

@@ -1,7 +1,5 @@
 """Elastic mounting between a prescribed motion and the cut: arm and holder."""
 
-import dataclasses as dc
-
 import numpy as np
 
 from sliceit_drake.cutting.board import Board
@@ -14,7 +12,6 @@ ATTEMPTS = 40
 anew."""
 
 
-@dc.dataclass
 class Mounting:
     """Displacements of knife and food, in balance with the mean force of each coupling step.
 
@@ -24,41 +21,32 @@ class Mounting:
     and the springs' agree: a quasi-Newton search for the displacements (rise of the knife,
     displacement of the food along Cx); where only one gives, it is bracketed.
 
-    Attributes:
-        arm, holder: Compliances of knife (vertical) and food (along the edge), m/N.
-        resistance: Force along the edge at which the food slips, N; None for never.
-        remaining: Fraction of the resistance that is left while it slips.
+    Args:
+        effects: Those of the cut: compliances of knife (vertical) and food (along the edge), slip.
         tolerance: Tolerance of the balance of forces, relative to 1 N and the force.
+
+    Attributes:
         given: Rise of the knife and displacement of the food, metres [2].
-        slipped: How far the food has slipped along Cx, metres.
-        slipping: Whether it slips.
     """
 
-    arm: float
-    holder: float
-    resistance: float | None
-    remaining: float
-    tolerance: float = 1e-4
-    given: np.ndarray = dc.field(default_factory=lambda: np.zeros(2))
-    slipped: float = 0.0
-    slipping: bool = False
-    _slope: np.ndarray = dc.field(default_factory=lambda: np.zeros((2, 2)))
-    _tried: tuple[np.ndarray, np.ndarray] | None = None
-    _between: np.ndarray = dc.field(default_factory=lambda: np.array([[-np.inf] * 2, [np.inf] * 2]))
-    _attempts: int = 0
+    def __init__(self, effects: Effects, tolerance: float = 1e-4) -> None:
+        self._arm, self._holder = effects.compliance.arm, effects.compliance.holder
+        self._slip, self._tolerance = effects.slip, tolerance
+        self.given = np.zeros(2)
+        # How far the food has slipped along Cx, and whether it slips.
+        self._slipped, self._slipping = 0.0, False
+        self._slope = np.zeros((2, 2))
+        self._begin()
 
-    @classmethod
-    def of(cls, effects: Effects, tolerance: float = 1e-4) -> "Mounting":
-        """The mounting of a cut at its start."""
-        slip, compliance = effects.slip, effects.compliance
-        return cls(
-            compliance.arm, compliance.holder, slip.resistance, slip.remaining, tolerance=tolerance
-        )
+    def _begin(self) -> None:
+        self._tried: tuple[np.ndarray, np.ndarray] | None = None
+        self._attempts = 0
+        self._between = np.array([[-np.inf] * 2, [np.inf] * 2])
 
     @property
     def rigid(self) -> bool:
         """Whether nothing gives."""
-        return self.arm == 0.0 and self.holder == 0.0
+        return self._arm == 0.0 and self._holder == 0.0
 
     def balanced(self, rise: float, draw: float, height: float, board: Board | None) -> bool:
         """Whether the springs hold the forces that a coupling step with `given` has answered.
@@ -74,10 +62,10 @@ class Mounting:
         """
         force = np.array([rise, draw])
         held, stiffness = self._held(height, board)
-        gives = np.array([self.arm > 0.0, self.holder > 0.0])
+        gives = np.array([self._arm > 0.0, self._holder > 0.0])
         excess = np.where(gives, force - held, 0.0)
         self._attempts += 1
-        small = self.tolerance * np.maximum(1.0, np.abs(force))
+        small = self._tolerance * np.maximum(1.0, np.abs(force))
         # Where the cut broke down there is nothing to balance. Where its force jumps, as when a
         # skin gives way, there is no balance, but a displacement at which it jumps.
         over = self._attempts >= ATTEMPTS or not np.isfinite(force).all()
@@ -111,13 +99,13 @@ class Mounting:
         """Forces that arm (with the board) and holder hold at `given`, and their slopes [2]."""
         rise, shift = self.given.tolist()
         held, stiffness = np.zeros(2), np.ones(2)
-        if self.arm > 0.0:
-            held[0], stiffness[0] = rise / self.arm, 1.0 / self.arm
+        if self._arm > 0.0:
+            held[0], stiffness[0] = rise / self._arm, 1.0 / self._arm
             if board is not None and height + rise < board.height:
                 held[0] -= board.stiffness * (board.height - height - rise)
                 stiffness[0] += board.stiffness
-        if self.holder > 0.0:
-            held[1], stiffness[1] = (shift - self.slipped) / self.holder, 1.0 / self.holder
+        if self._holder > 0.0:
+            held[1], stiffness[1] = (shift - self._slipped) / self._holder, 1.0 / self._holder
             if abs(held[1]) > self._limit():
                 held[1] = np.sign(held[1]) * self._limit()
                 # Not zero, so that the search has a slope where the cut has none.
@@ -125,17 +113,17 @@ class Mounting:
         return held, stiffness
 
     def _limit(self) -> float:
-        if self.resistance is None:
+        """Force at which the food slips along the edge, N."""
+        if self._slip.resistance is None:
             return np.inf
-        return self.resistance * (self.remaining if self.slipping else 1.0)
+        return self._slip.resistance * (self._slip.remaining if self._slipping else 1.0)
 
     def _settle(self) -> None:
         """Takes what was found: the food slips, or holds again."""
-        if self.holder > 0.0:
+        if self._holder > 0.0:
             shift, limit = float(self.given[1]), self._limit()
-            pull = (shift - self.slipped) / self.holder
-            self.slipping = abs(pull) >= limit
-            if self.slipping:
-                self.slipped = shift - self.holder * float(np.sign(pull)) * limit
-        self._tried, self._attempts = None, 0
-        self._between = np.array([[-np.inf] * 2, [np.inf] * 2])
+            pull = (shift - self._slipped) / self._holder
+            self._slipping = abs(pull) >= limit
+            if self._slipping:
+                self._slipped = shift - self._holder * float(np.sign(pull)) * limit
+        self._begin()

@@ -95,16 +95,6 @@ class SplitMesh:
     vertex_position: np.ndarray
     source_tetrahedra: np.ndarray
 
-    def volumes(self) -> np.ndarray:
-        """Material volumes [T], m^3."""
-        whole = TetrahedralMesh(self.nodes, self.tetrahedra).volumes()
-        return whole * self.fraction
-
-    def section_area(self) -> float:
-        """Area of the cut, m^2."""
-        a, b, c = (self.points[self.triangles[:, k]] for k in range(3))
-        return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-
 
 def _minority_part(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Volume share and barycentric centroid of the part above 0 of tetrahedra [K, 4].
