@@ -20,7 +20,7 @@ from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
 from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.diagnose import BASE, Progress, setup_of_food
-from sliceit_drake.diagnosis.evidence.columns import Sensitivities
+from sliceit_drake.diagnosis.evidence.columns import Column, Sensitivities
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.experiments.identifiability import SHIFT, Evidence, identifiability
 from sliceit_drake.diagnosis.one_slice.slice_evidence import (
@@ -200,25 +200,17 @@ def _confirm(
 def _all_free(found: Sensitivities) -> Sensitivities:
     """The same with what is the record's own as free as what all share, and what slices differ in
     left out: in one slice it is the same as a shift of a base parameter."""
-    keep = [
-        k
-        for k, c in enumerate(found.columns)
-        if c.kind != "record" or c.name in ("height", "speed")
-    ]
-    columns = []
-    for k in keep:
-        c = found.columns[k]
-        if c.kind == "record":
+    keep, columns = [], []
+    for k, c in enumerate(found.columns):
+        if c.kind != "record":
+            columns.append(c)
+        elif c.name in OWN:
             # A shift that is plausible for a base parameter counts as one of this for height.
-            plausible = OWN[c.name][1]
-            c = dc.replace(
-                c,
-                kind="base",
-                name=f"own.{c.name}",
-                size=c.size * SHIFT / plausible,
-                per_record=False,
-            )
-        columns.append(c)
+            size = c.size * SHIFT / OWN[c.name][1]
+            columns.append(Column("base", f"own.{c.name}", size=size, unit=c.unit))
+        else:
+            continue
+        keep.append(k)
     (record,) = found.records
     one = dc.replace(record, columns=record.columns[:, :, keep], even=record.even[:, :, keep])
     return Sensitivities(columns, [one], found.warnings, found.elements)

@@ -168,8 +168,12 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.asarray(np.tensordot(a, b, ((0, 1), (0, 1))))
 
 
-def bounded_gain(A: np.ndarray, b: np.ndarray, one_sided: list[bool]) -> tuple[float, np.ndarray]:
-    """Gain in the quadratic form where one-sided coefficients are not negative, and these."""
+def _bounded_gain(
+    problem: SliceProblem, columns: list[int], b: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Gain by columns from their products, and their coefficients; no one-sided one is negative."""
+    A = problem.gram[np.ix_(columns, columns)]
+    one_sided = [problem.found.columns[k].one_sided for k in columns]
     n = len(b)
     full = (1 << n) - 1
     best, at = 0.0, np.zeros(n)
@@ -311,15 +315,18 @@ def _known(found: Sensitivities) -> tuple[list[int], np.ndarray]:
     return columns, np.array(precision)
 
 
+_Option = tuple[str, float | None, list[int]]
+"""Cause, value of its scan, and numbers of its columns there."""
+
+
 def _best_gains(
-    problem: SliceProblem, options: Sequence[tuple[str, float | None, list[int]]], y: np.ndarray
+    problem: SliceProblem, options: Sequence[_Option], y: np.ndarray
 ) -> dict[str, tuple[float, float | None]]:
     """Largest gain of each cause, and the value of its scan."""
-    b, kinds = problem.with_y(y), problem.found.columns
+    b = problem.with_y(y)
     out: dict[str, tuple[float, float | None]] = {}
     for name, scan, columns in options:
-        A = problem.gram[np.ix_(columns, columns)]
-        gain, _ = bounded_gain(A, b[columns], [kinds[k].one_sided for k in columns])
+        gain, _ = _bounded_gain(problem, columns, b[columns])
         if name not in out or gain > out[name][0]:
             out[name] = gain, scan
     return out
@@ -327,25 +334,19 @@ def _best_gains(
 
 def _same_effect(
     problem: SliceProblem,
-    options: Sequence[tuple[str, float | None, list[int]]],
+    options: Sequence[_Option],
     found: CauseInSlice,
 ) -> list[str]:
     """Causes that can do what one was found to do to within `ANGLE`, at a value of their scan."""
-    kinds = problem.found.columns
-    b = problem.with_y(problem.record.residual)
-    own = next(c for n, s, c in options if (n, s) == (found.name, found.scan))
-    _, e = bounded_gain(problem.gram[np.ix_(own, own)], b[own], [kinds[k].one_sided for k in own])
+    own = problem.found.of_causes([(found.name, found.scan)])
+    _, e = _bounded_gain(problem, own, problem.with_y(problem.record.residual)[own])
     square = float(e @ problem.gram[np.ix_(own, own)] @ e)
     least = square * np.cos(np.radians(ANGLE)) ** 2
     out = []
     for name, _, columns in options:
         if name == found.name or name in out or square <= 0.0:
             continue
-        explained, _ = bounded_gain(
-            problem.gram[np.ix_(columns, columns)],
-            problem.gram[np.ix_(columns, own)] @ e,
-            [kinds[k].one_sided for k in columns],
-        )
+        explained, _ = _bounded_gain(problem, columns, problem.gram[np.ix_(columns, own)] @ e)
         if explained >= least:
             out.append(name)
     return out

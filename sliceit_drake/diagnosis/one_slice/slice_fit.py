@@ -160,33 +160,36 @@ def fit_slice(
     Raises:
         CuttingError: The slice breaks down where the fit begins.
     """
-    unknowns = _unknowns(predictor, cause)
-    given = start or {}
-    theta = np.array([np.clip(given.get(u.name, 0.0), u.low, u.high) for u in unknowns])
-    work = _Work(predictor, unknowns, cause, scan)
-    theta, predicted, jacobian = work.fit(theta)
-    held_out = np.empty_like(predicted)
-    shared = np.array([u.kind != "own" for u in unknowns])
+    fitter = _Fitter(predictor, _unknowns(predictor, cause), cause, scan)
+    fitter.fit(start or {})
+    held_out = np.empty_like(fitter.predicted)
     for number in np.unique(block):
         rows = block == number
-        held_out[rows] = work.without(theta, predicted, jacobian, rows, shared)[rows]
-    return SliceFit(unknowns, theta, work.point(theta), predicted, jacobian, held_out)
+        held_out[rows] = fitter.without(rows)[rows]
+    return SliceFit(
+        fitter.unknowns,
+        fitter.theta,
+        fitter.point(fitter.theta),
+        fitter.predicted,
+        fitter.jacobian,
+        held_out,
+    )
 
 
-@dc.dataclass
-class _Work:
-    """Gauss-Newton steps of one slice."""
+class _Fitter:
+    """Gauss-Newton steps of one slice; its state is that of `SliceFit`."""
 
-    predictor: SlicePredictor
-    unknowns: list[Unknown]
-    cause: Cause | None
-    scan: float | None
-
-    def __post_init__(self) -> None:
-        (self.target,) = self.predictor.targets
-        self.low, self.high, self.spread = np.array(
-            [(u.low, u.high, u.spread) for u in self.unknowns]
-        ).T
+    def __init__(
+        self,
+        predictor: SlicePredictor,
+        unknowns: list[Unknown],
+        cause: Cause | None,
+        scan: float | None,
+    ) -> None:
+        self.predictor, self.unknowns, self.cause, self.scan = predictor, unknowns, cause, scan
+        (self.target,) = predictor.targets
+        ranges = np.array([(u.low, u.high, u.spread) for u in unknowns])
+        self.low, self.high, self.spread = ranges.T
 
     def point(self, theta: np.ndarray) -> Point:
         values: dict[str, dict[str, float]] = {"base": {}, "own": {}, "cause": {}}
@@ -216,7 +219,9 @@ class _Work:
         rest = (self.target.measured - predicted)[rows].ravel() / NOISE
         return float(rest @ rest + ((theta / self.spread) ** 2).sum())
 
-    def fit(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def fit(self, start: Mapping[str, float]) -> None:
+        """Fits all rows from places of unknowns."""
+        theta = np.array([np.clip(start.get(u.name, 0.0), u.low, u.high) for u in self.unknowns])
         (predicted,) = self.predict([theta])
         everything = self.target.compared
         cost = self.cost(theta, predicted, everything)
@@ -224,35 +229,28 @@ class _Work:
             raise CuttingError(
                 f"{self.target.facts.name}: the prediction broke down where its fit begins"
             )
-        free = np.ones(len(theta), bool)
         for _ in range(STEPS):
-            jacobian = self.jacobian(theta, predicted)
-            aim = self.refit(theta, predicted, jacobian, everything, free)
+            self.jacobian = self.changes(theta, predicted)
+            aim = self.refit(theta, predicted, everything, np.ones(len(theta), bool))
             tries, seen, costs = self.search(theta, aim, everything)
             best = int(np.argmin(costs))
             if not costs[best] < (1.0 - ENOUGH) * cost:
                 break
             theta, predicted, cost = tries[best], seen[best], costs[best]
-        return theta, predicted, jacobian
+        self.theta, self.predicted = theta, predicted
 
-    def without(
-        self,
-        theta: np.ndarray,
-        predicted: np.ndarray,
-        jacobian: np.ndarray,
-        rows: np.ndarray,
-        free: np.ndarray,
-    ) -> np.ndarray:
+    def without(self, rows: np.ndarray) -> np.ndarray:
         """The prediction by a fit to the other rows, with the derivatives of the fit to all.
 
         It begins where all rows were fitted, so that one that stayed there would have seen what it
         predicts. The first step is taken even where it makes the rest a little worse: as good a
         fit to the rest as it can tell, and one without the rows.
         """
-        others = ~rows & self.target.compared
+        theta, predicted, others = self.theta, self.predicted, ~rows & self.target.compared
+        shared = np.array([u.kind != "own" for u in self.unknowns])
         cost = AS_GOOD * self.cost(theta, predicted, others)
         for _ in range(HELD_OUT_STEPS):
-            aim = self.refit(theta, predicted, jacobian, others, free)
+            aim = self.refit(theta, predicted, others, shared)
             tries, seen, costs = self.search(theta, aim, others)
             # The longest step that is nearly as good as the best one.
             best = int(np.argmax(np.array(costs) <= AS_GOOD * min(costs)))
@@ -269,7 +267,7 @@ class _Work:
         seen = self.predict(tries)
         return tries, seen, [self.cost(t, p, rows) for t, p in zip(tries, seen, strict=True)]
 
-    def jacobian(self, theta: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    def changes(self, theta: np.ndarray, predicted: np.ndarray) -> np.ndarray:
         """Change by each unknown, towards the side that has room [m, c, n]."""
         n = len(theta)
         sides = np.where(theta + 1.0 <= self.high, 1.0, -1.0)
@@ -281,15 +279,10 @@ class _Work:
         return out
 
     def refit(
-        self,
-        theta: np.ndarray,
-        predicted: np.ndarray,
-        jacobian: np.ndarray,
-        rows: np.ndarray,
-        free: np.ndarray,
+        self, theta: np.ndarray, predicted: np.ndarray, rows: np.ndarray, free: np.ndarray
     ) -> np.ndarray:
         """One Gauss-Newton step over some rows and some unknowns, within their ranges."""
-        A = jacobian[rows][:, :, free].reshape(-1, int(free.sum())) / NOISE
+        A = self.jacobian[rows][:, :, free].reshape(-1, int(free.sum())) / NOISE
         b = (self.target.measured - predicted)[rows].ravel() / NOISE
         prior = np.diag(1.0 / self.spread[free])
         low = np.maximum(self.low, theta - LONGEST)[free] - theta[free]
