@@ -18,8 +18,6 @@ from sliceit_drake.diagnosis.input_checks import check_records, without_lone_tor
 from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import open_causes
 from sliceit_drake.diagnosis.result import Diagnosis
-from sliceit_drake.prediction.clock import Clock
-from sliceit_drake.prediction.record_target import Meshing
 from sliceit_drake.prediction.simulator import Workers
 from sliceit_drake.records.slice_record import SliceRecord
 
@@ -126,8 +124,7 @@ def diagnose(
         remarks=remarks,
     )
     if verdict.findings:
-        runs = None if cache is None else cache / "slices"
-        predictor = SlicePredictor(setup, records, (Meshing(),), Clock(), runs, workers)
+        predictor = SlicePredictor(setup, records, cache=cache, workers=workers)
         result.confirm(predictor, seed, lambda done, total: show("confirmation", done, total))
         assert result.gain is not None
         result.verdict = checked_out_of_sample(result.verdict, result.gain, problem)

@@ -90,7 +90,7 @@ class SlicePredictor:
         records: What is predicted.
         meshings: How finely; the first is the default of a point.
         clock: How time is divided.
-        cache: Folder of finished simulations.
+        cache: Folder in which finished simulations are kept, in `slices`.
         workers: What simulates.
 
     Raises:
@@ -109,8 +109,9 @@ class SlicePredictor:
         self.setup, self.clock = setup, clock or Clock()
         self.meshings = tuple(meshings)
         self.targets = make_targets(setup, records, self.meshings, self.clock)
+        runs = None if cache is None else cache / "slices"
         self.board: Board = dc.replace(setup.board, height=0.0)
-        self.simulator = Simulator(self.clock, self.board, cache, workers)
+        self.simulator = Simulator(self.clock, self.board, runs, workers)
         self._boards: dict[bytes, np.ndarray] = {}
 
     def record_effects(self, target: RecordTarget) -> tuple[RecordEffect, ...]:

@@ -16,7 +16,6 @@ from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
 from sliceit_drake.cutting.foods.food import make_food_model
 from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.diagnosis.cause import Cause
-from sliceit_drake.diagnosis.evidence.columns import Sensitivities
 from sliceit_drake.diagnosis.evidence.confirm import Confirmation, confirm
 from sliceit_drake.diagnosis.evidence.held_out import HeldOutGain, held_out_gain, held_out_share
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
@@ -83,11 +82,6 @@ class Diagnosis:
                 "promise: take the values for a direction."
             )
         self.gain = held_out_gain(self.problem, self.verdict.named, seed, simulated)
-
-    @property
-    def sensitivities(self) -> Sensitivities:
-        """What the evidence rests on."""
-        return self.problem.found
 
     def values(self, finding: Finding) -> dict[str, float]:
         """Parameters of a finding's cause."""

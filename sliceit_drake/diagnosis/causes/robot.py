@@ -48,10 +48,9 @@ class ToolWeight(Cause):
             axis=1,
         )
         if facts.tared:
-            first = np.concatenate(
-                [series.in_knife(added[:, :3])[:1], series.in_knife(added[:, 3:])[:1]], axis=1
-            )[0]
-            added -= np.concatenate([series.in_food(first[:3]), series.in_food(first[3:])], axis=1)
+            for part in (slice(0, 3), slice(3, 6)):
+                first = series.in_knife(added[:, part])[0]
+                added[:, part] -= series.in_food(first)
         return series.wrench + added
 
 

@@ -132,10 +132,7 @@ class LinearProblem:
         self.spline = list(range(K, K + S))
         self.correction = list(range(K + S, K + S + N))
         self.size = K + S + N
-        self.discretisation = np.zeros(S)
-        scale = self._mesh_scale(len(channels))
-        for c in range(len(channels)):
-            self.discretisation[c * count : (c + 1) * count] = scale[c]
+        self.discretisation = np.repeat(self._mesh_scale(len(channels)), count)
         gram = np.zeros((len(found.records), self.size + 1, self.size + 1))
         force_gram, force_rows = np.zeros_like(gram), np.zeros(len(found.records), int)
         self.forces = found.records[0].forces
@@ -329,13 +326,10 @@ def integrate_out(G: np.ndarray, own: list[int], variance: np.ndarray) -> np.nda
 
 def _depth_splines(record: RecordSensitivity, count: int, channels: int) -> np.ndarray:
     """Hat functions of depth for each channel while the edge is in the food [m, c, c * count]."""
-    out = np.zeros((len(record.time), channels, channels * count))
     knots = KNOT * np.arange(count)
     hats = np.maximum(1.0 - np.abs(record.depth[:, None] - knots) / KNOT, 0.0)
     hats[~record.in_contact | (record.depth <= 0.0)] = 0.0
-    for c in range(channels):
-        out[:, c, c * count : (c + 1) * count] = hats
-    return out
+    return _by_channel(hats, channels)
 
 
 def _time_splines(record: RecordSensitivity, channels: int) -> np.ndarray:
@@ -348,7 +342,9 @@ def _time_splines(record: RecordSensitivity, channels: int) -> np.ndarray:
     basis = BSpline.design_matrix(np.clip(time, low, high), knots, 3).toarray()
     basis = basis[:, :PHASE_KNOTS]
     basis[(time < low) | (time > high)] = 0.0
-    out = np.zeros((len(time), channels, channels * PHASE_KNOTS))
-    for c in range(channels):
-        out[:, c, c * PHASE_KNOTS : (c + 1) * PHASE_KNOTS] = basis
-    return out
+    return _by_channel(basis, channels)
+
+
+def _by_channel(shapes: np.ndarray, channels: int) -> np.ndarray:
+    """Columns [m, k] for each channel by itself [m, c, c * k]."""
+    return np.einsum("mk,cd->mcdk", shapes, np.eye(channels)).reshape(len(shapes), channels, -1)

@@ -221,28 +221,19 @@ class _Statistics:
         total = reduced.sum(1)
         return np.asarray(total - total[:, self.baseline] @ self.baseline_weights.T)
 
-    def gains(
-        self, products: np.ndarray
-    ) -> tuple[dict[str, tuple[np.ndarray, list[float | None]]], np.ndarray, np.ndarray]:
-        """Largest gains of each cause [n] with their scans, gains by a correction of each condition
-        [n], and the products beside the baseline [n, K]."""
+    def gains(self, products: np.ndarray) -> tuple[dict[CauseAtScan, np.ndarray], np.ndarray]:
+        """Gains of the causes at each value of their scans [n], and by a correction of each
+        condition [n]."""
         reduced = self.reduce(products)
         projected = self.project(reduced)
         of_baseline = _squares(reduced.sum(1)[:, self.baseline], self.baseline_covariance)
-        out: dict[str, tuple[np.ndarray, list[float | None]]] = {}
+        out = {}
         for name, scan, columns in self.options:
             if self.per_record[name]:
-                gain = self._eliminated[columns[0]].gain(reduced) - of_baseline
+                out[name, scan] = self._eliminated[columns[0]].gain(reduced) - of_baseline
             else:
-                gain = self._bounded(projected, columns)[0]
-            if name not in out:
-                out[name] = gain, [scan] * len(gain)
-                continue
-            before, scans = out[name]
-            better = gain > before
-            scans = [scan if new else old for new, old in zip(better, scans, strict=True)]
-            out[name] = np.where(better, gain, before), scans
-        return out, self._corrected.gain(reduced) - of_baseline, projected
+                out[name, scan] = self._bounded(projected, columns)[0]
+        return out, self._corrected.gain(reduced) - of_baseline
 
     def _bounded(
         self, projected: np.ndarray, columns: list[int]
@@ -393,22 +384,23 @@ def screen(
     statistics = _Statistics(problem, assumed)
     K = problem.size
     measured = problem.moments.gram[None, :, :K, K]
-    gains, misfit, _ = statistics.gains(measured)
+    gains, misfit = statistics.gains(measured)
     draw = _Bootstrap(problem, np.random.default_rng(seed))
     chance_gains: dict[str, list[float]] = {name: [] for name in statistics.names}
     chance_misfits: list[float] = []
     while len(chance_misfits) < replicates:
         count = min(BATCH, replicates - len(chance_misfits))
-        own, of_correction, _ = statistics.gains(draw(count))
-        for name, (gain, _) in own.items():
-            chance_gains[name] += gain.tolist()
+        own, of_correction = statistics.gains(draw(count))
+        for name in statistics.names:
+            largest = np.max([gain for at, gain in own.items() if at[0] == name], axis=0)
+            chance_gains[name] += largest.tolist()
         chance_misfits += of_correction.tolist()
         if progress is not None:
             progress(count)
     evidence = []
     for name in statistics.names:
-        gain, (scan,) = gains[name]
-        columns = problem.found.index("cause", name, scan)
+        _, scan = best = max((at for at in gains if at[0] == name), key=lambda at: gains[at][0])
+        columns = problem.found.of_causes([best])
         kinds = [problem.found.columns[c] for c in columns]
         value, error = statistics.coefficients(measured, columns)
         fits, presence = np.zeros((0, 0)), 1.0
@@ -422,7 +414,7 @@ def screen(
         evidence.append(
             CauseEvidence(
                 name=name,
-                gain=float(gain[0]),
+                gain=float(gains[best][0]),
                 expected=float(by_chance.mean()),
                 deviation=float(by_chance.std()),
                 limit=float(np.quantile(by_chance, 0.95)),
@@ -437,11 +429,11 @@ def screen(
     means = np.array([[e.expected] for e in evidence])
     spreads = np.array([[max(e.deviation, MIN_DEVIATION)] for e in evidence])
     by_chance = (np.array([chance_gains[e.name] for e in evidence]) - means) / spreads
-    largest = max(e.deviations for e in evidence)
-    p = (1.0 + (by_chance.max(0) >= largest).sum()) / (replicates + 1.0)
+    most = max(e.deviations for e in evidence)
+    p = (1.0 + (by_chance.max(0) >= most).sum()) / (replicates + 1.0)
     for e in evidence:
         if e.gain > float(np.quantile(chance_gains[e.name], UNUSUAL)):
-            columns = problem.found.index("cause", e.name, e.scan)
+            columns = problem.found.of_causes([e.cause])
             e.gain = max(e.gain, statistics.gain_with_usual(measured, columns))
     p_misfit = (1.0 + (np.array(chance_misfits) >= misfit[0]).sum()) / (replicates + 1.0)
     angles, visible = _angles(statistics)

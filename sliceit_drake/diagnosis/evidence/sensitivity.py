@@ -187,8 +187,7 @@ def sensitivities(
     meshings = [meshing, dc.replace(meshing, time_step=0.5 * meshing.time_step)]
     if finer is not None:
         meshings.append(dc.replace(meshing, refinement=finer * meshing.refinement))
-    runs = None if cache is None else cache / "slices"
-    predictor = SlicePredictor(setup, records, meshings, clock, runs, workers)
+    predictor = SlicePredictor(setup, records, meshings, clock, cache, workers)
     store = ContentStore(None if cache is None else cache / "sensitivities")
 
     def computed(

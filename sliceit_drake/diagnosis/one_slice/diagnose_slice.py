@@ -113,9 +113,7 @@ def diagnose_slice(
     by_name = {c.name: c for c in causes}
     stages = 2 + CONFIRMED
     show("fits", 0, stages)
-    predictor = SlicePredictor(
-        setup, [record], cache=None if cache is None else cache / "slices", workers=workers
-    )
+    predictor = SlicePredictor(setup, [record], cache=cache, workers=workers)
     (target,) = predictor.targets
     block = depth_blocks(target.depth, target.depth > 0.0)
     fit = fit_slice(predictor, block)
