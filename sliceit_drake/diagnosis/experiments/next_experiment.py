@@ -22,7 +22,7 @@ from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
 from sliceit_drake.diagnosis.evidence.screen import CauseEvidence
 from sliceit_drake.diagnosis.evidence.sensitivity import Progress
 from sliceit_drake.diagnosis.evidence.verdict import CLASS_ANGLE, MIN_REPLICATES
-from sliceit_drake.diagnosis.experiments.designs import Experiment, menu
+from sliceit_drake.diagnosis.experiments.designs import menu
 from sliceit_drake.diagnosis.experiments.planned_record import (
     experiment_of_record,
     next_knife_slice,
@@ -74,8 +74,8 @@ def next_experiment(
     classes = _classes(diagnosis)
     if not classes:
         return _nothing(diagnosis, records)
-    experiments = _menu(diagnosis, records)
-    search = ExperimentSearch(diagnosis, experiments, classes, records, cache, workers, progress)
+    steps = _menu(diagnosis, records)
+    search = ExperimentSearch(diagnosis, steps, classes, records, cache, workers, progress)
     return search.result()
 
 
@@ -123,21 +123,21 @@ def _nothing(diagnosis: Diagnosis, records: Sequence[SliceRecord]) -> NextExperi
 
 
 def _exploring(diagnosis: Diagnosis, records: Sequence[SliceRecord]) -> list[Step]:
-    choice = {e.name: e for e in _menu(diagnosis, records)}
+    choice = {step.plan.name: step for step in _menu(diagnosis, records)}
     names = [n for n in EXPLORING if n in choice]
     if "draw_3" in names:
         names.remove("draw_1")
-    template, knife = template_of(records), next_knife_slice(records)
+    return [choice[n] for n in names]
+
+
+def _menu(diagnosis: Diagnosis, records: Sequence[SliceRecord]) -> list[Step]:
+    setup, template, knife = diagnosis.setup, template_of(records), next_knife_slice(records)
+    fixed = isinstance(setup.food.shape, MeshFile | Remainder | Tapered)
     return [
-        Step(choice[n], planned_slice(choice[n], diagnosis.setup, template, knife), MIN_REPLICATES)
-        for n in names
+        Step(e, planned_slice(e, setup, template, knife))
+        for e in menu(scale_of(setup, records))
+        if e.size == 1.0 or not fixed
     ]
-
-
-def _menu(diagnosis: Diagnosis, records: Sequence[SliceRecord]) -> list[Experiment]:
-    shape = diagnosis.setup.food.shape
-    fixed = isinstance(shape, MeshFile | Remainder | Tapered)
-    return [e for e in menu(scale_of(diagnosis.setup, records)) if e.size == 1.0 or not fixed]
 
 
 def _classes(diagnosis: Diagnosis) -> list[CauseClass]:

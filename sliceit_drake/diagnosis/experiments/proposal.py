@@ -9,7 +9,7 @@ from scipy.stats import norm
 
 from sliceit_drake.configuration import dump_yaml
 from sliceit_drake.cutting.planned_slice import PlannedSlice
-from sliceit_drake.diagnosis.evidence.verdict import ALARM, CLASS_ANGLE
+from sliceit_drake.diagnosis.evidence.verdict import ALARM, CLASS_ANGLE, MIN_REPLICATES
 from sliceit_drake.diagnosis.experiments.designs import Experiment
 
 __all__ = ["MARGIN", "NEEDED", "NextExperiment", "Pair", "Step"]
@@ -68,7 +68,7 @@ class Step:
 
     experiment: Experiment
     plan: PlannedSlice
-    slices: int
+    slices: int = MIN_REPLICATES
     file: Path | None = None
 
 
@@ -139,10 +139,10 @@ class NextExperiment:
         file.parent.mkdir(parents=True, exist_ok=True)
         for k, step in enumerate(self.steps):
             step.file = file if k == 0 else file.with_name(f"{file.stem}_{k + 1}{file.suffix}")
-        for step in self.steps:
-            assert step.file is not None
-            step.file.write_text(self._text(step, scenario_of(step.plan)), encoding="utf-8")
-        return [step.file for step in self.steps if step.file is not None]
+        files = [step.file for step in self.steps if step.file is not None]
+        for step, own in zip(self.steps, files, strict=True):
+            own.write_text(self._text(step, scenario_of(step.plan)), encoding="utf-8")
+        return files
 
     def _text(self, step: Step, scenario: Any) -> str:
         head = [

@@ -12,15 +12,12 @@ from sliceit_drake.diagnosis.evidence.columns import (
     RecordSensitivity,
     Sensitivities,
 )
-from sliceit_drake.diagnosis.evidence.linear import LinearProblem, integrate_out, scaled_inverse
+from sliceit_drake.diagnosis.evidence.linear import LinearProblem, scaled_inverse
 from sliceit_drake.diagnosis.evidence.screen import CauseEvidence, Screening
 from sliceit_drake.diagnosis.evidence.sensitivity import Progress, sensitivities
 from sliceit_drake.diagnosis.evidence.verdict import MIN_REPLICATES
-from sliceit_drake.diagnosis.experiments.designs import Experiment
 from sliceit_drake.diagnosis.experiments.planned_record import (
-    next_knife_slice,
     planned_record,
-    planned_slice,
     template_of,
 )
 from sliceit_drake.diagnosis.experiments.proposal import NextExperiment, Pair, Step
@@ -75,29 +72,26 @@ class ExperimentSearch:
     def __init__(
         self,
         diagnosis: Diagnosis,
-        experiments: list[Experiment],
+        menu: list[Step],
         classes: list[CauseClass],
         records: Sequence[SliceRecord],
         cache: Path | None,
         workers: Workers,
         progress: Progress | None,
     ) -> None:
-        self.experiments, self.classes = experiments, classes
-        setup, template, knife = diagnosis.setup, template_of(records), next_knife_slice(records)
-        self.plans = [planned_slice(e, setup, template, knife) for e in self.experiments]
+        self.menu, self.classes = menu, classes
+        setup, template = diagnosis.setup, template_of(records)
         first = 1 + max(r.metadata.slice_index for r in records)
-        planned = [planned_record(plan, setup, template, first) for plan in self.plans]
+        planned = [planned_record(step.plan, setup, template, first) for step in menu]
         found = diagnosis.problem.found
         names = {e.name for c in self.classes for e in c.evidence} | set(USUAL)
         names |= {name for c in self.classes for name, _ in c.assumed}
         causes = [diagnosis.causes[n] for n in found.causes if n in names]
         new = sensitivities(setup, planned, causes, cache=cache, workers=workers, progress=progress)
         self.problem = _joined(diagnosis.problem, new, names)
-        own, variance = self.problem.own_prior()
-        reduced = [integrate_out(G, own, variance) for G in self.problem.moments.gram]
+        reduced = self.problem.reduced(*self.problem.own_prior())
         count = len(found.records)
-        self.old = np.sum(reduced[:count], axis=0)
-        self.new = reduced[count:]
+        self.old, self.new = np.sum(reduced[:count], axis=0), reduced[count:]
         self._before = self._angles(self.old)
 
     def _projected(self, total: np.ndarray, assumed: Sequence[CauseAtScan]) -> np.ndarray:
@@ -138,10 +132,10 @@ class ExperimentSearch:
     def _further(self, choice: _Choice) -> _Choice:
         """The best with one experiment more."""
         choices = []
-        for number, experiment in enumerate(self.experiments):
+        for number, step in enumerate(self.menu):
             if number in choice.counts:
                 continue
-            by_hand = choice.by_hand + bool(experiment.by_hand)
+            by_hand = choice.by_hand + bool(step.experiment.by_hand)
             for slices in range(MIN_REPLICATES, MOST_SLICES + 1):
                 counts = {**choice.counts, number: slices}
                 choices.append(_Choice(counts, self.pairs(counts), by_hand))
@@ -158,7 +152,7 @@ class ExperimentSearch:
                 break
             choice = further
         counts, pairs = choice.counts, choice.pairs
-        steps = [Step(self.experiments[k], self.plans[k], n) for k, n in counts.items()]
+        steps = [dc.replace(self.menu[k], slices=n) for k, n in counts.items()]
         classes = "; ".join("{" + ", ".join(e.name for e in c.evidence) + "}" for c in self.classes)
         if all(p.parts for p in pairs) and not steps:
             reason = f"nothing to split: the records at hand part {classes}"
@@ -167,7 +161,7 @@ class ExperimentSearch:
             number, angle = self._largest()
             reason = (
                 f"no motion of the menu parts more of {classes} at the sizes found; the largest "
-                f"least angle, {angle:.0f} degrees, is that of {self.experiments[number].name}"
+                f"least angle, {angle:.0f} degrees, is that of {self.menu[number].plan.name}"
             )
             return NextExperiment("none", reason, [], self.pairs({number: MOST_SLICES}))
         left = sorted({tuple(sorted((p.true, p.fitted))) for p in pairs if not p.parts})
@@ -178,9 +172,7 @@ class ExperimentSearch:
 
     def _largest(self) -> tuple[int, float]:
         """The experiment of the largest least angle."""
-        angles = [
-            min(p.after for p in self.pairs({k: MOST_SLICES})) for k in range(len(self.experiments))
-        ]
+        angles = [min(p.after for p in self.pairs({k: MOST_SLICES})) for k in range(len(self.menu))]
         best = int(np.argmax(angles))
         return best, angles[best]
 
@@ -203,8 +195,5 @@ def _joined(problem: LinearProblem, new: Sensitivities, names: set[str]) -> Line
         dc.replace(r, columns=r.columns[:, :, kept], even=r.even[:, :, kept]) for r in old.records
     ]
     records += [dc.replace(r, columns=picked(r.columns), even=picked(r.even)) for r in new.records]
-    elements = max(old.elements, new.elements)
-    found = Sensitivities(columns, records, [], elements)
-    joint = LinearProblem(found, problem.noise, problem.variation)
-    joint.variation_samples = problem.variation_samples
-    return joint
+    found = Sensitivities(columns, records, [], max(old.elements, new.elements))
+    return LinearProblem(found, problem.noise, problem.variation)
