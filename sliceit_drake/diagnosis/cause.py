@@ -107,7 +107,6 @@ class Cause:
     Attributes:
         name: Short and unique, with underscores.
         family: One of `FAMILIES`.
-        row: Row of the list of causes in docs/causes.md that it stands for; 0 for none.
         parameters: Its numbers.
         scan: A number that exists only where the cause does, or None.
         per_record: Whether each record has values of its own, as the phase of a vibration.
@@ -124,7 +123,6 @@ class Cause:
 
     name = ""
     family = ""
-    row = 0
     parameters: tuple[CauseParameter, ...] = ()
     scan: Scan | None = None
     per_record = False

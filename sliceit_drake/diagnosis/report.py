@@ -32,11 +32,8 @@ img{max-width:100%}
 
 def html_page(title: str, parts: Sequence[str]) -> str:
     """A page with a title and parts, which are HTML."""
-    head = [
-        f"<!doctype html><html lang=en><meta charset=utf-8><title>{title}</title>",
-        f"<style>{STYLE}</style>",
-    ]
-    return "\n".join([*head, *parts, "</html>", ""])
+    head = f"<!doctype html><html lang=en><meta charset=utf-8><title>{title}</title>"
+    return "\n".join([head, f"<style>{STYLE}</style>", *parts, "</html>", ""])
 
 
 def image(figure: "Figure") -> str:

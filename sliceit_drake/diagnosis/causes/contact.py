@@ -24,7 +24,6 @@ class StaticFriction(Cause):
 
     name = "static_friction"
     family = "knife and contact"
-    row = 4
     parameters = (CauseParameter("share", "", 0.5, low=0.0, high=5.0),)
     scan = Scan("speed", "m/s", (3e-3, 1e-2, 3e-2))
     absorbed_by = ("material.static_friction",)
@@ -47,7 +46,6 @@ class FlankAdhesion(Cause):
 
     name = "adhesion"
     family = "knife and contact"
-    row = 5
     parameters = (
         CauseParameter("stress", "Pa", 400.0, low=0.0, high=1e5, adds_to="effects.adhesion.stress"),
         CauseParameter(
@@ -72,7 +70,6 @@ class BluntEdge(Cause):
 
     name = "bluntness"
     family = "knife and contact"
-    row = 8
     parameters = (CauseParameter("initiation", "J/m2", 250.0, low=0.0, high=1e4),)
     scan = Scan("depth", "m", (1e-3, 2e-3, 4e-3))
     absorbed_by = ("effects.bluntness.initiation",)
@@ -93,7 +90,6 @@ class Dulling(Cause):
 
     name = "dulling"
     family = "knife and contact"
-    row = 9
     by_slice = True
     parameters = (CauseParameter("growth", "J/m2", 250.0, low=0.0, high=1e4),)
     scan = Scan("exponent", "", (0.5, 1.0))

@@ -39,7 +39,6 @@ class Viscoelasticity(Cause):
 
     name = "viscoelasticity"
     family = "material"
-    row = 1
     parameters = tuple(
         CauseParameter(f"{kind}_{speed}", "", 0.1, low=0.0, high=0.33)
         for kind in ("share", "rest")
@@ -83,7 +82,6 @@ class ToughnessBySpeed(Cause):
 
     name = "toughness_rate"
     family = "material"
-    row = 2
     parameters = (
         CauseParameter(
             "exponent", "", 0.08, low=-0.5, high=0.5, adds_to="effects.toughness_rate.exponent"
@@ -102,7 +100,6 @@ class SkinToughness(Cause):
 
     name = "skin"
     family = "material"
-    row = 7
     parameters = (CauseParameter("toughness", "J/m", 0.5, low=0.0, high=20.0),)
     scan = Scan("thickness", "m", (5e-4, 1.2e-3, 3e-3))
     absorbed_by = ("effects.skin.toughness",)
@@ -128,7 +125,6 @@ class CoreRatio(Cause):
 
     name = "core"
     family = "material"
-    row = 12
     parameters = (CauseParameter("weakening", "", 0.3, low=-2.0, high=0.9),)
     scan = Scan("rind", "", (0.15, 0.3, 0.5))
     signature = "locked to depth, at any speed; another shape than the section's width"
@@ -153,7 +149,6 @@ class SlicePushLaw(Cause):
 
     name = "slice_push_law"
     family = "material"
-    row = 10
     parameters = (
         CauseParameter(
             "exponent", "", 0.25, low=-0.5, high=2.0, adds_to="effects.slice_push.exponent"

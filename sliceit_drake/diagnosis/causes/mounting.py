@@ -31,7 +31,6 @@ class BoardHeight(Cause):
 
     name = "board_height"
     family = "board, holder, geometry"
-    row = 13
     parameters = (CauseParameter("height", "m", 2e-4, low=-5e-3, high=5e-3),)
     signature = "everything earlier in depth by the same, the last rise at the board most of all"
     experiment = "board_press"
@@ -54,7 +53,6 @@ class BoardLaw(Cause):
 
     name = "board_stiffness"
     family = "board, holder, geometry"
-    row = 13
     parameters = (
         CauseParameter("share", "", 0.3, low=-0.9, high=10.0),
         CauseParameter("exponent", "", 0.3, low=-0.5, high=1.0),
@@ -75,7 +73,6 @@ class ArmCompliance(Cause):
 
     name = "arm_compliance"
     family = "robot"
-    row = 14
     parameters = (
         CauseParameter(
             "compliance", "m/N", 1e-5, low=0.0, high=1e-3, adds_to="effects.compliance.arm"
@@ -117,7 +114,6 @@ class HolderCompliance(Cause):
 
     name = "holder_compliance"
     family = "board, holder, geometry"
-    row = 14
     parameters = (
         CauseParameter(
             "compliance", "m/N", 4e-5, low=0.0, high=1e-3, adds_to="effects.compliance.holder"
@@ -132,7 +128,6 @@ class FoodSlip(Cause):
 
     name = "slip"
     family = "board, holder, geometry"
-    row = 15
     parameters = tuple(CauseParameter(f"knock_{a}", "N", 1.0) for a in "xyz")
     scan = Scan("fading", "s", (0.02, 0.05, 0.12))
     per_record = True
@@ -174,7 +169,6 @@ class SectionShape(Cause):
 
     name = "section_shape"
     family = "board, holder, geometry"
-    row = 11
     parameters = (
         CauseParameter("taper", "", 0.1, low=-0.5, high=0.5),
         CauseParameter("belly", "", 0.1, low=-0.5, high=0.5),

@@ -24,7 +24,6 @@ class ToolWeight(Cause):
 
     name = "tool_weight"
     family = "robot"
-    row = 20
     parameters = (
         CauseParameter("mass", "kg", 0.15, low=-5.0, high=5.0),
         CauseParameter("moment", "kg m", 0.01, low=-1.0, high=1.0),
@@ -59,7 +58,6 @@ class Vibration(Cause):
 
     name = "vibration"
     family = "robot"
-    row = 21
     parameters = tuple(
         CauseParameter(f"{wave}_{axis}", "N", 0.3) for axis in AXES for wave in ("cosine", "sine")
     )
@@ -97,7 +95,6 @@ class StickSlip(Cause):
 
     name = "stick_slip"
     family = "knife and contact"
-    row = 21
     parameters = tuple(
         CauseParameter(f"{wave}_{n}", "N", 0.3 / n)
         for n in (1, 2, 3)

@@ -16,7 +16,6 @@ class SensorZero(Cause):
 
     name = "sensor_zero"
     family = "sensor"
-    row = 16
     parameters = (
         *(CauseParameter(f"bias_{a}", "N", 0.3) for a in AXES),
         *(CauseParameter(f"drift_{a}", "N/s", 0.03) for a in AXES),
@@ -38,7 +37,6 @@ class SensorGain(Cause):
 
     name = "sensor_gain"
     family = "sensor"
-    row = 17
     parameters = (CauseParameter("gain", "", 0.08, low=-0.9, high=5.0),)
     signature = "scales everything, a known weight too"
     experiment = "weight"
@@ -53,7 +51,6 @@ class SensorTilt(Cause):
 
     name = "sensor_tilt"
     family = "sensor"
-    row = 18
     parameters = (
         CauseParameter("about_x", "rad", 0.06, low=-0.5, high=0.5),
         CauseParameter("about_y", "rad", 0.06, low=-0.5, high=0.5),
@@ -81,7 +78,6 @@ class SensorDelay(Cause):
 
     name = "sensor_delay"
     family = "sensor"
-    row = 19
     parameters = (CauseParameter("delay", "s", 0.01, low=0.0, high=0.2),)
     scan = Scan("stages", "", (1.0, 4.0))
     signature = "minus the delay times the rate of the force; in depth it goes with the speed"
