@@ -14,8 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
+from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.diagnosis.cause import EXPERIMENTS
 from sliceit_drake.diagnosis.evidence.verdict import MIN_REPLICATES
 from sliceit_drake.diagnosis.experiments.identifiability import ANGLE, short
@@ -100,7 +102,9 @@ def run(options: argparse.Namespace) -> int:
         remarks = check_records([record], food.food)
         item = MeasuredSlice(name, {})
         for simulation in SIMULATIONS:
-            setup = setup_of_slice(food, options.refinement, simulation == "plain")
+            setup = setup_of_slice(food, options.refinement)
+            if simulation == "plain":
+                setup = without_layers(setup)
             with StageBars(f"{name}, {simulation}: ") as bars:
                 item.results[simulation] = diagnose_slice(
                     setup,
@@ -124,6 +128,15 @@ def run(options: argparse.Namespace) -> int:
     values = page_values(items, REPLICATES, command)
     publish(render_and_store(file.stem, file, values, results), file)
     return 0
+
+
+def without_layers(setup: CalibrationSetup) -> CalibrationSetup:
+    """The same without skin, core and centre, so that the food is the same all through: what is
+    fitted is the material and the contact alone."""
+    none = Effects()
+    effects = dc.replace(setup.food.effects, skin=none.skin, core=none.core, centre=none.centre)
+    parameters = [p for p in setup.parameters if not p.name.startswith("effects.")]
+    return dc.replace(setup, food=dc.replace(setup.food, effects=effects), parameters=parameters)
 
 
 @dc.dataclass

@@ -184,7 +184,5 @@ class SectionShape(Cause):
         up = np.clip(2.0 * height / (model.top - model.bottom) - 1.0, -1.0, 1.0)
         width = 1.0 - values["taper"] * up + values["belly"] * (0.5 - up**2)
         old = model.point_scales
-        scales = PointScales(
-            old.toughness * width, old.friction.copy(), old.flank_stiffness * width
-        )
+        scales = PointScales(old.toughness * width, old.friction, old.flank_stiffness * width)
         return model.derive(point_scales=scales)

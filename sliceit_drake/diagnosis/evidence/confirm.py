@@ -72,12 +72,11 @@ def confirm(
     promised = start - end
     at = {cause.name: dict(values) for cause, values in causes}
     logs = {k: float(x) * found.columns[k].size for k, x in zip(problem.base, theta, strict=False)}
-    best: tuple[float, LinearProblem, dict[str, dict[str, float]], dict[int, float]] | None = None
+    rounds = []
     for _ in range(ROUNDS):
         moved = _at_point(problem, predictor, causes, at, logs, progress)
         step, chi_square = _fit(moved, [*moved.base, *shared], shared)
-        if best is None or chi_square < best[0]:
-            best = chi_square, moved, {n: dict(v) for n, v in at.items()}, dict(logs)
+        rounds.append((chi_square, moved, {n: dict(v) for n, v in at.items()}, dict(logs)))
         for k, change in zip([*moved.base, *shared], step, strict=True):
             column = found.columns[k]
             if k in logs:
@@ -86,8 +85,7 @@ def confirm(
             cause = next(c for c, _ in causes if c.name == column.name)
             value = at[column.name][column.parameter] + float(change) * column.size
             at[column.name][column.parameter] = cause.parameter(column.parameter).within(value)
-    assert best is not None
-    chi_square, moved, at, logs = best
+    chi_square, moved, at, logs = min(rounds, key=lambda each: each[0])
     return Confirmation(
         problem=moved,
         values=at,

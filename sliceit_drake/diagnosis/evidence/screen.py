@@ -408,7 +408,9 @@ def screen(
             fits, own_gains = statistics.own_fits(measured, columns)
             shown = own_gains > kinds[0].searched + PRESENT * len(columns)
             presence = float(shown.sum() / max((own_gains > 0.0).sum(), 1))
-        searched = _searched(problem, columns)
+        # By a cause that looked for itself in records where there is nothing.
+        touched = [bool(r.columns[:, :, columns].any()) for r in problem.found.records]
+        searched = kinds[0].searched * sum(touched)
         chance_gains[name] = [g + searched for g in chance_gains[name]]
         by_chance = np.array(chance_gains[name])
         evidence.append(
@@ -448,12 +450,6 @@ def screen(
         names=statistics.names,
         projected=statistics.projected,
     )
-
-
-def _searched(problem: LinearProblem, columns: list[int]) -> float:
-    """Gain by a cause that looked for itself in records where there is nothing."""
-    touched = sum(bool(r.columns[:, :, columns].any()) for r in problem.found.records)
-    return problem.found.columns[columns[0]].searched * touched
 
 
 class _Bootstrap:

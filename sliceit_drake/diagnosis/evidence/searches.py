@@ -68,6 +68,10 @@ BINS = 8
 FINENESS = 8
 """Frequencies in the resolution of the longest series: an eighth of it moves the phase at the ends
 by an eighth of a period."""
+COUNT = 3
+"""Frequencies that are looked for."""
+SMOOTH = 25
+"""Rows over whose running mean values are looked at."""
 FLOOR_BINS = 401
 """Frequencies over whose median the spectrum is what it would be without a period."""
 
@@ -76,8 +80,6 @@ def strongest_frequencies(
     series: Sequence[tuple[np.ndarray, np.ndarray]],
     low: float,
     high: float,
-    count: int = 3,
-    smooth: int = 25,
 ) -> tuple[float, ...]:
     """Frequencies at which series have most power against their neighbourhood in the spectrum.
 
@@ -87,22 +89,20 @@ def strongest_frequencies(
         series: Of each a coordinate [m], such as time or path, that does not decrease, and values
             [m, c].
         low, high: Range of the frequencies, 1 over the coordinate's unit.
-        count: How many.
-        smooth: Rows over whose running mean values are looked at.
 
     Returns:
-        At most `count` frequencies, the strongest first.
+        At most `COUNT` frequencies, the strongest first.
     """
     step = 1.0 / (BINS * high)
-    spans = [float(u[-1] - u[0]) for u, values in series if len(values) > smooth]
+    spans = [float(u[-1] - u[0]) for u, values in series if len(values) > SMOOTH]
     if not spans:
         return ()
     size = 1 << int(np.ceil(np.log2(FINENESS * max(spans) / step + 2.0)))
     power = np.zeros(size // 2 + 1)
     for u, values in series:
-        if len(values) <= smooth:
+        if len(values) <= SMOOTH:
             continue
-        rest = values - uniform_filter1d(values, smooth, axis=0)
+        rest = values - uniform_filter1d(values, SMOOTH, axis=0)
         place = np.rint((u - u[0]) / step).astype(int)
         for column in rest.T:
             on_grid = np.bincount(place, column, minlength=size)
@@ -112,7 +112,7 @@ def strongest_frequencies(
     over_floor[(frequency < low) | (frequency > high)] = 0.0
     apart = max(1, round(2.0 / (np.median(spans) * frequency[1])))
     found: list[float] = []
-    while len(found) < count and over_floor.max() > 0.0:
+    while len(found) < COUNT and over_floor.max() > 0.0:
         k = int(over_floor.argmax())
         found.append(float(frequency[k]))
         over_floor[max(0, k - apart) : k + apart + 1] = 0.0

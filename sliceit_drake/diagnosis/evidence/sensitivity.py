@@ -30,7 +30,6 @@ from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagnosis.cause import Cause, Values
 from sliceit_drake.diagnosis.evidence.columns import MESH, Column, RecordSensitivity, Sensitivities
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
-from sliceit_drake.prediction.clock import Clock
 from sliceit_drake.prediction.record_target import Meshing, RecordTarget
 from sliceit_drake.prediction.simulator import Workers
 from sliceit_drake.records.slice_record import SliceRecord
@@ -155,9 +154,7 @@ def sensitivities(
     records: Sequence[SliceRecord],
     causes: Sequence[Cause],
     point: Point | None = None,
-    meshing: Meshing | None = None,
     finer: float | None = FINER,
-    clock: Clock | None = None,
     cache: Path | None = None,
     workers: Workers = None,
     progress: Progress | None = None,
@@ -169,11 +166,8 @@ def sensitivities(
         records: Slice records.
         causes: What may be wrong.
         point: Where; the setup's values without any cause by default.
-        meshing: How finely the food is computed; the setup's refinement and a step of 0.5 ms by
-            default.
         finer: Elements along an edge of the mesh of the prediction itself, relative to that of its
             changes; None for the same mesh, and no column `mesh`.
-        clock: How time is divided.
         cache: Folder for finished simulations and sensitivities, found again by their content;
             some 6 MB a record.
         workers: What simulates.
@@ -183,11 +177,11 @@ def sensitivities(
         ConfigurationError: A record cannot be compared, naming file and field.
         CuttingError: The prediction itself broke down.
     """
-    point, meshing, clock = point or Point(), meshing or Meshing(), clock or Clock()
+    point, meshing = point or Point(), Meshing()
     meshings = [meshing, dc.replace(meshing, time_step=0.5 * meshing.time_step)]
     if finer is not None:
         meshings.append(dc.replace(meshing, refinement=finer * meshing.refinement))
-    predictor = SlicePredictor(setup, records, meshings, clock, cache, workers)
+    predictor = SlicePredictor(setup, records, meshings, cache=cache, workers=workers)
     store = ContentStore(None if cache is None else cache / "sensitivities")
 
     def computed(
@@ -195,7 +189,7 @@ def sensitivities(
     ) -> Sensitivities:
         common = None
         if cache is not None and not any(cause.adapts for cause in some):
-            common = _common_key(setup, some, point, not changes, meshing, finer, clock)
+            common = _common_key(setup, some, point, not changes, finer)
         by_slice = any(c.by_slice for c in (*some, *(a.cause for a in point.causes)))
         changes = changes + [change for cause in some for change in _cause_changes(cause, point)]
         return _Computation(predictor, point, changes, store, common, by_slice).result(show)

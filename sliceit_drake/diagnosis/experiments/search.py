@@ -158,10 +158,14 @@ class ExperimentSearch:
             reason = f"nothing to split: the records at hand part {classes}"
             return NextExperiment("none", reason, [], pairs)
         if not steps:
-            number, angle = self._largest()
+            least = [
+                min(p.after for p in self.pairs({k: MOST_SLICES})) for k in range(len(self.menu))
+            ]
+            number = int(np.argmax(least))
+            name = self.menu[number].plan.name
             reason = (
                 f"no motion of the menu parts more of {classes} at the sizes found; the largest "
-                f"least angle, {angle:.0f} degrees, is that of {self.menu[number].plan.name}"
+                f"least angle, {least[number]:.0f} degrees, is that of {name}"
             )
             return NextExperiment("none", reason, [], self.pairs({number: MOST_SLICES}))
         left = sorted({tuple(sorted((p.true, p.fitted))) for p in pairs if not p.parts})
@@ -169,12 +173,6 @@ class ExperimentSearch:
         if left:
             reason += "; not parted: " + ", ".join(f"{a} from {b}" for a, b in left)
         return NextExperiment("split", reason, steps, pairs)
-
-    def _largest(self) -> tuple[int, float]:
-        """The experiment of the largest least angle."""
-        angles = [min(p.after for p in self.pairs({k: MOST_SLICES})) for k in range(len(self.menu))]
-        best = int(np.argmax(angles))
-        return best, angles[best]
 
 
 def _joined(problem: LinearProblem, new: Sensitivities, names: set[str]) -> LinearProblem:

@@ -8,7 +8,6 @@ causes calibrated by a parametric bootstrap), and how well blocks of depth are p
 left out. Projected sensitivities say which causes such a motion cannot tell apart.
 """
 
-import copy
 import dataclasses as dc
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +16,6 @@ import numpy as np
 
 from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
-from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.diagnose import BASE, Progress, setup_of_food
 from sliceit_drake.diagnosis.evidence.columns import Column, Sensitivities
@@ -51,18 +49,10 @@ END = 0.02
 the record is over, and causes that go with speed or acceleration would be told by that."""
 
 
-def setup_of_slice(
-    food: CalibratedFood, refinement: float = 1.0, plain: bool = False
-) -> CalibrationSetup:
+def setup_of_slice(food: CalibratedFood, refinement: float = 1.0) -> CalibrationSetup:
     """What is fitted to one slice: all that its calibration fitted, and `BASE`.
 
     A cause that the calibration has in the food already gets no second chance: it is free.
-
-    Args:
-        food: Calibrated.
-        refinement: Elements along an edge, relative to the food's mesh.
-        plain: Whether skin, core and centre are taken out, so that the food is the same all
-            through; what is fitted is then the material and the contact alone.
     """
     known = food.distribution
     parameters = [
@@ -71,14 +61,7 @@ def setup_of_slice(
     ]
     names = {p.name for p in parameters}
     parameters += [p for p in BASE if p.name not in names]
-    own = copy.deepcopy(food.food)
-    if plain:
-        effects = Effects()
-        own.effects = dc.replace(
-            own.effects, skin=effects.skin, core=effects.core, centre=effects.centre
-        )
-        parameters = [p for p in parameters if not p.name.startswith("effects.")]
-    return setup_of_food(dc.replace(food, food=own), refinement, parameters)
+    return setup_of_food(food, refinement, parameters)
 
 
 def diagnose_slice(

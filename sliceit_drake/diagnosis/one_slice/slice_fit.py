@@ -17,9 +17,10 @@ from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.evidence.sensitivity import LINEAR_STEP, LOG_STEP
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 
-__all__ = ["BLOCKS", "OWN", "SliceFit", "Unknown", "depth_blocks", "fit_slice"]
+__all__ = ["OWN", "SliceFit", "Unknown", "depth_blocks", "fit_slice"]
 
 BLOCKS = 5
+"""Of equal depth, each of which is left out in turn."""
 STEPS = 8
 HELD_OUT_STEPS = 2
 AS_GOOD = 1.03
@@ -127,16 +128,15 @@ class SliceFit:
         return {u.name: u.value(float(x)) for u, x in pairs if u.kind == kind}
 
 
-def depth_blocks(depth: np.ndarray, inside: np.ndarray, count: int = BLOCKS) -> np.ndarray:
+def depth_blocks(depth: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """Number of each row's block of depth [m]; what is above the food belongs to the first.
 
     Args:
         depth: Of the edge in the food [m], metres.
         inside: Rows in contact [m].
-        count: Blocks of equal depth.
     """
-    edges = np.linspace(0.0, float(depth[inside].max()), count + 1)
-    return np.clip(np.searchsorted(edges, depth, side="right") - 1, 0, count - 1)
+    edges = np.linspace(0.0, float(depth[inside].max()), BLOCKS + 1)
+    return np.clip(np.searchsorted(edges, depth, side="right") - 1, 0, BLOCKS - 1)
 
 
 def fit_slice(
