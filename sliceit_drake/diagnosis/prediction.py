@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from sliceit_drake.calibration.setup import CalibrationSetup
-from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.diagnosis.cause import Cause
@@ -110,7 +109,7 @@ class SlicePredictor:
         self.meshings = tuple(meshings)
         self.targets = make_targets(setup, records, self.meshings, self.clock)
         runs = None if cache is None else cache / "slices"
-        self.board: Board = dc.replace(setup.board, height=0.0)
+        self.board = dc.replace(setup.board, height=0.0)
         self.simulator = Simulator(self.clock, self.board, runs, workers)
         self._boards: dict[bytes, np.ndarray] = {}
 

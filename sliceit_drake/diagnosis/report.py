@@ -60,14 +60,17 @@ def records_figure(problem: LinearProblem, verdict: Verdict) -> "Figure":
     figure = Figure(figsize=(11.0, 2.6 * len(picked)), layout="constrained")
     axes = figure.subplots(len(picked), 2, squeeze=False)
     changes = fitted_changes(problem, verdict.named)
+    what = "refitted with the causes" if verdict.named else "refitted"
+    label = f"what the model changes, {what}"
     for (left, right), r in zip(axes, picked, strict=True):
         record = found.records[r]
-        left.plot(record.time, record.measured[:, channel], color=MEASURED, lw=1.0)
-        left.plot(record.time, record.predicted[:, channel], "--", color=PREDICTED, lw=1.0)
+        measured, predicted = record.measured[:, channel], record.predicted[:, channel]
+        left.plot(record.time, measured, color=MEASURED, lw=1.0, label="measured")
+        left.plot(record.time, predicted, "--", color=PREDICTED, lw=1.0, label="simulated")
         left.set_ylabel("vertical force [N]")
         left.set_title(record.condition or record.name, loc="left", fontsize=10)
         right.plot(record.time, record.residual[:, channel], color=MEASURED, lw=0.8)
-        right.plot(record.time, changes[r][:, channel], color=EXTENDED, lw=1.2)
+        right.plot(record.time, changes[r][:, channel], color=EXTENDED, lw=1.2, label=label)
         right.set_ylabel("measured - simulated [N]")
         # Where the force jumps a row too early is a peak that would dwarf all else.
         calm = record.residual[record.kinks()[:, channel] < CALM, channel]
@@ -77,12 +80,8 @@ def records_figure(problem: LinearProblem, verdict: Verdict) -> "Figure":
         for axis in (left, right):
             axis.grid(alpha=0.25)
             axis.set_xlabel("time [s]")
-    axes[0, 0].plot([], [], color=MEASURED, label="measured")
-    axes[0, 0].plot([], [], "--", color=PREDICTED, label="simulated")
-    axes[0, 0].legend(frameon=False, fontsize=8)
-    what = "refitted with the causes" if verdict.named else "refitted"
-    axes[0, 1].plot([], [], color=EXTENDED, label=f"what the model changes, {what}")
-    axes[0, 1].legend(frameon=False, fontsize=8)
+    for axis in axes[0]:
+        axis.legend(frameon=False, fontsize=8)
     return figure
 
 
@@ -114,11 +113,6 @@ def report_html(
 ) -> str:
     """The report as one self-contained page: the result as text, figures, and the error on records
     that were left out, if anything is named."""
-    rows = []
-    if gain is not None:
-        for record, (before, after) in zip(problem.found.records, gain.by_record, strict=True):
-            rows.append(f"{record.name:20}{record.condition:20}{before:10.3f}{after:10.3f}")
-    held_out = "\n".join([f"{'record':20}{'condition':20}{'before N':>10}{'after N':>10}", *rows])
     parts = [
         "<h1>What the simulation gets wrong</h1>",
         f"<pre>{html.escape(table)}</pre>",
@@ -127,9 +121,10 @@ def report_html(
         "<h2>Evidence</h2>",
         image(evidence_figure(verdict.screening)),
     ]
-    if rows:
-        parts += [
-            "<h2>Error on records that were left out</h2>",
-            f"<pre>{html.escape(held_out)}</pre>",
-        ]
+    if gain is not None:
+        held_out = [f"{'record':20}{'condition':20}{'before N':>10}{'after N':>10}"]
+        for record, (before, after) in zip(problem.found.records, gain.by_record, strict=True):
+            held_out.append(f"{record.name:20}{record.condition:20}{before:10.3f}{after:10.3f}")
+        text = html.escape("\n".join(held_out))
+        parts += ["<h2>Error on records that were left out</h2>", f"<pre>{text}</pre>"]
     return html_page("Diagnosis", parts)

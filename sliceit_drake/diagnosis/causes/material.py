@@ -50,8 +50,8 @@ class Viscoelasticity(Cause):
     def model(self, model: CuttingModel, values: Values, facts: SliceFacts) -> CuttingModel:
         """Further branches."""
         old = model.effects.relaxation
-        added = {time: values[f"share_{speed}"] for speed, time in BRANCHES.items()}
-        added = {time: share for time, share in added.items() if share != 0.0}
+        shares = {time: values[f"share_{speed}"] for speed, time in BRANCHES.items()}
+        added = {time: share for time, share in shares.items() if share != 0.0}
         if not added:
             return model
         relaxation = Relaxation([*old.shares, *added.values()], [*old.times, *added])

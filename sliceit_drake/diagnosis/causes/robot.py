@@ -14,7 +14,6 @@ from sliceit_drake.prediction.series import ForceSeries, SliceFacts
 
 __all__ = ["StickSlip", "ToolWeight", "Vibration"]
 
-AXES = ("x", "y", "z")
 REST = 2e-3
 """Speed below which drives do not shake, m/s."""
 
@@ -59,7 +58,7 @@ class Vibration(Cause):
     name = "vibration"
     family = "robot"
     parameters = tuple(
-        CauseParameter(f"{wave}_{axis}", "N", 0.3) for axis in AXES for wave in ("cosine", "sine")
+        CauseParameter(f"{wave}_{axis}", "N", 0.3) for axis in "xyz" for wave in ("cosine", "sine")
     )
     scan = Scan("frequency", "Hz", (5.0, 10.0, 20.0, 40.0))
     per_record = True
@@ -83,7 +82,7 @@ class Vibration(Cause):
         angle = 2.0 * np.pi * values["frequency"] * (series.time - series.time[0])
         moving = np.tanh(series.speed / REST)
         out = series.wrench.copy()
-        for k, axis in enumerate(AXES):
+        for k, axis in enumerate("xyz"):
             wave = values[f"cosine_{axis}"] * np.cos(angle) + values[f"sine_{axis}"] * np.sin(angle)
             out[:, 3 + k] += moving * wave
         return out

@@ -8,8 +8,6 @@ from sliceit_drake.prediction.series import ForceSeries, SliceFacts
 
 __all__ = ["SensorDelay", "SensorGain", "SensorTilt", "SensorZero"]
 
-AXES = ("x", "y", "z")
-
 
 class SensorZero(Cause):
     """A zero that is off, and drifts, the same in all records, in the knife's axes."""
@@ -17,15 +15,15 @@ class SensorZero(Cause):
     name = "sensor_zero"
     family = "sensor"
     parameters = (
-        *(CauseParameter(f"bias_{a}", "N", 0.3) for a in AXES),
-        *(CauseParameter(f"drift_{a}", "N/s", 0.03) for a in AXES),
+        *(CauseParameter(f"bias_{a}", "N", 0.3) for a in "xyz"),
+        *(CauseParameter(f"drift_{a}", "N/s", 0.03) for a in "xyz"),
     )
     signature = "there without contact; independent of depth and speed"
     experiment = "air"
 
     def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:
         """With the zero added."""
-        bias, drift = (np.array([values[f"{k}_{a}"] for a in AXES]) for k in ("bias", "drift"))
+        bias, drift = (np.array([values[f"{k}_{a}"] for a in "xyz"]) for k in ("bias", "drift"))
         out = series.wrench.copy()
         since = (series.time - series.time[0])[:, None]
         out[:, 3:] += series.in_food(bias + since * drift)

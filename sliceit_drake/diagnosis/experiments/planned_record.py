@@ -33,6 +33,8 @@ __all__ = [
 
 TOLERANCE = 2e-5
 """By which a motion that is read from a record may be off, metres."""
+PLANNED = ("p_WK_z", "food.position", "motion.speed")
+"""Facts that are known of a planned slice."""
 
 
 def template_of(records: Sequence[SliceRecord]) -> SliceRecord:
@@ -108,11 +110,7 @@ def planned_record(
     metadata.slice_index, metadata.knife_slices = index, plan.knife_slices
     metadata.motion = _nominal(motion, time, v, R)
     metadata.board_height = float(p_WF[2])
-    metadata.unknown = [
-        field
-        for field in metadata.unknown
-        if field not in ("p_WK_z", "food.position", "motion.speed")
-    ]
+    metadata.unknown = [field for field in metadata.unknown if field not in PLANNED]
     metadata.food = _food_facts(plan, p_WF, metadata.food)
     if plan.weight > 0.0:
         metadata.tool = ToolFacts(mass=plan.weight, center_of_mass=[0.0, 0.0, 0.0])

@@ -123,7 +123,7 @@ class ExperimentSearch:
         """What slices of experiments do, by the number of the experiment."""
         total = self.old + np.sum([n * self.new[k] for k, n in counts.items()], axis=0)
         return [
-            Pair(a, b, was, angle, gain, (gain - start) / sum(counts.values()))
+            Pair(a, b, was, angle, gain, (gain - start) / max(sum(counts.values()), 1))
             for (a, b, was, start), (_, _, angle, gain) in zip(
                 self._before, self._angles(total), strict=True
             )
@@ -143,9 +143,7 @@ class ExperimentSearch:
 
     def result(self) -> NextExperiment:
         """The motions that part most with least."""
-        choice = _Choice(
-            {}, [Pair(a, b, angle, angle, gain, 0.0) for a, b, angle, gain in self._before], 0
-        )
+        choice = _Choice({}, self.pairs({}), 0)
         while len(choice.counts) < MOST_STEPS and not all(p.parts for p in choice.pairs):
             further = self._further(choice)
             if further.cost >= choice.cost:

@@ -213,13 +213,9 @@ class HeldOutDepth:
         problem = self.problem
         X = np.concatenate([problem.X, problem.C[:, :, columns]], axis=2)
         precision = np.concatenate([problem.precision, np.full(len(columns), 1e-6)])
-        kinds = problem.found.columns
-        bound = np.full(X.shape[2], -np.inf)
-        for j, k in enumerate(columns):
-            if kinds[k].one_sided:
-                bound[problem.X.shape[2] + j] = 0.0
-        everything = np.ones(len(rows), bool)
-        theta = self._solve(X, precision, bound, everything, None)
+        low = [0.0 if problem.found.columns[k].one_sided else -np.inf for k in columns]
+        bound = np.concatenate([np.full(problem.X.shape[2], -np.inf), low])
+        theta = self._solve(X, precision, bound, np.ones(len(rows), bool), None)
         theta = self._solve(X, precision, bound, ~rows, theta)
         rest = problem.record.residual - X @ theta
         return float((rest[~rows] ** 2).sum()), rest[rows]
@@ -270,9 +266,9 @@ def slice_evidence(
         own: Numbers of the unknowns that stay as fitted when depth is left out.
     """
     (record,) = found.records
-    known, weights = _known(found)
-    X = np.concatenate([free, record.columns[:, :, known].astype(float)], axis=2)
-    precision = np.concatenate([precision, weights])
+    known = _known(found)
+    X = np.concatenate([free, record.columns[:, :, list(known)].astype(float)], axis=2)
+    precision = np.concatenate([precision, list(known.values())])
     noise = tuple(
         estimate_slice_noise(record.time, record.residual[:, c], X[:, c], precision)
         for c in range(len(record.channels))
@@ -305,14 +301,14 @@ def slice_evidence(
     return SliceEvidence(causes, held_out.error([[]]), noise)
 
 
-def _known(found: Sensitivities) -> tuple[list[int], np.ndarray]:
+def _known(found: Sensitivities) -> dict[int, float]:
     """Columns whose coefficient is known but for a plausible spread, and their precision."""
-    columns, precision = list(found.index("numerical")), [1.0] * len(found.index("numerical"))
-    for k, c in enumerate(found.columns):
-        if (c.name, c.parameter) in USUAL:
-            columns.append(k)
-            precision.append((c.size / USUAL[c.name, c.parameter][0]) ** 2)
-    return columns, np.array(precision)
+    usual = {
+        k: (c.size / USUAL[c.name, c.parameter][0]) ** 2
+        for k, c in enumerate(found.columns)
+        if (c.name, c.parameter) in USUAL
+    }
+    return dict.fromkeys(found.index("numerical"), 1.0) | usual
 
 
 _Option = tuple[str, float | None, list[int]]
