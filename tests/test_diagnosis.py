@@ -10,11 +10,14 @@ import pytest
 from synthetic_records import COLUMNS, NOISE, ROWS, SPEEDS, VARIATION, record
 
 from sliceit_drake.diagnosis.evidence.columns import Sensitivities
-from sliceit_drake.diagnosis.evidence.effect_size import effect_in_noise
 from sliceit_drake.diagnosis.evidence.held_out import fitted_changes, held_out_gain
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.noise_levels import ChannelNoise
-from sliceit_drake.diagnosis.evidence.verdict import checked_out_of_sample, reach_verdict
+from sliceit_drake.diagnosis.evidence.verdict import (
+    checked_out_of_sample,
+    effect_in_noise,
+    reach_verdict,
+)
 
 
 def problem(

@@ -13,7 +13,7 @@ from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.own_values import at_own_values
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
-from sliceit_drake.diagnosis.evidence.verdict import ALARM, checked_out_of_sample, reach_verdict
+from sliceit_drake.diagnosis.evidence.verdict import ALARM, reach_verdict
 from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
 from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import open_causes
@@ -126,8 +126,6 @@ def diagnose(
     if verdict.findings:
         predictor = SlicePredictor(setup, records, cache=cache, workers=workers)
         result.confirm(predictor, seed, lambda done, total: show("confirmation", done, total))
-        assert result.gain is not None
-        result.verdict = checked_out_of_sample(result.verdict, result.gain, problem)
     return result
 
 

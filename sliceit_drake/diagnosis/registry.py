@@ -3,9 +3,10 @@
 A user's cause is tried on a made-up slice, so that its mistakes show before any simulation.
 """
 
+import contextlib
 import inspect
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -25,6 +26,8 @@ __all__ = ["ENTRY_POINTS", "all_causes", "dry_run", "is_users", "load_cause", "o
 
 ENTRY_POINTS = "sliceit_drake.causes"
 """Group of entry points that name classes of causes."""
+ROWS, PERIOD, HEIGHT = 200, 2e-3, 0.027
+"""Rows of the made-up slice, their distance, s, and the height of its food, metres."""
 
 
 def all_causes() -> list[Cause]:
@@ -84,10 +87,8 @@ def load_cause(file: str | Path) -> Cause:
             that is incomplete or fails on a made-up slice.
     """
     file = Path(file)
-    try:
+    with _blamed(file, "cannot be read as Python"):
         module = load_module(f"sliceit_cause_{file.stem}", file)
-    except Exception as error:
-        raise _broken(file, error, "cannot be read as Python") from error
     if module is None:
         raise ConfigurationError(
             "there is no such file", source=str(file), field="--cause", fix="Check the path."
@@ -103,36 +104,32 @@ def load_cause(file: str | Path) -> Cause:
             source=str(file),
             fix="Write one subclass of sliceit_drake.diagnosis.cause.Cause in it (docs/causes.md).",
         )
-    try:
+    with _blamed(file, "cannot be made"):
         cause = kinds[0]()
-    except Exception as error:
-        raise _broken(file, error, "cannot be made") from error
     check_cause(cause, str(file))
-    try:
+    with _blamed(file, "fails on a made-up slice", ConfigurationError):
         dry_run(cause, str(file))
-    except ConfigurationError:
-        raise
-    except Exception as error:
-        raise _broken(file, error, "fails on a made-up slice") from error
     return cause
 
 
-def _broken(file: Path, error: Exception, what: str) -> ConfigurationError:
-    """An error in a user's file, with the line of that file where it happened."""
-    lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(file)]
-    line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
-    text = error.msg if isinstance(error, SyntaxError) else str(error)
-    return ConfigurationError(
-        f"{what}: {type(error).__name__}: {text}",
-        source=f"{file}, line {line}" if line else str(file),
-        field="--cause",
-        fix="Correct the file (docs/causes.md has a complete example).",
-    )
-
-
-ROWS = 200
-PERIOD = 2e-3
-HEIGHT = 0.027
+@contextlib.contextmanager
+def _blamed(file: Path, what: str, *passed: type[Exception]) -> Iterator[None]:
+    """Turns errors in a user's file, but for some, into one with the line where it happened."""
+    try:
+        yield
+    except passed:
+        raise
+    except Exception as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        lines = [f.lineno for f in frames if f.filename == str(file)]
+        line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
+        text = error.msg if isinstance(error, SyntaxError) else str(error)
+        raise ConfigurationError(
+            f"{what}: {type(error).__name__}: {text}",
+            source=f"{file}, line {line}" if line else str(file),
+            field="--cause",
+            fix="Correct the file (docs/causes.md has a complete example).",
+        ) from error
 
 
 def dry_run(cause: Cause, source: str = "") -> None:

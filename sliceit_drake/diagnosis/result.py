@@ -19,7 +19,7 @@ from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.evidence.confirm import Confirmation, confirm
 from sliceit_drake.diagnosis.evidence.held_out import HeldOutGain, held_out_gain, held_out_share
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
-from sliceit_drake.diagnosis.evidence.verdict import Finding, Verdict
+from sliceit_drake.diagnosis.evidence.verdict import Finding, Verdict, checked_out_of_sample
 from sliceit_drake.diagnosis.experiments.proposal import NextExperiment
 from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import is_users
@@ -65,7 +65,7 @@ class Diagnosis:
         seed: int = 0,
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
-        """Simulates the records with what is named, and measures its worth from there."""
+        """Simulates the records with what is named, measures its worth, and judges by that."""
         findings = self.verdict.findings
         shared = [f for f in findings if not f.evidence.per_record]
         if shared:
@@ -82,6 +82,7 @@ class Diagnosis:
                 "promise: take the values for a direction."
             )
         self.gain = held_out_gain(self.problem, self.verdict.named, seed, simulated)
+        self.verdict = checked_out_of_sample(self.verdict, self.gain, self.problem)
 
     def values(self, finding: Finding) -> dict[str, float]:
         """Parameters of a finding's cause."""

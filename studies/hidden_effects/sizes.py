@@ -27,10 +27,10 @@ from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.diagnose import BASE, setup_of_food
 from sliceit_drake.diagnosis.evidence.columns import Column, Sensitivities
-from sliceit_drake.diagnosis.evidence.effect_size import effect_in_noise
 from sliceit_drake.diagnosis.evidence.linear import USUAL, LinearProblem
 from sliceit_drake.diagnosis.evidence.screen import screen
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
+from sliceit_drake.diagnosis.evidence.verdict import effect_in_noise
 from sliceit_drake.diagnosis.registry import all_causes, open_causes
 from sliceit_drake.records.slice_record import SliceRecord, write_record
 from sliceit_drake.records.validation import load_record, record_files
