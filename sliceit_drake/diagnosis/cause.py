@@ -78,6 +78,11 @@ class CauseParameter:
         """Whether the null is a bound, so that the cause can act in one direction alone."""
         return self.null in (self.low, self.high)
 
+    @property
+    def step(self) -> float:
+        """Its size, in a direction in which it can go from the null."""
+        return -self.size if self.null == self.high else self.size
+
     def within(self, value: float) -> float:
         """The value in the range that is nearest to another."""
         return float(np.clip(value, self.low, self.high))
@@ -164,9 +169,12 @@ class Cause:
         """One of its parameters."""
         return next(p for p in self.parameters if p.name == name)
 
-    def nulls(self) -> dict[str, float]:
-        """Values at which it is absent."""
-        return {p.name: p.null for p in self.parameters}
+    def nulls(self, scan: float | None = None) -> dict[str, float]:
+        """Values at which it is absent, and one of its scan, if given."""
+        values = {p.name: p.null for p in self.parameters}
+        if self.scan is not None and scan is not None:
+            values[self.scan.name] = scan
+        return values
 
     def model(self, model: CuttingModel, values: Values, facts: SliceFacts) -> CuttingModel:
         """The cut with the cause in it, derived from the cut without."""

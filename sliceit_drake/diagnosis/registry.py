@@ -140,13 +140,8 @@ def dry_run(cause: Cause, source: str = "") -> None:
         Exception: Whatever a hook raises.
     """
     facts = SliceFacts("rehearsal", "press", height=HEIGHT, width=HEIGHT, speed=0.02)
-    nulls = cause.nulls()
-    if cause.scan is not None:
-        nulls[cause.scan.name] = cause.scan.values[0]
-    full = dict(nulls)
-    for number in cause.parameters:
-        sign = -1.0 if number.null == number.high else 1.0
-        full[number.name] = number.null + sign * number.size
+    nulls = cause.nulls(cause.scan.values[0] if cause.scan else None)
+    full = nulls | {p.name: p.null + p.step for p in cause.parameters}
 
     def refuse(hook: str, problem: str, fix: str) -> ConfigurationError:
         return ConfigurationError(

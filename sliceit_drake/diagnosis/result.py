@@ -89,9 +89,7 @@ class Diagnosis:
         e, cause = finding.evidence, self.causes[finding.evidence.name]
         if self.confirmation is not None and e.name in self.confirmation.values:
             return dict(self.confirmation.values[e.name])
-        values = cause.nulls()
-        if cause.scan is not None and e.scan is not None:
-            values[cause.scan.name] = e.scan
+        values = cause.nulls(e.scan)
         for column, coefficient in zip(e.columns, e.coefficients, strict=True):
             p = cause.parameter(column.parameter)
             values[p.name] = p.within(p.null + coefficient * column.size)

@@ -92,48 +92,35 @@ def _model_changes(predictor: SlicePredictor, point: Point) -> list[_Change]:
             ends = start + size, start - size
         points = tuple(dc.replace(point, values={**point.values, name: v}) for v in ends)
         out.append(_Change(Column("base", name, size=size), points))
-    effects = [e for t in predictor.targets for e in predictor.record_effects(t)]
+    targets = predictor.targets
+    effects = [e for t in targets for e in predictor.record_effects(t)]
     for effect in dict.fromkeys(effects):
         column = Column("record", effect.name, size=effect.size, unit=effect.unit, per_record=True)
-        points = tuple(
-            _with_record_effect(predictor, point, effect.name, sign * effect.size)
-            for sign in (1.0, -1.0)
-        )
-        out.append(_Change(column, points))
+        moved = []
+        for change in (effect.size, -effect.size):
+            records = {t.facts.name: dict(point.records.get(t.facts.name, {})) for t in targets}
+            for own in records.values():
+                own[effect.name] = own.get(effect.name, 0.0) + change
+            moved.append(dc.replace(point, records=records))
+        out.append(_Change(column, tuple(moved)))
     for name, finer in zip(("step", "mesh"), predictor.meshings[1:], strict=False):
         out.append(_Change(Column("numerical", name), (dc.replace(point, meshing=finer),), -1.0))
     return out
-
-
-def _with_record_effect(
-    predictor: SlicePredictor, point: Point, effect: str, change: float
-) -> Point:
-    """A point at which all records differ by as much."""
-    records = {}
-    for target in predictor.targets:
-        own = dict(point.records.get(target.facts.name, {}))
-        own[effect] = own.get(effect, 0.0) + change
-        records[target.facts.name] = own
-    return dc.replace(point, records=records)
 
 
 def _cause_changes(cause: Cause, point: Point) -> list[_Change]:
     """Each parameter of a cause by its size, at each value of its scan."""
     out = []
     for value in cause.scan.values if cause.scan else (None,):
-        at = cause.nulls()
-        if cause.scan is not None and value is not None:
-            at[cause.scan.name] = value
         for p in cause.parameters:
-            sign = -1.0 if p.one_sided and p.null == p.high else 1.0
-            signs = (sign,) if p.one_sided else (sign, -sign)
-            values = tuple(at | {p.name: p.null + s * p.size} for s in signs)
+            steps = (p.step,) if p.one_sided else (p.step, -p.step)
+            values = tuple(cause.nulls(value) | {p.name: p.null + step} for step in steps)
             column = Column(
                 "cause",
                 cause.name,
                 p.name,
                 value,
-                sign * p.size,
+                p.step,
                 p.unit,
                 p.one_sided,
                 cause.per_record,

@@ -96,9 +96,8 @@ def _unknowns(predictor: SlicePredictor, cause: Cause | None) -> list[Unknown]:
         low, high = (values / size).tolist()
         out.append(Unknown("own", name, size, 0.0, False, low, high, spread / size))
     for q in cause.parameters if cause else ():
-        sign = -1.0 if q.one_sided and q.null == q.high else 1.0
-        low, high = sorted((bound - q.null) / (sign * q.size) for bound in (q.low, q.high))
-        out.append(Unknown("cause", q.name, sign * q.size, q.null, False, low, high, 1e3))
+        low, high = sorted((bound - q.null) / q.step for bound in (q.low, q.high))
+        out.append(Unknown("cause", q.name, q.step, q.null, False, low, high, 1e3))
     return out
 
 
@@ -197,10 +196,7 @@ class _Fitter:
             values[u.kind][u.name] = u.value(float(x))
         causes: tuple[ActiveCause, ...] = ()
         if self.cause is not None:
-            own = self.cause.nulls() | values["cause"]
-            if self.cause.scan is not None and self.scan is not None:
-                own[self.cause.scan.name] = self.scan
-            causes = (ActiveCause(self.cause, own),)
+            causes = (ActiveCause(self.cause, self.cause.nulls(self.scan) | values["cause"]),)
         return Point(values["base"], {self.target.facts.name: values["own"]}, causes)
 
     def predict(self, thetas: Sequence[np.ndarray]) -> list[np.ndarray]:
