@@ -72,9 +72,14 @@ def confirm(
     promised = start - end
     at = {cause.name: dict(values) for cause, values in causes}
     logs = {k: float(x) * found.columns[k].size for k, x in zip(problem.base, theta, strict=False)}
+    model = predictor.model_with_food
+    assert model is not None
+    calibrated = {k: float(get_parameter(model, found.columns[k].name)) for k in logs}
     rounds = []
     for _ in range(ROUNDS):
-        moved = _at_point(problem, predictor, causes, at, logs, progress)
+        base = {found.columns[k].name: calibrated[k] * float(np.exp(x)) for k, x in logs.items()}
+        active = tuple(ActiveCause(cause, at[cause.name]) for cause, _ in causes)
+        moved = _at_point(problem, predictor, Point(values=base, causes=active), progress)
         step, chi_square = _fit(moved, [*moved.base, *shared], shared)
         rounds.append((chi_square, moved, {n: dict(v) for n, v in at.items()}, dict(logs)))
         for k, change in zip([*moved.base, *shared], step, strict=True):
@@ -111,22 +116,14 @@ def _fit(
 def _at_point(
     problem: LinearProblem,
     predictor: SlicePredictor,
-    causes: Sequence[tuple[Cause, Mapping[str, float]]],
-    at: Mapping[str, Mapping[str, float]],
-    logs: Mapping[int, float],
+    point: Point,
     progress: Callable[[int, int], None] | None,
 ) -> LinearProblem:
     """The problem with what slices simulated there predict."""
-    found = problem.found
-    model = predictor.model_with_food
-    assert model is not None
-    names = {found.columns[k].name: change for k, change in logs.items()}
-    values = {n: float(get_parameter(model, n)) * float(np.exp(x)) for n, x in names.items()}
-    active = tuple(ActiveCause(cause, at[cause.name]) for cause, _ in causes)
-    before, after = predictor.predict([Point(), Point(values=values, causes=active)], progress)
+    before, after = predictor.predict([Point(), point], progress)
     moved = []
     for record, target, first, second in zip(
-        found.records, predictor.targets, before, after, strict=True
+        problem.found.records, predictor.targets, before, after, strict=True
     ):
         assert first is not None and second is not None
         seen = target.compare(np.stack([first.wrench, second.wrench], axis=2))
