@@ -120,7 +120,7 @@ def _requirements(judgements: Sequence[Judgement]) -> list[dict[str, Any]]:
         default=(Rate(0, 0), ""),
     )
     add(
-        "one cause, the worst",
+        "one cause, effect with the worst result",
         ">= 7 of 10",
         worst[0],
         worst[0].runs >= 10 and worst[0].share >= 0.7,
@@ -128,30 +128,33 @@ def _requirements(judgements: Sequence[Judgement]) -> list[dict[str, Any]]:
     )
     alarms = Rate(sum(j.verdict != "nothing" for j in nothing), len(nothing))
     add(
-        "alarms with nothing hidden",
+        "alarms where nothing is hidden",
         "<= 16 of >= 200",
         alarms,
         alarms.runs >= 200 and alarms.share <= 0.08,
         few=True,
     )
     r = rate(unknown)
-    add("unknown effects called so", ">= 90 % of >= 60", r, r.runs >= 60 and r.share >= 0.90)
+    enough = r.runs >= 60 and r.share >= 0.90
+    add("unknown effect, verdict unknown", ">= 90 % of >= 60", r, enough)
     named = Rate(sum(j.verdict in NAMING for j in unknown), len(unknown))
     enough = named.runs >= 60 and named.share <= 0.05
-    add("unknown effects given a name", "<= 5 %", named, enough, few=True)
+    add("unknown effect, verdict a cause", "<= 5 %", named, enough, few=True)
     r = rate(_of(judgements, "pairs"))
     add("two causes, both named", ">= 80 %", r, r.runs >= 40 and r.share >= 0.80)
     r = rate(poor)
-    add("poor protocol, the class", ">= 90 % of >= 60", r, r.runs >= 60 and r.share >= 0.90)
+    enough = r.runs >= 60 and r.share >= 0.90
+    add("poor protocol, right class", ">= 90 % of >= 60", r, enough)
     followed = [j for j in poor if j.resolved is not None]
     r = Rate(sum(bool(j.resolved) for j in followed), len(followed))
-    add("the next experiment resolves it", ">= 90 %", r, r.runs >= 60 and r.share >= 0.90)
+    enough = r.runs >= 60 and r.share >= 0.90
+    add("poor protocol, cause named after the next experiment", ">= 90 %", r, enough)
     both = [(j.gain or 0.0, j.oracle) for j in single if j.oracle is not None and j.oracle > 0.0]
     good = Rate(sum(g >= 0.9 * o for g, o in both), len(both))
     ratio = sum(g for g, _ in both) / sum(o for _, o in both) if both else math.nan
     add(
-        "held-out gain of an oracle's",
-        ">= 90 % in the mean",
+        "held-out gain relative to an oracle's",
+        ">= 90 % on average",
         good,
         bool(both) and ratio >= 0.90,
         f"mean {100 * ratio:.0f} %" if both else "",

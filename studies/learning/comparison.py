@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 METRICS = ("median_force", "peak_force", "board_peak", "duration")
-TITLES = ("median force", "peak force", "board's peak", "duration")
+TITLES = ("median force", "peak force", "peak force on the board", "duration")
 PAPER = {"cucumber": 0.61, "tomato": 0.68, "potato": 0.67, "carrot": 0.77}
 """Ratios of the contact force in the SliceIt! paper's figure: dual simulation over spring only."""
 OURS, BASELINE = "cutting", "spring"

@@ -168,10 +168,12 @@ def limits(results: Mapping[str, Any]) -> list[Limit]:
     default = mesh["size"].index(1.0)
     out = [
         Limit(
-            "patch tests: force where none belongs", max(r[p] for r in patch for p in parts), 1e-9
+            "patch tests: force where it should be zero",
+            max(r[p] for r in patch for p in parts),
+            1e-9,
         ),
         Limit(
-            "cantilever: 2 less the order of convergence", 2.0 - results["beam"]["order"][-1], 0.5
+            "cantilever: 2 minus the order of convergence", 2.0 - results["beam"]["order"][-1], 0.5
         ),
         Limit("cantilever: error on the finest mesh", abs(results["beam"]["ratio"][-1] - 1.0), 0.1),
         Limit("edge: force against Atkins", off(edge, "vertical", "along"), 0.02),

@@ -133,7 +133,7 @@ def station(docs: Docs) -> tuple[Mapping[str, float], str]:
     if values:
         return values, "benchmarks/station_speed.json"
     found = docs.numbers(
-        "speed.md", r"runs at ([\d.]+) of real time while it cuts, ([\d.]+) with the spring"
+        "speed.md", r"runs at ([\d.]+) of real time while it cuts, and at ([\d.]+) with the spring"
     )
     names = ("real_time_factor", "spring_real_time_factor")
     return dict(zip(names, found or (), strict=False)), "speed.md"
@@ -277,7 +277,7 @@ def slicing_rows(docs: Docs) -> Iterator[Row]:
             case = by_case.get((world, food))
             for metric, of, least in (
                 ("median_force", "contact force", paper),
-                ("board_peak", "board's peak", BOARD_RATIO),
+                ("board_peak", "peak force on the board", BOARD_RATIO),
             ):
                 value = met = None
                 if case is not None:
@@ -293,7 +293,7 @@ def slicing_rows(docs: Docs) -> Iterator[Row]:
                     source,
                 )
         done = [f["completed"]["cutting"] for (w, _), f in by_case.items() if w == world]
-        share = f"{100 * sum(done) / len(done):.1f} % in the mean of foods" if done else None
+        share = f"{100 * sum(done) / len(done):.1f} % on average over foods" if done else None
         met = min(done) == 1.0 if done else None
         yield Row(f"slices completed by ours, {name} world", "all", share, met, command, source)
 
