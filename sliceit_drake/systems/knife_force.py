@@ -54,7 +54,9 @@ class KnifeForceSystem(ReportingSystem):
         super().__init__()
         self.exchange_period = exchange_period
         self._pose_input = self.DeclareAbstractInputPort("knife_pose", Value(RigidTransform()))
-        self.DeclareAbstractInputPort("knife_velocity", Value(SpatialVelocity.Zero()))
+        self._velocity_input = self.DeclareAbstractInputPort(
+            "knife_velocity", Value(SpatialVelocity.Zero())
+        )
         self._wrench = self.DeclareDiscreteState(6)
         self._progress = self.DeclareDiscreteState(1)
         self._coupling = self.DeclareDiscreteState(1)
@@ -84,7 +86,7 @@ class KnifeForceSystem(ReportingSystem):
         """Advances the food to the context's time.
 
         Args:
-            context: Context before the update; its input ports are those of now.
+            context: Context before the update; its `knife_velocity` is that of the knife now.
             state: State to write to.
             X_WK: Pose of the knife now.
 
@@ -92,6 +94,10 @@ class KnifeForceSystem(ReportingSystem):
             Wrench F_K_W on the knife, moment and force [6], and the share that is cut.
         """
         raise NotImplementedError
+
+    def knife_velocity(self, context: Context) -> SpatialVelocity:
+        """V_WK now."""
+        return self._velocity_input.Eval(context)
 
     def last_pose(self, context: Context) -> np.ndarray:
         """X_WK at the previous coupling step, as [3, 4]."""
