@@ -13,8 +13,8 @@ def held_reaction(solver: CuttingSolver, state: np.ndarray, pose: Pose) -> np.nd
     m, ws, blocks = solver.model, solver._workspace, len(solver.model.blocks)
     solver._place(state, pose, SurfaceFactors())
     with LAUNCH_LOCK:
-        ws.launch(ws.kernels.look_ahead, len(m.nodes), ws.look_ahead_arguments())
-        ws.launch_elements(0)
+        ws.launch_look_ahead()
+        ws.launch_part("elements", 0)
         point_forces = ws.point_forces()
     forces = ws.force.numpy()[0, : blocks * 12 * LANES].astype(np.float64)
     held = np.ones(len(m.nodes), bool)

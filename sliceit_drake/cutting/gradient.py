@@ -17,7 +17,7 @@ from sliceit_drake.cutting.kernels.types import PARAMETERS
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.mounting import Mounting
 from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError
-from sliceit_drake.cutting.workspace import LAUNCH_LOCK, Workspace
+from sliceit_drake.cutting.workspace import Workspace
 
 __all__ = ["SliceAdjoint", "SliceGradient", "SliceRun"]
 
@@ -190,7 +190,8 @@ class SliceAdjoint:
         share = np.arange(1, n + 1) / n
         adj_p, adj_R = np.zeros((2, 3)), np.zeros((2, 3, 3))
         adj_sums, adj_R[1, :, 1] = self._adjoint_of_sums(weights, run.R[e + 1])
-        self._capture_backward()
+        if self._backward is None:
+            self._backward = ws.captured(self._launch_backward)
         for array in (ws.parameter_rows.grad, self._adj_mu, self._adj_lam):
             array.zero_()
         ws.write(ws.states[-1].grad, adj_state[None])
@@ -235,58 +236,25 @@ class SliceAdjoint:
             adjoint[ws.sum_layout["immersed"]] = np.tile(of_immersed, points)
         return adjoint, of_lateral * push / n
 
-    def _capture_backward(self) -> None:
-        if self._backward is not None:
-            return
+    def _launch_backward(self) -> None:
         ws = self._w
-        with LAUNCH_LOCK, wp.ScopedCapture(device=ws.device) as capture:
-            for slot in ws.states[:-1]:
-                slot.grad.zero_()
-            for slot in ws.slots:
-                slot.ahead.grad.zero_()
-            ws.motion_rows.grad.zero_()
-            for k in reversed(range(ws.steps)):
-                self._launch_substep_adjoint(k)
-            nodes = len(self.model.nodes)
-            self._launch_adjoint(ws.kernels.look_ahead, (1, nodes), ws.look_ahead_arguments())
-        self._backward = capture.graph
-
-    def _launch_adjoint(self, kernel: Any, dim: Any, arguments: list[Any]) -> None:
-        """Launches an adjoint; an empty struct stands for the adjoints that arrays bring along."""
-        adjoints = [type(a)() if hasattr(a, "assign") else None for a in arguments]
-        wp.launch(
-            kernel,
-            dim=dim,
-            inputs=arguments,
-            adj_inputs=adjoints,
-            adjoint=True,
-            device=self._w.device,
-        )
-
-    def _launch_adjoint_many(self, kernel: Any, count: int, arguments: list[Any]) -> None:
-        """Adjoint of `Workspace.launch_many`."""
-        threads, per_thread = self._w.threads(count)
-        self._launch_adjoint(kernel, (1, threads), [*arguments, per_thread])
+        for array in (*ws.states[:-1], *(slot.ahead for slot in ws.slots), ws.motion_rows):
+            array.grad.zero_()
+        for k in reversed(range(ws.steps)):
+            self._launch_substep_adjoint(k)
+        ws.launch_look_ahead(adjoint=True)
 
     def _launch_substep_adjoint(self, k: int) -> None:
-        ws, m = self._w, self.model
-        kern, points, ahead, forces = (
-            ws.kernels,
-            len(m.point_nodes),
-            ws.slots[k].ahead,
-            ws.forces[k],
-        )
+        ws, kern, m = self._w, self._w.kernels, self.model
+        ahead, forces = ws.slots[k].ahead, ws.forces[k]
         for name in ("lateral", "push", "from_elements", "from_bulk", "from_points"):
             getattr(forces, name).grad.zero_()
-        self._launch_adjoint(kern.bend_blade, 1, ws.blade_arguments(k))
-        self._launch_adjoint(kern.push_blade, 1, [forces])
-        self._launch_adjoint_many(kern.step_nodes, len(m.moving), ws.step_arguments(k))
-        if len(m.relaxing):
-            self._launch_adjoint_many(kern.relax_nodes, len(m.moving), ws.relax_arguments(k))
+        ws.launch_blade(k, adjoint=True)
+        for part in reversed(ws.node_parts[1:]):
+            ws.launch_part(part, k, adjoint=True)
         spread = [ws.points, forces.from_points.grad, forces.points.grad]
-        ws.launch(kern.spread_adjoint, points, spread)
-        arguments = ws.point_arguments(k, ws.substep_time())
-        self._launch_adjoint_many(kern.step_points, points, arguments)
+        ws.launch(kern.spread_adjoint, forces.lateral.shape, spread)
+        ws.launch_part("step_points", k, adjoint=True)
         strain, factors, direction = self._strain, self._factors, forces.from_elements.grad
         adjoints = [ws.parameters.stiff_volume.grad, self._adj_mu, self._adj_lam]
         for kernel, arguments in (
@@ -294,7 +262,7 @@ class SliceAdjoint:
             (kern.stresses, [ws.parameters, strain, factors, *adjoints]),
             (kern.elements_adjoint, [ws.mesh, strain, factors, forces.elements]),
         ):
-            ws.launch(kernel, len(m.blocks), arguments)
+            ws.launch(kernel, ws.parameters.stiff_volume.shape, arguments)
         ws.launch_many(kern.gather_adjoint, len(m.moving), [ws.mesh, forces, ahead.grad])
 
 

@@ -1,11 +1,13 @@
 """Device arrays of one or many cuts of one mesh, and the launches that advance them."""
 
+import math
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import warp as wp
+from scipy.sparse import coo_array
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.kernels import layouts
@@ -58,6 +60,7 @@ class Workspace:
         single = model.numerics.precision == "float32"
         self.real: Any = wp.float32 if single else wp.float64
         self.dtype: Any = np.float32 if single else np.float64
+        self.dt = self.real(exchange_period / self.substeps)
         with LAUNCH_LOCK:
             start_warp()
             self.kernels = kernels(self.real, gradients)
@@ -70,6 +73,9 @@ class Workspace:
         # What is allocated during a capture in another thread would be taken for part of it.
         with LAUNCH_LOCK:
             self._make_arrays()
+        # With gradients, what the nodes get is kept, and relaxed in a kernel of its own.
+        relaxation = ("relax_nodes",) if len(model.relaxing) else ()
+        self.node_parts = ("gather", *relaxation, "step_nodes") if gradients else ("move_nodes",)
         self._skin_thickness = model.effects.skin.thickness
         self.set_models(models)
 
@@ -79,86 +85,78 @@ class Workspace:
         return wp.zeros(shape, dtype=dtype, device=self.device, requires_grad=self._gradients)
 
     def _view(
-        self, rows: wp.array, start: int, dtype: Any, shape: tuple[int, ...], step: int = 0
+        self, rows: wp.array, start: int, kind: Any, shape: tuple[int, ...], step: int = 0
     ) -> wp.array:
-        """A view of rows of numbers [C, size] as an array [C, *shape].
+        """A view of rows of numbers [C, size] as an array [C, ...].
 
         Args:
             rows: The rows.
             start: First number in a row.
-            dtype: Type of the array.
-            shape: Its shape without the first axis.
+            kind: Type of the array, as a field of a struct declares it.
+            shape: Its shape without the first axis, in numbers.
             step: Numbers from one entry to the next; an entry's own by default.
         """
         item = wp.types.type_size_in_bytes(rows.dtype)
-        last = step * item or wp.types.type_size_in_bytes(dtype)
+        shape = shape[: kind.ndim - 1]
+        last = step * item or wp.types.type_size_in_bytes(kind.dtype)
         inner = np.cumprod([last, *shape[:0:-1]])[::-1].tolist()
         return wp.array(
             ptr=rows.ptr + start * item,
-            dtype=dtype,
+            dtype=kind.dtype,
             shape=(self.cuts, *shape),
             strides=(rows.strides[0], *inner),
             device=self.device,
-            grad=None if rows.grad is None else self._view(rows.grad, start, dtype, shape, step),
+            grad=None if rows.grad is None else self._view(rows.grad, start, kind, shape, step),
         )
 
     def _rows(
-        self, kind: Any, shapes: Mapping[str, tuple[int, ...]], dtype: Any = None
-    ) -> tuple[wp.array, Any, dict[str, slice]]:
-        """Rows of numbers [C, size] that hold the named arrays of a struct side by side.
+        self, struct: Any, shapes: Mapping[str, tuple[int, ...]], dtype: Any = None
+    ) -> tuple[wp.array, dict[str, slice]]:
+        """Rows of numbers [C, size], with arrays of a struct as views of them side by side.
 
         Args:
-            kind: The struct.
-            shapes: Shapes of the arrays without the first axis.
+            struct: The struct.
+            shapes: Shapes of the arrays without the first axis, in numbers.
             dtype: Type of the numbers, the kernels' by default.
 
         Returns:
-            The rows, a struct of views of them, and where each array stands in a row.
+            The rows, and where each array stands in a row.
         """
-        item = wp.types.type_size_in_bytes(dtype or self.real)
         layout, end = {}, 0
         for name, shape in shapes.items():
-            width = wp.types.type_size_in_bytes(kind.vars[name].type.dtype) // item
-            layout[name] = slice(end, end := end + int(np.prod(shape)) * width)
-        rows, struct = self.array((self.cuts, end), dtype), kind()
+            layout[name] = slice(end, end := end + math.prod(shape))
+        rows = self.array((self.cuts, end), dtype)
         for name, shape in shapes.items():
-            view = self._view(rows, layout[name].start, kind.vars[name].type.dtype, shape)
-            setattr(struct, name, view)
-        return rows, struct, layout
+            kind = struct._cls.vars[name].type
+            setattr(struct, name, self._view(rows, layout[name].start, kind, shape))
+        return rows, layout
 
-    def _constants(self, kind: Any, **values: Any) -> Any:
-        """A struct of constant arrays and numbers."""
-        struct = kind()
+    def _set(self, struct: Any, **values: Any) -> None:
+        """Sets constant arrays and numbers of a struct."""
         for name, value in values.items():
             if isinstance(value, np.ndarray):
-                dtype = kind.vars[name].type.dtype
-                value = wp.array(np.ascontiguousarray(value), dtype=dtype, device=self.device)
+                kind = struct._cls.vars[name].type
+                value = wp.array(value, dtype=kind.dtype, device=self.device)
             setattr(struct, name, value)
-        return struct
 
     def _make_arrays(self) -> None:
         m, k, C, K = self.model, self.kernels, self.cuts, self.steps
         N, P, B, E = len(m.nodes), len(m.point_nodes), len(m.blocks), self.coupling_steps
-        M = len(m.relaxing)
 
-        element_start, element_entry = _element_gather(m.blocks, m.element_count, N)
-        point_start, point_entry, point_weight = _point_gather(m.point_nodes, m.point_weights, N)
-        self.mesh = self._constants(
-            k.Mesh,
-            nodes=m.blocks.astype(np.int32),
+        self.mesh, self.points = k.Mesh(), k.Points()
+        self._set(
+            self.mesh,
+            nodes=m.blocks,
             shape=m.shape,
-            moving=m.moving.astype(np.int32),
-            element_start=element_start,
-            element_entry=element_entry,
-            point_start=point_start,
-            point_entry=point_entry,
-            point_weight=point_weight,
+            moving=m.moving,
             board_area=m.board_area,
             board=m.board,
+            **_element_gather(m.blocks, m.element_count, N),
+            **_point_gather(m.point_nodes, m.point_weights, N),
         )
-        self.points = self._constants(
-            k.Points,
-            nodes=m.point_nodes.astype(np.int32),
+        self._set(
+            self.points,
+            nodes=m.point_nodes,
             weights=m.point_weights,
             area=m.tables.area,
             width=m.tables.width,
@@ -169,86 +167,63 @@ class Workspace:
             reach=m.tables.reach,
             per_spacing=1.0 / m.tables.spacing,
         )
-        parameters = {
-            "P": (len(PARAMETERS),),
-            "knife": (layouts.numbers(layouts.KNIFE),),
-            "toughness": (P,),
-            "flank_scale": (P,),
-            "friction_scale": (P,),
-            "unloading": (P,),
-            "inverse_mass": (N,),
-            "local_damping": (N,),
-            "weight": (N,),
-            "relaxing": (M,),
-            "keep": (M,),
-            "stiff_volume": (B,),
-        }
-        self.parameter_rows, self.parameters, self.parameter_layout = self._rows(
-            k.Parameters, parameters
-        )
+        self.parameters, values = k.Parameters(), _parameter_arrays(m)
+        self.parameter_rows, self.parameter_layout = self._rows(self.parameters, _shapes(values))
 
-        motion = dict.fromkeys(("R_CK", "p_CK", "v_CK", "w_CK"), (K,))
-        self.motion_rows, self.motion, self.motion_layout = self._rows(k.Motion, motion)
+        self.motion = k.Motion()
+        self.motion.substeps, self.motion.period = self.substeps, self.exchange_period
         # At the ends of the coupling steps, as they are given.
         self.motion.R = wp.zeros((C, E + 1), dtype=wp.mat33d, device=self.device)
         self.motion.p = wp.zeros((C, E + 1), dtype=wp.vec3d, device=self.device)
-        self.motion.substeps, self.motion.period = self.substeps, self.exchange_period
+        motion = {"R_CK": (K, 9), "p_CK": (K, 3), "v_CK": (K, 3), "w_CK": (K, 3)}
+        self.motion_rows, self.motion_layout = self._rows(self.motion, motion)
 
-        state = {
-            "x": (N,),
-            "v": (N,),
-            "edge_depth": (P,),
-            "cohesive_damage": (P,),
-            "edge_force": (P,),
-            "edge_direction": (P,),
-            "slip": (P, 2),
-            "board_slip": (N,),
-            "overstress": (M, N),
-            "blade": (2,),
-        }
+        values = _initial_arrays(m)
+        self._initial_state = _row(values).astype(self.dtype)
+        self.state_size = len(self._initial_state)
         # With gradients, sub-step k reads slot k and writes slot k + 1; otherwise all are one.
-        slots = [self._rows(k.State, state) for _ in range(K + 1 if self._gradients else 1)]
-        self.states, self.slots = [slot[0] for slot in slots], [slot[1] for slot in slots]
-        self.layout = slots[0][2]
-        self.state_size = self.states[0].shape[1]
+        self.slots = [k.State() for _ in range(K + 1 if self._gradients else 1)]
+        self.states = []
         for slot in self.slots:
+            rows, self.layout = self._rows(slot, _shapes(values))
+            self.states.append(rows)
             slot.ahead = self.array((C, N), k.vec4)
 
         # Padded with a row of zeros, which fills up the nodes' lists of entries.
         size = B * 12 * LANES
         self.force = wp.zeros((C, size + 3 * LANES), dtype=self.real, device=self.device)
-        # With gradients, what each sub-step gave the nodes is kept.
-        forces = k.Forces()
-        forces.elements = self._view(self.force, 0, k.Vectors, (B, 4))
-        forces.rows = self._view(self.force, 0, k.strided, (size + 1,), step=1)
+        forces, kinds = k.Forces(), k.Forces.vars
+        forces.elements = self._view(self.force, 0, kinds["elements"].type, (B, 4))
+        forces.rows = self._view(self.force, 0, kinds["rows"].type, (size + 1,), step=1)
         forces.points = self.array((C, P, 2), k.vec3)
         # The same as one list, two entries a point.
         forces.listed = forces.points.reshape((C, 2 * P))
         forces.lateral = self.array((C, P))
+        # With gradients, what the nodes got in each sub-step is kept.
         self.forces = [k.Forces() for _ in range(K if self._gradients else 1)]
         for kept in self.forces:
             kept.assign(forces)
             kept.push = self.array(C)
             if self._gradients:
                 kept.from_elements = self.array((C, N), k.vec3)
-                kept.from_bulk = self.array((C, N), k.vec3) if M else kept.from_elements
                 kept.from_points = self.array((C, N), k.vec3)
+                relaxing = len(m.relaxing) > 0
+                kept.from_bulk = self.array((C, N), k.vec3) if relaxing else kept.from_elements
+
+        self.sums, self._results, self._energies = k.Sums(), k.Results(), k.Energies()
         sums = {
             "total": (E, P, layouts.ACCUMULATED),
-            "immersed": (E, P),
+            "immersed": (E, P, 4),
             "blade": (E, layouts.numbers(layouts.BLADE_SUMS)),
-            "board_force": (N,),
+            "board_force": (N, 3),
             "board_loss": (N,),
             "internal_work": (N,),
         }
-        self.sum_rows, self.sums, self.sum_layout = self._rows(k.Sums, sums)
+        self.sum_rows, self.sum_layout = self._rows(self.sums, sums)
         self._result_type = layouts.results(E)
-        shapes = {
-            name: layouts.field_shape(self._result_type, name)
-            for name in self._result_type.names or ()
-        }
-        self._result_rows, self._results, _ = self._rows(k.Results, shapes, wp.float64)
-        self._energies = k.Energies()
+        names = self._result_type.names or ()
+        shapes = {name: layouts.field_shape(self._result_type, name) for name in names}
+        self._result_rows, _ = self._rows(self._results, shapes, wp.float64)
         self._energies.elastic = self.array((C, B, LANES))
         self._energies.volume_ratio = self.array((C, B, LANES))
         self._energies.points = self.array((C, P))
@@ -277,11 +252,7 @@ class Workspace:
 
     def initial_state(self) -> np.ndarray:
         """The food at rest, to be cut downwards [state_size]."""
-        state = np.zeros(self.state_size, self.dtype)
-        state[self.layout["x"]] = self.model.nodes.ravel()
-        state[self.layout["edge_depth"]] = -self.model.tables.reach
-        state[self.layout["edge_direction"]].reshape(-1, 3)[:, 2] = -1.0
-        return state
+        return self._initial_state.copy()
 
     def results(self) -> np.ndarray:
         """A copy of what the last launch gave, by name [C]; see `layouts.results`."""
@@ -303,35 +274,30 @@ class Workspace:
             self._views[key] = array.numpy()
         return self._views[key]
 
-    def launch(self, kernel: Any, dim: int, inputs: list[Any]) -> None:
-        """Launches `kernel` over cuts and `dim` entries of each."""
-        wp.launch(kernel, dim=(self.cuts, dim), inputs=inputs, device=self.device)
+    def launch(
+        self, kernel: Any, shape: tuple[int, ...], inputs: list[Any], adjoint: bool = False
+    ) -> None:
+        """Launches `kernel`, or its adjoint, over cuts and what else `shape` counts."""
+        # An empty struct stands for the adjoints that arrays bring along.
+        empty = [type(a)() if hasattr(a, "assign") else None for a in inputs]
+        wp.launch(
+            kernel,
+            dim=shape,
+            inputs=inputs,
+            adj_inputs=empty if adjoint else [],
+            adjoint=adjoint,
+            device=self.device,
+        )
 
-    def launch_many(self, kernel: Any, count: int, inputs: list[Any]) -> None:
+    def launch_many(
+        self, kernel: Any, count: int, inputs: list[Any], adjoint: bool = False
+    ) -> None:
         """Launches `kernel` over cuts and `count` entries: on a CPU all in one thread.
 
         A thread's start, which copies the kernel's arguments, costs a CPU more than a node does.
         """
-        threads, per_thread = self.threads(count)
-        self.launch(kernel, threads, [*inputs, per_thread])
-
-    def threads(self, count: int) -> tuple[int, int]:
-        """Threads for `count` entries, and entries of each."""
-        return (1, count) if self.device.is_cpu else (count, 1)
-
-    def substep_time(self) -> Any:
-        """The sub-step as the kernels take it, s."""
-        return self.real(self.exchange_period / self.substeps)
-
-    def look_ahead_arguments(self, k: int = 0) -> list[Any]:
-        """Arguments of `look_ahead` from the first sub-step to the k-th."""
-        return [self.slots[0], self.parameters, self.slots[k]]
-
-    def launch_elements(self, k: int) -> None:
-        """Forces of the elements at the beginning of sub-step k."""
-        now, _, forces = self._substep(k)
-        inputs = [now, self.mesh, self.parameters, forces.elements]
-        self.launch_many(self.kernels.elements, len(self.model.blocks), inputs)
+        threads, per_thread = (1, count) if self.device.is_cpu else (count, 1)
+        self.launch(kernel, (self.cuts, threads), [*inputs, per_thread], adjoint)
 
     def _substep(self, k: int) -> tuple[Any, Any, Any]:
         """State before and after sub-step k, and its forces."""
@@ -339,75 +305,73 @@ class Workspace:
             return self.slots[k], self.slots[k + 1], self.forces[k]
         return self.slots[0], self.slots[0], self.forces[0]
 
-    def point_arguments(self, k: int, dt: Any) -> list[Any]:
-        """Arguments of `step_points` in sub-step k."""
-        given = [self.points, self.parameters, self.motion]
-        return [k, dt, *given, *self._substep(k), self.sums]
+    def launch_look_ahead(self, k: int = 0, adjoint: bool = False) -> None:
+        """Where the elements are evaluated in sub-step k, from the first state."""
+        inputs = [self.slots[0], self.parameters, self.slots[k]]
+        self.launch(self.kernels.look_ahead, self.slots[k].x.shape, inputs, adjoint)
 
-    def relax_arguments(self, k: int) -> list[Any]:
-        """Arguments of `relax_nodes` in sub-step k."""
-        return [self.mesh, self.parameters, *self._substep(k)]
+    def launch_part(self, part: str, k: int, dt: Any = None, adjoint: bool = False) -> None:
+        """Launches a kernel of sub-step k, or its adjoint.
 
-    def step_arguments(self, k: int) -> list[Any]:
-        """Arguments of `step_nodes` in sub-step k."""
-        given = [self.mesh, self.parameters]
-        return [self.substep_time(), *given, *self._substep(k), self.sums]
+        Args:
+            part: The kernel's name.
+            k: The sub-step.
+            dt: Its duration; the workspace's by default.
+            adjoint: Whether the kernel's adjoint is launched.
+        """
+        m, mesh, parameters, sums = self.model, self.mesh, self.parameters, self.sums
+        now, after, forces = self._substep(k)
+        dt = self.dt if dt is None else dt
+        on_points = [self.points, parameters, self.motion, now, after, forces, sums]
+        count, inputs = {
+            "elements": (m.blocks, [now, mesh, parameters, forces.elements]),
+            "step_points": (m.point_nodes, [k, dt, *on_points]),
+            "move_nodes": (m.moving, [dt, mesh, parameters, now, forces, sums]),
+            "gather": (m.moving, [mesh, forces]),
+            "relax_nodes": (m.moving, [mesh, parameters, now, after, forces]),
+            "step_nodes": (m.moving, [dt, mesh, parameters, now, after, forces, sums]),
+        }[part]
+        self.launch_many(getattr(self.kernels, part), len(count), inputs, adjoint)
 
-    def blade_arguments(self, k: int) -> list[Any]:
-        """Arguments of `bend_blade` in sub-step k."""
-        head = [k // self.substeps, self.substep_time(), self.parameters]
-        return [*head, *self._substep(k), self.sums]
+    def launch_blade(self, k: int, adjoint: bool = False) -> None:
+        """Launches the kernels of the blade in sub-step k, or their adjoints in reverse."""
+        now, after, forces = self._substep(k)
+        bend = [k // self.substeps, self.dt, self.parameters, now, after, forces, self.sums]
+        parts = [(self.kernels.push_blade, [forces]), (self.kernels.bend_blade, bend)]
+        for kernel, inputs in reversed(parts) if adjoint else parts:
+            self.launch(kernel, (self.cuts,), inputs, adjoint)
 
     def launch_substep(self, k: int) -> None:
         """One sub-step."""
-        kern, nodes = self.kernels, len(self.model.moving)
-        now, _, forces = self._substep(k)
-        self.launch_elements(k)
-        points = self.point_arguments(k, self.substep_time())
-        self.launch_many(kern.step_points, len(self.model.point_nodes), points)
-        if self._gradients:
-            self.launch_many(kern.gather, nodes, [self.mesh, forces])
-            if len(self.model.relaxing):
-                self.launch_many(kern.relax_nodes, nodes, self.relax_arguments(k))
-            self.launch_many(kern.step_nodes, nodes, self.step_arguments(k))
-        else:
-            given = [self.substep_time(), self.mesh, self.parameters]
-            self.launch_many(kern.move_nodes, nodes, [*given, now, forces, self.sums])
-        for kernel, arguments in (
-            (kern.push_blade, [forces]),
-            (kern.bend_blade, self.blade_arguments(k)),
-        ):
-            wp.launch(kernel, dim=self.cuts, inputs=arguments, device=self.device)
+        for part in ("elements", "step_points", *self.node_parts):
+            self.launch_part(part, k)
+        self.launch_blade(k)
+
+    def captured(self, launch: Callable[[], None]) -> Any:
+        """Graph of the launches that `launch` makes; compiles the kernels, once a machine."""
+        with LAUNCH_LOCK:
+            wp.load_module(self.kernels.module, device=self.device)
+            with wp.ScopedCapture(device=self.device) as capture:
+                launch()
+        return capture.graph
 
     def capture(self) -> None:
         """Compiles the kernels, once a machine, and captures a launch as a graph."""
-        if self._graph is not None:
-            return
-        with LAUNCH_LOCK:
-            self._graph = self._captured()
+        if self._graph is None:
+            self._graph = self.captured(self._launch_coupling_steps)
 
-    def _captured(self) -> Any:
-        kern, C, E = self.kernels, self.cuts, self.coupling_steps
-        wp.load_module(kern.module, device=self.device)
-        with wp.ScopedCapture(device=self.device) as capture:
-            self.sum_rows.zero_()
-            self.launch(kern.move_knife, self.steps, [self.motion])
-            # Later sub-steps need it for held nodes only, which never move.
-            for k in range(len(self.slots)):
-                nodes = len(self.model.nodes)
-                self.launch(kern.look_ahead, nodes, self.look_ahead_arguments(k))
-            for k in range(self.steps):
-                self.launch_substep(k)
-            wp.launch(
-                kern.add_points,
-                dim=(C, E, layouts.numbers(layouts.POINT_SUMS)),
-                inputs=[self.sums, self._results],
-                device=self.device,
-            )
-            numbers = layouts.numbers(layouts.NODE_SUMS)
-            self.launch(kern.add_nodes, numbers, [self.sums, self._results])
-            self.launch(kern.knife_wrenches, E, [self.sums, self.motion, self._results])
-        return capture.graph
+    def _launch_coupling_steps(self) -> None:
+        kern, sums, results = self.kernels, self.sums, self._results
+        self.sum_rows.zero_()
+        self.launch(kern.move_knife, self.motion.R_CK.shape, [self.motion])
+        # Later sub-steps need it for held nodes only, which never move.
+        for k in range(len(self.slots)):
+            self.launch_look_ahead(k)
+        for k in range(self.steps):
+            self.launch_substep(k)
+        self.launch(kern.add_points, results.point_sums.shape, [sums, results])
+        self.launch(kern.add_nodes, results.node_sums.shape, [sums, results])
+        self.launch(kern.knife_wrenches, results.work.shape, [sums, self.motion, results])
 
     def advance(self, states: np.ndarray, R: np.ndarray, p: np.ndarray) -> None:
         """Advances all cuts by the workspace's coupling steps.
@@ -430,24 +394,19 @@ class Workspace:
     def stored_energies(self) -> tuple[float, np.ndarray, float]:
         """Elastic energy, volume ratios [T] and energy of the cut points of the first cut, J."""
         if self._energy_graph is None:
-            with LAUNCH_LOCK:
-                self._energy_graph = self._captured_energies()
+            self._energy_graph = self.captured(self._launch_energies)
         wp.capture_launch(self._energy_graph)
         elastic = self.read(self._energies.elastic)[0].sum(dtype=np.float64)
         ratio = self.read(self._energies.volume_ratio)[0].ravel()[: self.model.element_count].copy()
         interface = self.read(self._energies.points)[0].sum(dtype=np.float64)
         return float(elastic), ratio, float(interface)
 
-    def _captured_energies(self) -> Any:
-        kern, device, state = self.kernels, self.device, self.slots[0]
-        elements = [state, self.mesh, self.parameters, self._energies]
-        points = [self.points, self.parameters, self.motion, state, self._energies]
-        dim = (self.cuts, len(self.model.blocks), LANES)
-        wp.load_module(kern.module, device=device)
-        with wp.ScopedCapture(device=device) as capture:
-            wp.launch(kern.element_energy, dim=dim, inputs=elements, device=device)
-            self.launch(kern.point_energy, len(self.model.point_nodes), points)
-        return capture.graph
+    def _launch_energies(self) -> None:
+        kern, state, energies = self.kernels, self.slots[0], self._energies
+        elements = [state, self.mesh, self.parameters, energies]
+        self.launch(kern.element_energy, energies.elastic.shape, elements)
+        points = [self.points, self.parameters, self.motion, state, energies]
+        self.launch(kern.point_energy, energies.points.shape, points)
 
     def place_knife(
         self, R: Any, p: Any, v: Any = (0.0, 0.0, 0.0), w: Any = (0.0, 0.0, 0.0)
@@ -460,40 +419,63 @@ class Workspace:
     def point_forces(self) -> np.ndarray:
         """Forces on both faces at the cut points of the first cut [P, 2, 3], N."""
         # A step of no duration changes no history that another call reads.
-        points = self.point_arguments(0, self.real(0.0))
         with LAUNCH_LOCK:
-            self.launch_many(self.kernels.step_points, len(self.model.point_nodes), points)
+            self.launch_part("step_points", 0, self.real(0.0))
         return np.array(self.forces[0].points.numpy()[0], np.float64)
 
 
 def parameter_row(model: CuttingModel) -> np.ndarray:
     """The numbers that a model gives the kernels, in the order of `Workspace.parameter_layout`."""
+    return _row(_parameter_arrays(model))
+
+
+def _parameter_arrays(model: CuttingModel) -> dict[str, np.ndarray]:
     inverse_mass = np.zeros(len(model.nodes))
     inverse_mass[model.moving] = 1.0 / model.mass[model.moving]
-    volume = model.in_blocks(model.element_volume).reshape(-1)
-    volume = np.where(np.arange(len(volume)) < model.element_count, volume, 0.0)
+    volume = model.in_blocks(model.element_volume)
+    real = np.arange(volume.size).reshape(volume.shape) < model.element_count
     scales = model.point_scales
-    return np.concatenate(
-        [
-            [model.parameters[name] for name in PARAMETERS],
-            model.knife.parameters(),
-            model.toughness,
-            scales.flank_stiffness,
-            scales.friction,
-            model.unloading,
-            inverse_mass,
-            model.local_damping,
-            model.weight.ravel(),
-            model.relaxing,
-            model.keep,
-            volume,
-        ]
-    )
+    return {
+        "P": np.array([model.parameters[name] for name in PARAMETERS]),
+        "knife": model.knife.parameters(),
+        "toughness": model.toughness,
+        "flank_scale": scales.flank_stiffness,
+        "friction_scale": scales.friction,
+        "unloading": model.unloading,
+        "inverse_mass": inverse_mass,
+        "local_damping": model.local_damping,
+        "weight": model.weight,
+        "relaxing": model.relaxing,
+        "keep": model.keep,
+        "stiff_volume": np.where(real, volume, 0.0),
+    }
 
 
-def _element_gather(
-    blocks: np.ndarray, count: int, node_count: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _initial_arrays(model: CuttingModel) -> dict[str, np.ndarray]:
+    N, P = len(model.nodes), len(model.point_nodes)
+    return {
+        "x": model.nodes,
+        "v": np.zeros((N, 3)),
+        "edge_depth": np.full(P, -model.tables.reach),
+        "cohesive_damage": np.zeros(P),
+        "edge_force": np.zeros(P),
+        "edge_direction": np.tile([0.0, 0.0, -1.0], (P, 1)),
+        "slip": np.zeros((P, 2, 3)),
+        "board_slip": np.zeros((N, 3)),
+        "overstress": np.zeros((len(model.relaxing), N, 3)),
+        "blade": np.zeros(2),
+    }
+
+
+def _row(arrays: dict[str, np.ndarray]) -> np.ndarray:
+    return np.concatenate([array.ravel() for array in arrays.values()])
+
+
+def _shapes(arrays: dict[str, np.ndarray]) -> dict[str, tuple[int, ...]]:
+    return {name: array.shape for name, array in arrays.items()}
+
+
+def _element_gather(blocks: np.ndarray, count: int, node_count: int) -> dict[str, np.ndarray]:
     """Places of each node's entries in the element forces, in rows of `GATHER`.
 
     Returns:
@@ -515,21 +497,23 @@ def _element_gather(
     rank = np.arange(len(node)) - np.repeat(np.cumsum(number) - number, number)
     rows = np.full(start[-1] * GATHER, B * 12 * LANES)
     rows[start[node[order]] * GATHER + rank] = entry[order]
-    return start.astype(np.int32), rows.reshape(-1, GATHER).astype(np.int32)
+    return {"element_start": start, "element_entry": rows.reshape(-1, GATHER)}
 
 
 def _point_gather(
     point_nodes: np.ndarray, weights: np.ndarray, node_count: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> dict[str, np.ndarray]:
     """Cut-point forces (2 point + side) that act on each node, and their weights."""
     P = len(point_nodes)
     entry = 2 * np.arange(P)[:, None] + np.array([0, 0, 1, 1])
     weight = np.tile(weights, (1, 2))
     use = weight > 0.0
-    node, entry, weight = point_nodes[use], entry[use], weight[use]
-    order = np.argsort(node, kind="stable")
-    start = np.concatenate([[0], np.cumsum(np.bincount(node, minlength=node_count))])
-    return start.astype(np.int32), entry[order].astype(np.int32), weight[order]
+    by_node = coo_array((weight[use], (point_nodes[use], entry[use])), (node_count, 2 * P)).tocsr()
+    return {
+        "point_start": by_node.indptr,
+        "point_entry": by_node.indices,
+        "point_weight": by_node.data,
+    }
 
 
 def _device(name: str) -> Any:

@@ -689,9 +689,7 @@ def kernel_time(solver: CuttingSolver, launch: Callable[[], None], count: int = 
 
 def point_time(solver: CuttingSolver) -> float:
     """Time of all cut points in the solver's kernel, s."""
-    ws, count = solver._workspace, len(solver.model.point_nodes)
-    arguments = ws.point_arguments(0, ws.substep_time())
-    return kernel_time(solver, lambda: ws.launch_many(ws.kernels.step_points, count, arguments))
+    return kernel_time(solver, lambda: solver._workspace.launch_part("step_points", 0))
 
 
 def sparse_rate() -> float:
@@ -722,7 +720,7 @@ def compare(name: str, model: CuttingModel, repeats: int) -> None:
     explicit = simulate_slice(solver, motion)
     sub_step = sub_step_time(solver, motion)
     point = point_time(solver)
-    element = kernel_time(solver, lambda: solver._workspace.launch_elements(0))
+    element = kernel_time(solver, lambda: solver._workspace.launch_part("elements", 0))
     per_entry = sparse_rate()
 
     condensed = Condensed(model)

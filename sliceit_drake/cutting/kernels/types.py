@@ -53,7 +53,7 @@ Scalar = enum.IntEnum("Scalar", [name.upper() for name in PARAMETERS], start=0)
 
 @functools.cache
 def kernel_types(real: Any) -> types.SimpleNamespace:
-    """Types and structs for `real` = wp.float32 or wp.float64, `slide`, `padded`.
+    """Types, structs and functions for `real` = wp.float32 or wp.float64, by name.
 
     The first index of all arrays but those of `Mesh` and `Points` is the cut.
     """
@@ -63,7 +63,7 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
     # From the x component of a nodal force in `elements` to its z component.
     strided = wp.types.vector(2 * LANES + 1, real)
     entries = wp.types.vector(GATHER, wp.int32)
-    tiny = wp.constant(real(1.0e-20))
+    TINY = wp.constant(real(1.0e-20))
 
     @wp.struct
     class Vectors:
@@ -213,7 +213,7 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         """
         trial = slip + step
         length = wp.length(trial)
-        reach = limit / wp.max(stiffness, tiny)
+        reach = limit / wp.max(stiffness, TINY)
         new_slip = trial
         lost = real(0.0)
         if length > reach:
@@ -226,27 +226,4 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
     def padded(a: vec3):
         return vec4(a[0], a[1], a[2], real(0.0))
 
-    return types.SimpleNamespace(
-        real=real,
-        vec2=vec2,
-        vec3=vec3,
-        vec4=vec4,
-        mat33=mat33,
-        lanes=lanes,
-        indices=indices,
-        strided=strided,
-        entries=entries,
-        TINY=tiny,
-        slide=slide,
-        padded=padded,
-        Vectors=Vectors,
-        Mesh=Mesh,
-        Points=Points,
-        Parameters=Parameters,
-        Motion=Motion,
-        State=State,
-        Forces=Forces,
-        Sums=Sums,
-        Results=Results,
-        Energies=Energies,
-    )
+    return types.SimpleNamespace(**locals())
