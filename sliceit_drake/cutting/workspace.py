@@ -79,9 +79,8 @@ class Workspace:
         self._skin_thickness = model.effects.skin.thickness
         self.set_models(models)
 
-    def array(self, shape: int | tuple[int, ...], dtype: Any = None) -> wp.array:
+    def _array(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
         """Zeros on the device, with room for their adjoint if gradients are kept."""
-        dtype = dtype or self.real
         return wp.zeros(shape, dtype=dtype, device=self.device, requires_grad=self._gradients)
 
     def _view(
@@ -125,7 +124,7 @@ class Workspace:
         layout, end = {}, 0
         for name, shape in shapes.items():
             layout[name] = slice(end, end := end + math.prod(shape))
-        rows = self.array((self.cuts, end), dtype)
+        rows = self._array((self.cuts, end), dtype or self.real)
         for name, shape in shapes.items():
             kind = struct._cls.vars[name].type
             setattr(struct, name, self._view(rows, layout[name].start, kind, shape))
@@ -138,6 +137,12 @@ class Workspace:
                 kind = struct._cls.vars[name].type
                 value = wp.array(value, dtype=kind.dtype, device=self.device)
             setattr(struct, name, value)
+
+    def _allocate(self, struct: Any, **shapes: tuple[int, ...]) -> None:
+        """Gives a struct arrays of zeros, of these shapes without the first axis."""
+        for name, shape in shapes.items():
+            dtype = struct._cls.vars[name].type.dtype
+            setattr(struct, name, self._array((self.cuts, *shape), dtype))
 
     def _make_arrays(self) -> None:
         m, k, C, K = self.model, self.kernels, self.cuts, self.steps
@@ -173,8 +178,7 @@ class Workspace:
         self.motion = k.Motion()
         self.motion.substeps, self.motion.period = self.substeps, self.exchange_period
         # At the ends of the coupling steps, as they are given.
-        self.motion.R = wp.zeros((C, E + 1), dtype=wp.mat33d, device=self.device)
-        self.motion.p = wp.zeros((C, E + 1), dtype=wp.vec3d, device=self.device)
+        self._allocate(self.motion, R=(E + 1,), p=(E + 1,))
         motion = {"R_CK": (K, 9), "p_CK": (K, 3), "v_CK": (K, 3), "w_CK": (K, 3)}
         self.motion_rows, self.motion_layout = self._rows(self.motion, motion)
 
@@ -187,7 +191,7 @@ class Workspace:
         for slot in self.slots:
             rows, self.layout = self._rows(slot, _shapes(values))
             self.states.append(rows)
-            slot.ahead = self.array((C, N), k.vec4)
+            self._allocate(slot, ahead=(N,))
 
         # Padded with a row of zeros, which fills up the nodes' lists of entries.
         size = B * 12 * LANES
@@ -195,20 +199,18 @@ class Workspace:
         forces, kinds = k.Forces(), k.Forces.vars
         forces.elements = self._view(self.force, 0, kinds["elements"].type, (B, 4))
         forces.rows = self._view(self.force, 0, kinds["rows"].type, (size + 1,), step=1)
-        forces.points = self.array((C, P, 2), k.vec3)
+        self._allocate(forces, points=(P, 2), lateral=(P,))
         # The same as one list, two entries a point.
         forces.listed = forces.points.reshape((C, 2 * P))
-        forces.lateral = self.array((C, P))
         # With gradients, what the nodes got in each sub-step is kept.
         self.forces = [k.Forces() for _ in range(K if self._gradients else 1)]
         for kept in self.forces:
             kept.assign(forces)
-            kept.push = self.array(C)
+            self._allocate(kept, push=())
             if self._gradients:
-                kept.from_elements = self.array((C, N), k.vec3)
-                kept.from_points = self.array((C, N), k.vec3)
-                relaxing = len(m.relaxing) > 0
-                kept.from_bulk = self.array((C, N), k.vec3) if relaxing else kept.from_elements
+                self._allocate(kept, from_elements=(N,), from_bulk=(N,), from_points=(N,))
+                if not len(m.relaxing):
+                    kept.from_bulk = kept.from_elements
 
         self.sums, self._results, self._energies = k.Sums(), k.Results(), k.Energies()
         sums = {
@@ -224,9 +226,7 @@ class Workspace:
         names = self._result_type.names or ()
         shapes = {name: layouts.field_shape(self._result_type, name) for name in names}
         self._result_rows, _ = self._rows(self._results, shapes, wp.float64)
-        self._energies.elastic = self.array((C, B, LANES))
-        self._energies.volume_ratio = self.array((C, B, LANES))
-        self._energies.points = self.array((C, P))
+        self._allocate(self._energies, elastic=(B, LANES), volume_ratio=(B, LANES), points=(P,))
 
     def set_models(self, models: Sequence[CuttingModel]) -> None:
         """Takes the parameters of other cuts of the same mesh, one for each row."""
