@@ -127,10 +127,12 @@ class ControlScript:
             self._controller.write_doubles(self._offset, _DOUBLES[command](self))
         elif command in _QUESTIONS:
             self._controller.write_integer(self._offset + 1, int(_QUESTIONS[command](self)))
-        elif command in _ACTIONS:
-            for target in _ACTIONS[command](self) or ():
-                if target is not None:
-                    self._controller.command(target)
+        elif command in _SETTINGS:
+            _SETTINGS[command](self)
+            yield
+        elif command in _MOTIONS:
+            for target in _MOTIONS[command](self) or ():
+                self._controller.command(target)
                 yield
         else:
             name = COMMAND_NAMES.get(command, "of no known name")
@@ -225,33 +227,24 @@ class ControlScript:
 
     # Settings.
 
-    def _zero_sensor(self) -> Iterator[None]:
-        self._controller.zero_sensor()
-        yield
-
-    def _set_payload(self) -> Iterator[None]:
+    def _set_payload(self) -> None:
         mass, *cog = self._doubles(0, 4)
         if not mass >= 0.0:
             raise ScriptError(f"set_payload: a mass of {mass} kg")
         # The client sends zeros for "keep the centre".
         self._controller.set_payload(mass, cog if any(cog) else None)
-        yield
 
-    def _set_tcp(self) -> Iterator[None]:
+    def _set_tcp(self) -> None:
         self._controller.tcp = np.array(self._doubles(0))
-        yield
 
-    def _set_watchdog(self) -> Iterator[None]:
+    def _set_watchdog(self) -> None:
         frequency = self._double(0)
         if not frequency > 0.0:
             raise ScriptError(f"rtde_set_watchdog: a frequency of {frequency} Hz")
-        name = f"input_int_register_{self._offset}"
-        self._controller.set_watchdog(name, 1.0 / frequency)
-        yield
+        self._controller.set_watchdog(f"input_int_register_{self._offset}", 1.0 / frequency)
 
-    def _trigger_protective_stop(self) -> Iterator[None]:
+    def _stop_protectively(self) -> None:
         self._controller.set_safety(SafetyMode.PROTECTIVE_STOP, "asked by the program")
-        yield
 
     # Questions.
 
@@ -281,22 +274,25 @@ class ControlScript:
 
 _END = object()
 
-# What moves the arm, or takes a cycle to set.
-_ACTIONS: dict[int, Callable[[ControlScript], Iterator | None]] = {
+# What moves the arm.
+_MOTIONS: dict[int, Callable[[ControlScript], Iterator[np.ndarray] | None]] = {
     1: lambda script: script._move_joints(script._doubles(0)),
     2: lambda script: script._move_joints(script._inverse_or_stop(script._controller.target)),
     3: lambda script: script._move_line(script._pose()),
     4: lambda script: script._move_line(forward(script._doubles(0), script._controller.X_FT)),
-    8: ControlScript._zero_sensor,
     9: ControlScript._speed_joints,
     SERVO_COMMAND: ControlScript._servo_joints,
     15: ControlScript._stop_speed,
     16: ControlScript._stop_servo,
-    17: ControlScript._set_payload,
-    29: ControlScript._set_tcp,
-    31: ControlScript._trigger_protective_stop,
     33: lambda script: script._stop_motion(_RADIANS_PER_METRE),
     34: lambda script: script._stop_motion(1.0),
+}
+# What takes a cycle to set.
+_SETTINGS: dict[int, Callable[[ControlScript], None]] = {
+    8: lambda script: script._controller.zero_sensor(),
+    17: ControlScript._set_payload,
+    29: ControlScript._set_tcp,
+    31: ControlScript._stop_protectively,
     35: ControlScript._set_watchdog,
     65: ControlScript._set_payload,
 }

@@ -21,8 +21,6 @@ CYCLE = 0.002
 START = (1.3524, -1.5555, 1.7697, -1.7785, -1.5644, 1.3493)
 """Joints at the start of SliceIt!, rad."""
 
-GRAVITY = (0.0, 0.0, -9.81)
-
 
 class SimulationStopped(RuntimeError):
     """The model cannot go on; its state stays as it is."""
@@ -100,7 +98,7 @@ class KinematicRobot:
         q = np.array(positions, float)
         none = np.zeros(JOINTS)
         self.state = ArmState(q, none, np.zeros(6), none)
-        self.gravity = np.array(GRAVITY)
+        self.gravity = np.array([0.0, 0.0, -9.81])
         self.warnings: list[str] = []
 
     def step(self, targets: ArrayLike, servo: ServoConfig | None) -> ArmState:

@@ -145,25 +145,26 @@ class RtdeServer(Service):
     def _answer(self, connection: Connection, session: _Session, kind: int, payload: bytes) -> None:
         if kind == PackageType.DATA:
             self._take_input(connection, session, payload)
-        elif kind == PackageType.TEXT:
+            return
+        if kind == PackageType.TEXT:
             self._controller.note(f"client says {payload!r}")
-        elif kind in (PackageType.START, PackageType.PAUSE):
-            is_start = kind == PackageType.START
-            accepted = session.outputs is not None or not is_start
-            session.is_started = is_start and accepted
-            connection.send(encode_frame(kind, bytes([accepted])))
+            return
+        if kind in (PackageType.START, PackageType.PAUSE):
+            accepted = session.outputs is not None or kind == PackageType.PAUSE
+            session.is_started = kind == PackageType.START and accepted
+            answer = bytes([accepted])
         elif kind == PackageType.PROTOCOL_VERSION:
-            (version,) = struct.unpack(">H", payload)
-            connection.send(encode_frame(kind, bytes([version == _PROTOCOL])))
+            answer = bytes([struct.unpack(">H", payload) == (_PROTOCOL,)])
         elif kind == PackageType.CONTROL_VERSION:
-            version = struct.pack(">IIII", *self._controller.config.version)
-            connection.send(encode_frame(kind, version))
+            answer = struct.pack(">IIII", *self._controller.config.version)
         elif kind == PackageType.SETUP_OUTPUTS:
-            connection.send(encode_frame(kind, self._set_outputs(session, payload)))
+            answer = self._set_outputs(session, payload)
         elif kind == PackageType.SETUP_INPUTS:
-            connection.send(encode_frame(kind, self._set_inputs(connection, session, payload)))
+            answer = self._set_inputs(connection, session, payload)
         else:
             connection.send(encode_text(f"unknown type of package {kind}", MessageLevel.ERROR))
+            return
+        connection.send(encode_frame(kind, answer))
 
     def _set_outputs(self, session: _Session, payload: bytes) -> bytes:
         (frequency,) = struct.unpack_from(">d", payload)

@@ -107,9 +107,10 @@ def train(
             if config.task.reward.schedule != "constant":
                 environments.env_method("set_progress", model.num_timesteps / config.steps)
             callback.restore(saved["watch"])
-            _cut_log(output / EPISODES, callback.episodes)
-        else:
-            (output / EPISODES).unlink(missing_ok=True)
+        # What was logged after the checkpoint is dropped.
+        if (log := output / EPISODES).exists():
+            kept = log.read_text(encoding="utf-8").splitlines(keepends=True)[: callback.episodes]
+            log.write_text("".join(kept), encoding="utf-8")
         begin = clock.perf_counter()
         remaining = config.steps - model.num_timesteps
         with contextlib.suppress(_Stopped):
@@ -205,13 +206,6 @@ def _load(file: Path, described: str) -> dict[str, Any] | None:
     raise ConfigurationError(
         problem, field="output", source=str(file), fix="Give another folder, or delete it."
     )
-
-
-def _cut_log(file: Path, episodes: int) -> None:
-    """Drops what was logged after the checkpoint."""
-    if file.exists():
-        lines = file.read_text(encoding="utf-8").splitlines(keepends=True)[:episodes]
-        file.write_text("".join(lines), encoding="utf-8")
 
 
 class _Watch(BaseCallback):

@@ -28,9 +28,7 @@ class FlankFriction(Effect):
     stribeck_speed = 8e-3
     viscous = 2.0
 
-    def begin(self, facts: SliceTruth, rng: np.random.Generator) -> None:
-        super().begin(facts, rng)
-        self._bristles = 0.0
+    _bristles = 0.0
 
     def drive(self, now: Now) -> None:
         speed = now.speed

@@ -59,10 +59,8 @@ class ArmCompliance(Effect):
     every_coupling_step = True
     fast, slow = 0.03, 0.6
 
-    def begin(self, facts: SliceTruth, rng: np.random.Generator) -> None:
-        super().begin(facts, rng)
-        self._given = np.zeros(2)
-        self._force = self._stiffness = self._place = self._before = 0.0
+    _given = np.zeros(2)
+    _force = _stiffness = _place = _before = 0.0
 
     def _yield(self, force: float, commanded: float, period: float) -> float:
         """How far it has given at the end of a stretch.
@@ -82,7 +80,7 @@ class ArmCompliance(Effect):
         given = (follow * (compliance * force - self._given)).sum()
         given /= 1.0 + self._stiffness * (follow * compliance).sum()
         force_then = force - self._stiffness * given
-        self._given += follow * (compliance * force_then - self._given)
+        self._given = self._given + follow * (compliance * force_then - self._given)
         total = float(self._given.sum())
         self._force, self._before, self._place = force, self._place, commanded + total
         return total
