@@ -14,7 +14,7 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.food import Food, make_food_model
 from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.mesh.body import food_body
+from sliceit_drake.cutting.mesh.surface import food_body
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.diagrams.outputs.paraview import FoodFrames, write_series
 from sliceit_drake.diagrams.run import prepare_run

@@ -48,8 +48,7 @@ def _responses(solver: CuttingSolver, speed: float, offset: float) -> list[np.nd
     """Those of a blade that enters at a speed, m/s, and then rests.
 
     It moves within one coupling step. Of both senses of a direction, that which the food resists
-    more
-    counts: pressed further an edge cuts, drawn back it unloads.
+    more counts: pressed further an edge cuts, drawn back it unloads.
 
     Raises:
         CuttingError: The food cannot be cut at this speed.

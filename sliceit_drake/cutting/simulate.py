@@ -30,7 +30,6 @@ LATERAL_LIMIT = 3e-3
 """Greatest distance of the blade from the cut plane, metres."""
 TILT_LIMIT = 0.15
 """Greatest angle between the blade and the cut plane, rad."""
-MIN_VOLUME_RATIO = 0.0
 
 
 @dc.dataclass
@@ -147,7 +146,7 @@ def check_energies(
     Raises:
         CuttingError: With time, element and cause.
     """
-    if energies.least_volume_ratio <= MIN_VOLUME_RATIO:
+    if energies.least_volume_ratio <= 0.0:
         stiffness = model.material.youngs_modulus * model.element_size
         softness = model.material.toughness / stiffness
         raise CuttingError(

@@ -12,8 +12,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, State
 
 from sliceit_drake.cutting.contact_response import contact_responses
 from sliceit_drake.cutting.coupling_steps import EnergyBalance
-from sliceit_drake.cutting.mesh.body import FoodBody, food_body
-from sliceit_drake.cutting.mesh.surface import food_surface
+from sliceit_drake.cutting.mesh.surface import FoodBody, food_body, food_surface
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.simulate import check_clear, check_energies, check_in_plane

@@ -200,12 +200,14 @@ def make_cut_geometry(
     nodes = split.nodes[computed]
     fraction, centroid = split.fraction[active], split.centroid[active]
 
-    edges = np.stack([nodes[t[:, k]] - nodes[t[:, 0]] for k in (1, 2, 3)], axis=-1)
-    whole = np.linalg.det(edges) / 6.0
+    bulk = TetrahedralMesh(nodes, t)
+    whole = bulk.volumes()
     volume = whole * fraction
-    node_volume, weight_volume = np.zeros(len(nodes)), np.zeros(len(nodes))
-    np.add.at(node_volume, t, np.repeat(0.25 * volume[:, None], 4, axis=1))
+    weight_volume = np.zeros(len(nodes))
     np.add.at(weight_volume, t, volume[:, None] * centroid)
+    # Both copies of a split element share its stiffness; see `MIN_SHARE`.
+    share = np.where(fraction < 1.0, np.clip(fraction, MIN_SHARE, 1.0 - MIN_SHARE), 1.0)
+    uncut = TetrahedralMesh(split.vertex_position, split.source_tetrahedra)
 
     point_nodes = number[split.point_nodes].reshape(-1, 4)
     free = (point_nodes >= 0).all(1)
@@ -232,12 +234,11 @@ def make_cut_geometry(
         moving=np.flatnonzero(~held_node[computed]),
         nodes=nodes,
         tetrahedra=t,
-        inverse=np.linalg.inv(edges),
-        # Both copies of a split element share its stiffness; see `MIN_SHARE`.
-        stiff_volume=whole * _stiffness_share(fraction),
-        node_volume=node_volume,
+        inverse=np.linalg.inv(bulk.edges()),
+        stiff_volume=whole * share,
+        node_volume=bulk.lumped(volume),
         weight_volume=weight_volume,
-        vertex_volume=_vertex_volume(split)[split.node_source[computed]],
+        vertex_volume=uncut.lumped(uncut.volumes())[split.node_source[computed]],
         element_distance=distance_inside(section, split.triangles, nodes[t].mean(1)[:, [0, 2]]),
         tables=edge_tables(section, split.triangles),
         point_nodes=point_nodes,
@@ -246,20 +247,8 @@ def make_cut_geometry(
         point_distance=distance_inside(section, split.triangles, section),
         board_area=board_area,
         board=board,
-        element_size=TetrahedralMesh(nodes, t).mean_edge_length(),
+        element_size=bulk.mean_edge_length(),
     )
-
-
-def _stiffness_share(fraction: np.ndarray) -> np.ndarray:
-    return np.where(fraction < 1.0, np.clip(fraction, MIN_SHARE, 1.0 - MIN_SHARE), 1.0)
-
-
-def _vertex_volume(split: SplitMesh) -> np.ndarray:
-    """Volume lumped to the vertices of the uncut mesh [V], m^3."""
-    volume = TetrahedralMesh(split.vertex_position, split.source_tetrahedra).volumes()
-    lumped = np.zeros(len(split.vertex_position))
-    np.add.at(lumped, split.source_tetrahedra, np.repeat(0.25 * volume[:, None], 4, axis=1))
-    return lumped
 
 
 def _downward_area(split: SplitMesh, up_C: np.ndarray) -> np.ndarray:

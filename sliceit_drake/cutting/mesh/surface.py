@@ -1,4 +1,5 @@
-"""The food's surface for drawing: outer skin and cut faces, following the computed nodes."""
+"""The food for drawing, following the computed nodes: its surface of outer skin and cut faces, and
+the solids of both sides."""
 
 import dataclasses as dc
 import functools
@@ -6,11 +7,11 @@ import itertools
 
 import numpy as np
 
+from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry
 from sliceit_drake.cutting.mesh.split import SplitMesh
 from sliceit_drake.cutting.mesh.tetrahedra import boundary_faces
-from sliceit_drake.cutting.model import CuttingModel
 
-__all__ = ["CornerList", "FoodCorners", "FoodSurface", "food_surface"]
+__all__ = ["FoodBody", "FoodCorners", "FoodSurface", "food_body", "food_surface"]
 
 
 @dc.dataclass
@@ -34,20 +35,20 @@ class FoodCorners:
         """Whether each corner belongs to the cut rather than the skin [V]."""
         return self.cut_point >= 0
 
-    def positions(self, model: CuttingModel, computed: np.ndarray) -> np.ndarray:
+    def positions(self, cut: CutGeometry, computed: np.ndarray) -> np.ndarray:
         """Corners in the food frame [V, 3], metres.
 
         Args:
-            model: The cut.
+            cut: The cut.
             computed: Positions of the computed nodes in C [N, 3].
         """
-        nodes = model.split.nodes.copy()
-        nodes[model.computed] = computed
+        nodes = cut.split.nodes.copy()
+        nodes[cut.computed] = computed
         corners = (nodes[self.ends] * self.weights[..., None]).sum(1)
-        return corners @ model.X_FC_rotation.T + model.X_FC_position
+        return corners @ cut.X_FC_rotation.T + cut.X_FC_position
 
     def damage(
-        self, model: CuttingModel, edge_depth: np.ndarray, cohesive_damage: np.ndarray
+        self, cut: CutGeometry, edge_depth: np.ndarray, cohesive_damage: np.ndarray
     ) -> np.ndarray:
         """Fraction of the toughness that is spent at each corner [V]: 0 intact and skin, 1 cut.
 
@@ -55,18 +56,18 @@ class FoodCorners:
         1 - (1 - D) (1 - phi).
 
         Args:
-            model: The cut.
+            cut: The cut.
             edge_depth: Largest depth of the edge below each cut point [P], metres.
             cohesive_damage: phi of each cut point [P].
         """
-        tables = model.tables
+        tables = cut.tables
         grid = np.clip(
             (edge_depth + tables.reach) / tables.spacing, 0.0, tables.fraction.shape[1] - 1
         )
         low = np.minimum(grid.astype(int), tables.fraction.shape[1] - 2)
         rows, part = np.arange(len(grid)), grid - low
-        cut = (1.0 - part) * tables.fraction[rows, low] + part * tables.fraction[rows, low + 1]
-        spent = 1.0 - (1.0 - cut) * (1.0 - cohesive_damage)
+        passed = (1.0 - part) * tables.fraction[rows, low] + part * tables.fraction[rows, low + 1]
+        spent = 1.0 - (1.0 - passed) * (1.0 - cohesive_damage)
         return np.where(self.is_cut_face, spent[self.cut_point], 0.0)
 
 
@@ -93,7 +94,18 @@ class FoodSurface(FoodCorners):
         return tuple(halves)
 
 
-class CornerList:
+@dc.dataclass
+class FoodBody(FoodCorners):
+    """Tetrahedra between corners.
+
+    Attributes:
+        tetrahedra: Corners [M, 4], of positive volume at rest; none joins both sides.
+    """
+
+    tetrahedra: np.ndarray
+
+
+class _CornerList:
     """Corners of a drawing, each once, in the order in which they are asked for.
 
     Attributes:
@@ -129,13 +141,13 @@ class CornerList:
         return {"ends": ends, "weights": weights, "side": side, "cut_point": cut_point}
 
 
-def food_surface(model: CuttingModel) -> FoodSurface:
+def food_surface(cut: CutGeometry) -> FoodSurface:
     """The drawable surface of both halves.
 
     Outer faces that the plane crosses are clipped, so that each side keeps its own part.
     """
-    split = model.split
-    corners = CornerList(split)
+    split = cut.split
+    corners = _CornerList(split)
     y = corners.heights.tolist()
     sides = zip(split.node_source.tolist(), split.node_side.tolist(), strict=True)
     node_of = {vertex_and_side: node for node, vertex_and_side in enumerate(sides)}
@@ -160,3 +172,57 @@ def food_surface(model: CuttingModel) -> FoodSurface:
             # Section triangles face +y, which is outward on the minus side.
             triangles.append((p, q, r) if side == 0 else (p, r, q))
     return FoodSurface(**corners.fields(), triangles=np.array(triangles))
+
+
+def food_body(cut: CutGeometry) -> FoodBody:
+    """The solid of both halves, at rest as large as the food.
+
+    A tetrahedron that the plane crosses belongs to both sides, with all of its nodes; of its copy
+    on each side only the part with material on that side is drawn.
+    """
+    split = cut.split
+    corners = _CornerList(split)
+    y = corners.heights[split.node_source]
+    point_of = {
+        (min(ends), max(ends)): k
+        for k, sides in enumerate(split.point_nodes.tolist())
+        for ends in sides
+    }
+    tetrahedra: list[tuple[int, ...]] = []
+
+    def corner(a: int, b: int) -> int:
+        ends = min(a, b), max(a, b)
+        return corners.number(*ends, point_of.get(ends, -1))
+
+    for nodes in split.tetrahedra.tolist():
+        sign = 1.0 if split.node_side[nodes[0]] else -1.0
+        inside = [n for n in nodes if sign * y[n] > 0.0]
+        beyond = [n for n in nodes if sign * y[n] < 0.0]
+        level = [n for n in nodes if y[n] == 0.0]
+        if not beyond:
+            tetrahedra.append(tuple(corner(n, n) for n in nodes))
+            continue
+        # From each node inside, its edges to the others, which end at the plane.
+        ways = [
+            [corner(n, n), *(corner(n, b) for b in beyond), *(corner(c, c) for c in level)]
+            for n in inside
+        ]
+        if len(inside) == 1:
+            tetrahedra.append(tuple(ways[0]))
+        elif len(inside) == 2:
+            tetrahedra += _wedge(*ways)
+        else:
+            tops = [way[0] for way in ways]
+            tetrahedra += _wedge(tops, [way[1] for way in ways])
+    cells = np.array([t for t in tetrahedra if len(set(t)) == 4])
+    body = FoodBody(**corners.fields(), tetrahedra=cells)
+    x = body.positions(cut, cut.nodes)[cells]
+    volume = np.linalg.det(x[:, 1:] - x[:, :1])
+    cells[volume < 0.0] = cells[volume < 0.0][:, [0, 2, 1, 3]]
+    return body
+
+
+def _wedge(bottom: list[int], top: list[int]) -> list[tuple[int, ...]]:
+    """The prism between two triangles as three tetrahedra; flat ones where corners coincide."""
+    (a, b, c), (d, e, f) = bottom, top
+    return [(a, b, c, f), (a, b, f, e), (a, e, f, d)]

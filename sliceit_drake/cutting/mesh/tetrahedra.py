@@ -34,7 +34,18 @@ class TetrahedralMesh:
 
     def volumes(self) -> np.ndarray:
         """Signed volumes [T], m^3."""
-        return np.linalg.det(_edges(self.vertices, self.tetrahedra)) / 6.0
+        return np.linalg.det(self.edges()) / 6.0
+
+    def edges(self) -> np.ndarray:
+        """Edge matrices [T, 3, 3], columns x1 - x0, x2 - x0, x3 - x0, metres."""
+        x = self.vertices[self.tetrahedra]
+        return np.stack([x[:, k] - x[:, 0] for k in (1, 2, 3)], axis=-1)
+
+    def lumped(self, volume: np.ndarray) -> np.ndarray:
+        """Volumes of the tetrahedra [T] lumped to the vertices [N]."""
+        at_vertices = np.zeros(len(self.vertices))
+        np.add.at(at_vertices, self.tetrahedra, np.repeat(0.25 * volume[:, None], 4, axis=1))
+        return at_vertices
 
     def mean_edge_length(self) -> float:
         """Mean edge length over all tetrahedra, metres."""
@@ -72,7 +83,7 @@ class TetrahedralMesh:
                 f"{where}: the mesh measures {size:.4g} m; foods are 0.001 to 1 m.{unit}"
             )
         volume = self.volumes()
-        scale = np.abs(_edges(v, t)).max((1, 2)) ** 3
+        scale = np.abs(self.edges()).max((1, 2)) ** 3
         bad = np.flatnonzero(volume < -1e-9 * scale)
         if len(bad):
             raise MeshError(
@@ -162,12 +173,6 @@ def _min_gap(vertices: np.ndarray, tetrahedra: np.ndarray, body: np.ndarray) -> 
     """Least distance of a vertex of the first body to one of the others, metres."""
     first, others = np.unique(tetrahedra[body == 0]), np.unique(tetrahedra[body != 0])
     return float(cKDTree(vertices[first]).query(vertices[others])[0].min())
-
-
-def _edges(vertices: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Edge matrices [T, 3, 3], columns x1 - x0, x2 - x0, x3 - x0."""
-    x = vertices[tetrahedra]
-    return np.stack([x[:, k] - x[:, 0] for k in (1, 2, 3)], axis=-1)
 
 
 def _faces(tetrahedra: np.ndarray) -> np.ndarray:
