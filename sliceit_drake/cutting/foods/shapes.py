@@ -13,7 +13,6 @@ from sliceit_drake.cutting.mesh.generators import (
     cylinder_mesh,
     ellipsoid_mesh,
     halved_mesh,
-    tapered_mesh,
 )
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError, TetrahedralMesh
 from sliceit_drake.resources import file_or_resource
@@ -209,8 +208,11 @@ class Tapered(_Body):
             )
 
     def between(self, y: np.ndarray, refinement: float) -> TetrahedralMesh:
-        first, last = (0.5 * self.diameter_at(float(y[k])) for k in (0, -1))
-        return tapered_mesh((first, last), y, max(2, round(self.rings * refinement)))
+        unit = cylinder_mesh(2.0, y, max(2, round(self.rings * refinement)))
+        p, ends = unit.vertices, y[[0, -1]]
+        radius = np.interp(p[:, 1], ends, [0.5 * self.diameter_at(float(end)) for end in ends])
+        p[:, [0, 2]] *= radius[:, None]
+        return unit
 
     def diameter_at(self, y: float) -> float:
         """Diameter of the section at `y`, metres."""

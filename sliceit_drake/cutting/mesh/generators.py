@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh
+from sliceit_drake.cutting.mesh.tetrahedra import EDGES, TetrahedralMesh
 
-__all__ = ["box_mesh", "cylinder_mesh", "ellipsoid_mesh", "halved_mesh", "tapered_mesh"]
+__all__ = ["box_mesh", "cylinder_mesh", "ellipsoid_mesh", "halved_mesh"]
 
 
 def _oriented(vertices: np.ndarray, tetrahedra: np.ndarray) -> TetrahedralMesh:
@@ -78,23 +78,6 @@ def cylinder_mesh(diameter: float, layers: np.ndarray, rings: int) -> Tetrahedra
     return _extruded(section, triangles, np.asarray(layers, float))
 
 
-def tapered_mesh(radii: tuple[float, float], layers: np.ndarray, rings: int) -> TetrahedralMesh:
-    """A cone's frustum along y that lies on z = 0 along a line; each section y is a circle.
-
-    Args:
-        radii: Radii at the first and at the last layer, metres; linear between.
-        layers: Increasing y coordinates of the mesh layers [L], metres.
-        rings: Concentric rings of the section.
-    """
-    y = np.asarray(layers, float)
-    unit = cylinder_mesh(2.0, y, rings)
-    p = unit.vertices
-    radius = np.interp(p[:, 1], y[[0, -1]], radii)
-    return TetrahedralMesh(
-        np.stack([radius * p[:, 0], p[:, 1], radius * p[:, 2]], axis=1), unit.tetrahedra
-    )
-
-
 def box_mesh(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> TetrahedralMesh:
     """A box meshed on a grid of increasing coordinates, metres, six tetrahedra a cell."""
     x, y, z = (np.asarray(c, float) for c in (x, y, z))
@@ -148,8 +131,7 @@ def halved_mesh(mesh: TetrahedralMesh) -> TetrahedralMesh:
 
 def _halved(vertices: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Each tetrahedron into four at its corners and four in the octahedron between them."""
-    pairs = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
-    edges = np.sort(tetrahedra[:, pairs].reshape(-1, 2), axis=1)
+    edges = np.sort(tetrahedra[:, EDGES].reshape(-1, 2), axis=1)
     edges, index = np.unique(edges, axis=0, return_inverse=True)
     m = len(vertices) + index.reshape(-1, 6)
     t = tetrahedra

@@ -13,7 +13,7 @@ import dataclasses as dc
 
 import numpy as np
 
-from sliceit_drake.cutting.mesh.tetrahedra import MeshError, TetrahedralMesh
+from sliceit_drake.cutting.mesh.tetrahedra import EDGES, MeshError, TetrahedralMesh
 
 __all__ = ["CutPlane", "SplitMesh", "split_mesh"]
 
@@ -226,9 +226,6 @@ def split_mesh(mesh: TetrahedralMesh, plane: CutPlane) -> SplitMesh:
     )
 
 
-_EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
-
-
 def _section(t0: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cut points and triangles of the section.
 
@@ -261,8 +258,8 @@ def _section(t0: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     through = np.flatnonzero((h > 0.0).any(1) & (h < 0.0).any(1))
     t, height = t0[through], h[through]
-    crossed = height[:, _EDGES[:, 0]] * height[:, _EDGES[:, 1]] < 0.0
-    edge_key = key(t[:, _EDGES[:, 0]], t[:, _EDGES[:, 1]])
+    crossed = height[:, EDGES[:, 0]] * height[:, EDGES[:, 1]] < 0.0
+    edge_key = key(t[:, EDGES[:, 0]], t[:, EDGES[:, 1]])
     corner_key = np.concatenate([key(t, t), edge_key], axis=1)
     present = np.concatenate([height == 0.0, crossed], axis=1)
     number = present.sum(1)

@@ -13,7 +13,11 @@ from sliceit_drake.cutting.mesh.manifold import (
     surface_crossings,
 )
 
-__all__ = ["MeshError", "TetrahedralMesh", "boundary_faces"]
+__all__ = ["EDGES", "MeshError", "TetrahedralMesh", "boundary_faces"]
+
+
+EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
+"""Corners of the edges of a tetrahedron."""
 
 
 class MeshError(ValueError):
@@ -49,9 +53,8 @@ class TetrahedralMesh:
 
     def mean_edge_length(self) -> float:
         """Mean edge length over all tetrahedra, metres."""
-        pairs = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
         v = self.vertices[self.tetrahedra]
-        return float(np.mean([np.linalg.norm(v[:, i] - v[:, j], axis=1) for i, j in pairs]))
+        return float(np.mean([np.linalg.norm(v[:, i] - v[:, j], axis=1) for i, j in EDGES]))
 
     def check(self, where: str = "mesh") -> None:
         """Refuses what the physics cannot use.
@@ -84,18 +87,16 @@ class TetrahedralMesh:
             )
         volume = self.volumes()
         scale = np.abs(self.edges()).max((1, 2)) ** 3
-        bad = np.flatnonzero(volume < -1e-9 * scale)
-        if len(bad):
-            raise MeshError(
-                f"{where}: {len(bad)} inverted tetrahedra, first {bad[0]} with vertices "
-                f"{t[bad[0]]} and volume {volume[bad[0]]:.3g} m^3. Swap two of its vertices."
-            )
-        bad = np.flatnonzero(volume <= 1e-9 * scale)
-        if len(bad):
-            raise MeshError(
-                f"{where}: {len(bad)} degenerate tetrahedra, first {bad[0]} with vertices "
-                f"{t[bad[0]]} and volume {volume[bad[0]]:.3g} m^3. Remesh or merge its vertices."
-            )
+        for kind, wrong, fix in (
+            ("inverted", volume < -1e-9 * scale, "Swap two of its vertices."),
+            ("degenerate", volume <= 1e-9 * scale, "Remesh or merge its vertices."),
+        ):
+            bad = np.flatnonzero(wrong)
+            if len(bad):
+                raise MeshError(
+                    f"{where}: {len(bad)} {kind} tetrahedra, first {bad[0]} with vertices "
+                    f"{t[bad[0]]} and volume {volume[bad[0]]:.3g} m^3. {fix}"
+                )
         _, first = np.unique(np.sort(t, axis=1), axis=0, return_index=True)
         if len(first) < len(t):
             again = np.setdiff1d(np.arange(len(t)), first)[0]
