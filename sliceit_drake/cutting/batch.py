@@ -9,29 +9,20 @@ from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.driver import Driver, DriverPool
 from sliceit_drake.cutting.knife_path import KnifePath, PosedMotion
 from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.cutting.simulate import SliceForces
 from sliceit_drake.cutting.solver import NOT_FINITE
 
 __all__ = ["BatchSlice", "cut_together", "simulate_batch"]
 
 
 @dc.dataclass
-class BatchSlice:
-    """One slice of a batch. Row k holds the mean over the coupling step that ends at time[k].
+class BatchSlice(SliceForces):
+    """One slice of a batch; the food's wrench is not finite from where it failed.
 
     Attributes:
-        time: End of each coupling step [n], s.
-        position: Position of Ko in F [n, 3], metres.
-        food_wrench, board_wrench: On the knife, moment about Ko and force, in F [n, 6]; not finite
-            from where the slice failed.
-        cut: Fraction of the section that is cut [n].
         failure: Why it failed, or None.
     """
 
-    time: np.ndarray
-    position: np.ndarray
-    food_wrench: np.ndarray
-    board_wrench: np.ndarray
-    cut: np.ndarray
     failure: str | None
 
 

@@ -16,6 +16,7 @@ from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError, CuttingSolver
 
 __all__ = [
     "ENERGY_RATIO_LIMIT",
+    "SliceForces",
     "SliceResult",
     "check_clear",
     "check_energies",
@@ -33,7 +34,7 @@ TILT_LIMIT = 0.15
 
 
 @dc.dataclass
-class SliceResult:
+class SliceForces:
     """A slice on a prescribed motion. Row k holds the mean over the coupling step that ends at
     time[k].
 
@@ -41,8 +42,22 @@ class SliceResult:
         time: End of each coupling step [n], s.
         position: Position of Ko in F [n, 3], metres.
         food_wrench, board_wrench: Wrenches on the knife, moment about Ko and force, in F [n, 6].
-        edge, normal, friction: Force of the food by mechanism, in F [n, 3].
         cut: Fraction of the section that is cut [n].
+    """
+
+    time: np.ndarray
+    position: np.ndarray
+    food_wrench: np.ndarray
+    board_wrench: np.ndarray
+    cut: np.ndarray
+
+
+@dc.dataclass
+class SliceResult(SliceForces):
+    """A slice with its energies.
+
+    Attributes:
+        edge, normal, friction: Force of the food by mechanism, in F [n, 3].
         state: The food at the end.
         pose: The knife in C at the end.
         balance: Work and dissipation.
@@ -50,14 +65,9 @@ class SliceResult:
         energy_ratio: Largest kinetic over internal energy.
     """
 
-    time: np.ndarray
-    position: np.ndarray
-    food_wrench: np.ndarray
-    board_wrench: np.ndarray
     edge: np.ndarray
     normal: np.ndarray
     friction: np.ndarray
-    cut: np.ndarray
     state: np.ndarray
     pose: Pose
     balance: EnergyBalance
