@@ -73,13 +73,8 @@ def protocol_file(options: argparse.Namespace) -> Path:
 def find_file(name: str, kind: str, example: str) -> Path:
     """The file that a user names: where they are, or one that ships with the package.
 
-    Args:
-        name: What they wrote.
-        kind: What it is, for the error.
-        example: One that ships, for the error.
-
     Raises:
-        ConfigurationError: There is none.
+        ConfigurationError: There is no such `kind` of file; `example` is one that ships.
     """
     file = file_or_resource(name)
     if file is None:

@@ -64,7 +64,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="software that the controller reports (default 5.11.1.108318)",
     )
     parser.add_argument("--end-with-stdin", action="store_true", help=argparse.SUPPRESS)
-    # The arm alone needs none.
 
 
 def run(options: argparse.Namespace) -> int:
@@ -114,7 +113,6 @@ def _robot(options: argparse.Namespace, config: "ControllerConfig") -> "RobotMod
 
 
 def _version(text: str) -> tuple[int, ...]:
-
     try:
         parts = tuple(int(part) for part in text.split("."))
     except ValueError:

@@ -3,6 +3,8 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from sliceit_drake.configuration import ConfigurationError
+
 __all__ = ["needs_extra"]
 
 
@@ -16,8 +18,6 @@ def needs_extra(extra: str) -> Iterator[None]:
     Raises:
         ConfigurationError: A package is not installed.
     """
-    from sliceit_drake.configuration import ConfigurationError
-
     try:
         yield
     except ModuleNotFoundError as error:

@@ -67,15 +67,15 @@ class PreparedFood:
         motion_plan: The scenario's segments, those of its sequence, or the bounds of its policy.
         make_cutting: Makes the cutting system; nothing of it is built before.
         held: Where a holder holds the food, or None.
-        estimate_error: Estimates the error of its discretisation on the prescribed motion, and
-            gives None where a policy moves the knife; None for a food that is not discretised.
+        estimate_error: Estimates the error of its discretisation on the prescribed motion; None for
+            a food that is not discretised.
     """
 
     start_pose: RigidTransform
     motion_plan: MotionPlan
     make_cutting: Callable[[], KnifeForceSystem]
     held: HeldFood | None = None
-    estimate_error: Callable[[], DiscretizationError | None] | None = None
+    estimate_error: Callable[[], DiscretizationError] | None = None
 
 
 def food_to_cut(scenario: Scenario, cutting: OwnCutting | None) -> PreparedFood:
@@ -175,10 +175,8 @@ def _(food: Food, scenario: Scenario) -> PreparedFood:
         solvers = [CuttingSolver(model, scenario.exchange_period) for model in models]
         return CuttingSystem(solvers, poses, in_sequence=sequence is not None)
 
-    def estimate_error() -> DiscretizationError | None:
+    def estimate_error() -> DiscretizationError:
         """That of the middle slice, which stands for all."""
-        if scenario.policy is not None:  # It would decide otherwise on another mesh.
-            return None
         middle = len(foods) // 2
         cut = cuts[middle]
         one = scenario.motion

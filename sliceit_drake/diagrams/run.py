@@ -293,25 +293,20 @@ def measured_profile(scenario: Scenario) -> ForceProfile | None:
     return load_force_profile(file)
 
 
-def _descent(run: Run, record: Record) -> tuple[np.ndarray, np.ndarray]:
-    """Depth [k], increasing, and norm of the force [k] until the deepest point."""
+def _comparison(run: Run, record: Record) -> Comparison | None:
+    """The measured force beside the simulated one until the deepest point."""
+    measurement = run.scenario.measurement
+    if measurement is None or run.profile is None:
+        return None
     depth = run.station.food_top() - record["knife_pose_p_z"]
     force = record.vector("food_wrench_f") + record.vector("board_wrench_f")
     norm = np.linalg.norm(force, axis=1)
     deepest = int(np.argmax(depth)) + 1
     depth, norm = depth[:deepest], norm[:deepest]
     rising = np.concatenate([[True], depth[1:] > np.maximum.accumulate(depth)[:-1]])
-    return depth[rising], norm[rising]
-
-
-def _comparison(run: Run, record: Record) -> Comparison | None:
-    measurement = run.scenario.measurement
-    if measurement is None or run.profile is None:
+    if not can_compare(depth[rising]):
         return None
-    depth, force = _descent(run, record)
-    if not can_compare(depth):
-        return None
-    return compare_with_measurement(run.profile, measurement, depth, force)
+    return compare_with_measurement(run.profile, measurement, depth[rising], norm[rising])
 
 
 def _title(run: Run) -> str:
@@ -421,15 +416,12 @@ def _slice_areas(run: Run) -> list[float]:
     return run.station.cutting.section_areas() if run.scenario.sequence is not None else []
 
 
-def _discretization_error(
-    run: Run, estimate: Callable[[], DiscretizationError | None]
-) -> dict | None:
+def _discretization_error(run: Run, estimate: Callable[[], DiscretizationError]) -> dict | None:
     """What the estimate says; None where the run ended early or a policy led."""
-    # Of a policy the prescribed motion is not known.
+    # A policy would decide otherwise on another mesh.
     if run.stopped is not None or run.diagram.policy is not None:
         return None
     try:
-        error = estimate()
-        return None if error is None else dc.asdict(error)
+        return dc.asdict(estimate())
     except (CuttingError, MeshError) as problem:
         return {"relative_rms": None, "problem": str(problem)}

@@ -28,7 +28,7 @@ from sliceit_drake.systems.contact_monitor import ContactMonitorConfig
 from sliceit_drake.systems.policy import PolicyConfig
 from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig
 
-__all__ = ["Measurement", "Placement", "Preparation", "Scenario", "Start", "load_scenario"]
+__all__ = ["Measurement", "Placement", "Preparation", "Scenario", "Start", "load_scenario", "plain"]
 
 CLEAR_OF_FOOD = 1e-3
 """Least height of the knife over the food while it goes from one slice to the next, metres."""
@@ -175,7 +175,7 @@ def load_scenario(
     paths: dict[str, Any] = {}
     if isinstance(overrides, Mapping):
         paths = {key: value for key, value in overrides.items() if "." in key}
-        plain = {k: _plain(value) for k, value in overrides.items() if k not in paths}
+        plain = {k: plain(value) for k, value in overrides.items() if k not in paths}
         overrides = yaml.safe_dump(plain) if plain else None
     if isinstance(scenario, Scenario):
         file, given, source = None, scenario, "scenario"
@@ -205,12 +205,12 @@ def _scenario_file(name: str | Path) -> Path:
     return file
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """What YAML has a form for, of arrays and numbers of NumPy."""
     if isinstance(value, Mapping):
-        return {key: _plain(each) for key, each in value.items()}
+        return {key: plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
-        return [_plain(each) for each in value]
+        return [plain(each) for each in value]
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -243,9 +243,9 @@ def _set_field(scenario: Scenario, path: str, value: Any) -> None:
         for part in parents:
             at = at[int(part)] if isinstance(at, list) else getattr(at, part)
         if isinstance(at, list):
-            at[int(last)] = _plain(value)
+            at[int(last)] = plain(value)
         elif last in {field.name for field in dc.fields(at)}:
-            setattr(at, last, _plain(value))
+            setattr(at, last, plain(value))
         else:
             raise AttributeError(last)
     except (AttributeError, IndexError, TypeError, ValueError) as error:

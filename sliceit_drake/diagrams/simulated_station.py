@@ -244,11 +244,5 @@ def _add_holder(plant: MultibodyPlant, scenario: Scenario, held: HeldFood) -> No
     if scenario.holder == "arm":
         grip = np.array([0.0, held.distance + FINGER, 0.5 * held.height])
         HoldingArm(scenario.X_WF(), grip).draw(plant)
-        return
-    add_holder(
-        plant,
-        scenario.X_WF(),
-        food_width=held.width,
-        food_height=held.height,
-        distance=held.distance,
-    )
+    else:
+        add_holder(plant, scenario.X_WF(), held.width, held.height, held.distance)

@@ -59,7 +59,7 @@ class Station(Diagram):
     meshcat: Meshcat | None
     visualizer: MeshcatVisualizer | None
     food_visualizer: FrameRecorder | None
-    estimate_error: Callable[[], DiscretizationError | None] | None
+    estimate_error: Callable[[], DiscretizationError] | None
 
     def SetStart(self, root_context: Context) -> None:
         """Puts the station at its start, in the context of the whole diagram."""

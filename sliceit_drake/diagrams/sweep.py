@@ -21,7 +21,7 @@ from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.cutting.workers import worker_processes
 from sliceit_drake.diagrams.outputs.run_log import Record
 from sliceit_drake.diagrams.run import prepare_run
-from sliceit_drake.diagrams.scenario import Scenario, load_scenario
+from sliceit_drake.diagrams.scenario import Scenario, load_scenario, plain
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -194,7 +194,7 @@ def sweep(
             has no prescribed cut of finite elements and `robot` is False.
     """
     base = load_scenario(scenario, overrides)
-    axes = {name: [_plain(value) for value in values] for name, values in parameters.items()}
+    axes = {name: [plain(value) for value in values] for name, values in parameters.items()}
     if not axes or not all(axes.values()):
         raise ConfigurationError(
             "has no values",
@@ -208,10 +208,6 @@ def sweep(
     else:
         found = _in_stations(points, scenarios, workers, client, progress)
     return Sweep(base, axes, found, robot)
-
-
-def _plain(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else value
 
 
 def _in_stations(

@@ -93,11 +93,9 @@ class Recorder:
         kept = [name for name in self.columns if not name.startswith("_")]
         add(kept, np.column_stack([raw[name] for name in kept]))
         joints = raw.vector("q", "123456")
-        for name, q in (
-            ("knife_pose", joints),
-            ("commanded_pose", raw.vector("q_command", "123456")),
-        ):
-            add(_pose_columns(name), self._knife_poses(q))
+        commands = raw.vector("q_command", "123456")
+        add(_pose_columns("knife_pose"), self._knife_poses(joints))
+        add(_pose_columns("commanded_pose"), self._knife_poses(commands))
         if _pose_columns("target_pose")[0] not in self.columns:
             R, p, _, _ = self.motion.sample(time)
             if "_target_x" in self.columns:
