@@ -14,9 +14,9 @@ import pytest
 
 from sliceit_drake.cli import main as program
 from sliceit_drake.cli.main import main
+from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.workers import worker_processes
-from sliceit_drake.diagrams import run
 from sliceit_drake.output_folder import check_output
 from studies.__main__ import main as studies
 
@@ -100,19 +100,17 @@ def test_without_a_place_for_kernels_a_run_has_its_own_and_warp_says_nothing(tmp
 def test_a_kill_ends_a_run_as_ctrl_c_does_offline_and_keeps_what_there_is(
     tmp_path, monkeypatch, capsys
 ):
-    progress = run._cut_progress
     parts = []
 
-    def kill_in_the_third(prepared):
-        parts.append(prepared)
+    def kill_in_the_third(bars, name, time, duration, remark):
+        parts.append(time)
         if len(parts) == 3:
             os.kill(os.getpid(), signal.SIGTERM)
-        return progress(prepared)
 
     def connect(*_):
         raise AssertionError("a run needs no network")
 
-    monkeypatch.setattr(run, "_cut_progress", kill_in_the_third)
+    monkeypatch.setattr(StageBars, "show", kill_in_the_third)
     monkeypatch.setattr(socket.socket, "connect", connect)
     before = signal.getsignal(signal.SIGTERM)
     output = tmp_path / "a folder"

@@ -175,8 +175,8 @@ def load_scenario(
     paths: dict[str, Any] = {}
     if isinstance(overrides, Mapping):
         paths = {key: value for key, value in overrides.items() if "." in key}
-        plain = {k: plain(value) for k, value in overrides.items() if k not in paths}
-        overrides = yaml.safe_dump(plain) if plain else None
+        fields = {k: plain(value) for k, value in overrides.items() if k not in paths}
+        overrides = yaml.safe_dump(fields) if fields else None
     if isinstance(scenario, Scenario):
         file, given, source = None, scenario, "scenario"
     else:
