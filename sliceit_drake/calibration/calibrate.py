@@ -48,10 +48,9 @@ class CalibrationOptions:
     """Options of a calibration: how much is searched, from how many starts, with which seed.
 
     Attributes:
-        trials: Of the search.
+        trials, seed: Of the search.
         steps: Of Adam from each start.
         starts: The best places of the search that are refined, far from each other.
-        seed: Of the search.
         workers: Processors to use.
         storage: Journal file or URL of the search, shared by many machines; None for a file in the
             output folder.
@@ -274,7 +273,6 @@ def blocked_error(model: Predictor, unit: np.ndarray, blocks: int = 5) -> HeldOu
     knife was is not what is predicted.
 
     Args:
-        model: Of the records.
         unit: The fit to all data [d]; each refit starts there.
         blocks: Number of blocks of equal depth.
 

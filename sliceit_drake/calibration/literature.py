@@ -40,7 +40,6 @@ def food_from_literature(
     Args:
         setup: With `literature`.
         cuts: Number of places tried; rounded up to a power of two.
-        seed: Of the sequence.
         progress: Called with the number of cuts done.
 
     Raises:

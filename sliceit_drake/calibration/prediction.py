@@ -227,14 +227,7 @@ class Predictor:
         return Job(model, R, p, target.stretches, target.record.name, "float64")
 
     def predict(self, units: Sequence[np.ndarray]) -> list[list[Prediction]]:
-        """Forces for several sets of parameters.
-
-        Args:
-            units: Places in the ranges, each [d].
-
-        Returns:
-            For each set, one prediction a record.
-        """
+        """Forces at several places in the ranges, each [d]: for each, one prediction a record."""
         jobs, failures = [], []
         for unit in units:
             values = self.values(unit)
@@ -294,12 +287,9 @@ class Predictor:
         return float(np.sqrt(np.mean(residual[self.used] ** 2)))
 
     def mean_square_and_gradient(self, unit: np.ndarray) -> tuple[float, np.ndarray]:
-        """Mean square of the used residuals [N^2], and its gradient by the unit values.
+        """Mean square of the used residuals [N^2] at places [d], and its gradient by them.
 
         The gradient is exact (the solver's adjoint) but for `NO_ADJOINT`.
-
-        Args:
-            unit: Places in the ranges [d].
 
         Raises:
             CuttingError: A slice broke down.

@@ -79,10 +79,8 @@ def search(
     was faster; give each its own seed.
 
     Args:
-        predictor: Of the records.
         study: From `open_study`.
         trials: Number of finished trials in the storage, those of all workers.
-        seed: Of the proposals.
         progress: Called with the finished trials and the best error so far, N.
 
     Raises:

@@ -142,7 +142,6 @@ def estimate(model: Predictor, unit: np.ndarray, rounds: int = ROUNDS) -> Estima
     apart than noise explains.
 
     Args:
-        model: Of the records.
         unit: A good fit, such as that of least squares [d].
         rounds: Most alternations.
 

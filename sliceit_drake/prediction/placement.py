@@ -23,14 +23,10 @@ known."""
 def poses_in_food(
     record: SliceRecord, model: CuttingModel
 ) -> tuple[Rotation, Rotation, np.ndarray]:
-    """Poses of the knife relative to the food that it cuts.
+    """Poses of the knife in a record of n rows, relative to the food that it cuts.
 
     Where food or heights are not known, contact is taken to begin over the middle of the cut, as
     high as its top, when the force does.
-
-    Args:
-        record: With n rows.
-        model: The cut.
 
     Returns:
         R_FW, R_FK [n], p_FK [n, 3], metres.

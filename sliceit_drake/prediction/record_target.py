@@ -75,7 +75,6 @@ class RecordTarget:
     and measurement went through the same filters: `records.preprocessing.as_measured`.
 
     Args:
-        record: The record.
         bench: Of which the knife is taken, but for what the record says of it, and the range of the
             record's height: the food is computed wherever a knife within it may touch.
         models: Its cut by meshing; empty without food.
@@ -137,7 +136,11 @@ class RecordTarget:
         rows = self._near(height) if near_food else slice(None)
         self.time, self.depth = record.time[rows], -height[rows]
         self.compared = ~turning(self.time, self.depth)
-        self.grid = self._times()
+        # It ends with the last row: a knife that stopped there would show weight and speed that it
+        # never had.
+        first, last = record.time[0], record.time[-1]
+        count = max(2, int((last - first) / clock.period + 1e-6))
+        self.grid = first + clock.period * np.arange(count + 1)
         at = np.minimum(self.grid, record.time[-1])
         self.p = np.column_stack([np.interp(at, record.time, column) for column in p.T])
         self.R = Slerp(record.time, rotation)(at).as_matrix()
@@ -190,13 +193,6 @@ class RecordTarget:
             )
         return slice(max(int(low[0]) - 1, 0), int(low[-1]) + 2)
 
-    def _times(self) -> np.ndarray:
-        """Times of the grid [N + 1], s. It ends with the last row: a knife that stopped there would
-        show weight and speed that it never had."""
-        first, last = self.record.time[0], self.record.time[-1]
-        count = max(2, int((last - first) / self.clock.period + 1e-6))
-        return np.asarray(first + self.clock.period * np.arange(count + 1))
-
     def _stretches(self) -> Stretches | None:
         height = self.p[:, 2] - self._top
         low = np.flatnonzero(height < self._margin)
@@ -228,12 +224,8 @@ class RecordTarget:
         return self.home + faster * (self.p - self.home) - np.array([0.0, 0.0, lower])
 
     def series(self, result: JobResult | None, board_wrench: np.ndarray) -> ForceSeries:
-        """The predicted slice on the even grid.
-
-        Args:
-            result: Of the food; None where the knife never comes near any.
-            board_wrench: Of the board, from `board` [N, 6].
-        """
+        """The predicted slice on the even grid, from the result of the food, None where the knife
+        never comes near any, and the wrench of the board, from `board` [N, 6]."""
         T, n = self.clock.period, len(self.grid) - 1
         parts = {name: np.zeros((n, 6)) for name in ("edge", "normal", "friction")}
         if result is not None:
@@ -273,12 +265,8 @@ class RecordTarget:
         return np.interp(np.arange(len(self.grid)), ends[1:], result.rise)
 
     def board(self, board: Board, R: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """Wrench of a board, its height in F, with the knife at poses at even times [N, 6], Nm, N.
-
-        Args:
-            board: The board.
-            R, p: Poses X_FK [N + 1, 3, 3] and [N + 1, 3], metres.
-        """
+        """Wrench of a board, its height in F, with the knife at poses X_FK [N + 1, 3, 3] and
+        [N + 1, 3], metres, at even times [N, 6], Nm, N."""
         return board_wrenches(board, self.knife, R, p, self.clock.period)
 
     def _weight(self) -> np.ndarray:

@@ -64,11 +64,9 @@ class RecordFinding:
     Attributes:
         severity: "error" if the record cannot be used, "warning" if with care.
         kind: Short name of what was found, such as "millimetres".
-        file: The file.
         column: The column, or the field of the YAML file, or "".
         lines: First and last line of the file concerned, or None for the file as a whole.
         problem: What is wrong and what was expected.
-        fix: What to do.
     """
 
     severity: str

@@ -192,10 +192,8 @@ class SliceMetadata:
     """The YAML file of a slice record.
 
     Attributes:
-        name: Name of the record.
         date: When the slice was cut, as 2026-03-01.
         provenance: Where the numbers come from and how they may be used.
-        board_height: Height of the board's surface in W, m.
         condition: Records with the same label were nominally the same cut (replicates).
         unknown: Names of fields, such as `food.size`, that are truly not known. A column named
             here, such as `p_WK_z`, is known up to a constant.

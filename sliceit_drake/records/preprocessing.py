@@ -145,11 +145,7 @@ def low_pass(
     """
     numbers = {"cutoff": cutoff, "order": float(order), "zero_phase": float(zero_phase)}
     result = _with_step(record, "low_pass", numbers)
-
-    def filtered(values: np.ndarray) -> np.ndarray:
-        return _filtered(record.time, values, cutoff, order, zero_phase)
-
-    return _map_wrench(result, filtered)
+    return _map_wrench(result, lambda x: _filtered(record.time, x, cutoff, order, zero_phase))
 
 
 def resample(record: SliceRecord, rate: float) -> SliceRecord:

@@ -5,6 +5,7 @@ or JointState. ROS is in SI units, as records are. No ROS is needed.
 """
 
 import dataclasses as dc
+import functools
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -47,6 +48,9 @@ LARGEST_GAP = 0.1
 """Time without a message over which a motion or a force is not interpolated, s."""
 
 Forward = Callable[[Sequence[float]], Sequence[float]]
+
+Wrong = Callable[..., ConfigurationError]
+"""Makes errors that name the file."""
 
 
 def import_rosbag(
@@ -96,30 +100,30 @@ def import_rosbag(
         raise ConfigurationError(
             f"{clock!r} is no clock", field="--clock", fix=f"Give one of {', '.join(CLOCKS)}."
         )
-    series = _read(Path(file), wrench, motion, clock)
+    wrong = functools.partial(ConfigurationError, source=str(file))
+    series = _read(Path(file), wrench, motion, clock, wrong)
     force, moving = series[wrench], series[motion]
     if between is not None:
         force = force.between(*between)
         moving = moving.between(between[0] - LARGEST_GAP, between[1] + LARGEST_GAP)
     for part, topic in ((force, wrench), (moving, motion)):
-        _check_gaps(part, topic, file)
+        _check_gaps(part, topic, wrong)
     kept = (force.time >= moving.time[0]) & (force.time <= moving.time[-1])
     if kept.sum() < 2:
-        raise ConfigurationError(
+        raise wrong(
             f"{wrench} runs from {force.time[0]:.3f} to {force.time[-1]:.3f} s, {motion} from "
             f"{moving.time[0]:.3f} to {moving.time[-1]:.3f} s",
-            source=str(file),
             fix="Both must cover the slice, on one clock; --clock received ignores their stamps.",
         )
     time, values = force.time[kept], force.values[kept]
-    joints, R_BT, p_BT = _poses(moving, time, forward, file, motion)
+    joints, R_BT, p_BT = _poses(moving, time, forward, wrong, motion)
     X_WB = np.eye(4) if X_WB is None else X_WB
     R_WB = X_WB[:3, :3]
     R_WT, p_WT = R_WB @ R_BT, X_WB[:3, 3] + p_BT @ R_WB.T
     R_WK, p_TK_W = R_WT @ X_TK[:3, :3], R_WT @ X_TK[:3, 3]
     facts = imported_facts(metadata, file)
     names = (tool_frame or moving.child, moving.frame)
-    placed = _place_wrench(facts, force.frame, names, values, R_WT, R_WB, p_TK_W, file)
+    placed = _place_wrench(facts, force.frame, names, values, R_WT, R_WB, p_TK_W, wrong)
     facts.processing = [
         ProcessingStep(
             "import_rosbag",
@@ -177,12 +181,12 @@ class _Series:
         return dc.replace(self, time=self.time[kept], values=self.values[kept])
 
 
-def _read(file: Path, wrench: str, motion: str, clock: str) -> dict[str, _Series]:
+def _read(file: Path, wrench: str, motion: str, clock: str, wrong: Wrong) -> dict[str, _Series]:
     from rosbags.highlevel import AnyReader, AnyReaderError
     from rosbags.typesys import Stores, get_typestore
 
     if not file.exists():
-        raise ConfigurationError("there is no such file", source=str(file), fix="Check the path.")
+        raise wrong("there is no such file", fix="Check the path.")
     found: dict[str, _Series] = {}
     try:
         # Bags of early ROS 2 do not say what their types are.
@@ -190,25 +194,24 @@ def _read(file: Path, wrench: str, motion: str, clock: str) -> dict[str, _Series
             there = {c.topic: c for c in bag.connections}
             for topic, kinds in ((wrench, (WRENCH,)), (motion, MOTIONS)):
                 if topic not in there or there[topic].msgtype not in kinds:
-                    raise _no_topic(file, topic, kinds, there)
+                    raise _no_topic(wrong, topic, kinds, there)
                 kind = there[topic].msgtype
                 rows = [
                     (received, bag.deserialize(raw, kind))
                     for connection, received, raw in bag.messages([there[topic]])
                 ]
                 origin = found[wrench].origin if found else None
-                found[topic] = _series(rows, kind, clock, origin, file, topic)
+                found[topic] = _series(rows, kind, clock, origin, wrong, topic)
     except AnyReaderError as error:
-        raise ConfigurationError(
+        raise wrong(
             f"cannot be read as a bag ({error})",
-            source=str(file),
             fix="Give a .bag, .db3 or .mcap file, or the folder of a ROS 2 bag.",
         ) from error
     return found
 
 
 def _no_topic(
-    file: Path, topic: str, kinds: Sequence[str], there: dict[str, Any]
+    wrong: Wrong, topic: str, kinds: Sequence[str], there: dict[str, Any]
 ) -> ConfigurationError:
     listed = ", ".join(
         f"{name} ({c.msgtype.split('/')[-1]}, {c.msgcount} messages)"
@@ -218,9 +221,8 @@ def _no_topic(
     problem = f"there is no topic {topic!r}"
     if topic in there:
         problem = f"{topic} is of {there[topic].msgtype.split('/')[-1]}, not {wanted}"
-    return ConfigurationError(
+    return wrong(
         problem,
-        source=str(file),
         field="--topics",
         fix=f"Give the topics of a WrenchStamped and of a {' or '.join(_short(MOTIONS))}. "
         f"There are: {listed or 'none'}.",
@@ -232,28 +234,24 @@ def _short(kinds: Sequence[str]) -> list[str]:
 
 
 def _series(
-    rows: list[tuple[int, Any]], kind: str, clock: str, origin: int | None, file: Path, topic: str
+    rows: list[tuple[int, Any]], kind: str, clock: str, origin: int | None, wrong: Wrong, topic: str
 ) -> _Series:
     """A topic's messages as arrays."""
     if len(rows) < 2:
-        raise ConfigurationError(
-            f"{topic} has {len(rows)} messages", source=str(file), fix="Give a longer bag."
-        )
+        raise wrong(f"{topic} has {len(rows)} messages", fix="Give a longer bag.")
     frames = {m.header.frame_id for _, m in rows}
     children = {m.child_frame_id for _, m in rows} if kind == TRANSFORM else {None}
     if len(frames) > 1 or len(children) > 1:
         names = ", ".join(repr(name) for name in sorted(map(str, frames | children - {None})))
-        raise ConfigurationError(
+        raise wrong(
             f"{topic} has messages in different frames: {names}",
-            source=str(file),
             fix="Record a topic that keeps to one frame, and one of one tool.",
         )
     if clock == "header":
         stamps = [10**9 * m.header.stamp.sec + m.header.stamp.nanosec for _, m in rows]
         if not any(stamps):
-            raise ConfigurationError(
+            raise wrong(
                 f"the messages of {topic} have no stamps",
-                source=str(file),
                 field="--clock",
                 fix="Give --clock received, if the delays of the network do not matter.",
             )
@@ -264,23 +262,22 @@ def _series(
     step = np.diff(time)
     if (step < 0.0).any():
         k = int(np.argmax(step < 0.0))
-        raise ConfigurationError(
+        raise wrong(
             f"the time of {topic} goes back by {-step[k]:.3g} s, {time[k] - time[0]:.3f} s after "
             "its first message",
-            source=str(file),
             fix="The clock was set, or two nodes publish it: record again, or try --clock received",
         )
     fresh = np.concatenate([[True], step > 0.0])
-    values = _values([m for _, m in rows], kind, file, topic)
+    values = _values([m for _, m in rows], kind, wrong, topic)
     child = FLANGE if kind == JOINTS else next(iter(children))
     return _Series(
         kind, origin, time[fresh], values[fresh], next(iter(frames)), child, int((~fresh).sum())
     )
 
 
-def _values(messages: list[Any], kind: str, file: Path, topic: str) -> np.ndarray:
+def _values(messages: list[Any], kind: str, wrong: Wrong, topic: str) -> np.ndarray:
     if kind == JOINTS:
-        return np.array([_joints(m, file, topic) for m in messages])
+        return np.array([_joints(m, wrong, topic) for m in messages])
     if kind == WRENCH:
         parts = [(m.wrench.force, m.wrench.torque) for m in messages]
         return np.array([[v for p in pair for v in (p.x, p.y, p.z)] for pair in parts])
@@ -291,58 +288,52 @@ def _values(messages: list[Any], kind: str, file: Path, topic: str) -> np.ndarra
     return np.array([[p.x, p.y, p.z, q.x, q.y, q.z, q.w] for p, q in poses])
 
 
-def _joints(message: Any, file: Path, topic: str) -> list[float]:
+def _joints(message: Any, wrong: Wrong, topic: str) -> list[float]:
     """Angles from the base on; a message has them in any order, drivers in that of the alphabet."""
     angles = []
     for name in JOINT_NAMES:
         places = [k for k, given in enumerate(message.name) if given.endswith(name)]
         if len(places) != 1:
-            raise ConfigurationError(
+            raise wrong(
                 f"{topic} names {len(places)} joints {name}: {', '.join(message.name)}",
-                source=str(file),
                 fix="Record the joint states of one UR5e alone, or a topic of its tool's pose.",
             )
         angles.append(float(message.position[places[0]]))
     return angles
 
 
-def _check_gaps(part: _Series, topic: str, file: str | Path) -> None:
+def _check_gaps(part: _Series, topic: str, wrong: Wrong) -> None:
     if len(part.time) < 2:
-        raise ConfigurationError(
+        raise wrong(
             f"{topic} has no messages there",
-            source=str(file),
             field="--between",
             fix="Give seconds from the first wrench.",
         )
     step = np.diff(part.time)
     k = int(step.argmax())
     if step[k] > LARGEST_GAP:
-        raise ConfigurationError(
+        raise wrong(
             f"{topic} has no message for {step[k]:.3g} s, from {part.time[k]:.3f} to "
             f"{part.time[k + 1]:.3f} s after the first wrench",
-            source=str(file),
             field="--between",
             fix=f"Give a part without a gap longer than {LARGEST_GAP:g} s, or record again.",
         )
 
 
 def _poses(
-    moving: _Series, time: np.ndarray, forward: Forward | None, file: str | Path, topic: str
+    moving: _Series, time: np.ndarray, forward: Forward | None, wrong: Wrong, topic: str
 ) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
     """Joints [n, 6] or None, R_BT [n, 3, 3] and p_BT [n, 3] at times."""
     if moving.kind == JOINTS:
         if forward is None:
-            raise ConfigurationError(
-                f"{topic} has joint angles, for which no kinematics is given", source=str(file)
-            )
+            raise wrong(f"{topic} has joint angles, for which no kinematics is given")
         joints = np.column_stack([np.interp(time, moving.time, q) for q in moving.values.T])
         rows = np.array([forward(q) for q in joints.tolist()])
         return joints, rows[:, :9].reshape(-1, 3, 3).transpose(0, 2, 1), rows[:, 9:]
     length = np.linalg.norm(moving.values[:, 3:], axis=1)
     if (np.abs(length - 1.0) > 1e-3).any():
-        raise ConfigurationError(
+        raise wrong(
             f"{topic} has quaternions whose length is not 1, as {length[0]:.3g}",
-            source=str(file),
             fix="Its publisher leaves the orientation out; record one that has it.",
         )
     p = np.column_stack([np.interp(time, moving.time, x) for x in moving.values[:, :3].T])
@@ -358,7 +349,7 @@ def _place_wrench(
     R_WT: np.ndarray,
     R_WB: np.ndarray,
     p_TK_W: np.ndarray,
-    file: str | Path,
+    wrong: Wrong,
 ) -> np.ndarray:
     """The wrench [n, 6] in the axes and about the point that `facts.wrench` says afterwards."""
     tool, base = names
@@ -373,9 +364,8 @@ def _place_wrench(
     if base and stated == re.sub("^/", "", base):
         return np.hstack([force @ R_WB.T, torque @ R_WB.T])
     moving = repr(tool) if tool else "a frame without a name"
-    raise ConfigurationError(
+    raise wrong(
         f"the wrench is in the frame {frame!r}, the motion is that of {moving} in {base!r}",
-        source=str(file),
         field="--tool-frame",
         fix=f"Give --tool-frame {frame or 'NAME'} if the wrench is in the frame that moves; if it "
         "is in the sensor's, give wrench.frame: S, wrench.point: So, sensor.position and "
