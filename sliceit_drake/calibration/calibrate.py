@@ -200,8 +200,7 @@ def _refine(
 ) -> list[Refinement]:
     starts = found.best(options.starts)
     if options.steps == 0:
-        errors = [float(found.errors.min())] * len(starts)
-        return [Refinement(u, e, []) for u, e in zip(starts, errors, strict=True)]
+        return [Refinement(start, float(found.errors.min()), []) for start in starts]
     jobs = [
         (setup, list(records), start, options.steps, directory / f"adam-{problem}-{k}.npz")
         for k, start in enumerate(starts)

@@ -132,7 +132,8 @@ def gauss_newton(
     damping, taken = FIRST_DAMPING, 0
     while taken < steps:
         H, g = _normal_equations(at, noise)
-        promised = _decrease(H, g, _step(H, g, at.unit, 0.0, free))
+        move = _step(H, g, at.unit, 0.0, free)
+        promised = float(-2.0 * g @ move - move @ H @ move)
         if promised <= tolerance * cost:
             return Fit(at.unit, cost, taken, True, at)
         accepted = None
@@ -210,8 +211,3 @@ def _step(
     result = lsq_linear(root[:, None] * vectors.T, target, (low, high), method="bvls")
     move[some] = result.x
     return move
-
-
-def _decrease(H: np.ndarray, g: np.ndarray, move: np.ndarray) -> float:
-    """By which the cost of the linear problem falls in a move."""
-    return float(-2.0 * g @ move - move @ H @ move)

@@ -36,20 +36,14 @@ class Oscillation:
 
     def factor(self, time: np.ndarray) -> np.ndarray:
         """Factor on the force at times [m], s."""
-        phase = 2.0 * np.pi * self.frequency * time
-        return 1.0 + self.cosine * np.cos(phase) + self.sine * np.sin(phase)
+        c, s = _waves(self.frequency, time)
+        return 1.0 + self.cosine * c + self.sine * s
 
     def derivatives(self, time: np.ndarray) -> np.ndarray:
         """Derivatives of `factor` by frequency, cosine and sine [m, 3]."""
-        phase = 2.0 * np.pi * self.frequency * time
-        c, s = np.cos(phase), np.sin(phase)
+        c, s = _waves(self.frequency, time)
         by_frequency = 2.0 * np.pi * time * (self.sine * c - self.cosine * s)
         return np.column_stack([by_frequency, c, s])
-
-    @property
-    def amplitude(self) -> float:
-        """Relative to the force."""
-        return float(np.hypot(self.cosine, self.sine))
 
 
 def fit_oscillation(
@@ -78,6 +72,11 @@ def fit_oscillation(
     return best
 
 
+def _waves(frequency: float, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    phase = 2.0 * np.pi * frequency * time
+    return np.cos(phase), np.sin(phase)
+
+
 def _at(
     frequency: float,
     time: np.ndarray,
@@ -85,8 +84,7 @@ def _at(
     measured: np.ndarray,
     weights: np.ndarray,
 ) -> tuple[float, Oscillation]:
-    phase = 2.0 * np.pi * frequency * time[:, None]
-    c, s = (predicted * np.cos(phase)), (predicted * np.sin(phase))
+    c, s = (predicted * wave for wave in _waves(frequency, time[:, None]))
     rest = measured - predicted
     cc, ss, cs = (weights * c * c).sum(), (weights * s * s).sum(), (weights * c * s).sum()
     cr, sr = (weights * c * rest).sum(), (weights * s * rest).sum()

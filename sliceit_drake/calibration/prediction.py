@@ -322,7 +322,10 @@ class Predictor:
         for target, used in zip(self.targets, self.split(self.used), strict=True):
             model = self.model(target, values)
             job = self._job(target, model, values)
-            path, adjoint = KnifePath(model, job, 1.0), self._adjoint(model)
+            path = KnifePath(model, job, 1.0)
+            if id(model.split) not in self._adjoints:
+                self._adjoints[id(model.split)] = SliceAdjoint(model, EXCHANGE_PERIOD)
+            adjoint = self._adjoints[id(model.split)]
             run = adjoint.run(path.R_CK, path.p_CK, model)
             R_FC = model.X_FC_rotation
             board = target.board(self.board, job.R, job.p)
@@ -371,12 +374,6 @@ class Predictor:
         ends[:, k] = np.clip(unit[k] + STEP * np.array([1.0, -1.0]), 0.0, 1.0)
         squares = [self.error(row) ** 2 for row in self.predict(list(ends))]
         return (squares[0] - squares[1]) / float(ends[0, k] - ends[1, k])
-
-    def _adjoint(self, model: CuttingModel) -> SliceAdjoint:
-        key = id(model.split)
-        if key not in self._adjoints:
-            self._adjoints[key] = SliceAdjoint(model, EXCHANGE_PERIOD)
-        return self._adjoints[key]
 
     def jacobian(self, unit: np.ndarray, step: float = 2e-3) -> tuple[np.ndarray, np.ndarray]:
         """Residuals [M] and their derivatives by the unit values [M, d], by central differences.

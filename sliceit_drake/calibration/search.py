@@ -52,8 +52,7 @@ def open_study(storage: str | Path, name: str) -> optuna.Study:
     """Opens a study or begins it.
 
     Args:
-        storage: A journal file (.log), or a URL that Optuna knows, as
-            postgresql://user@host/database, which many machines share; see `open_storage`.
+        storage: As of `open_storage`.
         name: Of the study in the storage.
 
     Raises:

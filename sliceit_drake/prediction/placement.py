@@ -77,12 +77,8 @@ def food_of(food: Food, record: SliceRecord) -> Food:
 
 def knife_of(knife: Knife, record: SliceRecord) -> Knife:
     """The knife with what the record says of it."""
-    facts = record.metadata.knife
-    known = {
-        name: getattr(facts, name)
-        for name in (f.name for f in dc.fields(Knife))
-        if getattr(facts, name, None) is not None
-    }
+    facts, measures = vars(record.metadata.knife), {f.name for f in dc.fields(Knife)}
+    known = {k: v for k, v in facts.items() if k in measures and v is not None}
     return dc.replace(knife, **known)
 
 

@@ -203,42 +203,34 @@ def import_frame(
         ConfigurationError: If a column that `columns` names is not there or holds no numbers, or
             the record lacks time, pose or force.
     """
+    facts = copy.deepcopy(metadata)
+    facts.processing = [ProcessingStep("import_frame")]
+    table = facts.name or "table"
     there = {str(name): name for name in frame.columns}
     source = {name: name for name in fmt.COLUMNS if name in there} | dict(columns or {})
     values = {}
     for name, other in source.items():
         if name not in fmt.COLUMNS or other not in there:
-            wrong = other if name in fmt.COLUMNS else name
-            known = there if name in fmt.COLUMNS else fmt.COLUMNS
+            wrong, known = (other, there) if name in fmt.COLUMNS else (name, fmt.COLUMNS)
+            fix = f"There are: {', '.join(known)}."
             raise ConfigurationError(
-                f"there is no column {wrong!r}",
-                source=metadata.name or "table",
-                field=name,
-                fix=f"There are: {', '.join(known)}.",
+                f"there is no column {wrong!r}", source=table, field=name, fix=fix
             )
         try:
             values[name] = np.asarray(frame[there[other]].to_numpy(), float)
         except (TypeError, ValueError) as error:
+            fix = "Convert it to floats in SI units."
             raise ConfigurationError(
-                f"holds no numbers ({error})",
-                source=metadata.name or "table",
-                field=other,
-                fix="Convert it to floats in SI units.",
+                f"holds no numbers ({error})", source=table, field=other, fix=fix
             ) from error
     has_force = set(fmt.FORCE) <= set(values) or fmt.FORCE_NORM in values
     for name in (fmt.TIME, *fmt.POSITION, *fmt.QUATERNION, *(() if has_force else fmt.FORCE)):
         if name not in values:
-            raise ConfigurationError(
-                "the column is missing",
-                source=metadata.name or "table",
-                field=name,
-                fix=f'Name it in columns, as {{"{name}": "..."}}. There are: {", ".join(there)}.',
-            )
-    require_increasing(values[fmt.TIME], metadata.name or "table", source[fmt.TIME])
+            fix = f'Name it in columns, as {{"{name}": "..."}}. There are: {", ".join(there)}.'
+            raise ConfigurationError("the column is missing", source=table, field=name, fix=fix)
+    require_increasing(values[fmt.TIME], table, source[fmt.TIME])
     lines = np.arange(2, len(values[fmt.TIME]) + 2)
-    facts = copy.deepcopy(metadata)
-    facts.processing = [ProcessingStep("import_frame")]
-    return record_from_table(SliceTable(facts, values, facts.name or "table", lines))
+    return record_from_table(SliceTable(facts, values, table, lines))
 
 
 def imported_facts(metadata: SliceMetadata, file: str | Path) -> SliceMetadata:

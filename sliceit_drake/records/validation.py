@@ -2,7 +2,7 @@
 
 import dataclasses as dc
 import difflib
-import functools
+import operator
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,6 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.records import slice_record as fmt
 from sliceit_drake.records.findings import MIN_ROWS, Findings, RecordFinding, runs
 from sliceit_drake.records.force_checks import check_force
-from sliceit_drake.records.metadata import SliceMetadata
 from sliceit_drake.records.motion_checks import check_motion
 from sliceit_drake.records.slice_record import SliceRecord, SliceTable
 
@@ -197,11 +196,10 @@ def _check_facts(table: SliceTable, findings: Findings) -> None:
     phases = metadata.motion.phases
     # A record of the air, the board or a weight has no food.
     is_slice = not phases or any(phase.label == "slice" for phase in phases)
-    forgotten = [
-        name
-        for name in (KEY_FACTS if is_slice else ())
-        if _value(metadata, name) in (None, "", "unknown") and name not in metadata.unknown
-    ]
+    values = operator.attrgetter(*KEY_FACTS)(metadata) if is_slice else ()
+    given = zip(KEY_FACTS, values, strict=False)
+    missing = [name for name, value in given if value in (None, "", "unknown")]
+    forgotten = [name for name in missing if name not in metadata.unknown]
     if forgotten:
         findings.fact("missing fact", ", ".join(forgotten), "not given")
     if table.has(fmt.TORQUE) and metadata.wrench.point == "unknown":
@@ -217,10 +215,6 @@ def _check_facts(table: SliceTable, findings: Findings) -> None:
             text = f"{phase.label} from {phase.start:g} to {phase.end:g} s is beside the record,"
             text += f" which has {time[0]:g} to {time[-1]:g} s"
             findings.fact("phases", f"motion.phases[{k}]", text)
-
-
-def _value(metadata: SliceMetadata, name: str) -> Any:
-    return functools.reduce(getattr, name.split("."), metadata)
 
 
 def _field_names(config: Any, lead: str = "") -> list[str]:
