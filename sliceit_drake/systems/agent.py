@@ -290,12 +290,9 @@ class AgentSystem(LeafSystem):
         angle = math.atan2(X[0, 2], X[2, 2])
         return np.array([-X[0, 3], self._config.descent - X[2, 3], -angle])
 
-    def _reading(self, context: Context) -> np.ndarray:
-        return self._of_wrench @ self._wrench_in.Eval(context).get_coeffs()
-
     def _history(self, context: Context) -> np.ndarray:
         before = self._value(context, self._readings).reshape(-1, 3)
-        return np.vstack([before, self._reading(context)])
+        return np.vstack([before, self._of_wrench @ self._wrench_in.Eval(context).get_coeffs()])
 
     def _begin(self, context: Context, discrete_state: DiscreteValues) -> None:
         # Wherever the knife is, it rests there: no velocity or jerk comes of the way from X_WK.
