@@ -297,7 +297,7 @@ def test_the_environment_takes_the_progress_for_its_schedule():
     env = SlicingEnv(task_of(reward=reward))
     rewards = []
     for progress in (0.0, 1.0):
-        env.set_progress(progress)
+        env.progress = progress
         env.reset(seed=0)
         _, value, _, _, info = env.step(PRESS)
         terms = [info["reward_terms"][name] for name in TERMS]

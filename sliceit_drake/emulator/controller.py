@@ -12,13 +12,12 @@ from numpy.typing import ArrayLike
 
 from sliceit_drake.emulator.kinematics import Posture, matrix_of_pose, pose_of_matrix
 from sliceit_drake.emulator.modes import (
+    JOINT_MODES,
     SAFETY_BITS,
     MessageLevel,
     RobotMode,
     RuntimeState,
     SafetyMode,
-    joint_mode,
-    robot_status_bits,
 )
 from sliceit_drake.emulator.motions import ScriptError, slow_down
 from sliceit_drake.emulator.registers import InputRegisters
@@ -360,7 +359,7 @@ class Controller:
         wrench = raw - self._payload_wrench(R) - self._sensor_zero
         force = wrench[:3]
         moment = wrench[3:] - _cross(X_FT[:3, 3], force)
-        safety, runtime, mode = self.safety, self.runtime, self.mode
+        safety, mode, is_playing = self.safety, self.mode, self.runtime == RuntimeState.PLAYING
         self.outputs |= {
             "timestamp": self.time,
             "actual_q": state.positions.tolist(),
@@ -379,13 +378,14 @@ class Controller:
             "payload": self.payload,
             "payload_cog": self.payload_cog.tolist(),
             "robot_mode": int(mode),
-            "joint_mode": [joint_mode(mode)] * 6,
+            "joint_mode": [JOINT_MODES[mode]] * 6,
             "safety_mode": int(safety),
             "safety_status": int(safety),
             "safety_status_bits": SAFETY_BITS[safety],
-            "runtime_state": int(runtime),
-            "robot_status_bits": robot_status_bits(mode, runtime),
-            "speed_scaling": self.speed_scale if runtime == RuntimeState.PLAYING else 0.0,
+            "runtime_state": int(self.runtime),
+            # Power on, program running.
+            "robot_status_bits": (mode >= RobotMode.POWER_ON) | is_playing << 1,
+            "speed_scaling": self.speed_scale if is_playing else 0.0,
             "target_speed_fraction": self.speed_scale,
             "actual_main_voltage": 48.0,
             "actual_robot_voltage": 48.0,

@@ -6,13 +6,12 @@ Numbers and bits are those of Universal Robots' RTDE guide and of its client lib
 import enum
 
 __all__ = [
+    "JOINT_MODES",
     "SAFETY_BITS",
     "MessageLevel",
     "RobotMode",
     "RuntimeState",
     "SafetyMode",
-    "joint_mode",
-    "robot_status_bits",
 ]
 
 
@@ -85,12 +84,5 @@ SAFETY_BITS = {
 }
 """safety_status_bits by mode."""
 
-
-def robot_status_bits(mode: RobotMode, runtime: RuntimeState) -> int:
-    """robot_status_bits: power on, program running."""
-    return (mode >= RobotMode.POWER_ON) | (runtime == RuntimeState.PLAYING) << 1
-
-
-def joint_mode(mode: RobotMode) -> int:
-    """joint_mode of each joint: running, idle or power off."""
-    return {RobotMode.RUNNING: 253, RobotMode.IDLE: 255}.get(mode, 239)
+JOINT_MODES = dict.fromkeys(RobotMode, 239) | {RobotMode.RUNNING: 253, RobotMode.IDLE: 255}
+"""joint_mode of each joint by mode: running, idle, or else power off."""

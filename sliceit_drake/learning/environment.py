@@ -40,6 +40,9 @@ class SlicingEnv(gymnasium.Env):
 
     Args:
         task: What to cut, and how.
+
+    Attributes:
+        progress: Fraction of the training that is done, for the reward's schedule.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}
@@ -55,10 +58,6 @@ class SlicingEnv(gymnasium.Env):
         self._decisions = 0
         self._potential = 0.0
         self._moment: dict[str, Any] = {}
-
-    def set_progress(self, progress: float) -> None:
-        """Says which fraction of the training is done, for the reward's schedule."""
-        self.progress = progress
 
     def moment(self) -> dict[str, Any]:
         """Where the episode is, for `return_to`, as plain data: how it began, the actions since.

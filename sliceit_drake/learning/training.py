@@ -105,7 +105,7 @@ def train(
         if saved is not None:
             model.set_training_state(saved["model"])
             if config.task.reward.schedule != "constant":
-                environments.env_method("set_progress", model.num_timesteps / config.steps)
+                environments.set_attr("progress", model.num_timesteps / config.steps)
             callback.restore(saved["watch"])
         # What was logged after the checkpoint is dropped.
         if (log := output / EPISODES).exists():
@@ -230,7 +230,6 @@ class _Watch(BaseCallback):
         self._returns: deque[float] = deque(maxlen=SELECTION)
         self.best_return, self.best_steps = -math.inf, 0
         self.best_actor: dict[str, torch.Tensor] | None = None
-        self._schedule = config.task.reward.schedule != "constant"
 
     def restore(self, state: dict[str, Any]) -> None:
         self.episodes, self._saved_at = state["episodes"], state["steps"]
@@ -267,9 +266,8 @@ class _Watch(BaseCallback):
             if done:
                 self._finish_episode(info, sums)
                 sums.clear()
-        if self._schedule:
-            share = self.num_timesteps / self._config.steps
-            self.training_env.env_method("set_progress", share)
+        if self._config.task.reward.schedule != "constant":
+            self.training_env.set_attr("progress", self.num_timesteps / self._config.steps)
         return True
 
     def _on_rollout_start(self) -> None:
