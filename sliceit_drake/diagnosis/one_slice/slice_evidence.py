@@ -23,6 +23,9 @@ MIN_SPREAD = 0.5
 """Least standard deviation of a gain where nothing is wrong. A cause that hardly shows has next to
 none, which would turn a small gain into many standard deviations."""
 
+_Option = tuple[str, float | None, list[int]]
+"""Cause, value of its scan, and numbers of its columns there."""
+
 
 @dc.dataclass
 class CauseInSlice:
@@ -309,10 +312,6 @@ def _known(found: Sensitivities) -> dict[int, float]:
         if (c.name, c.parameter) in USUAL
     }
     return dict.fromkeys(found.index("numerical"), 1.0) | usual
-
-
-_Option = tuple[str, float | None, list[int]]
-"""Cause, value of its scan, and numbers of its columns there."""
 
 
 def _best_gains(
