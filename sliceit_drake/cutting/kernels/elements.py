@@ -27,31 +27,20 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
 
     @wp.func
     def dot8(a: Vectors, b: Vectors):
-        return wp.cw_mul(a.x, b.x) + wp.cw_mul(a.y, b.y) + wp.cw_mul(a.z, b.z)
+        products = wp.cw_mul(a, b)
+        return products[0] + products[1] + products[2]
 
     @wp.func
     def cross8(a: Vectors, b: Vectors):
-        return Vectors(
-            wp.cw_mul(a.y, b.z) - wp.cw_mul(a.z, b.y),
-            wp.cw_mul(a.z, b.x) - wp.cw_mul(a.x, b.z),
-            wp.cw_mul(a.x, b.y) - wp.cw_mul(a.y, b.x),
+        return wp.matrix_from_rows(
+            wp.cw_mul(a[1], b[2]) - wp.cw_mul(a[2], b[1]),
+            wp.cw_mul(a[2], b[0]) - wp.cw_mul(a[0], b[2]),
+            wp.cw_mul(a[0], b[1]) - wp.cw_mul(a[1], b[0]),
         )
 
     @wp.func
-    def sum_of_two8(ka: lanes, a: Vectors, kb: lanes, b: Vectors):
-        return Vectors(
-            wp.cw_mul(ka, a.x) + wp.cw_mul(kb, b.x),
-            wp.cw_mul(ka, a.y) + wp.cw_mul(kb, b.y),
-            wp.cw_mul(ka, a.z) + wp.cw_mul(kb, b.z),
-        )
-
-    @wp.func
-    def sum_of_three8(ka: lanes, a: Vectors, kb: lanes, b: Vectors, kc: lanes, c: Vectors):
-        return Vectors(
-            wp.cw_mul(ka, a.x) + wp.cw_mul(kb, b.x) + wp.cw_mul(kc, c.x),
-            wp.cw_mul(ka, a.y) + wp.cw_mul(kb, b.y) + wp.cw_mul(kc, c.y),
-            wp.cw_mul(ka, a.z) + wp.cw_mul(kb, b.z) + wp.cw_mul(kc, c.z),
-        )
+    def scaled8(k: lanes, a: Vectors):
+        return wp.matrix_from_rows(wp.cw_mul(k, a[0]), wp.cw_mul(k, a[1]), wp.cw_mul(k, a[2]))
 
     @wp.func
     def corner8(
@@ -66,32 +55,20 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
             a[lane] = p[0]
             b[lane] = p[1]
             c[lane] = p[2]
-        return Vectors(a, b, c)
-
-    @wp.func
-    def edge8(
-        x: wp.array2d(dtype=Any),
-        cut: wp.int32,
-        mesh: Mesh,
-        block: wp.int32,
-        corner: wp.int32,
-        origin: Vectors,
-    ):
-        end = corner8(x, cut, mesh, block, corner)
-        return Vectors(end.x - origin.x, end.y - origin.y, end.z - origin.z)
+        return wp.matrix_from_rows(a, b, c)
 
     @wp.func
     def gradient8(x: wp.array2d(dtype=Any), cut: wp.int32, mesh: Mesh, block: wp.int32):
         """Columns of the edges at x times the inverse rest edges."""
-        o = corner8(x, cut, mesh, block, 0)
-        a = edge8(x, cut, mesh, block, 1, o)
-        b = edge8(x, cut, mesh, block, 2, o)
-        c = edge8(x, cut, mesh, block, 3, o)
+        origin = corner8(x, cut, mesh, block, 0)
+        a = corner8(x, cut, mesh, block, 1) - origin
+        b = corner8(x, cut, mesh, block, 2) - origin
+        c = corner8(x, cut, mesh, block, 3) - origin
         m = mesh.shape
         return (
-            sum_of_three8(m[block, 0], a, m[block, 3], b, m[block, 6], c),
-            sum_of_three8(m[block, 1], a, m[block, 4], b, m[block, 7], c),
-            sum_of_three8(m[block, 2], a, m[block, 5], b, m[block, 8], c),
+            scaled8(m[block, 0], a) + scaled8(m[block, 3], b) + scaled8(m[block, 6], c),
+            scaled8(m[block, 1], a) + scaled8(m[block, 4], b) + scaled8(m[block, 7], c),
+            scaled8(m[block, 2], a) + scaled8(m[block, 5], b) + scaled8(m[block, 8], c),
         )
 
     @wp.func
@@ -105,17 +82,17 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
         force: wp.array3d(dtype=Vectors),
     ):
         """Nodal forces of the stress times minus the volume, with columns p0, p1, p2."""
-        hx = lanes()
-        hy = lanes()
-        hz = lanes()
+        total = Vectors()
         m = mesh.shape
         for k in range(3):
-            g = sum_of_three8(m[block, 3 * k], p0, m[block, 3 * k + 1], p1, m[block, 3 * k + 2], p2)
+            g = (
+                scaled8(m[block, 3 * k], p0)
+                + scaled8(m[block, 3 * k + 1], p1)
+                + scaled8(m[block, 3 * k + 2], p2)
+            )
             force[cut, block, k + 1] = g
-            hx += g.x
-            hy += g.y
-            hz += g.z
-        force[cut, block, 0] = Vectors(-hx, -hy, -hz)
+            total += g
+        force[cut, block, 0] = -total
 
     @wp.kernel(enable_backward=False, module=module)
     def elements(
@@ -146,9 +123,9 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
             weight = -parameters.stiff_volume[cut, block]
             s = wp.cw_mul(weight, (one - wp.cw_div(one, Ic + one)) * mu)
             p = wp.cw_mul(weight, J * lam - one * (lam + real(0.75) * mu))
-            p0 = sum_of_two8(s, f0, p, d0)
-            p1 = sum_of_two8(s, f1, p, d1)
-            p2 = sum_of_two8(s, f2, p, d2)
+            p0 = scaled8(s, f0) + scaled8(p, d0)
+            p1 = scaled8(s, f1) + scaled8(p, d1)
+            p2 = scaled8(s, f2) + scaled8(p, d2)
             store8(p0, p1, p2, cut, block, mesh, force)
 
     @wp.kernel(enable_backward=gradients, module=module)
@@ -273,16 +250,12 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
         """Change of the first column of the stress; of the others with the columns rotated."""
         u = cross8(e1, f2)
         w = cross8(f1, e2)
-        both = Vectors(u.x + w.x, u.y + w.y, u.z + w.z)
         d = cross8(f1, f2)
         s = factors[cut, block, 0]
         ds = factors[cut, block, 1]
         p = factors[cut, block, 2]
         dp = factors[cut, block, 3]
-        three = sum_of_three8(s, e0, ds, f0, p, both)
-        return Vectors(
-            three.x + wp.cw_mul(dp, d.x), three.y + wp.cw_mul(dp, d.y), three.z + wp.cw_mul(dp, d.z)
-        )
+        return scaled8(s, e0) + scaled8(ds, f0) + scaled8(p, u + w) + scaled8(dp, d)
 
     @wp.kernel(enable_backward=False, module=module)
     def elements_adjoint(

@@ -63,15 +63,9 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
     # From the x component of a nodal force in `elements` to its z component.
     strided = wp.types.vector(2 * LANES + 1, real)
     entries = wp.types.vector(GATHER, wp.int32)
+    # A vector in each lane, by component.
+    Vectors = wp.types.matrix((3, LANES), real)
     TINY = wp.constant(real(1.0e-20))
-
-    @wp.struct
-    class Vectors:
-        """A vector in each lane."""
-
-        x: lanes
-        y: lanes
-        z: lanes
 
     @wp.struct
     class Mesh:
