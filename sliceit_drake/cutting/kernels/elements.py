@@ -17,13 +17,8 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
     """The kernels for scalars `real`, in the Warp module `module`, with adjoints if `gradients`."""
     t = kernel_types(real)
     vec3, vec4, mat33, lanes, padded = t.vec3, t.vec4, t.mat33, t.lanes, t.padded
-    Vectors, Mesh, Parameters, State, Energies = (
-        t.Vectors,
-        t.Mesh,
-        t.Parameters,
-        t.State,
-        t.Energies,
-    )
+    Vectors, Mesh, Parameters = t.Vectors, t.Mesh, t.Parameters
+    State, Energies = t.State, t.Energies
 
     @wp.func
     def dot8(a: Vectors, b: Vectors):

@@ -15,8 +15,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
     """The kernels for scalars `real`, in the Warp module `module`, with adjoints if `gradients`."""
     t = kernel_types(real)
     vec3, vec4, slide, padded = t.vec3, t.vec4, t.slide, t.padded
-    Mesh, Points, Parameters, State = t.Mesh, t.Points, t.Parameters, t.State
-    Forces, Sums = t.Forces, t.Sums
+    Mesh, Parameters, State, Forces, Sums = t.Mesh, t.Parameters, t.State, t.Forces, t.Sums
 
     # Nodes slower than this, in m/s, count as at rest.
     REST = wp.constant(real(1.0e-5))
@@ -263,19 +262,6 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
             adjoint = gather_elements(cut, i, mesh, forces)
             adj_ahead[cut, i] = adj_ahead[cut, i] + padded(adjoint)
 
-    @wp.kernel(enable_backward=False, module=module)
-    def spread_adjoint(
-        points: Points, adj_from_points: wp.array2d(dtype=vec3), adj_force: wp.array3d(dtype=vec3)
-    ):
-        """Adjoint of the forces of the cut points, from those of the nodes that gather them."""
-        cut, i = wp.tid()
-        w = points.weights[i]
-        for side in range(2):
-            adj_force[cut, i, side] = (
-                adj_from_points[cut, points.nodes[i, 2 * side]] * w[0]
-                + adj_from_points[cut, points.nodes[i, 2 * side + 1]] * w[1]
-            )
-
-    out.gather, out.relax_nodes, out.step_nodes = gather, relax_nodes, step_nodes
-    out.gather_adjoint, out.spread_adjoint = gather_adjoint, spread_adjoint
+    out.gather, out.relax_nodes = gather, relax_nodes
+    out.step_nodes, out.gather_adjoint = step_nodes, gather_adjoint
     return out

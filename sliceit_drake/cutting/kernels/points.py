@@ -25,6 +25,8 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
 
     @wp.struct
     class KnifePose:
+        """Pose of the knife in C, velocity of Ko and angular velocity."""
+
         R: mat33
         p: vec3
         v: vec3
@@ -42,16 +44,11 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         return values[row, k] * (real(1.0) - w) + values[row, k + 1] * w
 
     @wp.func
-    def intact_fraction(cohesive_damage: real, onset: real, failure: real):
-        """Secant over initial stiffness of a bilinear bond that spent the share
-        `cohesive_damage`."""
+    def intact_fraction(damage: real, onset: real, failure: real):
+        """Secant over initial stiffness of a bilinear bond that spent the share `damage`."""
         share = real(0.0)
         if failure > onset:
-            share = (
-                onset
-                * (real(1.0) - cohesive_damage)
-                / (onset + cohesive_damage * (failure - onset))
-            )
+            share = onset * (real(1.0) - damage) / (onset + damage * (failure - onset))
         return share
 
     @wp.func
@@ -86,8 +83,8 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
 
     @wp.func
     def outwards(R: mat33, face: wp.int32):
-        """Sign of Ky that points into a face's side: Ky is on the minus side of a knife that hangs
-        upside down in C."""
+        """Sign of Ky that points to a face's side of the cut: Ky points to the minus side when the
+        knife hangs upside down in C."""
         return wp.where((R[1, 1] < real(0.0)) == (face == 0), real(1.0), real(-1.0))
 
     @wp.func(inline=True)
@@ -107,9 +104,9 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         """Flank pressure and friction on one face of the cut.
 
         A part of the face's area is above the edge: `area` now, `old_area` before the sub-step. It
-        goes by the depth of the edge below this face, not below the middle of both: a
-        piece that is cut off leaves the other where it is. The mean of the flank's thickness over
-        that part is that at its centroid, `rise` above the point, for the flank is straight.
+        goes by the depth of the edge below this face, not below the middle of both: a piece that is
+        cut off leaves the other where it is. The mean of the flank's thickness over that part is
+        that at its centroid, `rise` above the point, for the flank is straight.
 
         The normal force is minus the gradient of 1/2 stiffness area depth^2, `growth` of the area
         with the depth of the edge included: a knife at rest then puts no energy into a vibration.
@@ -206,15 +203,15 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         A = points.area[i]
         toughness = parameters.toughness[cut, i]
         # s: depth of the edge below the point. Nothing happens beyond the ends of the blade.
-        old_edge_depth = now.edge_depth[cut, i]
-        s = old_edge_depth
+        old_depth = now.edge_depth[cut, i]
+        s = old_depth
         beyond = wp.abs(wp.dot(arm, knife_x)) >= parameters.knife[cut, Section.HALF_LENGTH]
         if not beyond:
             s = -wp.dot(arm, knife_z)
-        new_edge_depth = wp.max(old_edge_depth, s)
-        after.edge_depth[cut, i] = new_edge_depth
-        k0, w0 = place(old_edge_depth, points)
-        k1, w1 = place(new_edge_depth, points)
+        depth = wp.max(old_depth, s)
+        after.edge_depth[cut, i] = depth
+        k0, w0 = place(old_depth, points)
+        k1, w1 = place(depth, points)
         D0 = table(points.fraction, i, k0, w0)
         D = table(points.fraction, i, k1, w1)
 
@@ -225,20 +222,18 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         bond = P[cut, Scalar.BOND_STIFFNESS]
         onset = P[cut, Scalar.STRENGTH] / bond
         failure = real(2.0) * toughness / P[cut, Scalar.STRENGTH]
-        old_cohesive_damage = now.cohesive_damage[cut, i]
-        new_cohesive_damage = wp.max(
-            old_cohesive_damage,
+        old_damage = now.cohesive_damage[cut, i]
+        damage = wp.max(
+            old_damage,
             wp.clamp((length - onset) / wp.max(failure - onset, TINY), real(0.0), real(1.0)),
         )
-        after.cohesive_damage[cut, i] = new_cohesive_damage
-        intact = intact_fraction(new_cohesive_damage, onset, failure)
+        after.cohesive_damage[cut, i] = damage
+        intact = intact_fraction(damage, onset, failure)
         by_edge = P[cut, Scalar.EDGE_SHARE]
         stiffness = bond * A * (real(1.0) - by_edge * D) * intact
         closing = bond * A * wp.min(gap[1], real(0.0))
         pull = stiffness * opening + vec3(real(0.0), closing, real(0.0))
-        opening_loss = (
-            toughness * A * (real(1.0) - by_edge * D0) * (new_cohesive_damage - old_cohesive_damage)
-        )
+        opening_loss = toughness * A * (real(1.0) - by_edge * D0) * (damage - old_damage)
 
         # Edge: a force against the edge's direction d, elastic up to R T (d . n), where R is the
         # toughness that opening left less what the bonds that the edge cuts give up. d follows the
@@ -248,19 +243,19 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         along = moved - wp.dot(moved, knife_y) * knife_y
         speed = wp.length(along)
         travel = speed * dt
-        old_edge_direction = now.edge_direction[cut, i]
-        followed = old_edge_direction
+        old_direction = now.edge_direction[cut, i]
+        followed = old_direction
         if travel > real(0.0):
             keep = wp.exp(-travel / P[cut, Scalar.DIRECTION_LENGTH])
-            followed = keep * old_edge_direction + ((real(1.0) - keep) * dt / travel) * along
+            followed = keep * old_direction + ((real(1.0) - keep) * dt / travel) * along
         in_plane = followed - wp.dot(followed, knife_y) * knife_y
         size = wp.length(in_plane)
-        d = old_edge_direction
+        d = old_direction
         if size > real(1.0e-6):
             d = in_plane / size
         after.edge_direction[cut, i] = d
         bonded = real(0.5) * by_edge * bond * intact * length * length
-        left = wp.max(by_edge * toughness * (real(1.0) - new_cohesive_damage) - bonded, real(0.0))
+        left = wp.max(by_edge * toughness * (real(1.0) - damage) - bonded, real(0.0))
         # The edge cuts what its direction has across it; pressing straight, all.
         across = wp.max(wp.dot(d, knife_z), real(0.0))
         effect = across
@@ -272,7 +267,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
             relative_speed = wp.max(speed / P[cut, Scalar.REFERENCE_SPEED], real(1.0e-3))
             effect = effect * wp.pow(relative_speed, P[cut, Scalar.RATE_EXPONENT])
         if ALL or P[cut, Scalar.INITIATION] > real(0.0):
-            below = wp.max(points.depth[i] + new_edge_depth, real(0.0))
+            below = wp.max(points.depth[i] + depth, real(0.0))
             left = left + P[cut, Scalar.INITIATION] * wp.exp(
                 -below / P[cut, Scalar.INITIATION_DEPTH]
             )
@@ -282,7 +277,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
                 points.outline, i, k1, w1
             )
         spring = wp.max(parameters.unloading[cut, i], TINY)
-        slack = wp.max(new_edge_depth - s - P[cut, Scalar.UNLOADING_LENGTH], real(0.0))
+        slack = wp.max(depth - s - P[cut, Scalar.UNLOADING_LENGTH], real(0.0))
         limit = wp.max(resistance * effect - spring * slack, real(0.0))
         if beyond:
             limit = real(0.0)
@@ -371,14 +366,8 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         intact = intact_fraction(state.cohesive_damage[cut, i], onset, failure)
         opening = vec3(gap[0], wp.max(gap[1], real(0.0)), gap[2])
         closing = wp.min(gap[1], real(0.0))
-        doubled = (
-            bond
-            * A
-            * (
-                (real(1.0) - P[cut, Scalar.EDGE_SHARE] * D) * intact * wp.dot(opening, opening)
-                + closing * closing
-            )
-        )
+        uncut = (real(1.0) - P[cut, Scalar.EDGE_SHARE] * D) * intact
+        doubled = bond * A * (uncut * wp.dot(opening, opening) + closing * closing)
         knife_z = vec3(R[0, 2], R[1, 2], R[2, 2])
         edge = state.edge_force[cut, i]
         doubled += edge * edge / wp.max(parameters.unloading[cut, i], TINY)
@@ -397,4 +386,18 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
                     doubled += flank * A * share * (phi * phi + wp.dot(held, held))
         energies.points[cut, i] = real(0.5) * doubled
 
-    return types.SimpleNamespace(step_points=step_points, point_energy=point_energy)
+    out = types.SimpleNamespace(step_points=step_points, point_energy=point_energy)
+    if not gradients:
+        return out
+
+    @wp.kernel(enable_backward=False, module=module)
+    def spread_adjoint(
+        points: Points, adj_from_points: wp.array2d(dtype=vec3), adj_force: wp.array3d(dtype=vec3)
+    ):
+        """Adjoint of the forces of the cut points, from those of the nodes that gather them."""
+        cut, i = wp.tid()
+        for face in range(2):
+            adj_force[cut, i, face] = on_face(adj_from_points, cut, i, face, points)
+
+    out.spread_adjoint = spread_adjoint
+    return out
