@@ -42,7 +42,6 @@ def add_scenario_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set",
         metavar="YAML",
-        default=None,
         help="fields that replace those of the file, as '{food: {material: {toughness: 400}}}'",
     )
 

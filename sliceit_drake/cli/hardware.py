@@ -39,9 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the command's arguments."""
     add_scenario_arguments(parser)
     add_robot_arguments(parser)
-    parser.add_argument(
-        "--output", metavar="DIR", type=Path, default=None, help="default: output/NAME_robot"
-    )
+    parser.add_argument("--output", metavar="DIR", type=Path, help="default: output/NAME_robot")
     parser.add_argument("--duration", metavar="S", type=float, help="default: the motion's")
     parser.add_argument("--no-replay", action="store_true", help="do not write replay.html")
     parser.add_argument(

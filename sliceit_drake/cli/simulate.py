@@ -35,9 +35,7 @@ WAIT_FOR_BROWSER = 60.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the command's arguments."""
     add_scenario_arguments(parser)
-    parser.add_argument(
-        "--output", metavar="DIR", type=Path, default=None, help="default: output/NAME"
-    )
+    parser.add_argument("--output", metavar="DIR", type=Path, help="default: output/NAME")
     parser.add_argument("--duration", metavar="S", type=float, help="default: the motion's")
     parser.add_argument(
         "--meshcat",

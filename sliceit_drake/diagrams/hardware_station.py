@@ -199,17 +199,15 @@ class HardwareStation(Station):
             robot.client, make_safety_layer(twin, config.limits), config.watchdog, robot.pace
         )
         builder = DiagramBuilder()
-        self.rtde = builder.AddNamedSystem("robot", RtdeSystem(self.link, robot.pace))
+        rtde = self.rtde = builder.AddNamedSystem("robot", RtdeSystem(self.link, robot.pace))
         commander = builder.AddNamedSystem("controller", make_controller(scenario, controller))
-        estimate = builder.AddNamedSystem(
+        estimate = self.cutting = builder.AddNamedSystem(
             "knife_estimate",
             KnifeEstimate(twin.plant, twin.robot.knife, twin.food_top(), scenario.board.height),
         )
-        self.cutting = estimate
         monitor = builder.AddNamedSystem(
             "contact_monitor", ContactMonitor(scenario.monitor, PERIOD, scenario.sensor)
         )
-        rtde = self.rtde
         for source, *systems in (
             (rtde.GetOutputPort("joint_positions"), commander, estimate),
             (rtde.GetOutputPort("joint_velocities"), estimate),
