@@ -327,6 +327,8 @@ def setup(app: Sphinx) -> dict:
     app.add_source_suffix(".ipynb", "notebook")
     app.add_source_parser(NotebookParser)
     app.connect("builder-inited", write_api)
+    # It names the pages of the API, which change while its file does not.
+    app.connect("env-get-outdated", lambda *_: [root_doc])
     app.connect("source-read", order_pages)
     app.connect("env-check-consistency", check_names)
     app.connect("build-finished", open_at_the_index)

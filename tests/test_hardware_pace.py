@@ -9,6 +9,7 @@ from emulator_bench import free_address
 
 from sliceit_drake.configuration import ConfigurationError
 from studies.__main__ import main
+from studies.pages import render
 from studies.robot import hardware_pace as pace
 
 pytestmark = pytest.mark.second_tier
@@ -45,7 +46,8 @@ def test_runs_of_a_pace_make_a_row():
     assert row[:4] == ["0.5", "2 of 3", "2500", "5 (0.20 %)"]
     assert row[4:8] == ["0.50 ms", "1.00 ms", "12.00 ms", "5"], "of all runs together"
     assert row[8:] == ["0.030 N, at most 0.040 (0.80 %)", "1 state_age"]
-    assert len(row) == len(pace.HEAD.split(" | "))
+    head = render("hardware_pace", rows=[row], command="a", machine="b").splitlines()[0]
+    assert len(row) == len(cells_of(head))
     nothing = pace.row(1.0, [pace.PacedRun("Not ready")] * 2)
     assert nothing == ["1", "0 of 2", "0", "-", "-", "-", "-", "0", "-", "2 Not ready"]
 
