@@ -95,6 +95,6 @@ def test_all_modules_that_a_computation_loads_count(entry):
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     ).stdout
     loaded = {Path(line) for line in printed.split()}
-    assert loaded - set(source_files(PACKAGE / entry)) == {
-        file for file in loaded if file.name == "__init__.py"
-    }
+    # What gives the names of packages computes nothing.
+    names = {file for file in loaded if file.name == "__init__.py"} | {PACKAGE / "lazy_names.py"}
+    assert loaded - set(source_files(PACKAGE / entry)) == names
