@@ -245,12 +245,10 @@ class SliceAdjoint:
         ws.launch_look_ahead(adjoint=True)
 
     def _launch_substep_adjoint(self, k: int) -> None:
-        ws, kern, m = self._w, self._w.kernels, self.model
-        ahead, forces = ws.slots[k].ahead, ws.forces[k]
+        ws, kern, forces = self._w, self._w.kernels, self._w.forces[k]
         for name in ("lateral", "push", "from_elements", "from_bulk", "from_points"):
             getattr(forces, name).grad.zero_()
-        ws.launch_blade(k, adjoint=True)
-        for part in reversed(ws.node_parts[1:]):
+        for part in ("bend_blade", "push_blade", *reversed(ws.node_parts[1:])):
             ws.launch_part(part, k, adjoint=True)
         spread = [ws.points, forces.from_points.grad, forces.points.grad]
         ws.launch(kern.spread_adjoint, forces.lateral.shape, spread)
@@ -258,12 +256,12 @@ class SliceAdjoint:
         strain, factors, direction = self._strain, self._factors, forces.from_elements.grad
         adjoints = [ws.parameters.stiff_volume.grad, self._adj_mu, self._adj_lam]
         for kernel, arguments in (
-            (kern.strains, [ahead, direction, ws.mesh, strain]),
+            (kern.strains, [ws.slots[k].ahead, direction, ws.mesh, strain]),
             (kern.stresses, [ws.parameters, strain, factors, *adjoints]),
             (kern.elements_adjoint, [ws.mesh, strain, factors, forces.elements]),
         ):
             ws.launch(kernel, ws.parameters.stiff_volume.shape, arguments)
-        ws.launch_many(kern.gather_adjoint, len(m.moving), [ws.mesh, forces, ahead.grad])
+        ws.launch_part("gather_adjoint", k)
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -289,29 +289,16 @@ class Workspace:
             device=self.device,
         )
 
-    def launch_many(
-        self, kernel: Any, count: int, inputs: list[Any], adjoint: bool = False
-    ) -> None:
-        """Launches `kernel` over cuts and `count` entries: on a CPU all in one thread.
-
-        A thread's start, which copies the kernel's arguments, costs a CPU more than a node does.
-        """
-        threads, per_thread = (1, count) if self.device.is_cpu else (count, 1)
-        self.launch(kernel, (self.cuts, threads), [*inputs, per_thread], adjoint)
-
-    def _substep(self, k: int) -> tuple[Any, Any, Any]:
-        """State before and after sub-step k, and its forces."""
-        if self._gradients:
-            return self.slots[k], self.slots[k + 1], self.forces[k]
-        return self.slots[0], self.slots[0], self.forces[0]
-
     def launch_look_ahead(self, k: int = 0, adjoint: bool = False) -> None:
-        """Where the elements are evaluated in sub-step k, from the first state."""
+        """Launches where the elements are evaluated in sub-step k, from the first state."""
         inputs = [self.slots[0], self.parameters, self.slots[k]]
         self.launch(self.kernels.look_ahead, self.slots[k].x.shape, inputs, adjoint)
 
     def launch_part(self, part: str, k: int, dt: Any = None, adjoint: bool = False) -> None:
         """Launches a kernel of sub-step k, or its adjoint.
+
+        On a CPU all entries of a cut are in one thread: its start, which copies the kernel's
+        arguments, costs more than a node does.
 
         Args:
             part: The kernel's name.
@@ -320,32 +307,32 @@ class Workspace:
             adjoint: Whether the kernel's adjoint is launched.
         """
         m, mesh, parameters, sums = self.model, self.mesh, self.parameters, self.sums
-        now, after, forces = self._substep(k)
+        now, after, forces = self.slots[0], self.slots[0], self.forces[0]
+        if self._gradients:
+            now, after, forces = self.slots[k], self.slots[k + 1], self.forces[k]
         dt = self.dt if dt is None else dt
-        on_points = [self.points, parameters, self.motion, now, after, forces, sums]
-        count, inputs = {
+        states = [now, after, forces, sums]
+        entries, inputs = {
             "elements": (m.blocks, [now, mesh, parameters, forces.elements]),
-            "step_points": (m.point_nodes, [k, dt, *on_points]),
+            "step_points": (m.point_nodes, [k, dt, self.points, parameters, self.motion, *states]),
             "move_nodes": (m.moving, [dt, mesh, parameters, now, forces, sums]),
             "gather": (m.moving, [mesh, forces]),
             "relax_nodes": (m.moving, [mesh, parameters, now, after, forces]),
-            "step_nodes": (m.moving, [dt, mesh, parameters, now, after, forces, sums]),
+            "step_nodes": (m.moving, [dt, mesh, parameters, *states]),
+            "gather_adjoint": (m.moving, [mesh, forces, now.ahead.grad]),
+            "push_blade": (None, [forces]),
+            "bend_blade": (None, [k // self.substeps, dt, parameters, *states]),
         }[part]
-        self.launch_many(getattr(self.kernels, part), len(count), inputs, adjoint)
-
-    def launch_blade(self, k: int, adjoint: bool = False) -> None:
-        """Launches the kernels of the blade in sub-step k, or their adjoints in reverse."""
-        now, after, forces = self._substep(k)
-        bend = [k // self.substeps, self.dt, self.parameters, now, after, forces, self.sums]
-        parts = [(self.kernels.push_blade, [forces]), (self.kernels.bend_blade, bend)]
-        for kernel, inputs in reversed(parts) if adjoint else parts:
-            self.launch(kernel, (self.cuts,), inputs, adjoint)
+        shape: tuple[int, ...] = (self.cuts,)
+        if entries is not None:
+            threads, per_thread = (1, len(entries)) if self.device.is_cpu else (len(entries), 1)
+            shape, inputs = (self.cuts, threads), [*inputs, per_thread]
+        self.launch(getattr(self.kernels, part), shape, inputs, adjoint)
 
     def launch_substep(self, k: int) -> None:
         """One sub-step."""
-        for part in ("elements", "step_points", *self.node_parts):
+        for part in ("elements", "step_points", *self.node_parts, "push_blade", "bend_blade"):
             self.launch_part(part, k)
-        self.launch_blade(k)
 
     def captured(self, launch: Callable[[], None]) -> Any:
         """Graph of the launches that `launch` makes; compiles the kernels, once a machine."""

@@ -168,6 +168,16 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
             total += a[lane]
         return total
 
+    @wp.func
+    def columns8(
+        strain: wp.array3d(dtype=Vectors), cut: wp.int32, block: wp.int32, first: wp.int32
+    ):
+        return (
+            strain[cut, block, first],
+            strain[cut, block, first + 1],
+            strain[cut, block, first + 2],
+        )
+
     # In three kernels: in one, the compiler finds no vectors any more, and it takes twice as long.
     @wp.kernel(enable_backward=False, module=module)
     def strains(
@@ -204,12 +214,8 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
         cut, block = wp.tid()
         mu = parameters.P[cut, Scalar.MU]
         lam = parameters.P[cut, Scalar.LAM]
-        f0 = strain[cut, block, 0]
-        f1 = strain[cut, block, 1]
-        f2 = strain[cut, block, 2]
-        e0 = strain[cut, block, 3]
-        e1 = strain[cut, block, 4]
-        e2 = strain[cut, block, 5]
+        f0, f1, f2 = columns8(strain, cut, block, 0)
+        e0, e1, e2 = columns8(strain, cut, block, 3)
         d0 = cross8(f1, f2)
         J = dot8(f0, d0)
         dJ = dot8(d0, e0) + dot8(cross8(f2, f0), e1) + dot8(cross8(f0, f1), e2)
@@ -265,12 +271,8 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
         of the forces when the nodes move along that direction.
         """
         cut, block = wp.tid()
-        f0 = strain[cut, block, 0]
-        f1 = strain[cut, block, 1]
-        f2 = strain[cut, block, 2]
-        e0 = strain[cut, block, 3]
-        e1 = strain[cut, block, 4]
-        e2 = strain[cut, block, 5]
+        f0, f1, f2 = columns8(strain, cut, block, 0)
+        e0, e1, e2 = columns8(strain, cut, block, 3)
         p0 = stress_change8(f0, f1, f2, e0, e1, e2, factors, cut, block)
         p1 = stress_change8(f1, f2, f0, e1, e2, e0, factors, cut, block)
         p2 = stress_change8(f2, f0, f1, e2, e0, e1, factors, cut, block)
