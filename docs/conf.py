@@ -179,7 +179,10 @@ def constants(module: str) -> Iterator[tuple[str, str]]:
     """
     text = (ROOT / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8")
     body, lines = ast.parse(text).body, text.splitlines()
-    public: list[str] = []
+    with mock(autodoc_mock_imports):
+        found = importlib.import_module(module)
+    # A class by assignment, such as an enumeration made by a call, is shown as a class.
+    public = {name for name in found.__all__ if not inspect.isclass(getattr(found, name))}
     for node, following in itertools.pairwise([*body, ast.Pass()]):
         if isinstance(node, ast.FunctionDef):
             kernel = any(ast.unparse(d).startswith("wp.kernel") for d in node.decorator_list)
@@ -192,8 +195,6 @@ def constants(module: str) -> Iterator[tuple[str, str]]:
                 lambda line: line.startswith("# "), reversed(lines[: node.lineno - 1])
             )
             words = " ".join(line[2:] for line in reversed(list(before)))
-            if names == ["__all__"]:
-                public = ast.literal_eval(node.value)
         else:
             continue
         if not (isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant)):
