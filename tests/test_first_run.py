@@ -114,7 +114,8 @@ def test_a_kill_ends_a_run_as_ctrl_c_does_offline_and_keeps_what_there_is(
     monkeypatch.setattr(socket.socket, "connect", connect)
     before = signal.getsignal(signal.SIGTERM)
     output = tmp_path / "a folder"
-    assert main(["simulate", "--set", SMALL_FOOD, "--no-replay", "--output", str(output)]) == 1
+    options = ["--set", SMALL_FOOD, "--no-replay", "--no-animation", "--output", str(output)]
+    assert main(["simulate", *options]) == 1
     assert signal.getsignal(signal.SIGTERM) is before
     summary = json.loads((output / "summary.json").read_text(encoding="utf-8"))
     assert summary["stopped"] == "interrupted by the user"

@@ -12,6 +12,7 @@ from pydrake.multibody.math import SpatialForce
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import LeafSystem
 
+from sliceit_drake.cutting.mesh.surface import SKIN
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagrams.live_view import (
     FASTEST,
@@ -28,12 +29,7 @@ from sliceit_drake.diagrams.simulated_station import FRAMES_PER_SECOND, REPLAY_S
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.cutting_system import CuttingSystem
-from sliceit_drake.systems.food_visualizer import (
-    FLESH,
-    INTACT,
-    SKIN,
-    damage_colours,
-)
+from sliceit_drake.systems.food_look import INTACT, LOOKS, damage_colours
 from sliceit_drake.systems.frame_visualizer import FrameVisualizer
 from sliceit_drake.systems.wrench_visualizer import (
     NEWTON_METRES_PER_METRE,
@@ -175,11 +171,14 @@ def test_frames_follow_the_knife():
 
 
 def test_damage_colours_brighten_from_intact_to_cut():
-    colours = damage_colours(np.linspace(0.0, 1.0, 41))
-    np.testing.assert_allclose(colours[:, 0], INTACT)
-    np.testing.assert_allclose(colours[:, -1], FLESH)
-    luminance = np.array([0.2126, 0.7152, 0.0722]) @ colours
-    assert (np.diff(luminance) > 0.0).all()
+    for look in LOOKS.values():
+        cut = look.face(np.full(41, 0.4))
+        colours = damage_colours(np.linspace(0.0, 1.0, 41), cut)
+        np.testing.assert_allclose(colours[0], INTACT)
+        np.testing.assert_allclose(colours[-1], cut[-1])
+        luminance = colours @ np.array([0.2126, 0.7152, 0.0722])
+        # No flesh is darker than what is half cut; a tomato's is hardly brighter.
+        assert (np.diff(luminance) > -0.002).all()
 
 
 def test_cut_faces_show_where_the_edge_has_been_and_the_skin_stays_as_it_is():
@@ -226,9 +225,14 @@ def test_each_half_is_drawn_with_its_damage_and_skin_colours():
     run.advance(0.2)
     colours = fake.meshes["/drake/food/minus/frame_0006"]
     corners, _ = run.station.cutting.surfaces[0].halves[0]
-    is_cut = run.station.cutting.surfaces[0].is_cut_face[corners]
+    surface = run.station.cutting.surfaces[0]
+    is_cut, is_skin = surface.is_cut_face[corners], surface.cut_point[corners] == SKIN
     assert len(colours) == len(corners)
-    np.testing.assert_array_equal(colours[~is_cut], np.tile(SKIN, ((~is_cut).sum(), 1)))
+    cucumber = LOOKS["cucumber"]
+    np.testing.assert_array_equal(colours[is_skin], np.tile(cucumber.skin, (is_skin.sum(), 1)))
+    # The flat end shows the flesh, with its ring at the rim.
+    is_end = ~is_cut & ~is_skin
+    assert {cucumber.ring, cucumber.core} <= {tuple(c.round(9)) for c in colours[is_end]}
     assert np.ptp(colours[is_cut], axis=0).max() > 0.3
     # Live, only the newest frame of each half is seen.
     assert fake.properties["/drake/food/plus/frame_0005", "visible"] is False

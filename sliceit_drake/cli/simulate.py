@@ -2,6 +2,7 @@
 
 Writes to DIR:
   replay.html    the run in 3-D, opens in any browser without a server
+  slice.gif      the run as a short animation, with the force below it
   force.png      knife, and force over time and depth beside a measured curve if there is one
   record.csv     joints, poses, wrenches, energies at every coupling step (500 Hz), SI units
   summary.json   peak and mean force, work by mechanism, real-time factor, discretisation error, ...
@@ -55,6 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--fps", type=float, default=30.0, help="its frames a second (default 30)")
     parser.add_argument("--no-replay", action="store_true", help="do not write replay.html")
+    parser.add_argument("--no-animation", action="store_true", help="do not draw slice.gif")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -79,7 +81,7 @@ def run(options: argparse.Namespace) -> int:
         )
     meshcat = None if options.no_replay and not options.meshcat else make_meshcat()
     print("Preparing (the first run on a machine compiles the kernels, about 8 s)", flush=True)
-    prepared = prepare_run(scenario, meshcat)
+    prepared = prepare_run(scenario, meshcat, animation=not options.no_animation)
     if options.frames and meshcat is not None:
         meshcat.SetProperty("/frames", "visible", True)
     if options.meshcat and meshcat is not None:
@@ -99,7 +101,11 @@ def run(options: argparse.Namespace) -> int:
             bars.show(scenario.name, time, duration, f"{time / wall:.2f} x real time")
 
         prepared.advance(duration, show)
-    summary = prepared.save(directory, replay=not options.no_replay)
+        summary = prepared.save(
+            directory,
+            replay=not options.no_replay,
+            drawing=lambda done, count: bars.show("drawing slice.gif", done, count),
+        )
     if frames is not None:
         write_series(frames, directory / "paraview", options.paraview)
     _report(summary, directory)

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
+from pydrake.geometry import SurfaceTriangle, TriangleSurfaceMesh
 from pydrake.math import RigidTransform, RotationMatrix
 
 from sliceit_drake.configuration import ConfigurationError
@@ -19,9 +20,12 @@ from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry
 from sliceit_drake.cutting.model import prepare_cut
 from sliceit_drake.cutting.motion import Motion, MotionPlan
 from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.diagrams.plant.knife_body import blade_surface
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.systems.cutting_system import CuttingSystem
+from sliceit_drake.systems.cutting_system import COMPLETE, CuttingSystem
+from sliceit_drake.systems.food_look import look_of
 from sliceit_drake.systems.knife_force import KnifeForceSystem
+from sliceit_drake.systems.loose_slices import LooseSlices, SliceBody
 from sliceit_drake.systems.spring_cutter import SpringCutter
 
 __all__ = ["CuttableFood", "HeldFood", "OwnCutting", "PreparedFood", "food_to_cut", "prepare_food"]
@@ -69,6 +73,7 @@ class PreparedFood:
         held: Where a holder holds the food, or None.
         estimate_error: Estimates the error of its discretisation on the prescribed motion; None for
             a food that is not discretised.
+        make_slices: Makes the slices that come off; None where none does.
     """
 
     start_pose: RigidTransform
@@ -76,6 +81,7 @@ class PreparedFood:
     make_cutting: Callable[[], KnifeForceSystem]
     held: HeldFood | None = None
     estimate_error: Callable[[], DiscretizationError] | None = None
+    make_slices: Callable[[CuttingSystem], LooseSlices] | None = None
 
 
 def food_to_cut(scenario: Scenario, cutting: OwnCutting | None) -> PreparedFood:
@@ -90,7 +96,7 @@ def food_to_cut(scenario: Scenario, cutting: OwnCutting | None) -> PreparedFood:
         return prepare_food(cutting, scenario)
     food = prepare_food(scenario.food, scenario)
     own = functools.partial(_own_system, cutting, scenario)
-    return dc.replace(food, make_cutting=own, estimate_error=None)
+    return dc.replace(food, make_cutting=own, estimate_error=None, make_slices=None)
 
 
 def _own_system(
@@ -173,7 +179,8 @@ def _(food: Food, scenario: Scenario) -> PreparedFood:
             for cut, each in zip(cuts, foods, strict=True)
         ]
         solvers = [CuttingSolver(model, scenario.exchange_period) for model in models]
-        return CuttingSystem(solvers, poses, in_sequence=sequence is not None)
+        in_sequence = sequence is not None
+        return CuttingSystem(solvers, poses, in_sequence=in_sequence, look=look_of(food.name))
 
     def estimate_error() -> DiscretizationError:
         """That of the middle slice, which stands for all."""
@@ -193,6 +200,34 @@ def _(food: Food, scenario: Scenario) -> PreparedFood:
         make_cutting,
         _held(food, scenario, cuts[0]),
         estimate_error,
+        functools.partial(_loose_slices, scenario) if sequence is not None else None,
+    )
+
+
+def _loose_slices(scenario: Scenario, cutting: CuttingSystem) -> LooseSlices:
+    sequence = scenario.sequence
+    assert sequence is not None
+    slices, rest = [], None
+    for solver, surface, X_WF in zip(
+        cutting.solvers, cutting.surfaces, cutting.food_poses, strict=True
+    ):
+        model = solver.model
+        p_F = surface.positions(model, model.nodes)
+        own, rest = (
+            TriangleSurfaceMesh([SurfaceTriangle(*t) for t in triangles.tolist()], p_F[corners])
+            for corners, triangles in surface.halves
+        )
+        slices.append(SliceBody(own, model.material, X_WF))
+    return LooseSlices(
+        slices,
+        rest,
+        blade_surface(scenario.knife),
+        scenario.board,
+        scenario.X_WF(),
+        scenario.numerics.board_friction,
+        sequence.thickness if sequence.indexing == "food" else 0.0,
+        scenario.exchange_period,
+        COMPLETE,
     )
 
 

@@ -21,6 +21,13 @@ from sliceit_drake.cutting.mesh.tetrahedra import MeshError
 from sliceit_drake.cutting.motion import Motion, MotionPlan
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.live_view import LiveControls, make_meshcat
+from sliceit_drake.diagrams.outputs.animation import (
+    NEEDED,
+    Film,
+    add_force,
+    can_draw,
+    write_gif,
+)
 from sliceit_drake.diagrams.outputs.figures import CONTACT_THRESHOLD, plot_force
 from sliceit_drake.diagrams.outputs.measurement_comparison import (
     Comparison,
@@ -66,6 +73,7 @@ class Run:
         wall_time: Seconds spent in the simulator.
         stopped: Why the run ended early, or None.
         snapshot: Knife and food when half of the section was cut, or None.
+        film: Frames of an animation, or None.
         controls: Speed and stop in a live viewer, or None.
     """
 
@@ -79,6 +87,7 @@ class Run:
     wall_time: float = 0.0
     stopped: str | None = None
     snapshot: Snapshot | None = None
+    film: Film | None = None
     controls: LiveControls | None = None
 
     def advance(
@@ -108,6 +117,8 @@ class Run:
                 status = self.simulator.AdvanceTo(min(now + CHUNK, end))
                 if self.snapshot is None and cut_progress.Eval(own)[0] > SNAPSHOT_PROGRESS:
                     self.snapshot = take_snapshot(station, context)
+                if self.film is not None:
+                    self.film.look(context)
                 self.wall_time = clock.perf_counter() - begin
                 if progress is not None:
                     progress(context.get_time(), self.wall_time)
@@ -138,7 +149,7 @@ class Run:
     def plot(self) -> "Figure":
         """Knife and food, and the force over time and depth; of a sequence slice by slice."""
         record = self.record()
-        return _figure(self, record, _comparison(self, record))
+        return _figure(self, record, _comparison(self, record), self.snapshot)
 
     def summary(self) -> dict:
         """Forces, work, times, margins and versions, as summary.json has them.
@@ -148,13 +159,24 @@ class Run:
         record = self.record()
         return _summary(self, record, _comparison(self, record))
 
-    def save(self, folder: str | Path, *, replay: bool = True, extra: dict | None = None) -> dict:
+    def save(
+        self,
+        folder: str | Path,
+        *,
+        replay: bool = True,
+        extra: dict | None = None,
+        drawing: Callable[[int, int], None] | None = None,
+    ) -> dict:
         """Writes record.csv, replay.html, force.png, summary.json and scenario.yaml.
+
+        And slice.gif where there is a film; the summary's `animation` names it, or says what this
+        machine lacks for it.
 
         Args:
             folder: Made if absent.
             replay: False leaves replay.html out, as a run without a viewer does.
             extra: What else the summary shall say.
+            drawing: Called with the number of pictures of the animation, drawn and all.
 
         Returns:
             The summary.
@@ -166,9 +188,18 @@ class Run:
         dump_yaml(self.scenario, folder / "scenario.yaml")
         comparison = _comparison(self, record)
         summary = _summary(self, record, comparison) | (extra or {})
+        picture: Snapshot | np.ndarray | None = self.snapshot
+        if self.film is not None and can_draw():
+            pictures = self.film.draw(drawing)
+            picture = pictures[self._best(record)].copy()
+            add_force(pictures, self.film.times, record)
+            write_gif(folder / "slice.gif", pictures, self.film.period)
+            summary["animation"] = "slice.gif"
+        elif self.film is not None:
+            summary["animation"] = f"none: {NEEDED}"
         text = json.dumps(summary, indent=2) + "\n"
         (folder / "summary.json").write_text(text, encoding="utf-8")
-        _figure(self, record, comparison).savefig(folder / "force.png", dpi=150)
+        _figure(self, record, comparison, picture).savefig(folder / "force.png", dpi=150)
         if replay and self.meshcat is not None:
             if self.station.food_visualizer is not None:
                 self.station.food_visualizer.PublishRecording()
@@ -176,6 +207,13 @@ class Run:
             self.meshcat.PublishRecording()
             (folder / "replay.html").write_text(self.meshcat.StaticHtml(), encoding="utf-8")
         return summary
+
+    def _best(self, record: Record) -> int:
+        """The frame that shows most: the end of a sequence, or else the middle of the cut."""
+        assert self.film is not None
+        if self.scenario.sequence is not None or self.snapshot is None:
+            return -1
+        return int(np.argmin(np.abs(self.film.times - self.snapshot.time)))
 
 
 def simulate(
@@ -188,6 +226,7 @@ def simulate(
     duration: float | None = None,
     meshcat: Meshcat | None = None,
     replay: bool = True,
+    animation: bool = False,
     progress: Callable[[float, float], None] | None = None,
 ) -> Run:
     """A scenario simulated in the station, with systems of your own where you give them.
@@ -201,6 +240,7 @@ def simulate(
         duration: Simulated time, s; None for the motion's.
         meshcat: Viewer to draw in; None for one that only records the replay.
         replay: False draws nothing where no viewer is given; `Run.save` then leaves the replay out.
+        animation: Keeps frames, which `Run.save` draws as slice.gif.
         progress: Called with simulated time and wall time, s, after each part.
 
     Returns:
@@ -217,6 +257,7 @@ def simulate(
         policy=policy,
         cutting=cutting,
         controller=controller,
+        animation=animation,
     )
     run.advance(duration, progress)
     return run
@@ -229,6 +270,7 @@ def prepare_run(
     policy: PolicyConfig | AgentConfig | OwnPolicy | None = None,
     cutting: OwnCutting | None = None,
     controller: OwnController | None = None,
+    animation: bool = False,
 ) -> Run:
     """A run at its start.
 
@@ -238,6 +280,7 @@ def prepare_run(
         policy: A configuration, which takes the place of the scenario's motion; or a policy of your
             own, see `ScenarioDiagram`.
         cutting, controller: See `MakeStation`.
+        animation: See `simulate`.
 
     Raises:
         ConfigurationError, MeshError, TimeStepError, CuttingError: The scenario cannot start.
@@ -264,15 +307,24 @@ def prepare_run(
         own["cutting"] = type(station.cutting).__name__
     if controller is not None:
         own["controller"] = type(station.controller).__name__
-    return Run(scenario, diagram, simulator, profile, margin, meshcat, own)
+    run = Run(scenario, diagram, simulator, profile, margin, meshcat, own)
+    if animation:
+        run.film = Film(station, run.motion.duration)
+        run.film.look(simulator.get_context())
+    return run
 
 
-def _figure(run: Run, record: Record, comparison: Comparison | None) -> "Figure":
+def _figure(
+    run: Run,
+    record: Record,
+    comparison: Comparison | None,
+    picture: Snapshot | np.ndarray | None,
+) -> "Figure":
     title, caption = _title(run), _caption(run, comparison)
     if areas := _slice_areas(run):
         board = run.scenario.board.height
-        return plot_sequence(record, areas, title, board, caption, run.snapshot)
-    return plot_force(record, title, run.station.food_top(), comparison, caption, run.snapshot)
+        return plot_sequence(record, areas, title, board, caption, picture)
+    return plot_force(record, title, run.station.food_top(), comparison, caption, picture)
 
 
 def measured_profile(scenario: Scenario) -> ForceProfile | None:

@@ -1,6 +1,7 @@
 """Slices in a row: what each leaves of the body, where it lies, and the knife's motion over all."""
 
 import dataclasses as dc
+import math
 
 from pydrake.math import RigidTransform
 
@@ -42,6 +43,12 @@ class SliceSequence:
     """Depth of the knife's target below the board's top."""
     hold: float = quantity(0.1, "s", low=1e-3, high=60.0)
     """Rest at the board."""
+    push: float = quantity(0.0, "m", low=0.0, high=0.1)
+    """How far the knife pushes each slice away before it retracts, so that the slice falls over."""
+    push_height: float = quantity(0.65, "", low=0.0, high=1.0)
+    """Height of the edge as it pushes, over that of the section."""
+    push_speed: float = quantity(0.08, "m/s", low=1e-3, high=1.0)
+    """Of the knife, sideways."""
     slice_layers: int = quantity(2, "", low=1, high=20)
     """Layers of elements in a slice."""
     layers: list[float] = quantity([2.8e-3, 6.4e-3, 12e-3], "m", low=1e-4, high=0.5)
@@ -90,21 +97,18 @@ class SliceSequence:
             following = tops[k + 1] if k + 1 < len(tops) else top
             lower = max(top - following, 0.0)
             up = down + max(following - top, 0.0)
+            if self.push > 0.0:
+                lift = self.push_height * top + self.overtravel
+                segments.append(Retract(lift, speed, acceleration, label="lift"))
+                segments.append(self._across(self.push, self.push_speed, "push"))
+                up -= lift
             segments.append(Retract(up, speed, acceleration, label="retract"))
             if k + 1 == len(tops):
                 segments.append(Hold(self.hold, label="end"))
                 break
-            if self.indexing == "knife":
-                # The knife's y is opposite to the body's: its edge points down.
-                segments.append(
-                    ConstantSpeed(
-                        speed,
-                        [0.0, -1.0, 0.0],
-                        distance=self.thickness,
-                        acceleration=acceleration,
-                        label="index",
-                    )
-                )
+            back = self.push + (self.thickness if self.indexing == "knife" else 0.0)
+            if back > 0.0:
+                segments.append(self._across(-back, speed, "index"))
             else:
                 segments.append(Hold(self.thickness / speed + speed / acceleration, label="index"))
             if lower > 1e-6:
@@ -114,6 +118,14 @@ class SliceSequence:
                     )
                 )
         return MotionPlan(segments)
+
+    def _across(self, distance: float, speed: float, label: str) -> ConstantSpeed:
+        """To the side of the slices, or back where `distance` is negative."""
+        # The knife's y is opposite to the body's: its edge points down.
+        direction = [0.0, math.copysign(1.0, distance), 0.0]
+        return ConstantSpeed(
+            speed, direction, distance=abs(distance), acceleration=self.acceleration, label=label
+        )
 
     def check_food(self, food: object, where: str) -> None:
         """Refuses a food that cannot be sliced so.

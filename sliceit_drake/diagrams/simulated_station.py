@@ -4,8 +4,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, SceneGraph
-from pydrake.math import RigidTransform
+from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer
@@ -31,9 +31,12 @@ from sliceit_drake.diagrams.station_interface import (
 )
 from sliceit_drake.systems.contact_monitor import ContactMonitor
 from sliceit_drake.systems.cut_report import FrameRecorder
+from sliceit_drake.systems.cutting_system import CuttingSystem
+from sliceit_drake.systems.food_visualizer import FoodVisualizer
 from sliceit_drake.systems.frame_visualizer import FrameVisualizer
 from sliceit_drake.systems.knife_force import AppliedForce, KnifeForceSystem
 from sliceit_drake.systems.knife_kinematics import BoardContact, KnifeKinematics
+from sliceit_drake.systems.loose_slices import LooseSlices
 from sliceit_drake.systems.motion_sources import placed_motion
 from sliceit_drake.systems.servo import JOINTS
 from sliceit_drake.systems.wrench_sensor import WrenchSensor
@@ -49,7 +52,7 @@ REPLAY_SIZE = 16e6
 SCENE_FRAME_SIZE = 4e3
 FINGER = 0.015
 """Half the breadth of the holding arm's fingers along the food, metres."""
-CAMERA_OFFSET = np.array([0.17, 0.23, 0.17])
+CAMERA_OFFSET = np.array([0.24, -0.14, 0.13])
 
 
 class SimulatedStation(Station):
@@ -86,7 +89,7 @@ class SimulatedStation(Station):
         self.motion_plan, self.start_pose = food.motion_plan, food.start_pose
         self.estimate_error = food.estimate_error
         builder = DiagramBuilder()
-        self.plant, scene_graph = add_plant(builder, scenario.robot)
+        self.plant, self.scene_graph = add_plant(builder, scenario.robot)
         self.robot: Robot = add_robot(self.plant, scenario.robot, scenario.knife, scenario.board)
         add_table(self.plant, (0.1 if scenario.holder == "clamp" else -0.15, -0.3))
         add_board(self.plant, scenario.board, scenario.X_WF())
@@ -129,6 +132,13 @@ class SimulatedStation(Station):
         }
         for name, system in named.items():
             builder.AddNamedSystem(name, system)
+        self.slices: LooseSlices | None = None
+        if food.make_slices is not None and isinstance(self.cutting, CuttingSystem):
+            self.slices = builder.AddNamedSystem("slices", food.make_slices(self.cutting))
+            for name in ("cut_progress", "food_index", "slice_pose", "slice_velocity"):
+                connect(builder, self.cutting.GetOutputPort(name), self.slices)
+            for name in ("knife_pose", "knife_velocity"):
+                connect(builder, kinematics.GetOutputPort(name), self.slices)
 
         plant = self.plant
         for source, target in (
@@ -173,24 +183,33 @@ class SimulatedStation(Station):
         self.visualizer: MeshcatVisualizer | None = None
         self.food_visualizer: FrameRecorder | None = None
         if meshcat is not None:
-            self._add_visualization(builder, scene_graph, meshcat)
+            self._add_visualization(builder, meshcat)
         builder.BuildInto(self)
         self.set_name("station")
+
+    def camera_pose(self) -> RigidTransform:
+        """Pose of a camera that looks at knife and food, Cz forward and Cy down."""
+        target = self.start_pose.translation() + [0.01, 0.0, 0.0]
+        forward = -CAMERA_OFFSET / np.linalg.norm(CAMERA_OFFSET)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        R_WC = RotationMatrix(np.column_stack([right, np.cross(forward, right), forward]))
+        return RigidTransform(R_WC, target + CAMERA_OFFSET)
 
     def _frame_period(self) -> float:
         size = SCENE_FRAME_SIZE + self.cutting.frame_size()
         frames = FRAMES_PER_SECOND * placed_motion(self.motion_plan, self.start_pose).duration
         return math.ceil(frames * size / REPLAY_SIZE) / FRAMES_PER_SECOND
 
-    def _add_visualization(
-        self, builder: DiagramBuilder, scene_graph: SceneGraph, meshcat: Meshcat
-    ) -> None:
+    def _add_visualization(self, builder: DiagramBuilder, meshcat: Meshcat) -> None:
         """Bodies and food; wrenches on knife and sensor as arrows; triads of W, B, F, S, K."""
         period = self.frame_period
         self.visualizer = MeshcatVisualizer.AddToBuilder(
-            builder, scene_graph, meshcat, MeshcatVisualizerParams(publish_period=period)
+            builder, self.scene_graph, meshcat, MeshcatVisualizerParams(publish_period=period)
         )
         self.food_visualizer = self.cutting.add_visualizer(builder, meshcat, period)
+        if self.slices is not None and isinstance(self.food_visualizer, FoodVisualizer):
+            connect(builder, self.slices.GetOutputPort("slices"), self.food_visualizer)
         X_KS = self.X_KS()
         knife_pose = builder.GetSubsystemByName("kinematics").GetOutputPort("knife_pose")
         arrows = builder.AddNamedSystem(

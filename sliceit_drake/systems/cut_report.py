@@ -9,6 +9,8 @@ from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 
+from sliceit_drake.systems.food_look import OTHER
+
 __all__ = ["Columns", "FoodBodyFrame", "FoodPicture", "FrameRecorder", "ReportingSystem"]
 
 
@@ -39,12 +41,15 @@ class FoodPicture:
         top: Height of the section's top over the origin of F, metres.
         triangles: Corners in F [M, 3, 3], metres.
         is_cut_face: Whether each is on the cut [M].
+        skin, flesh: Colours outside and inside, red, green, blue.
     """
 
     X_WF: RigidTransform
     top: float
     triangles: np.ndarray
     is_cut_face: np.ndarray
+    skin: tuple[float, float, float] = OTHER.skin
+    flesh: tuple[float, float, float] = OTHER.flesh
 
 
 @dc.dataclass

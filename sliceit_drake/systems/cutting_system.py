@@ -6,19 +6,23 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from pydrake.common.value import Value
 from pydrake.geometry import Meshcat
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.math import SpatialVelocity
 from pydrake.systems.framework import Context, DiagramBuilder, State
 
 from sliceit_drake.cutting.contact_response import contact_responses
 from sliceit_drake.cutting.coupling_steps import EnergyBalance
-from sliceit_drake.cutting.mesh.surface import FoodBody, food_body, food_surface
+from sliceit_drake.cutting.mesh.surface import SKIN, FoodBody, food_body, food_surface
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
+from sliceit_drake.cutting.rigid_motion import rigid_motion
 from sliceit_drake.cutting.simulate import check_clear, check_energies, check_in_plane
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
 from sliceit_drake.systems.cut_report import Columns, FoodBodyFrame, FoodPicture
 from sliceit_drake.systems.declare import declare_output
+from sliceit_drake.systems.food_look import OTHER, FoodLook, FoodScene
 from sliceit_drake.systems.food_visualizer import FoodVisualizer, frame_size
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 
@@ -61,12 +65,15 @@ class CuttingSystem(KnifeForceSystem):
         energy: Energies of this food at the last check [5], see `ENERGY_NAMES`, J.
         surface_vertices: Corners of the food's surface [3 V], metres, in W, padded with zeros.
         surface_damage: Fraction of the toughness that is spent there [V], padded with zeros.
+        slice_pose: RigidTransform X_WS of the half at y < 0, as if it were rigid; S is F at rest.
+        slice_velocity: SpatialVelocity V_WS of that half, at So.
 
     Args:
         solvers: Prepared foods with one coupling period.
         X_WF: Pose of the food frame, or one for each of the foods.
         check_period: Interval of the energy and inversion checks, s.
         in_sequence: Whether each food follows the one before it once that is cut.
+        look: Colours.
 
     Attributes:
         solvers, surfaces, food_poses: Solver, surface and X_WF of each of the prepared foods.
@@ -78,19 +85,23 @@ class CuttingSystem(KnifeForceSystem):
         X_WF: RigidTransform | Sequence[RigidTransform],
         check_period: float = 0.05,
         in_sequence: bool = False,
+        look: FoodLook = OTHER,
     ) -> None:
         super().__init__(solvers[0].exchange_period)
         self.solvers = tuple(solvers)
         self.surfaces = tuple(food_surface(s.model) for s in solvers)
-        self._in_sequence = in_sequence
+        self._in_sequence, self._look = in_sequence, look
         self.food_poses = (
             (X_WF,) * len(solvers) if isinstance(X_WF, RigidTransform) else tuple(X_WF)
         )
-        self._R_CW, self._offset = [], []
+        self._R_CW, self._offset, self._X_WC = [], [], []
         for solver, X in zip(self.solvers, self.food_poses, strict=True):
             R_WC = X.rotation().matrix() @ solver.model.X_FC_rotation
             self._R_CW.append(R_WC.T)
             self._offset.append(R_WC.T @ X.multiply(solver.model.X_FC_position))
+            self._X_WC.append(
+                RigidTransform(RotationMatrix(R_WC), X.multiply(solver.model.X_FC_position))
+            )
         self._check_every = max(1, round(check_period / self.exchange_period))
         size = max(s.state_size for s in self.solvers)
         self._food = self.DeclareDiscreteState(self._padded(self.solvers[0].initial_state(), size))
@@ -111,6 +122,10 @@ class CuttingSystem(KnifeForceSystem):
         }
         declare_output(self, "surface_vertices", 3 * corners, self._surface_vertices, state)
         declare_output(self, "surface_damage", corners, self._surface_damage, state)
+        declare_output(self, "slice_pose", Value(RigidTransform()), self._slice_pose, state)
+        declare_output(
+            self, "slice_velocity", Value(SpatialVelocity.Zero()), self._slice_velocity, state
+        )
 
     def recorded(self) -> dict[str, list[str]]:
         parts = ("edge", "flank", "friction")
@@ -168,7 +183,9 @@ class CuttingSystem(KnifeForceSystem):
             X_WF,
             self.solver(context).model.top,
             vertices[surface.triangles],
-            surface.is_cut_face[surface.triangles[:, 0]],
+            (surface.cut_point != SKIN)[surface.triangles[:, 0]],
+            self._look.skin,
+            self._look.flesh,
         )
 
     def body(self, context: Context) -> FoodBodyFrame:
@@ -202,14 +219,20 @@ class CuttingSystem(KnifeForceSystem):
     def frame_size(self) -> float:
         return frame_size(self.surfaces)
 
+    def scene(self) -> FoodScene:
+        """The food's parts for drawing, none of them seen yet."""
+        models = [solver.model for solver in self.solvers]
+        return FoodScene(self.surfaces, models, self._look)
+
     def add_visualizer(
         self, builder: DiagramBuilder, meshcat: Meshcat, period: float
     ) -> FoodVisualizer:
-        slices_stay = not self.food_poses[0].IsExactlyEqualTo(self.food_poses[-1])
+        corners = max(len(surface.ends) for surface in self.surfaces)
         visualizer = builder.AddNamedSystem(
-            "food_visualizer", FoodVisualizer(self.surfaces, slices_stay, meshcat, period)
+            "food_visualizer",
+            FoodVisualizer(self.scene(), corners, len(self.solvers), meshcat, period),
         )
-        for name in ("surface_vertices", "surface_damage", "food_index"):
+        for name in ("surface_vertices", "surface_damage", "food_index", "slice_pose"):
             builder.Connect(self.GetOutputPort(name), visualizer.GetInputPort(name))
         return visualizer
 
@@ -293,6 +316,14 @@ class CuttingSystem(KnifeForceSystem):
             )
         return index
 
+    def _is_beside(self, context: Context, X_CK: Pose) -> bool:
+        """Whether the blade has left a section that it cut, on the side of the slice.
+
+        It then touches the slice alone, which is off, and the food stays as the blade left it.
+        """
+        progress = float(context.get_discrete_state(self._progress).value()[0])
+        return self._in_sequence and progress >= COMPLETE and X_CK.p[1] < -INDEXED
+
     def start(self, context: Context, state: State, X_WK: RigidTransform) -> None:
         index = self.food_index(context)
         self.solvers[index].compile()
@@ -316,6 +347,9 @@ class CuttingSystem(KnifeForceSystem):
             new.set_value(self._spent_before, [old_balance[SPENT].sum()])
         last = self._in_cut_frame(index, x.value(self._last_pose).reshape(3, 4))
         pose = self._in_cut_frame(index, now)
+        if self._is_beside(context, pose):
+            new.set_value(self._components, np.zeros(9))
+            return np.zeros(6), float(x.value(self._progress)[0])
         check_in_plane(solver.model, pose, time)
         try:
             step = solver.coupling_step(old, last, pose)
@@ -357,6 +391,23 @@ class CuttingSystem(KnifeForceSystem):
         """Edge depth and cohesive damage at the food's cut points, as the solver has them."""
         solver, state = self.solver(context), self.food_state(context)
         return solver.field(state, "edge_depth"), solver.field(state, "cohesive_damage")
+
+    def _slice_motion(self, context: Context) -> tuple[np.ndarray, ...]:
+        """`rigid_motion` of the half at y < 0, in C."""
+        solver, state = self.solver(context), self.food_state(context)
+        return rigid_motion(solver.model, solver.positions(state), solver.velocities(state))
+
+    def _slice_pose(self, context: Context) -> RigidTransform:
+        X_WC = self._X_WC[self.food_index(context)]
+        R, p, _, _ = self._slice_motion(context)
+        return X_WC @ RigidTransform(RotationMatrix(R), p) @ X_WC.inverse() @ self.X_WF(context)
+
+    def _slice_velocity(self, context: Context) -> SpatialVelocity:
+        X_WC = self._X_WC[self.food_index(context)]
+        _, _, w_C, v_C = self._slice_motion(context)
+        w, v = (X_WC.rotation().multiply(vector) for vector in (w_C, v_C))
+        arm = self._slice_pose(context).translation() - X_WC.translation()
+        return SpatialVelocity(w, v + np.cross(w, arm))
 
 
 def _in_world(X_WF: RigidTransform, p_F: np.ndarray) -> np.ndarray:

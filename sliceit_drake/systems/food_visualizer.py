@@ -1,34 +1,22 @@
-"""Draws the deforming food in Meshcat, live and in a recording."""
+"""Draws the deforming food and its slices in Meshcat, live and in a recording."""
 
+import dataclasses as dc
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from pydrake.common.value import Value
 from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Context, LeafSystem
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, EventStatus, LeafSystem
 
 from sliceit_drake.cutting.mesh.surface import FoodSurface
+from sliceit_drake.systems.food_look import ColouredMesh, FoodScene
+from sliceit_drake.systems.loose_slices import SLICE_ROW
 
-__all__ = ["FLESH", "INTACT", "SKIN", "FoodVisualizer", "damage_colours", "frame_size"]
-
-SKIN = (0.24, 0.52, 0.20)
-FLESH = (0.84, 0.91, 0.68)
-INTACT = (0.42, 0.09, 0.36)
-HALF_CUT = (0.93, 0.47, 0.22)
+__all__ = ["FoodVisualizer", "frame_size"]
 
 PATH = "/drake/food"
-HALVES = ("minus", "plus")
-
-
-def damage_colours(damage: np.ndarray) -> np.ndarray:
-    """Colours of the cut surface [3, V]: plum where intact, orange half cut, pale where cut.
-
-    Brightness rises all the way, so that the map is readable in greyscale and colour blindness.
-
-    Args:
-        damage: Fraction of the toughness that is spent [V], 0 to 1.
-    """
-    stops = np.array([INTACT, HALF_CUT, FLESH])
-    return np.array([np.interp(damage, (0.0, 0.5, 1.0), channel) for channel in stops.T])
 
 
 def frame_size(surfaces: Sequence[FoodSurface]) -> float:
@@ -40,97 +28,122 @@ def frame_size(surfaces: Sequence[FoodSurface]) -> float:
     ) * (4.0 / 3.0)
 
 
+@dc.dataclass
+class _Kept:
+    """What a recording shows at a path from one frame on, until another where it is not None."""
+
+    path: str
+    begin: float
+    end: float | None = None
+
+
 class FoodVisualizer(LeafSystem):
     """Publishes the food's surface at a fixed rate: skin, and cut faces coloured by their damage.
 
     The halves on the two sides of the cut are drake/food/minus and drake/food/plus: hiding one in
-    Meshcat's tree shows the cut face of the other.
+    Meshcat's tree shows the cut face of the other. A slice that is off is `slice_01` and so on; it
+    keeps the shape that it had when it came off.
 
     Meshcat's recordings animate transforms and properties, not vertices, so while a recording is on
-    each frame is a mesh of its own that is visible for one frame. An I/O system: what is drawn lies
-    in the Meshcat instance.
-
-    Where one food follows another, the slice that was cut off, the minus half of the last food,
-    stays as it was last seen; not where the next food comes to its place.
+    each frame of a half is a mesh of its own that is visible for one frame. An I/O system: what is
+    drawn lies in the Meshcat instance.
 
     Input ports:
         surface_vertices: The port of the `CuttingSystem` [3 V], metres, in W.
         surface_damage: The port of the `CuttingSystem` [V].
         food_index: The port of the `CuttingSystem` [1].
+        slice_pose: The port of the `CuttingSystem`, X_WS.
+        slices: The port of `LooseSlices` [14 N]; optional.
 
     Args:
-        surfaces: Surfaces of the prepared foods.
-        slices_stay: Whether each food lies beside the one before it.
+        scene: The food's parts.
+        corners: Most corners that a surface of it has.
+        slices: Slices that may come off.
         meshcat: Viewer.
         period: Time between frames, s.
     """
 
     def __init__(
-        self, surfaces: Sequence[FoodSurface], slices_stay: bool, meshcat: Meshcat, period: float
+        self,
+        scene: FoodScene,
+        corners: int,
+        slices: int,
+        meshcat: Meshcat,
+        period: float,
     ) -> None:
         super().__init__()
-        self._surfaces, self._slices_stay = tuple(surfaces), slices_stay
-        self._meshcat = meshcat
-        size = max(len(surface.ends) for surface in surfaces)
-        self._vertices = self.DeclareVectorInputPort("surface_vertices", 3 * size)
-        self._damage = self.DeclareVectorInputPort("surface_damage", size)
-        self._food_index = self.DeclareVectorInputPort("food_index", 1)
+        self._scene, self._meshcat = scene, meshcat
+        self.DeclareVectorInputPort("surface_vertices", 3 * corners)
+        self.DeclareVectorInputPort("surface_damage", corners)
+        self.DeclareVectorInputPort("food_index", 1)
+        self.DeclareAbstractInputPort("slice_pose", Value(RigidTransform()))
+        self.DeclareVectorInputPort("slices", SLICE_ROW * slices)
         self._recording = False
-        self._frames: list[float] = []
-        self._foods: list[int] = []
+        self._kept: dict[str, _Kept] = {}
+        self._past: list[_Kept] = []
+        self._shown: set[str] = set()
+        self._frame = 0
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
         self.DeclareForcedPublishEvent(self._publish)
 
     def StartRecording(self) -> None:
         """Keeps every frame from now on, for `Meshcat.StaticHtml`."""
         self._recording = True
-        self._frames, self._foods = [], []
+        self._kept, self._past, self._shown, self._frame = {}, [], set(), 0
         self._meshcat.Delete(PATH)
 
     def PublishRecording(self) -> None:
-        """Writes when each kept frame is visible into the recording, and stops keeping them."""
+        """Writes when each kept mesh is visible into the recording, and stops keeping them."""
         animation = self._meshcat.get_mutable_recording()
-        for k, time in enumerate(self._frames):
-            frame = animation.frame(time)
-            for half in HALVES:
-                path = self._frame_path(half, k)
-                animation.SetProperty(0, path, "visible", k == 0)
-                animation.SetProperty(frame, path, "visible", True)
-                if k + 1 < len(self._frames) and not self._stays(half, k):
-                    end = animation.frame(self._frames[k + 1])
-                    animation.SetProperty(end, path, "visible", False)
+        for kept in [*self._past, *self._kept.values()]:
+            begin = animation.frame(kept.begin)
+            if begin > 0:
+                animation.SetProperty(0, kept.path, "visible", False)
+            animation.SetProperty(begin, kept.path, "visible", True)
+            if kept.end is not None:
+                animation.SetProperty(animation.frame(kept.end), kept.path, "visible", False)
         self._recording = False
 
-    def _frame_path(self, half: str, k: int) -> str:
-        return f"{PATH}/{half}/frame_{k:04d}"
+    def _publish(self, context: Context) -> EventStatus:
+        time = context.get_time()
 
-    def _live_path(self, half: str, food: int) -> str:
-        slices = half == "minus" and self._slices_stay
-        return f"{PATH}/{half}" + (f"/slice_{food + 1:02d}" if slices else "")
+        def port(name: str) -> Any:
+            found = self.GetInputPort(name)
+            return found.Eval(context) if found.HasValue(context) else np.zeros(0)
 
-    def _stays(self, half: str, k: int) -> bool:
-        """Whether frame `k` shows a slice that has been cut off by frame k + 1."""
-        return half == "minus" and self._slices_stay and self._foods[k + 1] > self._foods[k]
+        parts = self._scene.parts(port)
+        for gone in self._shown - {part.name for part in parts}:
+            self._end(gone, time)
+        for part in parts:
+            deforms = not part.name.startswith("slice")
+            if deforms or part.name not in self._shown:
+                self._draw(part.name, part.mesh, time)
+            if not deforms:
+                path = f"{PATH}/{part.name}"
+                self._meshcat.SetTransform(path, part.X_WP, time if self._recording else None)
+        self._shown = {part.name for part in parts}
+        self._frame += 1
+        return EventStatus.Succeeded()
 
-    def _publish(self, context: Context) -> None:
-        vertices = self._vertices.Eval(context).reshape(-1, 3)
-        food = int(self._food_index.Eval(context)[0])
-        surface = self._surfaces[food]
-        damage = self._damage.Eval(context)[: len(surface.ends)]
-        skin = np.array(SKIN)[:, None]
-        colours = np.where(surface.is_cut_face, damage_colours(damage), skin)
-        k = len(self._frames)
+    def _draw(self, name: str, mesh: ColouredMesh, time: float) -> None:
+        path = f"{PATH}/{name}"
         if self._recording:
-            self._frames.append(context.get_time())
-            self._foods.append(food)
-        for half, (corners, triangles) in zip(HALVES, surface.halves, strict=True):
-            path = self._frame_path(half, k) if self._recording else self._live_path(half, food)
-            self._meshcat.SetTriangleColorMesh(
-                path,
-                np.asfortranarray(vertices[corners].T),
-                np.asfortranarray(triangles.T, dtype=np.int32),
-                np.asfortranarray(colours[:, corners]),
-            )
-            if self._recording and k > 0 and not self._stays(half, k - 1):
-                # A live viewer shows the newest frame alone.
-                self._meshcat.SetProperty(self._frame_path(half, k - 1), "visible", False)
+            self._end(name, time)
+            path += f"/frame_{self._frame:04d}"
+            self._kept[name] = _Kept(path, time)
+        self._meshcat.SetTriangleColorMesh(
+            path,
+            np.asfortranarray(mesh.points.T),
+            np.asfortranarray(mesh.triangles.T, dtype=np.int32),
+            np.asfortranarray(mesh.colours.T),
+        )
+
+    def _end(self, name: str, time: float) -> None:
+        """Takes away what is shown of a part."""
+        if not self._recording:
+            self._meshcat.Delete(f"{PATH}/{name}")
+        elif name in self._kept:
+            kept = self._kept.pop(name)
+            self._past.append(dc.replace(kept, end=time))
+            # A live viewer shows the newest frame alone.
+            self._meshcat.SetProperty(kept.path, "visible", False)

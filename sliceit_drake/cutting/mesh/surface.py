@@ -11,7 +11,10 @@ from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry
 from sliceit_drake.cutting.mesh.split import SplitMesh
 from sliceit_drake.cutting.mesh.tetrahedra import boundary_faces
 
-__all__ = ["FoodBody", "FoodCorners", "FoodSurface", "food_body", "food_surface"]
+__all__ = ["END", "SKIN", "FoodBody", "FoodCorners", "FoodSurface", "food_body", "food_surface"]
+
+SKIN, END = -1, -2
+"""Of a corner that is no cut point: it lies on the skin, or on a flat end of the food across y."""
 
 
 @dc.dataclass
@@ -22,7 +25,7 @@ class FoodCorners:
         ends: Nodes of the split mesh at each corner [V, 2].
         weights: Their weights [V, 2].
         side: Side of the cut: 0 minus, 1 plus [V].
-        cut_point: Cut point that each corner is, -1 elsewhere [V].
+        cut_point: Cut point that each corner is, `SKIN` or `END` elsewhere [V].
     """
 
     ends: np.ndarray
@@ -32,7 +35,7 @@ class FoodCorners:
 
     @functools.cached_property
     def is_cut_face(self) -> np.ndarray:
-        """Whether each corner belongs to the cut rather than the skin [V]."""
+        """Whether each corner belongs to the cut that is computed [V]."""
         return self.cut_point >= 0
 
     def positions(self, cut: CutGeometry, computed: np.ndarray) -> np.ndarray:
@@ -152,17 +155,21 @@ def food_surface(cut: CutGeometry) -> FoodSurface:
     sides = zip(split.node_source.tolist(), split.node_side.tolist(), strict=True)
     node_of = {vertex_and_side: node for node, vertex_and_side in enumerate(sides)}
     triangles: list[tuple[int, ...]] = []
+    along = split.vertex_position[:, 1]
+    ends_at = along.min(), along.max()
     faces, _ = boundary_faces(split.source_tetrahedra)
     for face in faces.tolist():
+        flat = any(np.allclose(along[face], end, rtol=0.0, atol=1e-9) for end in ends_at)
+        kind = END if flat else SKIN
         for side, sign in ((0, -1.0), (1, 1.0)):
             if max(sign * y[v] for v in face) <= 0.0:
                 continue
             polygon = []
             for a, b in zip(face, [*face[1:], face[0]], strict=True):
                 if sign * y[a] >= 0.0:
-                    polygon.append(corners.number(node_of[a, side], node_of[a, side]))
+                    polygon.append(corners.number(node_of[a, side], node_of[a, side], kind))
                 if y[a] * y[b] < 0.0:
-                    polygon.append(corners.number(node_of[a, side], node_of[b, side]))
+                    polygon.append(corners.number(node_of[a, side], node_of[b, side], kind))
             triangles += [(polygon[0], *pair) for pair in itertools.pairwise(polygon[1:])]
 
     minus, plus = split.point_nodes.transpose(1, 0, 2).tolist()

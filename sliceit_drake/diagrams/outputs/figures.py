@@ -6,7 +6,7 @@ import numpy as np
 
 from sliceit_drake.diagrams.outputs.measurement_comparison import Comparison
 from sliceit_drake.diagrams.outputs.run_log import Record
-from sliceit_drake.diagrams.outputs.snapshot import Snapshot, draw_snapshot
+from sliceit_drake.diagrams.outputs.snapshot import Snapshot, add_picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,7 +29,7 @@ def plot_force(
     top_height: float,
     comparison: Comparison | None,
     caption: str,
-    snapshot: Snapshot | None = None,
+    snapshot: Snapshot | np.ndarray | None = None,
 ) -> "Figure":
     """Draws the knife in the food, and its force over time and over depth.
 
@@ -39,7 +39,7 @@ def plot_force(
         top_height: World height of the food's top at the cut, metres.
         comparison: Measured profile with its fitted offset, or None.
         caption: Conditions and provenance, below the plots.
-        snapshot: Knife and food at some instant, or None to leave that panel out.
+        snapshot: Knife and food at some instant, see `add_picture`; None to leave that panel out.
     """
     from matplotlib.figure import Figure
 
@@ -56,7 +56,7 @@ def plot_force(
     over_depth = figure.add_subplot(grid[-1], sharey=over_time)
     over_depth.tick_params(labelleft=False)
     if snapshot is not None:
-        draw_snapshot(figure.add_subplot(grid[0], projection="3d", computed_zorder=False), snapshot)
+        add_picture(figure, grid[0], snapshot)
     for axes, x in ((over_time, time), (over_depth, depth)):
         axes.plot(x, norm, color=NORM, lw=3.2, label="simulated norm")
         axes.plot(x, total[:, 2], color=SIMULATED, lw=1.2, label="simulated vertical")

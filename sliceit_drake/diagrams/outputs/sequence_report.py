@@ -8,7 +8,7 @@ import numpy as np
 
 from sliceit_drake.diagrams.outputs.figures import BOARD_PHASE, CONTACT_THRESHOLD, SIMULATED
 from sliceit_drake.diagrams.outputs.run_log import Record
-from sliceit_drake.diagrams.outputs.snapshot import Snapshot, draw_snapshot
+from sliceit_drake.diagrams.outputs.snapshot import Snapshot, add_picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -107,7 +107,7 @@ def plot_sequence(
     title: str,
     board_height: float,
     caption: str,
-    snapshot: Snapshot | None = None,
+    snapshot: Snapshot | np.ndarray | None = None,
 ) -> "Figure":
     """Draws the force over time, over the edge's height slice by slice, and its spread by slice.
 
@@ -117,7 +117,7 @@ def plot_sequence(
         title: What is shown.
         board_height: World height of the board's top, metres.
         caption: Conditions and provenance, below the plots.
-        snapshot: Knife and food at some instant, or None to leave that panel out.
+        snapshot: Knife and food at some instant, see `add_picture`; None to leave that panel out.
     """
     from matplotlib import colormaps
     from matplotlib.figure import Figure
@@ -136,8 +136,7 @@ def plot_sequence(
     below = rows[1].subgridspec(1, len(widths), width_ratios=widths)
     over_height, by_slice = figure.add_subplot(below[-2]), figure.add_subplot(below[-1])
     if snapshot is not None:
-        axes = figure.add_subplot(below[0], projection="3d", computed_zorder=False)
-        draw_snapshot(axes, snapshot)
+        add_picture(figure, below[0], snapshot)
 
     over_time.plot(time, board, color=BOARD_PHASE, lw=0.9, label="of the board")
     over_time.plot(time, food, color=SIMULATED, lw=1.1, label="of the food")

@@ -2,16 +2,18 @@
 
 import dataclasses as dc
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydrake.systems.framework import Context
 
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.diagrams.station_interface import Station
-from sliceit_drake.systems.food_visualizer import FLESH, SKIN
 
-__all__ = ["Snapshot", "draw_snapshot", "take_snapshot"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Snapshot", "add_picture", "take_snapshot"]
 
 STEEL = (0.62, 0.66, 0.70)
 SHOWN_LENGTH = 0.035
@@ -26,6 +28,7 @@ class Snapshot:
         depth: Of the edge below the top of the food, metres.
         triangles: Corners of the food's triangles [M, 3, 3], metres.
         is_cut_face: Whether each is on the cut [M].
+        skin, flesh: Colours of the food outside and inside, red, green, blue.
         blade: Corners of the blade's faces, each [4, 3], metres.
     """
 
@@ -33,6 +36,8 @@ class Snapshot:
     depth: float
     triangles: np.ndarray
     is_cut_face: np.ndarray
+    skin: tuple[float, float, float]
+    flesh: tuple[float, float, float]
     blade: list[np.ndarray]
 
 
@@ -48,6 +53,8 @@ def take_snapshot(station: Station, root_context: Context) -> Snapshot | None:
         depth=food.top - float(X_FK.translation()[2]),
         triangles=food.triangles,
         is_cut_face=food.is_cut_face,
+        skin=food.skin,
+        flesh=food.flesh,
         blade=[X_FK.multiply(face.T).T for face in _blade_faces(station.scenario.knife)],
     )
 
@@ -77,7 +84,26 @@ def _blade_faces(knife: Knife) -> list[np.ndarray]:
     return faces
 
 
-def draw_snapshot(axes: Any, snapshot: Snapshot) -> None:
+def add_picture(figure: "Figure", place: Any, picture: Snapshot | np.ndarray) -> None:
+    """Adds a picture of knife and food to a figure.
+
+    Args:
+        figure: The figure.
+        place: Its place in the grid of the figure.
+        picture: A camera's picture [H, W, 3], or what matplotlib draws where there is no camera.
+    """
+    if isinstance(picture, Snapshot):
+        axes = figure.add_subplot(place, projection="3d", computed_zorder=False)
+        _draw_snapshot(axes, picture)
+        return
+    axes = figure.add_subplot(place)
+    # Its middle, as high as it is wide.
+    margin = (picture.shape[1] - picture.shape[0]) // 2
+    axes.imshow(picture[:, margin : picture.shape[1] - margin])
+    axes.set_axis_off()
+
+
+def _draw_snapshot(axes: Any, snapshot: Snapshot) -> None:
     """Draws on matplotlib 3-D axes made with computed_zorder=False, millimetres, flat shading.
 
     Seen from the side y < 0: the far half, the blade and the near half are drawn in this order,
@@ -91,10 +117,11 @@ def draw_snapshot(axes: Any, snapshot: Snapshot) -> None:
     end &= np.abs(triangles[:, 0, 1]) > 0.99 * SHOWN_LENGTH
     flesh = snapshot.is_cut_face | end
     near = triangles[..., 1].mean(1) < 0.0
+    inside, outside = snapshot.flesh, snapshot.skin
     layers: list[tuple[Sequence[np.ndarray], Sequence[tuple[float, float, float]]]] = [
-        (triangles[~near], [FLESH if f else SKIN for f in flesh[~near]]),
+        (triangles[~near], [inside if f else outside for f in flesh[~near]]),
         (snapshot.blade, [STEEL] * len(snapshot.blade)),
-        (triangles[near], [FLESH if f else SKIN for f in flesh[near]]),
+        (triangles[near], [inside if f else outside for f in flesh[near]]),
     ]
     light = np.array([0.45, -0.55, 0.75]) / np.linalg.norm([0.45, -0.55, 0.75])
     for order, (faces, base) in enumerate(layers):

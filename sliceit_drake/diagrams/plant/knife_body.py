@@ -40,6 +40,9 @@ HANDLE_THICKNESS = 0.020
 EDGE_SPHERE_RADIUS = 1e-3
 
 STEEL = np.array([0.66, 0.68, 0.70, 1.0])
+GROUND = np.array([0.86, 0.88, 0.90, 1.0])
+BEVEL = 0.12
+"""Part of the blade's height that is drawn brighter, as ground."""
 PLASTIC = np.array([0.06, 0.06, 0.07, 1.0])
 
 
@@ -74,7 +77,12 @@ def add_knife(
     inertia += CalcSpatialInertia(handle, HANDLE_DENSITY)
     body = plant.AddRigidBody("knife", plant.AddModelInstance("knife"), inertia)
     plant.WeldFrames(parent_frame, body.body_frame(), X_PK)
-    for name, mesh, colour in (("blade", blade, STEEL), ("handle", handle, PLASTIC)):
+    drawn = (
+        ("blade", _drawn_blade(knife, BEVEL, 1.0), STEEL),
+        ("edge", _drawn_blade(knife, 0.0, BEVEL), GROUND),
+        ("handle", handle, PLASTIC),
+    )
+    for name, mesh, colour in drawn:
         plant.RegisterVisualGeometry(body, RigidTransform(), _shape(mesh, name), name, colour)
     properties = contact_properties(board, len(edge_contact_positions(knife)))
     for i, x in enumerate(edge_contact_positions(knife)):
@@ -162,6 +170,30 @@ def blade_surface(knife: Knife) -> TriangleSurfaceMesh:
     ]
     outline = half + [(-y, z) for y, z in half[:0:-1]]
     return _loft([(x, outline) for x in (-0.5 * knife.length, 0.5 * knife.length)])
+
+
+def _drawn_blade(knife: Knife, low: float, high: float) -> TriangleSurfaceMesh:
+    """The blade as it is drawn in K, between two fractions of its height: the spine falls in front.
+
+    What cuts and weighs is the whole prism, `blade_surface`.
+    """
+    full = knife.tip_height + knife.height
+    rings = []
+    for along in (-0.5, *np.linspace(0.2, 0.5, 12)):
+        spine = 1.0 - 0.75 * max((along - 0.2) / 0.3, 0.0) ** 2
+        heights = [min(part, spine) * full for part in (low, high)]
+        half = [
+            0.5 * np.interp(z, [0.0, knife.tip_height, full], _thicknesses(knife)) for z in heights
+        ]
+        (bottom, top), (thin, thick) = heights, half
+        outline = [(-thin, -bottom), (thin, -bottom), (thick, -top), (-thick, -top)]
+        rings.append((along * knife.length, outline))
+    return _loft(rings)
+
+
+def _thicknesses(knife: Knife) -> list[float]:
+    """Of the blade at edge, shoulder and spine, metres."""
+    return [1e-6, knife.edge_thickness, knife.spine_thickness]
 
 
 def _handle(knife: Knife) -> TriangleSurfaceMesh:

@@ -20,8 +20,8 @@ __all__ = ["FINGERTIPS", "HoldingArm", "add_board", "add_holder", "add_table"]
 
 TABLE_SIZE = (1.10, 1.30, 0.03)
 
-TABLE = np.array([0.70, 0.66, 0.60, 1.0])
-BOARD = np.array([0.93, 0.91, 0.85, 1.0])
+TABLE = np.array([0.50, 0.46, 0.42, 1.0])
+BOARD = np.array([0.90, 0.80, 0.63, 1.0])
 BOARD_FEET = np.array([0.25, 0.25, 0.26, 1.0])
 HOLDER = np.array([0.55, 0.57, 0.60, 1.0])
 HOLDER_PADS = np.array([0.10, 0.10, 0.11, 1.0])
