@@ -13,7 +13,7 @@ from sliceit_drake.emulator.process import EmulatorProcess
 from sliceit_drake.resources import resource_path
 
 ROBOT = resource_path("hardware/emulated.yaml")
-CUCUMBER = resource_path("scenarios/cucumber.yaml")
+CUCUMBER = resource_path("scenarios/cucumber_measured.yaml")
 # A whole slice, board included, of 432 tetrahedra, in 1.4 s.
 SLICE = """{
   food: {shape: !Cylinder

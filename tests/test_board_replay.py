@@ -26,7 +26,7 @@ DIAMETER = 0.010
 
 def analytic(stiffness: float, time_step: float = 1e-3, speed: float = 0.05) -> Scenario:
     """Cuts an analytic food down to the board, presses 1 mm further and withdraws."""
-    scenario = load_scenario(resource_path("scenarios/cucumber.yaml"))
+    scenario = load_scenario(resource_path("scenarios/cucumber_measured.yaml"))
     scenario.food, scenario.measurement = AnalyticFood(diameter=DIAMETER), None
     scenario.start.clearance = 0.002
     scenario.board.stiffness, scenario.robot.plant_time_step = stiffness, time_step
@@ -83,7 +83,7 @@ def test_a_replayed_station_record_has_the_stations_board_force(
 
 def test_a_replayed_station_record_has_the_foods_force_as_well(tmp_path):
     overrides = "{food: {shape: !Cylinder {rings: 3, layers: [0.0, 0.004, 0.012]}}}"
-    scenario = load_scenario(resource_path("scenarios/cucumber.yaml"), overrides)
+    scenario = load_scenario(resource_path("scenarios/cucumber_measured.yaml"), overrides)
     scenario.start.clearance = 0.002
     scenario.motion = MotionPlan([ConstantSpeed(distance=0.030, speed=0.05, acceleration=2.0)])
     run = prepare_run(scenario)

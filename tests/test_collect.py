@@ -17,7 +17,7 @@ from sliceit_drake.systems.analytic_cutter import AnalyticFood
 
 pytestmark = pytest.mark.second_tier
 
-STATION = "scenarios/cucumber.yaml"
+STATION = "scenarios/cucumber_measured.yaml"
 PROTOCOL = """
 name: short
 food:

@@ -140,23 +140,23 @@ TESTED = {
     ],
     "tests/test_motion_optimization.py::test_the_command_leaves_a_scenario_that_simulate_takes": [
         "sliceit optimize-motion SCENARIO --output DIR",
-        "sliceit optimize-motion scenarios/cucumber.yaml --output FOLDER",
+        "sliceit optimize-motion scenarios/cucumber_measured.yaml --output FOLDER",
     ],
     "tests/test_hardware_end_to_end.py::test_a_robot_slices_over_the_network_as_the_simulation_"
     "does": [
         "sliceit hardware SCENARIO --host ADDRESS",
         "sliceit emulate SCENARIO",
-        "sliceit emulate scenarios/cucumber.yaml --pace 0.25",
-        "sliceit hardware scenarios/cucumber.yaml --host 127.0.0.1 --pace 0.25"
+        "sliceit emulate scenarios/cucumber_measured.yaml --pace 0.25",
+        "sliceit hardware scenarios/cucumber_measured.yaml --host 127.0.0.1 --pace 0.25"
         " --robot hardware/emulated.yaml",
-        "sliceit emulate scenarios/cucumber.yaml --pace 0.2",
+        "sliceit emulate scenarios/cucumber_measured.yaml --pace 0.2",
         "sliceit hardware --host 127.0.0.1 --pace 0.2 --robot hardware/emulated.yaml",
     ],
     "tests/test_hardware_end_to_end.py::test_the_touch_finds_a_lifted_board_and_refuses_the_"
     "height_that_was_given": ["sliceit hardware SCENARIO --host ADDRESS --robot my.yaml --touch"],
     "tests/test_collect.py::test_a_protocol_on_one_emulated_robot_is_recorded_as_on_the_"
     "simulated_station": [
-        "sliceit emulate scenarios/cucumber.yaml --pace 0.1",
+        "sliceit emulate scenarios/cucumber_measured.yaml --pace 0.1",
         "sliceit collect --emulator-pendant 30099",
         "sliceit collect calibration/protocols/rich.yaml --host 127.0.0.1 --pace 0.1"
         " --robot hardware/emulated.yaml --move-to-start --emulator-pendant 30099",

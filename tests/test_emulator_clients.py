@@ -290,10 +290,10 @@ def commands_and_record(scenario, cycles):
 
 def test_a_slice_over_the_network_has_the_force_of_the_simulated_one():
     overrides = "{start: {clearance: 0.001}}"
-    scenario = load_scenario(resource_path("scenarios/cucumber.yaml"), overrides)
+    scenario = load_scenario(resource_path("scenarios/cucumber_measured.yaml"), overrides)
     commands, simulated = commands_and_record(scenario, 250)
     with EmulatorProcess(
-        resource_path("scenarios/cucumber.yaml"),
+        resource_path("scenarios/cucumber_measured.yaml"),
         free_address(),
         lockstep=True,
         options=["--set", overrides],

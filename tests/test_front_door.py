@@ -85,7 +85,7 @@ def test_a_name_that_is_not_there_is_an_attribute_error():
 def test_a_plain_session_simulates_without_a_word_of_warp():
     code = (
         "import sliceit_drake as sliceit\n"
-        f"run = sliceit.simulate('cucumber', {COARSE!r}, duration=0.01)\n"
+        f"run = sliceit.simulate('cucumber_measured', {COARSE!r}, duration=0.01)\n"
         "assert run.stopped is None"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
@@ -164,8 +164,8 @@ def test_twenty_values_of_toughness_are_swept_and_drawn(tmp_path, monkeypatch):
 
 
 def test_a_scenario_is_found_by_name_and_by_file_and_copied(tmp_path):
-    by_name = sliceit.load_scenario("cucumber")
-    assert by_name == sliceit.load_scenario(sliceit.resource_path("scenarios/cucumber.yaml"))
+    by_name = sliceit.load_scenario("cucumber_measured")
+    assert by_name == sliceit.load_scenario(sliceit.resource_path("scenarios/cucumber_measured.yaml"))
     copy = sliceit.load_scenario(by_name, {"food.material.toughness": 123.0})
     assert copy.food.material.toughness == 123.0 != by_name.food.material.toughness
     sliceit.dump_yaml(copy, tmp_path / "mine.yaml")
@@ -177,27 +177,27 @@ def test_a_scenario_is_found_by_name_and_by_file_and_copied(tmp_path):
 def test_overrides_are_text_a_dictionary_or_paths():
     nested = {"food": {"material": {"toughness": np.float64(200.0), "damping_time": 1e-5}}}
     text = "{food: {material: {toughness: 200.0, damping_time: 0.00001}}}"
-    given = [sliceit.load_scenario("cucumber", each) for each in (nested, text)]
+    given = [sliceit.load_scenario("cucumber_measured", each) for each in (nested, text)]
     paths = {"food.material.toughness": 200.0, "food.material.damping_time": 1e-5}
-    assert given[0] == given[1] == sliceit.load_scenario("cucumber", paths)
-    swept = sliceit.load_scenario("cucumber", {"motion.segments.0.speed": np.float64(0.05)})
+    assert given[0] == given[1] == sliceit.load_scenario("cucumber_measured", paths)
+    swept = sliceit.load_scenario("cucumber_measured", {"motion.segments.0.speed": np.float64(0.05)})
     assert swept.motion.segments[0].speed == 0.05
     for path in ("food.material.tougness", "motion.segments.9.speed", "food.material.toughness.x"):
         with pytest.raises(sliceit.ConfigurationError, match="there is no such field"):
-            sliceit.load_scenario("cucumber", {path: 1.0})
+            sliceit.load_scenario("cucumber_measured", {path: 1.0})
     with pytest.raises(sliceit.ConfigurationError, match="toughness"):
-        sliceit.load_scenario("cucumber", {"food.material.toughness": -1.0})
+        sliceit.load_scenario("cucumber_measured", {"food.material.toughness": -1.0})
 
 
 def test_a_named_food_can_be_changed_after_it_is_loaded_and_replaced_by_another():
-    calibrated = sliceit.load_scenario("cucumber", {"calibration": "cucumber"})
+    calibrated = sliceit.load_scenario("cucumber_measured", {"calibration": "cucumber"})
     tougher = sliceit.load_scenario(calibrated, {"food.material.toughness": 999.0})
     assert tougher.food.material.toughness == 999.0
     assert tougher.food.material.friction == calibrated.food.material.friction
     potato = sliceit.load_scenario(tougher, {"calibration": "potato"})
     assert potato.food.material == sliceit.load_calibrated_food("potato").food.material
     knives = sliceit.load_scenario(
-        sliceit.load_scenario("cucumber", {"knife_name": "nakiri"}), {"knife_name": "chef"}
+        sliceit.load_scenario("cucumber_measured", {"knife_name": "nakiri"}), {"knife_name": "chef"}
     )
     assert knives.knife == sliceit.cutting.load_knife("chef").knife
 
@@ -225,7 +225,7 @@ class Gentle:
 
 
 def test_what_decides_is_a_policy_too():
-    run = sliceit.simulate("cucumber", COARSE, policy=Gentle(), duration=1.0, replay=False)
+    run = sliceit.simulate("cucumber_measured", COARSE, policy=Gentle(), duration=1.0, replay=False)
     assert run.own == {"policy": "Gentle"} and run.stopped is None
     assert 0.2 < run.record()["cut_progress"][-1] < 0.6
     assert run.meshcat is None and run.plot() is not None
@@ -233,7 +233,7 @@ def test_what_decides_is_a_policy_too():
 
 def test_a_configured_policy_takes_the_place_of_the_motion(tmp_path):
     policy = sliceit.PolicyConfig(duration=2.4)
-    run = sliceit.simulate("cucumber", COARSE, policy=policy, duration=0.02, replay=False)
+    run = sliceit.simulate("cucumber_measured", COARSE, policy=policy, duration=0.02, replay=False)
     assert run.scenario.policy == policy and run.own == {}
     run.save(tmp_path)
     assert sliceit.load_scenario(tmp_path / "scenario.yaml").policy == policy
@@ -270,8 +270,8 @@ def test_a_controller_of_ones_own_is_put_in_and_named(tmp_path):
 
 def test_a_sweep_in_the_station_and_one_without_a_robot_agree():
     values = {"food.material.toughness": [200.0, 400.0]}
-    station = sliceit.sweep("cucumber", values, COARSE)
-    alone = sliceit.sweep("cucumber", values, COARSE, robot=False)
+    station = sliceit.sweep("cucumber_measured", values, COARSE)
+    alone = sliceit.sweep("cucumber_measured", values, COARSE, robot=False)
     assert station.peaks == pytest.approx(alone.peaks, rel=0.01)
     assert station.peaks[0] < 0.8 * station.peaks[1]
 
@@ -279,7 +279,7 @@ def test_a_sweep_in_the_station_and_one_without_a_robot_agree():
 def test_several_fields_make_a_grid_and_what_cannot_start_says_why(tmp_path):
     done = []
     found = sliceit.sweep(
-        "cucumber",
+        "cucumber_measured",
         {
             "calibration": ["cucumber", "potato"],
             "food.cut_point": [[0.0, 0.0, 0.0], [0.0, 0.5, 0.0]],
@@ -298,9 +298,9 @@ def test_several_fields_make_a_grid_and_what_cannot_start_says_why(tmp_path):
 
 def test_a_sweep_that_makes_no_sense_is_refused():
     with pytest.raises(sliceit.ConfigurationError, match="has no values"):
-        sliceit.sweep("cucumber", {"food.material.toughness": []})
+        sliceit.sweep("cucumber_measured", {"food.material.toughness": []})
     with pytest.raises(sliceit.ConfigurationError, match="there is no such field"):
-        sliceit.sweep("cucumber", {"food.material.tougness": [1.0]})
+        sliceit.sweep("cucumber_measured", {"food.material.tougness": [1.0]})
     for name, field in (("cucumber_sequence", "sequence"), ("cucumber_policy", "policy")):
         with pytest.raises(sliceit.ConfigurationError, match=f"{field}: needs the robot"):
             sliceit.sweep(name, {"seed": [0]}, robot=False)

@@ -17,7 +17,7 @@ from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.resources import resource_path, shipped_names
 
-CUCUMBER = resource_path("scenarios/cucumber.yaml")
+CUCUMBER = resource_path("scenarios/cucumber_measured.yaml")
 KNIVES = shipped_names("calibration/knives")
 
 

@@ -47,7 +47,7 @@ def test_paths_outside_the_shipped_folders_are_refused(path):
 
 
 def test_a_file_here_goes_before_one_of_the_same_path_that_ships(tmp_path, monkeypatch):
-    path = "scenarios/cucumber.yaml"
+    path = "scenarios/cucumber_measured.yaml"
     monkeypatch.chdir(tmp_path)
     assert resources.file_or_resource(path) == ROOT / path
     (tmp_path / "scenarios").mkdir()

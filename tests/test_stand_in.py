@@ -769,7 +769,7 @@ def test_the_command_lists_the_effects(capsys):
 def test_a_scenario_is_recorded_as_its_one_cut():
     from sliceit_drake.diagrams.scenario import load_scenario
 
-    scenario = load_scenario(resource_path("scenarios/cucumber.yaml"))
+    scenario = load_scenario(resource_path("scenarios/cucumber_measured.yaml"))
     protocol = protocol_of_scenario(scenario, 2)
     record = Session(protocol, [], WORLDS[0], 0, COARSE).record(1)
     assert record.metadata.condition == "cucumber"

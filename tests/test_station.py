@@ -25,7 +25,7 @@ SMALL_FOOD = "{food: {shape: !Cylinder {rings: 3, layers: [0.0, 0.004, 0.012]}}}
 
 
 def cucumber(overrides: str = SMALL_FOOD) -> Scenario:
-    return load_scenario(resource_path("scenarios/cucumber.yaml"), overrides)
+    return load_scenario(resource_path("scenarios/cucumber_measured.yaml"), overrides)
 
 
 @pytest.fixture(scope="module")
@@ -204,6 +204,6 @@ def test_a_food_that_is_higher_than_the_blade_is_refused():
 def test_a_station_refuses_effects_that_are_for_a_prescribed_motion(group):
     with pytest.raises(ConfigurationError, match="prescribed motion") as error:
         load_scenario(
-            resource_path("scenarios/cucumber.yaml"), f"{{food: {{effects: {{{group}}}}}}}"
+            resource_path("scenarios/cucumber_measured.yaml"), f"{{food: {{effects: {{{group}}}}}}}"
         )
     assert "food.effects." in (error.value.field or "")

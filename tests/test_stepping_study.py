@@ -113,7 +113,7 @@ def test_energy_ratio_is_the_one_that_a_simulation_checks():
 
 
 def test_foods_are_those_that_the_scenarios_cut():
-    whole = sliced_food(load_scenario(resource_path("scenarios/cucumber.yaml")))[0]
+    whole = sliced_food(load_scenario(resource_path("scenarios/cucumber_measured.yaml")))[0]
     middle = sliced_food(load_scenario(resource_path("scenarios/potato_sequence.yaml")))[0]
     assert whole.held_sides == "both" and isinstance(whole.shape, Cylinder)
     assert middle.shape.thickness == 3e-3
@@ -122,7 +122,7 @@ def test_foods_are_those_that_the_scenarios_cut():
 
 
 def test_a_scenario_held_half_way_goes_as_far_as_before():
-    scenario = load_scenario(resource_path("scenarios/cucumber.yaml"))
+    scenario = load_scenario(resource_path("scenarios/cucumber_measured.yaml"))
     plans = [scenario.motion, held_half_way(scenario).motion]
     ends = [Motion(p, FAST.motion(FAST.model(5e-4, True)).pose(0.0)) for p in plans]
     assert np.allclose(ends[0].pose(1e3).p, ends[1].pose(1e3).p)

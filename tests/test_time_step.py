@@ -67,7 +67,7 @@ def test_double_precision_agrees_with_single():
 
 @pytest.fixture(scope="module")
 def cucumber():
-    return load_scenario(resource_path("scenarios/cucumber.yaml"))
+    return load_scenario(resource_path("scenarios/cucumber_measured.yaml"))
 
 
 def test_estimated_error_of_the_default_mesh_is_at_most_three_percent_and_honest(cucumber):

@@ -72,7 +72,7 @@ class FakeMeshcat:
 
 def fast_slice() -> Scenario:
     """From just above the food onto the board in a third of a second."""
-    scenario = load_scenario(resource_path("scenarios/cucumber.yaml"), SMALL_FOOD)
+    scenario = load_scenario(resource_path("scenarios/cucumber_measured.yaml"), SMALL_FOOD)
     scenario.start.clearance = 0.001
     slice_ = ConstantSpeed(distance=0.031, speed=0.1, acceleration=5.0)
     scenario.motion = MotionPlan([slice_, Hold(duration=0.08)])

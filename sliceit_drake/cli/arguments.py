@@ -24,6 +24,9 @@ __all__ = [
 ]
 
 SCENARIO = "scenarios/cucumber.yaml"
+"""What is simulated where nothing else is said."""
+ONE_CUT = "scenarios/cucumber_measured.yaml"
+"""A station that cuts once."""
 PROTOCOL = "calibration/protocols/rich.yaml"
 DASK = "dask"
 

@@ -29,7 +29,7 @@ import functools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sliceit_drake.cli.arguments import SCENARIO, add_protocol_argument, protocol_file
+from sliceit_drake.cli.arguments import ONE_CUT, add_protocol_argument, protocol_file
 from sliceit_drake.cli.hardware import add_robot_arguments, robot_of
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.hardware.client import is_loopback
@@ -49,9 +49,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_protocol_argument(parser)
     parser.add_argument(
         "--station",
-        default=SCENARIO,
+        default=ONE_CUT,
         metavar="SCENARIO",
-        help=f"whose robot, controller, sensor and numerics are used (default {SCENARIO})",
+        help=f"whose robot, controller, sensor and numerics are used (default {ONE_CUT})",
     )
     add_robot_arguments(parser)
     parser.add_argument(

@@ -22,7 +22,7 @@ class of your own: `sliceit_drake.stand_in.effect` shows one. --list-effects sho
 Examples
   sliceit record --output records/null --seed 1
   sliceit record calibration/protocols/full.yaml --effect arm_compliance:5e-5 --output records/a
-  sliceit record scenarios/cucumber.yaml --replicates 6 --world curves --output records/b
+  sliceit record scenarios/cucumber_measured.yaml --replicates 6 --world curves --output records/b
   sliceit record --output records/c --seed 1 --backend dask --scheduler tcp://192.168.0.5:8786
 The workers of a cluster need no shared disk, but a FILE.py of yours at its place on each of them.
 """

@@ -35,7 +35,7 @@ def optimize_scenario(
         raise ConfigurationError(
             "has no single cut of finite elements",
             field="scenario.food",
-            fix="Give a scenario such as scenarios/cucumber.yaml.",
+            fix="Give a scenario such as scenarios/cucumber_measured.yaml.",
         )
     validate(limits, "limits")
     model = make_food_model(scenario.food, scenario.knife, scenario.numerics)

@@ -16,7 +16,7 @@ __all__ = ["scenario_of_slice"]
 REACH = (0.3, 0.7)
 """Distances from the base at which the arm cuts, metres."""
 GAINS = 200.0
-"""Gains of the controller in motion mode, as in scenarios/cucumber.yaml."""
+"""Gains of the controller in motion mode, as in scenarios/cucumber_measured.yaml."""
 
 
 def scenario_of_slice(plan: PlannedSlice) -> Scenario:

@@ -31,7 +31,7 @@ from studies.marked_page import Place
 __all__ = ["PLACE", "add_arguments", "run"]
 
 PLACE = Place("policy_and_motion")
-STIFF = "scenarios/cucumber.yaml"
+STIFF = "scenarios/cucumber_measured.yaml"
 """Whose controller tracks the motion."""
 BELOW = 2e-4
 """How far below the board's top the motion aims, m."""

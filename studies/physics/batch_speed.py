@@ -41,7 +41,7 @@ def devices() -> list[str]:
 
 def variants(device: str, count: int, refinement: float) -> tuple[list[CuttingModel], Motion]:
     """Cuts of one cucumber with toughnesses of their own, and a press to the board at 20 mm/s."""
-    scenario = load_scenario(resource_path("scenarios/cucumber.yaml"))
+    scenario = load_scenario(resource_path("scenarios/cucumber_measured.yaml"))
     numerics = dc.replace(scenario.numerics, device=device)
     assert isinstance(scenario.food, Food)
     base = make_food_model(scenario.food, scenario.knife, numerics, refinement)

@@ -832,7 +832,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
-    scenario = load_scenario(resource_path("scenarios/cucumber.yaml"))
+    scenario = load_scenario(resource_path("scenarios/cucumber_measured.yaml"))
     food = scenario.food
     assert isinstance(food, Food)
     model = make_food_model(food, scenario.knife, scenario.numerics)

@@ -95,7 +95,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
-    scenario = load_scenario(resource_path("scenarios/cucumber.yaml"))
+    scenario = load_scenario(resource_path("scenarios/cucumber_measured.yaml"))
     food = scenario.food
     assert isinstance(food, Food) and isinstance(food.shape, Cylinder)
     diameter = food.shape.diameter

@@ -124,7 +124,7 @@ def bevel(knife: Knife) -> float:
 def cut_rows() -> list[tuple[str, ...]]:
     """What each knife does in foods that are held on one side and on both."""
     rows: list[tuple[str, ...]] = []
-    for name in ("cucumber", "cucumber_end_slice", "apple"):
+    for name in ("cucumber_measured", "cucumber_end_slice", "apple"):
         scenario = load_scenario(resource_path(f"scenarios/{name}.yaml"))
         food = scenario.food
         assert isinstance(food, Food)

@@ -42,7 +42,7 @@ __all__ = [
 ]
 
 
-FOODS = ("cucumber", "potato_sequence", "tomato_sequence")
+FOODS = ("cucumber_measured", "potato_sequence", "tomato_sequence")
 STATION_STEPS = (5e-5, 1e-4, 2.5e-4, 5e-4, 1e-3)
 
 

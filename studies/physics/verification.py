@@ -42,7 +42,7 @@ CHECKS = 4 + len(EDGE_CASES) + len(FRICTION_CASES) + len(REFINEMENTS) + len(DIVI
 
 
 def cucumber() -> Food:
-    """The food whose whole cut is refined: that of scenarios/cucumber.yaml."""
+    """The food whose whole cut is refined: that of scenarios/cucumber_measured.yaml."""
     return Food(material=Material(toughness=400.0, friction=0.05))
 
 

@@ -88,7 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
-    scenario = load_scenario(resource_path("scenarios/cucumber.yaml"), options.overrides)
+    scenario = load_scenario(resource_path("scenarios/cucumber_measured.yaml"), options.overrides)
     cut, cut_with_arm = prescribed_slices(scenario), station_slices(scenario)
     rows: list[tuple[float, float]] = []
     count = slices = 0

@@ -1,6 +1,6 @@
 """How a run of `sliceit hardware` keeps up with the controller's clock: emulator and client, paced.
 
-  python -m studies hardware_pace scenarios/cucumber.yaml --pace 0.5 0.2 --repeats 5
+  python -m studies hardware_pace scenarios/cucumber_measured.yaml --pace 0.5 0.2 --repeats 5
 
 For each pace and repeat it starts `sliceit emulate` and `sliceit hardware`, each in a process of
 its own, which talk over loopback TCP through ur_rtde, and reads what the run wrote. `sliceit

@@ -86,7 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
-    scenario = load_scenario(resource_path("scenarios/cucumber.yaml"))
+    scenario = load_scenario(resource_path("scenarios/cucumber_measured.yaml"))
     baseline = load_scenario(resource_path("scenarios/cucumber_spring.yaml"))
     # In turns, so that other work on the machine slows all alike.
     turns = [
