@@ -48,7 +48,9 @@ STIFF_FOOD = "food: {material: {youngs_modulus: 1.0e+7}}, "
 
 
 def cucumber(overrides: str = "", food: str = SMALL_FOOD) -> Scenario:
-    scenario = load_scenario(resource_path("scenarios/cucumber_measured.yaml"), f"{{{food}{overrides}}}")
+    scenario = load_scenario(
+        resource_path("scenarios/cucumber_measured.yaml"), f"{{{food}{overrides}}}"
+    )
     scenario.measurement = None
     return scenario
 

@@ -225,7 +225,9 @@ def test_a_new_food_has_no_past():
     from sliceit_drake.resources import resource_path
 
     small = "{food: {shape: !Cylinder {rings: 2, layers: [0.0, 0.004, 0.012]}}}"
-    diagram = ScenarioDiagram(load_scenario(resource_path("scenarios/cucumber_measured.yaml"), small))
+    diagram = ScenarioDiagram(
+        load_scenario(resource_path("scenarios/cucumber_measured.yaml"), small)
+    )
     simulator = Simulator(diagram)
     diagram.SetStart(simulator.get_mutable_context())
     simulator.AdvanceTo(0.8)

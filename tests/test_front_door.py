@@ -165,7 +165,9 @@ def test_twenty_values_of_toughness_are_swept_and_drawn(tmp_path, monkeypatch):
 
 def test_a_scenario_is_found_by_name_and_by_file_and_copied(tmp_path):
     by_name = sliceit.load_scenario("cucumber_measured")
-    assert by_name == sliceit.load_scenario(sliceit.resource_path("scenarios/cucumber_measured.yaml"))
+    assert by_name == sliceit.load_scenario(
+        sliceit.resource_path("scenarios/cucumber_measured.yaml")
+    )
     copy = sliceit.load_scenario(by_name, {"food.material.toughness": 123.0})
     assert copy.food.material.toughness == 123.0 != by_name.food.material.toughness
     sliceit.dump_yaml(copy, tmp_path / "mine.yaml")
@@ -180,7 +182,9 @@ def test_overrides_are_text_a_dictionary_or_paths():
     given = [sliceit.load_scenario("cucumber_measured", each) for each in (nested, text)]
     paths = {"food.material.toughness": 200.0, "food.material.damping_time": 1e-5}
     assert given[0] == given[1] == sliceit.load_scenario("cucumber_measured", paths)
-    swept = sliceit.load_scenario("cucumber_measured", {"motion.segments.0.speed": np.float64(0.05)})
+    swept = sliceit.load_scenario(
+        "cucumber_measured", {"motion.segments.0.speed": np.float64(0.05)}
+    )
     assert swept.motion.segments[0].speed == 0.05
     for path in ("food.material.tougness", "motion.segments.9.speed", "food.material.toughness.x"):
         with pytest.raises(sliceit.ConfigurationError, match="there is no such field"):

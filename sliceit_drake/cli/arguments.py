@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from sliceit_drake.diagrams.scenario import Scenario
 
 __all__ = [
+    "ONE_CUT",
     "add_cluster_arguments",
     "add_protocol_argument",
     "add_scenario_arguments",

@@ -30,7 +30,7 @@ from sliceit_drake.hardware.client import is_loopback
 if TYPE_CHECKING:
     from sliceit_drake.robot_run.operated_robot import OperatedRobot
 
-__all__ = ["add_arguments", "run", "add_robot_arguments", "robot_of"]
+__all__ = ["add_arguments", "add_robot_arguments", "robot_of", "run"]
 
 DEFAULT_ROBOT = "hardware/ur5e.yaml"
 

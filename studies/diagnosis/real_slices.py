@@ -24,8 +24,7 @@ from sliceit_drake.diagnosis.experiments.identifiability import ANGLE, short
 from sliceit_drake.diagnosis.input_checks import check_records
 from sliceit_drake.diagnosis.one_slice.diagnose_slice import diagnose_slice, setup_of_slice
 from sliceit_drake.diagnosis.one_slice.slice_evidence import LEVEL
-from sliceit_drake.diagnosis.one_slice.slice_report import slice_figure
-from sliceit_drake.diagnosis.one_slice.slice_result import MIN_GAIN, OneSlice
+from sliceit_drake.diagnosis.one_slice.slice_result import MIN_GAIN, OneSlice, slice_figure
 from sliceit_drake.output_folder import check_folder
 from sliceit_drake.records.validation import load_record
 from sliceit_drake.resources import resource_path

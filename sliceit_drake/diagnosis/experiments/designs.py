@@ -15,7 +15,7 @@ from sliceit_drake.cutting.motion import (
     Waypoints,
 )
 
-__all__ = ["Experiment", "Scale", "menu"]
+__all__ = ["CLEARANCE", "Experiment", "Scale", "menu"]
 
 OVERTRAVEL = 2e-4
 """How far a cut goes into the board, metres."""

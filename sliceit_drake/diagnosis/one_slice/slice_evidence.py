@@ -15,7 +15,15 @@ from sliceit_drake.diagnosis.evidence.noise_levels import ChannelNoise
 from sliceit_drake.diagnosis.experiments.identifiability import ANGLE
 from sliceit_drake.prediction.noise import MarkovCovariance
 
-__all__ = ["LEVEL", "CauseInSlice", "SliceEvidence", "estimate_slice_noise", "slice_evidence"]
+__all__ = [
+    "LEVEL",
+    "CauseInSlice",
+    "HeldOutDepth",
+    "SliceEvidence",
+    "SliceProblem",
+    "estimate_slice_noise",
+    "slice_evidence",
+]
 
 LEVEL = 0.05
 """Greatest p-value, over all causes, of one that the slice supports."""

@@ -25,9 +25,9 @@ __all__ = [
     "JointControlConfig",
     "Robot",
     "RobotConfig",
+    "add_arm_and_gripper",
     "add_plant",
     "add_robot",
-    "add_arm_and_gripper",
     "connect_arm_controller",
 ]
 
