@@ -5,7 +5,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from sliceit_drake.systems.ur5e_kinematics import ur5e_chain
 
-# Near the start of scenarios/cucumber_measured.yaml: the edge level, along Wy, 50 mm above the board.
+# Near the start of scenarios/cucumber_measured.yaml: the edge level, along Wy, 50 mm above the
+# board.
 START = [1.35559, -1.48188, 1.94802, -2.03694, -1.57079, 1.35559]
 BOARD = 0.05
 LENGTH = 0.15

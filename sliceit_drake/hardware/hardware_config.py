@@ -30,8 +30,8 @@ class SafetyLimits:
 
     The defaults are for slow slicing beside a person who holds the emergency stop. Their sources:
     the UR5e's published ranges and joint limits (Universal Robots' technical details; model file
-    models/ur5e/ur5e.urdf) bound them, and the motion of scenarios/cucumber_measured.yaml, simulated, needs
-    0.22 rad/s, 1.4 rad/s2, 0.08 m/s, 16 N, 0.007 rad of tracking error (docs/hardware.md). In
+    models/ur5e/ur5e.urdf) bound them, and the motion of the scenario cucumber_measured, simulated,
+    needs 0.22 rad/s, 1.4 rad/s2, 0.08 m/s, 16 N, 0.007 rad of tracking error (docs/hardware.md). In
     between they are choices, not measurements.
     """
 
