@@ -12,6 +12,9 @@ from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan, Retrac
 
 __all__ = ["SliceSequence"]
 
+FALL = 0.4
+"""Time in which the last slice comes to lie, s."""
+
 
 @dc.dataclass
 class SliceSequence:
@@ -104,7 +107,8 @@ class SliceSequence:
                 up -= lift
             segments.append(Retract(up, speed, acceleration, label="retract"))
             if k + 1 == len(tops):
-                segments.append(Hold(self.hold, label="end"))
+                fall = FALL if self.push > 0.0 else 0.0
+                segments.append(Hold(self.hold + fall, label="end"))
                 break
             back = self.push + (self.thickness if self.indexing == "knife" else 0.0)
             if back > 0.0:

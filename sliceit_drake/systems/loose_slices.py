@@ -43,6 +43,9 @@ KNIFE_MASS = 1e3
 MESH_SIZE = 5e-3
 """Of the pressure field in box and blade, metres; what is convex has its own corners."""
 
+MIN_MODULUS = 1e6
+"""Of the pressure in a slice, Pa: a softer food would flatten, a rigid body would sink in."""
+
 DISSIPATION = 10.0
 """Of a slice's contacts, s/m: food does not bounce. Declared free; it changes no resting place."""
 
@@ -133,7 +136,8 @@ class LooseSlices(LeafSystem):
         material = slices[0].material
         soft = ProximityProperties()
         AddContactMaterial(DISSIPATION, None, CoulombFriction(friction, friction), soft)
-        AddCompliantHydroelasticProperties(MESH_SIZE, material.youngs_modulus, soft)
+        modulus = max(material.youngs_modulus, MIN_MODULUS)
+        AddCompliantHydroelasticProperties(MESH_SIZE, modulus, soft)
         x, y, thickness = board.size
         place = [*X_WF.translation()[:2], board.height - 0.5 * thickness]
         X_WB = RigidTransform(X_WF.rotation(), place)
