@@ -53,6 +53,7 @@ WORLD = FiniteElementSettings(refinement=0.6, time_step=5e-4, travel=5e-4)
 SCENARIOS = {
     "apple": 3.0,
     "carrot_sequence": 2.5,
+    "cucumber": 3.0,
     "cucumber_measured": 10.0,
     "cucumber_agent": 2.0,
     "cucumber_end_slice": 10.0,
