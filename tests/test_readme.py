@@ -17,20 +17,25 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "sliceit_drake"
 
 
-def run_example(number: int) -> None:
-    examples = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    exec(compile(examples[number], "README.md", "exec"), {})
+TOUR = "docs/tour.md"
 
 
-def test_station_of_the_readme_runs(capsys):
-    run_example(0)
-    time, force = (float(x) for x in capsys.readouterr().out.split()[-2:])
-    assert time == 1.0
-    assert 5.0 < force < 20.0
+def run_example(page: str) -> None:
+    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)
+    exec(compile(example, page, "exec"), {})
 
 
-def test_batch_and_gradient_of_the_readme_run(capsys):
-    run_example(1)
+def test_run_of_the_readme_is_saved(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run_example("README.md")
+    said = re.search(r"run.save.*# (.*)", (ROOT / "README.md").read_text())
+    assert said is not None
+    found = {file.name for file in (tmp_path / "output/softer").iterdir()}
+    assert found == set(said[1].split(", "))
+
+
+def test_batch_and_gradient_of_the_tour_run(capsys):
+    run_example(TOUR)
     printed = [x for x in capsys.readouterr().out.splitlines() if x[:1] in ("[", "{")]
     peaks, gradient = (ast.literal_eval(x) for x in printed)
     assert sorted(peaks) == peaks and 5.0 < peaks[0] < peaks[2] < 20.0
@@ -39,9 +44,9 @@ def test_batch_and_gradient_of_the_readme_run(capsys):
     assert gradient["material.friction"] > 0.0
 
 
-def table_of_the_readme() -> dict[str, list[float]]:
+def table_of_the_tour() -> dict[str, list[float]]:
     """Numbers of the first table by row: those of its value, then those in the row's name."""
-    text = (ROOT / "README.md").read_text()
+    text = (ROOT / TOUR).read_text()
     table = text.partition("|---|---|\n")[2].partition("\n\n")[0]
     rows = re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", table, re.M)
     number = re.compile(r"\d[\d,]*\.?\d*")
@@ -53,10 +58,11 @@ def table_of_the_readme() -> dict[str, list[float]]:
     }
 
 
-def test_the_table_is_what_the_first_command_measures(tmp_path):
-    assert main(["simulate", "--no-replay", "--output", str(tmp_path)]) == 0
+def test_the_table_is_what_the_measured_slice_gives(tmp_path):
+    options = ["--no-replay", "--no-animation", "--output", str(tmp_path)]
+    assert main(["simulate", "cucumber_measured", *options]) == 0
     found = json.loads((tmp_path / "summary.json").read_text())
-    measured, work, table = found["measurement"], found["work_of_cutting_J"], table_of_the_readme()
+    measured, work, table = found["measurement"], found["work_of_cutting_J"], table_of_the_tour()
     stored = json.loads((ROOT / "docs/verification.json").read_text())["foods"]
     (paper,) = (food["curves"] for food in stored if food["name"] == "cucumber")
     error = found["discretization_error"]["relative_rms"]
