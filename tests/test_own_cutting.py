@@ -10,6 +10,7 @@ from pydrake.systems.framework import BasicVector
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagrams.hardware_station import RobotConnection
+from sliceit_drake.diagrams.outputs.animation import can_draw
 from sliceit_drake.diagrams.outputs.paraview import FoodFrames
 from sliceit_drake.diagrams.outputs.slice_record_of_run import slice_record_of
 from sliceit_drake.diagrams.run import prepare_run, simulate
@@ -95,7 +96,7 @@ def test_one_that_tells_nothing_gives_record_picture_replay_and_summary(tmp_path
 
 
 def test_what_it_tells_stands_in_record_picture_and_summary(tmp_path):
-    run = prepare_run(scenario(), cutting=TalkingDough(scenario()))
+    run = prepare_run(scenario(), cutting=TalkingDough(scenario()), animation=True)
     frames = FoodFrames(run, 30.0)
     run.advance()
     record = run.record()
@@ -105,7 +106,10 @@ def test_what_it_tells_stands_in_record_picture_and_summary(tmp_path):
     assert len(frames) > 5 and frames.bodies[0].points.shape == (4, 3)
     assert 0.5 * HEIGHT < run.snapshot.depth < 0.7 * HEIGHT
     np.testing.assert_array_equal(run.snapshot.is_cut_face, [False, True])
+    (part,) = run.film.frames[-1].parts
+    assert part.name == "food" and part.mesh.points.shape == (6, 3)
     run.save(tmp_path)
+    assert (tmp_path / "slice.gif").exists() == can_draw()
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert summary["peak_pressure_Pa"] == pytest.approx(force.max() / WIDTH**2)
     assert "dough of 500 N/m." in run.plot().get_supxlabel()

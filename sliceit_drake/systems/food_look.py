@@ -15,6 +15,7 @@ from sliceit_drake.systems.loose_slices import SLICE_ROW, slice_pose
 
 __all__ = [
     "INTACT",
+    "LOOKS",
     "OTHER",
     "ColouredMesh",
     "FoodLook",

@@ -9,6 +9,8 @@ from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, Leaf
 
 from sliceit_drake.cutting.foods.spring_food import SpringFood
 from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.systems.cut_report import FoodPicture
+from sliceit_drake.systems.food_look import LOOKS
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 
 __all__ = ["SpringCutter", "SpringVisualizer"]
@@ -62,6 +64,25 @@ class SpringCutter(KnifeForceSystem):
             "spring_visualizer", SpringVisualizer(self.food, self._X_WF, meshcat, period)
         )
         builder.Connect(self.GetOutputPort("compression"), plates.GetInputPort("compression"))
+
+    def picture(self, context: Context) -> FoodPicture:
+        """A drum between board and button."""
+        height = self.food.height - context.get_discrete_state(self._button).value()[0]
+        angle = np.linspace(0.0, 2.0 * np.pi, 33)
+        rim = (
+            0.5 * self.food.diameter * np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle])
+        )
+        low, top = rim, rim + [0.0, 0.0, height]
+        middle = np.broadcast_to([0.0, 0.0, height], low[1:].shape)
+        sides = [
+            (low[:-1], low[1:], top[1:]),
+            (low[:-1], top[1:], top[:-1]),
+            (top[:-1], top[1:], middle),
+        ]
+        triangles = np.concatenate([np.stack(corners, axis=1) for corners in sides])
+        is_top = np.arange(len(triangles)) >= 2 * len(middle)
+        look = LOOKS["cucumber"]
+        return FoodPicture(self._X_WF, self.food.height, triangles, is_top, look.flesh, look.skin)
 
     def spring(self, context: Context) -> tuple[float, float]:
         """Stiffness, N/m, and damping, Ns/m, in this context."""
