@@ -366,12 +366,11 @@ def _title(run: Run) -> str:
     speeds = [getattr(s, "speed", None) for s in segments]
     speed = next((s for s in speeds if s), None)
     at = f" at {1e3 * speed:.3g} mm/s" if speed and run.diagram.policy is None else ""
+    name = scenario.food.name if isinstance(scenario.food, Food) else scenario.name
     if scenario.sequence is not None:
-        name = scenario.food.name if isinstance(scenario.food, Food) else scenario.name
         count, thickness = scenario.sequence.count, 1e3 * scenario.sequence.thickness
         return f"A UR5e cuts {count} slices of {thickness:.3g} mm of {name}{at}"
-    name = run.own.get("cutting", scenario.name.replace("_", " "))
-    return f"A UR5e slices {name}{at}"
+    return f"A UR5e slices {run.own.get('cutting', name.replace('_', ' '))}{at}"
 
 
 def _caption(run: Run, comparison: Comparison | None) -> str:
