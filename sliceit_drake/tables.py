@@ -1,4 +1,4 @@
-"""Reading of comma-separated tables of numbers, with errors that name file, row and column."""
+"""Tables of numbers: CSV files, with errors that name file, row and column, and interpolation."""
 
 import csv
 import difflib
@@ -9,7 +9,7 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
 
-__all__ = ["read_columns", "read_rows", "require_increasing"]
+__all__ = ["interpolated", "read_columns", "read_rows", "require_increasing"]
 
 
 def read_rows(file: str | Path) -> list[tuple[int, list[str]]]:
@@ -101,3 +101,10 @@ def require_increasing(values: np.ndarray, file: str | Path, column: str) -> Non
             field=column,
             fix="Sort the rows so that it increases, and remove repeated ones.",
         )
+
+
+def interpolated(at: np.ndarray, known: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Rows [n, ...] at some places [n], linearly between rows [m, ...] at increasing places [m]."""
+    columns = values.reshape(len(values), -1).T
+    rows = np.column_stack([np.interp(at, known, column) for column in columns])
+    return rows.reshape(len(at), *values.shape[1:])

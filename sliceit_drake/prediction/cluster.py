@@ -70,13 +70,6 @@ def _run_jobs(
         yield from parallel(work)
 
 
-def _rebuilt(shared: CuttingModel, own: dict[str, Any]) -> CuttingModel:
-    """The cut of a job from the one that it shares most with."""
-    model = copy.copy(shared)
-    vars(model).update(own)
-    return model
-
-
 _THREAD = threading.local()
 
 
@@ -88,7 +81,12 @@ def _run_there(
     period: float,
     board: Board,
 ) -> tuple[int, JobResult]:
-    """Runs a job on a worker, which keeps what it needs from one to the next."""
+    """Runs a job on a worker, which keeps its driver from one to the next.
+
+    The job's cut is `shared` but for what is its `own`.
+    """
+    model = copy.copy(shared)
+    vars(model).update(own)
     drivers: dict[float, Driver] = _THREAD.__dict__.setdefault("drivers", {})
     driver = drivers.setdefault(period, Driver(period))
-    return number, run_job(driver, Job(_rebuilt(shared, own), **rest), board)
+    return number, run_job(driver, Job(model, **rest), board)

@@ -21,6 +21,7 @@ from sliceit_drake.prediction.series import ForceSeries, SliceFacts
 from sliceit_drake.prediction.simulator import JobResult
 from sliceit_drake.records.preprocessing import as_measured
 from sliceit_drake.records.slice_record import SliceRecord
+from sliceit_drake.tables import interpolated
 
 __all__ = ["CHANNELS", "Bench", "Meshing", "RecordTarget", "make_targets", "turning"]
 
@@ -142,7 +143,7 @@ class RecordTarget:
         count = max(2, int((last - first) / clock.period + 1e-6))
         self.grid = first + clock.period * np.arange(count + 1)
         at = np.minimum(self.grid, record.time[-1])
-        self.p = np.column_stack([np.interp(at, record.time, column) for column in p.T])
+        self.p = interpolated(at, record.time, p)
         self.R = Slerp(record.time, rotation)(at).as_matrix()
         phase = np.array([""] * len(record), dtype="<U16")
         for label in metadata.motion.phases:
@@ -235,7 +236,7 @@ class RecordTarget:
             wanted = np.arange(n) + 0.5
             known = result.parts.reshape(len(result.parts), 18)
             inside = (wanted > ends[0]) & (wanted < ends[-1])
-            values = np.column_stack([np.interp(wanted, middle, c) for c in known.T])
+            values = interpolated(wanted, middle, known)
             values = np.where(inside[:, None], values, 0.0)
             for k, name in enumerate(parts):
                 parts[name] = values[:, 6 * k : 6 * k + 6]

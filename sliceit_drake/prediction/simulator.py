@@ -163,19 +163,10 @@ class Simulator:
         known = self._geometry.get(id(model.split))
         if known is None or known[0] is not model.split:
             known = self._geometry[id(model.split)] = (model.split, _geometry_key(model))
+        settings = (model.effects, model.knife, model.numerics, self._clock, self._board)
+        motion = (job.R, job.p, job.stretches.ends, job.stretches.multiples, job.precision)
         return content_key(
-            self._code,
-            known[1],
-            parameter_row(model),
-            (model.effects, model.knife, model.numerics, self._clock, self._board),
-            *(
-                model.outline,
-                job.R,
-                job.p,
-                job.stretches.ends,
-                job.stretches.multiples,
-                job.precision,
-            ),
+            self._code, known[1], parameter_row(model), settings, model.outline, *motion
         )
 
 

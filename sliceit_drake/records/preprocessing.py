@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.records.metadata import ProcessingStep, SliceMetadata
 from sliceit_drake.records.slice_record import SliceRecord
+from sliceit_drake.tables import interpolated
 
 __all__ = [
     "MIN_AIR_ROWS",
@@ -167,7 +168,7 @@ def resample(record: SliceRecord, rate: float) -> SliceRecord:
     time = _grid(**numbers)
 
     def at(values: np.ndarray) -> np.ndarray:
-        return _interpolated(time, record.time, values)
+        return interpolated(time, record.time, values)
 
     result = _map_wrench(result, lambda values: _resampled(record.time, values, **numbers))
     result.time = time
@@ -275,19 +276,13 @@ def _grid(rate: float, start: float, end: float) -> np.ndarray:
     return start + np.arange(int(np.floor((end - start) * rate + 1e-6)) + 1) / rate
 
 
-def _interpolated(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    columns = values.reshape(len(time), -1).T
-    result = np.column_stack([np.interp(at, time, column) for column in columns])
-    return result.reshape(len(at), *values.shape[1:])
-
-
 def _resampled(
     time: np.ndarray, values: np.ndarray, rate: float, start: float, end: float
 ) -> np.ndarray:
     period = float(np.median(np.diff(time)))
     if ANTI_ALIASING * rate < 0.5 / period and rate * period < 0.999:
         values = _filtered(time, values, ANTI_ALIASING * rate, 4, zero_phase=True)
-    return _interpolated(_grid(rate, start, end), time, values)
+    return interpolated(_grid(rate, start, end), time, values)
 
 
 def _filtered(
@@ -304,9 +299,9 @@ def _filtered(
     is_uniform = bool(np.abs(np.diff(time) - period).max() < 0.01 * period)
     if not is_uniform:
         uniform = _grid(1.0 / period, float(time[0]), float(time[-1]) + period)
-        on_grid = _interpolated(uniform, time, values)
+        on_grid = interpolated(uniform, time, values)
         filtered = _filtered(uniform, on_grid, cutoff, order, zero_phase)
-        return _interpolated(time, uniform, filtered)
+        return interpolated(time, uniform, filtered)
     sections = butter(order, cutoff, fs=1.0 / period, output="sos")
     if zero_phase:
         # As long as the filter remembers, so that the ends do not ring.

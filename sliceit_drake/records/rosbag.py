@@ -20,6 +20,7 @@ from sliceit_drake.records.importers import imported_facts
 from sliceit_drake.records.metadata import ProcessingStep, SliceMetadata
 from sliceit_drake.records.phases import phases_from_motion
 from sliceit_drake.records.slice_record import SliceRecord, SliceTable, record_from_table
+from sliceit_drake.tables import interpolated
 
 __all__ = ["import_rosbag"]
 
@@ -327,7 +328,7 @@ def _poses(
     if moving.kind == JOINTS:
         if forward is None:
             raise wrong(f"{topic} has joint angles, for which no kinematics is given")
-        joints = np.column_stack([np.interp(time, moving.time, q) for q in moving.values.T])
+        joints = interpolated(time, moving.time, moving.values)
         rows = np.array([forward(q) for q in joints.tolist()])
         return joints, rows[:, :9].reshape(-1, 3, 3).transpose(0, 2, 1), rows[:, 9:]
     length = np.linalg.norm(moving.values[:, 3:], axis=1)
@@ -336,7 +337,7 @@ def _poses(
             f"{topic} has quaternions whose length is not 1, as {length[0]:.3g}",
             fix="Its publisher leaves the orientation out; record one that has it.",
         )
-    p = np.column_stack([np.interp(time, moving.time, x) for x in moving.values[:, :3].T])
+    p = interpolated(time, moving.time, moving.values[:, :3])
     turn = Slerp(moving.time, Rotation.from_quat(moving.values[:, 3:]))
     return None, turn(time).as_matrix(), p
 

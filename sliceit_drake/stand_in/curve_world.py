@@ -9,6 +9,7 @@ imports. Effects act on it by the same hooks as on the finite elements; a factor
 nothing to act on.
 """
 
+import dataclasses as dc
 from collections.abc import Sequence
 
 import numpy as np
@@ -17,7 +18,8 @@ from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.stand_in.curve_laws import CutState, EllipticSection, food_forces, measured_curve
 from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceTruth, Tissue
 from sliceit_drake.stand_in.protocol import Protocol, Specimen, section_size
-from sliceit_drake.stand_in.world import Path, Run, resampled
+from sliceit_drake.stand_in.world import Path, Run
+from sliceit_drake.tables import interpolated
 
 __all__ = ["CurveWorld"]
 
@@ -62,27 +64,23 @@ class CurveWorld:
             np.array([x + condition.offset, y, height + condition.clearance]),
         )
         path = Path.of(condition.motion, start, protocol.exchange_period)
-        return _CurveRun(self, path, specimen, facts, effects).cut()
+        return _CurveRun(path, specimen, facts, effects, self).cut()
 
 
+@dc.dataclass
 class _CurveRun(Run):
     """One slice by a measured curve."""
 
-    def __init__(
-        self,
-        world: CurveWorld,
-        path: Path,
-        specimen: Specimen,
-        facts: SliceTruth,
-        effects: Sequence[Effect],
-    ) -> None:
-        super().__init__(path, specimen, facts, effects)
-        self._protocol = world.protocol
+    world: CurveWorld
+
+    def __post_init__(self) -> None:
+        facts, specimen = self.facts, self.specimen
+        self._protocol = self.world.protocol
         self._section = EllipticSection(facts.width, facts.height)
         size = facts.width / section_size(self._protocol.food, 1.0)[0]
-        self._curve = world.curve.scaled(specimen.toughness).scaled(size)
-        self._excess = _edge_excess(self._section, facts, effects)
-        self._state = CutState(path.p[0])
+        self._curve = self.world.curve.scaled(specimen.toughness).scaled(size)
+        self._excess = _edge_excess(self._section, facts, self.effects)
+        self._state = CutState(self.path.p[0])
         self._has_food = not specimen.condition.without_food
 
     def reached(self) -> tuple[float, float, float]:
@@ -112,10 +110,10 @@ class _CurveRun(Run):
         stretches, forces, depths, shifts = self.drive(TRAVEL, LONGEST, 0.0)
         T, time = path.period, path.time[1:]
         ends = T * stretches[:, 1]
-        force = resampled(forces, ends, time)
-        knife, food = np.moveaxis(resampled(shifts, ends, time), 1, 0)
+        force = interpolated(time, ends, forces)
+        knife, food = np.moveaxis(interpolated(time, ends, shifts), 1, 0)
         p_true = path.p[1:] + knife
-        depth = resampled(depths, ends, time)
+        depth = interpolated(time, ends, depths)
         buried = np.array([section.above(d) for d in depth]) * self._has_food
         # The edge is pushed where the food is, the flanks in the middle of what is buried.
         arm = np.zeros((len(time), 3))

@@ -27,7 +27,8 @@ from sliceit_drake.cutting.simulate import check_clear, check_energies, check_in
 from sliceit_drake.cutting.solver import CuttingSolver, SurfaceFactors
 from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceTruth, Tissue
 from sliceit_drake.stand_in.protocol import Protocol, Specimen, scaled_food, section_size
-from sliceit_drake.stand_in.world import Path, Run, resampled
+from sliceit_drake.stand_in.world import Path, Run
+from sliceit_drake.tables import interpolated
 
 __all__ = ["FiniteElementSettings", "FiniteElementWorld"]
 
@@ -181,7 +182,7 @@ class FiniteElementWorld:
             section = self._section(food, TetrahedralMesh(moved, mesh.tetrahedra))
             model = _with_tissue(section, specimen, effects)
             check_clear(model, Pose(*_in_cut(model, path.R[0], path.p[0])))
-        return _FiniteElementRun(self, path, specimen, facts, effects, section, model).cut()
+        return _FiniteElementRun(path, specimen, facts, effects, self, section, model).cut()
 
     def _section(self, food: Food, mesh: TetrahedralMesh) -> _Section:
         key = mesh.vertices.tobytes()
@@ -218,26 +219,20 @@ def _with_tissue(section: _Section, specimen: Specimen, effects: Sequence[Effect
     return model
 
 
+@dc.dataclass
 class _FiniteElementRun(Run):
     """One slice of finite elements; without `model` there is none on the board."""
 
-    def __init__(
-        self,
-        world: FiniteElementWorld,
-        path: Path,
-        specimen: Specimen,
-        facts: SliceTruth,
-        effects: Sequence[Effect],
-        section: _Section,
-        model: CuttingModel | None,
-    ) -> None:
-        super().__init__(path, specimen, facts, effects)
-        self.settings, self.knife = world.settings, world.protocol.knife
-        self.section, self.model = section, model
-        self.board = dc.replace(world.protocol.board, height=0.0)
+    world: FiniteElementWorld
+    section: _Section
+    model: CuttingModel | None
+
+    def __post_init__(self) -> None:
+        path, model, protocol = self.path, self.model, self.world.protocol
+        self.knife, self.board = protocol.knife, dc.replace(protocol.board, height=0.0)
         self.solver = None if model is None else CuttingSolver(model, path.period)
         self.state = np.zeros(0) if self.solver is None else self.solver.initial_state()
-        self.fed = Pose(*_in_cut(section.model, path.R[0], path.p[0]))
+        self.fed = Pose(*_in_cut(self.section.model, path.R[0], path.p[0]))
         self.spent = self.since_check = 0.0
         self.cut_fraction = self.travel = self.swept = 0.0
 
@@ -282,12 +277,12 @@ class _FiniteElementRun(Run):
         rates = model is not None and model.material.static_friction > model.material.friction
         longest = 1 if rates else LONGEST
         reach = 0.5 * self.knife.length
-        stretches, parts, cut, shifts = self.drive(self.settings.travel, longest, reach)
+        stretches, parts, cut, shifts = self.drive(self.world.settings.travel, longest, reach)
         # Forces are means over stretches; shifts and cuts are those at their ends.
         T, time = path.period, path.time[1:]
         middle, ends = T * stretches.mean(1), T * stretches[:, 1]
-        forces = resampled(parts, middle, time - 0.5 * T)
-        knife, food = np.moveaxis(resampled(shifts, ends, time), 1, 0)
+        forces = interpolated(time - 0.5 * T, middle, parts)
+        knife, food = np.moveaxis(interpolated(time, ends, shifts), 1, 0)
         p_true = path.p[1:] + knife
         geometry = self.section.model
         height = geometry.to_cut_frame(p_true - food)[:, 2]
@@ -301,7 +296,7 @@ class _FiniteElementRun(Run):
             depth=geometry.top - height,
             flank=flank,
             flank_arm=arm,
-            cut=resampled(cut, ends, time),
+            cut=interpolated(time, ends, cut),
             edge=forces[:, 0],
             normal=forces[:, 1],
             friction=forces[:, 2],

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from sliceit_drake.configuration import quantity
+from sliceit_drake.tables import interpolated
 
 __all__ = ["SensorModel", "measured"]
 
@@ -75,7 +76,7 @@ def measured(
         shown, _state = lfilter([1.0 - keep], [1.0, -keep], shown, axis=0, zi=keep * shown[:1])
     if sensor.delay > 0.0:
         late = np.arange(count) - sensor.delay / period
-        shown = np.column_stack([np.interp(late, np.arange(count), c) for c in shown.T])
+        shown = interpolated(late, np.arange(count), shown)
     # Between the readings the correlated part goes on; only its readings are drawn.
     rows = np.arange(0, count, round(1.0 / (sensor.rate * period)))
     spacing = (rows[1] - rows[0]) * period if len(rows) > 1 else period

@@ -11,7 +11,7 @@ from sliceit_drake.cutting.motion import Motion, MotionPlan, Pose
 from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceTruth
 from sliceit_drake.stand_in.protocol import Specimen
 
-__all__ = ["GRAVITY", "Path", "Run", "World", "resampled"]
+__all__ = ["GRAVITY", "Path", "Run", "World"]
 
 GRAVITY = 9.81
 """m/s2."""
@@ -107,18 +107,22 @@ class Path:
             a = b
 
 
+@dc.dataclass
 class Run(abc.ABC):
     """One slice while it is cut, stretch by stretch of the knife's path.
 
     Attributes:
+        path: Of the knife.
+        specimen, facts: The slice.
+        effects: What is hidden; they have begun.
         force: Force of food and board on the knife in the last stretch, in F [3], N.
     """
 
-    def __init__(
-        self, path: Path, specimen: Specimen, facts: SliceTruth, effects: Sequence[Effect]
-    ) -> None:
-        self.path, self.specimen, self.facts, self.effects = path, specimen, facts, effects
-        self.force = np.zeros(3)
+    path: Path
+    specimen: Specimen
+    facts: SliceTruth
+    effects: Sequence[Effect]
+    force: np.ndarray = dc.field(init=False, default_factory=lambda: np.zeros(3))
 
     @abc.abstractmethod
     def reached(self) -> tuple[float, float, float]:
@@ -199,10 +203,3 @@ class Run(abc.ABC):
             other=other,
             **own,
         )
-
-
-def resampled(values: np.ndarray, known: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Values [M, ...] known at times [M], at other times [N, ...], linearly between them."""
-    rows = values.reshape(len(values), -1).T
-    found = np.column_stack([np.interp(wanted, known, row) for row in rows])
-    return found.reshape(len(wanted), *values.shape[1:])

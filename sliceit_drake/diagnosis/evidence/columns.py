@@ -12,7 +12,6 @@ __all__ = [
     "Column",
     "RecordSensitivity",
     "Sensitivities",
-    "at_times",
     "replicates",
 ]
 
@@ -178,10 +177,3 @@ def replicates(records: Sequence[RecordSensitivity]) -> dict[str, list[int]]:
     for k, record in enumerate(records):
         out.setdefault(record.condition or record.name, []).append(k)
     return out
-
-
-def at_times(values: np.ndarray, time: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Rows [m, ...] at times [m] interpolated to wanted times [n], s: [n, ...]."""
-    flat = values.reshape(len(values), -1)
-    out = np.column_stack([np.interp(wanted, time, column) for column in flat.T])
-    return out.reshape(len(wanted), *values.shape[1:])

@@ -11,8 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import least_squares
 
-from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, at_times, replicates
+from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, replicates
 from sliceit_drake.prediction.noise import MarkovCovariance
+from sliceit_drake.tables import interpolated
 
 __all__ = ["ChannelNoise", "differences", "estimate_noise"]
 
@@ -94,8 +95,8 @@ def differences(
             values.append(r.residual[:count])
             columns.append(r.columns[:count][:, :, own])
         else:
-            values.append(at_times(r.residual, r.time - r.time[0], grid))
-            columns.append(at_times(r.columns[:, :, own], r.time - r.time[0], grid))
+            values.append(interpolated(grid, r.time - r.time[0], r.residual))
+            columns.append(interpolated(grid, r.time - r.time[0], r.columns[:, :, own]))
     mean = np.mean(values, axis=0)
     return [(grid, v - mean, c) for v, c in zip(values, columns, strict=True)]
 

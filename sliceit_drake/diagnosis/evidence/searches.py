@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 
-from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, at_times, replicates
+from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, replicates
+from sliceit_drake.tables import interpolated
 
 __all__ = ["largest_jump", "strongest_frequencies", "unlike_others"]
 
@@ -57,9 +58,10 @@ def unlike_others(records: Sequence[RecordSensitivity]) -> list[np.ndarray]:
         first = records[members[0]]
         since = first.time - first.time[0]
         own = {k: records[k].time - records[k].time[0] for k in members}
-        common = np.median([at_times(records[k].residual, own[k], since) for k in members], axis=0)
+        seen = [interpolated(since, own[k], records[k].residual) for k in members]
+        common = np.median(seen, axis=0)
         for k in members:
-            out[k] = out[k] - at_times(common, since, own[k])
+            out[k] = out[k] - interpolated(own[k], since, common)
     return out
 
 
