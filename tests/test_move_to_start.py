@@ -15,7 +15,7 @@ from sliceit_drake.diagrams.hardware_station import make_edge_kinematics
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.hardware.client import RobotUnavailableError
 from sliceit_drake.hardware.hardware_config import HardwareConfig
-from sliceit_drake.hardware.interruption import catch_signals
+from sliceit_drake.interruption import catch_signals
 from sliceit_drake.robot_run.hardware_run import prepare_hardware_run
 from sliceit_drake.robot_run.move_to_start import MoveToStart
 

@@ -7,11 +7,10 @@ import os
 import signal
 import sys
 import textwrap
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
+from sliceit_drake.interruption import handle_signals
 from sliceit_drake.output_folder import check_output
 
 __all__ = ["main", "make_parser", "run_program"]
@@ -112,8 +111,14 @@ def run_program(parser: argparse.ArgumentParser, arguments: Sequence[str] | None
     # The arrays are small; threads of the linear algebra library would only wait beside the run.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     options = parser.parse_args(arguments)
+    # `nohup` has one ignored, for a reason.
+    ending = [
+        number
+        for number in (signal.SIGTERM, signal.SIGHUP)
+        if signal.getsignal(number) is signal.SIG_DFL
+    ]
     try:
-        with _ended_by_signals():
+        with handle_signals(ending, signal.default_int_handler):
             if isinstance(getattr(options, "output", None), Path):
                 check_output(options.output)
             return options.run(options)
@@ -132,22 +137,6 @@ def run_program(parser: argparse.ArgumentParser, arguments: Sequence[str] | None
         else:
             raise
         return BAD_INPUT
-
-
-@contextmanager
-def _ended_by_signals() -> Iterator[None]:
-    """Lets SIGTERM and SIGHUP interrupt the program as Ctrl-C does."""
-    before = {}
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            # `nohup` has one ignored, for a reason.
-            if signal.getsignal(number) is signal.SIG_DFL:
-                before[number] = signal.signal(number, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _is_bad_input(error: Exception) -> bool:

@@ -20,12 +20,11 @@ import argparse
 import signal
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from sliceit_drake.cli.extras import needs_extra
 from sliceit_drake.cli.progress import StageBars
+from sliceit_drake.interruption import handle_signals
 
 __all__ = ["add_arguments", "run"]
 
@@ -51,26 +50,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-@contextmanager
-def _stop_by(asked: threading.Event) -> Iterator[None]:
-    """Lets the first Ctrl-C or kill set `asked`, and the second interrupt."""
-
-    def ask(*_: object) -> None:
-        if asked.is_set():
-            raise KeyboardInterrupt
-        asked.set()
-        print("\nStopping with a checkpoint; Ctrl-C again stops at once", file=sys.stderr)
-
-    before = {}
-    if threading.current_thread() is threading.main_thread():
-        before = {n: signal.signal(n, ask) for n in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
 def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     with needs_extra("learn"):
@@ -89,8 +68,15 @@ def run(options: argparse.Namespace) -> int:
             bars.show("decisions", steps, config.steps, remark)
 
         asked = threading.Event()
+
+        def ask(*_: object) -> None:
+            if asked.is_set():
+                raise KeyboardInterrupt
+            asked.set()
+            print("\nStopping with a checkpoint; Ctrl-C again stops at once", file=sys.stderr)
+
         try:
-            with _stop_by(asked):
+            with handle_signals((signal.SIGINT, signal.SIGTERM), ask):
                 outcome = train(config, options.output, show, is_stopped=asked.is_set)
         except (KeyboardInterrupt, RuntimeError) as error:
             # A kill that reaches all processes ends the environment's as well.

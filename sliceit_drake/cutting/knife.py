@@ -186,9 +186,7 @@ def load_knife(name: str | Path, field: str = "knife_name") -> NamedKnife:
             field=field,
             fix="Name one of them, or give a YAML file (docs/foods.md).",
         )
-    knife = load_yaml(NamedKnife, file)
-    assert isinstance(knife, NamedKnife)
-    return knife
+    return load_yaml(NamedKnife, file)
 
 
 def section_distance(knife: Knife, y: np.ndarray, height: np.ndarray) -> np.ndarray:

@@ -9,9 +9,9 @@ __all__ = ["rigid_motion"]
 
 
 def rigid_motion(
-    model: CuttingModel, positions: np.ndarray, velocities: np.ndarray, side: int = 0
+    model: CuttingModel, positions: np.ndarray, velocities: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Pose and velocity of a half as if it were rigid.
+    """Pose and velocity of the half at y < 0 as if it were rigid.
 
     The pose is the least-squares fit to its nodes, weighted by their true masses; the velocity has
     their momentum and angular momentum.
@@ -19,13 +19,12 @@ def rigid_motion(
     Args:
         model: The cut.
         positions, velocities: Of the computed nodes in C [N, 3], metres and m/s.
-        side: 0 for the half at y < 0, 1 for that at y > 0.
 
     Returns:
         R [3, 3] and p [3] in C, so that a point at x at rest is now at R x + p; the angular
         velocity [3] in C, rad/s; and the velocity [3] of the point now at the origin of C, m/s.
     """
-    mine = model.split.node_side[model.computed] == side
+    mine = model.split.node_side[model.computed] == 0
     mass = model.true_mass[mine]
     rest, now, v = model.nodes[mine], positions[mine], velocities[mine]
     centre, here = mass @ rest / mass.sum(), mass @ now / mass.sum()

@@ -1,6 +1,6 @@
-"""Names and types of the variables of UR's Real-Time Data Coupling step (RTDE).
+"""Names and types of the variables of UR's Real-Time Data Exchange (RTDE).
 
-From Universal Robots' "Real-Time Data Coupling step (RTDE) guide". The lists hold what the public
+From Universal Robots' "Real-Time Data Exchange (RTDE) guide". The lists hold what the public
 clients ask for, not all that ever existed.
 """
 

@@ -14,8 +14,8 @@ import numpy as np
 from sliceit_drake.hardware.client import RobotState
 from sliceit_drake.hardware.edge_kinematics import EdgeKinematics
 from sliceit_drake.hardware.hardware_config import TouchConfig
-from sliceit_drake.hardware.interruption import raise_if_interrupted
 from sliceit_drake.hardware.rtde_link import LinkStatus, RobotLink
+from sliceit_drake.interruption import raise_if_interrupted
 
 __all__ = ["GuardedTouch", "Touch", "TouchError", "contact_of"]
 

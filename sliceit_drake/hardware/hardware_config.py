@@ -176,9 +176,7 @@ def load_hardware_config(file: str | Path, overrides: str | None = None) -> Hard
     Raises:
         ConfigurationError: Naming file, field and fix.
     """
-    config = load_yaml(HardwareConfig, file, defaults=HardwareConfig(), overrides_text=overrides)
-    assert isinstance(config, HardwareConfig)
-    return config
+    return load_yaml(HardwareConfig, file, overrides_text=overrides)
 
 
 def differing(config: HardwareConfig) -> list[str]:

@@ -1,6 +1,6 @@
 """The robot's own thread: reads each cycle of the controller, judges, and sends.
 
-The diagram and this thread coupling step only their newest values: neither waits for the other.
+The diagram and this thread exchange only their newest values: neither waits for the other.
 """
 
 import csv

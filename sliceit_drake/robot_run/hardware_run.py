@@ -29,8 +29,8 @@ from sliceit_drake.hardware.checks import (
 )
 from sliceit_drake.hardware.client import RobotClient, RobotState
 from sliceit_drake.hardware.hardware_config import HardwareConfig
-from sliceit_drake.hardware.interruption import raise_if_interrupted
 from sliceit_drake.hardware.rtde_link import RobotLink
+from sliceit_drake.interruption import raise_if_interrupted
 from sliceit_drake.robot_run.plan_check import JointPlan, check_plan, plan_joints
 from sliceit_drake.systems.agent import AgentSystem
 from sliceit_drake.systems.motion_sources import placed_motion

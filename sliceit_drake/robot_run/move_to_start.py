@@ -7,8 +7,8 @@ import numpy as np
 from sliceit_drake.diagrams.hardware_station import make_edge_kinematics
 from sliceit_drake.hardware.checks import Check
 from sliceit_drake.hardware.client import RobotUnavailableError
-from sliceit_drake.hardware.interruption import raise_if_interrupted
 from sliceit_drake.hardware.safety import robot_fault
+from sliceit_drake.interruption import raise_if_interrupted
 from sliceit_drake.robot_run.hardware_run import HardwareRun
 
 __all__ = ["MoveToStart"]

@@ -12,7 +12,7 @@ from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.hardware.client import RobotClient, is_loopback
 from sliceit_drake.hardware.guarded_touch import TouchError
 from sliceit_drake.hardware.hardware_config import HardwareConfig
-from sliceit_drake.hardware.interruption import catch_signals
+from sliceit_drake.interruption import catch_signals
 from sliceit_drake.robot_run.board_touch import BoardTouch, check_height
 from sliceit_drake.robot_run.hardware_run import (
     HardwareRun,

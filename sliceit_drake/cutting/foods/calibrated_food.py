@@ -71,7 +71,6 @@ def load_calibrated_food(name: str | Path) -> CalibratedFood:
             field="calibration",
             fix="Name one of them, or give the food.yaml of a calibration.",
         )
-    food = load_yaml(CalibratedFood, file)
-    assert isinstance(food, CalibratedFood)
+    food: CalibratedFood = load_yaml(CalibratedFood, file)
     food.food.look_beside(file)
     return food
