@@ -73,8 +73,7 @@ def board_wrench(
     """Wrench of the board on a knife that moves on a prescribed path, frictionless.
 
     Args:
-        board: The board.
-        knife: The knife.
+        board, knife: What meets.
         R_WK: Rotation of the knife frame [3, 3].
         p_WK: Position of the edge's middle [3], metres.
         v_WK: Velocity of that point [3], m/s.

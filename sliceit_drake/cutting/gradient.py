@@ -178,11 +178,9 @@ class SliceAdjoint:
     def _adjoint_of_coupling_step(
         self, run: SliceRun, e: int, weights: np.ndarray, adj_state: np.ndarray
     ) -> _Back:
-        """Back through coupling step e, whose sub-steps the workspace holds.
+        """Back through coupling step e of a slice, whose sub-steps the workspace holds.
 
         Args:
-            run: The slice.
-            e: The coupling step.
             weights: Adjoint of its wrench [6].
             adj_state: Adjoint of the state at its end.
         """

@@ -291,14 +291,7 @@ def prepare_cut(
     numerics: Numerics,
     effects: Effects | None = None,
 ) -> CuttingModel:
-    """Prepares a cut.
-
-    Args:
-        geometry: The geometry of the cut.
-        material: Food.
-        knife: Knife.
-        numerics: Discretisation.
-        effects: What goes beyond the base model; None for nothing.
+    """Prepares a cut; without `effects` it is that of the base model.
 
     Raises:
         TimeStepError: The step is beyond the limit and masses are not scaled.

@@ -358,22 +358,20 @@ class Motion:
 
     Before the start the knife rests at the start, after the end at the end.
 
+    Args:
+        plan: The segments.
+        start: Pose X_WK at the start. A first segment that is placed in the world as it was
+            recorded starts from its own first pose instead.
+
     Attributes:
         duration: Time from start to end, s.
+
+    Raises:
+        ConfigurationError: If the plan is invalid, or a record in it is.
+        ValueError: If `start` is not a pose.
     """
 
     def __init__(self, plan: MotionPlan, start: Pose) -> None:
-        """Places a plan.
-
-        Args:
-            plan: The segments.
-            start: Pose X_WK at the start. A first segment that is placed in the world as it was
-                recorded starts from its own first pose instead.
-
-        Raises:
-            ConfigurationError: If the plan is invalid, or a record in it is.
-            ValueError: If `start` is not a pose.
-        """
         validate(plan, "motion")
         first = plan.segments[0]
         if isinstance(first, Recorded) and first.placement == "world":

@@ -145,9 +145,7 @@ def check_energies(
     """Refuses inverted elements and too much kinetic energy.
 
     Args:
-        energies: Energies of the state.
-        dissipated: Since the start, J.
-        model: The cut.
+        energies, dissipated, model: As for `energy_ratio`.
         time: For the message, s.
 
     Returns:

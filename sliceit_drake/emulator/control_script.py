@@ -66,15 +66,14 @@ def register_offset(text: str) -> int | None:
 
 
 class ControlScript:
-    """The program, one `step` a cycle."""
+    """The program, one `step` a cycle.
+
+    Args:
+        controller: The controller whose registers and arm it uses.
+        offset: First register.
+    """
 
     def __init__(self, controller: Controller, offset: int = 0) -> None:
-        """Prepares to answer commands.
-
-        Args:
-            controller: The controller whose registers and arm it uses.
-            offset: First register.
-        """
         self._controller = controller
         self._offset = offset
         self._main = self._main_loop()

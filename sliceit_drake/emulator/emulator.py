@@ -62,6 +62,12 @@ class ControllerClock:
 class Emulator:
     """One emulated robot on one address; ports are those of a UR.
 
+    Args:
+        robot: What moves.
+        address: Loopback address, such as 127.0.0.2; one emulator each.
+        clock: Pace.
+        config: Kind of controller.
+
     Attributes:
         address: Address on which it listens.
         controller: The controller.
@@ -69,6 +75,9 @@ class Emulator:
         rtde: The RTDE service.
         late_cycles: Cycles that began more than half a period late.
         missed_cycles: Cycles in lockstep that ran without a command.
+
+    Raises:
+        OSError: A port is taken.
     """
 
     def __init__(
@@ -78,17 +87,6 @@ class Emulator:
         clock: ControllerClock | None = None,
         config: ControllerConfig | None = None,
     ) -> None:
-        """Opens the ports.
-
-        Args:
-            robot: What moves.
-            address: Loopback address, such as 127.0.0.2; one emulator each.
-            clock: Pace.
-            config: The controller.
-
-        Raises:
-            OSError: A port is taken.
-        """
         self.address = address
         self.controller = controller = Controller(robot, config)
         self.late_cycles = self.missed_cycles = 0

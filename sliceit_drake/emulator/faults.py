@@ -24,7 +24,14 @@ _CB3_RATE = 125.0
 
 
 class FaultInjector:
-    """Does what `FAULTS` says when the controller's time has come."""
+    """Does what `FAULTS` says when the controller's time has come.
+
+    Args:
+        controller: The controller on which faults act.
+        hub: Its ports.
+        rtde: Its RTDE service.
+        services: Services by the name that ``close`` has for them.
+    """
 
     def __init__(
         self,
@@ -33,14 +40,6 @@ class FaultInjector:
         rtde: RtdeServer,
         services: Mapping[str, Service],
     ) -> None:
-        """Prepares.
-
-        Args:
-            controller: The controller on which faults act.
-            hub: Its ports.
-            rtde: Its RTDE service.
-            services: Services by the name that ``close`` has for them.
-        """
         self._controller, self._hub, self._services = controller, hub, services
         self._number = itertools.count()
         self._waiting: list[tuple[float, int, Callable[[], object], str]] = []

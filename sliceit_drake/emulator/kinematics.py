@@ -46,14 +46,13 @@ def pose_of_matrix(X: np.ndarray) -> np.ndarray:
 
 
 class Posture:
-    """The arm at some joint positions.
+    """The arm at joint positions `q` [6], rad.
 
     Attributes:
         X_BF: Pose of the flange in the base [4, 4].
     """
 
     def __init__(self, q: ArrayLike) -> None:
-        """Places the links for joint positions `q` [6], rad."""
         # Frames of base, links and flange; joint i turns about the z axis of frame i.
         self._frames = [np.eye(4)]
         for (d, a, alpha), angle in zip(_DH, np.asarray(q, float).tolist(), strict=True):

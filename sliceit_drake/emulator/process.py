@@ -23,19 +23,18 @@ class EmulatorError(RuntimeError):
 
 
 class PendantClient:
-    """A connection to the own port of a running emulator."""
+    """A connection to the own port of a running emulator.
+
+    Args:
+        address: Address of the emulator.
+        timeout: Wall time to wait for an answer, s.
+        port: Port of the emulator.
+
+    Raises:
+        OSError: Nothing answers there.
+    """
 
     def __init__(self, address: str, timeout: float = 5.0, port: int = PENDANT_PORT) -> None:
-        """Connects.
-
-        Args:
-            address: Address of the emulator.
-            timeout: Wall time to wait for an answer, s.
-            port: Port of the emulator.
-
-        Raises:
-            OSError: Nothing answers there.
-        """
         self._socket = socket.create_connection((address, port), timeout)
         self._file = self._socket.makefile("rwb")
 
@@ -88,9 +87,20 @@ class EmulatorProcess(contextlib.AbstractContextManager["EmulatorProcess"]):
 
     The child ends with this process, however that ends.
 
+    Args:
+        scenario: What is on the table; None for an arm alone that follows without dynamics.
+        address: Loopback address; one emulator each.
+        pace: Controller time per wall time.
+        lockstep: See `emulator.ControllerClock`.
+        options: More options of the command.
+        timeout: Wall time that it may take to start, s.
+
     Attributes:
         address: Address on which it listens.
         pendant: Client that injects faults and asks how it does.
+
+    Raises:
+        EmulatorError: It did not start; the message has what it said.
     """
 
     def __init__(
@@ -102,19 +112,6 @@ class EmulatorProcess(contextlib.AbstractContextManager["EmulatorProcess"]):
         options: Sequence[str] = (),
         timeout: float = 60.0,
     ) -> None:
-        """Starts it and waits until it answers.
-
-        Args:
-            scenario: What is on the table; None for an arm alone that follows without dynamics.
-            address: Loopback address; one emulator each.
-            pace: Controller time per wall time.
-            lockstep: See `emulator.ControllerClock`.
-            options: More options of the command.
-            timeout: Wall time that it may take to start, s.
-
-        Raises:
-            EmulatorError: It did not start; the message has what it said.
-        """
         self.address = address
         command = [sys.executable, "-m", "sliceit_drake.cli.main", "emulate"]
         command += ["--arm-alone"] if scenario is None else [str(scenario)]

@@ -90,19 +90,16 @@ class RobotModel(Protocol):
 class KinematicRobot:
     """An arm without mass: planned motions are followed exactly, ``servoj`` with its lag.
 
-    The sensor feels nothing.
+    It begins at rest at `START`. The sensor feels nothing.
     """
 
-    def __init__(self, positions: ArrayLike = START) -> None:
-        """Puts the arm at rest at `positions` [6], rad."""
-        q = np.array(positions, float)
+    def __init__(self) -> None:
         none = np.zeros(JOINTS)
-        self.state = ArmState(q, none, np.zeros(6), none)
+        self.state = ArmState(np.array(START), none, np.zeros(6), none)
         self.gravity = np.array([0.0, 0.0, -9.81])
         self.warnings: list[str] = []
 
     def step(self, targets: ArrayLike, servo: ServoConfig | None) -> ArmState:
-        """See `RobotModel`."""
         q, v = self.state.positions, self.state.velocities
         if servo is None:
             target = np.array(targets, float)
@@ -113,10 +110,9 @@ class KinematicRobot:
         return self.state
 
     def zero_sensor(self) -> None:
-        """See `RobotModel`."""
+        pass
 
     def put_fresh_food(self, scenario: "Scenario | None" = None) -> None:
-        """See `RobotModel`."""
         raise ConfigurationError(
             "there is none under an arm alone",
             field="fresh_food",

@@ -86,21 +86,19 @@ class JointTargets(LeafSystem):
 class StationRobot:
     """Arm, knife, food, board and sensor of a scenario, as `sliceit simulate` has them.
 
-    Only the compliance controller is missing: that is the client's. All targets go through the
-    scenario's servo, planned motions too, which therefore lag by `ServoConfig.lag`.
+    A `RobotModel`. Only the compliance controller is missing: that is the client's. All targets go
+    through the scenario's servo, planned motions too, which therefore lag by `ServoConfig.lag`.
 
     Attributes:
         payload: Mass of all beyond the flange, kg.
         payload_cog: Its centre in the flange [3], m.
         is_zeroed: Whether the sensor starts at zero, the tool's weight included.
+
+    Raises:
+        ConfigurationError, MeshError, TimeStepError: The scenario cannot be built.
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        """Builds the station and puts the arm at the scenario's start.
-
-        Raises:
-            ConfigurationError, MeshError, TimeStepError: The scenario cannot be built.
-        """
         self._scenario = scenario
         station = _station_of(scenario)
         simulator = Simulator(station)
@@ -124,7 +122,6 @@ class StationRobot:
         self.state = self._read()
 
     def step(self, targets: ArrayLike, servo: ServoConfig | None) -> ArmState:
-        """See `robot_model.RobotModel`."""
         self._check_servo(servo)
         self._targets.set_targets(self._simulator.get_mutable_context(), targets)
         self._cycles += 1
@@ -138,11 +135,9 @@ class StationRobot:
         return self.state
 
     def zero_sensor(self) -> None:
-        """See `robot_model.RobotModel`."""
         self._station.sensor.tare(self._sensor_context)
 
     def put_fresh_food(self, scenario: Scenario | None = None) -> None:
-        """See `robot_model.RobotModel`."""
         old = self._scenario
         if scenario is not None:
             if scenario.knife != old.knife:

@@ -62,9 +62,8 @@ class PrioritizedSAC(SAC):
     """SAC whose replay buffer is a `PrioritizedReplayBuffer`.
 
     Args:
-        beta_end: Power of the importance weights after `beta_steps`; it grows linearly from that
-            of the replay buffer.
-        beta_steps: Steps in which it grows; None to leave it as it is.
+        beta_steps: Steps in which the power of the importance weights grows linearly to 1 from that
+            of the replay buffer; None to leave it as it is.
         value_limit: Bound on values, from observations [batch, n] to [batch, 1]; None for none.
             Where an episode can linger, an overestimated value feeds on itself, and fades only with
             the discount.
@@ -75,12 +74,11 @@ class PrioritizedSAC(SAC):
     def __init__(
         self,
         *arguments: Any,
-        beta_end: float = 1.0,
         beta_steps: int | None = None,
         value_limit: Callable[[torch.Tensor], torch.Tensor] | None = None,
         **options: Any,
     ) -> None:
-        self.beta_end, self.beta_steps, self.value_limit = beta_end, beta_steps, value_limit
+        self.beta_steps, self.value_limit = beta_steps, value_limit
         self.running: dict[str, float] = {}
         super().__init__(*arguments, replay_buffer_class=PrioritizedReplayBuffer, **options)
         self.beta_begin = self.replay_buffer.beta
@@ -93,7 +91,7 @@ class PrioritizedSAC(SAC):
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         if self.beta_steps is not None:
             done = min(self.num_timesteps / self.beta_steps, 1.0)
-            self.replay_buffer.set_beta(self.beta_begin + done * (self.beta_end - self.beta_begin))
+            self.replay_buffer.set_beta(self.beta_begin + done * (1.0 - self.beta_begin))
         self.policy.set_training_mode(True)
         for _ in range(gradient_steps):
             self._train_batch(batch_size)

@@ -236,6 +236,17 @@ class ComplianceController(LeafSystem):
         joint_velocities_command: [n], rad per *virtual* second. A real second has
             ``iterations * virtual_time_step / period`` virtual ones.
         commanded_pose: RigidTransform X_WE at `joint_positions_command`.
+
+    Args:
+        config: Mode, steps and values for unconnected ports. Later changes have no effect.
+        chain: The arm from B to E.
+        X_WB: Pose of the arm's base in the world; None for the identity.
+        X_EC: Pose of the compliance reference in E; None for the identity.
+        X_ES: Pose of the sensor in E; None for a sensor at the last moving link's frame (the tool
+            flange of a UR5e).
+
+    Raises:
+        ConfigurationError: If the configuration or the chain is invalid.
     """
 
     def __init__(
@@ -247,19 +258,6 @@ class ComplianceController(LeafSystem):
         X_EC: RigidTransform | None = None,
         X_ES: RigidTransform | None = None,
     ) -> None:
-        """Makes the controller of an arm.
-
-        Args:
-            config: Mode, steps and values for unconnected ports. Later changes have no effect.
-            chain: The arm from B to E.
-            X_WB: Pose of the arm's base in the world; None for the identity.
-            X_EC: Pose of the compliance reference in E; None for the identity.
-            X_ES: Pose of the sensor in E; None for a sensor at the last moving link's frame (the
-                tool flange of a UR5e).
-
-        Raises:
-            ConfigurationError: If the configuration or the chain is invalid.
-        """
         super().__init__()
         validate(config, "compliance_controller")
         config = self._config = copy.deepcopy(config)

@@ -21,25 +21,23 @@ class MotionSource(LeafSystem):
 
     It has no inputs and no state.
 
+    Args:
+        plan: The segments of the motion.
+        X_WK: Pose of the knife at time 0. A plan that begins with a record placed in the world
+            starts from the record's first pose instead.
+
     Outputs:
         target_pose: RigidTransform X_WK.
         target_velocity: SpatialVelocity V_WK of the knife frame K in W.
 
     Attributes:
         motion: The motion; its `phase_at` names the phase at a time.
+
+    Raises:
+        ConfigurationError: If the plan is invalid, or a record in it is.
     """
 
     def __init__(self, plan: MotionPlan, X_WK: RigidTransform) -> None:
-        """Places a plan at a start pose.
-
-        Args:
-            plan: The segments of the motion.
-            X_WK: Pose of the knife at time 0. A plan that begins with a record placed in the world
-                starts from the record's first pose instead.
-
-        Raises:
-            ConfigurationError: If the plan is invalid, or a record in it is.
-        """
         super().__init__()
         self.motion = placed_motion(plan, X_WK)
         pose, velocity = Value(RigidTransform()), Value(SpatialVelocity.Zero())

@@ -94,7 +94,6 @@ class PressByForce:
     """Speed of lifting."""
 
     def decide(self, observation: PolicyObservation) -> PolicyAction:
-        """See `Policy`."""
         if observation.time >= self.cut_time:
             return PolicyAction(0.0, -self.lift_speed)
         force = float(np.linalg.norm(observation.wrenches[:, 3:], axis=1).mean())

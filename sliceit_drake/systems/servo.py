@@ -49,21 +49,21 @@ class ServoLaw:
     The state [2 + n, J] of J joints is their positions, their velocities, and the targets of the
     last n periods, the oldest first, which are still on their way.
 
+    It is integrated exactly.
+
+    Args:
+        config: Its parameters.
+        period: Time between states, seconds: a plant's time step, or a controller's cycle.
+
     Attributes:
         A: Matrix [2 + n, 2 + n] from the state to the next, the same for each joint.
         B: Matrix [2 + n, 1] from the targets to the next state.
+
+    Raises:
+        ConfigurationError: If the delay is not a whole number of periods.
     """
 
     def __init__(self, config: ServoConfig, period: float) -> None:
-        """Integrates the law exactly.
-
-        Args:
-            config: Its parameters.
-            period: Time between states, seconds: a plant's time step, or a controller's cycle.
-
-        Raises:
-            ConfigurationError: If the delay is not a whole number of periods.
-        """
         n = round(config.delay / period)
         if abs(n * period - config.delay) > 1e-6 * period:
             raise ConfigurationError(
@@ -124,19 +124,16 @@ class Servo(Diagram):
         desired_state: Positions and velocities asked of the arm [12], rad and rad/s.
         desired_acceleration: Mean acceleration until the next step [6], rad/s2; depends directly on
             the targets.
+
+    Args:
+        config, period: As for `ServoLaw`; the period is the plant's time step, seconds.
+        initial_positions: Where targets and motion rest in the default context [6], rad.
+
+    Raises:
+        ConfigurationError: If the delay is not a whole number of periods.
     """
 
     def __init__(self, config: ServoConfig, period: float, initial_positions: ArrayLike) -> None:
-        """Builds the servo at rest.
-
-        Args:
-            config: Its parameters.
-            period: The plant's time step, seconds.
-            initial_positions: Where targets and motion start in the default context [6], rad.
-
-        Raises:
-            ConfigurationError: If the delay is not a whole number of periods.
-        """
         super().__init__()
         self._law = ServoLaw(config, period)
         # Each joint alone; Drake's state is the law's, row by row.

@@ -115,6 +115,15 @@ class WrenchSensor(LeafSystem):
 
     Parameters:
         0: Seed of noise and random walk [1].
+
+    Args:
+        plant: Finalized discrete plant, whose reaction forces will be connected.
+        weld: Joint between the arm (parent) and the tool (child).
+        exchange_period: Period of the readings, seconds; a multiple of the plant's time step.
+        config: The sensor's imperfections.
+
+    Raises:
+        ConfigurationError: If the periods do not fit, or the plant's ports are sampled.
     """
 
     def __init__(
@@ -124,17 +133,6 @@ class WrenchSensor(LeafSystem):
         exchange_period: float,
         config: WrenchSensorConfig,
     ) -> None:
-        """Declares a sensor at a weld of a plant.
-
-        Args:
-            plant: Finalized discrete plant, whose reaction forces will be connected.
-            weld: Joint between the arm (parent) and the tool (child).
-            exchange_period: Period of the readings, seconds; a multiple of the plant's time step.
-            config: The sensor's imperfections.
-
-        Raises:
-            ConfigurationError: If the periods do not fit, or the plant's ports are sampled.
-        """
         super().__init__()
         self._hold = max(1, round(config.sample_period / exchange_period))
         if config.sample_period > 0.0 and (
@@ -223,10 +221,7 @@ class WrenchSensor(LeafSystem):
         """Zeroes the sensor: what it senses now, drift included, is subtracted from now on.
 
         The bias stays, and readings on their way arrive as they are. Without effect on a sensor
-        that has not read yet.
-
-        Args:
-            context: The sensor's own context.
+        that has not read yet. The context is the sensor's own.
         """
         x = context.get_mutable_discrete_state_vector().get_mutable_value()
         if x[_READINGS] > 0.0:

@@ -81,11 +81,7 @@ class ParameterDistribution:
         return {n: float(from_unit(u, low, high, log)) for n, u, low, high, log in ranges}
 
     def intervals(self, level: float = 0.9) -> dict[str, tuple[float, float]]:
-        """Central intervals by name, in the parameters' units, within their ranges.
-
-        Args:
-            level: Probability within, such as 0.9.
-        """
+        """Central intervals by name, in the parameters' units, that hold a probability `level`."""
         reach = float(ndtri(0.5 + level / 2.0)) * self.deviation
         low = self.values(np.clip(np.array(self.mean) - reach, 0.0, 1.0))
         high = self.values(np.clip(np.array(self.mean) + reach, 0.0, 1.0))
@@ -133,11 +129,7 @@ class ParameterDistribution:
         raise ValueError(f"{count} of {n} samples were found within the ranges")
 
     def draw(self, rng: np.random.Generator, n: int) -> list[dict[str, float]]:
-        """A sample of n sets of parameters by name, all within the ranges.
-
-        Raises:
-            ValueError: So little of the distribution is within the ranges that none was found.
-        """
+        """A sample as of `draw_places`, as n sets of parameters by name."""
         if not self.names:
             return [{}] * n
         return [self.values(place) for place in self.draw_places(rng, n)]

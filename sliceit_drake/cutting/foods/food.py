@@ -75,13 +75,7 @@ class Food:
 def make_food_model(
     food: Food, knife: Knife, numerics: Numerics, refinement: float = 1.0
 ) -> CuttingModel:
-    """The prepared cut of a food that rests on the board z = 0 of F.
-
-    Args:
-        food: The food.
-        knife: The knife.
-        numerics: Discretisation.
-        refinement: Elements along an edge, relative to the food's mesh.
+    """The prepared cut of a food; see `make_food_geometry`.
 
     Raises:
         MeshError, ConfigurationError: As `make_cut_geometry`.
@@ -92,7 +86,7 @@ def make_food_model(
 
 
 def make_food_geometry(food: Food, refinement: float = 1.0) -> CutGeometry:
-    """The geometry of that cut.
+    """The geometry of the cut of a food that rests on the board z = 0 of F.
 
     Args:
         food: The food.
