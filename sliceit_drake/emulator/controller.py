@@ -20,9 +20,8 @@ from sliceit_drake.emulator.modes import (
     SafetyMode,
 )
 from sliceit_drake.emulator.motions import ScriptError, slow_down
-from sliceit_drake.emulator.registers import InputRegisters
 from sliceit_drake.emulator.robot_model import CYCLE, RobotModel, SimulationStopped
-from sliceit_drake.emulator.variables import OUTPUTS, zero
+from sliceit_drake.emulator.variables import OUTPUTS, InputRegisters, zero
 from sliceit_drake.systems.servo import ServoConfig
 
 __all__ = ["Controller", "ControllerConfig", "Program"]

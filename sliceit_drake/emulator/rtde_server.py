@@ -17,9 +17,8 @@ from sliceit_drake.emulator.frames import (
     take_frames,
 )
 from sliceit_drake.emulator.modes import MessageLevel
-from sliceit_drake.emulator.registers import IN_USE
 from sliceit_drake.emulator.robot_model import CYCLE
-from sliceit_drake.emulator.variables import NOT_FOUND, output_type
+from sliceit_drake.emulator.variables import IN_USE, NOT_FOUND, output_type
 
 __all__ = ["RATE", "RtdeServer"]
 

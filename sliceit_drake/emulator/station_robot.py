@@ -4,7 +4,7 @@ import dataclasses as dc
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.common.value import AbstractValue, Value
+from pydrake.common.value import Value
 from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
@@ -22,6 +22,7 @@ from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.emulator.kinematics import forward
 from sliceit_drake.emulator.robot_model import CYCLE, ArmState, SimulationStopped
 from sliceit_drake.systems.analytic_cutter import is_no_food
+from sliceit_drake.systems.declare import declare_output
 from sliceit_drake.systems.servo import JOINTS, ServoConfig
 
 __all__ = ["JointTargets", "StationRobot"]
@@ -56,12 +57,8 @@ class JointTargets(LeafSystem):
         self._command = self.DeclareDiscreteState(JOINTS)
         self._next = self.DeclareDiscreteState(JOINTS)
         self.DeclareStateOutputPort("joint_positions_command", self._command)
-        self.DeclareAbstractOutputPort(
-            "commanded_pose",
-            lambda: Value(RigidTransform()),
-            self._calc_commanded_pose,
-            {self.discrete_state_ticket(self._command)},
-        )
+        held = {self.discrete_state_ticket(self._command)}
+        declare_output(self, "commanded_pose", Value(RigidTransform()), self._commanded_pose, held)
         self.DeclareInitializationDiscreteUpdateEvent(self._start)
         self.DeclarePeriodicDiscreteUpdateEvent(CYCLE, 0.0, self._update)
 
@@ -78,9 +75,9 @@ class JointTargets(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._command, context.get_discrete_state(self._next).value())
 
-    def _calc_commanded_pose(self, context: Context, output: AbstractValue) -> None:
+    def _commanded_pose(self, context: Context) -> RigidTransform:
         q = context.get_discrete_state(self._command).value()
-        output.set_value(self._X_WB @ RigidTransform(forward(q)) @ self._X_TK)
+        return self._X_WB @ RigidTransform(forward(q)) @ self._X_TK
 
 
 class StationRobot:

@@ -1,10 +1,21 @@
-"""Names and types of the variables of UR's Real-Time Data Exchange (RTDE).
+"""The variables of UR's Real-Time Data Exchange (RTDE): names, types, and what clients write.
 
 From Universal Robots' "Real-Time Data Exchange (RTDE) guide". The lists hold what the public
 clients ask for, not all that ever existed.
 """
 
-__all__ = ["INPUTS", "NOT_FOUND", "OUTPUTS", "TYPES", "output_type", "zero"]
+from collections.abc import Hashable, Mapping, Sequence
+
+__all__ = [
+    "INPUTS",
+    "IN_USE",
+    "NOT_FOUND",
+    "OUTPUTS",
+    "TYPES",
+    "InputRegisters",
+    "output_type",
+    "zero",
+]
 
 TYPES = {
     "BOOL": "?",
@@ -22,6 +33,9 @@ TYPES = {
 
 NOT_FOUND = "NOT_FOUND"
 """Word in place of the type of a variable that the controller does not have."""
+
+IN_USE = "IN_USE"
+"""Word in place of the type of an input that another client holds."""
 
 _OUTPUT_LISTS = {
     "DOUBLE": """timestamp actual_execution_time target_execution_time speed_scaling
@@ -91,3 +105,61 @@ def zero(kind: str) -> int | float | bool | tuple:
     """The value 0 of a type; a tuple for vectors."""
     element = {"d": 0.0, "?": False}.get(TYPES[kind][-1], 0)
     return (element,) * int(TYPES[kind][:-1]) if len(TYPES[kind]) > 1 else element
+
+
+class InputRegisters:
+    """Inputs of the controller. Each belongs to the client that first asked for it.
+
+    They keep their values after a package, after their writer has gone, and across programs.
+
+    Attributes:
+        values: Value by name.
+        written_at: Controller time of the last package with a name, s; only names once written.
+    """
+
+    def __init__(self) -> None:
+        self.values = {name: zero(kind) for name, kind in INPUTS.items()}
+        self.written_at: dict[str, float] = {}
+        self._owners: dict[str, Hashable] = {}
+
+    def claim(self, owner: Hashable, names: Sequence[str]) -> list[str]:
+        """Asks for inputs; they are given only if all can be.
+
+        Args:
+            owner: Who asks.
+            names: Variables.
+
+        Returns:
+            Their types; `NOT_FOUND` or `IN_USE` for those that cannot be had.
+        """
+        types = []
+        for name in names:
+            held = self._owners.get(name, owner) != owner
+            types.append(IN_USE if held else INPUTS.get(name, NOT_FOUND))
+        if not {IN_USE, NOT_FOUND} & set(types):
+            self._owners.update(dict.fromkeys(names, owner))
+        return types
+
+    def claim_free(self, owner: Hashable, names: Sequence[str]) -> list[str]:
+        """Takes those of `names` that nobody holds, and returns them."""
+        free = [name for name in names if name not in self._owners]
+        self._owners.update(dict.fromkeys(free, owner))
+        return free
+
+    def release(self, owner: Hashable) -> None:
+        """Frees all inputs of an owner."""
+        self._owners = {name: o for name, o in self._owners.items() if o != owner}
+
+    def write(self, values: Mapping[str, int | float | bool | tuple], time: float) -> None:
+        """Sets inputs at a controller time, s."""
+        self.values.update(values)
+        self.written_at.update(dict.fromkeys(values, time))
+
+    def integer(self, index: int) -> int:
+        """input_int_register_<index>."""
+        return int(self.values[f"input_int_register_{index}"])  # type: ignore[arg-type]
+
+    def doubles(self, index: int, count: int) -> list[float]:
+        """`count` input_double_registers from `index` on."""
+        names = (f"input_double_register_{i}" for i in range(index, index + count))
+        return [float(self.values[name]) for name in names]  # type: ignore[arg-type]

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sliceit_drake.hardware.client import RobotState
 from sliceit_drake.hardware.edge_kinematics import EdgeKinematics
 from sliceit_drake.hardware.hardware_config import TouchConfig
 from sliceit_drake.hardware.rtde_link import LinkStatus, RobotLink
@@ -89,7 +88,11 @@ class GuardedTouch:
         Raises:
             TouchError: Nothing was touched, or the safety layer stopped the robot.
         """
-        forces = np.array([state.wrench[:3] for state in self._watch(BASELINE)])
+        status, rows = self._link.latest(), []
+        for _ in range(BASELINE):
+            status = self._next(status)
+            rows.append(status.state.wrench[:3])
+        forces = np.array(rows)
         zero = forces.mean(axis=0)
         noise = float(np.std(np.linalg.norm(forces - zero, axis=1)))
         stop = self._link.arm()
@@ -130,15 +133,6 @@ class GuardedTouch:
         self._way = self._way + dt * self._speed
         if is_up and self._way < 1e-6:
             self._way, self._speed = 0.0, 0.0
-
-    def _watch(self, count: int) -> list[RobotState]:
-        """The next states of the robot."""
-        status = self._link.latest()
-        states: list[RobotState] = []
-        while len(states) < count:
-            status = self._next(status)
-            states.append(status.state)
-        return states
 
     def _next(self, status: LinkStatus) -> LinkStatus:
         """The next state of the robot."""

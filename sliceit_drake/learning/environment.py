@@ -165,8 +165,7 @@ class SlicingEnv(gymnasium.Env):
         if food not in self._built:
             rng = np.random.default_rng([VARIANT_SEED, self.task.foods.index(food)])
             station = make_agent_station(self.task, food, rng)
-            simulator = Simulator(station)
-            self._built[food] = station, simulator
+            self._built[food] = station, Simulator(station)
         return self._built[food]
 
     def _output(self, port: str) -> Any:

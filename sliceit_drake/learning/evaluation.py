@@ -18,6 +18,7 @@ from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.learning.task import Limits
 from sliceit_drake.systems.agent import AgentConfig, Decide
+from sliceit_drake.systems.cutting_system import COMPLETE
 
 __all__ = ["LIMITS", "SliceMetrics", "SliceTrace", "cut_slice", "slice_metrics"]
 
@@ -27,8 +28,6 @@ LIMITS = Limits(force=150.0, torque=30.0, workspace=(0.05, 0.1, 0.1745))
 """Greater than in training: what a policy does over its sensor's limit is measured too."""
 CONTACT = 0.5
 """Force from which a sample counts as contact, N."""
-COMPLETE = 0.999
-"""Fraction of a section from which a slice counts as cut off."""
 
 
 @dc.dataclass(frozen=True)

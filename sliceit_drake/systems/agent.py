@@ -33,7 +33,7 @@ from pydrake.systems.framework import Context, DiscreteStateIndex, DiscreteValue
 from sliceit_drake.configuration import ConfigurationError, choice, quantity
 from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.systems.declare import declare_cached, declare_output
-from sliceit_drake.systems.envelope import envelope, envelope_time
+from sliceit_drake.systems.policy import envelope, envelope_time
 
 __all__ = ["ACTIONS", "ERROR", "AgentConfig", "AgentSystem", "Decide", "observation_names"]
 

@@ -97,11 +97,10 @@ class CuttingSystem(KnifeForceSystem):
         self._R_CW, self._offset, self._X_WC = [], [], []
         for solver, X in zip(self.solvers, self.food_poses, strict=True):
             R_WC = X.rotation().matrix() @ solver.model.X_FC_rotation
+            p_WC = X.multiply(solver.model.X_FC_position)
             self._R_CW.append(R_WC.T)
-            self._offset.append(R_WC.T @ X.multiply(solver.model.X_FC_position))
-            self._X_WC.append(
-                RigidTransform(RotationMatrix(R_WC), X.multiply(solver.model.X_FC_position))
-            )
+            self._offset.append(R_WC.T @ p_WC)
+            self._X_WC.append(RigidTransform(RotationMatrix(R_WC), p_WC))
         self._check_every = max(1, round(check_period / self.exchange_period))
         size = max(s.state_size for s in self.solvers)
         self._food = self.DeclareDiscreteState(self._padded(self.solvers[0].initial_state(), size))
@@ -227,10 +226,10 @@ class CuttingSystem(KnifeForceSystem):
     def add_visualizer(
         self, builder: DiagramBuilder, meshcat: Meshcat, period: float
     ) -> FoodVisualizer:
-        corners = max(len(surface.ends) for surface in self.surfaces)
+        count = len(self.solvers)
         visualizer = builder.AddNamedSystem(
             "food_visualizer",
-            FoodVisualizer(self.scene(), corners, len(self.solvers), meshcat, period),
+            FoodVisualizer(self.scene(), self._corners, count, meshcat, period),
         )
         for name in ("surface_vertices", "surface_damage", "food_index", "slice_pose"):
             builder.Connect(self.GetOutputPort(name), visualizer.GetInputPort(name))
@@ -367,14 +366,11 @@ class CuttingSystem(KnifeForceSystem):
             spent = float(balance[SPENT].sum() - new.value(self._spent_before)[0])
             ratio = check_energies(energies, spent, solver.model, time)
             *_, largest_ratio, least_volume_ratio = new.value(self._energy).tolist()
-            check = {
-                "elastic": energies.elastic,
-                "interface": energies.interface,
-                "kinetic": energies.kinetic,
-                "largest_energy_ratio": max(ratio, largest_ratio),
-                "least_volume_ratio": min(energies.least_volume_ratio, least_volume_ratio),
-            }
-            new.set_value(self._energy, [check[name] for name in ENERGY_NAMES])
+            stored = energies.elastic, energies.interface, energies.kinetic
+            largest = max(ratio, largest_ratio)
+            least = min(energies.least_volume_ratio, least_volume_ratio)
+            # In the order of `ENERGY_NAMES`.
+            new.set_value(self._energy, [*stored, largest, least])
         return step.wrench.reshape(2, 3).dot(R_CW).ravel(), float(step.cut[-1])
 
     def _surface_vertices(self, context: Context) -> np.ndarray:

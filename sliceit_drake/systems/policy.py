@@ -7,8 +7,9 @@ before it begins, whatever the policy decides.
 """
 
 import dataclasses as dc
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import NamedTuple, Protocol
 
@@ -19,9 +20,8 @@ from pydrake.multibody.math import SpatialForce
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from sliceit_drake.configuration import ConfigurationError, quantity
-from sliceit_drake.cutting.motion import MotionPlan
+from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan, Segment
 from sliceit_drake.systems.declare import declare_output
-from sliceit_drake.systems.envelope import envelope, envelope_time
 
 __all__ = [
     "Policy",
@@ -30,10 +30,14 @@ __all__ = [
     "PolicyObservation",
     "PolicySystem",
     "PressByForce",
+    "envelope",
+    "envelope_time",
 ]
 
 # Parts of the motion since the last decision.
 _OFFSET, _SPEED, _WANTED, _SINCE = slice(0, 2), slice(2, 4), slice(4, 6), 6
+
+_Corners = Sequence[tuple[float, float]]
 
 
 class PolicyObservation(NamedTuple):
@@ -147,6 +151,39 @@ class PolicyConfig:
     def _corners(self) -> list[tuple[float, float]]:
         corners = [(0.0, self.press), (self.draw, self.press), (-self.draw, self.press)]
         return corners + [(-self.draw, 0.0), (self.draw, 0.0)] if self.draw > 0.0 else corners
+
+
+def envelope(corners: _Corners, speed: float, duration: float, label: str) -> MotionPlan:
+    """The motion through all places where a policy may take the knife, for checks before a run.
+
+    Straight from corner to corner, then at rest.
+
+    Args:
+        corners: x and z in the knife frame at the start, m; the start before the first.
+        speed: Speed between the corners, m/s.
+        duration: Duration of the whole motion, s.
+        label: Label of its segments.
+    """
+    way: list[Segment] = [
+        ConstantSpeed(speed, [dx / distance, 0.0, dz / distance], distance, label=label)
+        for dx, dz, distance in _legs(corners)
+    ]
+    left = duration - envelope_time(corners, speed)
+    return MotionPlan([*way, Hold(left, label=label)] if left > 1e-9 else way)
+
+
+def envelope_time(corners: _Corners, speed: float) -> float:
+    """Duration of the path through the corners, s; arguments as for `envelope`."""
+    return sum(distance for *_, distance in _legs(corners)) / speed
+
+
+def _legs(corners: _Corners) -> list[tuple[float, float, float]]:
+    legs = []
+    for (x, z), (a, b) in itertools.pairwise([(0.0, 0.0), *corners]):
+        distance = math.hypot(a - x, b - z)
+        if distance > 0.0:
+            legs.append((a - x, b - z, distance))
+    return legs
 
 
 class PolicySystem(LeafSystem):
