@@ -142,12 +142,7 @@ class SliceAdjoint:
         return run
 
     def gradient(self, run: SliceRun, weights: np.ndarray) -> SliceGradient:
-        """Gradient of sum(weights * wrenches).
-
-        Args:
-            run: What `run` returned.
-            weights: Adjoints of the wrenches [E, 6].
-        """
+        """Gradient of sum(weights * wrenches) of what `run` returned; weights [E, 6]."""
         ws, count, give = self._w, len(run.wrenches), _give(run.model)
         ws.set_models([run.model])
         adj_state, row = np.zeros(ws.state_size), np.zeros(ws.parameter_rows.shape[1])

@@ -170,11 +170,7 @@ class NamedKnife:
 
 
 def load_knife(name: str | Path, field: str = "knife_name") -> NamedKnife:
-    """Reads a knife.
-
-    Args:
-        name: A knife that ships, or a YAML file.
-        field: Dotted path of what names it, for errors.
+    """Reads a knife that ships, or a YAML file; `field` is the path of what names it, for errors.
 
     Raises:
         ConfigurationError: Naming file, field and fix.
@@ -212,11 +208,9 @@ def section_distance(knife: Knife, y: np.ndarray, height: np.ndarray) -> np.ndar
 
 
 def signed_distance(knife: Knife, p_KP: np.ndarray) -> np.ndarray:
-    """Signed distance to the knife, a prism of `length` [N], metres, negative inside.
+    """Signed distance [N] of points [N, 3] to the knife, a prism of `length`: negative inside.
 
-    Args:
-        knife: The knife.
-        p_KP: Points [N, 3] in the knife frame, metres.
+    Points are in the knife frame; all is in metres.
     """
     section = section_distance(knife, p_KP[:, 1], -p_KP[:, 2])
     beyond = np.abs(p_KP[:, 0]) - 0.5 * knife.length

@@ -414,10 +414,7 @@ class Motion:
     def sample(
         self, times: Sequence[float] | np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Returns the motion at many times.
-
-        Args:
-            times: Times [N], s.
+        """Returns the motion at times [N], s.
 
         Returns:
             R_WK [N, 3, 3], p_WK [N, 3] in m, angular velocity w_WK [N, 3] in rad/s and velocity of

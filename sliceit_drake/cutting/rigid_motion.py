@@ -17,7 +17,6 @@ def rigid_motion(
     their momentum and angular momentum.
 
     Args:
-        model: The cut.
         positions, velocities: Of the computed nodes in C [N, 3], metres and m/s.
 
     Returns:

@@ -129,10 +129,7 @@ def check_in_plane(model: CuttingModel, X_CK: Pose, time: float) -> None:
 def energy_ratio(energies: Energies, dissipated: float, model: CuttingModel) -> float:
     """Kinetic energy over internal energy, at least 1 % of that needed to cut through.
 
-    Args:
-        energies: Energies of the state.
-        dissipated: Since the start, J.
-        model: The cut.
+    Of the internal energy, `dissipated` is that since the start, J.
     """
     through = float(model.toughness @ model.tables.area)
     internal = max(energies.elastic + energies.interface + dissipated, 0.01 * through, 1e-9)

@@ -109,8 +109,7 @@ class CuttingSolver:
 
         Args:
             state: The food's state [state_size]; not changed.
-            start: Knife pose in C at the beginning.
-            end: Knife pose in C at the end.
+            start, end: Knife poses in C.
             factors: Factors on toughness and friction in this coupling step.
 
         Raises:

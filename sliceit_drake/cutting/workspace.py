@@ -89,7 +89,6 @@ class Workspace:
         """A view of rows of numbers [C, size] as an array [C, ...].
 
         Args:
-            rows: The rows.
             start: First number in a row.
             kind: Type of the array, as a field of a struct declares it.
             shape: Its shape without the first axis, in numbers.
@@ -114,7 +113,6 @@ class Workspace:
         """Rows of numbers [C, size], with arrays of a struct as views of them side by side.
 
         Args:
-            struct: The struct.
             shapes: Shapes of the arrays without the first axis, in numbers.
             dtype: Type of the numbers, the kernels' by default.
 

@@ -225,13 +225,10 @@ class Controller:
         return True
 
     def set_safety(self, mode: SafetyMode, why: str, program: str = "pause") -> None:
-        """Enters a safety mode, with what it does to program and power.
+        """Enters a safety mode, with what it does to program and power, and notes why.
 
-        Args:
-            mode: The new mode.
-            why: Reason, for the log.
-            program: Fate of the program in a protective stop, "pause" or "stop"; which one a real
-                PolyScope chooses was not checked.
+        A protective stop pauses the program, or stops it if `program` is "stop"; which one a real
+        PolyScope chooses was not checked.
         """
         if mode == self.safety:
             return

@@ -80,14 +80,11 @@ class Posture:
 
 
 def forward(q: ArrayLike, X_FT: np.ndarray | None = None) -> np.ndarray:
-    """Pose of the tool in the base.
+    """Pose of the tool in the base [4, 4].
 
     Args:
         q: Joint positions [6], rad.
         X_FT: Tool in the flange [4, 4]; None for the flange itself.
-
-    Returns:
-        Homogeneous matrix [4, 4].
     """
     X = Posture(q).X_BF
     return X if X_FT is None else X @ X_FT

@@ -28,10 +28,8 @@ def joint_motion(
     """``movej``: all joints in step, the one that has farthest to go with a trapezoid of speed.
 
     Args:
-        start: Joint positions [6], rad.
-        end: Joint positions [6], rad.
-        speed: Speed of the leading joint, rad/s.
-        acceleration: Acceleration of the leading joint, rad/s2.
+        start, end: Joint positions [6], rad.
+        speed, acceleration: Of the leading joint, rad/s and rad/s2.
         scale: Speed slider.
 
     Raises:
@@ -57,8 +55,7 @@ def line_motion(
         start: Joint positions [6], rad.
         end: Pose of the tool in the base [4, 4].
         X_FT: Tool in the flange [4, 4].
-        speed: Speed of the tool, m/s.
-        acceleration: Acceleration of the tool, m/s2.
+        speed, acceleration: Of the tool, m/s and m/s2.
         scale: Speed slider.
 
     Raises:

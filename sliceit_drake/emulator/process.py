@@ -66,10 +66,7 @@ class PendantClient:
         return self.request(status=True)
 
     def put_fresh_food(self, scenario: str | None = None) -> None:
-        """Puts an uncut food under the knife.
-
-        Args:
-            scenario: YAML of the scenario whose food it is; None for the same again.
+        """Puts an uncut food under the knife: that of a scenario, as YAML, or the same again.
 
         Raises:
             EmulatorError: It was refused, or preparing it takes longer than the timeout.

@@ -123,11 +123,7 @@ class InputRegisters:
         self._owners: dict[str, Hashable] = {}
 
     def claim(self, owner: Hashable, names: Sequence[str]) -> list[str]:
-        """Asks for inputs; they are given only if all can be.
-
-        Args:
-            owner: Who asks.
-            names: Variables.
+        """Asks for inputs by name; they are given only if all can be.
 
         Returns:
             Their types; `NOT_FOUND` or `IN_USE` for those that cannot be had.

@@ -156,12 +156,7 @@ class RobotLink:
             return None if self._status is seen else self._status
 
     def put(self, q: Sequence[float], time: float) -> None:
-        """Hands over the newest target.
-
-        Args:
-            q: Joint positions [6], rad.
-            time: Controller time of the measurement that it answers, s.
-        """
+        """Hands over the newest target [6], rad, with the controller time that it answers, s."""
         number = self._command.number + 1 if self._command else self._judged + 1
         self._command = _Command(number, list(q), time)
 

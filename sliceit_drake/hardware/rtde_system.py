@@ -75,11 +75,7 @@ class RtdeSystem(LeafSystem):
         self.DeclareStateOutputPort("stop_reason", self._reason)
 
     def receive(self, context: Context, status: LinkStatus | None = None) -> Stop | None:
-        """Puts a measurement into the system's own context.
-
-        Args:
-            context: This system's context.
-            status: The measurement; None for the link's newest.
+        """Puts a measurement, by default the link's newest, into the system's own context.
 
         Returns:
             Why the safety layer is latched, or None.

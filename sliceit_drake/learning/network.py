@@ -92,13 +92,7 @@ class HistoryExtractor(BaseFeaturesExtractor):
 
 
 def export_policy(actor: Actor, config: AgentConfig, file: Path) -> None:
-    """Writes the actor's decisions, without its randomness, as ONNX with the layout it needs.
-
-    Args:
-        actor: Actor of a Stable-Baselines3 SAC.
-        config: The agent's configuration.
-        file: File to write.
-    """
+    """Writes the actor's decisions, without its randomness, as ONNX with the layout it needs."""
     # The middle of the distribution.
     parts = (actor.features_extractor, actor.latent_pi, actor.mu, nn.Tanh())
     network = nn.Sequential(*parts).eval()

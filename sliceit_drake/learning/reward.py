@@ -95,12 +95,7 @@ def reward_potential(config: RewardConfig, height: float, at_goal: float) -> flo
 
 
 def reward_weights(config: RewardConfig, progress: float = 0.0) -> np.ndarray:
-    """Weights of the terms [4], which sum to 1.
-
-    Args:
-        config: Weights and schedule.
-        progress: Fraction of the training that is done.
-    """
+    """Weights of the terms [4], which sum to 1, at a fraction `progress` of the training."""
     weights = np.array(config.weights)
     if config.schedule == "gaussian":
         away = progress - np.array([0.0, 0.5, 1.0])

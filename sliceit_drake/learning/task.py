@@ -175,12 +175,7 @@ def station_scenario(task: TaskConfig, calibrated: CalibratedFood, food: str) ->
 
 
 def make_agent_station(task: TaskConfig, food: str, rng: np.random.Generator) -> AgentStation:
-    """A food's station with all its prepared variants, and the agent on it.
-
-    Args:
-        task: Task of the training.
-        food: One of its foods.
-        rng: Draws the variants.
+    """The station of one of a task's foods with all its variants, drawn by `rng`, and the agent.
 
     Raises:
         ConfigurationError: The food cannot be loaded or cut.

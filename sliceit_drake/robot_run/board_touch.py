@@ -94,16 +94,10 @@ class BoardTouch:
 
 
 def check_height(found: Touch, expected: float, tolerance: float, field: str) -> None:
-    """Compares the board that was found with the one that was expected.
-
-    Args:
-        found: By the touch.
-        expected: m.
-        tolerance: m.
-        field: Where the expected height stands.
+    """Compares the height of the board with the expected one, m, which stands in `field`.
 
     Raises:
-        ConfigurationError: They differ by more; it names both, and the field.
+        ConfigurationError: They differ by more than the tolerance, m; it names both, and the field.
     """
     if abs(found.height - expected) <= tolerance:
         return

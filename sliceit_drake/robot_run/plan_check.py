@@ -101,13 +101,9 @@ def plan_joints(
 def check_plan(
     plan: JointPlan, station: Station, config: HardwareConfig, client: RobotClient | None
 ) -> list[Check]:
-    """Compares a plan with the limits, and asks the robot for its own.
+    """Compares a station's plan with the limits of the robot's file.
 
-    Args:
-        plan: Plan from `plan_joints`.
-        station: Whose plan it is.
-        config: The robot's file.
-        client: In control of the robot; None to ask nothing.
+    Asks the robot that `client` controls for its own limits, too, unless it is None.
     """
     limits, board = config.limits, station.scenario.board.height
     speed = np.abs(np.diff(plan.q, axis=0) / np.diff(plan.time)[:, None])

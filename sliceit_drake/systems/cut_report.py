@@ -128,12 +128,7 @@ class ReportingSystem(LeafSystem):
     def add_visualizer(
         self, builder: DiagramBuilder, meshcat: Meshcat, period: float
     ) -> FrameRecorder | None:
-        """Adds what draws the food to the diagram that holds this system, and connects it.
-
-        Args:
-            builder: Builder of the diagram.
-            meshcat: Viewer.
-            period: Between frames, s.
+        """Adds what draws the food each `period`, s, to this system's diagram, and connects it.
 
         Returns:
             What must be told when to record, or None.

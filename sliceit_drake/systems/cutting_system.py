@@ -284,12 +284,7 @@ class CuttingSystem(KnifeForceSystem):
         return Pose(X_CK[:, :3], X_CK[:, 3] - self._offset[index])
 
     def _index_to_cut(self, context: Context, index: int, X_WK: np.ndarray) -> int:
-        """The food that the next coupling step cuts: this, or the next if the knife is there.
-
-        Args:
-            context: This system's context.
-            index: This food.
-            X_WK: The knife's pose now [3, 4].
+        """The food that the next coupling step cuts: this, or the next if the knife is there now.
 
         Raises:
             CuttingError: The knife is in the next plane and has not cut the last section through.

@@ -52,8 +52,7 @@ def declare_cached(
 ) -> CacheEntry:
     """Declares a value of any type that is computed when it is asked for after a change.
 
-    Args:
-        system, name, calc, prerequisites: As for `declare_output`.
+    Arguments as for `declare_output`.
     """
     producer = ValueProducer(
         allocate=lambda: Value(object()),

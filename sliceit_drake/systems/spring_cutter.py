@@ -144,9 +144,6 @@ class SpringCutter(KnifeForceSystem):
     def _contact(self, X_WK: np.ndarray) -> tuple[float, tuple[float, float]]:
         """Depth of the edge below the button's released top, metres, and the arm from Ko to it.
 
-        Args:
-            X_WK: Pose of the knife as a matrix [3, 4].
-
         Returns:
             Depth, -inf where the edge passes beside the button, and the arm along Wx and Wy.
         """

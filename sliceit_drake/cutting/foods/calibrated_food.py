@@ -56,10 +56,7 @@ class CalibratedFood:
 
 
 def load_calibrated_food(name: str | Path) -> CalibratedFood:
-    """Reads a calibrated food.
-
-    Args:
-        name: A food that ships calibrated, or a YAML file.
+    """Reads a food that ships calibrated, or a YAML file.
 
     Raises:
         ConfigurationError: Naming file, field and fix.

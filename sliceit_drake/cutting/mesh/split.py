@@ -155,14 +155,7 @@ def _side_parts(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def split_mesh(mesh: TetrahedralMesh, plane: CutPlane) -> SplitMesh:
-    """Splits a mesh by a plane.
-
-    Args:
-        mesh: The mesh, checked.
-        plane: The cut plane, in the mesh's frame.
-
-    Returns:
-        The two halves in the frame of the cut.
+    """Splits a mesh, checked, by a plane in its frame.
 
     Raises:
         MeshError: The plane misses the mesh.

@@ -39,12 +39,7 @@ class FoodCorners:
         return self.cut_point >= 0
 
     def positions(self, cut: CutGeometry, computed: np.ndarray) -> np.ndarray:
-        """Corners in the food frame [V, 3], metres.
-
-        Args:
-            cut: The cut.
-            computed: Positions of the computed nodes in C [N, 3].
-        """
+        """Corners in F [V, 3], from positions of the computed nodes in C [N, 3], metres."""
         nodes = cut.split.nodes.copy()
         nodes[cut.computed] = computed
         corners = (nodes[self.ends] * self.weights[..., None]).sum(1)
@@ -59,7 +54,6 @@ class FoodCorners:
         1 - (1 - D) (1 - phi).
 
         Args:
-            cut: The cut.
             edge_depth: Largest depth of the edge below each cut point [P], metres.
             cohesive_damage: phi of each cut point [P].
         """
