@@ -33,7 +33,7 @@ project = "sliceit_drake"
 author = "the authors of sliceit_drake"
 release = importlib.metadata.version(project)
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.napoleon"]
 root_doc = "docs/index"
 include_patterns = [
     "*.md",
@@ -44,6 +44,7 @@ include_patterns = [
     "models/*/README.md",
 ]
 exclude_patterns = [".*", "**/.*", "output"]
+myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 # A single backtick in a docstring is code, as in Markdown.
 default_role = "code"
@@ -130,21 +131,24 @@ def names_of(package: str) -> dict[str, Any]:
 
 
 def front_door() -> list[str]:
-    """The names of `import sliceit_drake as sliceit`, by what they are for; modules at the end."""
+    """The names of `import sliceit_drake as sliceit`: a line for each, then each in full."""
     groups: dict[str, list[str]] = {title: [] for title in [*GROUPS, "Extension points", "Modules"]}
+    in_full = ["In full", "-------", ""]
     for name, found in names_of(project).items():
+        words = escape((inspect.getdoc(found) or "").partition("\n\n")[0].replace("\n", " "))
         if inspect.ismodule(found):
-            groups["Modules"] += [f"- ``{name}``: :py:mod:`{found.__name__}`"]
+            groups["Modules"] += [f"- :py:mod:`{name} <{found.__name__}>`: {words}"]
             continue
         folder = found.__module__.split(".")[1]
         (title,) = (title for title, folders in GROUPS.items() if folder in folders)
         kind = "autoclass" if inspect.isclass(found) else "autofunction"
         title = "Extension points" if name in EXTENSION_POINTS else title
-        groups[title] += [f".. {kind}:: {project}.{name}", ""]
+        groups[title] += [f"- :py:obj:`{name} <{project}.{name}>`: {words}"]
+        in_full += [f".. {kind}:: {project}.{name}", ""]
     lines = []
     for title, entries in groups.items():
-        lines += [title, "-" * len(title), "", *entries]
-    return [*lines, ""]
+        lines += [title, "-" * len(title), "", *entries, ""]
+    return [*lines, *in_full]
 
 
 def further_names(package: str) -> list[str]:
@@ -162,7 +166,8 @@ def further_names(package: str) -> list[str]:
 
 def package_page(package: str) -> str:
     """The docstring of a package, then each of its modules with the names of its `__all__`."""
-    lines = [package, "=" * len(package), "", f".. automodule:: {package}", "   :no-members:", ""]
+    title = "The names of sliceit_drake" if package == project else package
+    lines = [title, "=" * len(title), "", f".. automodule:: {package}", "   :no-members:", ""]
     lines += front_door() if package == project else further_names(package)
     for module in modules(package):
         title = module.removeprefix(f"{package}.")
@@ -231,17 +236,21 @@ def write_api(app: Sphinx) -> None:
             file.write_text(text, encoding="utf-8")
 
 
-def api_pages() -> list[Path]:
-    """The front door first, then the packages."""
-    return sorted(API.iterdir(), key=lambda file: (file.stem != project, file.name))
-
-
 def order_pages(app: Sphinx, docname: str, content: list[str]) -> None:
-    """Gives each section of the index a table of contents, of what it links to."""
+    """Gives each section of the index a table of contents, of what it links to.
+
+    The pages that are written here join it: names and commands head the reference, and the
+    modules come last.
+    """
     if docname != root_doc:
         return
-    api = "".join(f"- [{file.stem}](api/{file.name})\n" for file in api_pages())
-    text = f"{content[0]}\n## Commands and API\n\n{api}"
+    first_pages = f"""## Reference
+
+- [The names of `import sliceit_drake`](api/{project}.rst): a line for each, then each in full.
+- [The program `sliceit`](api/commands.md): the help of each command."""
+    modules = [f"- [{p}](api/{p}.rst)\n" for p in packages() if p != project]
+    text = content[0].replace("## Reference\n", first_pages)
+    text = f"{text}\n## API by module\n\n{''.join(modules)}"
     first, *sections = re.split(r"^(?=## )", text, flags=re.M)
     for k, section in enumerate(sections):
         title = section.partition("\n")[0].removeprefix("## ")

@@ -43,7 +43,7 @@ TESTED = {
     ],
     "tests/test_named_food.py::test_the_apple_is_cut_by_a_knife_that_is_higher_and_the_arm_"
     "reaches_its_start": ["sliceit simulate scenarios/apple.yaml"],
-    "tests/test_foods_page.py::test_what_the_page_says_to_write_is_a_food_a_knife_and_a_setup": [
+    "tests/test_foods_page.py::test_what_the_pages_say_to_write_is_a_food_a_knife_and_a_setup": [
         'sliceit simulate --set "{knife_name: knife.yaml}"',
         "sliceit simulate radish.yaml",
     ],
@@ -264,12 +264,12 @@ READ_ONLY = {
 READERS = {
     "records/monday": "the reader's records",
     "records/*.csv": "the reader's records",
-    "records/radish": "docs/foods.md, where the radish is recorded",
+    "records/radish": "docs/food_of_your_own.md, where the radish is recorded",
     "my.yaml": "docs/hardware.md: the reader's robot",
     "my_cause.py": "docs/causes.md, where it is shown",
     "brine.py": "docs/stand_in.md, where it is shown",
-    "radish.yaml": "docs/foods.md, where it is shown",
-    "radish_setup.yaml": "docs/foods.md, where it is shown",
+    "radish.yaml": "docs/food_of_your_own.md, where it is shown",
+    "radish_setup.yaml": "docs/food_of_your_own.md, where it is shown",
     "food.yaml": "docs/next_experiment.md, where it is said how to write it",
     "output/cucumber": "`sliceit simulate` without --output",
 }

@@ -1,4 +1,4 @@
-"""docs/foods.md: its tables are those of the files, and what it says to write can be used."""
+"""Foods and knives in docs: the tables are those of the files, and what to write can be used."""
 
 import re
 from pathlib import Path
@@ -13,7 +13,9 @@ from studies.marked_page import Place
 from studies.physics.foods_page import foods_table, knives_table
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGE = (ROOT / "docs/foods.md").read_text(encoding="utf-8")
+PAGE, TUTORIAL = (
+    (ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("foods.md", "food_of_your_own.md")
+)
 
 
 @pytest.mark.parametrize("name", ["foods", "knives"])
@@ -23,9 +25,9 @@ def test_tables_are_made_from_the_files_of_foods_and_knives(name):
     assert Place(name).put(PAGE, table, "docs/foods.md") == PAGE, command
 
 
-def test_what_the_page_says_to_write_is_a_food_a_knife_and_a_setup(tmp_path, monkeypatch):
+def test_what_the_pages_say_to_write_is_a_food_a_knife_and_a_setup(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for kind, text in re.findall(r"```(python|yaml)\n(.*?)```", PAGE, re.DOTALL):
+    for kind, text in re.findall(r"```(python|yaml)\n(.*?)```", PAGE + TUTORIAL, re.DOTALL):
         if kind == "python":
             exec(text, {})
         else:

@@ -1,0 +1,173 @@
+"""Draws pictures of the guides: the foods that ship, the station's loop, the servo, a slice record.
+
+Writes foods.png, station.png, servo.png and record.png to docs/figures.
+"""
+
+import argparse
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from sliceit_drake.diagrams.run import simulate
+from sliceit_drake.records.validation import load_record
+from sliceit_drake.resources import resource_path
+from sliceit_drake.systems.servo import ServoConfig, ServoLaw
+from studies.figures import BLUE, GREEN, ORANGE, PURPLE, new_figure, save_figure, tidy
+
+__all__ = [
+    "add_arguments",
+    "foods_figure",
+    "record_figure",
+    "run",
+    "servo_figure",
+    "station_figure",
+]
+
+FIGURES = Path(__file__).resolve().parents[2] / "docs" / "figures"
+SCENARIOS = {
+    "cucumber": "cucumber_sequence",
+    "carrot": "carrot_sequence",
+    "potato": "potato_sequence",
+    "tomato": "tomato_sequence",
+    "apple": "apple",
+}
+# Rows and columns of a picture of 480 x 640 around the food.
+CROP = (slice(130, 430), slice(150, 450))
+# Name, what it is made of, and its place.
+BOXES = {
+    "policy": ("policy or motion", (0.11, 0.72)),
+    "controller": ("compliance control\n(FDCC)", (0.37, 0.72)),
+    "arm": ("servo, arm, knife, board\n(plant), or a UR5e", (0.66, 0.72)),
+    "cutting": ("cutting system\n(food)", (0.66, 0.2)),
+    "sensor": ("wrench sensor", (0.37, 0.2)),
+}
+ARROWS = [
+    ("policy", "controller", "target_pose"),
+    ("controller", "arm", "joint_positions_command"),
+    ("arm", "cutting", "knife_pose, knife_velocity"),
+    ("cutting", "arm", "food_wrench"),
+    ("arm", "sensor", ""),
+    ("sensor", "controller", "sensor_wrench"),
+    ("sensor", "policy", ""),
+]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """It has none."""
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
+    figures: dict[str, Callable[[], Figure]] = {
+        "foods": foods_figure,
+        "station": station_figure,
+        "servo": servo_figure,
+        "record": record_figure,
+    }
+    for name, draw in figures.items():
+        save_figure(draw(), FIGURES / f"{name}.png", dpi=100)
+    return 0
+
+
+def foods_figure() -> Figure:
+    """Each food that ships, as it lies before the knife."""
+    figure = new_figure(10.0, 2.4)
+    for axes, (food, scenario) in zip(figure.subplots(1, 5), SCENARIOS.items(), strict=True):
+        film = simulate(scenario, duration=0.02, replay=False, animation=True).film
+        assert film is not None
+        axes.imshow(film.draw()[0][CROP])
+        axes.set_title(food, fontsize=11)
+        axes.axis("off")
+    return figure
+
+
+def station_figure() -> Figure:
+    """The systems of a station and what goes from one to the next."""
+    figure = new_figure(9.0, 3.6)
+    axes = figure.subplots()
+    axes.set(xlim=(0.0, 0.86), ylim=(0.0, 1.0))
+    axes.axis("off")
+    style = {"boxstyle": "round,pad=0.6", "facecolor": "#eef3f8", "edgecolor": BLUE}
+    drawn = {
+        name: axes.text(x, y, words, ha="center", va="center", fontsize=10, bbox=style)
+        for name, (words, (x, y)) in BOXES.items()
+    }
+    for begin, end, words in ARROWS:
+        a, b = (np.array(BOXES[name][1]) for name in (begin, end))
+        upright = a[0] == b[0]
+        # The two arrows between arm and food stand side by side.
+        shift = (0.02 if begin == "arm" else -0.02) if {begin, end} == {"arm", "cutting"} else 0.0
+        a, b = a + [shift, 0.0], b + [shift, 0.0]
+        arrow = {
+            "arrowstyle": "-|>",
+            "color": "0.35",
+            "patchA": drawn[begin].get_bbox_patch(),
+            "patchB": drawn[end].get_bbox_patch(),
+        }
+        axes.annotate("", xy=b, xytext=a, arrowprops=arrow)
+        x, y = (a + b) / 2.0
+        if upright:
+            side = 1.0 if shift > 0.0 else -1.0
+            axes.text(
+                x + 0.01 * side,
+                y,
+                words,
+                ha="left" if side > 0.0 else "right",
+                va="center",
+                fontsize=8,
+            )
+        else:
+            axes.text(x, y + 0.1, words, ha="center", va="center", fontsize=8)
+    return figure
+
+
+def servo_figure() -> Figure:
+    """The servo's answer to a step and to a ramp."""
+    figure = new_figure(10.0, 3.4)
+    step, ramp = figure.subplots(1, 2)
+    period = 1e-3
+    time = period * np.arange(600)
+    for colour, (lookahead, gain) in zip(
+        (BLUE, ORANGE, GREEN, PURPLE),
+        [(0.03, 2000.0), (0.03, 300.0), (0.1, 300.0), (0.2, 300.0)],
+        strict=True,
+    ):
+        law = ServoLaw(ServoConfig(lookahead_time=lookahead, gain=gain), period)
+        for axes, targets in ((step, np.full(len(time), 10.0)), (ramp, 100.0 * time)):
+            state, found = law.state_at_rest(np.zeros(1)), []
+            for target in targets:
+                found.append(state[0, 0])
+                state = law.A @ state + law.B * target
+            axes.plot(time, found, color=colour, label=f"lookahead {lookahead:g} s, gain {gain:g}")
+    for axes, title, targets in (
+        (step, "Step of 10 mrad", np.full(len(time), 10.0)),
+        (ramp, "Ramp of 0.1 rad/s", 100.0 * time),
+    ):
+        axes.plot(time, targets, "k--", lw=1.0, label="target")
+        axes.set(xlabel="time [s]", ylabel="joint position [mrad]")
+        tidy(axes, title)
+    ramp.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def record_figure() -> Figure:
+    """What a slice record holds: the motion of the knife, the force on it, and the phases."""
+    record = load_record(resource_path("calibration/records/cucumber.csv"))
+    figure = new_figure(8.0, 4.2)
+    height, force = figure.subplots(2, 1, sharex=True)
+    height.plot(record.time, 1e3 * record.position[:, 2], color=BLUE)
+    height.set_ylabel("edge above W [mm]")
+    tidy(height, "Slice record calibration/records/cucumber")
+    force.plot(record.time, record.force_magnitude, color=ORANGE)
+    force.set(xlabel="time [s]", ylabel="force on the knife [N]")
+    tidy(force)
+    shades = itertools.cycle(("0.95", "0.9"))
+    for phase, shade in zip(record.metadata.motion.phases, shades, strict=False):
+        for axes in (height, force):
+            axes.axvspan(phase.start, phase.end, color=shade, zorder=0)
+        middle = (phase.start + phase.end) / 2.0
+        force.text(middle, 1.0, phase.label, ha="center", fontsize=9)
+    return figure
