@@ -26,10 +26,16 @@ COMMANDS = [command for page in PAGES for command in commands_of(page, ROOT)]
 
 # Run below, in an empty folder; simulations for two coupling steps.
 HERE = """
-sliceit simulate --set "{calibration: cucumber}"
+sliceit simulate
+sliceit simulate cucumber_measured --set "{calibration: cucumber}"
+sliceit simulate cucumber_measured --set "{food: {held_sides: plus, hold_distance: 0.02}}"
+sliceit simulate cucumber_measured --set "{controller: {mode: compliance, error_scale: 0.5, p_gains: [0.05, 0.05, 0.05, 1, 1, 1], stiffness: [5000, 5000, 5000, 100, 100, 100]}}"
+sliceit simulate --set "{knife_name: nakiri}"
+sliceit simulate cucumber_spring
+sliceit simulate --set "{food: {material: {toughness: 300}}}"
 sliceit simulate --set "{calibration: potato, knife_name: nakiri}"
-sliceit simulate scenarios/carrot_sequence.yaml --set "{food: {shape: !Tapered {diameters: [0.018, 0.034], length: 0.10}}}"
-sliceit simulate --set "{food: {cut_normal: [0.2, 1.0, 0.1]}}"
+sliceit simulate carrot_sequence --set "{food: {shape: !Tapered {diameters: [0.018, 0.034], length: 0.10}}}"
+sliceit simulate cucumber_measured --set "{food: {cut_normal: [0.2, 1.0, 0.1]}}"
 sliceit calibrate --show cucumber
 sliceit calibrate --show NAME
 sliceit diagram --ports
@@ -38,11 +44,11 @@ python -c "from sliceit_drake.hardware.edge_kinematics import flange_pose; print
 
 # Run by another test, perhaps on a smaller food.
 TESTED = {
-    "tests/test_readme.py::test_the_table_is_what_the_first_command_measures": [
-        "sliceit simulate",
+    "tests/test_readme.py::test_the_table_is_what_the_measured_slice_gives": [
+        "sliceit simulate cucumber_measured",
     ],
     "tests/test_named_food.py::test_the_apple_is_cut_by_a_knife_that_is_higher_and_the_arm_"
-    "reaches_its_start": ["sliceit simulate scenarios/apple.yaml"],
+    "reaches_its_start": ["sliceit simulate apple"],
     "tests/test_foods_page.py::test_what_the_pages_say_to_write_is_a_food_a_knife_and_a_setup": [
         'sliceit simulate --set "{knife_name: knife.yaml}"',
         "sliceit simulate radish.yaml",
@@ -54,7 +60,6 @@ TESTED = {
         "sliceit simulate --paraview vtu",
     ],
     "tests/test_paraview.py::test_a_run_is_exported_again_as_it_was": [
-        "sliceit export FOLDER",
         "sliceit export output/cucumber",
     ],
     "tests/test_record_importers.py::test_the_program_imports_a_recording_and_says_what_is_wrong": [
@@ -131,7 +136,7 @@ TESTED = {
         " --output docs/slicing_evaluation.jsonl",
     ],
     "tests/test_learning_comparison.py::test_a_trained_policy_runs_in_a_scenario": [
-        "sliceit simulate scenarios/cucumber_agent.yaml",
+        "sliceit simulate cucumber_agent",
     ],
     "tests/test_learning_comparison.py::test_the_study_writes_its_page_and_says_what_it_lacks": [
         "python -m studies slicing output/evaluation.jsonl --output docs",
@@ -139,7 +144,6 @@ TESTED = {
         " --policies models/policies/cutting_0 models/policies/spring_0 --output docs",
     ],
     "tests/test_motion_optimization.py::test_the_command_leaves_a_scenario_that_simulate_takes": [
-        "sliceit optimize-motion SCENARIO --output DIR",
         "sliceit optimize-motion scenarios/cucumber_measured.yaml --output FOLDER",
     ],
     "tests/test_hardware_end_to_end.py::test_a_robot_slices_over_the_network_as_the_simulation_"
@@ -176,9 +180,6 @@ TESTED = {
     "tests/test_readme.py::test_every_page_of_a_study_is_rendered_from_its_stored_results": [
         "python -m studies pages",
     ],
-    "tests/test_rosbag.py::test_the_command_cuts_a_slice_out_of_a_bag": [
-        "sliceit records import rosbag",
-    ],
 }
 
 # Run by .ci/run, which installs what the tests need.
@@ -205,13 +206,24 @@ READ_ONLY = {
         pip install 'sliceit_drake[learn]'
         pip install 'sliceit_drake[ros]'
         """,
+    "the reader's files, a display, a GPU or another program": """
+        sliceit diagram --output station.svg
+        sliceit simulate --meshcat
+        sliceit records import force scale.csv --metadata facts.yaml --contact 0.4 --output records
+        sliceit records import rosbag run_07.mcap --topics /wrench /tcp_pose --between 4.0 9.5 --metadata session.yaml --output records
+        sliceit simulate --set "{food: {material: {toughness: 300}}}" --output output/softer
+        sliceit simulate --set "{numerics: {device: 'cuda:0'}}"
+        """,  # noqa: E501
     "of another project; the tests start its scheduler and workers from Python": """
         dask scheduler
         dask worker tcp://HOST:8786
         dask worker tcp://10.0.0.5:8786 --nthreads 1 --nworkers -1
         """,
     "minutes, of which parts are tested": """
-        sliceit simulate scenarios/cucumber_sequence.yaml
+        sliceit simulate cucumber_sequence
+        sliceit simulate tomato_sequence
+        sliceit calibrate calibration/records/cucumber.csv --food cucumber --output output/cucumber_food
+        sliceit simulate --set "{calibration: output/cucumber_food/food.yaml}"
         sliceit record radish.yaml --replicates 2 --seed 1 --output records/radish
         sliceit calibrate records/radish --food radish_setup.yaml --output output/radish_food
         sliceit simulate radish.yaml --set "{calibration: output/radish_food/food.yaml}"
@@ -262,6 +274,10 @@ READ_ONLY = {
 
 # Files that a reader has, by the pages that say so.
 READERS = {
+    "scale.csv": "docs/how_to.md: the reader's measurement",
+    "facts.yaml": "docs/how_to.md: the reader's measurement",
+    "session.yaml": "docs/how_to.md: the reader's measurement",
+    "run_07.mcap": "docs/how_to.md: the reader's measurement",
     "records/monday": "the reader's records",
     "records/*.csv": "the reader's records",
     "records/radish": "docs/food_of_your_own.md, where the radish is recorded",

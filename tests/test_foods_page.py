@@ -14,7 +14,8 @@ from studies.physics.foods_page import foods_table, knives_table
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE, TUTORIAL = (
-    (ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("foods.md", "food_of_your_own.md")
+    (ROOT / "docs" / name).read_text(encoding="utf-8")
+    for name in ("foods.md", "food_of_your_own.md")
 )
 
 
