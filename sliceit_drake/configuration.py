@@ -24,8 +24,11 @@ import numpy as np
 __all__ = [
     "ConfigurationError",
     "choice",
+    "closest",
+    "did_you_mean",
     "dump_yaml",
     "load_yaml",
+    "merge_yaml",
     "quantity",
     "unit_of",
     "validate",
@@ -149,6 +152,25 @@ def choice(default: str, options: collections.abc.Sequence[str]) -> Any:
     return dc.field(default=default, metadata={_METADATA_KEY: _Choice(tuple(options))})
 
 
+def closest(name: str, options: collections.abc.Iterable[str]) -> str | None:
+    """The option that is most alike to a name, or None where none is."""
+    return next(iter(difflib.get_close_matches(name, list(options), n=1)), None)
+
+
+def did_you_mean(name: str, options: collections.abc.Iterable[str], otherwise: str = "") -> str:
+    """What to do about a name that is not known: the one that is meant, or those that there are.
+
+    Args:
+        name: As it was given.
+        options: Names that are known.
+        otherwise: What to say where none is alike; "" for a list of all.
+    """
+    options = list(options)
+    if close := closest(name, options):
+        return f'Did you mean "{close}"?'
+    return otherwise or f"Known: {_listing(options)}."
+
+
 def unit_of(config: Any, path: str) -> str:
     """Unit of the quantity at a dotted path in a configuration; "" where it has none."""
     *parents, last = path.split(".")
@@ -205,7 +227,7 @@ def _check_field(value: Any, field: dc.Field, where: str) -> None:
             raise ConfigurationError(
                 f"{value!r} is not one of {_listing(rule.options)}",
                 field=where,
-                fix=_suggestion(str(value), rule.options),
+                fix=did_you_mean(str(value), rule.options),
             )
     else:
         validate(value, where)
@@ -282,9 +304,9 @@ def load_yaml(
     # Where each field was written, so that an error found after loading can name the line.
     origins: dict[str, str] = {}
     if file is not None:
-        config = _merge_text(config, _read_text(Path(file)), str(file), origins)
+        config = merge_yaml(config, _read_text(Path(file)), str(file), _root(config), origins)
     if overrides_text is not None and overrides_text.strip():
-        config = _merge_text(config, overrides_text, "overrides", origins)
+        config = merge_yaml(config, overrides_text, "overrides", _root(config), origins)
     try:
         validate(config, _root(config))
     except ConfigurationError as error:
@@ -320,7 +342,7 @@ def _read_text(file: Path) -> str:
     except FileNotFoundError:
         folder = file.parent
         names = sorted(item.name for item in folder.glob("*.y*ml")) if folder.is_dir() else []
-        fix = _suggestion(file.name, names) if names else f"The folder {folder} has no YAML files."
+        fix = did_you_mean(file.name, names) if names else f"The folder {folder} has no YAML files."
         raise ConfigurationError("the file does not exist", source=str(file), fix=fix) from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(
@@ -334,8 +356,21 @@ def _root(config: Any) -> str:
     return type(config).__name__.lower()
 
 
-def _merge_text(config: Any, text: str, source: str, origins: dict[str, str]) -> Any:
-    """Returns `config` with the YAML `text` merged over it, and notes origins of the fields."""
+def merge_yaml(
+    config: Any, text: str, source: str, where: str, origins: dict[str, str] | None = None
+) -> Any:
+    """A configuration with YAML merged over it; types are checked, ranges are not.
+
+    Args:
+        config: Dataclass instance, which stays as it is.
+        text: Fields and values.
+        source: Where the text comes from, for errors.
+        where: Dotted path of `config`, for errors.
+        origins: Takes, by the path of each field, where it was written.
+
+    Raises:
+        ConfigurationError: The text is not YAML, or a field or type in it is wrong.
+    """
     import yaml
     from pydrake.common.yaml import yaml_load_typed
 
@@ -363,8 +398,8 @@ def _merge_text(config: Any, text: str, source: str, origins: dict[str, str]) ->
         raise ConfigurationError(
             "the file holds no fields", source=source, fix='Write "field: value" lines.'
         )
-    tree = _TreeCheck(loader, source, origins)
-    tree.mapping(node, type(config), _root(config), is_root=True)
+    tree = _TreeCheck(loader, source, {} if origins is None else origins)
+    tree.mapping(node, type(config), where, is_root=True)
     try:
         return yaml_load_typed(schema=type(config), data=text, defaults=config)
     except (RuntimeError, ValueError, TypeError) as error:
@@ -410,7 +445,7 @@ class _TreeCheck:
                     value,
                     f"{where}.{name}",
                     f"unknown field of {schema.__name__}",
-                    _suggestion(name, list(fields)),
+                    did_you_mean(name, list(fields)),
                 )
             self.value(value, fields[name], f"{where}.{name}")
 
@@ -449,7 +484,7 @@ class _TreeCheck:
             by_tag = {f"!{option.__name__}": option for option in options}
             if len(options) < 2 or node.tag not in by_tag:
                 self._fail(
-                    node, where, f"unknown tag {node.tag}", _suggestion(node.tag, list(by_tag))
+                    node, where, f"unknown tag {node.tag}", did_you_mean(node.tag, list(by_tag))
                 )
             if node.id != "mapping":
                 self._fail(node, where, "expected named fields", f'Write "{node.tag} {{...}}".')
@@ -458,16 +493,26 @@ class _TreeCheck:
         scalars = [option for option in options if option in (bool, int, float, str)]
         if node.id == "scalar" and any(_scalar_fits(node, option) for option in scalars):
             return
-        try:
-            self.value(node, options[0], where)
-        except ConfigurationError as error:
-            if len(options) == 1 or error.field is None:
-                raise
+        if len(options) > 1 and node.id == "mapping" and all(map(_has_fields, options)):
+            self._check_untagged(node, options, where)
+        self.value(node, options[0], where)
+
+    def _check_untagged(self, node: Any, options: list[Any], where: str) -> None:
+        """Refuses fields that the first option lacks, where the tag of another may be missing."""
+        first, *others = options
+        known = _field_types(first)
+        for name, value in self.items(node, where).items():
+            owners = [f"!{option.__name__}" for option in others if name in _field_types(option)]
+            if name in known or not owners:
+                continue
             tags = _listing([f"!{option.__name__}" for option in options])
-            fix = f"{error.fix} Without a tag this is !{options[0].__name__}; tags: {tags}."
-            raise ConfigurationError(
-                error.problem, field=error.field, fix=fix, source=error.source
-            ) from None
+            self._fail(
+                value,
+                f"{where}.{name}",
+                f"unknown field of {first.__name__}",
+                f"It is a field of {_listing(owners)}. Without a tag this is !{first.__name__}; "
+                f"tags: {tags}.",
+            )
 
     def _scalar(self, node: Any, schema: type, where: str) -> None:
         expected = {
@@ -499,17 +544,14 @@ def _scalar_fits(node: Any, schema: type) -> bool:
     return schema is float or number.is_integer()
 
 
+def _has_fields(schema: Any) -> bool:
+    return dc.is_dataclass(schema) or hasattr(schema, "__fields__")
+
+
 def _field_types(schema: Any) -> dict[str, Any]:
     """Returns names and types of the fields of a dataclass or of a type bound by Drake."""
     fields = dc.fields(schema) if dc.is_dataclass(schema) else schema.__fields__
     return {field.name: field.type for field in fields}
-
-
-def _suggestion(name: str, options: collections.abc.Sequence[str]) -> str:
-    close = difflib.get_close_matches(name, options, n=1)
-    if close:
-        return f'Did you mean "{close[0]}"?'
-    return f"Known: {_listing(options)}."
 
 
 def _listing(names: collections.abc.Sequence[str]) -> str:

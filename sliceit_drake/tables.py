@@ -1,13 +1,12 @@
 """Tables of numbers: CSV files, with errors that name file, row and column, and interpolation."""
 
 import csv
-import difflib
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.configuration import ConfigurationError, closest
 
 __all__ = ["interpolated", "read_columns", "read_rows", "require_increasing"]
 
@@ -48,8 +47,8 @@ def read_columns(file: str | Path, columns: Sequence[str]) -> dict[str, np.ndarr
     header = rows[0][1] if rows else []
     for name in columns:
         if name not in header:
-            close = difflib.get_close_matches(name, header, n=1)
-            fix = f'Rename "{close[0]}"?' if close else "Add it."
+            close = closest(name, header)
+            fix = f'Rename "{close}"?' if close else "Add it."
             raise ConfigurationError(
                 f'there is no column "{name}"; the first row has: {", ".join(header) or "nothing"}',
                 source=str(file),

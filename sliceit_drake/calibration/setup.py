@@ -1,10 +1,15 @@
 """What is calibrated: a food as it is known beforehand, and the parameters that are searched."""
 
 import dataclasses as dc
-import difflib
 from pathlib import Path
 
-from sliceit_drake.configuration import ConfigurationError, choice, load_yaml, quantity
+from sliceit_drake.configuration import (
+    ConfigurationError,
+    choice,
+    did_you_mean,
+    load_yaml,
+    quantity,
+)
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.foods.food import Food, make_food_model
 from sliceit_drake.cutting.knife import Knife
@@ -126,7 +131,11 @@ def load_setup(name: str | Path) -> CalibrationSetup:
         raise ConfigurationError(
             f"{name!r} is no food that a setup ships for: {', '.join(shipped_names(FOLDER))}",
             field="--food",
-            fix="Name one of them, or give a YAML file of a setup.",
+            fix=did_you_mean(
+                str(name),
+                shipped_names(FOLDER),
+                "Name one of them, or give a YAML file of a setup.",
+            ),
         )
     setup = load_yaml(CalibrationSetup, file)
     assert isinstance(setup, CalibrationSetup)
@@ -139,11 +148,10 @@ def load_setup(name: str | Path) -> CalibrationSetup:
     known += ["effects.skin.thickness"]
     for k, parameter in enumerate(setup.parameters):
         if parameter.name not in known:
-            close = difflib.get_close_matches(parameter.name, known, n=1)
             raise ConfigurationError(
                 f"there is no parameter {parameter.name!r}",
                 source=str(file),
                 field=f"parameters[{k}].name",
-                fix=f"Did you mean {close[0]}?" if close else "See cutting/parameters.py.",
+                fix=did_you_mean(parameter.name, known, "See cutting/parameters.py."),
             )
     return setup

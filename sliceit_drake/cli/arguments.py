@@ -45,8 +45,10 @@ def add_scenario_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--set",
-        metavar="YAML",
-        help="fields that replace those of the file, as '{food: {material: {toughness: 400}}}'",
+        metavar="FIELD=VALUE",
+        action="append",
+        help="what replaces fields of the file: food.material.toughness=400, several separated by "
+        "commas; or as YAML, '{food: {material: {toughness: 400}}}'; may be given again",
     )
 
 

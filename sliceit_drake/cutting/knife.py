@@ -6,7 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from sliceit_drake.configuration import ConfigurationError, choice, load_yaml, quantity
+from sliceit_drake.configuration import (
+    ConfigurationError,
+    choice,
+    did_you_mean,
+    load_yaml,
+    quantity,
+)
 from sliceit_drake.resources import named_yaml, shipped_names
 
 __all__ = [
@@ -180,7 +186,11 @@ def load_knife(name: str | Path, field: str = "knife_name") -> NamedKnife:
         raise ConfigurationError(
             f"there is no knife {str(name)!r}; there are {', '.join(shipped_names(FOLDER))}",
             field=field,
-            fix="Name one of them, or give a YAML file (docs/foods.md).",
+            fix=did_you_mean(
+                str(name),
+                shipped_names(FOLDER),
+                "Name one of them, or give a YAML file (docs/foods.md).",
+            ),
         )
     return load_yaml(NamedKnife, file)
 

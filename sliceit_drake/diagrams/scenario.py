@@ -1,7 +1,7 @@
 """A scenario: everything about one simulated or real slice, and the YAML that holds it."""
 
 import dataclasses as dc
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,14 @@ from sliceit_drake.cutting.knife import Knife, load_knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.diagrams.plant.robot_plant import RobotConfig
+from sliceit_drake.diagrams.scenario_file import other_kind, scenario_file
 from sliceit_drake.diagrams.sequence import SliceSequence
-from sliceit_drake.resources import file_or_resource, named_yaml, shipped_names
+from sliceit_drake.overrides import (
+    assignments,
+    path_that_is_meant,
+    set_field,
+    set_field_to_yaml,
+)
 from sliceit_drake.systems.agent import AgentConfig
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
@@ -32,6 +38,8 @@ __all__ = ["Measurement", "Placement", "Preparation", "Scenario", "Start", "load
 
 CLEAR_OF_FOOD = 1e-3
 """Least height of the knife over the food while it goes from one slice to the next, metres."""
+NAMED = {"food": "calibration", "knife": "knife_name"}
+"""Fields of a scenario that name what ships, by the fields that they replace."""
 
 
 @dc.dataclass
@@ -158,7 +166,8 @@ class Scenario:
 
 
 def load_scenario(
-    scenario: str | Path | Scenario, overrides: str | Mapping[str, Any] | None = None
+    scenario: str | Path | Scenario,
+    overrides: str | Sequence[str] | Mapping[str, Any] | None = None,
 ) -> Scenario:
     """A validated scenario: one that ships, one of a file, or a copy of another.
 
@@ -166,43 +175,78 @@ def load_scenario(
         scenario: Name of one that ships, such as "cucumber"; a YAML file with one document of
             `Scenario` fields; or a `Scenario`, which stays as it is.
         overrides: Fields that replace those of the scenario: YAML text such as
-            `{food: {material: {toughness: 400}}}`, or a dictionary. A key of a dictionary may be
-            a path, such as `food.material.toughness` or `motion.segments.0.speed`.
+            `{food: {material: {toughness: 400}}}`, text of paths such as
+            `food.material.toughness=400, motion.segments.0.speed=0.05`, several such texts, or a
+            dictionary, whose keys may be paths.
 
     Raises:
         ConfigurationError: Naming file, field and fix.
     """
-    paths: dict[str, Any] = {}
+    texts: list[str] = []
+    values: dict[str, Any] = {}
+    written: dict[str, str] = {}
     if isinstance(overrides, Mapping):
-        paths = {key: value for key, value in overrides.items() if "." in key}
-        fields = {k: plain(value) for k, value in overrides.items() if k not in paths}
-        overrides = yaml.safe_dump(fields) if fields else None
+        values = {key: value for key, value in overrides.items() if "." in key}
+        fields = {k: plain(value) for k, value in overrides.items() if k not in values}
+        texts = [yaml.safe_dump(fields)] if fields else []
+    else:
+        given_texts = [overrides] if isinstance(overrides, str) else overrides or ()
+        for text in given_texts:
+            paths = assignments(text)
+            if paths is None:
+                texts.append(text)
+                continue
+            # What stands at the top may name a food or a knife, whose fields others replace.
+            top = [path for path in paths if path in {f.name for f in dc.fields(Scenario)}]
+            texts += [f"{path}: {paths[path]}" for path in top]
+            written |= {path: value for path, value in paths.items() if path not in top}
     if isinstance(scenario, Scenario):
         file, given, source = None, scenario, "scenario"
     else:
-        file, given = _scenario_file(scenario), Scenario()
+        file, given = scenario_file(scenario), Scenario()
         source = str(file)
-    loaded = load_yaml(Scenario, file, defaults=given, overrides_text=overrides)
-    assert isinstance(loaded, Scenario)
+    loaded = _load(file, given, texts)
     if file is not None and isinstance(loaded.food, Food):
         loaded.food.look_beside(file)
     _put_in_named(loaded, given, source)
-    for path, value in paths.items():
-        _set_field(loaded, path, value)
+    for path, value in values.items():
+        set_field(loaded, path, plain(value), "scenario")
+    for path, text in written.items():
+        path = path.removeprefix("scenario.")
+        set_field_to_yaml(loaded, path, text, "scenario", "--set")
     validate(loaded, "scenario")
     return loaded
 
 
-def _scenario_file(name: str | Path) -> Path:
-    file = file_or_resource(str(name)) or named_yaml(name, "scenarios")
-    if file is None or not file.is_file():
-        shipped = ", ".join(shipped_names("scenarios"))
+def _load(file: Path | None, given: Scenario, texts: Sequence[str]) -> Scenario:
+    """The scenario of a file with YAML texts over it, in turn."""
+    try:
+        loaded = load_yaml(Scenario, file, given, texts[0] if texts else None)
+        for text in texts[1:]:
+            loaded = load_yaml(Scenario, None, loaded, text)
+    except ConfigurationError as error:
+        top, _, name = (error.field or "").partition(".")
+        if name in NAMED and error.problem == "expected named fields":
+            raise ConfigurationError(
+                error.problem,
+                field=error.field,
+                source=error.source,
+                fix=f"{error.fix} One that has a name is given as {NAMED[name]}=NAME.",
+            ) from None
+        if top != "scenario" or not error.problem.startswith("unknown field of Scenario"):
+            raise
+        other = None if file is None or "overrides" in str(error.source) else other_kind(file)
+        if other is not None:
+            raise ConfigurationError(other[0], source=str(file), fix=other[1]) from None
+        like = path_that_is_meant(given, name)
+        if like is None or "." not in like:
+            raise
+        fix = f'Did you mean "{like}"? Write it as a path: --set {like}=VALUE.'
         raise ConfigurationError(
-            "there is no such scenario, neither here nor in the package",
-            source=str(name),
-            fix=f"Give a YAML file, or one of {shipped}.",
-        )
-    return file
+            error.problem, field=error.field, source=error.source, fix=fix
+        ) from None
+    assert isinstance(loaded, Scenario)
+    return loaded
 
 
 def plain(value: Any) -> Any:
@@ -233,27 +277,6 @@ def _put_in_named(scenario: Scenario, given: Scenario, source: str) -> None:
     if scenario.preparation is not None and scenario.preparation.peeled:
         if isinstance(scenario.food, Food):
             scenario.food.effects.skin.toughness = 0.0
-
-
-def _set_field(scenario: Scenario, path: str, value: Any) -> None:
-    """Sets the field at a path of names, and of numbers of elements of lists."""
-    *parents, last = path.split(".")
-    at: Any = scenario
-    try:
-        for part in parents:
-            at = at[int(part)] if isinstance(at, list) else getattr(at, part)
-        if isinstance(at, list):
-            at[int(last)] = plain(value)
-        elif last in {field.name for field in dc.fields(at)}:
-            setattr(at, last, plain(value))
-        else:
-            raise AttributeError(last)
-    except (AttributeError, IndexError, TypeError, ValueError) as error:
-        raise ConfigurationError(
-            "there is no such field",
-            field=f"scenario.{path}",
-            fix="Give a path such as food.material.toughness or motion.segments.0.speed.",
-        ) from error
 
 
 def _named_knife(name: str, given: Knife, source: str) -> Knife:

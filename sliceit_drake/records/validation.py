@@ -1,7 +1,6 @@
 """Checks of slice records: what is wrong, in which file, column and rows, and what to do."""
 
 import dataclasses as dc
-import difflib
 import operator
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.configuration import ConfigurationError, did_you_mean
 from sliceit_drake.records import slice_record as fmt
 from sliceit_drake.records.findings import MIN_ROWS, Findings, RecordFinding, runs
 from sliceit_drake.records.force_checks import check_force
@@ -189,8 +188,7 @@ def _check_facts(table: SliceTable, findings: Findings) -> None:
     names = _field_names(metadata)
     for name in metadata.unknown:
         if name not in names and name not in fmt.COLUMNS:
-            close = difflib.get_close_matches(name, [*names, *fmt.COLUMNS], n=1)
-            fix = f'Did you mean "{close[0]}"?' if close else None
+            fix = did_you_mean(name, [*names, *fmt.COLUMNS], "Name a field, as food.size.")
             text = f"{name!r} is no field and no column"
             findings.fact("unknown name", "unknown", text, fix)
     phases = metadata.motion.phases

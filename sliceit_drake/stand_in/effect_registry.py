@@ -3,7 +3,7 @@
 import inspect
 from pathlib import Path
 
-from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.configuration import ConfigurationError, did_you_mean
 from sliceit_drake.resources import load_module
 from sliceit_drake.stand_in import knife_effects, mounting_effects, sensor_effects, tissue_effects
 from sliceit_drake.stand_in.effect import Effect
@@ -80,7 +80,7 @@ def make_effect(text: str) -> Effect:
         raise ConfigurationError(
             f"{name!r} is no effect",
             field="--effect",
-            fix=f"Give a file.py, or one of {', '.join(EFFECTS)}.",
+            fix=did_you_mean(name, EFFECTS, f"Give a file.py, or one of {', '.join(EFFECTS)}."),
         )
     return kind(size)
 

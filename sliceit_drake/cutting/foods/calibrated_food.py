@@ -4,7 +4,7 @@ import copy
 import dataclasses as dc
 from pathlib import Path
 
-from sliceit_drake.configuration import ConfigurationError, load_yaml, quantity
+from sliceit_drake.configuration import ConfigurationError, did_you_mean, load_yaml, quantity
 from sliceit_drake.cutting.foods.distribution import ParameterDistribution
 from sliceit_drake.cutting.foods.effects import Compliance
 from sliceit_drake.cutting.foods.food import Food
@@ -66,7 +66,11 @@ def load_calibrated_food(name: str | Path) -> CalibratedFood:
         raise ConfigurationError(
             f"{name!r} is not calibrated; there are {', '.join(shipped_names(FOLDER))}",
             field="calibration",
-            fix="Name one of them, or give the food.yaml of a calibration.",
+            fix=did_you_mean(
+                str(name),
+                shipped_names(FOLDER),
+                "Name one of them, or give the food.yaml of a calibration.",
+            ),
         )
     food: CalibratedFood = load_yaml(CalibratedFood, file)
     food.food.look_beside(file)
