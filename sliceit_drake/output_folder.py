@@ -1,12 +1,50 @@
-"""Refuses a place that results cannot be written to, before anything is computed for it."""
+"""Where results go: refused before anything is computed for them, and cleared of older ones."""
 
+import errno
 import os
 import tempfile
 from pathlib import Path
 
 from sliceit_drake.configuration import ConfigurationError
 
-__all__ = ["check_folder", "check_output"]
+__all__ = ["check_folder", "check_output", "remove_results", "results_in"]
+
+RESULTS = (
+    "replay.html",
+    "slice.gif",
+    "force.png",
+    "record.csv",
+    "summary.json",
+    "scenario.yaml",
+    "robot.csv",
+    "slice.csv",
+    "slice.yaml",
+)
+"""What a run writes, a robot's too; in the order in which a person would look at it."""
+SERIES = ("run.pvd", "*.xdmf", "food_*.vtu", "knife_*.vtu", "force_*.vtu")
+"""What it writes to paraview/."""
+
+
+def results_in(folder: Path) -> list[str]:
+    """Names of the files of a run in a folder; empty where none was saved there."""
+    if not (folder / "record.csv").is_file():
+        return []
+    series = ["paraview"] if (folder / "paraview").is_dir() else []
+    return [name for name in RESULTS if (folder / name).is_file()] + series
+
+
+def remove_results(folder: Path) -> None:
+    """Removes what an earlier run wrote to a folder, and nothing else in it."""
+    if not results_in(folder):
+        return
+    for name in RESULTS:
+        (folder / name).unlink(missing_ok=True)
+    series = folder / "paraview"
+    for pattern in SERIES:
+        for file in series.glob(pattern):
+            file.unlink()
+    if series.is_dir() and not any(series.iterdir()):
+        series.rmdir()
 
 
 def check_folder(folder: Path, field: str) -> None:
@@ -28,17 +66,18 @@ def check_folder(folder: Path, field: str) -> None:
         raise _refusal(folder, error, field, "a folder of yours on a disk with room") from error
 
 
-def check_output(output: Path, field: str = "--output") -> None:
+def check_output(output: Path, field: str = "--output", is_folder: bool = False) -> None:
     """Refuses a file or folder that cannot be written or made; makes nothing.
 
     Args:
         output: What a command will write, a file or a folder.
         field: Option that names it.
+        is_folder: Whether it shall be a folder, so that a file is refused.
 
     Raises:
         ConfigurationError: Naming the folder in which it fails, and the reason.
     """
-    if output.is_file():
+    if output.is_file() and not is_folder:
         try:
             output.open("ab").close()
         except OSError as error:
@@ -47,6 +86,9 @@ def check_output(output: Path, field: str = "--output") -> None:
     place = output.absolute()
     while not place.exists():
         place = place.parent
+    if place.is_file():
+        refused = NotADirectoryError(errno.ENOTDIR, "it is a file, and results go to a folder")
+        raise _refusal(place, refused, field, f"a folder, such as {place.with_suffix('')}_results")
     check_folder(place, field)
 
 

@@ -10,7 +10,13 @@ import yaml
 
 from sliceit_drake.configuration import ConfigurationError, closest, merge_yaml
 
-__all__ = ["assignments", "path_that_is_meant", "set_field", "set_field_to_yaml"]
+__all__ = [
+    "assignments",
+    "changed_fields",
+    "path_that_is_meant",
+    "set_field",
+    "set_field_to_yaml",
+]
 
 EXAMPLE = "Give a path such as food.material.toughness or motion.segments.0.speed."
 _PATH = r"\s*[A-Za-z_]\w*(?:\.\w+)*\s*="
@@ -78,6 +84,18 @@ def path_that_is_meant(config: Any, path: str) -> str | None:
     ends = {each.rpartition(".")[2]: each for each in reversed(paths)}
     like = closest(path, paths)
     return ends[last] if last in ends else like or ends.get(closest(last, ends) or "")
+
+
+def changed_fields(before: Any, after: Any) -> list[str]:
+    """Paths of the fields in which two configurations of a type differ."""
+    changed = []
+    for field in dc.fields(before):
+        old, new = getattr(before, field.name), getattr(after, field.name)
+        if dc.is_dataclass(old) and type(old) is type(new):
+            changed += [f"{field.name}.{path}" for path in changed_fields(old, new)]
+        elif old != new:
+            changed.append(field.name)
+    return changed
 
 
 def _owner(config: Any, path: str, where: str) -> tuple[Any, str]:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from sliceit_drake.cli import main as program
+from sliceit_drake import output_folder
 from sliceit_drake.cli.main import main
 from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.configuration import ConfigurationError
@@ -68,10 +68,10 @@ def test_looking_at_a_place_makes_nothing_and_changes_no_file(tmp_path):
 
 
 def test_a_disk_that_refuses_is_a_message_and_no_traceback(monkeypatch, capsys):
-    def refuse(*_):
+    def refuse(*_, **__):
         raise OSError(28, "No space left on device", "out/record.csv")
 
-    monkeypatch.setattr(program, "check_output", refuse)
+    monkeypatch.setattr(output_folder, "check_output", refuse)
     assert main(["simulate", "--output", "out"]) == 2
     assert capsys.readouterr().err == "sliceit: out/record.csv: No space left on device\n"
 
@@ -126,11 +126,11 @@ def test_a_kill_ends_a_run_as_ctrl_c_does_offline_and_keeps_what_there_is(
 
 
 def test_a_command_that_goes_on_says_so_when_it_is_interrupted(tmp_path, monkeypatch, capsys):
-    def interrupt(*_):
+    def interrupt(*_, **__):
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(10.0)
 
-    monkeypatch.setattr(program, "check_output", interrupt)
+    monkeypatch.setattr(output_folder, "check_output", interrupt)
     for command, goes_on in ((["calibrate", "x", "--food", "cucumber"], True), (["export"], False)):
         folder = [] if goes_on else [str(tmp_path)]
         assert main([*command, *folder, "--output", str(tmp_path / "out")]) == 130

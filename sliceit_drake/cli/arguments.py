@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ONE_CUT",
     "add_cluster_arguments",
+    "add_output_folder",
     "add_protocol_argument",
     "add_scenario_arguments",
     "cluster_of",
@@ -57,6 +58,14 @@ def scenario_of(options: argparse.Namespace) -> "Scenario":
     from sliceit_drake.diagrams.scenario import load_scenario
 
     return load_scenario(options.scenario, options.set)
+
+
+def add_output_folder(
+    parser: argparse.ArgumentParser, text: str, *, required: bool = False
+) -> None:
+    """Adds --output DIR, a folder, which a file of that name refuses; `text` is for the help."""
+    parser.add_argument("--output", metavar="DIR", type=Path, required=required, help=text)
+    parser.set_defaults(output_is_folder=True)
 
 
 def add_protocol_argument(parser: argparse.ArgumentParser, kind: str = "a protocol") -> None:

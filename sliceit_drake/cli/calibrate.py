@@ -24,9 +24,9 @@ A food that nobody recorded, from published levels in its setup:
 
 import argparse
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sliceit_drake.cli.arguments import add_output_folder
 from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.resources import here_or_shipped
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "records", metavar="RECORD", nargs="*", type=here_or_shipped, help="NAME.csv or folder"
     )
     parser.add_argument("--food", metavar="NAME", help="a setup by name, or a YAML file of one")
-    parser.add_argument("--output", metavar="DIR", type=Path, help="where the results go")
+    add_output_folder(parser, "where the results go")
     parser.add_argument("--show", metavar="NAME", help="print a calibrated food and stop")
     parser.add_argument(
         "--literature",
@@ -160,7 +160,7 @@ def _calibrate(options: argparse.Namespace) -> int:
     records = [load_record(file) for path in options.records for file in record_files(path)]
     for record in records:
         for finding in check_record(record):
-            print(f"{finding.severity}: {finding}")
+            print(finding)
     names = [record.name for record in records]
     for name in options.hold_out:
         if name not in names:

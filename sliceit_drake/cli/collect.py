@@ -29,7 +29,12 @@ import functools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sliceit_drake.cli.arguments import ONE_CUT, add_protocol_argument, protocol_file
+from sliceit_drake.cli.arguments import (
+    ONE_CUT,
+    add_output_folder,
+    add_protocol_argument,
+    protocol_file,
+)
 from sliceit_drake.cli.hardware import add_robot_arguments, robot_of
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.hardware.client import is_loopback
@@ -54,9 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"whose robot, controller, sensor and numerics are used (default {ONE_CUT})",
     )
     add_robot_arguments(parser)
-    parser.add_argument(
-        "--output", metavar="DIR", type=Path, help="folder of the records; default output/NAME"
-    )
+    add_output_folder(parser, "folder of the records; default output/NAME")
     parser.add_argument(
         "--seed", type=int, default=0, help="of the order and the simulated variation (default 0)"
     )

@@ -28,7 +28,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sliceit_drake.cli.arguments import add_cluster_arguments, cluster_of
+from sliceit_drake.cli.arguments import add_cluster_arguments, add_output_folder, cluster_of
 from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.output_folder import check_folder
@@ -53,9 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--model", metavar="FOOD", required=True, help="a calibrated food by name, or its YAML file"
     )
-    parser.add_argument(
-        "--output", metavar="DIR", type=Path, required=True, help="where results go"
-    )
+    add_output_folder(parser, "where results go", required=True)
     parser.add_argument(
         "--cause", metavar="FILE", type=Path, action="append", default=[], help="a cause of yours"
     )

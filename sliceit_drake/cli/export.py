@@ -16,6 +16,7 @@ import argparse
 import functools
 from pathlib import Path
 
+from sliceit_drake.cli.arguments import add_output_folder
 from sliceit_drake.cli.progress import SIMULATED_TIME, StageBars
 
 __all__ = ["add_arguments", "run"]
@@ -26,9 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", metavar="FOLDER", type=Path, help="of `sliceit simulate`")
     parser.add_argument("--format", choices=("vtu", "xdmf"), default="vtu", help="default: vtu")
     parser.add_argument("--fps", type=float, default=30.0, help="frames a second (default 30)")
-    parser.add_argument(
-        "--output", metavar="DIR", type=Path, help="default: paraview, in the folder"
-    )
+    add_output_folder(parser, "default: paraview, in the folder")
 
 
 def run(options: argparse.Namespace) -> int:

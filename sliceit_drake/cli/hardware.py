@@ -23,7 +23,12 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sliceit_drake.cli.arguments import add_scenario_arguments, find_file, scenario_of
+from sliceit_drake.cli.arguments import (
+    add_output_folder,
+    add_scenario_arguments,
+    find_file,
+    scenario_of,
+)
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.hardware.client import is_loopback
 
@@ -39,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the command's arguments."""
     add_scenario_arguments(parser)
     add_robot_arguments(parser)
-    parser.add_argument("--output", metavar="DIR", type=Path, help="default: output/NAME_robot")
+    add_output_folder(parser, "default: output/NAME_robot")
     parser.add_argument("--duration", metavar="S", type=float, help="default: the motion's")
     parser.add_argument("--no-replay", action="store_true", help="do not write replay.html")
     parser.add_argument(

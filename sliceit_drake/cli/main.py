@@ -1,17 +1,20 @@
 """Entry point of `sliceit`: parses the command line and turns bad input into a message."""
 
 import argparse
+import difflib
 import errno
 import importlib
+import importlib.metadata
 import os
+import re
 import signal
 import sys
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, NoReturn
 
 from sliceit_drake.interruption import handle_signals
-from sliceit_drake.output_folder import check_output
 
 __all__ = ["main", "make_parser", "run_program"]
 
@@ -36,6 +39,7 @@ COMMANDS = {
     "look at it": {
         "diagram": "draw the systems of a scenario, or print its port contract",
         "export": "write a run as a series for ParaView",
+        "doctor": "check this machine, and say what to install",
     },
 }
 """What each command does, by group. A command is a module of this package with `add_arguments` and
@@ -58,14 +62,53 @@ REFUSED = {
 """Errors by which a disk refuses, rather than a program fails."""
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser that says which name is meant where one is not known."""
+
+    def __init__(self, *args: Any, **settings: Any) -> None:
+        self._known_options: list[str] = []
+        super().__init__(*args, **settings)
+
+    def add_argument(self, *args: Any, **settings: Any) -> argparse.Action:
+        """Also remembers the option's names."""
+        action = super().add_argument(*args, **settings)
+        self._known_options += action.option_strings
+        return action
+
+    def error(self, message: str) -> NoReturn:
+        """Ends the program with usage and message, and what may be meant."""
+        if choice := re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message):
+            given, names = choice[1], re.split(", ", choice[2].replace("'", ""))
+        elif unknown := re.search(r"unrecognized arguments: (\S+)", message):
+            given, names = unknown[1].split("=")[0], self._known_options
+        else:
+            given, names = "", []
+        if close := difflib.get_close_matches(given, names, n=1):
+            message = f'{message}. Did you mean "{close[0]}"?'
+        super().error(message)
+
+
+class _Versions(argparse.Action):
+    """Prints the versions of the package and of what it stands on, and ends."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        for name in ("sliceit_drake", "drake", "warp-lang", "numpy"):
+            print(f"{name} {importlib.metadata.version(name)}")
+        parser.exit()
+
+
 def make_parser() -> argparse.ArgumentParser:
     """The parser of the whole program."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="sliceit",
-        usage="sliceit [-h] COMMAND ...",
+        usage="sliceit [-h] [--version] [--verbose] COMMAND ...",
         description="Simulate a robot that slices food, in Drake.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument(
+        "--version", action=_Versions, nargs=0, help="versions of it and of Drake, Warp and NumPy"
+    )
+    parser.add_argument("--verbose", action="store_true", help="let Warp say what it compiles")
     commands = parser.add_subparsers(
         prog="sliceit", metavar="COMMAND", required=True, help=argparse.SUPPRESS
     )
@@ -80,7 +123,7 @@ def make_parser() -> argparse.ArgumentParser:
                 formatter_class=argparse.RawDescriptionHelpFormatter,
             )
             command.add_arguments(command_parser)
-            command_parser.set_defaults(run=command.run)
+            command_parser.set_defaults(run=command.run, parser=command_parser)
             lines += textwrap.wrap(
                 line, WIDTH, initial_indent=f"  {name:17}", subsequent_indent=19 * " "
             )
@@ -100,7 +143,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0 on success, 1 if a run stopped early, 2 for bad input, 130 for Ctrl-C outside a run (and
         for SIGTERM or SIGHUP).
     """
-    return run_program(make_parser(), arguments)
+    try:
+        return run_program(make_parser(), arguments)
+    except KeyboardInterrupt:
+        return _interrupted("sliceit")
 
 
 def run_program(parser: argparse.ArgumentParser, arguments: Sequence[str] | None = None) -> int:
@@ -110,7 +156,10 @@ def run_program(parser: argparse.ArgumentParser, arguments: Sequence[str] | None
     """
     # The arrays are small; threads of the linear algebra library would only wait beside the run.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    options = parser.parse_args(arguments)
+    options, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        # The command's own parser shows its usage.
+        getattr(options, "parser", parser).error(f"unrecognized arguments: {' '.join(unknown)}")
     # `nohup` has one ignored, for a reason.
     ending = [
         number
@@ -119,17 +168,20 @@ def run_program(parser: argparse.ArgumentParser, arguments: Sequence[str] | None
     ]
     try:
         with handle_signals(ending, signal.default_int_handler):
+            from sliceit_drake.cutting.warp_start import VERBOSE
+            from sliceit_drake.output_folder import check_output
+
+            if getattr(options, "verbose", False):
+                os.environ[VERBOSE] = "1"
             if isinstance(getattr(options, "output", None), Path):
-                check_output(options.output)
+                is_folder = getattr(options, "output_is_folder", False)
+                check_output(options.output, is_folder=is_folder)
             return options.run(options)
     except KeyboardInterrupt:
-        goes_on = getattr(options, "resumes", False) and options.output is not None
-        hint = (
-            f". What is done is in {options.output}; the same command goes on." if goes_on else ""
-        )
-        print(f"{parser.prog}: interrupted{hint}", file=sys.stderr)
-        return INTERRUPTED
+        return _interrupted(parser.prog, options)
     except Exception as error:
+        if _is_interrupt(error):
+            return _interrupted(parser.prog, options)
         if isinstance(error, OSError) and error.errno in REFUSED:
             print(f"{parser.prog}: {error.filename or 'output'}: {error.strerror}", file=sys.stderr)
         elif _is_bad_input(error):
@@ -137,6 +189,26 @@ def run_program(parser: argparse.ArgumentParser, arguments: Sequence[str] | None
         else:
             raise
         return BAD_INPUT
+
+
+def _interrupted(program: str, options: argparse.Namespace | None = None) -> int:
+    """Says how to go on after Ctrl-C."""
+    output = getattr(options, "output", None)
+    if getattr(options, "resumes", False) and output is not None:
+        hint = f"What is done is in {output}; the same command goes on."
+    else:
+        hint = "The same command starts again."
+    print(f"{program}: interrupted. {hint}", file=sys.stderr)
+    return INTERRUPTED
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Whether Ctrl-C is behind an error: compiled modules report it as a failed import."""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _is_bad_input(error: Exception) -> bool:

@@ -11,9 +11,8 @@ Writes to --output:
 """
 
 import argparse
-from pathlib import Path
 
-from sliceit_drake.cli.arguments import add_scenario_arguments, scenario_of
+from sliceit_drake.cli.arguments import add_output_folder, add_scenario_arguments, scenario_of
 from sliceit_drake.cli.progress import StageBars
 
 __all__ = ["add_arguments", "run"]
@@ -22,9 +21,7 @@ __all__ = ["add_arguments", "run"]
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the command's arguments."""
     add_scenario_arguments(parser)
-    parser.add_argument(
-        "--output", metavar="FOLDER", type=Path, required=True, help="where motion and figure go"
-    )
+    add_output_folder(parser, "where motion and figure go", required=True)
     for name, unit, default, text in (
         ("duration", "S", 3.0, "longest time of the cut, s"),
         ("draw-speed", "V", 0.15, "greatest speed along the edge, m/s"),

@@ -27,7 +27,8 @@ class StageBars(ExitStack):
         from tqdm import tqdm
 
         if stage not in self._bars:
-            bar = tqdm(total=total, desc=f"{self._prefix}{stage}", **self._style)
+            # A delay leaves out the bar that tqdm draws before anything is done.
+            bar = tqdm(total=total, desc=f"{self._prefix}{stage}", delay=1e-9, **self._style)
             self._bars[stage] = self.enter_context(bar)
         bar = self._bars[stage]
         bar.set_postfix_str(remark, refresh=False)

@@ -34,6 +34,7 @@ from typing import TYPE_CHECKING
 
 from sliceit_drake.cli.arguments import (
     add_cluster_arguments,
+    add_output_folder,
     add_protocol_argument,
     cluster_of,
     protocol_file,
@@ -51,9 +52,7 @@ __all__ = ["add_arguments", "run"]
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the command's arguments."""
     add_protocol_argument(parser, "a protocol or a scenario")
-    parser.add_argument(
-        "--output", metavar="DIR", type=Path, help="folder of the records; default output/NAME"
-    )
+    add_output_folder(parser, "folder of the records; default output/NAME")
     parser.add_argument(
         "--world", default="finite_elements", help="finite_elements (the default) or curves"
     )

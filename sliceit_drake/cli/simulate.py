@@ -21,22 +21,33 @@ coordinate frames W world, B robot base, S sensor, K knife, F food.
 """
 
 import argparse
+import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from sliceit_drake.cli.arguments import add_scenario_arguments, scenario_of
+from sliceit_drake.cli.arguments import add_output_folder, add_scenario_arguments, scenario_of
 from sliceit_drake.cli.progress import SIMULATED_TIME, StageBars
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.output_folder import check_output
+from sliceit_drake.output_folder import check_output, results_in
+from sliceit_drake.overrides import changed_fields
+
+if TYPE_CHECKING:
+    from sliceit_drake.diagrams.scenario import Scenario
 
 __all__ = ["add_arguments", "run"]
 
 WAIT_FOR_BROWSER = 60.0
+INTERRUPTED = 130
+MEASURED = ("food.", "knife", "board.", "motion.", "calibration", "placement.yaw")
+"""Fields of what a measured curve belongs to."""
+MESH = (".rings", ".layers", ".refinements", ".name")
+"""Fields in these that change nothing which is measured."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the command's arguments."""
     add_scenario_arguments(parser)
-    parser.add_argument("--output", metavar="DIR", type=Path, help="default: output/NAME")
+    add_output_folder(parser, "default: output/NAME")
     parser.add_argument("--duration", metavar="S", type=float, help="default: the motion's")
     parser.add_argument(
         "--meshcat",
@@ -63,7 +74,9 @@ def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     scenario = scenario_of(options)
     directory = options.output or Path("output") / scenario.name
-    check_output(directory)
+    check_output(directory, is_folder=True)
+    if results_in(directory):
+        print(f"{directory}/ has the results of an earlier run, which this one replaces")
 
     from sliceit_drake.diagrams.live_view import (
         FASTEST,
@@ -82,6 +95,7 @@ def run(options: argparse.Namespace) -> int:
     meshcat = None if options.no_replay and not options.meshcat else make_meshcat()
     print("Preparing (the first run on a machine compiles the kernels, about 8 s)", flush=True)
     prepared = prepare_run(scenario, meshcat, animation=not options.no_animation)
+    prepared.warnings += _changes_beside_measurement(options, scenario)
     if options.frames and meshcat is not None:
         meshcat.SetProperty("/frames", "visible", True)
     if options.meshcat and meshcat is not None:
@@ -96,25 +110,55 @@ def run(options: argparse.Namespace) -> int:
     frames = FoodFrames(prepared, options.fps) if options.paraview else None
     duration = options.duration or prepared.motion.duration
     with StageBars(bar_format=SIMULATED_TIME) as bars:
-
-        def show(time: float, wall: float) -> None:
-            bars.show(scenario.name, time, duration, f"{time / wall:.2f} x real time")
-
-        prepared.advance(duration, show)
-        summary = prepared.save(
-            directory,
-            replay=not options.no_replay,
-            drawing=lambda done, count: bars.show("drawing slice.gif", done, count),
+        prepared.advance(
+            duration,
+            lambda time, wall: bars.show(
+                scenario.name, time, duration, f"{time / wall:.2f} x real time"
+            ),
         )
-    if frames is not None:
-        write_series(frames, directory / "paraview", options.paraview)
+    print("Writing the results", flush=True)
+    try:
+        summary = prepared.save(directory, replay=not options.no_replay)
+        if frames is not None:
+            write_series(frames, directory / "paraview", options.paraview)
+    except KeyboardInterrupt:
+        print(
+            f"sliceit: interrupted. What is done is in {directory}/: "
+            f"{', '.join(results_in(directory))}. The same command starts again.",
+            file=sys.stderr,
+        )
+        return INTERRUPTED
     _report(summary, directory)
     if meshcat is not None:
         meshcat.Flush()  # A browser that watched keeps the replay.
     return 1 if prepared.stopped else 0
 
 
+def _changes_beside_measurement(options: argparse.Namespace, scenario: "Scenario") -> list[str]:
+    """A warning where --set makes the slice another than the one that was measured."""
+    from sliceit_drake.diagrams.scenario import load_scenario
+
+    if not options.set or scenario.measurement is None:
+        return []
+    given = load_scenario(options.scenario)
+    if given.measurement != scenario.measurement:
+        return []
+    changed = [
+        path
+        for path in changed_fields(given, scenario)
+        if path.startswith(MEASURED) and not path.endswith(MESH)
+    ]
+    if not changed:
+        return []
+    return [
+        f"the measured curve is of a slice without your change of {', '.join(changed)}: what "
+        "differs from it is no error of the simulation. Leave the curve out with "
+        "--set measurement=null"
+    ]
+
+
 def _report(summary: dict, directory: Path) -> None:
+    """Prints what came of the run, and what to open."""
     peak, board = summary["peak_force_N"], summary["board_peak_N"]
     print(
         f"Peak force {peak:.1f} N (board {board:.1f} N), cut {100 * summary['cut_progress']:.0f} %"
@@ -122,11 +166,26 @@ def _report(summary: dict, directory: Path) -> None:
     if "measurement" in summary:
         m = summary["measurement"]
         print(
-            f"Against the measured curve: RMS {m['rms_N']:.2f} N, peak {m['simulated_peak_N']:.1f} "
-            f"N (measured {m['measured_peak_N']:.1f} N)"
+            f"Against the measured curve, which ends at a depth of {m['compared_to_depth_mm']:.1f} "
+            f"mm: RMS {m['rms_N']:.2f} N, peak up to there {m['simulated_peak_N']:.1f} N (measured "
+            f"{m['measured_peak_N']:.1f} N)"
         )
     for warning in summary.get("warnings", ()):
         print(f"Warning: {warning}")
     if summary["stopped"]:
-        print(f"Stopped early: {summary['stopped']}. What there is so far is kept.")
-    print(f"Results in {directory}/: {', '.join(sorted(p.name for p in directory.iterdir()))}")
+        print(
+            f"Stopped early: {summary['stopped']}. What there is so far is kept; the same command "
+            "starts again"
+        )
+    written = results_in(directory)
+    print(f"Results in {directory}/: {', '.join(written)}")
+    animation = summary.get("animation", "")
+    if animation.startswith("none: "):
+        print(f"No slice.gif: {animation.removeprefix('none: ')}")
+    if "replay.html" in written:
+        also = "; slice.gif is the same as an animation" if "slice.gif" in written else ""
+        print(f"Open {directory / 'replay.html'} in a browser{also}")
+    elif "slice.gif" in written:
+        print(f"Open {directory / 'slice.gif'}")
+    else:
+        print(f"Open {directory / 'force.png'}")

@@ -20,8 +20,8 @@ import argparse
 import signal
 import sys
 import threading
-from pathlib import Path
 
+from sliceit_drake.cli.arguments import add_output_folder
 from sliceit_drake.cli.extras import needs_extra
 from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.interruption import handle_signals
@@ -37,9 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="TRAINING",
         help="YAML of a training; default: the settings of the package's study",
     )
-    parser.add_argument(
-        "--output", metavar="FOLDER", type=Path, required=True, help="where all is written"
-    )
+    add_output_folder(parser, "where all is written", required=True)
     parser.add_argument(
         "--simulator", choices=("cutting", "spring"), help="in the place of task.simulator"
     )

@@ -329,7 +329,10 @@ Segment = ConstantSpeed | PressAndDraw | Hold | Retract | Waypoints | Recorded
 
 @dc.dataclass
 class MotionPlan:
-    """A sequence of segments, each of which begins where the one before it ended."""
+    """A sequence of segments, each of which begins where the one before it ended.
+
+    A scenario that gives none cuts through its food, whatever its height.
+    """
 
     segments: list[Segment] = dc.field(
         default_factory=lambda: [

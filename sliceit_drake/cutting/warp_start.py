@@ -10,7 +10,10 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["start_warp"]
+__all__ = ["VERBOSE", "start_warp"]
+
+VERBOSE = "SLICEIT_VERBOSE"
+"""Environment variable that lets Warp say what it does; worker processes have it too."""
 
 CACHE = "WARP_CACHE_PATH"
 NO_GPU = b"NVIDIA CUDA driver"
@@ -21,12 +24,16 @@ NO_GPU = b"NVIDIA CUDA driver"
 def start_warp() -> None:
     """Starts Warp without its banner and its lines about modules; called where it is first used.
 
-    A log level that the user has set stays. Where Warp cannot keep compiled kernels it would end
-    with an error; they are then compiled for this process and those that it starts, which is said.
+    A log level that the user has set stays, and with `VERBOSE` all messages pass. Where Warp cannot
+    keep compiled kernels it would end with an error; they are then compiled for this process and
+    those that it starts, which is said.
     """
     _find_cache()
     import warp
 
+    if VERBOSE in os.environ:
+        warp.init()
+        return
     if warp.config.log_level == warp.LOG_INFO:
         warp.config.log_level = warp.LOG_ERROR
     with _without_line(NO_GPU):

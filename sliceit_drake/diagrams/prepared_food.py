@@ -18,7 +18,7 @@ from sliceit_drake.cutting.foods.food import Food, make_food_geometry, start_pos
 from sliceit_drake.cutting.foods.spring_food import SpringFood
 from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry
 from sliceit_drake.cutting.model import prepare_cut
-from sliceit_drake.cutting.motion import Motion, MotionPlan
+from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan, Retract
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.plant.knife_body import blade_surface
 from sliceit_drake.diagrams.scenario import Scenario
@@ -28,7 +28,22 @@ from sliceit_drake.systems.knife_force import KnifeForceSystem
 from sliceit_drake.systems.loose_slices import LooseSlices, SliceBody
 from sliceit_drake.systems.spring_cutter import SpringCutter
 
-__all__ = ["CuttableFood", "HeldFood", "OwnCutting", "PreparedFood", "food_to_cut", "prepare_food"]
+__all__ = [
+    "CuttableFood",
+    "HeldFood",
+    "OwnCutting",
+    "PreparedFood",
+    "food_to_cut",
+    "motion_of",
+    "prepare_food",
+]
+
+OVERTRAVEL = 2e-4
+"""Way into the board at the end of a cut through the food, metres; see `SliceSequence`."""
+ACCELERATION = 0.5
+"""Of the ramps of such a cut, m/s^2."""
+SHORT_HOLD = 0.1
+"""Time of rest at its end in a food that clamps the blade, s."""
 
 
 class CuttableFood(Protocol):
@@ -115,6 +130,25 @@ def _own_system(
     return system
 
 
+def motion_of(scenario: Scenario, top: float) -> MotionPlan:
+    """The scenario's segments; where it gives none, those of one cut through the food.
+
+    The knife then comes up again, but from a food that is held on both sides: that clamps the
+    blade, which would shake.
+
+    Args:
+        scenario: Without policy and sequence.
+        top: Height of the food at the cut, metres.
+    """
+    if scenario.motion != MotionPlan():
+        return scenario.motion
+    way = scenario.start.clearance + top + OVERTRAVEL
+    down = ConstantSpeed(distance=way, acceleration=ACCELERATION)
+    if isinstance(scenario.food, Food) and scenario.food.held_sides == "both":
+        return MotionPlan([down, Hold(SHORT_HOLD)])
+    return MotionPlan([down, Hold(), Retract(way, acceleration=ACCELERATION)])
+
+
 @functools.singledispatch
 def prepare_food(food: Any, scenario: Scenario) -> PreparedFood:
     """Prepares a food for the station of a scenario.
@@ -154,7 +188,10 @@ def _on_the_board(
     start = scenario.start
     down = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
     X_FK = RigidTransform(down, [start.offset, 0.0, height + start.clearance])
-    plan = scenario.motion if scenario.policy is None else scenario.policy.envelope()
+    if scenario.policy is None:
+        plan = motion_of(scenario, height)
+    else:
+        plan = scenario.policy.envelope()
     return PreparedFood(scenario.X_WF() @ X_FK, plan, make_cutting)
 
 
@@ -171,7 +208,7 @@ def _(food: Food, scenario: Scenario) -> PreparedFood:
     elif sequence is not None:
         plan = sequence.motion([cut.top for cut in cuts], start.clearance)
     else:
-        plan = scenario.motion
+        plan = motion_of(scenario, cuts[0].top)
 
     def make_cutting() -> KnifeForceSystem:
         models = [
@@ -186,9 +223,10 @@ def _(food: Food, scenario: Scenario) -> PreparedFood:
         """That of the middle slice, which stands for all."""
         middle = len(foods) // 2
         cut = cuts[middle]
-        one = scenario.motion
         if sequence is not None:
             one = sequence.motion([cut.top], start.clearance)
+        else:
+            one = plan
         motion = Motion(one, start_pose(cut, start.clearance, start.offset))
         return estimate_discretization_error(
             foods[middle], scenario.knife, numerics, scenario.exchange_period, motion

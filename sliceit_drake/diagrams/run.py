@@ -15,7 +15,6 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml, validate
-from sliceit_drake.cutting.discretization import DiscretizationError
 from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError
 from sliceit_drake.cutting.motion import Motion, MotionPlan
@@ -43,9 +42,11 @@ from sliceit_drake.diagrams.scenario_diagram import OwnPolicy, ScenarioDiagram
 from sliceit_drake.diagrams.stability import ContactMargin, check_contact_margin
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.diagrams.station_interface import OwnController, Station
+from sliceit_drake.output_folder import remove_results
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.resources import file_or_resource
 from sliceit_drake.systems.agent import AgentConfig
+from sliceit_drake.systems.contact_monitor import UNSTABLE_GAINS
 from sliceit_drake.systems.policy import PolicyConfig
 
 if TYPE_CHECKING:
@@ -55,6 +56,10 @@ __all__ = ["Run", "measured_profile", "prepare_run", "simulate"]
 
 CHUNK = 0.02
 SNAPSHOT_PROGRESS = 0.5
+CUT_THROUGH = 0.99
+"""Share of a section from which it counts as cut."""
+BOARD_REACHED = 5e-4
+"""Height of the edge over the board below which a longer way down would not help, m."""
 
 
 @dc.dataclass
@@ -75,6 +80,7 @@ class Run:
         snapshot: Knife and food when half of the section was cut, or None.
         film: Frames of an animation, or None.
         controls: Speed and stop in a live viewer, or None.
+        warnings: What the summary shall warn of, beside what the food does.
     """
 
     scenario: Scenario
@@ -89,6 +95,7 @@ class Run:
     snapshot: Snapshot | None = None
     film: Film | None = None
     controls: LiveControls | None = None
+    warnings: list[str] = dc.field(default_factory=list)
 
     def advance(
         self,
@@ -157,7 +164,9 @@ class Run:
         It simulates the cut again on other meshes, for the discretisation error.
         """
         record = self.record()
-        return _summary(self, record, _comparison(self, record))
+        summary = _summary(self, record, _comparison(self, record))
+        _add_discretization_error(self, summary)
+        return summary
 
     def save(
         self,
@@ -170,7 +179,8 @@ class Run:
         """Writes record.csv, replay.html, force.png, summary.json and scenario.yaml.
 
         And slice.gif where there is a film; the summary's `animation` names it, or says what this
-        machine lacks for it.
+        machine lacks for it. What an earlier run left in the folder is removed. Ctrl-C leaves all
+        but what takes long: the discretisation error and slice.gif.
 
         Args:
             folder: Made if absent.
@@ -183,29 +193,34 @@ class Run:
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
+        remove_results(folder)
         record = self.record()
         record.write_csv(folder / "record.csv")
         dump_yaml(self.scenario, folder / "scenario.yaml")
         comparison = _comparison(self, record)
         summary = _summary(self, record, comparison) | (extra or {})
         picture: Snapshot | np.ndarray | None = self.snapshot
-        if self.film is not None and can_draw():
-            pictures = self.film.draw(drawing)
-            picture = pictures[self._best(record)].copy()
-            add_force(pictures, self.film.times, record)
-            write_gif(folder / "slice.gif", pictures, self.film.period)
-            summary["animation"] = "slice.gif"
-        elif self.film is not None:
-            summary["animation"] = f"none: {NEEDED}"
-        text = json.dumps(summary, indent=2) + "\n"
-        (folder / "summary.json").write_text(text, encoding="utf-8")
-        _figure(self, record, comparison, picture).savefig(folder / "force.png", dpi=150)
-        if replay and self.meshcat is not None:
-            if self.station.food_visualizer is not None:
-                self.station.food_visualizer.PublishRecording()
-            self.meshcat.StopRecording()
-            self.meshcat.PublishRecording()
-            (folder / "replay.html").write_text(self.meshcat.StaticHtml(), encoding="utf-8")
+        try:
+            if replay and self.meshcat is not None:
+                if self.station.food_visualizer is not None:
+                    self.station.food_visualizer.PublishRecording()
+                self.meshcat.StopRecording()
+                self.meshcat.PublishRecording()
+                text = self.meshcat.StaticHtml()
+                (folder / "replay.html").write_text(text, encoding="utf-8")
+            _add_discretization_error(self, summary)
+            if self.film is not None and can_draw():
+                pictures = self.film.draw(drawing)
+                picture = pictures[self._best(record)].copy()
+                add_force(pictures, self.film.times, record)
+                write_gif(folder / "slice.gif", pictures, self.film.period)
+                summary["animation"] = "slice.gif"
+            elif self.film is not None:
+                summary["animation"] = f"none: {NEEDED}"
+        finally:
+            text = json.dumps(summary, indent=2) + "\n"
+            (folder / "summary.json").write_text(text, encoding="utf-8")
+            _figure(self, record, comparison, picture).savefig(folder / "force.png", dpi=150)
         return summary
 
     def _best(self, record: Record) -> int:
@@ -439,10 +454,15 @@ def _summary(run: Run, record: Record, comparison: Comparison | None) -> dict:
     summary |= station.cutting.summary(record)
     if areas := _slice_areas(run):
         summary["slices"] = [dc.asdict(report) for report in slice_reports(record, areas)]
+    warnings = [*summary.get("warnings", ()), *run.warnings]
+    warnings += [each for each in (_not_cut_through(run, record), _clamped(run)) if each]
+    if warnings:
+        summary["warnings"] = warnings
     if station.estimate_error is not None:
-        summary["discretization_error"] = _discretization_error(run, station.estimate_error)
+        summary["discretization_error"] = None
     measurement = scenario.measurement
     if comparison is not None and measurement is not None:
+        used = np.isfinite(comparison.simulated)
         summary["measurement"] = {
             "file": measurement.file,
             "rms_N": comparison.rms,
@@ -450,6 +470,7 @@ def _summary(run: Run, record: Record, comparison: Comparison | None) -> dict:
             "simulated_peak_N": comparison.simulated_peak,
             "fitted_contact_time_s": comparison.contact_time,
             "height_offset_mm": 1e3 * comparison.contact_time * measurement.speed,
+            "compared_to_depth_mm": 1e3 * float(comparison.depth[used].max()),
         }
     return summary
 
@@ -467,12 +488,58 @@ def _slice_areas(run: Run) -> list[float]:
     return run.station.cutting.section_areas() if run.scenario.sequence is not None else []
 
 
-def _discretization_error(run: Run, estimate: Callable[[], DiscretizationError]) -> dict | None:
-    """What the estimate says; None where the run ended early or a policy led."""
+def _add_discretization_error(run: Run, summary: dict) -> None:
+    """What the estimate says; None stays where the run ended early or a policy led."""
+    estimate = run.station.estimate_error
     # A policy would decide otherwise on another mesh.
-    if run.stopped is not None or run.diagram.policy is not None:
-        return None
+    if estimate is None or run.stopped is not None or run.diagram.policy is not None:
+        return
     try:
-        return dc.asdict(estimate())
+        summary["discretization_error"] = dc.asdict(estimate())
     except (CuttingError, MeshError) as problem:
-        return {"relative_rms": None, "problem": str(problem)}
+        summary["discretization_error"] = {"relative_rms": None, "problem": str(problem)}
+
+
+def _clamped(run: Run) -> str | None:
+    """Says that a blade shook in a food which clamps it, and what to change; else None."""
+    food = run.scenario.food
+    if not (run.stopped or "").startswith(UNSTABLE_GAINS) or not isinstance(food, Food):
+        return None
+    if food.held_sides != "both":
+        return None
+    return (
+        "the food is held on both sides of the cut and clamps the blade: with "
+        "food.held_sides=plus one half can give way"
+    )
+
+
+def _not_cut_through(run: Run, record: Record) -> str | None:
+    """Says that a motion's end left the food uncut, and what to change; None where it did not."""
+    scenario, station = run.scenario, run.station
+    # Without an estimate the food has no finite elements, or a robot cuts a real one.
+    if run.stopped or station.estimate_error is None:
+        return None
+    if record["time"][-1] < run.motion.duration - CHUNK:
+        return None
+    if scenario.sequence is not None:
+        shares = [report.cut_share for report in slice_reports(record, _slice_areas(run))]
+    else:
+        shares = [float(record["cut_progress"].max())]
+    uncut = [k for k, share in enumerate(shares) if share < CUT_THROUGH]
+    if not uncut:
+        return None
+    which = f"slice {uncut[0] + 1} is" if len(shares) > 1 else "the food is"
+    edge = record["knife_pose_p_z"].min() - scenario.board.height
+    if scenario.policy is not None or run.diagram.policy is not None:
+        fix = "give the policy more time (policy.duration) or depth (policy.press)"
+    elif edge > BOARD_REACHED:
+        fix = (
+            f"lengthen the way down by {1e3 * edge:.1f} mm (motion.segments.0.distance), or leave "
+            "motion out, which cuts through"
+        )
+    else:
+        fix = "draw the knife along its edge as it presses (!PressAndDraw), or refine food.shape"
+    return (
+        f"{which} not cut through: {100 * shares[uncut[0]]:.0f} % of the section is cut, and the "
+        f"edge came to {1e3 * max(edge, 0.0):.1f} mm above the board. To cut through, {fix}."
+    )

@@ -20,6 +20,7 @@ from sliceit_drake.cutting.parameters import with_parameters
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.cutting.workers import worker_processes
 from sliceit_drake.diagrams.outputs.run_log import Record
+from sliceit_drake.diagrams.prepared_food import motion_of
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario, plain
 
@@ -287,7 +288,7 @@ def _on_motion(
             found[k].stopped = str(error)
             continue
         pose = start_pose(model, start.clearance, start.offset)
-        prepared[k] = (model, Motion(scenario.motion, pose))
+        prepared[k] = (model, Motion(motion_of(scenario, model.top), pose))
     # Slices side by side have the period and the board in common.
     groups: dict[str, list[int]] = {}
     for k in prepared:

@@ -127,7 +127,7 @@ def study_scenario(mode: str, scaled_gain: float) -> Scenario:
             the middle of the agent's box, or "motion" as the scenarios track.
         scaled_gain: Error scale times P gain along z.
     """
-    scenario = Scenario(food=AnalyticFood())
+    scenario = Scenario(controller=ComplianceControllerConfig(), food=AnalyticFood())
     scenario.monitor.enabled = False
     if mode == "parallel":
         scenario.controller = AgentGains(error_scale=1.0).controller(1.0)

@@ -76,7 +76,7 @@ def solve_start_joints(
             return q
     raise ConfigurationError(
         f"the arm cannot put the knife at {np.round(p_WK, 4).tolist()} m; it comes "
-        f"within {1e3 * missed:.3g} mm and {np.rad2deg(turned):.3g} degrees",
+        f"within {missed:.4f} m and {np.rad2deg(turned):.1f} degrees",
         field="scenario.placement and scenario.start",
         fix="Place the food nearer to the robot's base (reach of the knife: about 0.85 m), or "
         "give robot.joint_positions near a posture that reaches it.",
