@@ -25,7 +25,8 @@ def write_mesh(path: Path, vertices: list, tetrahedra: list) -> Path:
 
 
 def test_simulate_writes_replay_figure_record_and_summary(tmp_path):
-    assert main(["simulate", "--set", SMALL_FOOD, "--output", str(tmp_path)]) == 0
+    options = ["--set", SMALL_FOOD, "--output", str(tmp_path)]
+    assert main(["simulate", "cucumber_measured", *options]) == 0
     # A machine that cannot draw without a display writes no animation.
     names = {p.name for p in tmp_path.iterdir()} - {"slice.gif"}
     assert names == {"replay.html", "force.png", "record.csv", "summary.json", "scenario.yaml"}
@@ -104,7 +105,8 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_bad_input_is_refused_by_name_with_exit_code_2(case, tmp_path, capsys):
     overrides, words = BAD[case]
-    arguments = ["simulate", "--set", overrides, "--no-replay", "--duration", "0.01"]
+    arguments = ["simulate", "cucumber_measured", "--set", overrides, "--no-replay"]
+    arguments += ["--duration", "0.01"]
     assert main([*arguments, "--output", str(tmp_path / "out")]) == 2
     message = capsys.readouterr().err
     assert message.startswith("sliceit: ")
@@ -130,7 +132,7 @@ def test_missing_scenario_is_refused_with_exit_code_2(capsys):
 def test_bad_mesh_file_is_refused_with_exit_code_2(vertices, words, tmp_path, capsys):
     mesh = write_mesh(tmp_path / "food.vtk", vertices, [[0, 1, 2, 3]])
     overrides = f"{{food: {{shape: !MeshFile {{path: {mesh}}}}}}}"
-    assert main(["simulate", "--set", overrides, "--no-replay"]) == 2
+    assert main(["simulate", "cucumber_measured", "--set", overrides, "--no-replay"]) == 2
     message = capsys.readouterr().err
     for word in words:
         assert word in message

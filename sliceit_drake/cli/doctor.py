@@ -36,7 +36,7 @@ EXTRAS = {
 WIDTH = 13
 
 
-class Finding(NamedTuple):
+class _Finding(NamedTuple):
     """What was looked at.
 
     Attributes:
@@ -72,12 +72,12 @@ def run(options: argparse.Namespace) -> int:
     return 1
 
 
-def _findings() -> Iterator[Finding]:
+def _findings() -> Iterator[_Finding]:
     """Checks in turn, the quick ones first."""
     yield _python()
     lacking = _lacking("")
     versions = [f"{name} {importlib.metadata.version(name)}" for name in SHOWN]
-    yield Finding(
+    yield _Finding(
         "packages",
         f"lacking: {', '.join(lacking)}" if lacking else ", ".join(versions),
         f"pip install --upgrade {PACKAGE}" if lacking else "",
@@ -91,19 +91,19 @@ def _findings() -> Iterator[Finding]:
     yield _gpu()
     for extra, purpose in EXTRAS.items():
         lacking = _lacking(extra)
-        yield Finding(
+        yield _Finding(
             extra,
             f"to {purpose}; lacking: {', '.join(lacking)}" if lacking else f"to {purpose}",
             f"pip install -e '.[{extra}]'" if lacking else "",
         )
 
 
-def _python() -> Finding:
+def _python() -> _Finding:
     wanted = importlib.metadata.metadata(PACKAGE)["Requires-Python"]
     least = tuple(int(part) for part in re.findall(r"\d+", wanted)[:2])
     found = ".".join(map(str, sys.version_info[:3]))
     fix = "" if sys.version_info[:2] >= least else f"Install Python {wanted} and the package in it."
-    return Finding("Python", f"{found} (needs {wanted})", fix, True)
+    return _Finding("Python", f"{found} (needs {wanted})", fix, True)
 
 
 def _lacking(extra: str) -> list[str]:
@@ -124,16 +124,16 @@ def _lacking(extra: str) -> list[str]:
     return lacking
 
 
-def _folder(name: str, folder: Path, fix: str, *, is_needed: bool) -> Finding:
+def _folder(name: str, folder: Path, fix: str, *, is_needed: bool) -> _Finding:
     """Whether a folder can be written to, or made."""
     try:
         check_output(folder, is_folder=True)
     except ConfigurationError as error:
-        return Finding(name, f"{error.source} {error.problem}", fix, is_needed)
-    return Finding(name, f"{folder.absolute()} can be written to")
+        return _Finding(name, f"{error.source} {error.problem}", fix, is_needed)
+    return _Finding(name, f"{folder.absolute()} can be written to")
 
 
-def _kernels() -> Finding:
+def _kernels() -> _Finding:
     from sliceit_drake.cutting.warp_start import CACHE, start_warp
 
     start_warp()
@@ -147,23 +147,23 @@ def _kernels() -> Finding:
     )
 
 
-def _drawing() -> Finding:
+def _drawing() -> _Finding:
     from sliceit_drake.diagrams.outputs.animation import NEEDED, can_draw
 
     if can_draw():
-        return Finding("drawing", "without a display works: slice.gif can be drawn")
+        return _Finding("drawing", "without a display works: slice.gif can be drawn")
     packages = " ".join(re.findall(r"lib[\w-]+", NEEDED))
-    return Finding(
+    return _Finding(
         "drawing", f"no slice.gif: {NEEDED}", f"apt install {packages} (as root), or --no-animation"
     )
 
 
-def _gpu() -> Finding:
+def _gpu() -> _Finding:
     import warp
 
     devices = [f"{device.name} ({device})" for device in warp.get_cuda_devices()]
     if devices:
-        return Finding("GPU", ", ".join(devices))
+        return _Finding("GPU", ", ".join(devices))
     driver = os.path.exists("/proc/driver/nvidia/version")
     found = "its driver is too old for Warp" if driver else "none, which nothing needs"
-    return Finding("GPU", found, "Update the NVIDIA driver to use it." if driver else "")
+    return _Finding("GPU", found, "Update the NVIDIA driver to use it." if driver else "")

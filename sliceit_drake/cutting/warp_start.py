@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["VERBOSE", "start_warp"]
+__all__ = ["CACHE", "VERBOSE", "start_warp"]
 
 VERBOSE = "SLICEIT_VERBOSE"
 """Environment variable that lets Warp say what it does; worker processes have it too."""

@@ -89,7 +89,7 @@ class Preparation:
     """Slices since sharpening before the first."""
 
 
-def tracking() -> ComplianceControllerConfig:
+def _tracking() -> ComplianceControllerConfig:
     """A controller that follows the motion, whatever force the food has against it."""
     return ComplianceControllerConfig(mode="motion", error_scale=1.0, p_gains=[200.0] * 6)
 
@@ -105,7 +105,7 @@ class Scenario:
     """Interval at which food, controller and sensor update."""
     robot: RobotConfig = dc.field(default_factory=RobotConfig)
     sensor: WrenchSensorConfig = dc.field(default_factory=WrenchSensorConfig)
-    controller: ComplianceControllerConfig = dc.field(default_factory=tracking)
+    controller: ComplianceControllerConfig = dc.field(default_factory=_tracking)
     """By default one that follows the motion; fields that are given replace that one's."""
     monitor: ContactMonitorConfig = dc.field(default_factory=ContactMonitorConfig)
     knife: Knife = dc.field(default_factory=Knife)
