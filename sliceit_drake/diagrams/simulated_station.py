@@ -190,11 +190,14 @@ class SimulatedStation(Station):
     def camera_pose(self) -> RigidTransform:
         """Pose of a camera that looks at knife and food, Cz forward and Cy down."""
         target = self.start_pose.translation() + [0.01, 0.0, 0.0]
+        height = target[2] - self.scenario.board.height
+        target[2] -= max(0.4 * (height - 0.05), 0.0)
+        offset = max(1.0, height / 0.05) * CAMERA_OFFSET
         forward = -CAMERA_OFFSET / np.linalg.norm(CAMERA_OFFSET)
         right = np.cross(forward, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
         R_WC = RotationMatrix(np.column_stack([right, np.cross(forward, right), forward]))
-        return RigidTransform(R_WC, target + CAMERA_OFFSET)
+        return RigidTransform(R_WC, target + offset)
 
     def _frame_period(self) -> float:
         size = SCENE_FRAME_SIZE + self.cutting.frame_size()
