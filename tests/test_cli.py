@@ -69,7 +69,20 @@ def test_a_run_that_breaks_off_keeps_its_record_and_says_why(tmp_path, capsys):
         "{food: {material: {youngs_modulus: 3.0e+3, toughness: 2000.0},"
         " shape: !Cylinder {rings: 2, layers: [0.0, 0.004, 0.012]}}}"
     )
-    assert main(["simulate", "--set", overrides, "--no-replay", "--output", str(tmp_path)]) == 1
+    assert (
+        main(
+            [
+                "simulate",
+                "cucumber_measured",
+                "--set",
+                overrides,
+                "--no-replay",
+                "--output",
+                str(tmp_path),
+            ]
+        )
+        == 1
+    )
     assert "Stopped early: at " in capsys.readouterr().out
     assert json.loads((tmp_path / "summary.json").read_text())["stopped"]
     assert len((tmp_path / "record.csv").read_text().splitlines()) > 10

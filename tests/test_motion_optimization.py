@@ -97,7 +97,16 @@ def test_the_command_leaves_a_scenario_that_simulate_takes(tmp_path, capsys):
         " layers: [0.0, 0.004, 0.012]}}}"
     )
     out = tmp_path / "out"
-    arguments = ["optimize-motion", "--set", small, "--output", str(out), "--iterations", "2"]
+    arguments = [
+        "optimize-motion",
+        "cucumber_measured",
+        "--set",
+        small,
+        "--output",
+        str(out),
+        "--iterations",
+        "2",
+    ]
     assert main(arguments) == 0
     assert "N in the mean over the depth" in capsys.readouterr().out
     scenario = load_scenario(out / "scenario.yaml")

@@ -63,7 +63,9 @@ def run(tmp_path_factory) -> Path:
     """A run of 0.85 s, in which the knife enters, with a series of ten frames a second."""
     folder = tmp_path_factory.mktemp("run")
     arguments = ["--duration", "0.85", "--no-replay", "--output", str(folder), "--set", SMALL]
-    assert main(["simulate", *arguments, "--paraview", "vtu", "--fps", "10"]) == 0
+    assert (
+        main(["simulate", "cucumber_measured", *arguments, "--paraview", "vtu", "--fps", "10"]) == 0
+    )
     return folder
 
 

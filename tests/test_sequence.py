@@ -21,7 +21,7 @@ SMALL = """
 food: {shape: !Cylinder {diameter: 0.016, length: 0.05, rings: 2}}
 start: {clearance: 0.002}
 numerics: {time_step: 2.0e-4}
-sequence: {count: 2, slice_layers: 1, layers: [0.004, 0.012], slice_speed: 0.08}
+sequence: {count: 2, slice_layers: 1, layers: [0.004, 0.012], slice_speed: 0.08, push: 0.0}
 """
 
 
@@ -149,8 +149,9 @@ class Shallow(SliceSequence):
         return super().motion(tops, clearance - 0.003)
 
 
-def test_a_slice_that_is_not_cut_off_stops_the_run():
-    shallow = scenario()
+@pytest.mark.parametrize("push", [0.0, 0.012])
+def test_a_slice_that_is_not_cut_off_stops_the_run(push):
+    shallow = scenario(push=push)
     shallow.sequence = Shallow(**vars(shallow.sequence))
     run = prepare_run(shallow)
     run.advance()

@@ -16,6 +16,7 @@ from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError, CuttingSolver
 
 __all__ = [
     "ENERGY_RATIO_LIMIT",
+    "LATERAL_LIMIT",
     "SliceForces",
     "SliceResult",
     "check_clear",

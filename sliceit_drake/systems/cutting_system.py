@@ -18,7 +18,12 @@ from sliceit_drake.cutting.mesh.surface import SKIN, FoodBody, food_body, food_s
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.rigid_motion import rigid_motion
-from sliceit_drake.cutting.simulate import check_clear, check_energies, check_in_plane
+from sliceit_drake.cutting.simulate import (
+    LATERAL_LIMIT,
+    check_clear,
+    check_energies,
+    check_in_plane,
+)
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
 from sliceit_drake.systems.cut_report import Columns, FoodBodyFrame, FoodPicture
 from sliceit_drake.systems.declare import declare_output
@@ -303,20 +308,23 @@ class CuttingSystem(KnifeForceSystem):
         if progress >= COMPLETE:
             return index + 1
         if abs(self._in_cut_frame(index, poses[1]).p[1]) > INDEXED:
-            raise CuttingError(
-                f"at {context.get_time():.4g} s the knife is over the next slice, but the cut of "
-                f"slice {index + 1} has parted {100 * progress:.2f} % of its section. Cut deeper "
-                "(sequence.overtravel), or wait at the board (sequence.hold)."
-            )
+            raise _not_parted(context, index, progress)
         return index
 
     def _is_beside(self, context: Context, X_CK: Pose) -> bool:
         """Whether the blade has left a section that it cut, on the side of the slice.
 
         It then touches the slice alone, which is off, and the food stays as the blade left it.
+
+        Raises:
+            CuttingError: It leaves a section that it has not cut through.
         """
+        if not self._in_sequence or X_CK.p[1] > -INDEXED:
+            return False
         progress = float(context.get_discrete_state(self._progress).value()[0])
-        return self._in_sequence and progress >= COMPLETE and X_CK.p[1] < -INDEXED
+        if progress < COMPLETE and X_CK.p[1] < -LATERAL_LIMIT:
+            raise _not_parted(context, self.food_index(context), progress)
+        return progress >= COMPLETE
 
     def start(self, context: Context, state: State, X_WK: RigidTransform) -> None:
         index = self.food_index(context)
@@ -399,6 +407,14 @@ class CuttingSystem(KnifeForceSystem):
         w, v = (X_WC.rotation().multiply(vector) for vector in (w_C, v_C))
         arm = self._slice_pose(context).translation() - X_WC.translation()
         return SpatialVelocity(w, v + np.cross(w, arm))
+
+
+def _not_parted(context: Context, index: int, progress: float) -> CuttingError:
+    return CuttingError(
+        f"at {context.get_time():.4g} s the knife goes on to the next slice, but the cut of slice "
+        f"{index + 1} has parted {100 * progress:.2f} % of its section. Cut deeper "
+        "(sequence.overtravel), or wait at the board (sequence.hold)."
+    )
 
 
 def _in_world(X_WF: RigidTransform, p_F: np.ndarray) -> np.ndarray:
