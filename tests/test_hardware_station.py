@@ -28,8 +28,7 @@ from sliceit_drake.hardware.hardware_config import (
 )
 from sliceit_drake.resources import resource_path
 from sliceit_drake.robot_run.hardware_run import prepare_hardware_run, write_hardware_outputs
-from sliceit_drake.robot_run.operated_robot import OperatedRobot
-from sliceit_drake.robot_run.operator import ask, plan_text
+from sliceit_drake.robot_run.operated_robot import OperatedRobot, ask, plan_text
 from sliceit_drake.robot_run.plan_check import check_plan, plan_joints
 
 EMULATED = "127.0.0.1"

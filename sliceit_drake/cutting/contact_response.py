@@ -26,17 +26,13 @@ ANGLE = 1e-3
 
 
 def contact_responses(solver: CuttingSolver, offset: float) -> list[np.ndarray]:
-    """How the food answers small motions of the blade in it, at several depths.
-
-    Args:
-        solver: The food.
-        offset: Shift of the knife along its edge, metres.
+    """How the food answers small motions of a blade in it, shifted along its edge by `offset`, m.
 
     Returns:
-        For each depth, less the mean wrench over each coupling step from the motion's on, per unit
-        [RESPONSE, 6, 6], along and about the axes of K at Ko, translations first. The last is
-        the mean of the last `SETTLED`, over the period in which the food rings. Empty if the food
-        cannot be cut at any of `APPROACH_SPEEDS`.
+        For each of several depths, less the mean wrench over each coupling step from the motion's
+        on, per unit [RESPONSE, 6, 6], along and about the axes of K at Ko, translations first. The
+        last is the mean of the last `SETTLED`, over the period in which the food rings. Empty if
+        the food cannot be cut at any of `APPROACH_SPEEDS`.
     """
     for speed in APPROACH_SPEEDS:
         with contextlib.suppress(CuttingError):

@@ -14,14 +14,10 @@ __all__ = ["children_without_interrupts", "start_worker", "worker_processes"]
 
 @contextmanager
 def worker_processes(count: int, method: str = "spawn") -> Iterator[ProcessPoolExecutor]:
-    """Processes that end with the context.
+    """Processes that end with the context, started by "spawn" or "forkserver".
 
     What leaves the context by an error, Ctrl-C included, ends the tasks that run by a SystemExit
     and drops those that wait.
-
-    Args:
-        count: How many.
-        method: How they start, "spawn" or "forkserver".
     """
     pool = _Pool(count, get_context(method), initializer=start_worker)
     try:

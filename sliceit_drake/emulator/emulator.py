@@ -176,10 +176,8 @@ class Emulator:
     def put_fresh_food(self, scenario: str | None = None) -> None:
         """Puts an uncut food under the knife, as a person does between two cuts.
 
-        The clock and the ports stand while the food is prepared.
-
-        Args:
-            scenario: YAML of the `Scenario` whose food is put there; None for the same again.
+        The clock and the ports stand while the food is prepared. It is that of a `Scenario`, as
+        YAML, or the same again.
 
         Raises:
             ConfigurationError: A program plays, the arm moves, the knife is in the way, or there is

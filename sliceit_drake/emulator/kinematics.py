@@ -69,10 +69,9 @@ class Posture:
         self.X_BF = self._frames[-1]
 
     def jacobian(self, p_B: np.ndarray) -> np.ndarray:
-        """Matrix [6, 6] from joint velocities to velocity and angular velocity, in the base.
+        """From joint velocities to velocity of a point p_B [3] and angular velocity, in the base.
 
-        Args:
-            p_B: The point of the tool whose velocity is meant, in the base [3], m.
+        A matrix [6, 6]; the point is of the tool, in the base, m.
         """
         origins = np.array([X[:3, 3] for X in self._frames[:-1]])
         axes = np.array([X[:3, 2] for X in self._frames[:-1]])
@@ -80,12 +79,7 @@ class Posture:
 
 
 def forward(q: ArrayLike, X_FT: np.ndarray | None = None) -> np.ndarray:
-    """Pose of the tool in the base [4, 4].
-
-    Args:
-        q: Joint positions [6], rad.
-        X_FT: Tool in the flange [4, 4]; None for the flange itself.
-    """
+    """Pose X_BT [4, 4] at joint positions [6], rad, of a tool at X_FT, or of the flange itself."""
     X = Posture(q).X_BF
     return X if X_FT is None else X @ X_FT
 

@@ -58,15 +58,12 @@ class RobotModel(Protocol):
     warnings: list[str]
 
     def step(self, targets: ArrayLike, servo: ServoConfig | None) -> ArmState:
-        """Advances one cycle.
+        """Advances one cycle; returns the state afterwards.
 
         Args:
             targets: Joint positions [6], rad.
             servo: Parameters of the ``servoj`` that gave them; None if they are points of a motion
                 that the controller itself has planned.
-
-        Returns:
-            The state afterwards.
 
         Raises:
             SimulationStopped: There is no state afterwards.
@@ -78,9 +75,7 @@ class RobotModel(Protocol):
     def put_fresh_food(self, scenario: "Scenario | None" = None) -> None:
         """Puts an uncut food in the place of the one that is there; the arm stays as it is.
 
-        Args:
-            scenario: Scenario of food, numerics and placement on the board; None for the same
-                food again.
+        Food, numerics and placement on the board are those of a scenario, or the same again.
 
         Raises:
             ConfigurationError, MeshError, TimeStepError: It cannot be put there.

@@ -182,10 +182,7 @@ class SafetyLayer:
         *,
         sends: bool = False,
     ) -> Stop:
-        """Stops for what another part found.
-
-        Args:
-            limit, detail, value, bound, sends: As in `Stop`.
+        """Stops for what another part found; arguments as in `Stop`.
 
         Returns:
             The first stop, which may be an earlier one; it sends no more if this one does not.

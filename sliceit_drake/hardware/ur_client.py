@@ -154,11 +154,9 @@ class UrClient:
             raise RuntimeError(f"the robot's program still plays, or no data come{reason}")
 
     def _ends(self, ask: Callable[[], object], before: float) -> bool:
-        """Whether the program ends within the time for that, by data newer than `before`.
+        """Whether the program ends in time that is asked to, by data newer than `before`, s.
 
-        Args:
-            ask: What asks it to; may block for ever.
-            before: Controller time, s.
+        What asks may block for ever.
         """
 
         def quietly() -> None:

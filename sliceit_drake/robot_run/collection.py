@@ -51,10 +51,7 @@ class Collection:
     put_fresh_food: Callable[[Scenario], None] | None = None
 
     def cut(self, first: int | None = None) -> bool:
-        """Cuts, and writes a record of each slice; on a robot a dry run ends at the first of them.
-
-        Args:
-            first: Only so many slices; None for all.
+        """Cuts the first slices, or all, and records each; on a robot a dry run ends at the first.
 
         Returns:
             False if the robot was not ready, the operator did not confirm, or a slice ended early.

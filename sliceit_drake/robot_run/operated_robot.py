@@ -1,7 +1,9 @@
 """A robot whose motions an operator confirms: connect, check, show, ask for the word, move."""
 
 import dataclasses as dc
-from collections.abc import Iterator
+import sys
+import termios
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -9,9 +11,11 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.live_view import make_meshcat
 from sliceit_drake.diagrams.run import Run
 from sliceit_drake.diagrams.scenario import Scenario
+from sliceit_drake.hardware.checks import Check
 from sliceit_drake.hardware.client import RobotClient, is_loopback
 from sliceit_drake.hardware.guarded_touch import TouchError
-from sliceit_drake.hardware.hardware_config import HardwareConfig
+from sliceit_drake.hardware.hardware_config import HardwareConfig, differing
+from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.interruption import catch_signals
 from sliceit_drake.robot_run.board_touch import BoardTouch, check_height
 from sliceit_drake.robot_run.hardware_run import (
@@ -20,9 +24,8 @@ from sliceit_drake.robot_run.hardware_run import (
     write_hardware_outputs,
 )
 from sliceit_drake.robot_run.move_to_start import MoveToStart
-from sliceit_drake.robot_run.operator import ask, plan_text, report, stopped_text
 
-__all__ = ["OperatedRobot"]
+__all__ = ["OperatedRobot", "ask", "plan_text"]
 
 WORD = "slice"
 MOVE_WORD = "move"
@@ -89,10 +92,10 @@ class OperatedRobot:
         """
         with self._connected() as client:
             hardware = prepare_hardware_run(scenario, self.config, client, self.pace)
-            if not report("Robot", hardware.check_facts()):
+            if not _report("Robot", hardware.check_facts()):
                 return False
             move = MoveToStart(hardware)
-            if not report("Move to the start", move.checks()):
+            if not _report("Move to the start", move.checks()):
                 return False
             print(
                 "\nMOVE: the joints turn straight to "
@@ -127,9 +130,9 @@ class OperatedRobot:
             config.board_height = scenario.board.height
         hardware = prepare_hardware_run(scenario, config, client, self.pace)
         touch = BoardTouch(hardware)
-        if not report("Robot and touch", [*hardware.check_facts(), *touch.checks()]):
+        if not _report("Robot and touch", [*hardware.check_facts(), *touch.checks()]):
             return False
-        if not report("Start", hardware.check_at_start()):
+        if not _report("Start", hardware.check_at_start()):
             return False
         print(
             f"\nTOUCH: the knife goes straight down by up to {1e3 * touch.depth:.1f} mm at "
@@ -144,7 +147,7 @@ class OperatedRobot:
             found = touch.execute()
         except TouchError as error:
             print(f"STOPPED: {error}")
-            print(stopped_text(touch.link))
+            print(_stopped_text(touch.link))
             return False
         print(
             f"The board is at {found.height:.4f} m (+- {1e3 * found.uncertainty:.2f} mm), expected "
@@ -160,10 +163,10 @@ class OperatedRobot:
         self, hardware: HardwareRun, directory: Path, duration: float | None = None
     ) -> Run | None:
         """The same as `run` with a robot that is connected already, and at the start."""
-        if not report("Robot and plan", hardware.check_before()):
+        if not _report("Robot and plan", hardware.check_before()):
             return None
         duration = _run_duration(hardware, duration)
-        if not report("Start", hardware.check_at_start()):
+        if not _report("Start", hardware.check_at_start()):
             return None
         print(plan_text(hardware, duration))
         if self.dry_run:
@@ -233,7 +236,7 @@ def _slice(hardware: HardwareRun, duration: float, directory: Path) -> Run:
     summary = write_hardware_outputs(hardware, directory)
     if made.stopped:
         print(f"STOPPED: {made.stopped}")
-        print(stopped_text(hardware.link))
+        print(_stopped_text(hardware.link))
     robot = summary["robot"]
     print(
         f"Peak force {summary['peak_force_N']:.1f} N; {robot['cycles']:.0f} cycles, "
@@ -241,3 +244,74 @@ def _slice(hardware: HardwareRun, duration: float, directory: Path) -> Run:
         f"(99 %), {1e3 * robot['lateness_max_s']:.2f} ms at most"
     )
     return made
+
+
+def ask(word: str, is_emulated: bool) -> bool:
+    """Whether the operator types the word; Enter alone, an end of input or Ctrl-C do not.
+
+    What was typed before the question does not count, and a robot is not moved by a pipe.
+
+    Args:
+        word: The word that goes on.
+        is_emulated: Whether the robot is emulated on this machine, so that a pipe may answer.
+    """
+    if sys.stdin.isatty():
+        termios.tcflush(sys.stdin, termios.TCIFLUSH)
+    elif not is_emulated:
+        print(f'The word "{word}" must be typed at a terminal. Nothing was moved.')
+        return False
+    try:
+        answer = input(f'Type "{word}" to go on, anything else to leave: ')
+    except EOFError:
+        answer = ""
+    if answer.strip() == word:
+        return True
+    print("Not confirmed. Nothing was moved.")
+    return False
+
+
+def _report(title: str, checks: Sequence[Check]) -> bool:
+    """Prints checks; whether all passed."""
+    print(f"{title}:")
+    for check in checks:
+        print(f"  {check}")
+    failed = [check.name for check in checks if not check.passed]
+    if failed:
+        print(f"Not ready: {', '.join(failed)}. Nothing was moved.")
+    return not failed
+
+
+def plan_text(hardware: HardwareRun, duration: float) -> str:
+    """What is about to happen, for the operator to read."""
+    scenario, plan, limits = hardware.scenario, hardware.plan, hardware.config.limits
+    board = scenario.board.height
+    changed = differing(hardware.config)
+    phases = ", ".join(
+        f"{label} {end - begin:.2f} s" for label, begin, end in hardware.motion.phases
+    )
+    policy = scenario.policy
+    if policy is not None:
+        phases = f"{policy.describe()}; up to there"
+    low, high = plan.edge_low[2] - board, plan.edge_high[2] - board
+    lines = [
+        "",
+        f"PLAN: {scenario.name}, {duration:.2f} s: {phases}",
+        f"  knife up to {1e3 * plan.fastest:.0f} mm/s; edge between "
+        f"{1e3 * low:+.2f} and {1e3 * high:+.1f} mm over the board at {board:.4f} m",
+        f"  stops at {limits.force:g} N, {limits.torque:g} Nm, {limits.knife_speed:g} m/s of the "
+        f"knife, {1e3 * limits.board_depth:g} mm below the board, {limits.tracking_error:g} rad "
+        "off the target",
+        f"  settings that differ from the defaults: {'; '.join(changed) if changed else 'none'}",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _stopped_text(link: RobotLink | None) -> str:
+    """What an operator must know about the robot after a stop."""
+    if link is None or link.stop_error is None:
+        return "The robot's program is stopped. Find the cause before you start again."
+    return (
+        f"THE ROBOT DID NOT CONFIRM THAT ITS PROGRAM IS STOPPED ({link.stop_error}). Use the "
+        "emergency stop before you go near it."
+    )

@@ -88,11 +88,7 @@ class ReportingSystem(LeafSystem):
         return ""
 
     def summary(self, record: Columns) -> dict[str, Any]:
-        """Facts for the summary of a run.
-
-        Args:
-            record: With the columns of `recorded`.
-        """
+        """Facts for the summary of a run, whose record has the columns of `recorded`."""
         return {}
 
     def section_areas(self) -> list[float]:
@@ -111,14 +107,7 @@ class ReportingSystem(LeafSystem):
         return None
 
     def contact_responses(self, offset: float) -> list[np.ndarray]:
-        """How the food answers small motions of a blade that rests in it, at several depths.
-
-        Args:
-            offset: Shift of the knife along its edge, metres.
-
-        Returns:
-            For each depth what `cutting.contact_response` says; empty if it is not known.
-        """
+        """What `cutting.contact_response.contact_responses` says; empty if it is not known."""
         return []
 
     def frame_size(self) -> float:

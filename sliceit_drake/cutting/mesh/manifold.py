@@ -29,8 +29,7 @@ def bodies(tetrahedra: np.ndarray) -> np.ndarray:
 def folded_faces(faces: np.ndarray) -> np.ndarray:
     """Faces [K, 3] that have both of their tetrahedra on one side.
 
-    Args:
-        faces: Faces of all tetrahedra, outward oriented [F, 3]; each at most twice.
+    Of the faces of all tetrahedra, outward oriented [F, 3], each at most twice.
     """
     key, face, count = np.unique(
         np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True
@@ -73,15 +72,11 @@ def pinched_vertices(boundary: np.ndarray) -> np.ndarray:
 
 
 def surface_crossings(vertices: np.ndarray, boundary: np.ndarray) -> np.ndarray:
-    """Where a surface goes through itself: pairs of faces (one by an edge of the other).
+    """Where a surface of faces [B, 3] goes through itself: pairs (one by an edge of the other).
 
     Edge by edge against face by face, those apart that share a vertex. Surfaces that only touch
     do not count. Where each tetrahedron is positive, no face is folded and the body is one, a
     surface without crossings bounds each point at most once, so that no elements overlap.
-
-    Args:
-        vertices: Positions [N, 3].
-        boundary: Faces [B, 3].
 
     Returns:
         Indices [K, 2] of the faces: that the edge belongs to, and that it goes through.
