@@ -18,7 +18,6 @@ from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import GRAVITY
-from sliceit_drake.cutting.rigid_motion import rigid_motion
 from sliceit_drake.diagrams.live_view import make_meshcat
 from sliceit_drake.diagrams.outputs import animation
 from sliceit_drake.diagrams.plant.knife_body import blade_surface
@@ -228,7 +227,7 @@ def test_rigid_motion_finds_a_rigid_motion_again():
     R = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
     p, w, v = np.array([0.01, 0.02, -0.03]), np.array([1.0, -2.0, 0.5]), np.array([0.1, 0.2, 0.3])
     now = model.nodes @ R.T + p
-    found = rigid_motion(model, now, v + np.cross(w, now))
+    found = model.rigid_motion(now, v + np.cross(w, now))
     for value, expected in zip(found, (R, p, w, v), strict=True):
         np.testing.assert_allclose(value, expected, atol=1e-9)
 

@@ -14,8 +14,8 @@ import warp as wp
 
 from sliceit_drake.cutting.kernels.layouts import ACCUMULATED, BLADE_SUMS, POINT_SUMS
 from sliceit_drake.cutting.kernels.types import PARAMETERS
+from sliceit_drake.cutting.knife_path import Mounting
 from sliceit_drake.cutting.model import CuttingModel
-from sliceit_drake.cutting.mounting import Mounting
 from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError
 from sliceit_drake.cutting.workspace import Workspace
 

@@ -17,7 +17,6 @@ from sliceit_drake.cutting.coupling_steps import EnergyBalance
 from sliceit_drake.cutting.mesh.surface import SKIN, FoodBody, food_body, food_surface
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
-from sliceit_drake.cutting.rigid_motion import rigid_motion
 from sliceit_drake.cutting.simulate import (
     LATERAL_LIMIT,
     check_clear,
@@ -392,9 +391,9 @@ class CuttingSystem(KnifeForceSystem):
         return solver.field(state, "edge_depth"), solver.field(state, "cohesive_damage")
 
     def _slice_motion(self, context: Context) -> tuple[np.ndarray, ...]:
-        """`rigid_motion` of the half at y < 0, in C."""
+        """`CuttingModel.rigid_motion` of the half at y < 0, in C."""
         solver, state = self.solver(context), self.food_state(context)
-        return rigid_motion(solver.model, solver.positions(state), solver.velocities(state))
+        return solver.model.rigid_motion(solver.positions(state), solver.velocities(state))
 
     def _slice_pose(self, context: Context) -> RigidTransform:
         X_WC = self._X_WC[self.food_index(context)]
