@@ -466,7 +466,7 @@ def test_a_training_whose_guards_end_episodes_has_failed(tmp_path, one_process, 
 
 @pytest.mark.parametrize(("episodes", "failed"), [(1000, False), (999, True)])
 def test_one_guard_in_a_thousand_episodes_may_be(tmp_path, episodes, failed):
-    watch = training._Watch(training_of(), tmp_path, "", None, None, None)
+    watch = training._Watch(training_of(), tmp_path, "", None, None)
     watch.episodes = episodes
     watch._guards.update({"CuttingError": 1})
     assert (watch.outcome(1.0).failed is not None) == failed
@@ -480,7 +480,7 @@ class Episodes:
         config.task.reward = RewardConfig()
         self.model = training.make_model(config, OverlapVecEnv(DummyVecEnv([Still])))
         self.model.set_logger(Logger(None, []))
-        self.watch = training._Watch(config, output, "", None, None, None)
+        self.watch = training._Watch(config, output, "", None, None)
         self.watch.init_callback(self.model)
 
     def cut(self, returns):
