@@ -208,7 +208,8 @@ class CuttingModel(CutGeometry):
         np.add.at(viscous, ends, (dragged * shares).ravel())
         # A step margin x is stable if stiff x^2 + viscous x <= mass; explicit damping counts twice.
         stiff = bulk * (1.0 + 2.0 * numerics.numerical_damping) + 0.25 * contact
-        limit = _largest_step(self.true_mass, stiff, viscous)
+        root = np.sqrt(viscous**2 + 4.0 * stiff * self.true_mass)
+        limit = 2.0 * self.true_mass / (viscous + root)
         sliver = self.node_volume < SLIVER * self.vertex_volume
         setting = self.moving[~sliver[self.moving]]
         if not len(setting):
@@ -332,8 +333,3 @@ def prepare_cut(
         numerics=numerics,
         point_scales=PointScales(ones, ones, ones),
     )
-
-
-def _largest_step(mass: np.ndarray, stiff: np.ndarray, viscous: np.ndarray) -> np.ndarray:
-    """Positive root x of stiff x^2 + viscous x = mass [N], s."""
-    return 2.0 * mass / (viscous + np.sqrt(viscous**2 + 4.0 * stiff * mass))

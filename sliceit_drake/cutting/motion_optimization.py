@@ -155,7 +155,10 @@ def optimize_motion(
             field="press_speed",
             fix="Allow more time or a greater speed.",
         )
-    start = _fitting(low, high, limits, height)
+    f, v = (float(np.sqrt(low[k] * high[k])) for k in (1, 2))
+    omega = 2.0 * np.pi * f
+    A = 0.5 * min(high[0], limits.draw_speed / omega, limits.draw_acceleration / omega**2)
+    start = PressAndDraw(press_speed=v, distance=height, amplitude=float(A), frequency=f)
     # All three of the order of one.
     scale = high
     best: list = [np.inf, start]
@@ -217,13 +220,3 @@ def _room(values: np.ndarray, limits: MotionLimits) -> tuple[float, float]:
     """Fractions of draw speed and acceleration that are left."""
     A, omega = float(values[0]), 2.0 * np.pi * float(values[1])
     return 1.0 - A * omega / limits.draw_speed, 1.0 - A * omega**2 / limits.draw_acceleration
-
-
-def _fitting(
-    low: np.ndarray, high: np.ndarray, limits: MotionLimits, height: float
-) -> PressAndDraw:
-    """A motion in the middle of what the limits allow."""
-    f, v = float(np.sqrt(low[1] * high[1])), float(np.sqrt(low[2] * high[2]))
-    omega = 2.0 * np.pi * f
-    A = 0.5 * min(high[0], limits.draw_speed / omega, limits.draw_acceleration / omega**2)
-    return PressAndDraw(press_speed=v, distance=height, amplitude=float(A), frequency=f)

@@ -146,12 +146,13 @@ class SlicingEnv(gymnasium.Env):
             reward += config.goal
         elif end:
             reward += config.collision
+        food, board = self._output("food_wrench_vector"), self._output("board_wrench_vector")
         info: dict[str, Any] = {
             "reward_terms": dict(zip(TERMS, terms.tolist(), strict=True)),
             "shaping": shaping,
             "cut_progress": float(self._output("cut_progress")[0]),
             "height": float(error[1]),
-            "force": self._force(),
+            "force": float(np.linalg.norm(food[3:] + board[3:])),
         }
         if guard:
             info["guard_error"], info["guard_message"] = guard, message
@@ -180,10 +181,6 @@ class SlicingEnv(gymnasium.Env):
     def _calc_potential(self, height: float) -> float:
         share = float(self._output("at_goal")[0]) / max(self.task.agent.goal_decisions, 1)
         return reward_potential(self.task.reward, height, share)
-
-    def _force(self) -> float:
-        food, board = self._output("food_wrench_vector"), self._output("board_wrench_vector")
-        return float(np.linalg.norm(food[3:] + board[3:]))
 
     def _end(self, time: float, error: np.ndarray) -> str:
         """Why the episode ends, or nothing."""

@@ -35,14 +35,10 @@ def folded_faces(faces: np.ndarray) -> np.ndarray:
         np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True
     )
     turn = np.zeros(len(key), int)
-    np.add.at(turn, face.ravel(), _parity(faces))
-    return key[(count == 2) & (turn != 0)]
-
-
-def _parity(faces: np.ndarray) -> np.ndarray:
-    """1 where the vertices of a face [F, 3] stand in even order, else -1 [F]."""
+    # 1 where the vertices of a face stand in even order, else -1.
     a, b, c = faces.T
-    return np.sign(b - a) * np.sign(c - b) * np.sign(c - a)
+    np.add.at(turn, face.ravel(), np.sign(b - a) * np.sign(c - b) * np.sign(c - a))
+    return key[(count == 2) & (turn != 0)]
 
 
 def pinched_edges(boundary: np.ndarray) -> np.ndarray:

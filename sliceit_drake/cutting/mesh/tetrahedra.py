@@ -132,7 +132,8 @@ class TetrahedralMesh:
             count = np.sort(np.bincount(body))[::-1]
             listed = ", ".join(str(n) for n in count[:5]) + (", ..." if len(count) > 5 else "")
             fix = "Keep one of them."
-            gap = _min_gap(v, t, body)
+            first, others = np.unique(t[body == 0]), np.unique(t[body != 0])
+            gap = cKDTree(v[first]).query(v[others])[0].min()
             if gap <= 1e-6 * self.mean_edge_length():
                 fix = "They touch: merge the vertices that lie on each other when meshing."
             raise MeshError(
@@ -168,12 +169,6 @@ class TetrahedralMesh:
                 f"tetrahedra {one} and {other} overlap, at {v[t[one]].mean(0)} m. Repair the "
                 "surface and mesh it again."
             )
-
-
-def _min_gap(vertices: np.ndarray, tetrahedra: np.ndarray, body: np.ndarray) -> float:
-    """Least distance of a vertex of the first body to one of the others, metres."""
-    first, others = np.unique(tetrahedra[body == 0]), np.unique(tetrahedra[body != 0])
-    return float(cKDTree(vertices[first]).query(vertices[others])[0].min())
 
 
 def _faces(tetrahedra: np.ndarray) -> np.ndarray:
