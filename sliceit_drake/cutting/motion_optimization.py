@@ -135,8 +135,7 @@ def optimize_motion(
     """The press and draw with the least mean force, from the middle of what the limits allow.
 
     Args:
-        model: The cut.
-        limits: What the motion may be.
+        model, limits: The cut, and what the motion may be.
         period: Coupling step period, s.
         iterations: Most of the optimiser.
         progress: Called with the number of slices, the best force so far, N, and its motion.

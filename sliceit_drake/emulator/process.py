@@ -23,12 +23,7 @@ class EmulatorError(RuntimeError):
 
 
 class PendantClient:
-    """A connection to the own port of a running emulator.
-
-    Args:
-        address: Address of the emulator.
-        timeout: Wall time to wait for an answer, s.
-        port: Port of the emulator.
+    """A connection to the own port of a running emulator; answers come within `timeout`, s.
 
     Raises:
         OSError: Nothing answers there.

@@ -162,14 +162,11 @@ class RobotLink:
 
     @contextmanager
     def deadline(self, limit: str, allowed: float) -> Iterator[None]:
-        """Stops the robot, braking, if what is done inside takes longer.
+        """Stops the robot, braking, if what is done inside takes longer than allowed, controller s.
 
         It would be late as a command anyway (`SafetyLimits.command_age`), but the operator shall
-        read what was slow. So that this comes first, less is allowed where that limit is shorter.
-
-        Args:
-            limit: Name of the fault, and of what is done.
-            allowed: Controller time, s.
+        read what was slow: `limit` names it. So that this comes first, less is allowed where that
+        limit is shorter.
         """
         ages = self._safety.limits.command_age - self._safety.period
         self._task = _Task(limit, self.latest().state.time, min(allowed, ages))

@@ -60,8 +60,7 @@ def slice_metrics(
 
     Args:
         time: [n], s.
-        food: Force of the food on the knife [n, 3], N.
-        board: Likewise of the board.
+        food, board: Forces on the knife [n, 3], N.
         cut: Fraction of the section that is cut [n].
         end: Why it ended.
     """

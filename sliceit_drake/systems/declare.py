@@ -26,8 +26,7 @@ def declare_output(
     """Declares an output port.
 
     Args:
-        system: What has the port.
-        name: Name of the port.
+        system, name: What has the port, and the port's name.
         example: A value of the port's type; of a vector port its size.
         calc: From the system's context to the port's value.
         prerequisites: What the value depends on.

@@ -33,12 +33,7 @@ COLOURS = {
 class _Arrow:
     """One arrow from the origin of a path; its length changes by properties alone.
 
-    Args:
-        meshcat: Viewer.
-        path: Path in Meshcat's tree.
-        colour: Red, green, blue.
-        heads: 1, or 2 for a moment.
-        order: Drawn over arrows of lower order.
+    That of a moment has two heads. It is drawn over arrows of lower order.
     """
 
     def __init__(

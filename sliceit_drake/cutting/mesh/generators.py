@@ -15,12 +15,9 @@ def _oriented(vertices: np.ndarray, tetrahedra: np.ndarray) -> TetrahedralMesh:
 
 
 def _extruded(section: np.ndarray, triangles: np.ndarray, layers: np.ndarray) -> TetrahedralMesh:
-    """Prisms over `triangles` between the `layers` along y, three tetrahedra each.
+    """Prisms over triangles [M, 3] between increasing `layers` along y [L], of three tetrahedra.
 
-    Args:
-        section: Points of the section [P, 2], (x, z).
-        triangles: Indices [M, 3].
-        layers: Increasing y coordinates [L].
+    The section's points are (x, z) [P, 2].
     """
     n = len(section)
     vertices = np.concatenate(
