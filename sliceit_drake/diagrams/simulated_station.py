@@ -10,6 +10,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer
 
+from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.plant.knife_body import check_plant_step, effective_mass
 from sliceit_drake.diagrams.plant.robot_plant import (
     ArmController,
@@ -52,7 +53,26 @@ REPLAY_SIZE = 16e6
 SCENE_FRAME_SIZE = 4e3
 FINGER = 0.015
 """Half the breadth of the holding arm's fingers along the food, metres."""
+LEANS = 3.0
+"""Angle of a cut from the vertical from which it counts as leaning, degrees."""
 CAMERA_OFFSET = np.array([0.24, -0.14, 0.13])
+
+
+def _board_peak_loss(scenario: Scenario, start_pose: RigidTransform, mass: float) -> float:
+    """As `check_plant_step`; names a cut that leans, where the arm is heavier against the board."""
+    board, robot = scenario.board, scenario.robot
+    try:
+        return check_plant_step(board, mass, robot.plant_time_step, scenario.exchange_period)
+    except ConfigurationError as error:
+        leaning = math.degrees(math.asin(min(1.0, abs(start_pose.rotation().matrix()[2, 1]))))
+        if leaning < LEANS:
+            raise
+        raise ConfigurationError(
+            f"the cut leans by {leaning:.0f} degrees, and pressed so the arm meets the board with "
+            f"{mass:.2g} kg: {error.problem}",
+            field="scenario.food.cut_normal and scenario.robot.plant_time_step",
+            fix=f"{error.fix} Or lean the cut less.",
+        ) from None
 
 
 class SimulatedStation(Station):
@@ -105,9 +125,7 @@ class SimulatedStation(Station):
             np.array(scenario.robot.joint_positions),
         )
         mass = effective_mass(self.plant, self.robot.knife, self.start_joints)
-        self.board_peak_loss = check_plant_step(
-            scenario.board, mass, scenario.robot.plant_time_step, scenario.exchange_period
-        )
+        self.board_peak_loss = _board_peak_loss(scenario, self.start_pose, mass)
         self._arm: ArmController = connect_arm_controller(
             builder, self.plant, self.robot, scenario.robot
         )

@@ -1,0 +1,295 @@
+"""What a newcomer meets in the program: its messages, its results, its end."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sliceit_drake.cli import doctor
+from sliceit_drake.cli.main import main
+from sliceit_drake.diagrams.outputs.animation import Film
+from sliceit_drake.diagrams.run import prepare_run
+from sliceit_drake.diagrams.scenario import load_scenario
+from sliceit_drake.output_folder import remove_results, results_in
+from sliceit_drake.resources import resource_path
+
+SMALL = "food.shape.rings=3,food.shape.layers=[0.0, 0.004, 0.012]"
+QUICK = ["--set", SMALL, "--no-replay", "--no-animation"]
+BRIEF = [*QUICK, "--duration", "0.05"]
+
+MISTAKES = {
+    # The scenario.
+    "a scenario's name misspelt": (["cucmber"], 'Did you mean "cucumber"?'),
+    "a food's name": (["tomato"], 'Did you mean "tomato_sequence", which cuts a tomato?'),
+    "a knife's name": (["nakiri"], "It is a knife: sliceit simulate --set knife_name=nakiri"),
+    "a calibrated food": (
+        ["calibration/foods/tomato.yaml"],
+        r"is a calibrated food, and not a scenario.*--set calibration=\S*tomato.yaml",
+    ),
+    "a knife's file": (["calibration/knives/chef.yaml"], r"is a knife.*--set knife_name="),
+    "a protocol": (["calibration/protocols/rich.yaml"], "is a protocol.*sliceit record"),
+    "a setup": (["calibration/setups/tomato.yaml"], "sliceit calibrate RECORDS --food"),
+    "the facts of a record": (["calibration/records/tomato.yaml"], "sliceit records check"),
+    "a robot's file": (["hardware/ur5e.yaml"], "describes a robot.*--robot"),
+    "a record's table": (["calibration/records/tomato.csv"], "a scenario is a YAML file"),
+    "a folder": (["calibration"], "is a folder, not a scenario. Give a YAML file, or one of"),
+    # Fields.
+    "a field without its path": (["--set", "toughness=400"], 'mean "food.material.toughness"'),
+    "the same as YAML": (["--set", "{toughness: 400}"], "Write it as a path: --set food.mater"),
+    "a path misspelt": (
+        ["--set", "food.material.tougness=400"],
+        r'scenario.food.material.tougness: there is no such field. Did you mean "food.material.to',
+    ),
+    "a path without a value": (["--set", "knife.height"], "Write knife.height=VALUE"),
+    "text for a number": (["--set", "food.material.toughness=high"], "is 'high'. Give a number"),
+    "millimetres": (["--set", "food.shape.diameter=27"], "Is it in mm. Write 0.027"),
+    "a negative value": (["--set", "food.material.density=-1"], "-1 kg/m3 is not within"),
+    "an element that is not there": (["--set", "motion.segments.9.speed=1"], "no such field"),
+    "the second of two": (
+        ["--set", "food.material.toughness=300, food.material.frction=0.1"],
+        'Did you mean "food.material.friction"',
+    ),
+    "a food by name": (["--set", "food=tomato"], "given as calibration=NAME"),
+    "a food misspelt": (["--set", "calibration=tomatoe"], 'Did you mean "tomato"'),
+    "a knife misspelt": (["--set", "knife_name=nakri"], 'Did you mean "nakiri"'),
+    "a tag misspelt": (["--set", "food.shape=!Cilinder {}"], 'Did you mean "!Cylinder"'),
+    "a missing tag": (
+        ["--set", "{food: {stiffness: 500}}"],
+        "It is a field of !AnalyticFood, !SpringFood. Without a tag this is !Food",
+    ),
+    "out of reach": (
+        ["--set", "placement.position=[1.5, -1.5]"],
+        r"comes within 1\.\d+ m and \d\.\d degrees",
+    ),
+    "a leaning cut": (
+        ["--set", "food.cut_normal=[0, 1, 1]"],
+        "scenario.food.cut_normal.*the cut leans by 45 degrees",
+    ),
+    # Options.
+    "no duration": (["--duration", "-1"], "--duration: -1.0 s is not a duration"),
+}
+
+
+@pytest.mark.parametrize("case", MISTAKES)
+def test_a_mistake_gets_a_message_that_says_what_to_do(case, tmp_path, capsys):
+    given, message = MISTAKES[case]
+    scenario = [] if given[0][0] != "-" else ["cucumber_measured"]
+    options = ["--no-replay", "--no-animation", "--output", str(tmp_path / "out")]
+    assert main(["simulate", *scenario, *given, *options]) == 2
+    shown = capsys.readouterr().err
+    assert re.search(message, shown, re.S), shown
+    assert shown.startswith("sliceit: ") and "Traceback" not in shown
+    assert "Without a tag" not in shown or case == "a missing tag"
+    assert not (tmp_path / "out").exists()
+
+
+def test_other_commands_say_what_is_meant_too(tmp_path, capsys):
+    for given, message in (
+        (["record", "--effect", "friktion"], "is no effect"),
+        (["record", "--effect", "flank_frction"], 'Did you mean "flank_friction"'),
+        (["calibrate", "x.csv", "--food", "tomatto"], 'Did you mean "tomato"'),
+        (["diagnose", str(tmp_path), "--model", "tomatto"], 'Did you mean "tomato"'),
+    ):
+        assert main([*given, "--output", str(tmp_path / "out")]) == 2
+        assert message in capsys.readouterr().err
+    for given, message in (
+        (["simulat"], 'Did you mean "simulate"?'),
+        (["simulate", "--ouput", "x"], 'Did you mean "--output"?'),
+        (["simulate", "--paraview", "vtk"], 'Did you mean "vtu"?'),
+    ):
+        with pytest.raises(SystemExit, match="2"):
+            main(given)
+        assert message in capsys.readouterr().err
+
+
+def test_what_a_run_left_suggests_its_scenario(tmp_path, capsys):
+    (tmp_path / "scenario.yaml").touch()
+    (tmp_path / "force.png").touch()
+    for given in (tmp_path, tmp_path / "force.png"):
+        assert main(["simulate", str(given)]) == 2
+        assert f"Give {tmp_path / 'scenario.yaml'}." in capsys.readouterr().err
+
+
+def test_a_mesh_is_told_apart_from_a_scenario(tmp_path, capsys):
+    (tmp_path / "pear.msh").touch()
+    assert main(["simulate", str(tmp_path / "pear.msh")]) == 2
+    assert "!MeshFile {path: " in capsys.readouterr().err
+
+
+def test_overrides_are_paths_or_yaml_and_both_together():
+    texts = ["food.material.toughness=300, motion.segments.0.speed=0.05", "{board: {height: 0.04}}"]
+    found = load_scenario("cucumber_measured", [*texts, "calibration=tomato"])
+    assert found.food.material.toughness == 300.0
+    assert found.motion.segments[0].speed == 0.05
+    assert found.board.height == 0.04
+    # A food by name stands below what is set in it.
+    assert found.food.material.youngs_modulus != load_scenario("cucumber").food.material.toughness
+    shape = load_scenario("cucumber", "food.shape=!Box {}").food.shape
+    assert type(shape).__name__ == "Box"
+
+
+def test_a_file_in_the_place_of_the_folder_is_refused_before_the_run(tmp_path, capsys):
+    (tmp_path / "taken").touch()
+    for command in (["simulate"], ["train"], ["record"]):
+        assert main([*command, "--output", str(tmp_path / "taken")]) == 2
+        shown = capsys.readouterr()
+        assert shown.out == "" and "it is a file, and results go to a folder" in shown.err
+
+
+def test_a_second_run_replaces_the_first_and_lists_its_own_files_alone(tmp_path, capsys):
+    folder = tmp_path / "run"
+    assert main(["simulate", *BRIEF, "--output", str(folder)]) == 0
+    assert "earlier run" not in capsys.readouterr().out
+    (folder / "paraview").mkdir()
+    for name in ("replay.html", "slice.gif", "notes.txt", "paraview/run.pvd", "paraview/mine"):
+        (folder / name).touch()
+    assert main(["simulate", *BRIEF, "--output", str(folder)]) == 0
+    shown = capsys.readouterr().out
+    assert "has the results of an earlier run, which this one replaces" in shown
+    kept = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+    own = {"force.png", "record.csv", "summary.json", "scenario.yaml"}
+    assert kept == own | {"notes.txt", "paraview", "paraview/mine"}
+    assert "notes.txt" not in shown and f"Open {folder / 'force.png'}" in shown
+
+
+def test_a_folder_without_a_run_is_left_alone(tmp_path):
+    (tmp_path / "scenario.yaml").touch()
+    remove_results(tmp_path)
+    assert results_in(tmp_path) == [] and (tmp_path / "scenario.yaml").exists()
+
+
+def test_a_measured_curve_of_another_slice_is_warned_of(tmp_path, capsys):
+    given = ["--set", "food.material.toughness=4000, food.cut_normal=[1, 1, 0]"]
+    options = ["--duration", "0.8", "--output", str(tmp_path)]
+    quick = ["--no-replay", "--no-animation", "--set", "food.shape.rings=3"]
+    assert main(["simulate", "cucumber_measured", *quick, *given, *options]) == 0
+    shown = capsys.readouterr().out
+    assert "Against the measured curve, which ends at a depth of" in shown
+    assert "your change of food.material.toughness, food.cut_normal" in shown
+    assert "food.shape" not in shown
+
+
+def test_nothing_but_a_food_is_cut_through_whatever_its_height(tmp_path):
+    file = tmp_path / "mine.yaml"
+    shape = "!Cylinder {diameter: 0.034, length: 0.08, rings: 3, layers: [0.0, 0.004, 0.012]}"
+    file.write_text(f"name: mine\nfood: {{shape: {shape}}}\n", encoding="utf-8")
+    run = prepare_run(load_scenario(file))
+    run.advance()
+    assert run.stopped is None and run.record()["cut_progress"][-1] > 0.99
+
+
+def test_a_cut_that_ends_above_the_board_says_what_to_change(tmp_path, capsys):
+    given = ["--set", "motion.segments.0.distance=0.02", "--output", str(tmp_path)]
+    assert main(["simulate", "cucumber_measured", *QUICK, *given]) == 0
+    shown = capsys.readouterr().out
+    assert "not cut through: " in shown and "motion.segments.0.distance" in shown
+    lengthen = float(re.search(r"lengthen the way down by ([\d.]+) mm", shown)[1])
+    assert lengthen == pytest.approx(17.0, abs=0.5)
+
+
+def test_ctrl_c_while_results_are_written_keeps_what_is_there(tmp_path, monkeypatch, capsys):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Film, "draw", interrupt)
+    monkeypatch.setattr("sliceit_drake.diagrams.run.can_draw", lambda: True)
+    options = ["--set", SMALL, "--no-replay", "--duration", "0.05", "--output", str(tmp_path)]
+    assert main(["simulate", *options]) == 130
+    shown = capsys.readouterr()
+    assert "interrupted. What is done is in" in shown.err and "starts again" in shown.err
+    assert results_in(tmp_path) == ["force.png", "record.csv", "summary.json", "scenario.yaml"]
+    assert json.loads((tmp_path / "summary.json").read_text())["scenario"]
+
+
+@pytest.mark.parametrize("wait", [0.25, 0.6, 1.2])
+def test_ctrl_c_during_imports_is_no_traceback(wait, tmp_path):
+    command = [sys.executable, "-c", "from sliceit_drake.cli.main import main; exit(main())"]
+    with subprocess.Popen(
+        [*command, "simulate", "--output", str(tmp_path / "out")],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        time.sleep(wait)
+        os.kill(process.pid, signal.SIGINT)
+        error = process.communicate(timeout=60)[1]
+    # Before the program's first line only Python itself is there to be interrupted.
+    if "sliceit_drake" in error or "sliceit:" in error:
+        assert "sliceit: interrupted" in error and "Traceback" not in error, error
+
+
+def test_warp_says_nothing_in_a_program_of_ones_own_unless_asked():
+    code = (
+        "import sliceit_drake as sliceit\n"
+        "food = {'food.shape.rings': 2, 'food.shape.layers': [0.0, 0.004, 0.012]}\n"
+        "sliceit.simulate('cucumber_measured', food, duration=0.01, replay=False)\n"
+        "short = food | {'motion.segments': []}\n"
+        "sliceit.sweep('cucumber_measured', {'food.material.toughness': [300.0, 400.0]},\n"
+        "    '{motion: {segments: [!Hold {duration: 0.01}]}}', robot=False)\n"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "SLICEIT_VERBOSE"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "" and done.stderr == ""
+    code = "from sliceit_drake.cutting.warp_start import start_warp; start_warp()"
+    environment["SLICEIT_VERBOSE"] = "1"
+    loud = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True)
+    assert b"Warp 1." in loud.stdout + loud.stderr
+
+
+def test_versions_are_those_of_all_that_matters(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main(["--version"])
+    shown = capsys.readouterr().out
+    for name in ("sliceit_drake 0", "drake 1", "warp-lang 1", "numpy "):
+        assert f"{name}" in shown
+
+
+def test_the_doctor_finds_what_is_there_and_says_how_to_install_the_rest(monkeypatch, capsys):
+    monkeypatch.setattr("sliceit_drake.diagrams.outputs.animation.can_draw", lambda: False)
+    lacking = {"": [], "learn": ["torch"]}
+    monkeypatch.setattr(doctor, "_lacking", lambda extra: lacking.get(extra, []))
+    assert main(["doctor"]) == 0
+    shown = capsys.readouterr().out
+    assert "pip install -e '.[learn]'" in shown and "apt install libegl1" in shown
+    assert "`sliceit simulate` can run here" in shown
+    lacking[""] = ["drake>=99 (found 1.51.1)"]
+    assert main(["doctor"]) == 1
+    assert "MISSING packages" in capsys.readouterr().out
+
+
+def test_evaluation_needs_no_torch(tmp_path):
+    code = (
+        "import sys, importlib.abc\n"
+        "class Block(importlib.abc.MetaPathFinder):\n"
+        "    def find_spec(self, name, path, target=None):\n"
+        "        if name.split('.')[0] == 'torch':\n"
+        "            raise ModuleNotFoundError(name, name=name)\n"
+        "sys.meta_path.insert(0, Block())\n"
+        "from sliceit_drake.cli.main import main\n"
+        "exit(main())\n"
+    )
+    policy = str(resource_path("models/policies/cutting_0"))
+    for command, status in (
+        (["evaluate", policy, "--world", "curves", "--foods", "cucumber", "--slices", "1"], 0),
+        (["train"], 2),
+    ):
+        arguments = [*command, "--output", str(tmp_path / f"{command[0]}.jsonl")]
+        done = subprocess.run(
+            [sys.executable, "-c", code, *arguments], capture_output=True, text=True
+        )
+        assert done.returncode == status and "Traceback" not in done.stderr, done.stderr
+
+
+def test_a_warning_of_a_record_says_so_once(capsys):
+    record = Path("calibration/records/cucumber.csv")
+    assert main(["records", "check", str(record)]) == 0
+    shown = capsys.readouterr().out
+    assert "warning: " in shown and "warning: warning" not in shown
