@@ -167,7 +167,7 @@ def test_a_folder_without_a_run_is_left_alone(tmp_path):
 def test_a_measured_curve_of_another_slice_is_warned_of(tmp_path, capsys):
     given = ["--set", "food.material.toughness=4000, food.cut_normal=[1, 1, 0]"]
     options = ["--duration", "0.8", "--output", str(tmp_path)]
-    quick = ["--no-replay", "--no-animation", "--set", "food.shape.rings=3"]
+    quick = ["--no-replay", "--no-animation"]
     assert main(["simulate", "cucumber_measured", *quick, *given, *options]) == 0
     shown = capsys.readouterr().out
     assert "Against the measured curve, which ends at a depth of" in shown
@@ -286,6 +286,15 @@ def test_evaluation_needs_no_torch(tmp_path):
             [sys.executable, "-c", code, *arguments], capture_output=True, text=True
         )
         assert done.returncode == status and "Traceback" not in done.stderr, done.stderr
+
+
+def test_a_table_without_its_facts_says_the_next_step(tmp_path, capsys):
+    (tmp_path / "run.csv").write_text("time,food_wrench_f_z\n0.0,1.0\n", encoding="utf-8")
+    for given in (["records", "check"], ["calibrate", "--food", "cucumber"]):
+        output = ["--output", str(tmp_path / "out")] if given[0] == "calibrate" else []
+        assert main([given[0], *given[1:], str(tmp_path / "run.csv"), *output]) == 2
+        shown = capsys.readouterr().err
+        assert "has no run.yaml beside it" in shown and "sliceit records import force" in shown
 
 
 def test_a_warning_of_a_record_says_so_once(capsys):

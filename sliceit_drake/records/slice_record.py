@@ -196,6 +196,13 @@ def read_table(file: str | Path) -> SliceTable:
             cell holds text.
     """
     table, facts = _files(file)
+    if table.is_file() and not facts.is_file():
+        raise ConfigurationError(
+            f"has no {facts.name} beside it, which says what was cut and how",
+            source=str(table),
+            fix="Write one as docs/records.md has it; of a table in another format make both: "
+            f"sliceit records import force {table} --metadata FACTS.yaml --output records.",
+        )
     metadata = load_yaml(SliceMetadata, facts)
     metadata.name = metadata.name or table.stem
     columns, lines = _read_csv(table)
