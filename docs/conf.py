@@ -255,6 +255,8 @@ def order_pages(app: Sphinx, docname: str, content: list[str]) -> None:
     for k, section in enumerate(sections):
         title = section.partition("\n")[0].removeprefix("## ")
         links = re.findall(r"\]\(([^)#:]+)\.(?:md|rst|ipynb)\)", section)
+        # Two pages have the project's name as their title.
+        links = [{"../README": "README <../README>"}.get(link, link) for link in links]
         table = "\n".join([":hidden:", f":caption: {title}", "", *dict.fromkeys(links)])
         sections[k] = f"{section}\n```{{toctree}}\n{table}\n```\n\n"
     content[0] = "".join([first, *sections])

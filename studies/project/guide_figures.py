@@ -1,6 +1,6 @@
-"""Draws pictures of the guides: the foods that ship, the station's loop, the servo, a slice record.
+"""Draws pictures of the guides: foods, frames, the station's loop, the servo, a slice record.
 
-Writes foods.png, station.png, servo.png and record.png to docs/figures.
+Writes foods.png, frames.png, station.png, servo.png and record.png to docs/figures.
 """
 
 import argparse
@@ -10,16 +10,18 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from sliceit_drake.diagrams.run import simulate
 from sliceit_drake.records.validation import load_record
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.servo import ServoConfig, ServoLaw
-from studies.figures import BLUE, GREEN, ORANGE, PURPLE, new_figure, save_figure, tidy
+from studies.figures import BLUE, GREEN, ORANGE, PURPLE, RED, new_figure, save_figure, tidy
 
 __all__ = [
     "add_arguments",
     "foods_figure",
+    "frames_figure",
     "record_figure",
     "run",
     "servo_figure",
@@ -63,6 +65,7 @@ def run(options: argparse.Namespace) -> int:
     """Runs the study."""
     figures: dict[str, Callable[[], Figure]] = {
         "foods": foods_figure,
+        "frames": frames_figure,
         "station": station_figure,
         "servo": servo_figure,
         "record": record_figure,
@@ -81,6 +84,41 @@ def foods_figure() -> Figure:
         axes.imshow(film.draw()[0][CROP])
         axes.set_title(food, fontsize=11)
         axes.axis("off")
+    return figure
+
+
+def frames_figure() -> Figure:
+    """World, food, knife and sensor, and where their frames are; mm."""
+    figure = new_figure(6.0, 5.4)
+    axes = figure.add_subplot(projection="3d", proj_type="ortho")
+    axes.set_axis_off()
+    axes.view_init(elev=18.0, azim=-58.0)
+    turn, along = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 41), [-60.0, 60.0])
+    axes.plot_surface(
+        13.5 * np.cos(turn), along, 13.5 + 13.5 * np.sin(turn), color=GREEN, alpha=0.35
+    )
+    edge, spine = 62.0, 105.0
+    blade = np.array([[[-70, 0, edge], [70, 0, edge], [70, 0, spine], [-70, 0, spine]]], float)
+    axes.add_collection3d(Poly3DCollection(blade, facecolor="0.6", edgecolor="0.3", alpha=0.6))
+    board = np.array([[[-90, -75, 0], [90, -75, 0], [90, 75, 0], [-90, 75, 0]]], float)
+    axes.add_collection3d(Poly3DCollection(board, facecolor=ORANGE, edgecolor="0.5", alpha=0.15))
+    down = np.diag([1.0, -1.0, -1.0])
+    for name, origin, R in (
+        ("W", [-90.0, -75.0, 0.0], np.eye(3)),
+        ("F", [0.0, 0.0, 0.0], np.eye(3)),
+        ("K", [0.0, 0.0, edge], down),
+        ("S", [0.0, 0.0, 165.0], down),
+    ):
+        at = np.array(origin)
+        for k, colour in enumerate((RED, GREEN, BLUE)):
+            axes.quiver(*at, *(28.0 * R[:, k]), color=colour, lw=2.0, arrow_length_ratio=0.2)
+            beside = [7.0, 0.0, 0.0] if k == 2 else [0.0, 0.0, 0.0]
+            where = at + (24.0 if k == 2 else 35.0) * R[:, k] + beside
+            axes.text(*where, "xyz"[k], color=colour, ha="center", va="center", zorder=20)
+        axes.text(*(at + [-9.0, 0.0, 3.0]), name, fontsize=13, weight="bold", zorder=20)
+    axes.plot([0.0, 0.0], [0.0, 0.0], [spine, 165.0], color="0.3", lw=4.0)
+    axes.set(xlim=(-90, 90), ylim=(-90, 90), zlim=(0, 170))
+    axes.set_box_aspect((180, 180, 170), zoom=1.25)
     return figure
 
 
