@@ -1,6 +1,8 @@
 """The programs of the how-to list and of other guides run, and its YAML is a scenario's."""
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -47,6 +49,14 @@ def test_a_program_of_the_how_to_list_runs(title, tmp_path, monkeypatch):
     if "run" in names:
         assert names["run"].stopped is None
     assert list(folder.glob("*.png"))
+
+
+def test_a_process_that_has_drawn_an_animation_can_import_the_learner(tmp_path):
+    pytest.importorskip("triton")
+    program = f"{PROGRAMS['Record an animation']}\nimport torch._dynamo\nprint('imported')"
+    program = program.replace("duration=1.0", "duration=0.1")
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True)
+    assert done.returncode == 0 and b"imported" in done.stdout, done.stderr[-500:]
 
 
 def test_a_scenario_of_the_how_to_list_loads(tmp_path):

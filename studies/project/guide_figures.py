@@ -145,7 +145,7 @@ def station_figure() -> Figure:
             "patchA": drawn[begin].get_bbox_patch(),
             "patchB": drawn[end].get_bbox_patch(),
         }
-        axes.annotate("", xy=b, xytext=a, arrowprops=arrow)
+        axes.annotate("", xy=tuple(b), xytext=tuple(a), arrowprops=arrow)
         x, y = (a + b) / 2.0
         if upright:
             side = 1.0 if shift > 0.0 else -1.0

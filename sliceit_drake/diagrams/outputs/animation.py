@@ -1,7 +1,9 @@
 """Pictures of a run as a camera would see it, drawn without a display or a browser."""
 
 import base64
+import contextlib
 import dataclasses as dc
+import importlib
 import json
 import math
 import subprocess
@@ -143,6 +145,9 @@ class Film:
         Call it only where `can_draw`.
         """
         assert self._root is not None, "look() has kept frames"
+        # The LLVM in Triton, which PyTorch imports, crashes if it is loaded after the one in Mesa.
+        with contextlib.suppress(ImportError):
+            importlib.import_module("triton")
         root = self._root.Clone()
         scene_graph = self._station.scene_graph
         context = scene_graph.GetMyMutableContextFromRoot(root)
