@@ -27,13 +27,13 @@ COMMANDS = [command for page in PAGES for command in commands_of(page, ROOT)]
 # Run below, in an empty folder; simulations for two coupling steps.
 HERE = """
 sliceit simulate
-sliceit simulate cucumber_measured --set "{calibration: cucumber}"
-sliceit simulate cucumber_measured --set "{food: {held_sides: plus, hold_distance: 0.02}}"
+sliceit simulate cucumber_measured --set calibration=cucumber
+sliceit simulate cucumber_measured --set food.held_sides=plus,food.hold_distance=0.02
 sliceit simulate cucumber_measured --set "{controller: {mode: compliance, error_scale: 0.5, p_gains: [0.05, 0.05, 0.05, 1, 1, 1], stiffness: [5000, 5000, 5000, 100, 100, 100]}}"
-sliceit simulate --set "{knife_name: nakiri}"
+sliceit simulate --set knife_name=nakiri
 sliceit simulate cucumber_spring
-sliceit simulate --set "{food: {material: {toughness: 300}}}"
-sliceit simulate --set "{calibration: potato, knife_name: nakiri}"
+sliceit simulate --set food.material.toughness=300
+sliceit simulate --set calibration=potato,knife_name=nakiri
 sliceit simulate carrot_sequence --set "{food: {shape: !Tapered {diameters: [0.018, 0.034], length: 0.10}}}"
 sliceit simulate cucumber_measured --set "{food: {cut_normal: [0.2, 1.0, 0.1]}}"
 sliceit calibrate --show cucumber
@@ -50,7 +50,7 @@ TESTED = {
     "tests/test_named_food.py::test_the_apple_is_cut_by_a_knife_that_is_higher_and_the_arm_"
     "reaches_its_start": ["sliceit simulate apple"],
     "tests/test_foods_page.py::test_what_the_pages_say_to_write_is_a_food_a_knife_and_a_setup": [
-        'sliceit simulate --set "{knife_name: knife.yaml}"',
+        "sliceit simulate --set knife_name=knife.yaml",
         "sliceit simulate radish.yaml",
     ],
     "tests/test_foods_page.py::test_tables_are_made_from_the_files_of_foods_and_knives": [
@@ -211,8 +211,8 @@ READ_ONLY = {
         sliceit simulate --meshcat
         sliceit records import force scale.csv --metadata facts.yaml --contact 0.4 --output records
         sliceit records import rosbag run_07.mcap --topics /wrench /tcp_pose --between 4.0 9.5 --metadata session.yaml --output records
-        sliceit simulate --set "{food: {material: {toughness: 300}}}" --output output/softer
-        sliceit simulate --set "{numerics: {device: 'cuda:0'}}"
+        sliceit simulate --set food.material.toughness=300 --output output/softer
+        sliceit simulate --set numerics.device=cuda:0
         """,  # noqa: E501
     "of another project; the tests start its scheduler and workers from Python": """
         dask scheduler
@@ -223,10 +223,10 @@ READ_ONLY = {
         sliceit simulate cucumber_sequence
         sliceit simulate tomato_sequence
         sliceit calibrate calibration/records/cucumber.csv --food cucumber --output output/cucumber_food
-        sliceit simulate --set "{calibration: output/cucumber_food/food.yaml}"
+        sliceit simulate --set calibration=output/cucumber_food/food.yaml
         sliceit record radish.yaml --replicates 2 --seed 1 --output records/radish
         sliceit calibrate records/radish --food radish_setup.yaml --output output/radish_food
-        sliceit simulate radish.yaml --set "{calibration: output/radish_food/food.yaml}"
+        sliceit simulate radish.yaml --set calibration=output/radish_food/food.yaml
         sliceit calibrate RECORD... --food cucumber --output DIR
         sliceit calibrate RECORD... --food NAME --output DIR
         sliceit calibrate calibration/records/NAME.csv --food NAME --start NAME --output FOLDER --blocks 0 --per-point 60
