@@ -208,6 +208,7 @@ READ_ONLY = {
         """,
     "the reader's files, a display, a GPU or another program": """
         sliceit diagram --output station.svg
+        sliceit doctor
         sliceit simulate --meshcat
         sliceit records import force scale.csv --metadata facts.yaml --contact 0.4 --output records
         sliceit records import rosbag run_07.mcap --topics /wrench /tcp_pose --between 4.0 9.5 --metadata session.yaml --output records
