@@ -183,6 +183,13 @@ TOPICS: dict[str, tuple[Study, ...]] = {
         Study("pages", "project.stored_pages", "renders all pages from stored results", "10 s"),
         Study("aims", "project.aims", "writes docs/benchmarks.md from stored results", "1 s"),
         Study("first_run", "project.first_run", "a newcomer's first run with the wheel", "2 min"),
+        Study(
+            "notebooks",
+            "project.notebooks",
+            "runs the notebooks and stores their outputs",
+            "3 min",
+            "notebooks",
+        ),
     ),
 }
 
