@@ -5,10 +5,10 @@ stand inside the package, under ``_resources``. Everything else asks here and do
 """
 
 import importlib.util
+import inspect
 import sys
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
     from pydrake.multibody.parsing import Parser
@@ -17,11 +17,13 @@ __all__ = [
     "add_package_map",
     "file_or_resource",
     "here_or_shipped",
-    "load_module",
+    "load_subclasses",
     "named_yaml",
     "resource_path",
     "shipped_names",
 ]
+
+_Base = TypeVar("_Base")
 
 _MODEL_PACKAGE = "sliceit_drake_models"
 FOLDERS = ("calibration", "hardware", "models", "scenarios")
@@ -124,10 +126,13 @@ def _resource_root() -> Path:
     )
 
 
-def load_module(name: str, file: Path) -> ModuleType | None:
+def load_subclasses(name: str, file: Path, base: type[_Base]) -> list[type[_Base]] | None:
     """Runs a user's Python file as a module of a name; None where there is no such file.
 
     What its code raises is not caught.
+
+    Returns:
+        The subclasses of `base` that the file defines.
     """
     spec = importlib.util.spec_from_file_location(name, file)
     if spec is None or spec.loader is None or not file.is_file():
@@ -137,4 +142,5 @@ def load_module(name: str, file: Path) -> ModuleType | None:
     sys.modules[name] = module
     # Not by the loader: its bytecode is stale where a file was written twice in a second.
     exec(compile(file.read_bytes(), str(file), "exec"), module.__dict__)
-    return module
+    kinds = (kind for _, kind in inspect.getmembers(module, inspect.isclass))
+    return [kind for kind in kinds if issubclass(kind, base) and kind.__module__ == name]

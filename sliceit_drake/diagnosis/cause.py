@@ -57,8 +57,7 @@ class CauseParameter:
     """A number of a cause.
 
     Attributes:
-        name: Its name.
-        unit: Its unit.
+        name, unit: Of the number.
         size: A size that matters and is plausible before any measurement, from the null.
         low, high: Range.
         null: Value at which the cause is absent.
@@ -93,8 +92,7 @@ class Scan:
     """A number without a meaning where the cause is absent: it is tried at some values.
 
     Attributes:
-        name: Its name.
-        unit: Its unit.
+        name, unit: Of the number.
         values: What is tried.
     """
 

@@ -24,8 +24,7 @@ class RecordEffect:
     """What differs from slice to slice.
 
     Attributes:
-        name: Its name.
-        unit: Its unit; "" for the logarithm of a factor.
+        name, unit: The unit is "" for the logarithm of a factor.
         size: Plausible standard deviation, and the step of the derivative.
         parameter: Of the cut that it multiplies; "" for none.
     """
@@ -51,12 +50,7 @@ SPEED = RecordEffect("speed", "", 0.05)
 
 @dc.dataclass(frozen=True)
 class ActiveCause:
-    """A cause at values of its parameters and, if it has one, of its scan.
-
-    Attributes:
-        cause: The cause.
-        values: By name.
-    """
+    """A cause at values, by name, of its parameters and, if it has one, of its scan."""
 
     cause: Cause
     values: Mapping[str, float]

@@ -4,7 +4,6 @@ A user's cause is tried on a made-up slice, so that its mistakes show before any
 """
 
 import contextlib
-import inspect
 import traceback
 from collections.abc import Iterator, Sequence
 from importlib.metadata import entry_points
@@ -20,7 +19,7 @@ from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.diagnosis.cause import Cause, check_cause
 from sliceit_drake.diagnosis.causes import BUILT_IN
 from sliceit_drake.prediction.series import ForceSeries, SliceFacts
-from sliceit_drake.resources import load_module
+from sliceit_drake.resources import load_subclasses
 
 __all__ = ["ENTRY_POINTS", "all_causes", "dry_run", "is_users", "load_cause", "open_causes"]
 
@@ -88,16 +87,11 @@ def load_cause(file: str | Path) -> Cause:
     """
     file = Path(file)
     with _blamed(file, "cannot be read as Python"):
-        module = load_module(f"sliceit_cause_{file.stem}", file)
-    if module is None:
+        kinds = load_subclasses(f"sliceit_cause_{file.stem}", file, Cause)
+    if kinds is None:
         raise ConfigurationError(
             "there is no such file", source=str(file), field="--cause", fix="Check the path."
         )
-    kinds = [
-        kind
-        for _, kind in inspect.getmembers(module, inspect.isclass)
-        if issubclass(kind, Cause) and kind.__module__ == module.__name__
-    ]
     if len(kinds) != 1:
         raise ConfigurationError(
             f"holds {len(kinds)} causes",

@@ -1,10 +1,9 @@
 """Effects by name, and effects that a user wrote."""
 
-import inspect
 from pathlib import Path
 
 from sliceit_drake.configuration import ConfigurationError, did_you_mean
-from sliceit_drake.resources import load_module
+from sliceit_drake.resources import load_subclasses
 from sliceit_drake.stand_in import knife_effects, mounting_effects, sensor_effects, tissue_effects
 from sliceit_drake.stand_in.effect import Effect
 
@@ -86,16 +85,11 @@ def make_effect(text: str) -> Effect:
 
 
 def _from_file(file: Path) -> type[Effect]:
-    module = load_module(f"stand_in_effect_{file.stem}", file)
-    if module is None:
+    kinds = load_subclasses(f"stand_in_effect_{file.stem}", file, Effect)
+    if kinds is None:
         raise ConfigurationError(
             "there is no such file", source=str(file), field="--effect", fix="Check the path."
         )
-    kinds = [
-        kind
-        for _, kind in inspect.getmembers(module, inspect.isclass)
-        if issubclass(kind, Effect) and kind.__module__ == module.__name__
-    ]
     if len(kinds) != 1:
         raise ConfigurationError(
             f"holds {len(kinds)} effects",

@@ -107,16 +107,20 @@ def fitted_changes(problem: LinearProblem, causes: Sequence[CauseAtScan]) -> lis
     """Change of each record's prediction by causes and all that is refitted with them [m, c]."""
     linear = _Linear(problem, causes)
     theta = linear.shared(linear.reduced.sum(0))
-    return [linear.change(r, theta) for r in range(len(problem.found.records))]
+    out = []
+    for r, record in enumerate(problem.found.records):
+        shared = record.columns[:, :, linear.columns] @ theta
+        out.append(shared + record.columns[:, :, linear.own] @ linear.of_own(r, theta))
+    return out
 
 
-def own_coefficients(problem: LinearProblem, own: Sequence[int]) -> list[np.ndarray]:
-    """Coefficients of columns [n] that are each record's own, where no cause is at work: of each
-    record [n], in the columns' sizes."""
+def own_coefficients(problem: LinearProblem) -> np.ndarray:
+    """Coefficients of what is each record's own (`LinearProblem.own`), where no cause is at work
+    [R, n], in the columns' sizes."""
     linear = _Linear(problem, ())
     theta = linear.shared(linear.reduced.sum(0))
-    at = [linear.own.index(k) for k in own]
-    return [linear.of_own(r, theta)[at] for r in range(len(problem.found.records))]
+    records = range(len(problem.found.records))
+    return np.array([linear.of_own(r, theta)[: len(problem.own)] for r in records])
 
 
 def _errors(
@@ -167,9 +171,3 @@ class _Linear:
         inner = G[np.ix_(own, own)] + np.diag(1.0 / np.maximum(self.variance, 1e-12))
         rest = G[own, self.problem.size] - G[np.ix_(own, self.columns)] @ theta
         return np.asarray(np.linalg.solve(inner, rest))
-
-    def change(self, r: int, theta: np.ndarray) -> np.ndarray:
-        """Change of a record's prediction, its own part taken from itself [m, c]."""
-        record = self.problem.found.records[r]
-        shared = record.columns[:, :, self.columns] @ theta
-        return np.asarray(shared + record.columns[:, :, self.own] @ self.of_own(r, theta))

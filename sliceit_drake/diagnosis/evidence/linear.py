@@ -256,20 +256,23 @@ class LinearProblem:
         """Maximum likelihood of the variation, from differences within conditions alone."""
         if self.variation_samples == 0 or not self.own:
             return np.ones(len(self.own))
-        differences = []
-        for members in self.conditions.values():
-            n = len(members)
-            if n > 1:
-                own = self._differences([self.found.records[k] for k in members])
+        grams: list[tuple[np.ndarray, float]] = []
+        own = [*self.own, *self.usual_own]
+        for group in self.conditions.values():
+            n, members = len(group), [self.found.records[k] for k in group]
+            error = self.model_error(members[0])
+            for time, rest, columns in differences(members, own) if n > 1 else ():
+                scaled = np.sqrt(n / (n - 1.0)) * rest
+                X = np.concatenate([columns, scaled[:, :, None]], axis=2)
                 # Of n deviations from their mean n - 1 are independent.
-                differences += [(G, (n - 1.0) / n) for G in own]
+                grams.append((self._weighted(time, X, error[: len(time)]), (n - 1.0) / n))
         d = len(self.own)
         usual = np.array(list(self.usual_own.values()))
 
         def objective(log_s: np.ndarray) -> float:
             s2 = np.concatenate([np.exp(2.0 * log_s), usual**2])
             total = 0.0
-            for G, weight in differences:
+            for G, weight in grams:
                 inner = np.eye(len(s2)) + np.sqrt(np.outer(s2, s2)) * G[:-1, :-1]
                 _, logdet = np.linalg.slogdet(inner)
                 rest = integrate_out(G, list(range(len(s2))), s2)[-1, -1]
@@ -278,17 +281,6 @@ class LinearProblem:
 
         fit = minimize(objective, np.zeros(d), method="L-BFGS-B", bounds=[(-4.0, 2.5)] * d)
         return np.exp(fit.x)
-
-    def _differences(self, members: list[RecordSensitivity]) -> list[np.ndarray]:
-        """Gram matrices of each replicate's own columns and its difference from the mean."""
-        n = len(members)
-        out = []
-        error = self.model_error(members[0])
-        for time, rest, columns in differences(members, [*self.own, *self.usual_own]):
-            scaled = np.sqrt(n / (n - 1.0)) * rest
-            X = np.concatenate([columns, scaled[:, :, None]], axis=2)
-            out.append(self._weighted(time, X, error[: len(time)]))
-        return out
 
     def model_error(self, record: RecordSensitivity) -> np.ndarray:
         """Standard deviation of what the model is unsure of at each row by itself [m, c]: when a

@@ -26,7 +26,7 @@ def at_own_values(problem: LinearProblem) -> Sensitivities:
     e b^2 goes on in a straight line, as it does past a sharp bend.
     """
     found, own = problem.found, problem.own
-    values = np.array(own_coefficients(problem, own)).reshape(-1, len(own))
+    values = own_coefficients(problem)
     values -= values.mean(0)
     records = [_moved(record, own, b) for record, b in zip(found.records, values, strict=True)]
     added = [Column("numerical", f"mean_{found.columns[k].name}") for k in own]

@@ -117,6 +117,7 @@ class Screening:
         visible: Norm of each cause's projected sensitivity at its plausible size, in noise.
         names: Of the causes.
         projected: Gram matrix of all columns and y beside what is free in any case.
+        assumed: Causes that are part of the model already.
     """
 
     causes: list[CauseEvidence]
@@ -128,6 +129,7 @@ class Screening:
     visible: np.ndarray
     names: list[str]
     projected: np.ndarray
+    assumed: Sequence[CauseAtScan] = ()
 
     def evidence(self, name: str) -> CauseEvidence:
         """Evidence of one cause."""
@@ -449,6 +451,7 @@ def screen(
         visible=visible,
         names=statistics.names,
         projected=statistics.projected,
+        assumed=assumed,
     )
 
 

@@ -115,17 +115,8 @@ def _cause_changes(cause: Cause, point: Point) -> list[_Change]:
         for p in cause.parameters:
             steps = (p.step,) if p.one_sided else (p.step, -p.step)
             values = tuple(cause.nulls(value) | {p.name: p.null + step} for step in steps)
-            column = Column(
-                "cause",
-                cause.name,
-                p.name,
-                value,
-                p.step,
-                p.unit,
-                p.one_sided,
-                cause.per_record,
-                cause.searched,
-            )
+            traits = p.step, p.unit, p.one_sided, cause.per_record, cause.searched
+            column = Column("cause", cause.name, p.name, value, *traits)
             if cause.simulates:
                 ends = tuple(
                     dc.replace(point, causes=(*point.causes, ActiveCause(cause, v))) for v in values

@@ -56,13 +56,8 @@ EXPLORING = ("tour", "draw_3", "draw_1", "air")
 """Motions for what no cause explains: what differs most from one another."""
 
 
-@dc.dataclass(frozen=True)
-class _CauseClass:
-    """Causes to be told apart, their evidence, and what is in the model beside."""
-
-    evidence: list[CauseEvidence]
-    screening: Screening
-    assumed: tuple[CauseAtScan, ...]
+_CauseClass = tuple[list[CauseEvidence], Screening]
+"""Evidence for causes to be told apart, and the screening that it is from."""
 
 
 @dc.dataclass
@@ -104,8 +99,8 @@ class _Search:
         planned = [planned_record(step.plan, setup, template, first) for step in steps]
         found = diagnosis.problem.found
         # What every record has a little of is fitted beside.
-        names = {e.name for c in classes for e in c.evidence} | {name for name, _ in USUAL}
-        names |= {name for c in classes for name, _ in c.assumed}
+        names = {e.name for evidence, _ in classes for e in evidence} | {name for name, _ in USUAL}
+        names |= {name for _, screening in classes for name, _ in screening.assumed}
         causes = [diagnosis.causes[n] for n in found.causes if n in names]
         new = sensitivities(setup, planned, causes, cache=cache, workers=workers, progress=progress)
         self.problem = _joined(diagnosis.problem, new, names)
@@ -126,11 +121,9 @@ class _Search:
     def _angles(self, total: np.ndarray) -> list[tuple[str, str, float, float]]:
         """Angle, degrees, and expected gain of each ordered pair of causes."""
         out = []
-        for members in self.classes:
-            screening = dc.replace(
-                members.screening, projected=self._projected(total, members.assumed)
-            )
-            for a, b in itertools.permutations(members.evidence, 2):
+        for evidence, before in self.classes:
+            screening = dc.replace(before, projected=self._projected(total, before.assumed))
+            for a, b in itertools.permutations(evidence, 2):
                 own = self.problem.found.of_causes([a.cause])
                 e = np.array(a.coefficients)
                 square = float(e @ screening.projected[np.ix_(own, own)] @ e)
@@ -171,7 +164,7 @@ class _Search:
             choice = further
         counts, pairs = choice.counts, choice.pairs
         steps = [dc.replace(self.menu[k], slices=n) for k, n in counts.items()]
-        classes = "; ".join("{" + ", ".join(e.name for e in c.evidence) + "}" for c in self.classes)
+        classes = "; ".join("{" + ", ".join(e.name for e in own) + "}" for own, _ in self.classes)
         if all(p.parts for p in pairs) and not steps:
             reason = f"nothing to split: the records at hand part {classes}"
             return NextExperiment("none", reason, [], pairs)
@@ -314,7 +307,6 @@ def _classes(diagnosis: Diagnosis) -> list[_CauseClass]:
     that are nearly so, or would be taken for it if they were the ones that act."""
     verdict, problem = diagnosis.verdict, diagnosis.problem
     out = []
-    assumed: tuple[CauseAtScan, ...] = ()
     for finding, screening in zip(
         verdict.findings, (verdict.screening, verdict.second), strict=False
     ):
@@ -335,8 +327,7 @@ def _classes(diagnosis: Diagnosis) -> list[_CauseClass]:
             names = [*finding.names, *alike]
             if len(names) > 1:
                 evidence = [_within_range(diagnosis, screening.evidence(n)) for n in names]
-                out.append(_CauseClass(evidence, screening, assumed))
-        assumed = (*assumed, best.cause)
+                out.append((evidence, screening))
     return out
 
 
