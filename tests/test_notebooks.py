@@ -161,6 +161,35 @@ def test_a_notebook_uses_nothing_of_ours_but_the_front_door(path):
     assert set(imports) == {"import sliceit_drake as sliceit"}
 
 
+@pytest.mark.parametrize(
+    ("fresh", "same"),
+    [
+        ("peak 15.5 N at slice_001", True),
+        ("peak  15.3 N at slice_001", True),
+        ("peak 16.5 N at slice_001", False),
+        ("peak -15.4 N at slice_001", False),
+        ("peak 15.4 N at slice_002", False),
+        ("peak 15.4 N at slice_001, 2", False),
+    ],
+)
+def test_outputs_agree_where_only_rounding_differs(fresh, same):
+    assert agree(fresh, "peak 15.4 N at slice_001", tolerance=0.02) == same
+
+
+def test_an_output_is_stored_without_what_differs_from_run_to_run(tmp_path):
+    """But a warning, an address or a folder of this machine is a fault."""
+    cell = nbformat.v4.new_code_cell("...", metadata={"tags": ["x"]})
+    for name, text in (("stdout", "a\n"), ("stdout", "http://localhost:7012\n"), ("stderr", "!")):
+        cell.outputs.append(nbformat.v4.new_output("stream", name=name, text=text))
+    data = {"text/plain": f"<Food at 0x7f12> in {tmp_path}"}
+    cell.outputs.append(nbformat.v4.new_output("display_data", data))
+    faults = tidy(nbformat.v4.new_notebook(cells=[cell]), tmp_path)
+    assert cell.metadata == {} and cell.outputs[0].text == "a\nhttp://localhost:7000\n"
+    assert "standard error" in faults[0]
+    assert any("' at 0x'" in fault for fault in faults)
+    assert any(str(tmp_path) in fault for fault in faults)
+
+
 # --- As they run.
 
 
@@ -183,7 +212,8 @@ def test_1_a_diagram_by_hand_slices_and_prints_where_to_watch(tmp_path):
     assert found["depth"][0] > 26.0 > 20.0 > found["depth"][1]
     assert found["same"] == pytest.approx(1.0, abs=0.05)
     printed = "".join(o.get("text", "") for c in notebook.cells for o in c.get("outputs", []))
-    assert re.fullmatch(r"http://localhost:\d+", found["url"]) and found["url"] in printed
+    # `executed` has put Meshcat's first port in the place of the one that was free.
+    assert re.fullmatch(r"http://localhost:\d+", found["url"]) and "localhost:7000\n" in printed
     assert figures(notebook) == 2
 
 
