@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+import sliceit_drake.diagrams.run as run_module
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.foods.material import Material
@@ -258,6 +259,8 @@ def test_without_a_library_that_draws_all_else_is_written_and_the_packages_are_n
     run, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(animation, "TRIAL", "raise SystemExit(1)")
+    assert not animation.can_draw.__wrapped__()
+    monkeypatch.setattr(run_module, "can_draw", lambda: False)
     run.save(tmp_path, replay=False)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert "libegl1" in summary["animation"]

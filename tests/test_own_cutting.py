@@ -21,6 +21,7 @@ from sliceit_drake.stand_in.curve_cutter import CurveCutter, CurveFood
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
 from sliceit_drake.systems.cut_report import FoodBodyFrame, FoodPicture
+from sliceit_drake.systems.food_look import OTHER
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 
 HEIGHT, WIDTH = 0.027, 0.03
@@ -73,7 +74,7 @@ class TalkingDough(Dough):
 
     def picture(self, context):
         triangles = CORNERS[[[0, 1, 2], [0, 2, 3]]]
-        return FoodPicture(self.X_WF, HEIGHT, triangles, np.array([False, True]))
+        return FoodPicture(self.X_WF, triangles, np.array([False, True]))
 
     def body(self, context):
         points = self.X_WF.multiply(CORNERS.T).T
@@ -89,7 +90,7 @@ def test_one_that_tells_nothing_gives_record_picture_replay_and_summary(tmp_path
     assert summary["peak_force_N"] > 10.0 and summary["cut_progress"] > 0.9
     # What only finite elements have is not made up.
     assert not {"elements", "energy_imbalance_J", "discretization_error"} & set(summary)
-    assert run.snapshot is None and run.contact_margin.food is None
+    assert run.half_cut.parts == [] and run.contact_margin.food is None
     assert "energy_work" not in run.record().columns
     with pytest.raises(ConfigurationError, match="has no body"):
         FoodFrames(prepare_run(scenario(), cutting=Dough), 30.0)
@@ -104,8 +105,8 @@ def test_what_it_tells_stands_in_record_picture_and_summary(tmp_path):
     np.testing.assert_allclose(record["mean_pressure"], force / WIDTH**2)
     assert (record["one"] == 1.0).all()
     assert len(frames) > 5 and frames.bodies[0].points.shape == (4, 3)
-    assert 0.5 * HEIGHT < run.snapshot.depth < 0.7 * HEIGHT
-    np.testing.assert_array_equal(run.snapshot.is_cut_face, [False, True])
+    (part,) = run.half_cut.parts
+    np.testing.assert_array_equal(part.mesh.colours[[0, 3]], [OTHER.skin, OTHER.flesh])
     (part,) = run.film.frames[-1].parts
     assert part.name == "food" and part.mesh.points.shape == (6, 3)
     run.save(tmp_path)

@@ -23,6 +23,7 @@ from sliceit_drake.diagrams.live_view import LiveControls, make_meshcat
 from sliceit_drake.diagrams.outputs.animation import (
     NEEDED,
     Film,
+    Frame,
     add_force,
     can_draw,
     write_gif,
@@ -35,7 +36,6 @@ from sliceit_drake.diagrams.outputs.measurement_comparison import (
 )
 from sliceit_drake.diagrams.outputs.run_log import Record
 from sliceit_drake.diagrams.outputs.sequence_report import plot_sequence, slice_reports
-from sliceit_drake.diagrams.outputs.snapshot import Snapshot, take_snapshot
 from sliceit_drake.diagrams.prepared_food import OwnCutting
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.scenario_diagram import OwnPolicy, ScenarioDiagram
@@ -55,7 +55,6 @@ if TYPE_CHECKING:
 __all__ = ["Run", "measured_profile", "prepare_run", "simulate"]
 
 CHUNK = 0.02
-SNAPSHOT_PROGRESS = 0.5
 CUT_THROUGH = 0.99
 """Share of a section from which it counts as cut."""
 BOARD_REACHED = 5e-4
@@ -77,8 +76,9 @@ class Run:
         own: Class of each system of the user's own, by what it is put in for.
         wall_time: Seconds spent in the simulator.
         stopped: Why the run ended early, or None.
-        snapshot: Knife and food when half of the section was cut, or None.
-        film: Frames of an animation, or None.
+        film: Draws knife and food; holds the frames of an animation.
+        animation: Whether frames of it are kept.
+        half_cut: When half of the section was cut, or None.
         controls: Speed and stop in a live viewer, or None.
         warnings: What the summary shall warn of, beside what the food does.
     """
@@ -88,12 +88,13 @@ class Run:
     simulator: Simulator
     profile: ForceProfile | None
     contact_margin: ContactMargin | None
+    film: Film
+    animation: bool = False
     meshcat: Meshcat | None = None
     own: dict[str, str] = dc.field(default_factory=dict)
     wall_time: float = 0.0
     stopped: str | None = None
-    snapshot: Snapshot | None = None
-    film: Film | None = None
+    half_cut: Frame | None = None
     controls: LiveControls | None = None
     warnings: list[str] = dc.field(default_factory=list)
 
@@ -122,9 +123,9 @@ class Run:
                     self.stopped = "stopped in the viewer"
                     break
                 status = self.simulator.AdvanceTo(min(now + CHUNK, end))
-                if self.snapshot is None and cut_progress.Eval(own)[0] > SNAPSHOT_PROGRESS:
-                    self.snapshot = take_snapshot(station, context)
-                if self.film is not None:
+                if self.half_cut is None and cut_progress.Eval(own)[0] > 0.5:
+                    self.half_cut = self.film.frame(context)
+                if self.animation:
                     self.film.look(context)
                 self.wall_time = clock.perf_counter() - begin
                 if progress is not None:
@@ -156,7 +157,7 @@ class Run:
     def plot(self) -> "Figure":
         """Knife and food, and the force over time and depth; of a sequence slice by slice."""
         record = self.record()
-        return _figure(self, record, _comparison(self, record), self.snapshot)
+        return _figure(self, record, _comparison(self, record), self._picture())
 
     def summary(self) -> dict:
         """Forces, work, times, margins and versions, as summary.json has them.
@@ -199,7 +200,7 @@ class Run:
         dump_yaml(self.scenario, folder / "scenario.yaml")
         comparison = _comparison(self, record)
         summary = _summary(self, record, comparison) | (extra or {})
-        picture: Snapshot | np.ndarray | None = self.snapshot
+        picture = None
         try:
             if replay and self.meshcat is not None:
                 if self.station.food_visualizer is not None:
@@ -209,13 +210,13 @@ class Run:
                 text = self.meshcat.StaticHtml()
                 (folder / "replay.html").write_text(text, encoding="utf-8")
             _add_discretization_error(self, summary)
-            if self.film is not None and can_draw():
-                pictures = self.film.draw(drawing)
-                picture = pictures[self._best(record)].copy()
+            picture = self._picture()
+            if self.animation and can_draw():
+                pictures = self.film.draw(self.film.frames, drawing)
                 add_force(pictures, self.film.times, record)
                 write_gif(folder / "slice.gif", pictures, self.film.period)
                 summary["animation"] = "slice.gif"
-            elif self.film is not None:
+            elif self.animation:
                 summary["animation"] = f"none: {NEEDED}"
         finally:
             text = json.dumps(summary, indent=2) + "\n"
@@ -223,12 +224,12 @@ class Run:
             _figure(self, record, comparison, picture).savefig(folder / "force.png", dpi=150)
         return summary
 
-    def _best(self, record: Record) -> int:
-        """The frame that shows most: the end of a sequence, or else the middle of the cut."""
-        assert self.film is not None
-        if self.scenario.sequence is not None or self.snapshot is None:
-            return -1
-        return int(np.argmin(np.abs(self.film.times - self.snapshot.time)))
+    def _picture(self) -> np.ndarray | None:
+        """The end of a sequence, or else the middle of the cut, where this machine can draw."""
+        if not can_draw():
+            return None
+        frame = None if self.scenario.sequence is not None else self.half_cut
+        return self.film.draw([frame or self.film.frame(self.simulator.get_context())])[0]
 
 
 def simulate(
@@ -322,18 +323,17 @@ def prepare_run(
         own["cutting"] = type(station.cutting).__name__
     if controller is not None:
         own["controller"] = type(station.controller).__name__
-    run = Run(scenario, diagram, simulator, profile, margin, meshcat, own)
+    film = Film(station, diagram.motion.duration)
     if animation:
-        run.film = Film(station, run.motion.duration)
-        run.film.look(simulator.get_context())
-    return run
+        film.look(simulator.get_context())
+    return Run(scenario, diagram, simulator, profile, margin, film, animation, meshcat, own)
 
 
 def _figure(
     run: Run,
     record: Record,
     comparison: Comparison | None,
-    picture: Snapshot | np.ndarray | None,
+    picture: np.ndarray | None,
 ) -> "Figure":
     title, caption = _title(run), _caption(run, comparison)
     if areas := _slice_areas(run):

@@ -38,14 +38,12 @@ class FoodPicture:
 
     Attributes:
         X_WF: Pose of the food frame.
-        top: Height of the section's top over the origin of F, metres.
         triangles: Corners in F [M, 3, 3], metres.
         is_cut_face: Whether each is on the cut [M].
         skin, flesh: Colours outside and inside, red, green, blue.
     """
 
     X_WF: RigidTransform
-    top: float
     triangles: np.ndarray
     is_cut_face: np.ndarray
     skin: tuple[float, float, float] = OTHER.skin

@@ -14,7 +14,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, State
 
 from sliceit_drake.cutting.contact_response import contact_responses
 from sliceit_drake.cutting.coupling_steps import EnergyBalance
-from sliceit_drake.cutting.mesh.surface import SKIN, FoodBody, food_body, food_surface
+from sliceit_drake.cutting.mesh.surface import FoodBody, food_body, food_surface
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.simulate import (
@@ -24,7 +24,7 @@ from sliceit_drake.cutting.simulate import (
     check_in_plane,
 )
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
-from sliceit_drake.systems.cut_report import Columns, FoodBodyFrame, FoodPicture
+from sliceit_drake.systems.cut_report import Columns, FoodBodyFrame
 from sliceit_drake.systems.declare import declare_output
 from sliceit_drake.systems.food_look import OTHER, FoodLook, FoodScene
 from sliceit_drake.systems.food_visualizer import FoodVisualizer, frame_size
@@ -177,19 +177,6 @@ class CuttingSystem(KnifeForceSystem):
 
     def section_areas(self) -> list[float]:
         return [solver.model.section_area for solver in self.solvers]
-
-    def picture(self, context: Context) -> FoodPicture:
-        surface, X_WF = self.surfaces[self.food_index(context)], self.X_WF(context)
-        values = self.GetOutputPort("surface_vertices").Eval(context).reshape(-1, 3)
-        vertices = X_WF.inverse().multiply(values[: len(surface.ends)].T).T
-        return FoodPicture(
-            X_WF,
-            self.solver(context).model.top,
-            vertices[surface.triangles],
-            (surface.cut_point != SKIN)[surface.triangles[:, 0]],
-            self._look.skin,
-            self._look.flesh,
-        )
 
     def body(self, context: Context) -> FoodBodyFrame:
         index, solver = self.food_index(context), self.solver(context)

@@ -82,7 +82,7 @@ class SpringCutter(KnifeForceSystem):
         triangles = np.concatenate([np.stack(corners, axis=1) for corners in sides])
         is_top = np.arange(len(triangles)) >= 2 * len(middle)
         look = LOOKS["cucumber"]
-        return FoodPicture(self._X_WF, self.food.height, triangles, is_top, look.flesh, look.skin)
+        return FoodPicture(self._X_WF, triangles, is_top, look.flesh, look.skin)
 
     def spring(self, context: Context) -> tuple[float, float]:
         """Stiffness, N/m, and damping, Ns/m, in this context."""

@@ -3,6 +3,7 @@
 import base64
 import contextlib
 import dataclasses as dc
+import functools
 import importlib
 import json
 import math
@@ -109,9 +110,11 @@ class Film:
 
     def look(self, root_context: Context) -> None:
         """Keeps what there is to see now, if it is time for a frame."""
-        time = root_context.get_time()
-        if time < len(self.frames) * self.period - 1e-9:
-            return
+        if root_context.get_time() > len(self.frames) * self.period - 1e-9:
+            self.frames.append(self.frame(root_context))
+
+    def frame(self, root_context: Context) -> Frame:
+        """What there is to see now."""
         if self._root is None:
             self._root = root_context.Clone()
         station = self._station
@@ -129,22 +132,26 @@ class Film:
             parts = _pictured(
                 station.cutting.picture(station.cutting.GetMyContextFromRoot(root_context))
             )
-        self.frames.append(Frame(time, station.plant.GetPositions(plant_context).copy(), parts))
+        joints = station.plant.GetPositions(plant_context).copy()
+        return Frame(root_context.get_time(), joints, parts)
 
     @property
     def times(self) -> np.ndarray:
         """Of the frames, s."""
         return np.array([frame.time for frame in self.frames])
 
-    def draw(self, progress: Callable[[int, int], None] | None = None) -> list[np.ndarray]:
-        """Pictures of the frames [H, W, 3], red, green, blue, 0 to 255.
+    def draw(
+        self, frames: Sequence[Frame], progress: Callable[[int, int], None] | None = None
+    ) -> list[np.ndarray]:
+        """Pictures of frames of its own [H, W, 3], red, green, blue, 0 to 255.
 
         Args:
+            frames: What is drawn.
             progress: Called with the number of pictures, drawn and all, after each.
 
         Call it only where `can_draw`.
         """
-        assert self._root is not None, "look() has kept frames"
+        assert self._root is not None, "the frames are of another film"
         # The LLVM in Triton, which PyTorch imports, crashes if it is loaded after the one in Mesa.
         with contextlib.suppress(ImportError):
             importlib.import_module("triton")
@@ -169,17 +176,18 @@ class Film:
         X_WC = self._station.camera_pose()
         pictures = []
         plant = self._station.plant
-        for frame in self.frames:
+        for frame in frames:
             plant.SetPositions(plant.GetMyMutableContextFromRoot(root), frame.joints)
             drawn.show(frame.parts)
             query = scene_graph.get_query_output_port().Eval(context)
             image = query.RenderColorImage(camera, scene_graph.world_frame_id(), X_WC)
             pictures.append(image.data[:, :, :3].copy())
             if progress is not None:
-                progress(len(pictures), len(self.frames))
+                progress(len(pictures), len(frames))
         return pictures
 
 
+@functools.cache
 def can_draw() -> bool:
     """Whether this machine can draw without a display, tried in another process.
 

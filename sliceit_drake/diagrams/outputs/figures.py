@@ -6,12 +6,11 @@ import numpy as np
 
 from sliceit_drake.diagrams.outputs.measurement_comparison import Comparison
 from sliceit_drake.diagrams.outputs.run_log import Record
-from sliceit_drake.diagrams.outputs.snapshot import Snapshot, add_picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["BOARD_PHASE", "CONTACT_THRESHOLD", "SIMULATED", "plot_force"]
+__all__ = ["BOARD_PHASE", "CONTACT_THRESHOLD", "SIMULATED", "add_picture", "plot_force"]
 
 # Okabe and Ito's palette: distinct for colour-blind readers and in grey.
 SIMULATED = "#0072B2"
@@ -23,13 +22,21 @@ CONTACT_THRESHOLD = 0.05
 """Force from which knife and food, or knife and board, count as touching, N."""
 
 
+def add_picture(figure: "Figure", place: Any, picture: np.ndarray) -> None:
+    """Shows the middle of a picture [H, W, 3] at a place in the grid of a figure."""
+    axes = figure.add_subplot(place)
+    margin = (picture.shape[1] - picture.shape[0]) // 2
+    axes.imshow(picture[:, margin : picture.shape[1] - margin])
+    axes.set_axis_off()
+
+
 def plot_force(
     record: Record,
     title: str,
     top_height: float,
     comparison: Comparison | None,
     caption: str,
-    snapshot: Snapshot | np.ndarray | None = None,
+    picture: np.ndarray | None = None,
 ) -> "Figure":
     """Draws the knife in the food, and its force over time and over depth.
 
@@ -39,7 +46,7 @@ def plot_force(
         top_height: World height of the food's top at the cut, metres.
         comparison: Measured profile with its fitted offset, or None.
         caption: Conditions and provenance, below the plots.
-        snapshot: Knife and food at some instant, see `add_picture`; None to leave that panel out.
+        picture: Knife and food at some instant [H, W, 3]; None to leave that panel out.
     """
     from matplotlib.figure import Figure
 
@@ -49,14 +56,14 @@ def plot_force(
     norm = np.linalg.norm(total, axis=1)
     depth = 1e3 * (top_height - record["knife_pose_p_z"])
 
-    figure = Figure(figsize=(9.0 if snapshot is None else 12.0, 4.6), layout="constrained")
-    widths = [1.5, 1.0] if snapshot is None else [1.0, 1.5, 1.0]
+    figure = Figure(figsize=(9.0 if picture is None else 12.0, 4.6), layout="constrained")
+    widths = [1.5, 1.0] if picture is None else [1.0, 1.5, 1.0]
     grid = figure.add_gridspec(1, len(widths), width_ratios=widths)
     over_time = figure.add_subplot(grid[-2])
     over_depth = figure.add_subplot(grid[-1], sharey=over_time)
     over_depth.tick_params(labelleft=False)
-    if snapshot is not None:
-        add_picture(figure, grid[0], snapshot)
+    if picture is not None:
+        add_picture(figure, grid[0], picture)
     for axes, x in ((over_time, time), (over_depth, depth)):
         axes.plot(x, norm, color=NORM, lw=3.2, label="simulated norm")
         axes.plot(x, total[:, 2], color=SIMULATED, lw=1.2, label="simulated vertical")

@@ -6,9 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sliceit_drake.diagrams.outputs.figures import BOARD_PHASE, CONTACT_THRESHOLD, SIMULATED
+from sliceit_drake.diagrams.outputs.figures import (
+    BOARD_PHASE,
+    CONTACT_THRESHOLD,
+    SIMULATED,
+    add_picture,
+)
 from sliceit_drake.diagrams.outputs.run_log import Record
-from sliceit_drake.diagrams.outputs.snapshot import Snapshot, add_picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -107,7 +111,7 @@ def plot_sequence(
     title: str,
     board_height: float,
     caption: str,
-    snapshot: Snapshot | np.ndarray | None = None,
+    picture: np.ndarray | None = None,
 ) -> "Figure":
     """Draws the force over time, over the edge's height slice by slice, and its spread by slice.
 
@@ -117,7 +121,7 @@ def plot_sequence(
         title: What is shown.
         board_height: World height of the board's top, metres.
         caption: Conditions and provenance, below the plots.
-        snapshot: Knife and food at some instant, see `add_picture`; None to leave that panel out.
+        picture: Knife and food at some instant [H, W, 3]; None to leave that panel out.
     """
     from matplotlib import colormaps
     from matplotlib.figure import Figure
@@ -132,11 +136,11 @@ def plot_sequence(
     figure = Figure(figsize=(12.0, 7.0), layout="constrained")
     rows = figure.add_gridspec(2, 1, height_ratios=[1.0, 1.15])
     over_time = figure.add_subplot(rows[0])
-    widths = [1.0, 1.2] if snapshot is None else [0.8, 1.0, 1.2]
+    widths = [1.0, 1.2] if picture is None else [0.8, 1.0, 1.2]
     below = rows[1].subgridspec(1, len(widths), width_ratios=widths)
     over_height, by_slice = figure.add_subplot(below[-2]), figure.add_subplot(below[-1])
-    if snapshot is not None:
-        add_picture(figure, below[0], snapshot)
+    if picture is not None:
+        add_picture(figure, below[0], picture)
 
     over_time.plot(time, board, color=BOARD_PHASE, lw=0.9, label="of the board")
     over_time.plot(time, food, color=SIMULATED, lw=1.1, label="of the food")
