@@ -76,7 +76,7 @@ class Run:
         own: Class of each system of the user's own, by what it is put in for.
         wall_time: Seconds spent in the simulator.
         stopped: Why the run ended early, or None.
-        film: Draws knife and food; holds the frames of an animation.
+        film: Draws knife and food, and holds the frames of an animation; None on a robot.
         animation: Whether frames of it are kept.
         half_cut: When half of the section was cut, or None.
         controls: Speed and stop in a live viewer, or None.
@@ -88,9 +88,9 @@ class Run:
     simulator: Simulator
     profile: ForceProfile | None
     contact_margin: ContactMargin | None
-    film: Film
-    animation: bool = False
     meshcat: Meshcat | None = None
+    film: Film | None = None
+    animation: bool = False
     own: dict[str, str] = dc.field(default_factory=dict)
     wall_time: float = 0.0
     stopped: str | None = None
@@ -123,10 +123,11 @@ class Run:
                     self.stopped = "stopped in the viewer"
                     break
                 status = self.simulator.AdvanceTo(min(now + CHUNK, end))
-                if self.half_cut is None and cut_progress.Eval(own)[0] > 0.5:
-                    self.half_cut = self.film.frame(context)
-                if self.animation:
-                    self.film.look(context)
+                if self.film is not None:
+                    if self.half_cut is None and cut_progress.Eval(own)[0] > 0.5:
+                        self.half_cut = self.film.frame(context)
+                    if self.animation:
+                        self.film.look(context)
                 self.wall_time = clock.perf_counter() - begin
                 if progress is not None:
                     progress(context.get_time(), self.wall_time)
@@ -211,7 +212,7 @@ class Run:
                 (folder / "replay.html").write_text(text, encoding="utf-8")
             _add_discretization_error(self, summary)
             picture = self._picture()
-            if self.animation and can_draw():
+            if self.animation and self.film is not None and can_draw():
                 pictures = self.film.draw(self.film.frames, drawing)
                 add_force(pictures, self.film.times, record)
                 write_gif(folder / "slice.gif", pictures, self.film.period)
@@ -226,7 +227,7 @@ class Run:
 
     def _picture(self) -> np.ndarray | None:
         """The end of a sequence, or else the middle of the cut, where this machine can draw."""
-        if not can_draw():
+        if self.film is None or not can_draw():
             return None
         frame = None if self.scenario.sequence is not None else self.half_cut
         return self.film.draw([frame or self.film.frame(self.simulator.get_context())])[0]
@@ -326,7 +327,7 @@ def prepare_run(
     film = Film(station, diagram.motion.duration)
     if animation:
         film.look(simulator.get_context())
-    return Run(scenario, diagram, simulator, profile, margin, film, animation, meshcat, own)
+    return Run(scenario, diagram, simulator, profile, margin, meshcat, film, animation, own)
 
 
 def _figure(
