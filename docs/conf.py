@@ -74,7 +74,7 @@ html_copy_source = False
 
 
 class NotebookParser(MystParser):
-    """Shows a notebook as it is stored, without outputs; the tests run them."""
+    """Shows a notebook as it is stored, with its outputs."""
 
     supported = ("notebook",)
 
@@ -84,6 +84,13 @@ class NotebookParser(MystParser):
             language = "text" if cell.source.startswith("%%") else "python"
             code = f"```{language}\n{cell.source}\n```"
             parts.append(cell.source if cell.cell_type == "markdown" else code)
+            for output in cell.get("outputs", []):
+                data = output.get("data", {})
+                if "image/png" in data:
+                    image = data["image/png"].replace("\n", "")
+                    parts.append(f"![What the code above draws](data:image/png;base64,{image})")
+                elif text := output.get("text") or data.get("text/plain"):
+                    parts.append(f"```text\n{text.rstrip()}\n```")
         super().parse("\n\n".join(parts), document)
 
 

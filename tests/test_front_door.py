@@ -235,6 +235,15 @@ def test_what_decides_is_a_policy_too():
     assert run.meshcat is None and run.plot() is not None
 
 
+def test_a_policy_of_ones_own_under_limits_of_ones_own_is_saved(tmp_path):
+    policy = sliceit.PolicyConfig(decide=Gentle(), draw=0.01, duration=10.0)
+    run = sliceit.simulate("cucumber_measured", COARSE, policy=policy, duration=0.02, replay=False)
+    assert run.own == {"policy": "Gentle"}
+    run.save(tmp_path)
+    # A file cannot say the policy; its limits it can.
+    assert sliceit.load_scenario(tmp_path / "scenario.yaml").policy.draw == 0.01
+
+
 def test_a_configured_policy_takes_the_place_of_the_motion(tmp_path):
     policy = sliceit.PolicyConfig(duration=2.4)
     run = sliceit.simulate("cucumber_measured", COARSE, policy=policy, duration=0.02, replay=False)

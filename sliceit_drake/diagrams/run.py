@@ -47,7 +47,7 @@ from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.resources import file_or_resource
 from sliceit_drake.systems.agent import AgentConfig
 from sliceit_drake.systems.contact_monitor import UNSTABLE_GAINS
-from sliceit_drake.systems.policy import PolicyConfig
+from sliceit_drake.systems.policy import PolicyConfig, PressByForce
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -198,7 +198,7 @@ class Run:
         remove_results(folder)
         record = self.record()
         record.write_csv(folder / "record.csv")
-        dump_yaml(self.scenario, folder / "scenario.yaml")
+        dump_yaml(_written(self.scenario), folder / "scenario.yaml")
         comparison = _comparison(self, record)
         summary = _summary(self, record, comparison) | (extra or {})
         picture = None
@@ -302,7 +302,10 @@ def prepare_run(
     Raises:
         ConfigurationError, MeshError, TimeStepError, CuttingError: The scenario cannot start.
     """
+    own = {}
     if isinstance(policy, PolicyConfig | AgentConfig):
+        if isinstance(policy, PolicyConfig) and not isinstance(policy.decide, PressByForce):
+            own["policy"] = type(policy.decide).__name__
         scenario = dc.replace(scenario, policy=policy, motion=MotionPlan(), sequence=None)
         validate(scenario, "scenario")
         policy = None
@@ -317,7 +320,6 @@ def prepare_run(
         if station.food_visualizer is not None:
             station.food_visualizer.StartRecording()
     simulator.Initialize()
-    own = {}
     if policy is not None:
         own["policy"] = type(diagram.policy if callable(policy) else policy).__name__
     if cutting is not None:
@@ -328,6 +330,14 @@ def prepare_run(
     if animation:
         film.look(simulator.get_context())
     return Run(scenario, diagram, simulator, profile, margin, meshcat, film, animation, own)
+
+
+def _written(scenario: Scenario) -> Scenario:
+    """A scenario as a file can say it: in place of a user's own policy stands ours."""
+    policy = scenario.policy
+    if isinstance(policy, PolicyConfig) and not isinstance(policy.decide, PressByForce):
+        return dc.replace(scenario, policy=dc.replace(policy, decide=PressByForce()))
+    return scenario
 
 
 def _figure(
