@@ -304,7 +304,7 @@ def prepare_run(
     """
     own = {}
     if isinstance(policy, PolicyConfig | AgentConfig):
-        if isinstance(policy, PolicyConfig) and not isinstance(policy.decide, PressByForce):
+        if isinstance(policy, PolicyConfig) and type(policy.decide) is not PressByForce:
             own["policy"] = type(policy.decide).__name__
         scenario = dc.replace(scenario, policy=policy, motion=MotionPlan(), sequence=None)
         validate(scenario, "scenario")
@@ -335,7 +335,7 @@ def prepare_run(
 def _written(scenario: Scenario) -> Scenario:
     """A scenario as a file can say it: in place of a user's own policy stands ours."""
     policy = scenario.policy
-    if isinstance(policy, PolicyConfig) and not isinstance(policy.decide, PressByForce):
+    if isinstance(policy, PolicyConfig) and type(policy.decide) is not PressByForce:
         return dc.replace(scenario, policy=dc.replace(policy, decide=PressByForce()))
     return scenario
 
