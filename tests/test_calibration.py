@@ -437,7 +437,7 @@ def test_each_setup_names_parameters_of_its_food_within_their_ranges(name):
 def test_a_setup_with_a_parameter_that_does_not_exist_is_refused(tmp_path):
     file = tmp_path / "food.yaml"
     file.write_text("parameters: [{name: material.toughnes, low: 1.0, high: 2.0}]\n")
-    with pytest.raises(ConfigurationError, match="Did you mean material.toughness"):
+    with pytest.raises(ConfigurationError, match='Did you mean "material.toughness"'):
         load_setup(file)
     with pytest.raises(ConfigurationError, match="no food that a setup ships for"):
         load_setup("pineapple")

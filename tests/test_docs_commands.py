@@ -44,6 +44,9 @@ python -c "from sliceit_drake.hardware.edge_kinematics import flange_pose; print
 
 # Run by another test, perhaps on a smaller food.
 TESTED = {
+    "tests/test_notebooks.py::test_1_a_diagram_by_hand_slices_and_prints_where_to_watch": [
+        "python -m studies notebooks",
+    ],
     "tests/test_readme.py::test_the_table_is_what_the_measured_slice_gives": [
         "sliceit simulate cucumber_measured",
     ],
