@@ -131,6 +131,33 @@ def test_a_slice_that_rests_is_not_moved_any_more_and_one_in_the_air_falls():
     np.testing.assert_array_equal(slices.pose(context, 0).GetAsMatrix34(), rested)
 
 
+@pytest.mark.parametrize(("friction", "of_the_blade"), [(0.3, 0.9), (0.0, 0.0), (0.0, 0.3)])
+def test_any_pair_of_frictions_can_be_simulated(friction, of_the_blade):
+    body = SliceBody(box(0.03, 0.01, 0.03), Material(friction=of_the_blade), RigidTransform())
+    blade, board = blade_surface(Knife()), Board(height=0.0)
+    slices = LooseSlices([body], None, blade, board, RigidTransform(), friction, 0.0, PERIOD, 0.999)
+    simulator = let_go(slices, RigidTransform([0.0, 0.0, 0.01]))
+    simulator.AdvanceTo(0.2)
+    assert abs(slices.pose(simulator.get_context(), 0).translation()[2]) < 5e-4
+
+
+def test_two_contexts_of_one_system_do_not_disturb_each_other():
+    slices = one_slice(box(0.027, 0.009, 0.027), friction=0.5)
+    places = [tipped(np.radians(25.0), 0.009), RigidTransform([0.01, 0.02, 0.03])]
+    alone = []
+    for X_WS in places:
+        simulator = let_go(slices, X_WS)
+        simulator.AdvanceTo(0.1)
+        alone.append(slices.pose(simulator.get_context(), 0).GetAsMatrix34())
+    together = [let_go(slices, X_WS) for X_WS in places]
+    for step in range(1, 51):
+        for simulator in together:
+            simulator.AdvanceTo(step * PERIOD)
+    for simulator, expected in zip(together, alone, strict=True):
+        found = slices.pose(simulator.get_context(), 0).GetAsMatrix34()
+        np.testing.assert_array_equal(found, expected)
+
+
 def test_before_it_is_cut_through_a_slice_stays():
     slices = one_slice(box(0.027, 0.009, 0.027), friction=0.5)
     simulator = let_go(slices, RigidTransform([0.0, 0.0, 0.1]), progress=0.99)

@@ -168,8 +168,7 @@ class LooseSlices(LeafSystem):
             plant.RegisterCollisionGeometry(
                 self._rest, RigidTransform(), _convex(rest), "rest", soft
             )
-        # Drake takes 2 a b / (a + b) of the coefficients of two surfaces.
-        slip = material.friction * friction / (2.0 * friction - material.friction)
+        slip = _paired(material.friction, friction)
         self._knife = plant.AddRigidBody(
             "knife",
             plant.AddModelInstance("knife"),
@@ -297,6 +296,15 @@ def _hold(body: RigidBody, context: Context, held: bool) -> None:
 def _coordinates(X: RigidTransform) -> np.ndarray:
     """Position coordinates of a free body [7]: quaternion and position."""
     return np.concatenate([X.rotation().ToQuaternion().wxyz(), X.translation()])
+
+
+def _paired(wanted: float, other: float) -> float:
+    """The coefficient of friction that has `wanted` together with `other`, or comes closest.
+
+    Drake takes 2 a b / (a + b) of two surfaces, so it is less than twice the other.
+    """
+    room = 2.0 * other - wanted
+    return wanted * other / room if room > 1e-3 * wanted else 1e3 * wanted
 
 
 def _hard(friction: float) -> ProximityProperties:
