@@ -38,6 +38,7 @@ root_doc = "docs/index"
 include_patterns = [
     "*.md",
     "docs/*.md",
+    "docs/*/*.md",
     "docs/api/*",
     "notebooks/*",
     "calibration/*/README.md",

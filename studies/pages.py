@@ -10,7 +10,7 @@ from studies.results import plain, write_json
 __all__ = ["RESULTS", "percent", "publish", "render", "render_and_store", "table"]
 
 TEMPLATES = Path(__file__).parent / "templates"
-RESULTS = "results"
+RESULTS = "data"
 """Folder beside the pages, for the values that they show."""
 
 

@@ -181,7 +181,7 @@ TOPICS: dict[str, tuple[Study, ...]] = {
         Study("architecture", "project.architecture", "draws the folders and their imports", "5 s"),
         Study("guide_figures", "project.guide_figures", "draws pictures of the guides", "30 s"),
         Study("pages", "project.stored_pages", "renders all pages from stored results", "10 s"),
-        Study("aims", "project.aims", "writes docs/benchmarks.md from stored results", "1 s"),
+        Study("aims", "project.aims", "writes results/benchmarks.md from stored results", "1 s"),
         Study("first_run", "project.first_run", "a newcomer's first run with the wheel", "2 min"),
         Study(
             "notebooks",

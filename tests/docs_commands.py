@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Command", "commands_of"]
+__all__ = ["Command", "commands_of", "pages_of"]
 
 PROGRAMS = r"(?:\.venv/bin/)?(?:sliceit|python3?|pip|pytest|dask|sphinx-build)"
 STARTS = re.compile(rf"(?:[A-Z_]+=\S+ )*{PROGRAMS}\s")
@@ -33,6 +33,11 @@ class Command:
         """As a shell takes it apart; "..." stands for whatever the reader has."""
         words = shlex.split(self.text)
         return [word.removesuffix("...") for word in words if word != "..."]
+
+
+def pages_of(docs: Path) -> list[Path]:
+    """The pages of docs but those that are written for the site."""
+    return sorted(file for file in docs.rglob("*.md") if file.parent.name != "api")
 
 
 def commands_of(file: Path, root: Path) -> list[Command]:

@@ -1,4 +1,4 @@
-"""docs/architecture.md names what there is, and its picture is drawn from the imports."""
+"""docs/explanation/architecture.md names what there is; its picture is drawn from the imports."""
 
 import re
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 from studies.project.architecture import draw, layers, needless, uses
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs/explanation/architecture.md").read_text(encoding="utf-8")
 
 
 def test_the_page_tells_every_folder_in_a_sentence():

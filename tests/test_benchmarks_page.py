@@ -1,4 +1,4 @@
-"""docs/benchmarks.md says what the benchmarks wrote, and says so where they wrote nothing."""
+"""docs/results/benchmarks.md says what the benchmarks wrote, and where they wrote nothing."""
 
 import json
 import shutil
@@ -9,15 +9,21 @@ import pytest
 from studies.project import aims
 
 ROOT = Path(__file__).resolve().parent.parent
-SOURCES = ("speed.md", "calibration.md", "verification.json", "hidden_effects.json")
+SOURCES = (
+    "results/speed.md",
+    "explanation/calibration.md",
+    "results/verification.json",
+    "results/hidden_effects.json",
+)
 
 
 @pytest.fixture
 def docs(tmp_path):
-    for name in (*SOURCES, "random_slices.md"):
-        shutil.copy(ROOT / "docs" / name, tmp_path)
-    (tmp_path / "benchmarks").mkdir()
-    return tmp_path
+    (tmp_path / "explanation").mkdir()
+    (tmp_path / "results" / "benchmarks").mkdir(parents=True)
+    for name in (*SOURCES, "results/random_slices.md"):
+        shutil.copy(ROOT / "docs" / name, tmp_path / name)
+    return tmp_path / "results"
 
 
 def write(docs: Path, name: str, **values: float) -> None:
@@ -31,7 +37,7 @@ def line(text: str, begin: str) -> str:
 
 
 def test_the_page_is_what_its_command_makes():
-    page = (ROOT / "docs/benchmarks.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/results/benchmarks.md").read_text(encoding="utf-8")
     assert page == aims.page(), "python -m studies aims"
 
 

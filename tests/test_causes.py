@@ -23,7 +23,7 @@ from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredicto
 from sliceit_drake.diagnosis.registry import all_causes, load_cause, open_causes
 from sliceit_drake.prediction.record_target import Meshing
 
-DOCS = Path(__file__).resolve().parent.parent / "docs"
+DOCS = Path(__file__).resolve().parent.parent / "docs/reference"
 GRAVITY = 9.81
 X, Y, Z = range(3)
 MIDDLE = "share_medium"

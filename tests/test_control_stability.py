@@ -39,7 +39,7 @@ from studies.robot.control import (
 )
 from studies.robot.stiffness_limit import directional_stiffness, stiffness_limit
 
-CONTROL_DOC = Path(__file__).parents[1] / "docs/control.md"
+CONTROL_DOC = Path(__file__).parents[1] / "docs/explanation/control.md"
 SMALL_FOOD = "food: {shape: !Cylinder {rings: 3, layers: [0.0, 0.004, 0.012]}}, "
 
 

@@ -188,7 +188,7 @@ def settings_rows(text):
 
 
 def test_every_field_that_the_page_names_exists():
-    rows = settings_rows((ROOT / "docs" / "disect.md").read_text(encoding="utf-8"))
+    rows = settings_rows((ROOT / "docs/results/disect.md").read_text(encoding="utf-8"))
     assert [row[0] for row in rows] == [name for name, _, _ in SETTINGS]
     for name, _, here in rows:
         named = re.findall(r"`([^`]+)`", here)

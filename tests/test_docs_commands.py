@@ -14,14 +14,14 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from docs_commands import Command, commands_of
+from docs_commands import Command, commands_of, pages_of
 
 from sliceit_drake.cli.main import main, make_parser
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError
 from studies.registry import find_study, study_parser
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *pages_of(ROOT / "docs")]
 COMMANDS = [command for page in PAGES for command in commands_of(page, ROOT)]
 
 # Run below, in an empty folder; simulations for two coupling steps.
@@ -57,7 +57,7 @@ TESTED = {
         "sliceit simulate radish.yaml",
     ],
     "tests/test_foods_page.py::test_tables_are_made_from_the_files_of_foods_and_knives": [
-        "python -m studies foods_page --output docs/foods.md",
+        "python -m studies foods_page --output docs/reference/foods.md",
     ],
     "tests/test_paraview.py::test_the_series_of_a_run_has_its_body_its_knife_and_its_forces": [
         "sliceit simulate --paraview vtu",
@@ -114,8 +114,8 @@ TESTED = {
     ],
     "tests/test_hidden_effects_page.py::test_the_page_is_made_from_the_runs_and_says_how_they_"
     "were": [
-        "python -m studies score docs/hidden_effects.jsonl --output docs",
-        "python -m studies score output/hidden --output docs",
+        "python -m studies score docs/results/hidden_effects.jsonl --output docs/results",
+        "python -m studies score output/hidden --output docs/results",
     ],
     "tests/test_learning_agent.py::test_a_training_that_was_stopped_goes_on_as_if_it_had_not": [
         "sliceit train --output DIR",
@@ -130,21 +130,21 @@ TESTED = {
     "tests/test_learning_comparison.py::test_a_pressing_policy_completes_a_slice_and_its_forces_"
     "are_those_of_food_and_board": [
         "sliceit evaluate output/ours output/baseline --output output/evaluation.jsonl",
-        "sliceit evaluate output/draws/*_[0-2] --output docs/faster_draws.jsonl",
+        "sliceit evaluate output/draws/*_[0-2] --output docs/results/faster_draws.jsonl",
     ],
     "tests/test_learning_comparison.py::test_an_evaluation_goes_on_over_batches_of_processes_and_"
     "runs": [
-        "sliceit evaluate models/policies/*_[0-4] --output docs/slicing_evaluation.jsonl",
+        "sliceit evaluate models/policies/*_[0-4] --output docs/results/slicing_evaluation.jsonl",
         "sliceit evaluate models/policies/*_[0-4] --board-stiffness 3e3 3e5"
-        " --output docs/slicing_evaluation.jsonl",
+        " --output docs/results/slicing_evaluation.jsonl",
     ],
     "tests/test_learning_comparison.py::test_a_trained_policy_runs_in_a_scenario": [
         "sliceit simulate cucumber_agent",
     ],
     "tests/test_learning_comparison.py::test_the_study_writes_its_page_and_says_what_it_lacks": [
-        "python -m studies slicing output/evaluation.jsonl --output docs",
-        "python -m studies slicing docs/slicing_evaluation.jsonl"
-        " --policies models/policies/cutting_0 models/policies/spring_0 --output docs",
+        "python -m studies slicing output/evaluation.jsonl --output output",
+        "python -m studies slicing docs/results/slicing_evaluation.jsonl"
+        " --policies models/policies/cutting_0 models/policies/spring_0 --output docs/results",
     ],
     "tests/test_motion_optimization.py::test_the_command_leaves_a_scenario_that_simulate_takes": [
         "sliceit optimize-motion scenarios/cucumber_measured.yaml --output FOLDER",
@@ -173,7 +173,7 @@ TESTED = {
         "sliceit hardware SCENARIO --host ADDRESS --robot my.yaml --dry-run",
     ],
     "tests/test_hardware_pace.py::test_it_runs_emulator_and_client_and_prints_and_writes_the_"
-    "table": ["python -m studies hardware_pace --output docs/hardware.md"],
+    "table": ["python -m studies hardware_pace --output docs/how_to/hardware.md"],
     "tests/test_architecture.py::test_the_picture_leaves_out_what_longer_paths_of_arrows_say": [
         "python -m studies architecture",
     ],
@@ -241,56 +241,56 @@ READ_ONLY = {
     "a study of minutes to hours, whose results stand in docs": """
         python -m studies calibration --output FOLDER
         python -m studies control --output FOLDER
-        python -m studies coverage --replicates 24 --output docs
-        python -m studies disect --output docs
+        python -m studies coverage --replicates 24 --output docs/results
+        python -m studies disect --output docs/results
         python -m studies hidden --output output/hidden --seed 1 --replicates 100
-        python -m studies identifiability --output docs/identifiability.md --figure docs/figures/identifiability.png
-        python -m studies random --count 200 --seed 1 --output docs
-        python -m studies real --output docs
+        python -m studies identifiability --output docs/results/identifiability.md --figure docs/results/figures/identifiability.png
+        python -m studies random --count 200 --seed 1 --output docs/results
+        python -m studies real --output docs/results
         python -m studies stepping --output FOLDER
         python -m studies verification --fit
-        python -m studies verification --output docs/verification.md
+        python -m studies verification --output docs/results/verification.md
         """,  # noqa: E501
     "measures times or draws figures, whose results stand in docs": """
-        python -m studies batch_speed --output docs/speed.md
+        python -m studies batch_speed --output docs/results/speed.md
         python -m studies condensed_scheme
-        python -m studies cutting_speed --json docs/benchmarks/cutting_speed.json
-        python -m studies cutting_speed --repeats 3 --output docs/figures/cutting_speed.png
-        python -m studies diagnosis_speed --json docs/benchmarks/diagnosis_speed.json
+        python -m studies cutting_speed --json docs/results/benchmarks/cutting_speed.json
+        python -m studies cutting_speed --repeats 3 --output docs/results/figures/cutting_speed.png
+        python -m studies diagnosis_speed --json docs/results/benchmarks/diagnosis_speed.json
         python -m studies effects_figure
-        python -m studies endurance --minutes 60 --output docs/endurance.md
-        python -m studies faster_draws docs/slicing_evaluation.jsonl docs/faster_draws.jsonl --output docs/learning.md
-        python -m studies first_run --json docs/benchmarks/first_run.json
-        python -m studies foods_page --cut --output docs/foods.md
-        python -m studies learning_speed --output docs/learning.md --json docs/benchmarks/learning_speed.json
-        python -m studies policy_and_motion models/policies/cutting_0 --output docs/learning.md
+        python -m studies endurance --minutes 60 --output docs/results/endurance.md
+        python -m studies faster_draws docs/results/slicing_evaluation.jsonl docs/results/faster_draws.jsonl --output docs/results/learning.md
+        python -m studies first_run --json docs/results/benchmarks/first_run.json
+        python -m studies foods_page --cut --output docs/reference/foods.md
+        python -m studies learning_speed --output docs/results/learning.md --json docs/results/benchmarks/learning_speed.json
+        python -m studies policy_and_motion models/policies/cutting_0 --output docs/results/learning.md
         python -m studies safety_layer
-        python -m studies scaling --output docs/scaling.md
-        python -m studies scaling --trials 24 --slices 4 --tasks 500 --seconds 2 --output docs/scaling.md
-        python -m studies slicing_ablations --folder output/ablations --output docs/learning.md
+        python -m studies scaling --output docs/results/scaling.md
+        python -m studies scaling --trials 24 --slices 4 --tasks 500 --seconds 2 --output docs/results/scaling.md
+        python -m studies slicing_ablations --folder output/ablations --output docs/results/learning.md
         python -m studies split_step_limit
         python -m studies stand_in_figure
         python -m studies station_speed
-        python -m studies station_speed --json docs/benchmarks/station_speed.json
-        python -m studies unfinished_slices docs/slicing_evaluation.jsonl --output docs/learning.md
+        python -m studies station_speed --json docs/results/benchmarks/station_speed.json
+        python -m studies unfinished_slices docs/results/slicing_evaluation.jsonl --output docs/results/learning.md
         """,  # noqa: E501
 }
 
 # Files that a reader has, by the pages that say so.
 READERS = {
-    "scale.csv": "docs/how_to.md: the reader's measurement",
-    "facts.yaml": "docs/how_to.md: the reader's measurement",
-    "session.yaml": "docs/how_to.md: the reader's measurement",
-    "run_07.mcap": "docs/how_to.md: the reader's measurement",
+    "scale.csv": "docs/how_to/tasks.md: the reader's measurement",
+    "facts.yaml": "docs/how_to/tasks.md: the reader's measurement",
+    "session.yaml": "docs/how_to/tasks.md: the reader's measurement",
+    "run_07.mcap": "docs/how_to/tasks.md: the reader's measurement",
     "records/monday": "the reader's records",
     "records/*.csv": "the reader's records",
-    "records/radish": "docs/food_of_your_own.md, where the radish is recorded",
-    "my.yaml": "docs/hardware.md: the reader's robot",
-    "my_cause.py": "docs/causes.md, where it is shown",
-    "brine.py": "docs/stand_in.md, where it is shown",
-    "radish.yaml": "docs/food_of_your_own.md, where it is shown",
-    "radish_setup.yaml": "docs/food_of_your_own.md, where it is shown",
-    "food.yaml": "docs/next_experiment.md, where it is said how to write it",
+    "records/radish": "docs/tutorials/food_of_your_own.md, where the radish is recorded",
+    "my.yaml": "docs/how_to/hardware.md: the reader's robot",
+    "my_cause.py": "docs/reference/causes.md, where it is shown",
+    "brine.py": "docs/explanation/stand_in.md, where it is shown",
+    "radish.yaml": "docs/tutorials/food_of_your_own.md, where it is shown",
+    "radish_setup.yaml": "docs/tutorials/food_of_your_own.md, where it is shown",
+    "food.yaml": "docs/how_to/next_experiment.md, where it is said how to write it",
     "output/cucumber": "`sliceit simulate` without --output",
 }
 WRITES = ("--output", "--folder", "--figure", "--json", "--next-experiment")

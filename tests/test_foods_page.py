@@ -15,15 +15,15 @@ from studies.physics.foods_page import foods_table, knives_table
 ROOT = Path(__file__).resolve().parent.parent
 PAGE, TUTORIAL = (
     (ROOT / "docs" / name).read_text(encoding="utf-8")
-    for name in ("foods.md", "food_of_your_own.md")
+    for name in ("reference/foods.md", "tutorials/food_of_your_own.md")
 )
 
 
 @pytest.mark.parametrize("name", ["foods", "knives"])
 def test_tables_are_made_from_the_files_of_foods_and_knives(name):
     table = {"foods": foods_table, "knives": knives_table}[name]()
-    command = "python -m studies foods_page --output docs/foods.md"
-    assert Place(name).put(PAGE, table, "docs/foods.md") == PAGE, command
+    command = "python -m studies foods_page --output docs/reference/foods.md"
+    assert Place(name).put(PAGE, table, "docs/reference/foods.md") == PAGE, command
 
 
 def test_what_the_pages_say_to_write_is_a_food_a_knife_and_a_setup(tmp_path, monkeypatch):

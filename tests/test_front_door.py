@@ -96,14 +96,14 @@ def test_a_plain_session_simulates_without_a_word_of_warp():
 
 
 def programs() -> list[str]:
-    text = (ROOT / "docs/programs.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs/tutorials/programs.md").read_text(encoding="utf-8")
     return re.findall(r"^```python\n(.*?)^```", text, re.M | re.S)
 
 
 def run_program(number: int, folder: Path, monkeypatch) -> dict:
     monkeypatch.chdir(folder)
     names: dict = {}
-    exec(compile(programs()[number], "docs/programs.md", "exec"), names)
+    exec(compile(programs()[number], "docs/tutorials/programs.md", "exec"), names)
     return names
 
 

@@ -71,5 +71,5 @@ def test_the_benchmark_goes_on_without_a_gpu_and_says_why(monkeypatch, capsys, t
     assert [row[3].strip() for row in rows] == ["0.0000 %", "0.0000 %"]
     assert text.startswith("before\n") and text.endswith("after\n")
     assert batch_speed.PLACE.put(
-        (ROOT / "docs/speed.md").read_text(encoding="utf-8"), "", "speed.md"
+        (ROOT / "docs/results/speed.md").read_text(encoding="utf-8"), "", "speed.md"
     )

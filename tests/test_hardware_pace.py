@@ -85,7 +85,7 @@ def test_a_table_replaces_what_is_between_the_marks_and_nothing_else():
     for wrong in ("a", f"{pace.PLACE.end}{pace.PLACE.begin}", text + text):
         with pytest.raises(ConfigurationError, match=r"x\.md.*no place for the table"):
             pace.PLACE.put(wrong, "new", "x.md")
-    pace.PLACE.put((ROOT / "docs/hardware.md").read_text(), "new", "docs/hardware.md")
+    pace.PLACE.put((ROOT / "docs/how_to/hardware.md").read_text(), "new", "docs/how_to/hardware.md")
 
 
 def test_it_runs_emulator_and_client_and_prints_and_writes_the_table(tmp_path, capsys):

@@ -1,8 +1,8 @@
 """A part of the study of hidden effects: a fresh draw of single effects, pairs, unknowns and nulls.
 
 Each diagnosis is a process of its own that sees a folder of records and a food, as
-docs/hidden_effects.md says, which also gives how often it is right of 633 runs. What is cut next
-(`poor` runs of that study) is protected by tests/test_next_experiment.py.
+docs/results/hidden_effects.md says, which also gives how often it is right of 633 runs. What is cut
+next (`poor` runs of that study) is protected by tests/test_next_experiment.py.
 """
 
 import dataclasses as dc

@@ -1,11 +1,11 @@
-"""docs/hidden_effects.md is what the runs beside it come to."""
+"""docs/results/hidden_effects.md is what the runs beside it come to."""
 
 import json
 from pathlib import Path
 
 from studies.__main__ import main
 
-DOCS = Path(__file__).resolve().parent.parent / "docs"
+DOCS = Path(__file__).resolve().parent.parent / "docs/results"
 RUNS = DOCS / "hidden_effects.jsonl"
 
 

@@ -11,7 +11,7 @@ from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.diagrams.scenario import load_scenario
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
-HOW_TO = (DOCS / "how_to.md").read_text(encoding="utf-8")
+HOW_TO = (DOCS / "how_to/tasks.md").read_text(encoding="utf-8")
 
 
 def blocks(language: str, text: str = HOW_TO) -> dict[str, str]:
@@ -70,14 +70,15 @@ def test_a_scenario_of_the_how_to_list_loads(tmp_path):
 
 
 def test_the_controller_of_the_ports_page_follows_the_motion(tmp_path, monkeypatch):
-    (program,) = blocks("python", (DOCS / "ports.md").read_text(encoding="utf-8")).values()
+    (program,) = blocks(
+        "python", (DOCS / "reference/ports.md").read_text(encoding="utf-8")
+    ).values()
     run = run_program(program, tmp_path, monkeypatch)["run"]
     assert run.stopped is None and run.own == {"controller": "ResolvedRate"}
     assert run.record()["cut_progress"][-1] > 0.999
 
 
 def test_the_first_slice_is_softer_in_python(tmp_path, monkeypatch, capsys):
-    page = (DOCS / "first_slice.md").read_text(encoding="utf-8")
-    (program,) = blocks("python", page).values()
-    run_program(program, tmp_path, monkeypatch)
+    page = (DOCS / "tutorials/first_slice.md").read_text(encoding="utf-8")
+    run_program(blocks("python", page)["The same in Python"], tmp_path, monkeypatch)
     assert 12.0 < float(capsys.readouterr().out.split()[-1]) < 14.5

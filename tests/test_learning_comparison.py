@@ -184,26 +184,26 @@ def test_an_evaluation_goes_on_over_batches_of_processes_and_runs(tmp_path, monk
 
 
 def test_the_page_is_that_of_the_slices(tmp_path, capsys):
-    file = ROOT / "docs/slicing_evaluation.jsonl"
+    file = ROOT / "docs/results/slicing_evaluation.jsonl"
     assert studies(["slicing", str(file), "--output", str(tmp_path)]) == 0
     for name in ("slicing_results.md", "slicing_results.json"):
-        assert (tmp_path / name).read_text() == (ROOT / "docs" / name).read_text()
+        assert (tmp_path / name).read_text() == (ROOT / "docs/results" / name).read_text()
     capsys.readouterr()
 
 
 def test_the_table_of_faster_draws_is_that_of_the_slices():
-    text = (ROOT / "docs/learning.md").read_text(encoding="utf-8")
-    files = ["docs/slicing_evaluation.jsonl", "docs/faster_draws.jsonl"]
-    command = f"python -m studies faster_draws {' '.join(files)} --output docs/learning.md"
+    text = (ROOT / "docs/results/learning.md").read_text(encoding="utf-8")
+    files = ["docs/results/slicing_evaluation.jsonl", "docs/results/faster_draws.jsonl"]
+    command = f"python -m studies faster_draws {' '.join(files)} --output docs/results/learning.md"
     table = faster_draws.draws_table(*(ROOT / file for file in files), command)
-    assert faster_draws.PLACE.put(text, "\n".join(table), "docs/learning.md") == text, command
+    assert faster_draws.PLACE.put(text, "\n".join(table), "learning.md") == text, command
 
 
-def test_the_tour_says_what_the_policies_are_worth():
-    facts = json.loads((ROOT / "docs/slicing_results.json").read_text())
+def test_the_page_says_what_the_policies_are_worth():
+    facts = json.loads((ROOT / "docs/results/slicing_results.json").read_text())
     everywhere = [case["ratios"]["median_force"][0] for case in facts]
     ratios = [c["ratios"]["median_force"][0] for c in facts if c["board_stiffness"] == 3e4]
-    said = " ".join((ROOT / "docs/tour.md").read_text().split())
+    said = " ".join((ROOT / "docs/explanation/learning.md").read_text().split())
     assert f"press with {min(ratios):.2f} to {max(ratios):.2f} times the contact force" in said
     assert f"it is {min(everywhere):.2f} to {max(everywhere):.2f} times" in said
 

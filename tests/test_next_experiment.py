@@ -74,7 +74,7 @@ class Bench:
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
-    # A session in which the class is found; docs/hidden_effects.md says how often that is so.
+    # The class is found in this session; docs/results/hidden_effects.md says how often it is.
     folder = tmp_path_factory.mktemp("bench")
     records = load_sessions([cut(POOR, folder / "old", 21)])
     diagnosis = diagnosis_of(sensitivities(SETUP, records, CAUSES, workers=2))

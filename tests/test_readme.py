@@ -7,6 +7,7 @@ import runpy
 from pathlib import Path
 
 import pytest
+from docs_commands import pages_of
 
 from sliceit_drake.cli.main import main
 from sliceit_drake.diagrams.ports import ports_as_markdown
@@ -17,11 +18,12 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "sliceit_drake"
 
 
-TOUR = "docs/tour.md"
+TUTORIAL = "docs/tutorials/first_slice.md"
 
 
 def run_example(page: str) -> None:
-    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)
+    """Runs the last program of a page."""
+    *_, example = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)
     exec(compile(example, page, "exec"), {})
 
 
@@ -34,8 +36,8 @@ def test_run_of_the_readme_is_saved(tmp_path, monkeypatch):
     assert found == set(said[1].split(", "))
 
 
-def test_batch_and_gradient_of_the_tour_run(capsys):
-    run_example(TOUR)
+def test_batch_and_gradient_of_the_tutorial_run(capsys):
+    run_example(TUTORIAL)
     printed = [x for x in capsys.readouterr().out.splitlines() if x[:1] in ("[", "{")]
     peaks, gradient = (ast.literal_eval(x) for x in printed)
     assert sorted(peaks) == peaks and 5.0 < peaks[0] < peaks[2] < 20.0
@@ -44,10 +46,10 @@ def test_batch_and_gradient_of_the_tour_run(capsys):
     assert gradient["material.friction"] > 0.0
 
 
-def table_of_the_tour() -> dict[str, list[float]]:
-    """Numbers of the first table by row: those of its value, then those in the row's name."""
-    text = (ROOT / TOUR).read_text()
-    table = text.partition("|---|---|\n")[2].partition("\n\n")[0]
+def table_of_the_tutorial() -> dict[str, list[float]]:
+    """Numbers of its table by row: those of its value, then those in the row's name."""
+    text = (ROOT / TUTORIAL).read_text()
+    table = text.partition("| what it measures | value |\n|---|---|\n")[2].partition("\n\n")[0]
     rows = re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", table, re.M)
     number = re.compile(r"\d[\d,]*\.?\d*")
     return {
@@ -62,8 +64,12 @@ def test_the_table_is_what_the_measured_slice_gives(tmp_path):
     options = ["--no-replay", "--no-animation", "--output", str(tmp_path)]
     assert main(["simulate", "cucumber_measured", *options]) == 0
     found = json.loads((tmp_path / "summary.json").read_text())
-    measured, work, table = found["measurement"], found["work_of_cutting_J"], table_of_the_tour()
-    stored = json.loads((ROOT / "docs/verification.json").read_text())["foods"]
+    measured, work, table = (
+        found["measurement"],
+        found["work_of_cutting_J"],
+        table_of_the_tutorial(),
+    )
+    stored = json.loads((ROOT / "docs/results/verification.json").read_text())["foods"]
     (paper,) = (food["curves"] for food in stored if food["name"] == "cucumber")
     error = found["discretization_error"]["relative_rms"]
     expected = {
@@ -95,14 +101,14 @@ def test_the_table_is_what_the_measured_slice_gives(tmp_path):
 
 
 def test_files_that_the_docs_link_to_exist():
-    for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
+    for page in [ROOT / "README.md", *pages_of(ROOT / "docs")]:
         for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
             if not target.startswith("http"):
                 assert (page.parent / target).exists(), f"{page.name} links to {target}"
 
 
 def test_written_port_contract_is_that_of_the_code():
-    assert ports_as_markdown() in (ROOT / "docs/ports.md").read_text()
+    assert ports_as_markdown() in (ROOT / "docs/reference/ports.md").read_text()
 
 
 # --- Pages whose numbers are stored beside them.
@@ -119,7 +125,7 @@ COMPARED = {
 
 
 def test_each_file_of_numbers_has_a_test_that_its_page_says_them():
-    assert {file.name for file in (ROOT / "docs").glob("*.json*")} == set(COMPARED)
+    assert {file.name for file in (ROOT / "docs/results").glob("*.json*")} == set(COMPARED)
     for test in COMPARED.values():
         file, _, name = test.partition("::")
         assert f"def {name}" in (ROOT / "tests" / file).read_text()
@@ -133,15 +139,16 @@ def test_every_page_of_a_study_is_rendered_from_its_stored_results():
         assert text.rstrip("\n") == shown.rstrip("\n"), f"{name}: python -m studies pages"
     # All templates are among them, as a page or as a place of one.
     shown = "\n".join((docs / name).read_text(encoding="utf-8") for name in pages)
+    whole = {Path(name).name for name in pages}
     for template in (ROOT / "studies/templates").glob("*.md"):
-        assert template.name in pages or f"<!-- {template.stem} -->" in shown
+        assert template.name in whole or f"<!-- {template.stem} -->" in shown
 
 
 def test_the_page_on_coverage_is_that_of_its_replicates(tmp_path, monkeypatch):
-    page = (ROOT / "docs/coverage.md").read_text()
+    page = (ROOT / "docs/results/coverage.md").read_text()
     (command,) = re.findall(r"^    (python -m studies coverage .*)$", page, re.M)
     file = tmp_path / "coverage.jsonl"
-    file.write_bytes((ROOT / "docs/coverage.jsonl").read_bytes())
+    file.write_bytes((ROOT / "docs/results/coverage.jsonl").read_bytes())
     count = int(re.search(r"--replicates (\d+)", command)[1])
     # All replicates are there, so that none is computed.
     monkeypatch.setattr(coverage, "_run_replicate", None)
@@ -151,7 +158,7 @@ def test_the_page_on_coverage_is_that_of_its_replicates(tmp_path, monkeypatch):
 
 
 def test_marks_between_which_commands_write_come_in_pairs():
-    for file in (ROOT / "docs").glob("*.md"):
+    for file in pages_of(ROOT / "docs"):
         marks = re.findall(r"<!-- (.*?) -->", file.read_text())
         begun, ended = marks[::2], marks[1::2]
         assert ended == [f"end of {name}" for name in begun], file.name
@@ -162,14 +169,15 @@ def test_marks_between_which_commands_write_come_in_pairs():
 
 def test_every_page_is_linked_from_the_index_and_the_index_from_the_readme():
     index = (ROOT / "docs/index.md").read_text()
-    pages = {file.name for file in (ROOT / "docs").glob("*.md")} - {"index.md"}
+    docs = ROOT / "docs"
+    pages = {file.relative_to(docs).as_posix() for file in pages_of(docs)} - {"index.md"}
     pages |= {f"../notebooks/{file.name}" for file in (ROOT / "notebooks").glob("*.ipynb")}
     assert pages <= set(re.findall(r"\]\(([^)#]+)\)", index))
     assert "](docs/index.md)" in (ROOT / "README.md").read_text()
 
 
 def test_names_that_code_of_the_docs_imports_exist():
-    for file in (ROOT / "docs").glob("*.md"):
+    for file in pages_of(ROOT / "docs"):
         for block in re.findall(r"^```(?:python)?\n(.*?)^```", file.read_text(), re.M | re.S):
             for line in re.findall(r"^from sliceit_drake.*$", block, re.M):
                 exec(line, {})

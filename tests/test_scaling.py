@@ -62,5 +62,5 @@ def test_tables_say_what_was_measured_and_go_between_the_marks(tmp_path):
     with pytest.raises(ValueError, match="page.md has not the lines"):
         scaling.PLACE.put("no marks", "", "page.md")
     # The page that ships has both.
-    shipped = (ROOT / "docs/scaling.md").read_text(encoding="utf-8")
-    assert scaling.PLACE.put(shipped, "", "docs/scaling.md")
+    shipped = (ROOT / "docs/results/scaling.md").read_text(encoding="utf-8")
+    assert scaling.PLACE.put(shipped, "", "docs/results/scaling.md")

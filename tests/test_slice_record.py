@@ -199,7 +199,7 @@ def test_metadata_that_are_wrong_are_refused_with_the_field(tmp_path, old, new, 
 
 
 def test_the_example_of_the_documentation_is_a_good_record(tmp_path):
-    page = (Path(__file__).resolve().parent.parent / "docs" / "records.md").read_text()
+    page = (Path(__file__).resolve().parent.parent / "docs/reference/records.md").read_text()
     for kind, fence in (("csv", "text"), ("yaml", "yaml")):
         (text,) = re.findall(rf"```{fence}\n(.*?)```", page, flags=re.DOTALL)
         (tmp_path / f"cucumber_03.{kind}").write_text(text, encoding="utf-8")
@@ -207,7 +207,7 @@ def test_the_example_of_the_documentation_is_a_good_record(tmp_path):
 
 
 def test_the_documentation_names_every_column_and_field():
-    page = (Path(__file__).resolve().parent.parent / "docs" / "records.md").read_text()
+    page = (Path(__file__).resolve().parent.parent / "docs/reference/records.md").read_text()
     words = set(re.findall(r"\w+", page))
     for group in dc.fields(SliceMetadata):
         parts = [group.name]

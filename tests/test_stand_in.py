@@ -770,7 +770,7 @@ def test_the_command_lists_the_effects(capsys):
     assert main(["record", "--list-effects"]) == 0
     table = capsys.readouterr().out.strip()
     assert all(f"`{name}`" in table for name in EFFECTS)
-    assert table in (PACKAGE.parent / "docs/stand_in.md").read_text(encoding="utf-8")
+    assert table in (PACKAGE.parent / "docs/explanation/stand_in.md").read_text(encoding="utf-8")
 
 
 def test_a_scenario_is_recorded_as_its_one_cut():

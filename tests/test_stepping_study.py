@@ -37,7 +37,7 @@ SMALL = Food(
 )
 FAST = SteppingCase(SMALL, Knife(), Numerics(), 0.1, depth=0.2)
 LIMIT = 0.02
-DOCS = Path(__file__).resolve().parent.parent / "docs" / "stepping.md"
+DOCS = Path(__file__).resolve().parent.parent / "docs/results/stepping.md"
 
 
 def cells(table):
@@ -150,7 +150,7 @@ def test_in_the_committed_tables_the_default_step_errs_at_most_two_percent():
     column = head.index(f"{Numerics().time_step:g} s") - 1
     assert {name.split(",")[0] for name in rows} == {"cucumber", "potato", "tomato"}
     errors = {name: row[column] for name, row in rows.items() if not name.endswith("true masses")}
-    # True masses swing after this stop, which damped ones do not (docs/stepping.md).
+    # True masses swing after this stop, which damped ones do not (docs/results/stepping.md).
     swinging = errors.pop("tomato, hold after a sudden stop, 100 mm/s")
     assert float(swinging) < 2.5
     # Nor do heavy nodes follow a blade that turns round in flesh that clamps it.

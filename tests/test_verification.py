@@ -1,4 +1,4 @@
-"""docs/verification.md says what its numbers say, and the numbers are what the code computes."""
+"""docs/results/verification.md says what its numbers say, and these are what the code computes."""
 
 import copy
 import json
@@ -20,13 +20,13 @@ from studies.physics.measured_curves import (
 from studies.physics.verification import EDGE_CASES, FRICTION_CASES, food_numbers, limits
 from studies.physics.verification_page import verification_page
 
-PAGE = Path(__file__).parents[1] / "docs" / "verification.md"
+PAGE = Path(__file__).parents[1] / "docs/results/verification.md"
 RESULTS = json.loads(PAGE.with_suffix(".json").read_text(encoding="utf-8"))
 FOODS = load_measured_foods(resource_path("calibration/verification_foods.yaml")).foods
 
 # The numbers are kept to six digits, and another machine rounds single precision elsewhere.
 ROUNDING = 1e-3
-REMEDY = "run: python -m studies verification --output docs/verification.md"
+REMEDY = "run: python -m studies verification --output docs/results/verification.md"
 
 
 def assert_same(found, stored, where="", tolerance=ROUNDING, scale=0.0):

@@ -1,4 +1,4 @@
-"""Calibrate a food from slice records (NAME.csv and NAME.yaml, see docs/records.md).
+"""Calibrate a food from slice records (NAME.csv and NAME.yaml, see docs/reference/records.md).
 
 Searches with Optuna's TPE, refines the best places with Adam on the exact gradient, polishes with
 Gauss-Newton, and says how sure it is. Writes to DIR:
@@ -12,7 +12,7 @@ Gauss-Newton, and says how sure it is. Writes to DIR:
 Several machines: give all the same --storage and different --seed, as
   PGPASSWORD=... sliceit calibrate records/*.csv --food cucumber --output a \\
     --storage postgresql://user@host/sliceit --seed 1
-PostgreSQL needs pip install 'sliceit_drake[database]'; what it gains: docs/scaling.md.
+PostgreSQL needs pip install 'sliceit_drake[database]'; what it gains: docs/how_to/scaling.md.
 A journal file (--storage trials.log) serves several processes that share a file system.
 
   sliceit calibrate calibration/records/cucumber.csv --food cucumber --output output/cucumber

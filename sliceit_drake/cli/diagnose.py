@@ -1,7 +1,7 @@
 """Compare slice records with a calibrated food, name what causes the difference, measure the gain.
 
-RECORDS_DIR holds slice records (docs/records.md), or is one; best three or more of each condition
-at several speeds, with a hold, a withdrawal and draws. Writes to DIR:
+RECORDS_DIR holds slice records (docs/reference/records.md), or is one; best three or more of each
+condition at several speeds, with a hold, a withdrawal and draws. Writes to DIR:
   diagnosis.json  verdict, evidence, values, errors
   report.html     prediction against measurement, evidence, angles between causes; opens anywhere
   extended.yaml   the food with the cause in it: `calibration: DIR/extended.yaml` in a scenario

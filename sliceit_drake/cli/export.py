@@ -4,7 +4,7 @@ FOLDER has the scenario and the record, not the food's states: the scenario is s
 which repeats it bit for bit on the same machine and version, and its force is compared with
 FOLDER/record.csv. To do without, give `sliceit simulate --paraview vtu`.
 
-Writes to DIR (docs/paraview.md):
+Writes to DIR (docs/how_to/paraview.md):
   run.pvd and *.vtu   with --format vtu (the default): open run.pvd
   food.xdmf, knife.xdmf, force.xdmf   with --format xdmf
 

@@ -1,7 +1,7 @@
 """Run a scenario on a UR5e, through RTDE, with the same controller and plan as `sliceit simulate`.
 
-THIS SOFTWARE IS NOT A SAFETY FUNCTION, and no physical robot has run it yet. Read docs/hardware.md
-first. Stay out of the arm's reach, with the emergency stop in your hand.
+THIS SOFTWARE IS NOT A SAFETY FUNCTION, and no physical robot has run it yet. Read
+docs/how_to/hardware.md first. Stay out of the arm's reach, with the emergency stop in your hand.
 
 In this order: connects; checks the robot, the plan and the start; zeroes the force sensor; shows
 the plan; waits until you type the word "slice"; runs; stops the program on the robot. At the first

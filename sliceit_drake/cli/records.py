@@ -1,5 +1,5 @@
 """Slice records: one slice as a table (NAME.csv) and what is known about it (NAME.yaml), SI units.
-docs/records.md describes the format; calibration/records holds three to look at.
+docs/reference/records.md describes the format; calibration/records holds three to look at.
 """
 
 import argparse
@@ -46,8 +46,8 @@ Make a slice record from another format.
                 --output records
 
 --metadata is a YAML file with what FILE does not say: food, board, knife, nominal motion, sensor,
-provenance, and what is unknown (docs/records.md). Writes DIR/NAME.csv and DIR/NAME.yaml, and prints
-what `sliceit records check` finds in them.
+provenance, and what is unknown (docs/reference/records.md). Writes DIR/NAME.csv and DIR/NAME.yaml,
+and prints what `sliceit records check` finds in them.
 """
 
 

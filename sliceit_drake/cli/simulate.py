@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--paraview",
         choices=("vtu", "xdmf"),
-        help="also write DIR/paraview, the run as a series of that format (docs/paraview.md)",
+        help="also write DIR/paraview, the run as such a series (docs/how_to/paraview.md)",
     )
     parser.add_argument("--fps", type=float, default=30.0, help="its frames a second (default 30)")
     parser.add_argument("--no-replay", action="store_true", help="do not write replay.html")

@@ -1,8 +1,8 @@
 """Train a slicing policy: SAC with prioritised replay, a temporal convolution over the wrench.
 
 The agent of SliceIt! decides at 20 Hz how compliant the knife is and where its target lies, on
-calibrated foods that differ from slice to slice (docs/learning.md). --simulator spring trains the
-baseline of the paper, for which food is a spring, on the same task.
+calibrated foods that differ from slice to slice (docs/explanation/learning.md). --simulator spring
+trains the baseline of the paper, for which food is a spring, on the same task.
 
 Writes to --output:
   policy.onnx       the policy; a scenario runs it as "policy: !AgentConfig {network: policy.onnx}"

@@ -28,7 +28,7 @@ class Board:
     Stiffness and dissipation are those of the whole edge lying on the board, with all that gives
     under it, down to the table. Both are declared free: no measurement of the paper's board is
     published, nor did we find one of a blade on any board. The force of an impact measures what is
-    assumed here; the default is as stiff as steps of 1 ms resolve (docs/physics.md).
+    assumed here; the default is as stiff as steps of 1 ms resolve (docs/explanation/physics.md).
     """
 
     height: float = quantity(0.05, "m", low=-1.0, high=2.0)

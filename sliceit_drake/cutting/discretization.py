@@ -47,7 +47,7 @@ def estimate_discretization_error(
     The error is the difference over `REFINEMENT`^-`ORDER` - 1. The order lies below the 1.6 to 1.9
     seen with cucumbers between the meshes of half and of full fineness: flanks and bonds, whose
     stiffness goes with E/h, are of first order, the bulk of second. The step's error is not in it
-    (docs/stepping.md).
+    (docs/results/stepping.md).
 
     Args:
         food, knife, numerics, exchange_period: The cut.

@@ -45,7 +45,7 @@ class Knife:
     Knife frame K: origin at the middle of the edge, Kx along the edge, Kz from the spine to the
     edge, Ky the blade's normal. The section is the convex polygon tip, shoulder, spine, mirrored in
     the plane y = 0. Defaults are the knife of the SliceIt! configuration ("gazebo"); see
-    docs/physics.md.
+    docs/explanation/physics.md.
     """
 
     profile: str = choice("straight", ("straight", *UNSUPPORTED))
@@ -189,7 +189,7 @@ def load_knife(name: str | Path, field: str = "knife_name") -> NamedKnife:
             fix=did_you_mean(
                 str(name),
                 shipped_names(FOLDER),
-                "Name one of them, or give a YAML file (docs/foods.md).",
+                "Name one of them, or give a YAML file (docs/reference/foods.md).",
             ),
         )
     return load_yaml(NamedKnife, file)

@@ -1,6 +1,6 @@
 """What a cause is: a small class that changes the prediction of a slice in one way.
 
-A user's own cause is a file with one subclass (docs/causes.md has a complete example).
+A user's own cause is a file with one subclass (docs/reference/causes.md has a complete example).
 """
 
 import dataclasses as dc

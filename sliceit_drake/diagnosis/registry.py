@@ -96,7 +96,8 @@ def load_cause(file: str | Path) -> Cause:
         raise ConfigurationError(
             f"holds {len(kinds)} causes",
             source=str(file),
-            fix="Write one subclass of sliceit_drake.diagnosis.cause.Cause in it (docs/causes.md).",
+            fix="Write one subclass of sliceit_drake.diagnosis.cause.Cause in it "
+            "(docs/reference/causes.md).",
         )
     with _blamed(file, "cannot be made"):
         cause = kinds[0]()
@@ -122,7 +123,7 @@ def _blamed(file: Path, what: str, *passed: type[Exception]) -> Iterator[None]:
             f"{what}: {type(error).__name__}: {text}",
             source=f"{file}, line {line}" if line else str(file),
             field="--cause",
-            fix="Correct the file (docs/causes.md has a complete example).",
+            fix="Correct the file (docs/reference/causes.md has a complete example).",
         ) from error
 
 

@@ -7,7 +7,7 @@ from sliceit_drake.systems.compliance_controller import ComplianceControllerConf
 __all__ = ["ERROR_FACTOR", "AgentGains"]
 
 ERROR_FACTOR = 0.1
-"""Factor on the agent's error scale, the same in simulation and on hardware (docs/control.md)."""
+"""Factor on the agent's error scale, simulated and on hardware (docs/explanation/control.md)."""
 
 
 @dc.dataclass(frozen=True)

@@ -36,7 +36,7 @@ def add_agent(
         raise ConfigurationError(
             f"is {controller.mode!r}; the agent decides stiffness and gains of parallel control",
             field="scenario.controller.mode",
-            fix="Write parallel, with the gains of docs/control.md.",
+            fix="Write parallel, with the gains of docs/explanation/control.md.",
         )
     descent = station.descent()
     if abs(descent - config.descent) > DESCENT_TOLERANCE:

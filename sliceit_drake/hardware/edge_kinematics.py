@@ -3,7 +3,7 @@
 Closed forward kinematics of a UR, in plain floats: numpy's calls on six numbers cost more than the
 arithmetic. The lengths are Universal Robots' nominal ones for the UR5e; a real arm differs from
 them by its factory calibration, up to some millimetres in position. The board's height must
-therefore be found with the same nominal kinematics (docs/hardware.md).
+therefore be found with the same nominal kinematics (docs/how_to/hardware.md).
 
 Apart on purpose from the model of the controller (`systems.ur5e_kinematics`, against which a test
 holds it): what checks commands shares no mistake with what makes them.

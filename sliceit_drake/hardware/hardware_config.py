@@ -31,8 +31,8 @@ class SafetyLimits:
     The defaults are for slow slicing beside a person who holds the emergency stop. Their sources:
     the UR5e's published ranges and joint limits (Universal Robots' technical details; model file
     models/ur5e/ur5e.urdf) bound them, and the motion of the scenario cucumber_measured, simulated,
-    needs 0.22 rad/s, 1.4 rad/s2, 0.08 m/s, 16 N, 0.007 rad of tracking error (docs/hardware.md). In
-    between they are choices, not measurements.
+    needs 0.22 rad/s, 1.4 rad/s2, 0.08 m/s, 16 N, 0.007 rad of tracking error
+    (docs/how_to/hardware.md). In between they are choices, not measurements.
     """
 
     joint_lower: list[float] = quantity(
@@ -105,7 +105,7 @@ class TouchConfig:
     """How the knife feels for the board (hardware.guarded_touch).
 
     The force goes on rising while the arm comes to rest, in proportion to speed and stiffness: 4 N
-    at the defaults on the emulated board of 30 kN/m (docs/hardware.md).
+    at the defaults on the emulated board of 30 kN/m (docs/how_to/hardware.md).
     """
 
     speed: float = quantity(0.005, "m/s", low=5e-4, high=0.02)

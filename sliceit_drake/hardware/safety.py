@@ -1,7 +1,7 @@
 """The safety layer: every joint target passes here before it goes out, or stops the robot.
 
 Plain Python, no input or output, no clock but the controller's. It is not a safety function in the
-sense of ISO 13849 or ISO 10218: the robot's own safety system is (docs/hardware.md).
+sense of ISO 13849 or ISO 10218: the robot's own safety system is (docs/how_to/hardware.md).
 """
 
 import math

@@ -1,8 +1,8 @@
 """A UR robot through ur_rtde.
 
-ur_rtde 1.6.5 keeps silent about much (docs/hardware.md): its getters return the last values for
-ever when the link is gone, servoJ returns True on a dead link, and a lost control link is taken up
-again, with the program uploaded anew. So freshness comes from the controller's timestamp alone,
+ur_rtde 1.6.5 keeps silent about much (docs/how_to/hardware.md): its getters return the last values
+for ever when the link is gone, servoJ returns True on a dead link, and a lost control link is taken
+up again, with the program uploaded anew. So freshness comes from the controller's timestamp alone,
 and `RobotLink` latches on what a program that restarts leaves as traces.
 """
 

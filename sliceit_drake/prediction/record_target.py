@@ -40,7 +40,7 @@ TURN_TRAVEL, TURN_TIME, STILL = 1e-3, 0.03, 2e-5
 """Where the knife turns round in the food, the rows that are not compared: until it is as far back,
 metres, and for as long, s, counted from where it was last as deep but for `STILL`, metres. The
 force turns round over some tenths of a millimetre, in which scaled masses err by half of it
-(docs/stepping.md)."""
+(docs/results/stepping.md)."""
 
 
 class Bench(Protocol):

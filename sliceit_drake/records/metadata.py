@@ -1,4 +1,4 @@
-"""What a slice record says besides its series: the YAML file of the pair (docs/records.md).
+"""What a slice record says besides its series: its YAML file (docs/reference/records.md).
 
 A field that is null was not given. One that was looked for and is not known is also listed in
 `SliceMetadata.unknown`, so that a forgotten field can be told from an unknown one.

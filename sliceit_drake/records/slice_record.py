@@ -1,4 +1,4 @@
-"""The slice record: one slice as series over time and what is known about it (docs/records.md).
+"""The slice record: a slice as series over time and what is known (docs/reference/records.md).
 
 On disk a record is a pair NAME.csv and NAME.yaml. `SliceTable` is that pair as it stands in the
 files; `SliceRecord` is what the rest of the project works with: poses as matrices, velocities, and
@@ -200,8 +200,8 @@ def read_table(file: str | Path) -> SliceTable:
         raise ConfigurationError(
             f"has no {facts.name} beside it, which says what was cut and how",
             source=str(table),
-            fix="Write one as docs/records.md has it; of a table in another format make both: "
-            f"sliceit records import force {table} --metadata FACTS.yaml --output records.",
+            fix="Write one as docs/reference/records.md has it; of a table in another format make "
+            f"both: sliceit records import force {table} --metadata FACTS.yaml --output records.",
         )
     metadata = load_yaml(SliceMetadata, facts)
     metadata.name = metadata.name or table.stem

@@ -154,7 +154,7 @@ def check_plan(
             "board height",
             config.board_height is not None,
             f"{board:.4f} m" + ("" if config.board_height is not None else ", not measured"),
-            "Measure it and write board_height in the robot's file (docs/hardware.md).",
+            "Measure it and write board_height in the robot's file (docs/how_to/hardware.md).",
         ),
         Check(
             "depth at the board",

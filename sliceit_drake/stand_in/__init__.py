@@ -1,4 +1,4 @@
-"""Reality stand-in: worlds with hidden effects that make slice records (docs/stand_in.md).
+"""Worlds with hidden effects that make slice records (docs/explanation/stand_in.md).
 
 Calibration and diagnosis never import it: what it hides is theirs to find.
 """

@@ -83,7 +83,7 @@ class AgentConfig:
     p_ry: list[float] = quantity([0.2, 3.0], "", low=0.0, size=2)
     """Range of the gain about Ky."""
     error_scale: list[float] = quantity([0.15, 0.25], "", low=0.0, size=2)
-    """Error scale far from the final pose, and at it; with the factor of docs/control.md."""
+    """Error scale far from the final pose, and at it; its factor: docs/explanation/control.md."""
     draw_increment: float = quantity(2e-3, "m", low=0.0, high=0.05)
     """Greatest move of the target along Kx in a decision."""
     press_increment: float = quantity(2e-3, "m", low=0.0, high=0.05)

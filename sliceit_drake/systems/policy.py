@@ -1,9 +1,9 @@
 """A policy that decides at 20 Hz how the knife's target moves: its port, and a scripted one.
 
-The port is the smallest that a controller of a station needs (docs/ports.md): a target pose that
-moves at decided speeds, and the stiffness and gains of the compliance controller, which a policy
-may leave alone. What a policy may do at most stands in the scenario, so that a run can be checked
-before it begins, whatever the policy decides.
+The port is the smallest that a controller of a station needs (docs/reference/ports.md): a target
+pose that moves at decided speeds, and the stiffness and gains of the compliance controller, which a
+policy may leave alone. What a policy may do at most stands in the scenario, so that a run can be
+checked before it begins, whatever the policy decides.
 """
 
 import dataclasses as dc

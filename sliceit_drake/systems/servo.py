@@ -113,7 +113,7 @@ class Servo(Diagram):
 
     The law (`ServoLaw`) is integrated exactly between the plant's steps. The motion it asks for
     carries its velocity and acceleration, so that the arm's own controller adds no lag to it, as
-    on a real UR. Measured here (tests; docs/servo.md has a table): lag behind a ramp
+    on a real UR. Measured here (tests; docs/explanation/servo.md has a table): lag behind a ramp
     `ServoConfig.lag` within a plant step; a step at the defaults overshoots by 5.8 % and stays
     within 2 % after 0.14 s. Speed and acceleration are not limited.
 

@@ -2,7 +2,8 @@
 
 Runs `sliceit calibrate` on calibration/records for each food and writes to FOLDER the table
 (calibration.md), the figure (calibration.png), and a folder for each food with what `calibrate`
-leaves. A run that was killed goes on where it was. docs/calibration.md explains what comes out.
+leaves. A run that was killed goes on where it was. docs/explanation/calibration.md explains what
+comes out.
 """
 
 import argparse

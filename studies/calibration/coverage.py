@@ -291,7 +291,7 @@ def coverage_study(
 
 
 def coverage_page(problem: Problem, replicates: Sequence[Replicate], command: str) -> str:
-    """The page docs/coverage.md.
+    """The page docs/results/coverage.md.
 
     Args:
         problem: What was simulated.

@@ -2,7 +2,7 @@
 
 Records the 18 slices of the rich protocol, with nothing hidden, and has `sliceit diagnose` look at
 them with all causes, twice: first with nothing computed before, then with what it has kept.
-docs/benchmarks.md shows what --json docs/benchmarks/diagnosis_speed.json writes.
+docs/results/benchmarks.md shows what --json docs/results/benchmarks/diagnosis_speed.json writes.
 """
 
 import argparse

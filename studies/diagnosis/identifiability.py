@@ -3,7 +3,7 @@
 Takes the motions of the protocols poor, rich and full without noise, computes how each cause would
 change the forces, and the angles between causes after base parameters, differences from slice to
 slice and the discretisation have taken what they can. Takes a few minutes.
-docs/identifiability.md is what comes out.
+docs/results/identifiability.md is what comes out.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""The report of what protocols can tell: docs/identifiability.md, and the figure of the angles."""
+"""What protocols can tell: docs/results/identifiability.md, and the figure of the angles."""
 
 import dataclasses as dc
 from collections.abc import Sequence
@@ -100,7 +100,7 @@ def _scan_angles(found: Sensitivities) -> dict[str, float]:
 
 
 def page_values(
-    study: Study, figure: str = "docs/figures/identifiability.png"
+    study: Study, figure: str = "docs/results/figures/identifiability.png"
 ) -> dict[str, object]:
     """What the page shows."""
     found = study.found

@@ -118,7 +118,7 @@ def run(options: argparse.Namespace) -> int:
         draw(item, options.output / "figures")
         items.append(item)
     file = options.output / "what_the_simulation_gets_wrong.md"
-    command = "python -m studies real --output docs"
+    command = "python -m studies real --output docs/results"
     if options.refinement != 1.0:
         command += f" --refinement {options.refinement:g}"
     if options.foods != list(FOODS):

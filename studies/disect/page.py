@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> int:
     minutes = max(1.0, (time.monotonic() - begin) / 60.0)
     figure = options.output / "figures" / "disect.png"
     plot_disect(study, figure)
-    values = page_values(study, "python -m studies disect --output docs", minutes)
+    values = page_values(study, "python -m studies disect --output docs/results", minutes)
     page = options.output / "disect.md"
     publish(render_and_store("disect", page, values, _numbers(study)), page)
     return 0

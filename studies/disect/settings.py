@@ -188,5 +188,5 @@ SETTINGS: tuple[tuple[str, str, str], ...] = (
     ),
 )
 """Its setting, its value in the reference case, and the field of a `Case` here (with a reason where
-there is none). The tables of docs/disect.md are made of them.
+there is none). The tables of docs/results/disect.md are made of them.
 """

@@ -43,7 +43,7 @@ PAIRS: tuple[tuple[str, str, str], ...] = (
     ("rich", "board_height", "core"),
 )
 """Effects that are hidden together, fixed before any was diagnosed: families and phases differ, and
-none is of a class with the other by docs/identifiability.md (all at 20 degrees or more)."""
+none is of a class with the other by docs/results/identifiability.md (all at 20 degrees or more)."""
 
 CURVE_EFFECTS = ("skin", "rate_toughness", "sensor_delay", "board_height", "flank_adhesion")
 CURVE_DELTAS = (0.5, 1.0, 2.0, 4.0)

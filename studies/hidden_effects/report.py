@@ -6,8 +6,8 @@ hidden_effects.json, hidden_effects.jsonl (the runs, from which the study can be
 gone on with) and figures/hidden_effects.png there. A study that is not done is judged by what there
 is. In place of its folder such a file of runs will do.
 
-  python -m studies score output/hidden --output docs
-  python -m studies score docs/hidden_effects.jsonl
+  python -m studies score output/hidden --output docs/results
+  python -m studies score docs/results/hidden_effects.jsonl
 """
 
 import argparse

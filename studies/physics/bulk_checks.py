@@ -1,4 +1,4 @@
-"""The bulk against exact solutions, one function a check; docs/verification.md."""
+"""The bulk against exact solutions, one function a check; docs/results/verification.md."""
 
 import dataclasses as dc
 import functools

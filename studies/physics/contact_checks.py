@@ -1,4 +1,4 @@
-"""Edge, flanks, holds and gradients against what they must be; docs/verification.md."""
+"""Edge, flanks, holds and gradients against what they must be; docs/results/verification.md."""
 
 import dataclasses as dc
 

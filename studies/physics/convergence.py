@@ -1,4 +1,4 @@
-"""Whole cuts against finer ones, and where the knife's work goes; docs/verification.md."""
+"""Whole cuts against finer ones, and where the knife's work goes; docs/results/verification.md."""
 
 import dataclasses as dc
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""Tables of foods and knives, for docs/foods.md.
+"""Tables of foods and knives, for docs/reference/foods.md.
 
 Foods and knives are read from calibration/foods and calibration/knives. --cut presses knives
 through foods as well, without a robot, which takes a minute. --output puts the tables into a

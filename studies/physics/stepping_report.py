@@ -2,7 +2,7 @@
 
 Presses, draws and holds in three foods at two speeds with steps of 1e-5 to 1e-3 s: scaled masses
 against true ones where the cut is fast, against the finest step where it is slow; then the cucumber
-scenario in the station. Takes some minutes, --quick ten seconds. docs/stepping.md explains
+scenario in the station. Takes some minutes, --quick ten seconds. docs/results/stepping.md explains
 what comes out.
 """
 

@@ -1,4 +1,4 @@
-"""All checks of the verification as one result of plain numbers; docs/verification.md shows it."""
+"""All checks of the verification as plain numbers; docs/results/verification.md shows them."""
 
 import dataclasses as dc
 from collections.abc import Callable, Mapping

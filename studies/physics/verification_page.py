@@ -1,8 +1,8 @@
 """The cutting physics against exact solutions, finer computations and the measured cuts.
 
-Prints the page that docs/verification.md holds; takes a few minutes. With --output it also writes
-the numbers beside it (.json) and the figures (figures/verification_*.png). Ends with status 1 if
-a number is beyond its limit.
+Prints the page that docs/results/verification.md holds; takes a few minutes. With --output it also
+writes the numbers beside it (.json) and the figures (figures/verification_*.png). Ends with status
+1 if a number is beyond its limit.
 """
 
 import argparse
@@ -28,7 +28,7 @@ __all__ = [
     "verification_page",
 ]
 
-COMMAND = "python -m studies verification --output docs/verification.md"
+COMMAND = "python -m studies verification --output docs/results/verification.md"
 FOODS = "calibration/verification_foods.yaml"
 CURVES = ("measured", "DiSECt", "spring", "ours")
 
@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--output",
         metavar="FILE",
         type=Path,
-        help="write the page there, as docs/verification.md, with its numbers and figures",
+        help="write the page there, as docs/results/verification.md, with its numbers and figures",
     )
     parser.add_argument(
         "--foods", metavar="FILE", type=Path, help=f"fitted foods; default: {FOODS}"

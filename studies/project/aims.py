@@ -1,4 +1,4 @@
-"""Writes docs/benchmarks.md: each aim of the project with the value that was measured last.
+"""Writes docs/results/benchmarks.md: each aim of the project with the value that was measured last.
 
 It measures nothing: values are those that the studies wrote into a page or a JSON file of docs. A
 test fails where the page is not what this makes of them.
@@ -18,6 +18,7 @@ from studies.pages import render
 __all__ = ["Row", "add_arguments", "page", "run"]
 
 ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "docs" / "results"
 NOT_MEASURED = "not measured"
 
 
@@ -31,7 +32,7 @@ class Row:
         value: What was measured, or None.
         met: Whether it is reached; None without a value.
         command: That measures it.
-        source: Where its value stands, relative to docs.
+        source: Where its value stands, relative to docs/results.
     """
 
     what: str
@@ -141,7 +142,7 @@ def station(docs: Docs) -> tuple[Mapping[str, float], str]:
 
 def speed_rows(docs: Docs) -> Iterator[Row]:
     """Aims for the simulation's cost."""
-    command = "python -m studies cutting_speed --json docs/benchmarks/cutting_speed.json"
+    command = "python -m studies cutting_speed --json docs/results/benchmarks/cutting_speed.json"
     values, source = cutting(docs)
     yield measured(
         "27 mm of cucumber, no robot, one core, defaults",
@@ -180,7 +181,7 @@ def speed_rows(docs: Docs) -> Iterator[Row]:
     yield measured(
         "station with arm and control while it cuts, one core",
         ">= 4 times real time",
-        "python -m studies station_speed --json docs/benchmarks/station_speed.json",
+        "python -m studies station_speed --json docs/results/benchmarks/station_speed.json",
         source,
         values,
         lambda v: (
@@ -193,7 +194,7 @@ def speed_rows(docs: Docs) -> Iterator[Row]:
     yield measured(
         "from the installed wheel to the first picture, kernels compiled",
         "<= 60 s",
-        "python -m studies first_run --json docs/benchmarks/first_run.json",
+        "python -m studies first_run --json docs/results/benchmarks/first_run.json",
         "benchmarks/first_run.json",
         values,
         lambda v: (
@@ -208,8 +209,8 @@ def learning_rows(docs: Docs) -> Iterator[Row]:
     """Aims for the cost of learning."""
     values, source = docs.values("learning_speed"), "benchmarks/learning_speed.json"
     command = (
-        "python -m studies learning_speed --output docs/learning.md "
-        "--json docs/benchmarks/learning_speed.json"
+        "python -m studies learning_speed --output docs/results/learning.md "
+        "--json docs/results/benchmarks/learning_speed.json"
     )
 
     def rate(name: str) -> float:
@@ -250,8 +251,8 @@ USUAL_BOARD = 3e4
 def slicing_rows(docs: Docs) -> Iterator[Row]:
     """Aims for what a policy of the cutting simulator is worth, on the usual board but for one."""
     command = (
-        "python -m studies slicing docs/slicing_evaluation.jsonl "
-        "--policies models/policies/cutting_0 models/policies/spring_0 --output docs"
+        "python -m studies slicing docs/results/slicing_evaluation.jsonl "
+        "--policies models/policies/cutting_0 models/policies/spring_0 --output docs/results"
     )
     source = "slicing_results.md"
     facts = docs.facts("slicing_results.json") or []
@@ -300,7 +301,8 @@ def slicing_rows(docs: Docs) -> Iterator[Row]:
 
 def calibration_rows(docs: Docs) -> Iterator[Row]:
     """Aims for the calibration on the paper's curves."""
-    command, source = "python -m studies calibration --output FOLDER", "calibration.md"
+    command = "python -m studies calibration --output FOLDER"
+    source = "../explanation/calibration.md"
     for food in ("cucumber", "tomato", "potato"):
         found = docs.numbers(
             source, rf"^\| {food} \| ([\d.]+) \| [\d.]+ \| [\d.]+ \| [\d.]+ \| ([\d.]+) \|"
@@ -331,7 +333,7 @@ def accuracy_rows(docs: Docs) -> Iterator[Row]:
     yield measured(
         "discretisation error of mesh and step at the defaults (Richardson)",
         "<= 3 % RMS",
-        "python -m studies verification --output docs/verification.md",
+        "python -m studies verification --output docs/results/verification.md",
         "verification.md",
         values,
         lambda v: (
@@ -344,7 +346,7 @@ def accuracy_rows(docs: Docs) -> Iterator[Row]:
     yield measured(
         "200 random slices: cut, or a reason",
         "none unexplained",
-        "python -m studies random --count 200 --seed 1 --output docs",
+        "python -m studies random --count 200 --seed 1 --output docs/results",
         "random_slices.md",
         dict(zip(names, counts or (), strict=False)),
         lambda v: (
@@ -356,8 +358,8 @@ def accuracy_rows(docs: Docs) -> Iterator[Row]:
 
 def diagnosis_rows(docs: Docs) -> Iterator[Row]:
     """Aims for the diagnosis."""
-    command = "python -m studies diagnosis_speed --json docs/benchmarks/diagnosis_speed.json"
     values, source = docs.values("diagnosis_speed"), "benchmarks/diagnosis_speed.json"
+    command = f"python -m studies diagnosis_speed --json docs/results/{source}"
     for key, what, limit in (
         ("cold_s", "diagnosis of 18 records, all causes", 600.0),
         ("warm_s", "the same again, with what it has kept", 60.0),
@@ -375,7 +377,7 @@ def diagnosis_rows(docs: Docs) -> Iterator[Row]:
             row["asked"],
             f"{row['hits']} of {row['runs']}{shown}",
             row["met"],
-            "python -m studies score docs/hidden_effects.jsonl --output docs",
+            "python -m studies score docs/results/hidden_effects.jsonl --output docs/results",
             "hidden_effects.md",
         )
 
@@ -390,7 +392,7 @@ SECTIONS = {
 }
 
 
-def page(folder: Path = ROOT / "docs") -> str:
+def page(folder: Path = RESULTS) -> str:
     """The page of what stands in a folder."""
     docs = Docs(folder)
     sections = {title: list(rows_of(docs)) for title, rows_of in SECTIONS.items()}
@@ -417,5 +419,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Writes the page."""
-    (ROOT / "docs" / "benchmarks.md").write_text(page(), encoding="utf-8")
+    (RESULTS / "benchmarks.md").write_text(page(), encoding="utf-8")
     return 0

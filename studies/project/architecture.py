@@ -1,4 +1,4 @@
-"""The picture of docs/architecture.md: the folders of the project, and which imports which.
+"""The picture of docs/explanation/architecture.md: folders, and which imports which.
 
 Reads the layers from the import rules in pyproject.toml and the imports from the code.
 """

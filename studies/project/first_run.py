@@ -3,8 +3,8 @@
 Builds source distribution and wheel, installs the wheel into an empty environment outside the
 checkout (from the index that pip is set to), and calls `sliceit` as a user would who has nothing:
 an empty home, an empty folder with a blank in its name, no display. Each stage is timed. Ends with
-status 1 if a command fails. docs/benchmarks.md shows what --json docs/benchmarks/first_run.json
-writes.
+status 1 if a command fails. docs/results/benchmarks.md shows what --json
+docs/results/benchmarks/first_run.json writes.
 
 Needs pip and hatchling. Takes a minute or two, and 2 GB in the folder for temporary files.
 """

@@ -1,8 +1,9 @@
 """Renders all pages and tables of docs/ that studies write, from stored results.
 
-Nothing is measured: templates are filled with the values in docs/results, and pages whose results
-stand in docs/*.json and docs/*.jsonl are made from these. For changes of a template, and to see
-that a page is what was measured. `architecture` and the studies that draw figures are not run.
+Nothing is measured: templates are filled with the values in the folder data beside a page, and
+pages whose results stand in docs/results/*.json and *.jsonl are made from these. For changes of a
+template, and to see that a page is what was measured. `architecture` and the studies that draw
+figures are not run.
 """
 
 import argparse
@@ -27,7 +28,7 @@ __all__ = ["add_arguments", "run", "stored_pages"]
 
 
 def stored_pages(docs: Path) -> dict[str, str]:
-    """Text of each page that shows stored results, by its file name.
+    """Text of each page that shows stored results, by its file relative to docs.
 
     Args:
         docs: Folder of pages and results. Of a page that is written by hand only the marked places
@@ -43,46 +44,49 @@ def stored_pages(docs: Path) -> dict[str, str]:
 def _whole_pages(docs: Path) -> Iterator[tuple[str, str]]:
     """Name and text of each page that is rendered as a whole."""
     yield from ((page, text) for _, page, text in _rendered(docs, whole=True))
-    yield "benchmarks.md", aims.page(docs)
-    results = json.loads((docs / "verification.json").read_text(encoding="utf-8"))
-    yield "verification.md", verification_page(results)
-    lines = (docs / "slicing_evaluation.jsonl").read_text(encoding="utf-8").splitlines()
+    results = docs / "results"
+    yield "results/benchmarks.md", aims.page(results)
+    verified = json.loads((results / "verification.json").read_text(encoding="utf-8"))
+    yield "results/verification.md", verification_page(verified)
+    lines = (results / "slicing_evaluation.jsonl").read_text(encoding="utf-8").splitlines()
     found = comparison.compare([json.loads(line) for line in lines])
-    yield "slicing_results.md", comparison.comparison_page(found)
-    replicates = docs / "coverage.jsonl"
+    yield "results/slicing_results.md", comparison.comparison_page(found)
+    replicates = results / "coverage.jsonl"
     count = len(replicates.read_text(encoding="utf-8").splitlines())
     problem = coverage.Problem()
-    command = f"python -m studies coverage --replicates {count} --output docs"
+    command = f"python -m studies coverage --replicates {count} --output docs/results"
     # All replicates are there: none is computed.
     measured = coverage.coverage_study(problem, count, replicates)
-    yield "coverage.md", coverage.coverage_page(problem, measured, command)
+    yield "results/coverage.md", coverage.coverage_page(problem, measured, command)
     with tempfile.TemporaryDirectory() as folder:
         study = Path(folder)
-        unpack(docs / "hidden_effects.jsonl", study)
+        unpack(results / "hidden_effects.jsonl", study)
         judged, facts = judge_study(study), read_facts(study / "study.json")
-    yield "hidden_effects.md", report(judged, "figures/hidden_effects.png", facts)
+    yield "results/hidden_effects.md", report(judged, "figures/hidden_effects.png", facts)
 
 
 def _places(docs: Path) -> Iterator[tuple[str, str, str]]:
     """Name, page and text of each marked place."""
     yield from _rendered(docs, whole=False)
-    yield "foods", "foods.md", foods_page.foods_table()
-    yield "knives", "foods.md", foods_page.knives_table()
+    yield "foods", "reference/foods.md", foods_page.foods_table()
+    yield "knives", "reference/foods.md", foods_page.knives_table()
     command = (
-        "python -m studies faster_draws docs/slicing_evaluation.jsonl docs/faster_draws.jsonl"
-        " --output docs/learning.md"
+        "python -m studies faster_draws docs/results/slicing_evaluation.jsonl"
+        " docs/results/faster_draws.jsonl --output docs/results/learning.md"
     )
-    evaluation, faster = docs / "slicing_evaluation.jsonl", docs / "faster_draws.jsonl"
+    results = docs / "results"
+    evaluation, faster = results / "slicing_evaluation.jsonl", results / "faster_draws.jsonl"
     table = faster_draws.draws_table(evaluation, faster, command)
-    yield "faster_draws", "learning.md", "\n".join(table)
+    yield "faster_draws", "results/learning.md", "\n".join(table)
 
 
 def _rendered(docs: Path, whole: bool) -> Iterator[tuple[str, str, str]]:
     """Name, page and text of each template whose values are stored, of whole pages or of places."""
-    for file in sorted((docs / RESULTS).glob("*.json")):
+    for file in sorted(docs.rglob(f"{RESULTS}/*.json")):
         facts = json.loads(file.read_text(encoding="utf-8"))
         if facts["whole"] == whole:
-            yield file.stem, facts["page"], render(file.stem, **facts["values"]).rstrip("\n")
+            page = file.parent.with_name(facts["page"]).relative_to(docs).as_posix()
+            yield file.stem, page, render(file.stem, **facts["values"]).rstrip("\n")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

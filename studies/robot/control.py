@@ -2,7 +2,7 @@
 
 Computes the linear loop's limit over error scale x gain and servo lag, simulates the station on
 both sides of it, and runs the station over the SliceIt! agent's whole box of gains on food and
-board. Takes a few minutes. docs/control.md explains what comes out.
+board. Takes a few minutes. docs/explanation/control.md explains what comes out.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """What the base model leaves out: parameter groups whose default changes nothing.
 
-Forms and their signatures in measured forces are those of docs/physics.md, "Effects".
+Forms and their signatures in measured forces are those of docs/explanation/physics.md, "Effects".
 """
 
 import dataclasses as dc

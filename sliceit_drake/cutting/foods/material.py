@@ -12,7 +12,7 @@ class Material:
     """Bulk and cut-surface properties of a food.
 
     The cut surface dissipates `toughness` per area, by the edge that passes or by opening,
-    whichever comes first (docs/physics.md).
+    whichever comes first (docs/explanation/physics.md).
     """
 
     youngs_modulus: float = quantity(2.6e6, "Pa", low=1e3, high=1e9)

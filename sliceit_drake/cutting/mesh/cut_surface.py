@@ -8,7 +8,8 @@ Cx, lies s below point i in the rest configuration, the point carries
 The hats are a partition of unity, so the T_i of all points sum to the section's width at the edge
 for any mesh, and the integral of T_i over s is the point's area A_i. The force that parts the
 surface is then toughness times T_i at the largest s so far: pressing through gives toughness times
-width with no ripple from the mesh, and R A_i of work at each point (docs/physics.md, "Edge").
+width with no ripple from the mesh, and R A_i of work at each point (docs/explanation/physics.md,
+"Edge").
 """
 
 import dataclasses as dc

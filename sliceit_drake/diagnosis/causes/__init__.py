@@ -29,4 +29,4 @@ BUILT_IN: tuple[type[Cause], ...] = (
     robot.Vibration,
     robot.StickSlip,
 )
-"""In the order of docs/causes.md. Modulus, toughness and friction are base parameters."""
+"""In the order of docs/reference/causes.md. Modulus, toughness and friction are base parameters."""

@@ -35,7 +35,7 @@ itself is only known to within its replicates."""
 ONE_CONDITION_MISFIT = 0.55
 ONE_CONDITION_FACTOR = 2.5
 """The same where all cuts are of one condition, whose only depth profile the simulation has to
-meet: where nothing is wrong up to 0.9 of the noise is left (docs/hidden_effects.jsonl)."""
+meet: where nothing is wrong up to 0.9 of the noise is left (docs/results/hidden_effects.jsonl)."""
 TOLERATED = 0.4
 """Misfit against the in-contact noise that the simulation leaves where nothing is wrong."""
 EXPLAINED = 0.6

@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 ANGLE = 20.0
-"""Degrees below which two causes are of one class; see docs/identifiability.md."""
+"""Degrees below which two causes are of one class; see docs/results/identifiability.md."""
 SHOWS = 3.0
 """Standard deviations that must be left of a cause of its prior size for it to show."""
 SHIFT = 0.25

@@ -1,4 +1,4 @@
-"""The slice record (docs/records.md) of a run, simulated or on a robot."""
+"""The slice record (docs/reference/records.md) of a run, simulated or on a robot."""
 
 import datetime
 
