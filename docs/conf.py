@@ -111,6 +111,7 @@ def modules(package: str) -> list[str]:
 
 
 EXTENSION_POINTS = (
+    "ControllerSystem",
     "KnifeForceSystem",
     "PolicyAction",
     "PolicySystem",

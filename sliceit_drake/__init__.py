@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from sliceit_drake.cutting.knife import Knife as Knife
     from sliceit_drake.diagnosis.cause import Cause as Cause
     from sliceit_drake.diagnosis.diagnose import diagnose as diagnose
+    from sliceit_drake.diagrams.controller_system import ControllerSystem as ControllerSystem
     from sliceit_drake.diagrams.run import Run as Run
     from sliceit_drake.diagrams.run import simulate as simulate
     from sliceit_drake.diagrams.scenario import Scenario as Scenario

@@ -107,8 +107,8 @@ def run_program(number: int, folder: Path, monkeypatch) -> dict:
     return names
 
 
-def test_there_are_three_of_at_most_fifteen_lines_that_use_the_front_door():
-    assert len(programs()) == 3
+def test_there_are_four_of_at_most_fifteen_lines_that_use_the_front_door():
+    assert len(programs()) == 4
     for program in programs():
         assert len([line for line in program.splitlines() if line.strip()]) <= 15
         assert not re.search(r"from sliceit_drake|import sliceit_drake\.", program)
@@ -132,8 +132,22 @@ def test_a_policy_of_ones_own_moves_the_knife(tmp_path, monkeypatch):
     assert 3.0 < summary["peak_force_N"] < 30.0
 
 
+def test_a_controller_of_ones_own_follows_the_motion(tmp_path, monkeypatch):
+    run = run_program(1, tmp_path, monkeypatch)["run"]
+    folder = tmp_path / "output/resolved_rate"
+    assert {file.name for file in folder.iterdir()} == FILES
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["own"] == {"controller": "ResolvedRate"} and summary["stopped"] is None
+    record = run.record()
+    assert record["cut_progress"][-1] > 0.999
+    # A tenth of the error each 2 ms: at 20 mm/s the command is 0.4 mm behind.
+    moving = (record["time"] > 0.5) & (record["time"] < 1.5)
+    behind = (record["commanded_pose_p_z"] - record["target_pose_p_z"])[moving]
+    assert behind == pytest.approx(0.36e-3, abs=0.06e-3)
+
+
 def test_a_cutting_system_of_ones_own_gives_the_force(tmp_path, monkeypatch):
-    run_program(1, tmp_path, monkeypatch)
+    run_program(2, tmp_path, monkeypatch)
     folder = tmp_path / "output/dough"
     assert {file.name for file in folder.iterdir()} == FILES
     summary = json.loads((folder / "summary.json").read_text())
@@ -146,7 +160,7 @@ def test_a_cutting_system_of_ones_own_gives_the_force(tmp_path, monkeypatch):
 
 
 def test_twenty_values_of_toughness_are_swept_and_drawn(tmp_path, monkeypatch):
-    names = run_program(2, tmp_path, monkeypatch)
+    names = run_program(3, tmp_path, monkeypatch)
     folder = tmp_path / "output/toughness"
     assert {file.name for file in folder.iterdir()} == {"sweep.csv", "curves.csv", "sweep.png"}
     with (folder / "sweep.csv").open() as file:

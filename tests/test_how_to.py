@@ -69,15 +69,6 @@ def test_a_scenario_of_the_how_to_list_loads(tmp_path):
     assert measured == load_scenario("cucumber_measured")
 
 
-def test_the_controller_of_the_ports_page_follows_the_motion(tmp_path, monkeypatch):
-    (program,) = blocks(
-        "python", (DOCS / "reference/ports.md").read_text(encoding="utf-8")
-    ).values()
-    run = run_program(program, tmp_path, monkeypatch)["run"]
-    assert run.stopped is None and run.own == {"controller": "ResolvedRate"}
-    assert run.record()["cut_progress"][-1] > 0.999
-
-
 def test_the_first_slice_is_softer_in_python(tmp_path, monkeypatch, capsys):
     page = (DOCS / "tutorials/first_slice.md").read_text(encoding="utf-8")
     run_program(blocks("python", page)["The same in Python"], tmp_path, monkeypatch)
