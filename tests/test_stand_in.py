@@ -782,8 +782,32 @@ def test_a_scenario_is_recorded_as_its_one_cut():
     assert record.metadata.condition == "cucumber_measured"
     assert {p.label for p in record.metadata.motion.phases} == {"slice", "hold", "retract", "other"}
     assert record.metadata.motion.speed == pytest.approx(0.02)
-    with pytest.raises(ConfigurationError, match="single cut"):
-        protocol_of_scenario(load_scenario(resource_path("scenarios/cucumber_sequence.yaml")))
+    for name, field in (
+        ("cucumber_sequence", "sequence"),
+        ("cucumber_policy", "policy"),
+        ("cucumber_spring", "food"),
+    ):
+        with pytest.raises(ConfigurationError, match=f"scenario.{field}: has no single cut"):
+            protocol_of_scenario(load_scenario(name))
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("held", ["plus", "both"])
+def test_a_scenario_without_a_motion_is_cut_through_as_it_is_simulated(world, held):
+    from sliceit_drake.diagrams.prepared_food import prepare_food
+    from sliceit_drake.diagrams.scenario import Scenario, load_scenario
+
+    scenario = load_scenario(
+        Scenario(),
+        f"food.name=cucumber, food.held_sides={held}, start.clearance=0.003,"
+        "food.shape=!Cylinder {diameter: 0.04, length: 0.05, layers: [0.0, 0.004, 0.012]}",
+    )
+    protocol = dc.replace(protocol_of_scenario(scenario), sensor=IDEAL, variation=SAME)
+    record = Session(protocol, [], world, 0, COARSE).record(0)
+    assert record.position[:, 2].min() == pytest.approx(protocol.board.height - 2e-4, abs=1e-5)
+    simulated = prepare_food(scenario.food, scenario).motion_plan.segments
+    assert {s.label for s in simulated} <= {p.label for p in record.metadata.motion.phases}
+    assert (record.position[-1, 2] > protocol.board.height + 0.03) == (held == "plus")
 
 
 @pytest.mark.parametrize(("name", "count"), [("poor", 6), ("rich", 18), ("full", 30)])

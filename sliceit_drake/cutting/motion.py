@@ -35,6 +35,13 @@ __all__ = [
     "small_turn",
 ]
 
+OVERTRAVEL = 2e-4
+"""Way into the board at the end of a cut through the food, metres; see `SliceSequence`."""
+ACCELERATION = 0.5
+"""Of the ramps of such a cut, m/s^2."""
+SHORT_HOLD = 0.1
+"""Time of rest at its end in a food that clamps the blade, s."""
+
 _NO_TURN = np.eye(3)
 _NO_TURN.setflags(write=False)
 
@@ -354,6 +361,24 @@ class MotionPlan:
                     field=f"{where}.segments[{index}].placement",
                     fix='Put it first, or write "placement: start".',
                 )
+
+    def or_cut_through(self, height: float, clamps: bool) -> "MotionPlan":
+        """These segments; where none were given, those of one cut through the food.
+
+        The knife then comes up again, but not out of a food that clamps the blade, which would
+        shake.
+
+        Args:
+            height: Of the edge over the board at the start, metres.
+            clamps: Whether the food clamps the blade, as one that is held on both sides does.
+        """
+        if self != MotionPlan():
+            return self
+        way = height + OVERTRAVEL
+        down = ConstantSpeed(distance=way, acceleration=ACCELERATION)
+        if clamps:
+            return MotionPlan([down, Hold(SHORT_HOLD)])
+        return MotionPlan([down, Hold(), Retract(way, acceleration=ACCELERATION)])
 
 
 class Motion:

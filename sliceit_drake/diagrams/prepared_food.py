@@ -18,7 +18,7 @@ from sliceit_drake.cutting.foods.food import Food, make_food_geometry, start_pos
 from sliceit_drake.cutting.foods.spring_food import SpringFood
 from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry
 from sliceit_drake.cutting.model import prepare_cut
-from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan, Retract
+from sliceit_drake.cutting.motion import Motion, MotionPlan
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.plant.knife_body import blade_surface
 from sliceit_drake.diagrams.scenario import Scenario
@@ -37,13 +37,6 @@ __all__ = [
     "motion_of",
     "prepare_food",
 ]
-
-OVERTRAVEL = 2e-4
-"""Way into the board at the end of a cut through the food, metres; see `SliceSequence`."""
-ACCELERATION = 0.5
-"""Of the ramps of such a cut, m/s^2."""
-SHORT_HOLD = 0.1
-"""Time of rest at its end in a food that clamps the blade, s."""
 
 
 class CuttableFood(Protocol):
@@ -133,20 +126,13 @@ def _own_system(
 def motion_of(scenario: Scenario, top: float) -> MotionPlan:
     """The scenario's segments; where it gives none, those of one cut through the food.
 
-    The knife then comes up again, but from a food that is held on both sides: that clamps the
-    blade, which would shake.
-
     Args:
         scenario: Without policy and sequence.
         top: Height of the food at the cut, metres.
     """
-    if scenario.motion != MotionPlan():
-        return scenario.motion
-    way = scenario.start.clearance + top + OVERTRAVEL
-    down = ConstantSpeed(distance=way, acceleration=ACCELERATION)
-    if isinstance(scenario.food, Food) and scenario.food.held_sides == "both":
-        return MotionPlan([down, Hold(SHORT_HOLD)])
-    return MotionPlan([down, Hold(), Retract(way, acceleration=ACCELERATION)])
+    food = scenario.food
+    clamps = isinstance(food, Food) and food.held_sides == "both"
+    return scenario.motion.or_cut_through(scenario.start.clearance + top, clamps)
 
 
 @functools.singledispatch

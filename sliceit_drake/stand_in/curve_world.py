@@ -63,7 +63,7 @@ class CurveWorld:
             np.diag([1.0, -1.0, -1.0]),
             np.array([x + condition.offset, y, height + condition.clearance]),
         )
-        path = Path.of(condition.motion, start, protocol.exchange_period)
+        path = Path.of(protocol, condition, start)
         return _CurveRun(path, specimen, facts, effects, self).cut()
 
 

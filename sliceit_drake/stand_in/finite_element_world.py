@@ -173,7 +173,7 @@ class FiniteElementWorld:
         if isinstance(food.shape, Box | Cylinder):
             # The clearance is over the food, not over a mesh that conserves its volume.
             start.p[2] = section_size(food)[1] + condition.clearance
-        path = Path.of(condition.motion, start, protocol.exchange_period)
+        path = Path.of(protocol, condition, start)
         model, section = None, nominal
         if not condition.without_food:
             moved = mesh.vertices

@@ -36,8 +36,9 @@ class Condition:
 
     label: str = "press"
     motion: MotionPlan = dc.field(default_factory=MotionPlan)
-    """Labels of segments that are those of records (air, slice, hold, retract, second_pass,
-    board_press, weight, ...) become phases; others become "other"."""
+    """Where none is given one cut through the food. Labels of segments that are those of records
+    (air, slice, hold, retract, second_pass, board_press, weight, ...) become phases; others become
+    "other"."""
     replicates: int = quantity(3, "", low=1, high=1000)
     """How often."""
     clearance: float = quantity(3e-3, "m", low=-0.05, high=0.5)
@@ -211,16 +212,17 @@ def protocol_of_scenario(scenario: Scenario, replicates: int = 1) -> Protocol:
     left out. An analytic food of no toughness, which the station's knife does not feel, is none.
 
     Raises:
-        ConfigurationError: The scenario has no food to cut, or is a sequence.
+        ConfigurationError: The scenario has no food to cut, or a sequence or a policy moves its knife.
     """
     food, prepared = scenario.food, scenario.preparation or Preparation()
     without_food = is_no_food(food)
     if is_no_food(food):
         food = Food(name="none", shape=Cylinder(diameter=food.diameter))
-    if not isinstance(food, Food) or scenario.sequence is not None:
+    refused = [name for name in ("sequence", "policy") if getattr(scenario, name) is not None]
+    if not isinstance(food, Food) or refused:
         raise ConfigurationError(
-            "has no single cut through a finite-element food",
-            field="scenario.food" if scenario.sequence is None else "scenario.sequence",
+            "has no single cut through a finite-element food on a prescribed motion",
+            field=f"scenario.{(refused or ['food'])[0]}",
             fix="Give a scenario with one cut, or a protocol with a list of conditions.",
         )
     protocol = Protocol(

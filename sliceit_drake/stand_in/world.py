@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from sliceit_drake.cutting.motion import Motion, MotionPlan, Pose
+from sliceit_drake.cutting.motion import Motion, Pose
 from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceTruth
-from sliceit_drake.stand_in.protocol import Specimen
+from sliceit_drake.stand_in.protocol import Condition, Protocol, Specimen
 
 __all__ = ["GRAVITY", "Path", "Run", "World"]
 
@@ -54,9 +54,11 @@ class Path:
     span: np.ndarray
 
     @classmethod
-    def of(cls, plan: MotionPlan, start: Pose, period: float) -> "Path":
-        """Samples a plan from a start pose in F."""
-        motion = Motion(plan, start)
+    def of(cls, protocol: Protocol, condition: Condition, start: Pose) -> "Path":
+        """Samples the motion of a condition from a start pose in F."""
+        clamps = not condition.without_food and protocol.food.held_sides == "both"
+        plan = condition.motion.or_cut_through(float(start.p[2]), clamps)
+        motion, period = Motion(plan, start), protocol.exchange_period
         count = max(2, round(motion.duration / period))
         time = period * np.arange(count + 1)
         poses = [motion.pose(t) for t in time]
