@@ -1,28 +1,147 @@
-"""Values that replace single fields of a configuration, by their paths."""
+"""Values that replace single fields of a configuration: as YAML, or by their paths."""
 
 import dataclasses as dc
 import re
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 import yaml
 
-from sliceit_drake.configuration import ConfigurationError, closest, merge_yaml
+from sliceit_drake.configuration import (
+    ConfigurationError,
+    closest,
+    did_you_mean,
+    load_yaml,
+    merge_yaml,
+    validate,
+)
 
 __all__ = [
-    "assignments",
+    "Overrides",
+    "Replacements",
     "changed_fields",
+    "field_names",
+    "load_overridden",
     "path_that_is_meant",
-    "set_field",
-    "set_field_to_yaml",
+    "plain",
 ]
 
-EXAMPLE = "Give a path such as food.material.toughness or motion.segments.0.speed."
+Overrides: TypeAlias = str | Sequence[str] | Mapping[str, Any] | None
+"""YAML text such as `{food: {material: {toughness: 400}}}`, text of paths such as
+`food.material.toughness=400, motion.segments.0.speed=0.05`, several such texts, or a dictionary,
+whose keys may be paths."""
 _PATH = r"\s*[A-Za-z_]\w*(?:\.\w+)*\s*="
 
 
-def assignments(text: str) -> dict[str, str] | None:
+class Replacements:
+    """What overrides say, for a configuration that is loaded in steps.
+
+    Args:
+        overrides: See `Overrides`.
+        schema: Dataclass whose fields they replace.
+        option: That gives them, for errors.
+
+    Raises:
+        ConfigurationError: A path stands there without a value.
+
+    Attributes:
+        texts: YAML of whole fields, to be merged in turn before `set_in`.
+    """
+
+    def __init__(self, overrides: Overrides, schema: type, option: str = "--set") -> None:
+        self.texts: list[str] = []
+        self._schema, self._option = schema, option
+        self._values: dict[str, Any] = {}
+        self._written: dict[str, str] = {}
+        if isinstance(overrides, Mapping):
+            self._values = {key: value for key, value in overrides.items() if "." in key}
+            fields = {k: plain(value) for k, value in overrides.items() if k not in self._values}
+            self.texts = [yaml.safe_dump(fields)] if fields else []
+            return
+        for text in [overrides] if isinstance(overrides, str) else overrides or ():
+            paths = _assignments(text)
+            if paths is None:
+                self.texts.append(text)
+                continue
+            # What stands at the top may name a food or a knife, whose fields others replace.
+            top = [path for path in paths if path in {f.name for f in dc.fields(schema)}]
+            self.texts += [f"{path}: {paths[path]}" for path in top]
+            self._written |= {path: value for path, value in paths.items() if path not in top}
+
+    def load(self, file: Path | None, given: Any = None) -> Any:
+        """Reads a file and merges `texts` over it, see `load_yaml`.
+
+        Raises:
+            ConfigurationError: Naming file, field and fix.
+        """
+        try:
+            loaded = load_yaml(self._schema, file, given, self.texts[0] if self.texts else None)
+            for text in self.texts[1:]:
+                loaded = load_yaml(self._schema, None, loaded, text)
+        except ConfigurationError as error:
+            top, _, name = (error.field or "").partition(".")
+            like = path_that_is_meant(self._schema() if given is None else given, name)
+            if "." in name or not error.problem.startswith("unknown field") or "." not in str(like):
+                raise
+            write = f"Write it below {str(like).rpartition('.')[0]}."
+            if "overrides" in str(error.source):
+                write = f"Write it as a path: {self._option} {like}=VALUE."
+            raise ConfigurationError(
+                error.problem,
+                field=error.field,
+                source=error.source,
+                fix=f'Did you mean "{like}"? {write}',
+            ) from None
+        return loaded
+
+    def set_in(self, config: Any, where: str) -> None:
+        """Sets what was given by paths, and validates.
+
+        Args:
+            config: Changed in place.
+            where: Dotted path of `config`, for errors.
+
+        Raises:
+            ConfigurationError: There is no such field, or it cannot hold the value.
+        """
+        for path, value in self._values.items():
+            _set_field(config, path, plain(value), where)
+        for path, text in self._written.items():
+            _set_field_to_yaml(config, path.removeprefix(f"{where}."), text, where, self._option)
+        validate(config, where)
+
+
+def load_overridden(
+    schema: type, file: str | Path | None, overrides: Overrides, option: str = "--set"
+) -> Any:
+    """Reads a configuration from a YAML file, with fields replaced, and validates it.
+
+    Args:
+        schema: Dataclass to read.
+        file: None to start from the defaults.
+        overrides, option: See `Replacements`.
+
+    Raises:
+        ConfigurationError: Naming file, field and fix.
+    """
+    replacements = Replacements(overrides, schema, option)
+    config = replacements.load(None if file is None else Path(file))
+    replacements.set_in(config, schema.__name__.lower())
+    return config
+
+
+def plain(value: Any) -> Any:
+    """What YAML has a form for, of arrays and numbers of NumPy."""
+    if isinstance(value, Mapping):
+        return {key: plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [plain(each) for each in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _assignments(text: str) -> dict[str, str] | None:
     """The YAML texts of values by path, of `a.b=1, c=2`; None where a text is YAML itself.
 
     Raises:
@@ -38,7 +157,7 @@ def assignments(text: str) -> dict[str, str] | None:
     return {path.strip(): value.strip() for path, value in pairs}
 
 
-def set_field(config: Any, path: str, value: Any, where: str) -> None:
+def _set_field(config: Any, path: str, value: Any, where: str) -> None:
     """Sets the field at a path of names, and of numbers of elements of lists.
 
     Args:
@@ -57,11 +176,11 @@ def set_field(config: Any, path: str, value: Any, where: str) -> None:
         setattr(at, last, value)
 
 
-def set_field_to_yaml(config: Any, path: str, text: str, where: str, source: str) -> None:
-    """As `set_field`, with the value as YAML text, checked against the field's type.
+def _set_field_to_yaml(config: Any, path: str, text: str, where: str, source: str) -> None:
+    """As `_set_field`, with the value as YAML text, checked against the field's type.
 
     Args:
-        config, path, where: See `set_field`.
+        config, path, where: See `_set_field`.
         text: The value; where it needs one with its tag, as "!Cylinder {diameter: 0.03}".
         source: Where the text comes from, for errors.
 
@@ -98,6 +217,11 @@ def changed_fields(before: Any, after: Any) -> list[str]:
     return changed
 
 
+def field_names(config: Any) -> set[str]:
+    """Names of all fields of a configuration and of what it holds."""
+    return {path.rpartition(".")[2] for path in _paths(config)}
+
+
 def _owner(config: Any, path: str, where: str) -> tuple[Any, str]:
     """What holds the field at a path, and the field's name or number in it."""
     *parents, last = path.split(".")
@@ -114,7 +238,7 @@ def _owner(config: Any, path: str, where: str) -> tuple[Any, str]:
         raise ConfigurationError(
             "there is no such field",
             field=f"{where}.{path}",
-            fix=f'Did you mean "{like}"?' if like else EXAMPLE,
+            fix=f'Did you mean "{like}"?' if like else did_you_mean("", vars(config)),
         ) from error
     return at, last
 

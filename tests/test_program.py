@@ -16,6 +16,8 @@ from sliceit_drake.cli.main import main
 from sliceit_drake.diagrams.outputs.animation import Film
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import load_scenario
+from sliceit_drake.hardware.hardware_config import load_hardware_config
+from sliceit_drake.learning.training_config import load_training
 from sliceit_drake.output_folder import remove_results, results_in
 from sliceit_drake.resources import resource_path
 
@@ -76,6 +78,28 @@ MISTAKES = {
 }
 
 
+FILES = {
+    "of another program": ("version: 3\nservices: {web: 1}\n", "has none of a scenario's fields"),
+    "with a field at the wrong place": (
+        "name: mine\ntoughness: 400\n",
+        r'line 2: .*Did you mean "food.material.toughness".* Write it below food.material\.',
+    ),
+    "with a misspelt field at depth": (
+        "motion:\n  segments:\n    - !Hold {}\n    - !ConstantSpeed {distnce: 0.03}\n",
+        r'line 4: scenario.motion.segments\[1\].distnce: .*Did you mean "distance"',
+    ),
+}
+
+
+@pytest.mark.parametrize("case", FILES)
+def test_a_file_that_is_wrong_is_named_with_line_field_and_fix(case, tmp_path, capsys):
+    text, message = FILES[case]
+    (tmp_path / "mine.yaml").write_text(text, encoding="utf-8")
+    assert main(["simulate", str(tmp_path / "mine.yaml"), "--output", str(tmp_path / "out")]) == 2
+    shown = capsys.readouterr().err
+    assert "mine.yaml" in shown and re.search(message, shown), shown
+
+
 @pytest.mark.parametrize("case", MISTAKES)
 def test_a_mistake_gets_a_message_that_says_what_to_do(case, tmp_path, capsys):
     given, message = MISTAKES[case]
@@ -132,6 +156,33 @@ def test_overrides_are_paths_or_yaml_and_both_together():
     assert found.food.material.youngs_modulus != load_scenario("cucumber").food.material.toughness
     shape = load_scenario("cucumber", "food.shape=!Box {}").food.shape
     assert type(shape).__name__ == "Box"
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["train", "--set", "task.food=[potato]"], r'task.food: .*Did you mean "task.foods"'),
+        (["train", "--set", "{foods: [potato]}"], "as a path: --set task.foods=VALUE"),
+        (["train", "--steps", "-5"], "steps: -5 is not within"),
+        (["train", "--set", "zzz=3"], "zzz: there is no such field. Known: task, steps"),
+        (["hardware", "--set-robot", "touch.sped=1"], 'Did you mean "touch.speed"'),
+        (["hardware", "--set-robot", "{speed: 1}"], "as a path: --set-robot touch.speed=VALUE"),
+        (["hardware", "--set-robot", "touch.speed=1"], "1 m/s is not within"),
+    ],
+)
+def test_every_option_that_replaces_fields_takes_paths(given, message, tmp_path, capsys):
+    given += ["--host", "127.0.0.1"] if given[0] == "hardware" else []
+    assert main([*given, "--output", str(tmp_path / "out")]) == 2
+    shown = capsys.readouterr().err
+    assert re.search(message, shown), shown
+
+
+def test_fields_of_a_training_and_of_a_robot_are_replaced_by_paths_and_yaml():
+    training = load_training(None, ["task.foods=[potato], steps=30", "{seed: 4}"])
+    assert (training.task.foods, training.steps, training.seed) == (["potato"], 30, 4)
+    file = resource_path("hardware/ur5e.yaml")
+    robot = load_hardware_config(file, ["touch.speed=0.01, payload=1.0", "{gain: 1000.0}"])
+    assert (robot.touch.speed, robot.payload, robot.gain) == (0.01, 1.0, 1000.0)
 
 
 def test_a_file_in_the_place_of_the_folder_is_refused_before_the_run(tmp_path, capsys):

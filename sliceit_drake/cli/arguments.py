@@ -17,6 +17,7 @@ __all__ = [
     "ONE_CUT",
     "add_cluster_arguments",
     "add_output_folder",
+    "add_overrides",
     "add_protocol_argument",
     "add_scenario_arguments",
     "cluster_of",
@@ -44,12 +45,20 @@ def add_scenario_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"YAML file, or the name of one that ships with the package: {shipped}; default "
         f"{SCENARIO}",
     )
+    add_overrides(parser, "--set", "food.material.toughness=400")
+
+
+def add_overrides(parser: argparse.ArgumentParser, option: str, example: str) -> None:
+    """Adds an option that replaces fields of a file; `example` is of a path, for the help."""
+    path, _, value = example.partition("=")
+    names = path.split(".")
+    as_yaml = "".join(f"{{{name}: " for name in names) + value + "}" * len(names)
     parser.add_argument(
-        "--set",
+        option,
         metavar="FIELD=VALUE",
         action="append",
-        help="what replaces fields of the file: food.material.toughness=400, several separated by "
-        "commas; or as YAML, '{food: {material: {toughness: 400}}}'; may be given again",
+        help=f"what replaces fields of the file: {example}, several separated by commas; or as "
+        f"YAML, '{as_yaml}'; may be given again",
     )
 
 

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING
 
 from sliceit_drake.cli.arguments import (
     add_output_folder,
+    add_overrides,
     add_scenario_arguments,
     find_file,
     scenario_of,
@@ -61,9 +62,7 @@ def add_robot_arguments(parser: argparse.ArgumentParser) -> None:
         default=DEFAULT_ROBOT,
         help=f"YAML with your robot (default {DEFAULT_ROBOT})",
     )
-    parser.add_argument(
-        "--set-robot", metavar="YAML", help="fields that replace those of the robot's file"
-    )
+    add_overrides(parser, "--set-robot", "limits.force=40")
     parser.add_argument(
         "--pace",
         type=float,

@@ -21,7 +21,7 @@ import signal
 import sys
 import threading
 
-from sliceit_drake.cli.arguments import add_output_folder
+from sliceit_drake.cli.arguments import add_output_folder, add_overrides
 from sliceit_drake.cli.extras import needs_extra
 from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.interruption import handle_signals
@@ -43,9 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--steps", metavar="N", type=int, help="decisions, in the place of steps")
     parser.add_argument("--seed", metavar="N", type=int, help="in the place of seed")
-    parser.add_argument(
-        "--set", metavar="YAML", help="fields that replace others, as '{task: {foods: [potato]}}'"
-    )
+    add_overrides(parser, "--set", "task.foods=[potato]")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -54,12 +52,9 @@ def run(options: argparse.Namespace) -> int:
         from sliceit_drake.learning.training import train
         from sliceit_drake.learning.training_config import load_training
 
-    config = load_training(options.config, options.set)
-    if options.simulator is not None:
-        config.task.simulator = options.simulator
-    for name in ("steps", "seed"):
-        if getattr(options, name) is not None:
-            setattr(config, name, getattr(options, name))
+    given = {"task.simulator": options.simulator, "steps": options.steps, "seed": options.seed}
+    replaced = [f"{path}={value}" for path, value in given.items() if value is not None]
+    config = load_training(options.config, [*(options.set or ()), *replaced])
     with StageBars() as bars:
 
         def show(steps: int, remark: str) -> None:

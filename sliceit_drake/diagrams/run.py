@@ -6,9 +6,9 @@ import importlib.metadata
 import json
 import platform
 import time as clock
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydrake.geometry import Meshcat
@@ -43,6 +43,7 @@ from sliceit_drake.diagrams.stability import ContactMargin, check_contact_margin
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.diagrams.station_interface import OwnController, Station
 from sliceit_drake.output_folder import remove_results
+from sliceit_drake.overrides import Overrides
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.resources import file_or_resource
 from sliceit_drake.systems.agent import AgentConfig
@@ -235,7 +236,7 @@ class Run:
 
 def simulate(
     scenario: str | Path | Scenario,
-    overrides: str | Mapping[str, Any] | None = None,
+    overrides: Overrides = None,
     *,
     policy: PolicyConfig | AgentConfig | OwnPolicy | None = None,
     cutting: OwnCutting | None = None,

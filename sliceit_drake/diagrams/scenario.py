@@ -1,15 +1,12 @@
 """A scenario: everything about one simulated or real slice, and the YAML that holds it."""
 
 import dataclasses as dc
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import yaml
 from pydrake.math import RigidTransform, RotationMatrix
 
-from sliceit_drake.configuration import ConfigurationError, choice, load_yaml, quantity, validate
+from sliceit_drake.configuration import ConfigurationError, choice, quantity
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
 from sliceit_drake.cutting.foods.effects import Effects
@@ -21,12 +18,7 @@ from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.diagrams.plant.robot_plant import RobotConfig
 from sliceit_drake.diagrams.scenario_file import other_kind, scenario_file
 from sliceit_drake.diagrams.sequence import SliceSequence
-from sliceit_drake.overrides import (
-    assignments,
-    path_that_is_meant,
-    set_field,
-    set_field_to_yaml,
-)
+from sliceit_drake.overrides import Overrides, Replacements, field_names
 from sliceit_drake.systems.agent import AgentConfig
 from sliceit_drake.systems.analytic_cutter import AnalyticFood
 from sliceit_drake.systems.compliance_controller import ComplianceControllerConfig
@@ -34,7 +26,7 @@ from sliceit_drake.systems.contact_monitor import ContactMonitorConfig
 from sliceit_drake.systems.policy import PolicyConfig
 from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig
 
-__all__ = ["Measurement", "Placement", "Preparation", "Scenario", "Start", "load_scenario", "plain"]
+__all__ = ["Measurement", "Placement", "Preparation", "Scenario", "Start", "load_scenario"]
 
 CLEAR_OF_FOOD = 1e-3
 """Least height of the knife over the food while it goes from one slice to the next, metres."""
@@ -173,7 +165,7 @@ class Scenario:
 
 def load_scenario(
     scenario: str | Path | Scenario,
-    overrides: str | Sequence[str] | Mapping[str, Any] | None = None,
+    overrides: Overrides = None,
 ) -> Scenario:
     """A validated scenario: one that ships, one of a file, or a copy of another.
 
@@ -188,50 +180,26 @@ def load_scenario(
     Raises:
         ConfigurationError: Naming file, field and fix.
     """
-    texts: list[str] = []
-    values: dict[str, Any] = {}
-    written: dict[str, str] = {}
-    if isinstance(overrides, Mapping):
-        values = {key: value for key, value in overrides.items() if "." in key}
-        fields = {k: plain(value) for k, value in overrides.items() if k not in values}
-        texts = [yaml.safe_dump(fields)] if fields else []
-    else:
-        given_texts = [overrides] if isinstance(overrides, str) else overrides or ()
-        for text in given_texts:
-            paths = assignments(text)
-            if paths is None:
-                texts.append(text)
-                continue
-            # What stands at the top may name a food or a knife, whose fields others replace.
-            top = [path for path in paths if path in {f.name for f in dc.fields(Scenario)}]
-            texts += [f"{path}: {paths[path]}" for path in top]
-            written |= {path: value for path, value in paths.items() if path not in top}
+    replacements = Replacements(overrides, Scenario)
     if isinstance(scenario, Scenario):
         file, given, source = None, scenario, "scenario"
     else:
         file, given = scenario_file(scenario), Scenario()
         source = str(file)
-    loaded = _load(file, given, texts)
+    loaded = _load(file, given, replacements)
     if file is not None and isinstance(loaded.food, Food):
         loaded.food.look_beside(file)
     _put_in_named(loaded, given, source)
-    for path, value in values.items():
-        set_field(loaded, path, plain(value), "scenario")
-    for path, text in written.items():
-        path = path.removeprefix("scenario.")
-        set_field_to_yaml(loaded, path, text, "scenario", "--set")
-    validate(loaded, "scenario")
+    replacements.set_in(loaded, "scenario")
     return loaded
 
 
-def _load(file: Path | None, given: Scenario, texts: Sequence[str]) -> Scenario:
-    """The scenario of a file with YAML texts over it, in turn."""
+def _load(file: Path | None, given: Scenario, replacements: Replacements) -> Scenario:
+    """The scenario of a file with what replaces whole fields of it."""
     try:
-        loaded = load_yaml(Scenario, file, given, texts[0] if texts else None)
-        for text in texts[1:]:
-            loaded = load_yaml(Scenario, None, loaded, text)
+        loaded = replacements.load(file, given)
     except ConfigurationError as error:
-        top, _, name = (error.field or "").partition(".")
+        _, _, name = (error.field or "").partition(".")
         if name in NAMED and error.problem == "expected named fields":
             raise ConfigurationError(
                 error.problem,
@@ -239,29 +207,14 @@ def _load(file: Path | None, given: Scenario, texts: Sequence[str]) -> Scenario:
                 source=error.source,
                 fix=f"{error.fix} One that has a name is given as {NAMED[name]}=NAME.",
             ) from None
-        if top != "scenario" or not error.problem.startswith("unknown field of Scenario"):
+        if file is None or not error.problem.startswith("unknown field of Scenario"):
             raise
-        other = None if file is None or "overrides" in str(error.source) else other_kind(file)
-        if other is not None:
-            raise ConfigurationError(other[0], source=str(file), fix=other[1]) from None
-        like = path_that_is_meant(given, name)
-        if like is None or "." not in like:
+        other = None if "overrides" in str(error.source) else other_kind(file, field_names(given))
+        if other is None:
             raise
-        fix = f'Did you mean "{like}"? Write it as a path: --set {like}=VALUE.'
-        raise ConfigurationError(
-            error.problem, field=error.field, source=error.source, fix=fix
-        ) from None
+        raise ConfigurationError(other[0], source=str(file), fix=other[1]) from None
     assert isinstance(loaded, Scenario)
     return loaded
-
-
-def plain(value: Any) -> Any:
-    """What YAML has a form for, of arrays and numbers of NumPy."""
-    if isinstance(value, Mapping):
-        return {key: plain(each) for key, each in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [plain(each) for each in value]
-    return value.item() if isinstance(value, np.generic) else value
 
 
 def _put_in_named(scenario: Scenario, given: Scenario, source: str) -> None:

@@ -45,6 +45,7 @@ KINDS = (
     ),
 )
 """Other files of the project, by fields that only they have: what each is, and what it is for."""
+EXAMPLE = "scenarios/cucumber_measured.yaml"
 
 
 def scenario_file(name: str | Path) -> Path:
@@ -78,13 +79,21 @@ def scenario_file(name: str | Path) -> Path:
     return file
 
 
-def other_kind(file: Path) -> tuple[str, str] | None:
-    """What a YAML file of the project is that is no scenario, and what to do with it; or None."""
+def other_kind(file: Path, known: set[str]) -> tuple[str, str] | None:
+    """What a YAML file is that is no scenario, and what to do with it; or None.
+
+    Args:
+        file: Whose fields are not those of a scenario.
+        known: Names of all fields that a scenario has at any depth.
+    """
     root = yaml.compose(file.read_text(encoding="utf-8"))
-    fields = {key.value for key, _ in root.value} if isinstance(root, yaml.MappingNode) else set()
+    pairs = root.value if isinstance(root, yaml.MappingNode) else []
+    fields = {key.value for key, _ in pairs}
     for own, problem, fix in KINDS:
         if own & fields:
             return problem, fix.format(file)
+    if len(fields) > 1 and not fields & known:
+        return "has none of a scenario's fields", f"Give a scenario, such as {EXAMPLE}."
     return None
 
 

@@ -22,7 +22,8 @@ from sliceit_drake.cutting.workers import worker_processes
 from sliceit_drake.diagrams.outputs.run_log import Record
 from sliceit_drake.diagrams.prepared_food import motion_of
 from sliceit_drake.diagrams.run import prepare_run
-from sliceit_drake.diagrams.scenario import Scenario, load_scenario, plain
+from sliceit_drake.diagrams.scenario import Scenario, load_scenario
+from sliceit_drake.overrides import Overrides, plain
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -169,7 +170,7 @@ def _text(value: object) -> str:
 def sweep(
     scenario: str | Path | Scenario,
     parameters: Mapping[str, Iterable[Any]],
-    overrides: str | Mapping[str, Any] | None = None,
+    overrides: Overrides = None,
     *,
     robot: bool = True,
     workers: int = 1,

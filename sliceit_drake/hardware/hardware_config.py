@@ -7,7 +7,8 @@ loosens one unaware.
 import dataclasses as dc
 from pathlib import Path
 
-from sliceit_drake.configuration import ConfigurationError, choice, dump_yaml, load_yaml, quantity
+from sliceit_drake.configuration import ConfigurationError, choice, dump_yaml, quantity
+from sliceit_drake.overrides import Overrides, load_overridden
 
 __all__ = [
     "HardwareConfig",
@@ -170,13 +171,18 @@ class HardwareConfig:
             )
 
 
-def load_hardware_config(file: str | Path, overrides: str | None = None) -> HardwareConfig:
+def load_hardware_config(file: str | Path, overrides: Overrides = None) -> HardwareConfig:
     """Reads and validates a robot's file; what it does not name keeps its default.
+
+    Args:
+        file: YAML of `HardwareConfig` fields.
+        overrides: What replaces them, see `Overrides`.
 
     Raises:
         ConfigurationError: Naming file, field and fix.
     """
-    return load_yaml(HardwareConfig, file, overrides_text=overrides)
+    config: HardwareConfig = load_overridden(HardwareConfig, file, overrides, "--set-robot")
+    return config
 
 
 def differing(config: HardwareConfig) -> list[str]:

@@ -3,8 +3,9 @@
 import dataclasses as dc
 from pathlib import Path
 
-from sliceit_drake.configuration import ConfigurationError, load_yaml, quantity
+from sliceit_drake.configuration import ConfigurationError, quantity
 from sliceit_drake.learning.task import TaskConfig
+from sliceit_drake.overrides import Overrides, load_overridden
 
 __all__ = ["CONFIGURATION", "POLICY", "TrainingConfig", "load_policy_folder", "load_training"]
 
@@ -44,13 +45,18 @@ class TrainingConfig:
     """Decisions between checkpoints."""
 
 
-def load_training(file: str | Path | None, overrides: str | None = None) -> TrainingConfig:
+def load_training(file: str | Path | None, overrides: Overrides = None) -> TrainingConfig:
     """Reads and validates a training; None for the defaults.
+
+    Args:
+        file: YAML of `TrainingConfig` fields.
+        overrides: What replaces them, see `Overrides`.
 
     Raises:
         ConfigurationError: Naming file, field and fix.
     """
-    return load_yaml(TrainingConfig, file, overrides_text=overrides)
+    config: TrainingConfig = load_overridden(TrainingConfig, file, overrides)
+    return config
 
 
 def load_policy_folder(folder: Path) -> TrainingConfig:

@@ -212,7 +212,7 @@ def protocol_of_scenario(scenario: Scenario, replicates: int = 1) -> Protocol:
     left out. An analytic food of no toughness, which the station's knife does not feel, is none.
 
     Raises:
-        ConfigurationError: The scenario has no food to cut, or a sequence or a policy moves its knife.
+        ConfigurationError: It has no food to cut, or a sequence or policy moves the knife.
     """
     food, prepared = scenario.food, scenario.preparation or Preparation()
     without_food = is_no_food(food)
