@@ -278,7 +278,7 @@ def test_4_a_policy_is_trained_and_cuts(tmp_path):
 
 
 @pytest.mark.second_tier
-def test_5_a_cause_a_food_and_a_cutting_system_of_ones_own(tmp_path):
+def test_5_a_cause_a_food_a_cutting_system_and_a_controller_of_ones_own(tmp_path):
     notebook = stored(5)
     found = executed(
         notebook,
@@ -288,6 +288,8 @@ def test_5_a_cause_a_food_and_a_cutting_system_of_ones_own(tmp_path):
         stiffness="result.values(result.verdict.findings[0])['stiffness']",
         parsnip="float(parsnip.record()['food_wrench_f_z'].max())",
         dough="float(dough['food_wrench_f_z'].max()) / expected",
+        behind="float(behind)",
+        followed="float(followed['cut_progress'][-1])",
     )
     assert "cable" in found["causes"] and "skin" in found["causes"]
     assert found["names"] == [["cable"]]
@@ -295,7 +297,9 @@ def test_5_a_cause_a_food_and_a_cutting_system_of_ones_own(tmp_path):
     # 400 J/m2 over a section of 27 mm, and friction.
     assert 10.0 < found["parsnip"] < 20.0
     assert found["dough"] == pytest.approx(1.0, abs=0.08)
-    assert figures(notebook) == 2
+    assert found["behind"] == pytest.approx(1.2, abs=0.05) and found["followed"] > 0.99
+    assert (tmp_path / "with_own_controller" / "replay.html").exists()
+    assert figures(notebook) == 3
 
 
 @pytest.mark.second_tier

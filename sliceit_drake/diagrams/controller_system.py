@@ -49,9 +49,11 @@ class ControllerSystem(LeafSystem):
         self._measured = self.DeclareVectorInputPort("joint_positions", arm.num_positions())
         self.DeclareAbstractInputPort("sensor_wrench", Value(SpatialForce.Zero()))
         for port in STATION_PORTS:
-            if port.direction == "input" and isinstance(port.type, int):
+            if port.direction != "input":
+                continue
+            if isinstance(port.type, int):
                 self.DeclareVectorInputPort(port.name, port.type)
-            elif port.direction == "input":
+            else:
                 self.DeclareAbstractInputPort(port.name, Value(port.type()))
         command = self._command = self.DeclareDiscreteState(arm.num_positions())
         self.DeclareStateOutputPort("joint_positions_command", command)
