@@ -1,5 +1,6 @@
 """Slices that are off fall as rigid bodies, on the board and on each other."""
 
+import dataclasses as dc
 import json
 
 import numpy as np
@@ -19,9 +20,12 @@ from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import GRAVITY
+from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan, Retract
+from sliceit_drake.diagrams import simulated_station
 from sliceit_drake.diagrams.live_view import make_meshcat
 from sliceit_drake.diagrams.outputs import animation
 from sliceit_drake.diagrams.plant.knife_body import blade_surface
+from sliceit_drake.diagrams.prepared_food import food_to_cut
 from sliceit_drake.diagrams.run import Run, prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.simulated_station import FRAMES_PER_SECOND
@@ -248,6 +252,66 @@ def test_a_viewer_shows_a_slice_from_the_time_it_is_off():
     last = round(run.motion.duration * FRAMES_PER_SECOND) - 2
     assert not meshcat.HasPath(f"/drake/food/minus/frame_{last:04d}")
     assert meshcat.HasPath(f"/drake/food/plus/frame_{last:04d}")
+
+
+def single_cut(held_sides: str, cut_normal: list[float]) -> Scenario:
+    """A cut 9 mm from the free end, after which the knife comes up again."""
+    food = Food(
+        shape=Cylinder(diameter=0.027, length=0.05, rings=3),
+        held_sides=held_sides,
+        cut_point=[0.0, {"plus": -0.016, "minus": 0.016, "both": 0.0}[held_sides], 0.0],
+        cut_normal=cut_normal,
+    )
+    down = ConstantSpeed(0.08, distance=0.0372, acceleration=2.0)
+    plan = MotionPlan([down, Hold(0.2), Retract(0.05, 0.2, 2.0), Hold(0.2)])
+    return load_scenario(Scenario(food=food, motion=plan))
+
+
+@pytest.fixture(scope="module", params=[("plus", [0.0, 1.0, 0.0]), ("minus", [0.3, 1.0, 0.0])])
+def cut_once(request) -> Run:
+    run = prepare_run(single_cut(*request.param), animation=True)
+    run.advance()
+    assert run.stopped is None
+    return run
+
+
+def test_what_a_single_cut_takes_off_goes_through_neither_board_nor_blade_nor_the_rest(cut_once):
+    station, held = cut_once.station, cut_once.scenario.food.held_sides
+    assert cut_once.film is not None
+    frames = cut_once.film.frames
+    assert {part.name for part in frames[0].parts} == {"minus", "plus"}
+    assert {part.name for part in frames[-1].parts} == {"slice_01", held}
+    blade = ConvexHull(np.array(blade_surface(cut_once.scenario.knife).vertices())).equations
+    context = station.plant.CreateDefaultContext()
+    for frame in frames:
+        parts = {part.name: part for part in frame.parts}
+        if "slice_01" not in parts:
+            continue
+        p_W = parts["slice_01"].X_WP.multiply(parts["slice_01"].mesh.points.T)
+        assert p_W[2].min() > cut_once.scenario.board.height - 5e-4
+        station.plant.SetPositions(context, frame.joints)
+        X_WK = station.plant.EvalBodyPoseInWorld(context, station.robot.knife)
+        rest = ConvexHull(parts[held].mesh.points).equations
+        for planes, p in ((blade, X_WK.inverse().multiply(p_W)), (rest, p_W)):
+            assert (planes[:, :3] @ p + planes[:, 3:]).max(0).min() > -5e-4
+
+
+def test_no_record_of_a_single_cut_depends_on_what_it_takes_off(cut_once, monkeypatch):
+    def without(*given):
+        return dc.replace(food_to_cut(*given), make_slices=None)
+
+    monkeypatch.setattr(simulated_station, "food_to_cut", without)
+    other = prepare_run(cut_once.scenario)
+    assert other.station.slices is None
+    other.advance()
+    np.testing.assert_array_equal(other.record().values, cut_once.record().values)
+
+
+@pytest.mark.parametrize("held_sides", ["both", "none"])
+def test_a_food_held_on_both_sides_or_none_has_nothing_that_comes_off(held_sides):
+    scenario = single_cut("both", [0.0, 1.0, 0.0])
+    scenario.food.held_sides = held_sides
+    assert prepare_run(scenario).station.slices is None
 
 
 def test_rigid_motion_finds_a_rigid_motion_again():

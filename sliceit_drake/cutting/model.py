@@ -273,7 +273,7 @@ class CuttingModel(CutGeometry):
     def rigid_motion(
         self, positions: np.ndarray, velocities: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Pose and velocity of the half at y < 0 as if it were rigid.
+        """Pose and velocity of the half on the `free_side` as if it were rigid.
 
         The pose is the least-squares fit to its nodes, weighted by their true masses; the velocity
         has their momentum and angular momentum.
@@ -285,7 +285,7 @@ class CuttingModel(CutGeometry):
             R [3, 3] and p [3] in C, so that a point at x at rest is now at R x + p; the angular
             velocity [3] in C, rad/s; and the velocity [3] of the point now at the origin of C, m/s.
         """
-        mine = self.split.node_side[self.computed] == 0
+        mine = self.split.node_side[self.computed] == self.free_side
         mass = self.true_mass[mine]
         rest, now, v = self.nodes[mine], positions[mine], velocities[mine]
         centre, here = mass @ rest / mass.sum(), mass @ now / mass.sum()

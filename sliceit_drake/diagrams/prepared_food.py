@@ -224,24 +224,26 @@ def _(food: Food, scenario: Scenario) -> PreparedFood:
         make_cutting,
         _held(food, scenario, cuts[0]),
         estimate_error,
-        functools.partial(_loose_slices, scenario) if sequence is not None else None,
+        functools.partial(_loose_slices, scenario)
+        if food.held_sides in ("minus", "plus")
+        else None,
     )
 
 
 def _loose_slices(scenario: Scenario, cutting: CuttingSystem) -> LooseSlices:
     sequence = scenario.sequence
-    assert sequence is not None
     slices, rest = [], None
     for solver, surface, X_WF in zip(
         cutting.solvers, cutting.surfaces, cutting.food_poses, strict=True
     ):
         model = solver.model
         p_F = surface.positions(model, model.nodes)
-        own, rest = (
+        halves = [
             TriangleSurfaceMesh([SurfaceTriangle(*t) for t in triangles.tolist()], p_F[corners])
             for corners, triangles in surface.halves
-        )
-        slices.append(SliceBody(own, model.material, X_WF))
+        ]
+        rest = halves[1 - model.free_side]
+        slices.append(SliceBody(halves[model.free_side], model.material, X_WF))
     return LooseSlices(
         slices,
         rest,
@@ -249,7 +251,7 @@ def _loose_slices(scenario: Scenario, cutting: CuttingSystem) -> LooseSlices:
         scenario.board,
         scenario.X_WF(),
         scenario.numerics.board_friction,
-        sequence.thickness if sequence.indexing == "food" else 0.0,
+        sequence.thickness if sequence is not None and sequence.indexing == "food" else 0.0,
         scenario.exchange_period,
         COMPLETE,
     )

@@ -69,7 +69,7 @@ class CuttingSystem(KnifeForceSystem):
         energy: Energies of this food at the last check [5], see `ENERGY_NAMES`, J.
         surface_vertices: Corners of the food's surface [3 V], metres, in W, padded with zeros.
         surface_damage: Fraction of the toughness that is spent there [V], padded with zeros.
-        slice_pose: RigidTransform X_WS of the half at y < 0, as if it were rigid; S is F at rest.
+        slice_pose: RigidTransform X_WS of the half that comes off, were it rigid; S is F at rest.
         slice_velocity: SpatialVelocity V_WS of that half, at So.
 
     Args:
@@ -378,7 +378,7 @@ class CuttingSystem(KnifeForceSystem):
         return solver.field(state, "edge_depth"), solver.field(state, "cohesive_damage")
 
     def _slice_motion(self, context: Context) -> tuple[np.ndarray, ...]:
-        """`CuttingModel.rigid_motion` of the half at y < 0, in C."""
+        """`CuttingModel.rigid_motion` of the half that comes off, in C."""
         solver, state = self.solver(context), self.food_state(context)
         return solver.model.rigid_motion(solver.positions(state), solver.velocities(state))
 

@@ -165,18 +165,21 @@ class FoodScene:
         """
         food = int(port("food_index")[0])
         points = port("surface_vertices").reshape(-1, 3)
-        minus, plus = self._halves(food, points, port("surface_damage"))
-        parts = [Part("plus", plus, RigidTransform())]
+        halves = dict(
+            zip(("minus", "plus"), self._halves(food, points, port("surface_damage")), strict=True)
+        )
+        parts = []
         rows = port("slices").reshape(-1, SLICE_ROW)
+        free = ("minus", "plus")[self._models[food].free_side]
         for k in np.flatnonzero(rows[:, 0]).tolist():
             if k not in self._slices and k == food:
-                self._slices[k] = minus.seen_from(port("slice_pose").inverse())
+                self._slices[k] = halves[free].seen_from(port("slice_pose").inverse())
             elif k not in self._slices:
                 self._slices[k] = self._at_rest(k)
             parts.append(Part(f"slice_{k + 1:02d}", self._slices[k], slice_pose(rows[k])))
-        if len(rows) == 0 or rows[food, 0] == 0.0:
-            parts.append(Part("minus", minus, RigidTransform()))
-        return parts
+        if len(rows) > 0 and rows[food, 0] > 0.0:
+            del halves[free]
+        return parts + [Part(name, mesh, RigidTransform()) for name, mesh in halves.items()]
 
     def _halves(
         self, food: int, points: np.ndarray, damage: np.ndarray
@@ -195,7 +198,7 @@ class FoodScene:
         """A slice that was not seen when it came off, in S."""
         model, surface = self._models[food], self._surfaces[food]
         points = surface.positions(model, model.nodes)
-        return self._halves(food, points, np.ones(len(points)))[0]
+        return self._halves(food, points, np.ones(len(points)))[model.free_side]
 
 
 def _rest_colours(surface: FoodSurface, model: CuttingModel, look: FoodLook) -> np.ndarray:

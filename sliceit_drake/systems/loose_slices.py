@@ -4,7 +4,6 @@ import dataclasses as dc
 from collections.abc import Sequence
 
 import numpy as np
-from pydrake.common import MemoryFile
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.value import Value
 from pydrake.geometry import (
@@ -13,7 +12,6 @@ from pydrake.geometry import (
     AddRigidHydroelasticProperties,
     Box,
     Convex,
-    InMemoryMesh,
     ProximityProperties,
     TriangleSurfaceMesh,
 )
@@ -28,6 +26,7 @@ from pydrake.systems.framework import (
     EventStatus,
     LeafSystem,
 )
+from scipy.spatial import cKDTree
 
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.foods.material import Material
@@ -42,6 +41,10 @@ KNIFE_MASS = 1e3
 
 MESH_SIZE = 5e-3
 """Of the pressure field in box and blade, metres; what is convex has its own corners."""
+
+DIRECTIONS = 3000
+LEAST_EDGE = 2e-4
+"""Directions in which, and distance at which, the corners of a slice's hull are told apart, m."""
 
 MIN_MODULUS = 1e6
 """Of the pressure in a slice, Pa: a softer food would flatten, a rigid body would sink in."""
@@ -153,12 +156,12 @@ class LooseSlices(LeafSystem):
         )
         instance = plant.AddModelInstance("slices")
         self._bodies = []
-        self._corners = [np.array(each.surface.vertices()).T for each in slices]
+        self._corners = [_corners(each.surface) for each in slices]
         for k, each in enumerate(slices):
             inertia = CalcSpatialInertia(each.surface, each.material.density)
             body = plant.AddRigidBody(f"slice_{k + 1}", instance, inertia)
             plant.RegisterCollisionGeometry(
-                body, RigidTransform(), _convex(each.surface), f"slice_{k + 1}", soft
+                body, RigidTransform(), Convex(self._corners[k], "slice"), f"slice_{k + 1}", soft
             )
             self._bodies.append(body)
         self._rest: RigidBody | None = None
@@ -166,7 +169,7 @@ class LooseSlices(LeafSystem):
             inertia = CalcSpatialInertia(rest, material.density)
             self._rest = plant.AddRigidBody("rest", plant.AddModelInstance("rest"), inertia)
             plant.RegisterCollisionGeometry(
-                self._rest, RigidTransform(), _convex(rest), "rest", soft
+                self._rest, RigidTransform(), Convex(_corners(rest), "rest"), "rest", soft
             )
         slip = _paired(material.friction, friction)
         self._knife = plant.AddRigidBody(
@@ -174,11 +177,11 @@ class LooseSlices(LeafSystem):
             plant.AddModelInstance("knife"),
             SpatialInertia.SolidSphereWithMass(KNIFE_MASS, 0.1),
         )
+        corners = np.array(blade.vertices()).T
         plant.RegisterCollisionGeometry(
-            self._knife, RigidTransform(), _convex(blade), "blade", _hard(slip)
+            self._knife, RigidTransform(), Convex(corners, "blade"), "blade", _hard(slip)
         )
-        corners = np.array(blade.vertices())
-        self._blade_low, self._blade_high = corners.min(0), corners.max(0)
+        self._blade_low, self._blade_high = corners.min(1), corners.max(1)
         plant.set_gravity_enabled(self._knife.model_instance(), False)
         plant.Finalize()
         self._diagram = builder.Build()
@@ -315,9 +318,18 @@ def _hard(friction: float) -> ProximityProperties:
     return properties
 
 
-def _convex(surface: TriangleSurfaceMesh) -> Convex:
-    """The convex hull of a surface."""
-    lines = ["v {:.9g} {:.9g} {:.9g}".format(*v) for v in surface.vertices()]
-    lines += ["f " + " ".join(str(t.vertex(k) + 1) for k in range(3)) for t in surface.triangles()]
-    text = "\n".join(lines) + "\n"
-    return Convex(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", "surface")))
+def _corners(surface: TriangleSurfaceMesh) -> np.ndarray:
+    """Corners of the convex hull of a surface [3, V]: its farthest points in many directions.
+
+    So no three are in line and no two close together, as where a cut meets the edges of a mesh:
+    elements of the pressure field would be degenerate.
+    """
+    points = np.array(surface.vertices())
+    # A spiral about z covers the directions evenly.
+    share = (np.arange(DIRECTIONS) + 0.5) / DIRECTIONS
+    angle, z = np.pi * (1.0 + np.sqrt(5.0)) * DIRECTIONS * share, 1.0 - 2.0 * share
+    across = np.sqrt(1.0 - z * z)
+    directions = np.array([across * np.cos(angle), across * np.sin(angle), z])
+    found = points[np.unique((points @ directions).argmax(0))]
+    close = cKDTree(found).query_pairs(LEAST_EDGE)
+    return np.delete(found, [second for _, second in close], axis=0).T

@@ -86,6 +86,13 @@ class CutGeometry:
         return len(self.tetrahedra)
 
     @functools.cached_property
+    def free_side(self) -> int:
+        """The half that comes off where one alone is held: 0 for that at y < 0, 1 for the other."""
+        # Elements across a slanting cut may hold the free half by some nodes as well.
+        sides = np.delete(self.split.node_side, self.computed[self.moving])
+        return int(np.bincount(sides, minlength=2).argmin())
+
+    @functools.cached_property
     def section_area(self) -> float:
         """Area of the cut, m^2."""
         return float(self.tables.area.sum())
