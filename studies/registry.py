@@ -92,6 +92,13 @@ TOPICS: dict[str, tuple[Study, ...]] = {
             "how a run keeps up with the controller's clock",
             "5 min",
         ),
+        Study(
+            "emulator_figure",
+            "robot.emulator_figure",
+            "a slice on the emulator beside the simulated one",
+            "1 min",
+            "hardware",
+        ),
         Study("endurance", "robot.endurance", "memory over an hour of slices", "1 h"),
     ),
     "calibration": (
@@ -180,6 +187,10 @@ TOPICS: dict[str, tuple[Study, ...]] = {
     "the project": (
         Study("architecture", "project.architecture", "draws the folders and their imports", "5 s"),
         Study("guide_figures", "project.guide_figures", "draws pictures of the guides", "30 s"),
+        Study("guide_diagrams", "project.guide_diagrams", "draws words, files and states", "1 min"),
+        Study(
+            "result_figures", "project.result_figures", "draws pictures of stored results", "5 s"
+        ),
         Study("pages", "project.stored_pages", "renders all pages from stored results", "10 s"),
         Study("aims", "project.aims", "writes results/benchmarks.md from stored results", "1 s"),
         Study("first_run", "project.first_run", "a newcomer's first run with the wheel", "2 min"),

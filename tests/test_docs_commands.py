@@ -258,6 +258,7 @@ READ_ONLY = {
         python -m studies cutting_speed --repeats 3 --output docs/results/figures/cutting_speed.png
         python -m studies diagnosis_speed --json docs/results/benchmarks/diagnosis_speed.json
         python -m studies effects_figure
+        python -m studies emulator_figure
         python -m studies endurance --minutes 60 --output docs/results/endurance.md
         python -m studies faster_draws docs/results/slicing_evaluation.jsonl docs/results/faster_draws.jsonl --output docs/results/learning.md
         python -m studies first_run --json docs/results/benchmarks/first_run.json

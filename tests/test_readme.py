@@ -167,6 +167,26 @@ def test_marks_between_which_commands_write_come_in_pairs():
 # --- The site.
 
 
+def blocks_of(page: Path) -> list[str]:
+    """Title, paragraphs, tables and commands of a page."""
+    return page.read_text(encoding="utf-8").strip().split("\n\n")
+
+
+WITHOUT = {"licences.md", "package.md", "endurance.md", "random_slices.md"}
+"""Tables of licences, the text for the package index, and two results of a few numbers."""
+
+
+def test_a_page_begins_with_what_it_is_and_shows_a_picture():
+    for page in pages_of(ROOT / "docs"):
+        title, first, *_ = blocks_of(page)
+        assert title.startswith("# "), page
+        assert re.match(r"[\w*\[`!]", first) and not first.startswith("```"), page
+        pictures = re.findall(r"!\[(.+?)\]\((.+?)\)", page.read_text(encoding="utf-8"))
+        assert bool(pictures) != (page.name in WITHOUT), page
+        for words, file in pictures:
+            assert len(words) > 5 and (page.parent / file).exists(), page
+
+
 def test_every_page_is_linked_from_the_index_and_the_index_from_the_readme():
     index = (ROOT / "docs/index.md").read_text()
     docs = ROOT / "docs"

@@ -10,8 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sliceit_drake.diagnosis.experiments.designs import Scale, menu
 from studies.__main__ import main, study_list
+from studies.figures import RED
 from studies.pages import publish, render, table
+from studies.project import guide_diagrams, result_figures
+from studies.project.aims import RESULTS
 from studies.registry import TOPICS, study_parser
 from studies.results import plain, write_results
 
@@ -92,3 +96,29 @@ def test_results_are_kept_with_the_command_that_was_typed(tmp_path):
     write_results(options, {"time_s": 1.23456})
     facts = json.loads((tmp_path / "x.json").read_text(encoding="utf-8"))
     assert facts["command"] == "python -m studies x" and facts["values"] == {"time_s": 1.235}
+
+
+def test_pictures_of_stored_results_say_what_their_pages_say():
+    coverage = result_figures.coverage_figure()
+    rows = re.findall(
+        r"^\| material\.(\w+) \| (\d+) of (\d+) ", (RESULTS / "coverage.md").read_text(), re.M
+    )
+    for axes, (name, inside, count) in zip(coverage.axes, rows, strict=True):
+        assert axes.get_title(loc="left") == name
+        points = [line for line in axes.lines if line.get_marker() == "."]
+        assert len(points) == int(count)
+        assert sum(line.get_color() != RED for line in points) == int(inside)
+    (bars,) = result_figures.aims_figure().axes
+    reached, missed = (sum(bar.get_width() for bar in c) for c in bars.containers)
+    page = (RESULTS / "benchmarks.md").read_text()
+    assert f"{reached:.0f} are reached, {missed:.0f} are missed" in page
+    assert len(result_figures.scaling_figure().axes[0].lines) == 6
+
+
+def test_each_motion_of_the_picture_of_proposals_is_one_that_may_be_proposed():
+    figure = guide_diagrams.next_experiment_figure()
+    names = [axes.get_title(loc="left") for axes in figure.axes]
+    proposed = menu(Scale(height=0.027, width=0.027, length=0.2))
+    assert names == [each.name for each in proposed if not each.by_hand]
+    for draw in (guide_diagrams.hardware_figure, guide_diagrams.scaling_figure):
+        draw().canvas.draw()

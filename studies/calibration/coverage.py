@@ -338,8 +338,10 @@ def coverage_share(replicates: Sequence[Replicate]) -> float:
 
 
 def _wrapped(paragraph: str) -> str:
-    """A paragraph of a page in lines of 100; titles, commands and tables as they are."""
-    return paragraph if paragraph.startswith(("#", " ", "|")) else textwrap.fill(paragraph, 100)
+    """A paragraph of a page in lines of 100; titles, pictures, commands and tables as they are."""
+    return (
+        paragraph if paragraph.startswith(("#", " ", "|", "!")) else textwrap.fill(paragraph, 100)
+    )
 
 
 def _quantiles(values: np.ndarray) -> str:

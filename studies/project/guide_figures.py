@@ -16,7 +16,17 @@ from sliceit_drake.diagrams.run import simulate
 from sliceit_drake.records.validation import load_record
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.servo import ServoConfig, ServoLaw
-from studies.figures import BLUE, GREEN, ORANGE, PURPLE, RED, new_figure, save_figure, tidy
+from studies.figures import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    RED,
+    draw_boxes,
+    new_figure,
+    save_figure,
+    tidy,
+)
 
 __all__ = [
     "add_arguments",
@@ -127,38 +137,7 @@ def station_figure() -> Figure:
     figure = new_figure(9.0, 3.6)
     axes = figure.subplots()
     axes.set(xlim=(0.0, 0.86), ylim=(0.0, 1.0))
-    axes.axis("off")
-    style = {"boxstyle": "round,pad=0.6", "facecolor": "#eef3f8", "edgecolor": BLUE}
-    drawn = {
-        name: axes.text(x, y, words, ha="center", va="center", fontsize=10, bbox=style)
-        for name, (words, (x, y)) in BOXES.items()
-    }
-    for begin, end, words in ARROWS:
-        a, b = (np.array(BOXES[name][1]) for name in (begin, end))
-        upright = a[0] == b[0]
-        # The two arrows between arm and food stand side by side.
-        shift = (0.02 if begin == "arm" else -0.02) if {begin, end} == {"arm", "cutting"} else 0.0
-        a, b = a + [shift, 0.0], b + [shift, 0.0]
-        arrow = {
-            "arrowstyle": "-|>",
-            "color": "0.35",
-            "patchA": drawn[begin].get_bbox_patch(),
-            "patchB": drawn[end].get_bbox_patch(),
-        }
-        axes.annotate("", xy=tuple(b), xytext=tuple(a), arrowprops=arrow)
-        x, y = (a + b) / 2.0
-        if upright:
-            side = 1.0 if shift > 0.0 else -1.0
-            axes.text(
-                x + 0.01 * side,
-                y,
-                words,
-                ha="left" if side > 0.0 else "right",
-                va="center",
-                fontsize=8,
-            )
-        else:
-            axes.text(x, y + 0.1, words, ha="center", va="center", fontsize=8)
+    draw_boxes(axes, BOXES, ARROWS)
     return figure
 
 
