@@ -239,6 +239,10 @@ class HardwareStation(Station):
         """Names for the port `sensor_state`: `reading` [6] for the moment and force."""
         return list(reading)
 
+    def cutting_columns(self, wrench: Sequence[str]) -> list[str]:
+        """Empty: there is no port `cutting_state`."""
+        return []
+
 
 def make_edge_kinematics(twin: Station) -> EdgeKinematics:
     """Where the edge of a scenario's knife is."""

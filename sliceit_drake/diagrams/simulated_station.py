@@ -185,6 +185,7 @@ class SimulatedStation(Station):
         builder.ExportOutput(joints.get_output_port(0), "joint_positions")
         builder.ExportOutput(joints.get_output_port(1), "joint_velocities")
         builder.ExportOutput(sensor.GetOutputPort("state"), "sensor_state")
+        builder.ExportOutput(self.cutting.GetOutputPort("state"), "cutting_state")
         # A name that ends in "vector" is for records: what the contract gives as a typed value.
         exported = {
             self.controller: ("joint_positions_command", "commanded_pose"),
@@ -257,6 +258,10 @@ class SimulatedStation(Station):
     def sensor_columns(self, reading: Sequence[str]) -> list[str]:
         """Names for the port `sensor_state`: `reading` [6] for the moment and force."""
         return self.sensor.state_columns(reading)
+
+    def cutting_columns(self, wrench: Sequence[str]) -> list[str]:
+        """Names for the port `cutting_state`: `wrench` [6] for the food's moment and force."""
+        return self.cutting.state_columns(wrench)
 
     def SetStart(self, root_context: Context, joints: np.ndarray | None = None) -> None:
         """Puts arm and controller at rest at the start, in the context of the whole diagram.

@@ -69,6 +69,13 @@ class Station(Diagram):
         """Names for the port `sensor_state`: `reading` [6] for the moment and force."""
         raise NotImplementedError
 
+    def cutting_columns(self, wrench: Sequence[str]) -> list[str]:
+        """Names for the port `cutting_state`: `wrench` [6] for the food's moment and force.
+
+        Empty in a station without this port.
+        """
+        raise NotImplementedError
+
     def descent(self) -> float:
         """Height of the edge over the board at the start, metres."""
         return float(self.start_pose.translation()[2]) - self.scenario.board.height

@@ -132,8 +132,7 @@ class CurveCutter(KnifeForceSystem):
         context.get_mutable_numeric_parameter(self._slice).SetFromVector(values)
         # `start` takes the knife's place from its pose.
         context.SetDiscreteState(self._cut, CutState(np.zeros(3)).vector())
-        for part in (self._wrench, self._progress, self._coupling, self._components):
-            context.SetDiscreteState(part, np.zeros(context.get_discrete_state(part).size()))
+        self.set_to_zero(context, self._components)
 
     def randomize_context(self, context: Context, rng: np.random.Generator) -> None:
         """Puts an uncut slice, drawn by the food's spreads, into the context."""

@@ -2,6 +2,7 @@
 
 import dataclasses as dc
 import functools
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,7 +11,7 @@ from pydrake.common.value import Value
 from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.math import SpatialVelocity
-from pydrake.systems.framework import Context, DiagramBuilder, State
+from pydrake.systems.framework import Context, DiagramBuilder, DiscreteStateIndex, State
 
 from sliceit_drake.cutting.contact_response import contact_responses
 from sliceit_drake.cutting.coupling_steps import EnergyBalance
@@ -28,7 +29,7 @@ from sliceit_drake.systems.cut_report import Columns, FoodBodyFrame
 from sliceit_drake.systems.declare import declare_output
 from sliceit_drake.systems.food_look import OTHER, FoodLook, FoodScene
 from sliceit_drake.systems.food_visualizer import FoodVisualizer, frame_size
-from sliceit_drake.systems.knife_force import KnifeForceSystem
+from sliceit_drake.systems.knife_force import KEPT, KnifeForceSystem
 
 __all__ = ["BALANCE_NAMES", "COMPLETE", "ENERGY_NAMES", "CuttingSystem"]
 
@@ -40,7 +41,18 @@ MECHANISMS = ("edge", "opening", "friction", "board_friction", "blade")
 
 NO_ENERGY = (0.0, 0.0, 0.0, 0.0, 1.0)
 
-SPENT = slice(BALANCE_NAMES.index("edge"), BALANCE_NAMES.index("friction") + 1)
+# Parts of the state behind those of all cutting systems.
+_COMPONENTS = slice(KEPT, KEPT + 9)
+_BALANCE = slice(_COMPONENTS.stop, _COMPONENTS.stop + len(BALANCE_NAMES))
+_ENERGY = slice(_BALANCE.stop, _BALANCE.stop + len(ENERGY_NAMES))
+_FOOD_INDEX = _ENERGY.stop
+_SPENT_BEFORE = _FOOD_INDEX + 1  # Dissipated when this food was taken, J.
+
+_SPENT = slice(
+    _BALANCE.start + BALANCE_NAMES.index("edge"),
+    _BALANCE.start + BALANCE_NAMES.index("friction") + 1,
+)
+_balance = operator.attrgetter(*BALANCE_NAMES)
 
 COMPLETE = 0.999
 """Fraction of a section from which a slice counts as cut off."""
@@ -52,8 +64,8 @@ INDEXED = 5e-4
 class CuttingSystem(KnifeForceSystem):
     """A finite-element food as a cutting system, with sub-steps of its own in each coupling step.
 
-    All state is in the Context: the food's nodes and history as one discrete vector, the food that
-    is cut as an index into the prepared foods. The solvers hold only workspaces that each update
+    All state is in the Context: the food's nodes and history as one discrete vector, the rest, with
+    the index of the food that is cut, as another. The solvers hold only workspaces that each update
     fills and empties, so contexts do not disturb each other.
 
     In a sequence the prepared foods are what successive slices leave of one body. The next is taken
@@ -91,7 +103,9 @@ class CuttingSystem(KnifeForceSystem):
         in_sequence: bool = False,
         look: FoodLook = OTHER,
     ) -> None:
-        super().__init__(solvers[0].exchange_period)
+        further = np.zeros(_SPENT_BEFORE + 1 - KEPT)
+        further[_ENERGY.start - KEPT : _ENERGY.stop - KEPT] = NO_ENERGY
+        super().__init__(solvers[0].exchange_period, further)
         self.solvers = tuple(solvers)
         self.surfaces = tuple(food_surface(s.model) for s in solvers)
         self._in_sequence, self._look = in_sequence, look
@@ -107,21 +121,19 @@ class CuttingSystem(KnifeForceSystem):
             self._X_WC.append(RigidTransform(RotationMatrix(R_WC), p_WC))
         self._check_every = max(1, round(check_period / self.exchange_period))
         size = max(s.state_size for s in self.solvers)
-        self._food = self.DeclareDiscreteState(self._padded(self.solvers[0].initial_state(), size))
-        self._food_index = self.DeclareDiscreteState(1)
-        self._components = self.DeclareDiscreteState(9)
-        self._balance = self.DeclareDiscreteState(len(BALANCE_NAMES))
-        self._energy = self.DeclareDiscreteState(NO_ENERGY)
-        # Dissipated when this food was taken, J.
-        self._spent_before = self.DeclareDiscreteState(1)
-        self.DeclareStateOutputPort("force_components", self._components)
-        self.DeclareStateOutputPort("balance", self._balance)
-        self.DeclareStateOutputPort("energy", self._energy)
-        self.DeclareStateOutputPort("food_index", self._food_index)
+        food = self.DeclareDiscreteState(self._padded(self.solvers[0].initial_state(), size))
+        self._food = int(food)
+        for name, part in (
+            ("force_components", _COMPONENTS),
+            ("balance", _BALANCE),
+            ("energy", _ENERGY),
+            ("food_index", slice(_FOOD_INDEX, _FOOD_INDEX + 1)),
+        ):
+            self._declare_part(name, part.stop - part.start, lambda kept, part=part: kept[part])
         corners = self._corners = max(len(surface.ends) for surface in self.surfaces)
         state = {
-            self.discrete_state_ticket(self._food),
-            self.discrete_state_ticket(self._food_index),
+            self.discrete_state_ticket(food),
+            self.discrete_state_ticket(DiscreteStateIndex(self._state)),
         }
         declare_output(self, "surface_vertices", 3 * corners, self._surface_vertices, state)
         declare_output(self, "surface_damage", corners, self._surface_damage, state)
@@ -139,6 +151,12 @@ class CuttingSystem(KnifeForceSystem):
             "coupling_work_error": ["coupling_work_error"],
             "food_index": ["food_index"],
         }
+
+    def state_columns(self, wrench: Sequence[str]) -> list[str]:
+        recorded = self.recorded()
+        names = ("force_components", "balance", "energy", "food_index")
+        further = [column for name in names for column in recorded[name]]
+        return [*super().state_columns(wrench), *further, "_spent_before"]
 
     def _middle_model(self) -> CuttingModel:
         """The cut; of a sequence, its middle slice, which stands for all."""
@@ -234,7 +252,7 @@ class CuttingSystem(KnifeForceSystem):
 
     def food_index(self, context: Context) -> int:
         """Which prepared food this context cuts."""
-        return int(context.get_discrete_state(self._food_index).value()[0])
+        return int(self.kept(context)[_FOOD_INDEX])
 
     def food_state(self, context: Context) -> np.ndarray:
         """State of the food as its solver reads it."""
@@ -260,10 +278,12 @@ class CuttingSystem(KnifeForceSystem):
         size = len(context.get_discrete_state(self._food).value())
         state = self._padded(self.solvers[index].initial_state(), size)
         context.SetDiscreteState(self._food, state)
-        context.SetDiscreteState(self._food_index, [index])
         # A new food has given no force and cost no work yet.
-        self.set_to_zero(context, self._components, self._balance, self._spent_before)
-        context.SetDiscreteState(self._energy, NO_ENERGY)
+        self.set_to_zero(context)
+        kept = self.kept(context).copy()
+        kept[KEPT:] = 0.0
+        kept[_ENERGY], kept[_FOOD_INDEX] = NO_ENERGY, index
+        context.SetDiscreteState(self._state, kept)
 
     def randomize_context(self, context: Context, rng: np.random.Generator) -> None:
         """Puts an uncut food, drawn from the prepared ones, into the context."""
@@ -290,7 +310,7 @@ class CuttingSystem(KnifeForceSystem):
             lowest = following.p[2] - 0.5 * model.knife.length * abs(following.R[2, 0])
             if lowest <= clear or abs(following.p[1]) > INDEXED:
                 return index
-        progress = float(context.get_discrete_state(self._progress).value()[0])
+        progress = self.progress(context)
         if progress >= COMPLETE:
             return index + 1
         if abs(self._in_cut_frame(index, poses[1]).p[1]) > INDEXED:
@@ -307,7 +327,7 @@ class CuttingSystem(KnifeForceSystem):
         """
         if not self._in_sequence or X_CK.p[1] > -INDEXED:
             return False
-        progress = float(context.get_discrete_state(self._progress).value()[0])
+        progress = self.progress(context)
         if progress < COMPLETE and X_CK.p[1] < -LATERAL_LIMIT:
             raise _not_parted(context, self.food_index(context), progress)
         return progress >= COMPLETE
@@ -320,46 +340,42 @@ class CuttingSystem(KnifeForceSystem):
     def advance(
         self, context: Context, state: State, X_WK: RigidTransform
     ) -> tuple[np.ndarray, float]:
-        x, new = context.get_discrete_state(), state.get_mutable_discrete_state()
-        before, time = int(x.value(self._food_index)[0]), context.get_time()
-        now = X_WK.GetAsMatrix34()
+        kept, time = self.kept(context), context.get_time()
+        new = state.get_mutable_discrete_state()
+        new_kept = new.get_mutable_value(self._state)
+        before, now = int(kept[_FOOD_INDEX]), X_WK.GetAsMatrix34()
         index = self._index_to_cut(context, before, now)
         solver = self.solvers[index]
-        old_balance = x.value(self._balance)
         if index == before:
-            old = x.value(self._food)[: solver.state_size]
+            old = self.food_state(context)
         else:
             old = solver.initial_state()
-            new.set_value(self._food_index, [index])
-            new.set_value(self._energy, NO_ENERGY)
-            new.set_value(self._spent_before, [old_balance[SPENT].sum()])
-        last = self._in_cut_frame(index, x.value(self._last_pose).reshape(3, 4))
+            new_kept[_FOOD_INDEX], new_kept[_ENERGY] = index, NO_ENERGY
+            new_kept[_SPENT_BEFORE] = kept[_SPENT].sum()
+        last = self._in_cut_frame(index, self.last_pose(context))
         pose = self._in_cut_frame(index, now)
         if self._is_beside(context, pose):
-            new.set_value(self._components, np.zeros(9))
-            return np.zeros(6), float(x.value(self._progress)[0])
+            new_kept[_COMPONENTS] = 0.0
+            return np.zeros(6), self.progress(context)
         check_in_plane(solver.model, pose, time)
         try:
             step = solver.coupling_step(old, last, pose)
         except CuttingError as error:
             raise CuttingError(f"at {time:.4g} s {error}") from error
-        food = new.get_mutable_value(self._food)
-        food[: len(old)] = step.state
+        new.get_mutable_value(self._food)[: len(old)] = step.state
         R_CW = self._R_CW[index]
-        forces = step.wrenches[-1, :, 3:].dot(R_CW)
-        new.set_value(self._components, forces.ravel())
-        balance = old_balance + dc.astuple(step.balance)
-        new.set_value(self._balance, balance)
+        new_kept[_COMPONENTS] = step.wrenches[-1, :, 3:].dot(R_CW).ravel()
+        new_kept[_BALANCE] += _balance(step.balance)
         if round(time / self.exchange_period) % self._check_every == 0:
             energies = solver.energies(step.state, pose)
-            spent = float(balance[SPENT].sum() - new.value(self._spent_before)[0])
+            spent = float(new_kept[_SPENT].sum() - new_kept[_SPENT_BEFORE])
             ratio = check_energies(energies, spent, solver.model, time)
-            *_, largest_ratio, least_volume_ratio = new.value(self._energy).tolist()
+            *_, largest_ratio, least_volume_ratio = new_kept[_ENERGY].tolist()
             stored = energies.elastic, energies.interface, energies.kinetic
             largest = max(ratio, largest_ratio)
             least = min(energies.least_volume_ratio, least_volume_ratio)
             # In the order of `ENERGY_NAMES`.
-            new.set_value(self._energy, [*stored, largest, least])
+            new_kept[_ENERGY] = [*stored, largest, least]
         return step.wrench.reshape(2, 3).dot(R_CW).ravel(), float(step.cut[-1])
 
     def _surface_vertices(self, context: Context) -> np.ndarray:

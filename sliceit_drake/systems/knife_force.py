@@ -1,9 +1,11 @@
 """The ports that every cutting system has; a subclass says what force the food gives."""
 
-from typing import Protocol
+import copy
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
 import numpy as np
-from pydrake.common.value import Value
+from pydrake.common.value import AbstractValue, Value
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce, SpatialVelocity
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce
@@ -14,7 +16,16 @@ from sliceit_drake.cutting.motion import small_turn
 from sliceit_drake.systems.cut_report import ReportingSystem
 from sliceit_drake.systems.declare import declare_output
 
-__all__ = ["AppliedForce", "CuttingSetup", "KnifeForceSystem"]
+__all__ = ["KEPT", "AppliedForce", "CuttingSetup", "KnifeForceSystem"]
+
+# Parts of the state, one vector so that an update fetches it once.
+_WRENCH = slice(0, 6)
+_PROGRESS = 6
+_COUPLING = 7
+_LAST_POSE = slice(8, 20)  # X_WK at the last coupling step, row by row.
+_START_TIME = 20
+KEPT = 21
+"""Numbers that every cutting system keeps; those of a subclass stand behind them."""
 
 
 class CuttingSetup(Protocol):
@@ -46,36 +57,56 @@ class KnifeForceSystem(ReportingSystem):
         coupling_work_error: Work that the held wrench did on the knife minus work that the food did
             on it [1], J; it comes from the delay of one coupling step.
 
+        state: What is kept from one coupling step to the next, see `state_columns`.
+
     Args:
         exchange_period: Duration of a coupling step, s.
+        further: Initial values of the numbers that a subclass keeps behind those of all.
     """
 
-    def __init__(self, exchange_period: float) -> None:
+    def __init__(self, exchange_period: float, further: Sequence[float] = ()) -> None:
         super().__init__()
         self.exchange_period = exchange_period
         self._pose_input = self.DeclareAbstractInputPort("knife_pose", Value(RigidTransform()))
         self._velocity_input = self.DeclareAbstractInputPort(
             "knife_velocity", Value(SpatialVelocity.Zero())
         )
-        self._wrench = self.DeclareDiscreteState(6)
-        self._progress = self.DeclareDiscreteState(1)
-        self._coupling = self.DeclareDiscreteState(1)
-        self._last_pose = self.DeclareDiscreteState(12)
-        self._start_time = self.DeclareDiscreteState(1)
-        declare_output(
-            self,
-            "food_wrench",
-            Value(SpatialForce.Zero()),
-            lambda context: SpatialForce(self.wrench(context)),
-            {self.discrete_state_ticket(self._wrench)},
+        # A plain number: Drake's index would be made one in each call.
+        self._state = int(self.DeclareDiscreteState(np.concatenate([np.zeros(KEPT), further])))
+        self._declare_part(
+            "food_wrench", Value(SpatialForce.Zero()), lambda kept: SpatialForce(kept[_WRENCH])
         )
-        self.DeclareStateOutputPort("food_wrench_vector", self._wrench)
-        self.DeclareStateOutputPort("cut_progress", self._progress)
-        self.DeclareStateOutputPort("coupling_work_error", self._coupling)
+        self._declare_part("food_wrench_vector", 6, lambda kept: kept[_WRENCH])
+        self._declare_part("cut_progress", 1, lambda kept: kept[_PROGRESS : _PROGRESS + 1])
+        self._declare_part("coupling_work_error", 1, lambda kept: kept[_COUPLING : _COUPLING + 1])
+        self.DeclareStateOutputPort("state", DiscreteStateIndex(self._state))
         self.DeclareInitializationUnrestrictedUpdateEvent(self._initialize)
         # An offset of one period would round k + 1 periods otherwise than the plant's steps do, and
         # so see the plant a step ahead at some coupling steps.
         self.DeclarePeriodicUnrestrictedUpdateEvent(exchange_period, 0.0, self._update)
+
+    def _declare_part(
+        self,
+        name: str,
+        example: AbstractValue | int,
+        calc: Callable[[np.ndarray], Any],
+    ) -> None:
+        """Declares an output port, as `declare_output`, of a function of the kept numbers."""
+        declare_output(
+            self,
+            name,
+            example,
+            lambda context: calc(self.kept(context)),
+            {self.discrete_state_ticket(DiscreteStateIndex(self._state))},
+        )
+
+    def state_columns(self, wrench: Sequence[str]) -> list[str]:
+        """Names for the port `state`: `wrench` [6] for moment and force, others as in a record.
+
+        What no record shows has a name that begins with an underscore.
+        """
+        past = [f"_past_{k}" for k in range(_LAST_POSE.start, KEPT)]
+        return [*wrench, "cut_progress", "coupling_work_error", *past]
 
     def start(self, context: Context, state: State, X_WK: RigidTransform) -> None:
         """Called once at initialization; a subclass may check the start and set its state."""
@@ -99,40 +130,51 @@ class KnifeForceSystem(ReportingSystem):
         """V_WK now."""
         return self._velocity_input.Eval(context)
 
+    def kept(self, context: Context) -> np.ndarray:
+        """The numbers that are kept from one coupling step to the next; a view."""
+        return context.get_discrete_state().value(self._state)
+
     def last_pose(self, context: Context) -> np.ndarray:
         """X_WK at the previous coupling step, as [3, 4]."""
-        return context.get_discrete_state(self._last_pose).value().reshape(3, 4)
+        return self.kept(context)[_LAST_POSE].reshape(3, 4)
 
     def wrench(self, context: Context) -> np.ndarray:
         """The held wrench F_K_W, moment and force [6]."""
-        return context.get_discrete_state(self._wrench).value()
+        return self.kept(context)[_WRENCH]
+
+    def progress(self, context: Context) -> float:
+        """The fraction of the section that is cut."""
+        return float(self.kept(context)[_PROGRESS])
 
     def set_to_zero(self, context: Context, *parts: DiscreteStateIndex) -> None:
         """Sets wrench, progress, coupling error and a subclass's parts in the context to zero."""
-        for part in (self._wrench, self._progress, self._coupling, *parts):
+        kept = self.kept(context).copy()
+        kept[: _COUPLING + 1] = 0.0
+        context.SetDiscreteState(self._state, kept)
+        for part in parts:
             context.SetDiscreteState(part, np.zeros(context.get_discrete_state(part).size()))
 
     def _initialize(self, context: Context, state: State) -> None:
         X_WK = self._pose_input.Eval(context)
-        self._set(state, self._last_pose, X_WK.GetAsMatrix34().ravel())
-        self._set(state, self._start_time, [context.get_time()])
+        kept = state.get_mutable_discrete_state().get_mutable_value(self._state)
+        kept[_LAST_POSE] = X_WK.GetAsMatrix34().ravel()
+        kept[_START_TIME] = context.get_time()
         self.start(context, state, X_WK)
 
     def _update(self, context: Context, state: State) -> EventStatus | None:
-        x = context.get_discrete_state()
-        if context.get_time() <= x.value(self._start_time)[0]:
+        before = self.kept(context)
+        if context.get_time() <= before[_START_TIME]:
             return EventStatus.DidNothing()
         X_WK = self._pose_input.Eval(context)
         wrench, progress = self.advance(context, state, X_WK)
-        last, now = x.value(self._last_pose).reshape(3, 4), X_WK.GetAsMatrix34()
+        last, now = before[_LAST_POSE].reshape(3, 4), X_WK.GetAsMatrix34()
         turn = small_turn(last[:, :3], now[:, :3])
         moved = np.concatenate([turn, now[:, 3] - last[:, 3]])
-        error = x.value(self._coupling)[0] + (x.value(self._wrench) - wrench).dot(moved)
-        new = state.get_mutable_discrete_state()
-        new.set_value(self._coupling, [error])
-        new.set_value(self._wrench, wrench)
-        new.set_value(self._progress, [progress])
-        new.set_value(self._last_pose, now.ravel())
+        new = state.get_mutable_discrete_state().get_mutable_value(self._state)
+        new[_COUPLING] = before[_COUPLING] + (before[_WRENCH] - wrench).dot(moved)
+        new[_WRENCH] = wrench
+        new[_PROGRESS] = progress
+        new[_LAST_POSE] = now.ravel()
         return None
 
     @staticmethod
@@ -155,14 +197,14 @@ class AppliedForce(LeafSystem):
 
     def __init__(self, knife_body: BodyIndex) -> None:
         super().__init__()
-        self._knife_body = knife_body
+        self._no_force = ExternallyAppliedSpatialForce()
+        self._no_force.body_index = knife_body
+        self._no_force.p_BoBq_B = np.zeros(3)
         self._wrench = self.DeclareAbstractInputPort("food_wrench", Value(SpatialForce.Zero()))
         forces = Value[list[ExternallyAppliedSpatialForce]]()
         declare_output(self, "applied_force", forces, self._forces, {self._wrench.ticket()})
 
     def _forces(self, context: Context) -> list[ExternallyAppliedSpatialForce]:
-        force = ExternallyAppliedSpatialForce()
-        force.body_index = self._knife_body
-        force.p_BoBq_B = np.zeros(3)
+        force = copy.copy(self._no_force)
         force.F_Bq_W = self._wrench.Eval(context)
         return [force]

@@ -117,7 +117,7 @@ class SpringCutter(KnifeForceSystem):
         begin, _ = self._contact(self.last_pose(context))
         end, arm = self._contact(X_WK.GetAsMatrix34())
         impulse = 0.0
-        deepest = float(context.get_discrete_state(self._progress).value()[0])
+        deepest = self.progress(context)
         for k in range(1, self._steps + 1):
             # An edge that was beside the button has no depth to come from.
             edge = end if begin == -math.inf else begin + (end - begin) * k / self._steps

@@ -13,7 +13,6 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem, OutputPort
 from pydrake.systems.primitives import (
-    ConstantVectorSource,
     LogVectorOutput,
     Multiplexer,
     VectorLogSink,
@@ -69,12 +68,16 @@ class Recorder:
 
     Attributes:
         log: The log.
-        columns: Names of its rows.
+        logged: Names of its rows.
+        configured: What is the same in all rows, by name.
+        columns: All names, in the order in which a record has them.
         station: What is logged.
         motion: What the knife shall do.
     """
 
     log: VectorLogSink
+    logged: list[str]
+    configured: dict[str, float]
     columns: list[str]
     station: Station
     motion: Motion
@@ -83,7 +86,11 @@ class Recorder:
         """What has been logged so far in the context of the diagram."""
         log = self.log.FindLog(root_context)
         time = np.array(log.sample_times())
-        raw = Record(["time", *self.columns], np.column_stack([time, log.data().T]))
+        constant = np.tile(list(self.configured.values()), (len(time), 1))
+        raw = Record(
+            ["time", *self.logged, *self.configured],
+            np.column_stack([time, log.data().T, constant]),
+        )
         columns, parts = ["time"], [time[:, None]]
 
         def add(names: list[str], values: np.ndarray) -> None:
@@ -168,8 +175,8 @@ def add_recorder(
         builder: Builder of the diagram that holds the station.
         station: The station.
         motion: What drives its target pose.
-        sources: Output ports that drive the station's vector inputs, by input name; for the others
-            the configured constants are recorded. And where a policy moves the target either
+        sources: Output ports that drive the station's vector inputs, by input name; the others are
+            recorded as configured. And where a policy moves the target either
             "target_offset", its place along Kx and Kz of the start, or its "target_pose".
     """
     sources = dict(sources)
@@ -191,22 +198,34 @@ def add_recorder(
         sources["target_pose_row"] = target.get_output_port()
         vectors["target_pose_row"] = _pose_columns("target_pose")
     vectors |= {name: list(columns) for name, columns in station.cutting.recorded().items()}
+    commands = _COMMANDS.keys() - sources.keys()
+    configured = {
+        column: value
+        for name in vectors
+        if name in commands
+        for column, value in zip(
+            vectors[name], np.atleast_1d(getattr(station.scenario.controller, name)), strict=True
+        )
+    }
+    # A port costs more than its numbers do, so one stands for those whose numbers it has.
+    kept = station.cutting_columns(_wrench_columns("food_wrench"))
+    ports = {
+        name: columns
+        for name, columns in vectors.items()
+        if name not in commands and not set(columns) <= set(kept)
+    }
+    if kept:
+        ports["cutting_state"] = kept
     row = builder.AddNamedSystem(
-        "record_row", Multiplexer([len(columns) for columns in vectors.values()])
+        "record_row", Multiplexer([len(columns) for columns in ports.values()])
     )
-    for i, name in enumerate(vectors):
-        if name in sources:
-            source = sources[name]
-        elif name in _COMMANDS:
-            value = np.atleast_1d(np.array(getattr(station.scenario.controller, name), float))
-            constant = builder.AddNamedSystem(f"configured_{name}", ConstantVectorSource(value))
-            source = constant.get_output_port()
-        else:
-            source = station.GetOutputPort(name)
+    for i, name in enumerate(ports):
+        source = sources[name] if name in sources else station.GetOutputPort(name)
         builder.Connect(source, row.get_input_port(i))
     log = LogVectorOutput(
         row.get_output_port(), builder, publish_period=station.scenario.exchange_period
     )
     log.set_name("record")
+    logged = [column for group in ports.values() for column in group]
     columns = [column for group in vectors.values() for column in group]
-    return Recorder(log, columns, station, motion)
+    return Recorder(log, logged, configured, columns, station, motion)
