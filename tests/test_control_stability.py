@@ -5,10 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.common.value import Value
-from pydrake.multibody.math import SpatialForce
 from pydrake.systems.analysis import Simulator, SimulatorStatus
-from pydrake.systems.framework import Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
@@ -159,13 +157,11 @@ class Wrench(LeafSystem):
     def __init__(self, force):
         super().__init__()
         self._force = force
-        self.DeclareAbstractOutputPort(
-            "wrench", lambda: Value(SpatialForce.Zero()), self._calc, {self.time_ticket()}
-        )
+        self.DeclareVectorOutputPort("wrench", 6, self._calc, {self.time_ticket()})
 
-    def _calc(self, context: Context, output: Value) -> None:
+    def _calc(self, context: Context, output: BasicVector) -> None:
         f = float(self._force(context.get_time()))
-        output.set_value(SpatialForce([0.0, 0.0, 0.0], [f, 0.0, 0.0]))
+        output.SetFromVector([0.0, 0.0, 0.0, f, 0.0, 0.0])
 
 
 def alarm_time(force, **sensor) -> float | None:

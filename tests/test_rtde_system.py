@@ -223,7 +223,7 @@ def test_the_system_shows_the_wrench_at_the_flange_in_its_axes(robot):
     R_BK = chain_pose(START).rotation()  # The knife has the flange's axes.
     assert np.allclose(R_BK @ shown.translational(), robot.wrench[:3])
     assert np.allclose(R_BK @ shown.rotational(), robot.wrench[3:])
-    vector = system.GetOutputPort("wrench_vector").Eval(context)
+    vector = system.GetOutputPort("sensor_wrench_vector").Eval(context)
     assert np.allclose(vector, shown.get_coeffs())
     assert np.allclose(system.GetOutputPort("joint_positions").Eval(context), status.state.q)
     assert system.GetOutputPort("period").Eval(context)[0] == pytest.approx(0.002)

@@ -559,4 +559,5 @@ def _ramp_time(speed: float, acceleration: float | None) -> float:
 
 
 def _compose(X_AB: Pose, X_BC: Pose) -> Pose:
-    return Pose(X_AB.R @ X_BC.R, X_AB.p + X_AB.R @ X_BC.p)
+    R_AC = X_AB.R if X_BC.R is _NO_TURN else X_AB.R @ X_BC.R
+    return Pose(R_AC, X_AB.p + X_AB.R @ X_BC.p)

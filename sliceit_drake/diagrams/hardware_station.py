@@ -211,13 +211,14 @@ class HardwareStation(Station):
         for source, *systems in (
             (rtde.GetOutputPort("joint_positions"), commander, estimate),
             (rtde.GetOutputPort("joint_velocities"), estimate),
-            (rtde.GetOutputPort("sensor_wrench"), commander, estimate, monitor),
+            (rtde.GetOutputPort("sensor_wrench"), commander, estimate),
+            (rtde.GetOutputPort("sensor_wrench_vector"), monitor),
             (commander.GetOutputPort("joint_positions_command"), rtde),
         ):
             connect(builder, source, *systems)
         exported = {
-            rtde: ("joint_positions", "joint_velocities", "sensor_wrench", "period", "lateness")
-            + ("age", "missed_cycles", "latched", "stop_reason"),
+            rtde: ("joint_positions", "joint_velocities", "sensor_wrench", "sensor_wrench_vector")
+            + ("period", "lateness", "age", "missed_cycles", "latched", "stop_reason"),
             commander: ("joint_positions_command", "commanded_pose"),
             estimate: ("knife_pose", "knife_velocity", "food_wrench", "food_wrench_vector")
             + ("board_wrench", "cut_progress"),
@@ -227,17 +228,12 @@ class HardwareStation(Station):
         # For records: what the contract gives as typed values, as vectors.
         no_board = builder.AddNamedSystem("no_board", ConstantVectorSource(np.zeros(6)))
         builder.ExportOutput(no_board.get_output_port(), "board_wrench_vector")
-        builder.ExportOutput(rtde.GetOutputPort("wrench_vector"), "sensor_state")
         builder.BuildInto(self)
         self.set_name("station")
 
     def SetStart(self, root_context: Context) -> None:
         """Takes in where the robot is; it is moved to the start before."""
         self.rtde.receive(self.rtde.GetMyMutableContextFromRoot(root_context))
-
-    def sensor_columns(self, reading: Sequence[str]) -> list[str]:
-        """Names for the port `sensor_state`: `reading` [6] for the moment and force."""
-        return list(reading)
 
     def cutting_columns(self, wrench: Sequence[str]) -> list[str]:
         """Empty: there is no port `cutting_state`."""

@@ -174,7 +174,8 @@ class SimulatedStation(Station):
             (plant.get_reaction_forces_output_port(), sensor),
             (kinematics.GetOutputPort("knife_pose"), self.cutting, board_contact),
             (kinematics.GetOutputPort("knife_velocity"), self.cutting),
-            (sensor.GetOutputPort("sensor_wrench"), self.controller, monitor),
+            (sensor.GetOutputPort("sensor_wrench"), self.controller),
+            (sensor.GetOutputPort("sensor_wrench_vector"), monitor),
             (self.controller.GetOutputPort("joint_positions_command"), self._arm),
         ):
             connect(builder, source, *systems)
@@ -184,13 +185,12 @@ class SimulatedStation(Station):
 
         builder.ExportOutput(joints.get_output_port(0), "joint_positions")
         builder.ExportOutput(joints.get_output_port(1), "joint_velocities")
-        builder.ExportOutput(sensor.GetOutputPort("state"), "sensor_state")
         builder.ExportOutput(self.cutting.GetOutputPort("state"), "cutting_state")
         # A name that ends in "vector" is for records: what the contract gives as a typed value.
         exported = {
             self.controller: ("joint_positions_command", "commanded_pose"),
             kinematics: ("knife_pose", "knife_velocity"),
-            sensor: ("sensor_wrench",),
+            sensor: ("sensor_wrench", "sensor_wrench_vector"),
             self.cutting: ("food_wrench", "food_wrench_vector", "cut_progress")
             + tuple(self.cutting.recorded()),
             board_contact: ("board_wrench", "board_wrench_vector"),
@@ -254,10 +254,6 @@ class SimulatedStation(Station):
         builder.AddNamedSystem("frame_visualizer", frames)
         connect(builder, knife_pose, frames)
         _set_scene(meshcat, self.start_pose)
-
-    def sensor_columns(self, reading: Sequence[str]) -> list[str]:
-        """Names for the port `sensor_state`: `reading` [6] for the moment and force."""
-        return self.sensor.state_columns(reading)
 
     def cutting_columns(self, wrench: Sequence[str]) -> list[str]:
         """Names for the port `cutting_state`: `wrench` [6] for the food's moment and force."""

@@ -65,10 +65,6 @@ class Station(Diagram):
         """Puts the station at its start, in the context of the whole diagram."""
         raise NotImplementedError
 
-    def sensor_columns(self, reading: Sequence[str]) -> list[str]:
-        """Names for the port `sensor_state`: `reading` [6] for the moment and force."""
-        raise NotImplementedError
-
     def cutting_columns(self, wrench: Sequence[str]) -> list[str]:
         """Names for the port `cutting_state`: `wrench` [6] for the food's moment and force.
 

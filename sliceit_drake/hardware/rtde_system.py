@@ -18,7 +18,7 @@ _JOINTS = 6
 _SHOWN = {
     "joint_positions": _JOINTS,
     "joint_velocities": _JOINTS,
-    "wrench_vector": 6,
+    "sensor_wrench_vector": 6,
     "period": 1,
     "lateness": 1,
     "missed_cycles": 1,
@@ -40,7 +40,7 @@ class RtdeSystem(LeafSystem):
     Outputs:
         joint_positions, joint_velocities: Measured [6], rad and rad/s.
         sensor_wrench: SpatialForce of the environment on the tool, at the flange, in its axes (S).
-        wrench_vector: The wrench as moment and force [6], Nm and N.
+        sensor_wrench_vector: The wrench as moment and force [6], Nm and N.
         period: Controller time between the last two states, s [1].
         lateness: Wall time between them less that, s [1].
         age: Controller time that would have passed since the state arrived, s [1].
@@ -67,7 +67,7 @@ class RtdeSystem(LeafSystem):
             "sensor_wrench",
             lambda: Value(SpatialForce.Zero()),
             self._calc_wrench,
-            {self.discrete_state_ticket(self._parts["wrench_vector"])},
+            {self.discrete_state_ticket(self._parts["sensor_wrench_vector"])},
         )
         age = self.DeclareVectorOutputPort("age", 1, self._calc_age, {self.all_sources_ticket()})
         age.disable_caching_by_default()
@@ -90,7 +90,7 @@ class RtdeSystem(LeafSystem):
         for name, value in {
             "joint_positions": state.q,
             "joint_velocities": state.qd,
-            "wrench_vector": np.concatenate([torque, force]),
+            "sensor_wrench_vector": np.concatenate([torque, force]),
             "period": [status.period],
             "lateness": [status.lateness],
             "missed_cycles": [status.missed],
@@ -110,7 +110,7 @@ class RtdeSystem(LeafSystem):
         return context.get_discrete_state(self._parts[part]).value()
 
     def _calc_wrench(self, context: Context, output: AbstractValue) -> None:
-        output.set_value(SpatialForce(self._value(context, "wrench_vector")))
+        output.set_value(SpatialForce(self._value(context, "sensor_wrench_vector")))
 
     def _calc_age(self, context: Context, output: BasicVector) -> None:
         arrival = self._value(context, "arrival")[0]

@@ -109,6 +109,7 @@ class ComplianceUpdate:
         q: State: joint positions of the virtual model [n], rad.
         v: State: their velocities [n], rad per virtual second.
         error: State: net force, or pose error in motion mode [2, 3].
+        moving: State: `v` and `error` in one array [n + 6].
         u: The scaled error of the last step [2, 3].
     """
 
@@ -117,9 +118,12 @@ class ComplianceUpdate:
     ) -> None:
         self._law = config, chain, R_EC
         n = len(chain.joints)
-        self.measured, self.q, self.v = np.zeros((3, n))
+        self.measured, self.q = np.zeros((2, n))
+        # Velocities and error side by side, so that they are copied at once.
+        self.moving = np.zeros(n + 6)
+        self.v, self.error = self.moving[:n], self.moving[n:].reshape(2, 3)
         self.target, self.settings = np.zeros((3, 4)), np.zeros((5, 2, 3))
-        self.sensor_wrench, self.error, self.u = np.zeros((3, 2, 3))
+        self.sensor_wrench, self.u = np.zeros((2, 2, 3))
         self._R_BL, self._p_BL = np.zeros((n + 1, 3, 3)), np.zeros((n + 1, 3))
         self._failed = np.zeros(1, np.int32)
         _load_kernels()
@@ -307,17 +311,25 @@ class ComplianceController(LeafSystem):
             self, "settings", self._calc_settings, {port.ticket() for port in setting_ports}
         )
 
-        self._positions_state = self.DeclareDiscreteState(size)
-        self._velocities_state = self.DeclareDiscreteState(size)
-        self._error_state = self.DeclareDiscreteState(6)
-        self.DeclareStateOutputPort("joint_positions_command", self._positions_state)
-        self.DeclareStateOutputPort("joint_velocities_command", self._velocities_state)
+        positions = self.DeclareDiscreteState(size)
+        # Velocities, then the error.
+        moving = self.DeclareDiscreteState(size + 6)
+        # Plain numbers: Drake's indices would be made such in each call.
+        self._positions_state, self._moving_state, self._size = int(positions), int(moving), size
+        self.DeclareStateOutputPort("joint_positions_command", positions)
+        declare_output(
+            self,
+            "joint_velocities_command",
+            size,
+            lambda context: context.get_discrete_state().value(self._moving_state)[:size],
+            {self.discrete_state_ticket(moving)},
+        )
         declare_output(
             self,
             "commanded_pose",
             Value(RigidTransform()),
             self._commanded_pose,
-            {self.discrete_state_ticket(self._positions_state)},
+            {self.discrete_state_ticket(positions)},
         )
         self.DeclareInitializationDiscreteUpdateEvent(self._activate)
         self.DeclarePeriodicDiscreteUpdateEvent(config.period, 0.0, self._update)
@@ -326,7 +338,7 @@ class ComplianceController(LeafSystem):
         # The previous error is left alone, as in the reference implementation.
         positions = self._joint_positions.Eval(context)
         discrete_state.set_value(self._positions_state, positions)
-        discrete_state.set_value(self._velocities_state, np.zeros_like(positions))
+        discrete_state.get_mutable_value(self._moving_state)[: self._size] = 0.0
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         room: ComplianceUpdate = self._room.Eval(context)
@@ -342,8 +354,7 @@ class ComplianceController(LeafSystem):
         room.measured[:] = self._joint_positions.Eval(context)
         state = context.get_discrete_state()
         room.q[:] = state.value(self._positions_state)
-        room.v[:] = state.value(self._velocities_state)
-        room.error.reshape(6)[:] = state.value(self._error_state)
+        room.moving[:] = state.value(self._moving_state)
         if not room.run():
             raise RuntimeError(
                 f"{self.GetSystemPathname()}: the virtual model has no finite acceleration at "
@@ -352,8 +363,7 @@ class ComplianceController(LeafSystem):
                 "error_scale or the stiffness."
             )
         discrete_state.set_value(self._positions_state, room.q)
-        discrete_state.set_value(self._velocities_state, room.v)
-        discrete_state.set_value(self._error_state, room.error.reshape(6))
+        discrete_state.set_value(self._moving_state, room.moving)
 
     def _calc_settings(self, context: Context) -> np.ndarray:
         """Returns what `ComplianceUpdate.settings` takes [5, 2, 3]."""

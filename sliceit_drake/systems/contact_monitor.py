@@ -3,8 +3,6 @@
 import dataclasses as dc
 
 import numpy as np
-from pydrake.common.value import Value
-from pydrake.multibody.math import SpatialForce
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
 
 from sliceit_drake.configuration import quantity
@@ -76,7 +74,7 @@ class ContactMonitor(LeafSystem):
     the target at more than 5 Hz in contact is not told from an unstable loop.
 
     Input ports:
-        sensor_wrench: SpatialForce.
+        sensor_wrench_vector: The sensor's moment and force [6].
 
     Output ports:
         unstable_gains: 1 after the alarm, else 0 [1].
@@ -96,8 +94,8 @@ class ContactMonitor(LeafSystem):
             max(config.moment_swing, _NOISE_SWING * sensor.moment_noise),
             max(config.force_swing, _NOISE_SWING * sensor.force_noise),
         ]
-        self._scale = 1.0 / np.repeat(least, 3)
-        self._wrench = self.DeclareAbstractInputPort("sensor_wrench", Value(SpatialForce.Zero()))
+        self._scale = (1.0 / np.repeat(least, 3)).tolist()
+        self._wrench = self.DeclareVectorInputPort("sensor_wrench_vector", _AXES)
         initial = np.zeros(_STATE_SIZE)
         initial[:_AXES] = 1.0
         self._state = self.DeclareDiscreteState(initial)
@@ -108,17 +106,18 @@ class ContactMonitor(LeafSystem):
             self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus | None:
-        x = discrete_state.get_mutable_vector(self._state).get_mutable_value()
+        x = discrete_state.get_mutable_value()
         if not x[_ALARM]:
             # Upwards and downwards alike: how far each signal is, and has been, in its direction.
-            s = self._wrench.Eval(context).get_coeffs() * self._scale
-            reach = x[_AXES : 2 * _AXES]
-            s *= x[:_AXES]
-            np.maximum(reach, s, out=reach)
-            back = reach - s
-            if back.max() > 1.0:
-                for axis in np.flatnonzero(back > 1.0):
-                    self._turn(x, int(axis), s[axis], context.get_time())
+            # Plain numbers: of so few, an operation on arrays costs more than all of them.
+            directions, reaches = x[:_AXES].tolist(), x[_AXES : 2 * _AXES].tolist()
+            wrench = self._wrench.Eval(context).tolist()
+            for axis, component in enumerate(wrench):
+                s = component * self._scale[axis] * directions[axis]
+                if s > reaches[axis]:
+                    x[_AXES + axis] = s
+                elif reaches[axis] - s > 1.0:
+                    self._turn(x, axis, s, context.get_time())
         if x[_ALARM]:
             return EventStatus.ReachedTermination(self, self._message(x))
         return None

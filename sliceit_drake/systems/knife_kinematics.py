@@ -14,6 +14,9 @@ __all__ = ["BoardContact", "KnifeKinematics"]
 
 NEAR_BOARD = 1e-3
 
+_NO_WRENCH = np.zeros(6)
+_NO_WRENCH.setflags(write=False)
+
 
 class KnifeKinematics(LeafSystem):
     """Picks the knife from the plant's lists of poses and velocities.
@@ -93,18 +96,19 @@ class BoardContact(LeafSystem):
     def _wrench(self, context: Context) -> np.ndarray:
         X_WK = self._pose.Eval(context).GetAsMatrix34()
         lowest = X_WK[2, 3] - abs(X_WK[2, 0]) * self._half_length
+        if lowest >= self._near_height:
+            return _NO_WRENCH
         moment, force = np.zeros(3), np.zeros(3)
-        if lowest < self._near_height:
-            results = self._results.Eval(context)
-            for i in range(results.num_point_pair_contacts()):
-                info = results.point_pair_contact_info(i)
-                # contact_force acts on body B of the pair.
-                if info.bodyB_index() == self._knife_body:
-                    f = info.contact_force()
-                elif info.bodyA_index() == self._knife_body:
-                    f = -info.contact_force()
-                else:
-                    continue
-                force += f
-                moment += np.cross(info.contact_point() - X_WK[:, 3], f)
+        results = self._results.Eval(context)
+        for i in range(results.num_point_pair_contacts()):
+            info = results.point_pair_contact_info(i)
+            # contact_force acts on body B of the pair.
+            if info.bodyB_index() == self._knife_body:
+                f = info.contact_force()
+            elif info.bodyA_index() == self._knife_body:
+                f = -info.contact_force()
+            else:
+                continue
+            force += f
+            moment += np.cross(info.contact_point() - X_WK[:, 3], f)
         return np.concatenate([moment, force])

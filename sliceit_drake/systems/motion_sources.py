@@ -40,6 +40,9 @@ class MotionSource(LeafSystem):
     def __init__(self, plan: MotionPlan, X_WK: RigidTransform) -> None:
         super().__init__()
         self.motion = placed_motion(plan, X_WK)
+        # The rotation in the last pose asked for, as the motion has it and as Drake's: a motion
+        # that does not turn gives one array, and Drake checks each that it is given.
+        self._turned = X_WK.rotation().matrix(), X_WK.rotation()
         pose, velocity = Value(RigidTransform()), Value(SpatialVelocity.Zero())
         time = {self.time_ticket()}
         declare_output(self, "target_pose", pose, self._target_pose, time)
@@ -47,7 +50,11 @@ class MotionSource(LeafSystem):
 
     def _target_pose(self, context: Context) -> RigidTransform:
         pose = self.motion.pose(context.get_time())
-        return RigidTransform(RotationMatrix(pose.R), pose.p)
+        R, R_WK = self._turned
+        if pose.R is not R:
+            R_WK = RotationMatrix(pose.R)
+            self._turned = pose.R, R_WK
+        return RigidTransform(R_WK, pose.p)
 
     def _target_velocity(self, context: Context) -> SpatialVelocity:
         velocity = self.motion.velocity(context.get_time())

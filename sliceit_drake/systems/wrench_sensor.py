@@ -3,7 +3,6 @@
 import dataclasses as dc
 import functools
 import math
-from collections.abc import Sequence
 
 import numpy as np
 from pydrake.common.value import Value
@@ -18,14 +17,13 @@ from sliceit_drake.systems.declare import declare_output
 
 __all__ = ["WrenchSensor", "WrenchSensorConfig", "wrench_shift"]
 
-# Parts of the state, one vector so that an update fetches it once.
+# Parts of the state beside the reading, one vector so that an update fetches it once.
 _SUM = slice(0, 6)  # Sum of the plant's reactions since the last coupling step.
 _COUNT = 6  # How many are in the sum.
-_READING = slice(7, 13)
-_FILTERED = slice(13, 19)  # Wrench behind the low-pass filter.
-_ZERO = slice(19, 25)  # What is subtracted: the tare less the bias.
-_READINGS = 25  # How many there have been.
-_STATE_SIZE = 26  # Without drift (6 more) and delay (6 more for each reading on its way).
+_FILTERED = slice(7, 13)  # Wrench behind the low-pass filter.
+_ZERO = slice(13, 19)  # What is subtracted: the tare less the bias.
+_READINGS = 19  # How many there have been.
+_STATE_SIZE = 20  # Without drift (6 more) and delay (6 more for each reading on its way).
 
 _NOISE_BLOCK = 1024  # Readings whose noise is drawn at once.
 _READOUT, _WALK = 0, 1  # Independent streams of random numbers.
@@ -112,6 +110,7 @@ class WrenchSensor(LeafSystem):
     Outputs:
         sensor_wrench: SpatialForce at So, in S; held over each coupling step. No direct
             feedthrough.
+        sensor_wrench_vector: The same as moment and force [6].
 
     Parameters:
         0: Seed of noise and random walk [1].
@@ -194,24 +193,20 @@ class WrenchSensor(LeafSystem):
 
         self._reactions = self.DeclareAbstractInputPort(
             "reaction_forces", Value[list[SpatialForce]]()
-        ).get_index()
+        )
         self._seed = self.DeclareNumericParameter(BasicVector([float(config.seed)]))
-        state = self.DeclareDiscreteState(np.zeros(self._size))
+        reading = self.DeclareDiscreteState(6)
+        # Plain numbers: Drake's indices would be made such in each call.
+        self._reading, self._state = int(reading), int(self.DeclareDiscreteState(self._size))
         declare_output(
             self,
             "sensor_wrench",
             Value(SpatialForce.Zero()),
-            lambda context: SpatialForce(context.get_discrete_state_vector().value()[_READING]),
-            {self.xd_ticket()},
+            lambda context: SpatialForce(context.get_discrete_state().value(self._reading)),
+            {self.discrete_state_ticket(reading)},
         )
-        self.DeclareStateOutputPort("state", state)
+        self.DeclareStateOutputPort("sensor_wrench_vector", reading)
         self.DeclarePeriodicDiscreteUpdateEvent(step, 0.0, self._update)
-
-    def state_columns(self, reading: Sequence[str]) -> list[str]:
-        """Names for the port `state`: `reading` [6] for the moment and force, others private."""
-        names = [f"_sensor_{k}" for k in range(self._size)]
-        names[_READING] = reading
-        return names
 
     def randomize_context(self, context: Context, rng: np.random.Generator) -> None:
         """Draws a new seed of noise and random walk."""
@@ -223,22 +218,22 @@ class WrenchSensor(LeafSystem):
         The bias stays, and readings on their way arrive as they are. Without effect on a sensor
         that has not read yet. The context is the sensor's own.
         """
-        x = context.get_mutable_discrete_state_vector().get_mutable_value()
+        x = context.get_mutable_discrete_state().get_mutable_value(self._state)
         if x[_READINGS] > 0.0:
             x[_ZERO] = x[_FILTERED] - self._bias
             x[self._drift] = 0.0
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         # The whole list crosses into Python for the one wrench wanted; no port gives less.
-        reactions = self.EvalAbstractInput(context, self._reactions).get_value()
-        x = discrete_state.get_mutable_value()
+        reaction = self._reactions.Eval(context)[self._index].get_coeffs()
+        x = discrete_state.get_mutable_value(self._state)
         total = x[_SUM]
-        total += reactions[self._index].get_coeffs()
+        total += reaction
         x[_COUNT] += 1.0
         if x[_COUNT] == self._steps:
-            self._read(context, x)
+            self._read(context, x, discrete_state.get_mutable_value(self._reading))
 
-    def _read(self, context: Context, x: np.ndarray) -> None:
+    def _read(self, context: Context, x: np.ndarray, reading: np.ndarray) -> None:
         wrench = self._on_arm.dot(x[_SUM])
         x[: _COUNT + 1] = 0.0
         x[_READINGS] += 1.0
@@ -250,14 +245,18 @@ class WrenchSensor(LeafSystem):
         x[_FILTERED] = wrench
         shown = wrench - x[_ZERO]
         if self._is_imperfect:
-            shown = self._spoil(context, x, shown, is_first)
-        x[_READING] = shown
+            shown = self._spoil(context, x, shown, reading)
+        reading[:] = shown
 
     def _spoil(
-        self, context: Context, x: np.ndarray, shown: np.ndarray, is_first: bool
+        self, context: Context, x: np.ndarray, shown: np.ndarray, last: np.ndarray
     ) -> np.ndarray:
-        """Adds drift and noise to the tared wrench [6], rounds, samples and delays it."""
+        """Adds drift and noise to the tared wrench [6], rounds, samples and delays it.
+
+        `last` is the reading before.
+        """
         readings = int(x[_READINGS])
+        is_first = readings == 1
         seed = int(context.get_numeric_parameter(self._seed)[0])
         block, row = divmod(readings, _NOISE_BLOCK)
         drift = x[self._drift]
@@ -274,7 +273,7 @@ class WrenchSensor(LeafSystem):
             shown = np.where(step > 0.0, np.rint(shown / np.where(step, step, 1.0)) * step, shown)
         line = x[self._line]
         if (readings - 1) % self._hold:
-            shown = (line[:6] if line.size else x[_READING]).copy()
+            shown = (line[:6] if line.size else last).copy()
         if line.size:
             line[6:] = line[:-6].copy()
             line[:6] = shown

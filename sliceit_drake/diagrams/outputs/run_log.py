@@ -187,7 +187,7 @@ def add_recorder(
         "cut_progress": ["cut_progress"],
         "food_wrench_vector": _wrench_columns("food_wrench"),
         "board_wrench_vector": _wrench_columns("board_wrench"),
-        "sensor_state": station.sensor_columns(_wrench_columns("sensor_wrench")),
+        "sensor_wrench_vector": _wrench_columns("sensor_wrench"),
         **_COMMANDS,
     }
     if "target_offset" in sources:
