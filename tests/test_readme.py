@@ -7,6 +7,7 @@ import runpy
 from pathlib import Path
 
 import pytest
+import yaml
 from docs_commands import pages_of
 
 from sliceit_drake.cli.main import main
@@ -34,6 +35,19 @@ def test_run_of_the_readme_is_saved(tmp_path, monkeypatch):
     assert said is not None
     found = {file.name for file in (tmp_path / "output/softer").iterdir()}
     assert found == set(said[1].split(", "))
+
+
+def test_the_readme_cites_what_the_citation_file_cites():
+    (paper,) = yaml.safe_load((ROOT / "CITATION.cff").read_text())["references"]
+    shown = dict(re.findall(r"\b(\w+) = \{(.*?)\},?$", (ROOT / "README.md").read_text(), re.M))
+    assert shown == {
+        "title": paper["title"],
+        "author": " and ".join(
+            f"{a['family-names']}, {a['given-names']}" for a in paper["authors"]
+        ),
+        "booktitle": paper["collection-title"],
+        "year": str(paper["year"]),
+    }
 
 
 def test_batch_and_gradient_of_the_tutorial_run(capsys):
