@@ -135,6 +135,33 @@ def test_a_slice_that_rests_is_not_moved_any_more_and_one_in_the_air_falls():
     np.testing.assert_array_equal(slices.pose(context, 0).GetAsMatrix34(), rested)
 
 
+def test_a_slice_at_rest_is_held_until_one_that_moves_comes_near():
+    surface, blade = box(0.03, 0.03, 0.01), blade_surface(Knife())
+    bodies = [
+        SliceBody(surface, Material(youngs_modulus=2.6e6), RigidTransform([0.0, y, 0.0]))
+        for y in (0.0, -0.5)
+    ]
+    board = Board(height=0.0)
+    slices = LooseSlices(bodies, None, blade, board, RigidTransform(), 0.5, 0.0, PERIOD, 0.999)
+    simulator = let_go(slices, RigidTransform([0.0, 0.0, 0.001]))
+    context = simulator.get_mutable_context()
+    simulator.AdvanceTo(0.6)
+    assert not slices.GetOutputPort("slices").Eval(context)[8:14].any()
+    rested = slices.pose(context, 0).GetAsMatrix34()
+    slices.GetInputPort("food_index").FixValue(context, [1.0])
+    # The second falls beside the first, and slides against it.
+    slices.GetInputPort("slice_pose").FixValue(context, RigidTransform([0.0, 0.04, 0.003]))
+    push = SpatialVelocity(np.zeros(3), np.array([0.0, -0.7, 0.0]))
+    slices.GetInputPort("slice_velocity").FixValue(context, push)
+    simulator.AdvanceTo(0.604)
+    np.testing.assert_array_equal(slices.pose(context, 0).GetAsMatrix34(), rested)
+    assert slices.pose(context, 1).translation()[1] < 0.04
+    simulator.AdvanceTo(1.2)
+    first, second = (slices.pose(context, k).translation()[1] for k in range(2))
+    assert first < -1e-3
+    assert second - first > 0.0295
+
+
 @pytest.mark.parametrize(("friction", "of_the_blade"), [(0.3, 0.9), (0.0, 0.0), (0.0, 0.3)])
 def test_any_pair_of_frictions_can_be_simulated(friction, of_the_blade):
     body = SliceBody(box(0.03, 0.01, 0.03), Material(friction=of_the_blade), RigidTransform())

@@ -2,6 +2,7 @@
 
 import dataclasses as dc
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
@@ -11,7 +12,10 @@ from pydrake.geometry import (
     AddContactMaterial,
     AddRigidHydroelasticProperties,
     Box,
+    CollisionFilterDeclaration,
     Convex,
+    FilterId,
+    GeometrySet,
     ProximityProperties,
     TriangleSurfaceMesh,
 )
@@ -27,6 +31,7 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.foods.material import Material
@@ -55,10 +60,10 @@ DISSIPATION = 10.0
 REST_SPEED = 2e-3
 REST_RATE = 0.1
 """Speed, m/s, and rate, rad/s, below which a slice may be at rest."""
-REST_TIME = 0.2
+REST_TIME = 0.1
 """Time below both until it is at rest, s."""
 NEAR = 1e-3
-"""Distance of the blade that ends a slice's rest, metres."""
+"""Distance of the blade, or of a slice that moves, that ends a slice's rest, metres."""
 
 
 @dc.dataclass
@@ -82,7 +87,8 @@ class LooseSlices(LeafSystem):
     A slice is taken over with the pose and the momentum that the finite elements give it when its
     section is cut. From then on weight, board, blade, the other slices and the rest of the food act
     on it, in a plant of its own whose step is the coupling step. The blade moves as the robot moves
-    it: what a slice of some grams would do to the arm is left out. Slices at rest cost nothing.
+    it: what a slice of some grams would do to the arm is left out. A slice at rest is held, at no
+    cost, until the blade or a slice that moves comes near.
 
     All state is in the Context; the plant's own is filled from it at each step.
 
@@ -126,7 +132,7 @@ class LooseSlices(LeafSystem):
         self._slices, self._pitch, self._complete = tuple(slices), pitch, complete
         self._period = period
         builder = DiagramBuilder()
-        self._plant, _ = AddMultibodyPlant(
+        self._plant, scene_graph = AddMultibodyPlant(
             MultibodyPlantConfig(
                 time_step=period,
                 contact_model="hydroelastic_with_fallback",
@@ -156,12 +162,17 @@ class LooseSlices(LeafSystem):
         )
         instance = plant.AddModelInstance("slices")
         self._bodies = []
-        self._corners = [_corners(each.surface) for each in slices]
+        hulls = [_corners(each.surface) for each in slices]
+        most = max(hull.shape[1] for hull in hulls)
+        # With the last one again where a hull has fewer.
+        self._corners = np.array(
+            [np.pad(hull, ((0, 0), (0, most - hull.shape[1])), "edge") for hull in hulls]
+        )
         for k, each in enumerate(slices):
             inertia = CalcSpatialInertia(each.surface, each.material.density)
             body = plant.AddRigidBody(f"slice_{k + 1}", instance, inertia)
             plant.RegisterCollisionGeometry(
-                body, RigidTransform(), Convex(self._corners[k], "slice"), f"slice_{k + 1}", soft
+                body, RigidTransform(), Convex(hulls[k], "slice"), f"slice_{k + 1}", soft
             )
             self._bodies.append(body)
         self._rest: RigidBody | None = None
@@ -188,7 +199,14 @@ class LooseSlices(LeafSystem):
         self._root = self._diagram.CreateDefaultContext()
         self._scratch = plant.GetMyMutableContextFromRoot(self._root)
         plant.SetFreeBodyPose(self._scratch, self._board, X_WB)
-        self._board.Lock(self._scratch)
+        for body in (self._board, self._rest):
+            if body is not None:
+                body.Lock(self._scratch)
+        self._filters = scene_graph.collision_filter_manager(
+            scene_graph.GetMyMutableContextFromRoot(self._root)
+        )
+        self._filter: FilterId | None = None
+        self._awake = np.ones(len(slices), bool)
 
         self._knife_pose = self.DeclareAbstractInputPort("knife_pose", Value(RigidTransform()))
         self._knife_velocity = self.DeclareAbstractInputPort(
@@ -204,7 +222,7 @@ class LooseSlices(LeafSystem):
         for k, each in enumerate(slices):
             state[k, 1:8] = _coordinates(each.X_WS)
         self._state = self.DeclareDiscreteState(state.ravel())
-        self._quiet = self.DeclareDiscreteState(1)
+        self._quiet = self.DeclareDiscreteState(len(slices))
         self.DeclareStateOutputPort("slices", self._state)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
@@ -233,43 +251,49 @@ class LooseSlices(LeafSystem):
         if not off.any():
             return EventStatus.DidNothing()
         X_WK = self._knife_pose.Eval(context)
-        quiet = context.get_discrete_state(self._quiet).value()[0] + self._period
-        if cut or self._moves(table[off]) or self._is_near(X_WK, table):
-            quiet = 0.0
-        new.set_value(self._quiet, [quiet])
-        if quiet < REST_TIME:
-            self._step(context, table, index, X_WK)
+        quiet = context.get_discrete_state(self._quiet).value() + self._period
+        quiet[self._stirred(table, X_WK)] = 0.0
+        if cut:
+            quiet[index] = 0.0
+        new.set_value(self._quiet, quiet)
+        awake = off & (quiet < REST_TIME)
+        table[~awake, 8:] = 0.0
+        if awake.any():
+            self._step(context, table, index, X_WK, awake)
         new.set_value(self._state, table.ravel())
         return EventStatus.Succeeded()
 
-    @staticmethod
-    def _moves(table: np.ndarray) -> bool:
-        rate = np.linalg.norm(table[:, 8:11], axis=1)
-        speed = np.linalg.norm(table[:, 11:], axis=1)
-        return bool((rate > REST_RATE).any() or (speed > REST_SPEED).any())
+    def _stirred(self, table: np.ndarray, X_WK: RigidTransform) -> np.ndarray:
+        """Which slices move, or might be touched by the blade or by a slice that moves [N]."""
+        rate, speed = (np.linalg.norm(table[:, k : k + 3], axis=1) for k in (8, 11))
+        moves = (rate > REST_RATE) | (speed > REST_SPEED)
+        if moves[table[:, 0] > 0.0].all():
+            return np.asarray(moves)
+        R_WS = Rotation.from_quat(table[:, 1:5], scalar_first=True).as_matrix()
+        p_W = R_WS @ self._corners + table[:, 5:8, None]
+        p_K = X_WK.rotation().matrix().T @ (p_W - X_WK.translation()[:, None])
+        at_blade = _near(p_K.min(2), p_K.max(2), self._blade_low, self._blade_high)
+        low, high = p_W.min(2), p_W.max(2)
+        touched = _near(low[:, None], high[:, None], low, high) & moves
+        return np.asarray(moves | at_blade | touched.any(1))
 
-    def _is_near(self, X_WK: RigidTransform, table: np.ndarray) -> bool:
-        """Whether the blade might touch a slice that is off."""
-        X_KW = X_WK.inverse()
-        for k in np.flatnonzero(table[:, 0]):
-            p_K = (X_KW @ slice_pose(table[k])).multiply(self._corners[k])
-            low, high = p_K.min(1) - NEAR, p_K.max(1) + NEAR
-            if (low < self._blade_high).all() and (high > self._blade_low).all():
-                return True
-        return False
-
-    def _step(self, context: Context, table: np.ndarray, index: int, X_WK: RigidTransform) -> None:
-        """Advances the slices that are off, rows of `table`, by a step of the plant."""
+    def _step(
+        self,
+        context: Context,
+        table: np.ndarray,
+        index: int,
+        X_WK: RigidTransform,
+        awake: np.ndarray,
+    ) -> None:
+        """Advances the slices that are awake, rows of `table`, by a step of the plant."""
         plant, scratch = self._plant, self._scratch
-        for k, body in enumerate(self._bodies):
-            if table[k, 0] == 0.0:
-                table[k, 1:8] = _coordinates(self._standing(k, index))
-            _hold(body, scratch, table[k, 0] == 0.0)
+        self._hold_all_but(awake)
+        for k in np.flatnonzero(table[:, 0] == 0.0).tolist():
+            table[k, 1:8] = _coordinates(self._standing(k, index))
         instance = self._bodies[0].model_instance()
         plant.SetPositions(scratch, instance, table[:, 1:8].ravel())
         plant.SetVelocities(scratch, instance, table[:, 8:].ravel())
         if self._rest is not None:
-            _hold(self._rest, scratch, True)
             last = len(self._bodies) - 1
             plant.SetFreeBodyPose(scratch, self._rest, self._standing(last, index))
         plant.SetFreeBodyPose(scratch, self._knife, X_WK)
@@ -278,8 +302,26 @@ class LooseSlices(LeafSystem):
         scratch.get_mutable_discrete_state().SetFrom(after)
         q = plant.GetPositions(scratch, instance).reshape(-1, 7)
         v = plant.GetVelocities(scratch, instance).reshape(-1, 6)
-        off = table[:, 0] > 0.0
-        table[off, 1:8], table[off, 8:] = q[off], v[off]
+        table[awake, 1:8], table[awake, 8:] = q[awake], v[awake]
+
+    def _hold_all_but(self, awake: np.ndarray) -> None:
+        """Holds the other slices; what is held takes no time to meet what is held."""
+        if self._filter is not None and (awake == self._awake).all():
+            return
+        self._awake = awake
+        still = [self._board, self._knife] + ([] if self._rest is None else [self._rest])
+        for body, free in zip(self._bodies, awake.tolist(), strict=True):
+            if free:
+                body.Unlock(self._scratch)
+            else:
+                body.Lock(self._scratch)
+                still.append(body)
+        if self._filter is not None:
+            self._filters.RemoveDeclaration(self._filter)
+        shapes = [g for body in still for g in self._plant.GetCollisionGeometriesForBody(body)]
+        self._filter = self._filters.ApplyTransient(
+            CollisionFilterDeclaration().ExcludeWithin(GeometrySet(shapes))
+        )
 
     def _standing(self, k: int, index: int) -> RigidTransform:
         """X_WS of slice `k` in the food while slice `index` is cut."""
@@ -291,9 +333,9 @@ def slice_pose(row: np.ndarray) -> RigidTransform:
     return RigidTransform(Quaternion(row[1:5] / np.linalg.norm(row[1:5])), row[5:8])
 
 
-def _hold(body: RigidBody, context: Context, held: bool) -> None:
-    if body.is_locked(context) != held:
-        body.Lock(context) if held else body.Unlock(context)
+def _near(low: np.ndarray, high: np.ndarray, other_low: np.ndarray, other_high: np.ndarray) -> Any:
+    """Whether boxes of corners [..., 3] come closer to each other than `NEAR`."""
+    return ((low - NEAR < other_high) & (high + NEAR > other_low)).all(-1)
 
 
 def _coordinates(X: RigidTransform) -> np.ndarray:
