@@ -341,8 +341,10 @@ def _read_text(file: Path) -> str:
         return file.read_text(encoding="utf-8")
     except FileNotFoundError:
         folder = file.parent
-        names = sorted(item.name for item in folder.glob("*.y*ml")) if folder.is_dir() else []
+        names = sorted(item.name for item in folder.glob("*.y*ml"))
         fix = did_you_mean(file.name, names) if names else f"The folder {folder} has no YAML files."
+        if not folder.is_dir():
+            fix = f"There is no folder {folder} either."
         raise ConfigurationError("the file does not exist", source=str(file), fix=fix) from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(

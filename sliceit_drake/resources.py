@@ -6,6 +6,7 @@ stand inside the package, under ``_resources``. Everything else asks here and do
 
 import importlib.util
 import inspect
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -65,7 +66,7 @@ def here_or_shipped(path: str | Path) -> Path:
     Args:
         path: As a user writes it; it is returned where there is none at either.
     """
-    path = Path(path)
+    path = Path(os.path.expanduser(path))
     if path.exists():
         return path
     try:
@@ -92,7 +93,7 @@ def named_yaml(name: str | Path, folder: str) -> Path | None:
     """
     file = Path(name)
     if file.suffix in (".yaml", ".yml"):
-        return file
+        return here_or_shipped(file)
     file = resource_path(folder) / f"{name}.yaml"
     return file if file.is_file() and file.parent == resource_path(folder) else None
 

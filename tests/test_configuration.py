@@ -208,8 +208,11 @@ def test_a_missing_file_suggests_what_exists(tmp_path):
     write(tmp_path, "")
     with pytest.raises(ConfigurationError, match='does not exist. Did you mean "station.yaml"'):
         load_yaml(Station, tmp_path / "sation.yaml")
-    with pytest.raises(ConfigurationError, match="has no YAML files"):
+    with pytest.raises(ConfigurationError, match="There is no folder .*nowhere either"):
         load_yaml(Station, tmp_path / "nowhere" / "a.yaml")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ConfigurationError, match="has no YAML files"):
+        load_yaml(Station, tmp_path / "empty" / "a.yaml")
     with pytest.raises(ConfigurationError, match="the file cannot be read"):
         load_yaml(Station, tmp_path)
 

@@ -1,8 +1,11 @@
 """What a newcomer meets in the program: its messages, its results, its end."""
 
+import argparse
 import json
 import os
 import re
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,7 +15,8 @@ from pathlib import Path
 import pytest
 
 from sliceit_drake.cli import doctor
-from sliceit_drake.cli.main import main
+from sliceit_drake.cli.main import main, run_program
+from sliceit_drake.configuration import dump_yaml
 from sliceit_drake.diagrams.outputs.animation import Film
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import load_scenario
@@ -75,6 +79,7 @@ MISTAKES = {
     ),
     # Options.
     "no duration": (["--duration", "-1"], "--duration: -1.0 s is not a duration"),
+    "an endless duration": (["--duration", "inf"], "--duration: inf s is not a duration"),
 }
 
 
@@ -111,6 +116,109 @@ def test_a_mistake_gets_a_message_that_says_what_to_do(case, tmp_path, capsys):
     assert shown.startswith("sliceit: ") and "Traceback" not in shown
     assert "Without a tag" not in shown or case == "a missing tag"
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["record", "--seed", "-1"], "--seed: is -1. Give at least 0"),
+        (["record", "--workers", "0"], "--workers: is 0. Give 1 to 10000"),
+        (["record", "--refinement", "0"], "settings.refinement: 0 is not within"),
+        (["record", "--time-step", "0"], "settings.time_step: 0 s is not within"),
+        (["record", "calibration/records/cucumber.csv"], "is a .csv file"),
+        (["record", "pour"], "there is no such scenario"),
+        (["collect", "pour"], "or one of full, poor, rich"),
+        (["collect", "--first", "-1"], "--first: is -1. Give at least 1"),
+        (["collect", "--seed", "-1"], "--seed: is -1. Give at least 0"),
+        (["calibrate", "x.csv", "--food", "tomato", "--seed", "-1"], "--seed: is -1"),
+        (["calibrate", "x.csv", "--food", "nowhere/x.yaml"], "There is no folder nowhere either"),
+        (["calibrate", "x.csv", "--food", "scenarios/cucumber.yaml"], "line 2: .*unknown field"),
+        (["diagnose", "calibration/records", "--model", "tomato", "--seed", "-1"], "--seed"),
+        (["evaluate", "models/policies/cutting_0", "--slices", "0"], "--slices: is 0"),
+        (["evaluate", "models/policies/cutting_0", "--board-stiffness", "-3"], "stiffness: is -3"),
+        (["optimize-motion", "cucumber_measured", "--iterations", "0"], "--iterations: is 0"),
+        (["diagram", "--depth", "-1"], "--depth: is -1. Give at least 0"),
+    ],
+)
+def test_values_of_options_that_make_no_sense_are_refused(
+    given, message, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    output = {"evaluate": "out.jsonl", "diagram": "out.dot"}.get(given[0], "out")
+    assert main([*given, "--output", output]) == 2
+    shown = capsys.readouterr().err
+    assert re.search(message, shown) and shown.startswith("sliceit: "), shown
+    assert list(tmp_path.rglob("*.*")) == []
+
+
+@pytest.mark.parametrize(
+    "command", [["record", "--list-effects"], ["simulate", *BRIEF, "--output", "out"]]
+)
+@pytest.mark.parametrize("end", ["| head -0", ">&-", "2>&-", ">&- 2>&-"])
+def test_a_command_does_what_it_shall_though_nobody_reads(command, end, tmp_path):
+    program = [sys.executable, "-c", "from sliceit_drake.cli.main import main; exit(main())"]
+    line = f"set -o pipefail; {shlex.join([*program, *command])} {end}"
+    done = subprocess.run(
+        ["bash", "-c", line], capture_output=True, text=True, cwd=tmp_path, check=False
+    )
+    assert done.returncode == 0 and "Error" not in done.stderr, done.stderr
+    assert command[0] == "record" or "force.png" in results_in(tmp_path / "out")
+
+
+def test_a_robot_stops_when_nobody_reads_what_it_says():
+    def say(_):
+        raise BrokenPipeError
+
+    parser = argparse.ArgumentParser()
+    parser.set_defaults(run=say, host="10.0.0.5")
+    with pytest.raises(BrokenPipeError):
+        run_program(parser, [])
+
+
+def test_a_scenario_in_the_place_of_a_command_is_recognised(capsys):
+    for given in ("cucumber", "mine.yaml"):
+        with pytest.raises(SystemExit, match="2"):
+            main([given])
+        assert f'Did you mean "sliceit simulate {given}"?' in capsys.readouterr().err
+
+
+def test_an_output_may_be_in_the_home_folder_and_is_not_empty(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(resource_path("scenarios/cucumber_measured.yaml"), tmp_path / "mine.yaml")
+    assert main(["simulate", "~/mine.yaml", *BRIEF, "--output=~/out"]) == 0
+    assert results_in(tmp_path / "out") and not (tmp_path / "~").exists()
+    with pytest.raises(SystemExit, match="2"):
+        main(["simulate", "--output", ""])
+    assert "--output: is empty: give a path" in capsys.readouterr().err
+
+
+def test_a_record_that_is_not_there_is_named_as_it_was_given(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["calibrate", "mine.csv", "--food", "tomato", "--output", "out"]) == 2
+    assert "mine.csv: there is no such record" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["simulate", "record", "hardware"])
+def test_a_name_that_leads_out_of_the_folder_of_outputs_is_refused(
+    command, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    scenario = dump_yaml(load_scenario("cucumber_measured", "name=../../mine"))
+    (tmp_path / "a.yaml").write_text(scenario, encoding="utf-8")
+    assert main([command, "a.yaml"]) == 2
+    assert "'../../mine' is no name for the folder of the results" in capsys.readouterr().err
+
+
+def test_a_protocol_and_a_scenario_go_by_their_names(tmp_path, capsys, monkeypatch):
+    made = []
+    monkeypatch.setattr(
+        "sliceit_drake.stand_in.session.record_session",
+        lambda protocol, *_: made.append((protocol.name, len(protocol.conditions))) or [],
+    )
+    for name in ("poor", "cucumber_measured"):
+        assert main(["record", name, "--output", str(tmp_path)]) == 0
+    assert made == [("poor", 1), ("cucumber_measured", 1)]
 
 
 def test_other_commands_say_what_is_meant_too(tmp_path, capsys):

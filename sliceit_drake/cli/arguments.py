@@ -1,6 +1,8 @@
 """The arguments that several commands share: a scenario, a protocol, a Dask cluster."""
 
 import argparse
+import math
+import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -8,20 +10,25 @@ from typing import TYPE_CHECKING, Any
 
 from sliceit_drake.cluster import connected
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.resources import file_or_resource, shipped_names
+from sliceit_drake.resources import file_or_resource, named_yaml, shipped_names
 
 if TYPE_CHECKING:
     from sliceit_drake.diagrams.scenario import Scenario
 
 __all__ = [
     "ONE_CUT",
+    "SEEDS",
+    "WORKERS",
     "add_cluster_arguments",
     "add_output_folder",
     "add_overrides",
     "add_protocol_argument",
     "add_scenario_arguments",
+    "check_numbers",
     "cluster_of",
     "find_file",
+    "output_of",
+    "output_path",
     "protocol_file",
     "scenario_of",
 ]
@@ -32,6 +39,8 @@ ONE_CUT = "scenarios/cucumber_measured.yaml"
 """A station that cuts once."""
 PROTOCOL = "calibration/protocols/rich.yaml"
 DASK = "dask"
+SEEDS = (0, math.inf)
+WORKERS = (1, 10_000)
 
 
 def add_scenario_arguments(parser: argparse.ArgumentParser) -> None:
@@ -73,8 +82,15 @@ def add_output_folder(
     parser: argparse.ArgumentParser, text: str, *, required: bool = False
 ) -> None:
     """Adds --output DIR, a folder, which a file of that name refuses; `text` is for the help."""
-    parser.add_argument("--output", metavar="DIR", type=Path, required=required, help=text)
+    parser.add_argument("--output", metavar="DIR", type=output_path, required=required, help=text)
     parser.set_defaults(output_is_folder=True)
+
+
+def output_path(text: str) -> Path:
+    """The path of --output; an empty one, as of a variable that is not set, is refused."""
+    if not text:
+        raise argparse.ArgumentTypeError("is empty: give a path, or leave it out")
+    return Path(os.path.expanduser(text))
 
 
 def add_protocol_argument(parser: argparse.ArgumentParser, kind: str = "a protocol") -> None:
@@ -84,7 +100,7 @@ def add_protocol_argument(parser: argparse.ArgumentParser, kind: str = "a protoc
         nargs="?",
         default=PROTOCOL,
         metavar="PROTOCOL",
-        help=f"YAML of {kind}; default {PROTOCOL}",
+        help=f"YAML of {kind}, or the name of one that ships; default {PROTOCOL}",
     )
 
 
@@ -94,19 +110,57 @@ def protocol_file(options: argparse.Namespace) -> Path:
 
 
 def find_file(name: str, kind: str, example: str) -> Path:
-    """The file that a user names: where they are, or one that ships with the package.
+    """The file that a user names: where they are, or one that ships, by its path or its name.
 
     Raises:
         ConfigurationError: There is no such `kind` of file; `example` is one that ships.
     """
-    file = file_or_resource(name)
-    if file is None:
+    folder = str(Path(example).parent)
+    file = file_or_resource(name) or named_yaml(name, folder)
+    if file is None or not file.is_file():
+        shipped = ", ".join(shipped_names(folder))
         raise ConfigurationError(
             f"there is no such {kind}, neither here nor in the package",
             source=name,
-            fix=f"Give a YAML file; {example} is one to start from.",
+            fix=f"Give a YAML file, or one of {shipped}; {example} is one to start from.",
         )
     return file
+
+
+def check_numbers(options: argparse.Namespace, **ranges: tuple[float, float]) -> None:
+    """Refuses numbers of options that are out of their range; None is not given.
+
+    Args:
+        options: Of a command.
+        ranges: Least and greatest value, by the option's name in `options`.
+
+    Raises:
+        ConfigurationError: Naming option and range.
+    """
+    for name, (least, most) in ranges.items():
+        values = getattr(options, name)
+        for value in values if isinstance(values, list) else [values]:
+            if value is not None and not least <= value <= most:
+                span = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
+                field = f"--{name.replace('_', '-')}"
+                raise ConfigurationError(f"is {value:g}", field=field, fix=f"Give {span}.")
+
+
+def output_of(options: argparse.Namespace, name: str, suffix: str = "") -> Path:
+    """The folder of --output, or else one in output/ of a name, such as a scenario's.
+
+    Raises:
+        ConfigurationError: The name is none that a folder can have.
+    """
+    if options.output is not None:
+        return options.output
+    if Path(name).name != name or not name:
+        raise ConfigurationError(
+            f"{name!r} is no name for the folder of the results",
+            field="name",
+            fix="Give --output, or a name without slashes.",
+        )
+    return Path("output") / f"{name}{suffix}"
 
 
 def add_cluster_arguments(parser: argparse.ArgumentParser, here: str, work: str) -> None:

@@ -23,10 +23,11 @@ A food that nobody recorded, from published levels in its setup:
 """
 
 import argparse
+import math
 import os
 from typing import TYPE_CHECKING
 
-from sliceit_drake.cli.arguments import add_output_folder
+from sliceit_drake.cli.arguments import WORKERS, add_output_folder, check_numbers
 from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.resources import here_or_shipped
@@ -95,11 +96,9 @@ def run(options: argparse.Namespace) -> int:
             raise ConfigurationError(
                 "is not given", field=f"--{name}", fix=f"Give --{name}; see --help."
             )
-    for name, least in (("trials", 1), ("steps", 0), ("starts", 1), ("workers", 1), ("blocks", 0)):
-        if getattr(options, name) < least:
-            raise ConfigurationError(
-                f"= {getattr(options, name)}", field=f"--{name}", fix=f"Give at least {least}."
-            )
+    any_number, some = (0, math.inf), (1, math.inf)
+    check_numbers(options, trials=some, starts=some, workers=WORKERS, seed=(0, 2**32 - 1))
+    check_numbers(options, steps=any_number, blocks=any_number, per_point=any_number)
     return _from_literature(options) if options.literature else _calibrate(options)
 
 

@@ -26,13 +26,16 @@ Examples
 import argparse
 import contextlib
 import functools
-from pathlib import Path
+import math
 from typing import TYPE_CHECKING
 
 from sliceit_drake.cli.arguments import (
     ONE_CUT,
+    SEEDS,
     add_output_folder,
     add_protocol_argument,
+    check_numbers,
+    output_of,
     protocol_file,
 )
 from sliceit_drake.cli.hardware import add_robot_arguments, robot_of
@@ -79,6 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     _check(options)
+    check_numbers(options, seed=SEEDS, first=(1, math.inf))
     robot = robot_of(options) if options.host else None
 
     from sliceit_drake.diagrams.scenario import load_scenario
@@ -87,7 +91,7 @@ def run(options: argparse.Namespace) -> int:
 
     protocol = load_protocol(str(protocol_file(options)))
     station = load_scenario(options.station)
-    options.output = directory = options.output or Path("output") / protocol.name
+    options.output = directory = output_of(options, protocol.name)
     check_folder(directory, "--output")
     port, put_fresh_food = options.emulator_pendant, None
     if port is not None:

@@ -28,7 +28,14 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sliceit_drake.cli.arguments import add_cluster_arguments, add_output_folder, cluster_of
+from sliceit_drake.cli.arguments import (
+    SEEDS,
+    WORKERS,
+    add_cluster_arguments,
+    add_output_folder,
+    check_numbers,
+    cluster_of,
+)
 from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.output_folder import check_folder
@@ -97,16 +104,8 @@ def run(options: argparse.Namespace) -> int:
             raise ConfigurationError(
                 "is no folder", source=str(folder), fix="Give folders of slice records."
             )
-    for name, least, most in (
-        ("workers", 1, 10_000),
-        ("refinement", 0.2, 4.0),
-        ("replicates", 1, 100_000),
-    ):
-        value = getattr(options, name)
-        if not least <= value <= most:
-            raise ConfigurationError(
-                f"is {value:g}", field=f"--{name}", fix=f"Give {least:g} to {most:g}."
-            )
+    ranges = {"refinement": (0.2, 4.0), "replicates": (1, 100_000)}
+    check_numbers(options, workers=WORKERS, seed=SEEDS, **ranges)
     cluster = cluster_of(options, on_cluster)
     food = load_calibrated_food(options.model)
     extra = [load_cause(file) for file in options.cause]

@@ -5,11 +5,17 @@ With Graphviz installed (its program `dot`) the picture is written in the format
 """
 
 import argparse
+import math
 import shutil
 import subprocess
 from pathlib import Path
 
-from sliceit_drake.cli.arguments import add_scenario_arguments, scenario_of
+from sliceit_drake.cli.arguments import (
+    add_scenario_arguments,
+    check_numbers,
+    output_path,
+    scenario_of,
+)
 from sliceit_drake.configuration import ConfigurationError
 
 __all__ = ["add_arguments", "run"]
@@ -19,7 +25,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the command's arguments."""
     add_scenario_arguments(parser)
     parser.add_argument(
-        "--output", metavar="FILE", type=Path, default=Path("diagram.svg"), help="picture to write"
+        "--output",
+        metavar="FILE",
+        type=output_path,
+        default=Path("diagram.svg"),
+        help="picture to write",
     )
     parser.add_argument(
         "--depth", type=int, default=2, help="levels of nested diagrams (default 2)"
@@ -53,6 +63,7 @@ def run(options: argparse.Namespace) -> int:
             field="--output",
             fix="Install Graphviz (Debian: apt install graphviz), or give a .dot file.",
         )
+    check_numbers(options, depth=(0, math.inf))
     text = ScenarioDiagram(scenario_of(options)).GetGraphvizString(options.depth)
     options.output.parent.mkdir(parents=True, exist_ok=True)
     if kind == "dot" or dot is None:

@@ -11,10 +11,12 @@ Writes a line for each slice to --output, a .jsonl file, and goes on where it is
 """
 
 import argparse
-from pathlib import Path
+import math
 
+from sliceit_drake.cli.arguments import SEEDS, WORKERS, check_numbers, output_path
 from sliceit_drake.cli.extras import needs_extra
 from sliceit_drake.cli.progress import StageBars
+from sliceit_drake.resources import here_or_shipped
 
 __all__ = ["add_arguments", "run"]
 
@@ -25,7 +27,11 @@ FOODS = ("cucumber", "tomato", "potato", "carrot")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the command's arguments."""
     parser.add_argument(
-        "policies", nargs="+", metavar="POLICY", type=Path, help="folder of a training"
+        "policies",
+        nargs="+",
+        metavar="POLICY",
+        type=here_or_shipped,
+        help="folder of a training",
     )
     parser.add_argument(
         "--world", nargs="+", choices=WORLDS, default=list(WORLDS), help="default: both"
@@ -45,13 +51,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="of the slices; 0")
     parser.add_argument("--workers", metavar="N", type=int, default=2, help="processes; 2")
     parser.add_argument(
-        "--output", metavar="FILE", type=Path, required=True, help=".jsonl file of slices"
+        "--output", metavar="FILE", type=output_path, required=True, help=".jsonl file of slices"
     )
     parser.set_defaults(resumes=True)
 
 
 def run(options: argparse.Namespace) -> int:
     """Runs the command."""
+    check_numbers(options, slices=(1, math.inf), seed=SEEDS, workers=WORKERS)
+    check_numbers(options, board_stiffness=(1e2, 1e8))
     with needs_extra("learn"):
         from sliceit_drake.learning.unseen_worlds import cases_of, evaluate, results_table
 

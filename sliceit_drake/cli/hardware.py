@@ -20,7 +20,6 @@ Writes to DIR what `sliceit simulate` writes, and
 """
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sliceit_drake.cli.arguments import (
@@ -28,6 +27,7 @@ from sliceit_drake.cli.arguments import (
     add_overrides,
     add_scenario_arguments,
     find_file,
+    output_of,
     scenario_of,
 )
 from sliceit_drake.configuration import ConfigurationError
@@ -88,12 +88,12 @@ def add_robot_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     scenario = scenario_of(options)
+    directory = output_of(options, scenario.name, "_robot")
     robot = robot_of(options)
 
     from sliceit_drake.diagrams.outputs.slice_record_of_run import slice_record_of
     from sliceit_drake.records.slice_record import write_record
 
-    directory = options.output or Path("output") / f"{scenario.name}_robot"
     made = robot.run(
         scenario,
         directory,

@@ -1,6 +1,7 @@
 """Entry point of `sliceit`: parses the command line and turns bad input into a message."""
 
 import argparse
+import contextlib
 import difflib
 import errno
 import importlib
@@ -10,11 +11,12 @@ import re
 import signal
 import sys
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 from sliceit_drake.interruption import handle_signals
+from sliceit_drake.resources import shipped_names
 
 __all__ = ["main", "make_parser", "run_program"]
 
@@ -45,6 +47,7 @@ COMMANDS = {
 """What each command does, by group. A command is a module of this package with `add_arguments` and
 `run`, which returns the exit status; its docstring is the text of `--help`."""
 
+PROGRAM = "sliceit"
 BAD_INPUT = 2
 INTERRUPTED = 130
 WIDTH = 88
@@ -83,9 +86,41 @@ class _Parser(argparse.ArgumentParser):
             given, names = unknown[1].split("=")[0], self._known_options
         else:
             given, names = "", []
-        if close := difflib.get_close_matches(given, names, n=1):
+        if self.prog == PROGRAM and (
+            given in shipped_names("scenarios") or given.endswith((".yaml", ".yml"))
+        ):
+            message = f'{message}. Did you mean "{PROGRAM} simulate {given}"?'
+        elif close := difflib.get_close_matches(given, names, n=1):
             message = f'{message}. Did you mean "{close[0]}"?'
         super().error(message)
+
+
+class _Output:
+    """Standard output that outlives its reader: results are written though `head` has left."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Writes text, to nowhere once nobody reads."""
+        with self._for_nobody():
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Passes on what was written."""
+        with self._for_nobody():
+            self._stream.flush()
+
+    @contextlib.contextmanager
+    def _for_nobody(self) -> Iterator[None]:
+        try:
+            yield
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
 
 
 class _Versions(argparse.Action):
@@ -100,7 +135,7 @@ class _Versions(argparse.Action):
 def make_parser() -> argparse.ArgumentParser:
     """The parser of the whole program."""
     parser = _Parser(
-        prog="sliceit",
+        prog=PROGRAM,
         usage="sliceit [-h] [--version] [--verbose] COMMAND ...",
         description="Simulate a robot that slices food, in Drake.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -110,7 +145,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--verbose", action="store_true", help="let Warp say what it compiles")
     commands = parser.add_subparsers(
-        prog="sliceit", metavar="COMMAND", required=True, help=argparse.SUPPRESS
+        prog=PROGRAM, metavar="COMMAND", required=True, help=argparse.SUPPRESS
     )
     lines = []
     for title, group in COMMANDS.items():
@@ -146,7 +181,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return run_program(make_parser(), arguments)
     except KeyboardInterrupt:
-        return _interrupted("sliceit")
+        return _interrupted(PROGRAM)
 
 
 def run_program(parser: argparse.ArgumentParser, arguments: Sequence[str] | None = None) -> int:
@@ -166,8 +201,16 @@ def run_program(parser: argparse.ArgumentParser, arguments: Sequence[str] | None
         for number in (signal.SIGTERM, signal.SIGHUP)
         if signal.getsignal(number) is signal.SIG_DFL
     ]
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")
+    # With a robot a reader that leaves ends the motion.
+    survives = sys.stdout is not None and not getattr(options, "host", None)
+    output: Any = _Output(sys.stdout) if survives else sys.stdout
     try:
-        with handle_signals(ending, signal.default_int_handler):
+        with (
+            contextlib.redirect_stdout(output),
+            handle_signals(ending, signal.default_int_handler),
+        ):
             from sliceit_drake.cutting.warp_start import VERBOSE
             from sliceit_drake.output_folder import check_output
 
@@ -176,7 +219,10 @@ def run_program(parser: argparse.ArgumentParser, arguments: Sequence[str] | None
             if isinstance(getattr(options, "output", None), Path):
                 is_folder = getattr(options, "output_is_folder", False)
                 check_output(options.output, is_folder=is_folder)
-            return options.run(options)
+            status = options.run(options)
+            if output is not None:
+                output.flush()
+            return status
     except KeyboardInterrupt:
         return _interrupted(parser.prog, options)
     except Exception as error:

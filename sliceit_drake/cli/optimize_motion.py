@@ -11,8 +11,14 @@ Writes to --output:
 """
 
 import argparse
+import math
 
-from sliceit_drake.cli.arguments import add_output_folder, add_scenario_arguments, scenario_of
+from sliceit_drake.cli.arguments import (
+    add_output_folder,
+    add_scenario_arguments,
+    check_numbers,
+    scenario_of,
+)
 from sliceit_drake.cli.progress import StageBars
 
 __all__ = ["add_arguments", "run"]
@@ -46,6 +52,7 @@ def run(options: argparse.Namespace) -> int:
     from sliceit_drake.cutting.motion_optimization import MotionLimits
     from sliceit_drake.diagrams.optimized_scenario import optimize_scenario
 
+    check_numbers(options, iterations=(1, math.inf))
     limits = MotionLimits(
         duration=options.duration,
         draw_speed=options.draw_speed,

@@ -29,24 +29,29 @@ The workers of a cluster need no shared disk, but a FILE.py of yours at its plac
 
 import argparse
 import functools
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sliceit_drake.cli.arguments import (
+    SEEDS,
+    WORKERS,
     add_cluster_arguments,
     add_output_folder,
     add_protocol_argument,
+    check_numbers,
     cluster_of,
+    output_of,
     protocol_file,
 )
 from sliceit_drake.cli.progress import StageBars
-from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.output_folder import check_output
+from sliceit_drake.resources import shipped_names
 
 if TYPE_CHECKING:
     from sliceit_drake.stand_in.protocol import Protocol
 
 __all__ = ["add_arguments", "run"]
+
+PROTOCOLS = "calibration/protocols"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -83,8 +88,9 @@ def run(options: argparse.Namespace) -> int:
 
         print(effects_as_markdown())
         return 0
+    check_numbers(options, seed=SEEDS, workers=WORKERS, replicates=(1, 1000))
     protocol = _protocol(options)
-    options.output = directory = options.output or Path("output") / protocol.name
+    options.output = directory = output_of(options, protocol.name)
     check_output(directory)
     options.resumes = options.seed is not None
 
@@ -92,9 +98,8 @@ def run(options: argparse.Namespace) -> int:
     from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
     from sliceit_drake.stand_in.session import record_session
 
-    settings = FiniteElementSettings()
-    settings.refinement = options.refinement or settings.refinement
-    settings.time_step = options.time_step or settings.time_step
+    given = {name: getattr(options, name) for name in ("refinement", "time_step")}
+    settings = FiniteElementSettings(**{k: v for k, v in given.items() if v is not None})
     validate(settings, "settings")
     with cluster_of(options) as client, StageBars(unit="slice") as bars:
         files = record_session(
@@ -113,20 +118,15 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _protocol(options: argparse.Namespace) -> "Protocol":
-    import yaml
-
     from sliceit_drake.cutting.foods.effects import Effects
     from sliceit_drake.cutting.foods.food import Food
     from sliceit_drake.diagrams.scenario import load_scenario
+    from sliceit_drake.diagrams.scenario_file import scenario_file, top_fields
     from sliceit_drake.stand_in.protocol import load_protocol, protocol_of_scenario
 
-    file = protocol_file(options)
-    try:
-        root = yaml.compose(file.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        raise ConfigurationError(f"is no YAML ({error})", source=str(file)) from error
-    pairs = root.value if isinstance(root, yaml.MappingNode) else []
-    if any(key.value == "conditions" for key, _ in pairs):
+    is_shipped = options.protocol in shipped_names(PROTOCOLS)
+    file = protocol_file(options) if is_shipped else scenario_file(options.protocol)
+    if "conditions" in top_fields(file):
         return load_protocol(str(file))
     scenario = load_scenario(file)
     if isinstance(scenario.food, Food) and scenario.food.effects != Effects():

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sliceit_drake.cli.arguments import add_output_folder
 from sliceit_drake.cli.extras import needs_extra
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.resources import here_or_shipped
@@ -78,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "format", choices=("ur_rtde", "force", "profile", "rosbag"), help="what FILE is"
     )
     make.add_argument("file", metavar="FILE", type=Path, help="what to read")
-    make.add_argument("--output", metavar="DIR", type=Path, required=True, help="folder of records")
+    add_output_folder(make, "folder of records", required=True)
     make.add_argument("--metadata", metavar="YAML", type=Path, help="what FILE does not say")
     make.add_argument("--name", help="name of the record; default: that in YAML, or FILE's")
     pose = ("X", "Y", "Z", "ROLL", "PITCH", "YAW")

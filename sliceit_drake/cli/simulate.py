@@ -21,11 +21,17 @@ coordinate frames W world, B robot base, S sensor, K knife, F food.
 """
 
 import argparse
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sliceit_drake.cli.arguments import add_output_folder, add_scenario_arguments, scenario_of
+from sliceit_drake.cli.arguments import (
+    add_output_folder,
+    add_scenario_arguments,
+    output_of,
+    scenario_of,
+)
 from sliceit_drake.cli.progress import SIMULATED_TIME, StageBars
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.output_folder import check_output, results_in
@@ -72,8 +78,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Runs the command."""
+    if options.duration is not None and not 0.0 < options.duration < math.inf:
+        raise ConfigurationError(
+            f"{options.duration} s is not a duration", field="--duration", fix="Give seconds > 0."
+        )
     scenario = scenario_of(options)
-    directory = options.output or Path("output") / scenario.name
+    directory = output_of(options, scenario.name)
     check_output(directory, is_folder=True)
     if results_in(directory):
         print(f"{directory}/ has the results of an earlier run, which this one replaces")
@@ -88,10 +98,6 @@ def run(options: argparse.Namespace) -> int:
     from sliceit_drake.diagrams.outputs.paraview import FoodFrames, write_series
     from sliceit_drake.diagrams.run import prepare_run
 
-    if options.duration is not None and not options.duration > 0.0:
-        raise ConfigurationError(
-            f"{options.duration} s is not a duration", field="--duration", fix="Give seconds > 0."
-        )
     meshcat = None if options.no_replay and not options.meshcat else make_meshcat()
     print("Preparing (the first run on a machine compiles the kernels, about 8 s)", flush=True)
     prepared = prepare_run(scenario, meshcat, animation=not options.no_animation)

@@ -7,7 +7,7 @@ import yaml
 from sliceit_drake.configuration import ConfigurationError, closest
 from sliceit_drake.resources import file_or_resource, here_or_shipped, named_yaml, shipped_names
 
-__all__ = ["other_kind", "scenario_file"]
+__all__ = ["other_kind", "scenario_file", "top_fields"]
 
 MESHES = (".inp", ".mesh", ".msh", ".obj", ".ply", ".stl", ".vtk", ".vtu")
 OTHERS = (".csv", ".gif", ".html", ".jpg", ".json", ".md", ".npz", ".onnx", ".pdf", ".png", ".py")
@@ -86,15 +86,23 @@ def other_kind(file: Path, known: set[str]) -> tuple[str, str] | None:
         file: Whose fields are not those of a scenario.
         known: Names of all fields that a scenario has at any depth.
     """
-    root = yaml.compose(file.read_text(encoding="utf-8"))
-    pairs = root.value if isinstance(root, yaml.MappingNode) else []
-    fields = {key.value for key, _ in pairs}
+    fields = top_fields(file)
     for own, problem, fix in KINDS:
         if own & fields:
             return problem, fix.format(file)
     if len(fields) > 1 and not fields & known:
         return "has none of a scenario's fields", f"Give a scenario, such as {EXAMPLE}."
     return None
+
+
+def top_fields(file: Path) -> set[str]:
+    """Names of the fields at the top of a YAML file; none where it cannot be read."""
+    try:
+        root = yaml.compose(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        return set()
+    pairs = root.value if isinstance(root, yaml.MappingNode) else []
+    return {str(key.value) for key, _ in pairs}
 
 
 def _no_scenario(problem: str, place: Path, folder: Path) -> ConfigurationError:

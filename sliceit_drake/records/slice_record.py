@@ -196,7 +196,13 @@ def read_table(file: str | Path) -> SliceTable:
             cell holds text.
     """
     table, facts = _files(file)
-    if table.is_file() and not facts.is_file():
+    if not table.is_file() and not facts.is_file():
+        raise ConfigurationError(
+            "there is no such record",
+            source=str(table),
+            fix="Check the path.",
+        )
+    if not facts.is_file():
         raise ConfigurationError(
             f"has no {facts.name} beside it, which says what was cut and how",
             source=str(table),
