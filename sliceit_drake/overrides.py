@@ -29,9 +29,11 @@ __all__ = [
 ]
 
 Overrides: TypeAlias = str | Sequence[str] | Mapping[str, Any] | None
-"""YAML text such as `{food: {material: {toughness: 400}}}`, text of paths such as
-`food.material.toughness=400, motion.segments.0.speed=0.05`, several such texts, or a dictionary,
-whose keys may be paths."""
+"""What replaces fields, as YAML text, text of paths, several such texts, or a dictionary.
+
+YAML is `{food: {material: {toughness: 400}}}`; a path is `food.material.toughness=400`, with a
+comma before the next. Keys of a dictionary may be paths.
+"""
 _PATH = r"\s*[A-Za-z_]\w*(?:\.\w+)*\s*="
 
 
