@@ -91,12 +91,13 @@ class SliceAdjoint:
         self.exchange_period = exchange_period
         self._w = Workspace([model], exchange_period, gradients=True)
         self._backward: Any = None
-        ws, B = self._w, len(model.blocks)
+        ws = self._w
+        by_element = ws.parameters.stiff_volume.shape
         self._forward = Workspace([model], exchange_period)
-        self._strain = wp.zeros((1, B, 6), dtype=ws.kernels.Vectors, device=ws.device)
-        self._factors = wp.zeros((1, B, 4), dtype=ws.kernels.lanes, device=ws.device)
+        self._strain = wp.zeros((*by_element, 6), dtype=ws.kernels.Vectors, device=ws.device)
+        self._factors = wp.zeros((*by_element, 4), dtype=ws.kernels.lanes, device=ws.device)
         self._adj_mu, self._adj_lam = (
-            wp.zeros((1, B), dtype=ws.real, device=ws.device) for _ in range(2)
+            wp.zeros(by_element, dtype=ws.real, device=ws.device) for _ in range(2)
         )
 
     def run(
@@ -248,12 +249,11 @@ class SliceAdjoint:
         ws.launch_part("step_points", k, adjoint=True)
         strain, factors, direction = self._strain, self._factors, forces.from_elements.grad
         adjoints = [ws.parameters.stiff_volume.grad, self._adj_mu, self._adj_lam]
-        for kernel, arguments in (
-            (kern.strains, [ws.slots[k].ahead, direction, ws.mesh, strain]),
-            (kern.stresses, [ws.parameters, strain, factors, *adjoints]),
-            (kern.elements_adjoint, [ws.mesh, strain, factors, forces.elements]),
-        ):
-            ws.launch(kernel, ws.parameters.stiff_volume.shape, arguments)
+        by_element = ws.parameters.stiff_volume.shape
+        ws.launch(kern.strains, by_element, [ws.slots[k].ahead, direction, ws.mesh, strain])
+        ws.launch(kern.stresses, by_element, [ws.parameters, strain, factors, *adjoints])
+        changes = [ws.mesh, strain, factors, forces.elements]
+        ws.launch(kern.elements_adjoint, by_element[:2], changes)
         ws.launch_part("gather_adjoint", k)
 
 

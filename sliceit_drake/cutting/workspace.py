@@ -12,7 +12,7 @@ from scipy.sparse import coo_array
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.kernels import layouts
 from sliceit_drake.cutting.kernels.precision import kernels
-from sliceit_drake.cutting.kernels.types import GATHER, LANES, PARAMETERS
+from sliceit_drake.cutting.kernels.types import CORNERS, GATHER, LANES, PARAMETERS, STRIP
 from sliceit_drake.cutting.model import CuttingModel, TimeStepError
 from sliceit_drake.cutting.warp_start import start_warp
 
@@ -154,7 +154,7 @@ class Workspace:
             moving=m.moving,
             board_area=m.board_area,
             board=m.board,
-            **_element_gather(m.blocks, m.element_count, N),
+            **_element_gather(m),
             **_point_gather(m.point_nodes, m.point_weights, N),
         )
         self._set(
@@ -192,12 +192,12 @@ class Workspace:
             self._allocate(slot, ahead=(N,))
 
         # Padded with a row of zeros, which fills up the nodes' lists of entries.
-        size = B * 12 * LANES
+        size = B * CORNERS * 3 * LANES
         self.force = wp.zeros((C, size + 3 * LANES), dtype=self.real, device=self.device)
         forces, kinds = k.Forces(), k.Forces.vars
-        forces.elements = self._view(self.force, 0, kinds["elements"].type, (B, 4))
+        forces.elements = self._view(self.force, 0, kinds["elements"].type, (B, CORNERS))
         forces.rows = self._view(self.force, 0, kinds["rows"].type, (size + 1,), step=1)
-        self._allocate(forces, points=(P, 2), lateral=(P,))
+        self._allocate(forces, corners=(B, CORNERS), points=(P, 2), lateral=(P,))
         # The same as one list, two entries a point.
         forces.listed = forces.points.reshape((C, 2 * P))
         # With gradients, what the nodes got in each sub-step is kept.
@@ -224,7 +224,8 @@ class Workspace:
         names = self._result_type.names or ()
         shapes = {name: layouts.field_shape(self._result_type, name) for name in names}
         self._result_rows, _ = self._rows(self._results, shapes, wp.float64)
-        self._allocate(self._energies, elastic=(B, LANES), volume_ratio=(B, LANES), points=(P,))
+        by_element = (B, STRIP, LANES)
+        self._allocate(self._energies, elastic=by_element, volume_ratio=by_element, points=(P,))
 
     def set_models(self, models: Sequence[CuttingModel]) -> None:
         """Takes the parameters of other cuts of the same mesh, one for each row."""
@@ -311,7 +312,7 @@ class Workspace:
         dt = self.dt if dt is None else dt
         states = [now, after, forces, sums]
         entries, inputs = {
-            "elements": (m.blocks, [now, mesh, parameters, forces.elements]),
+            "elements": (m.blocks, [now, mesh, parameters, forces]),
             "step_points": (m.point_nodes, [k, dt, self.points, parameters, self.motion, *states]),
             "move_nodes": (m.moving, [dt, mesh, parameters, now, forces, sums]),
             "gather": (m.moving, [mesh, forces]),
@@ -382,7 +383,7 @@ class Workspace:
             self._energy_graph = self.captured(self._launch_energies)
         wp.capture_launch(self._energy_graph)
         elastic = self.read(self._energies.elastic)[0].sum(dtype=np.float64)
-        ratio = self.read(self._energies.volume_ratio)[0].ravel()[: self.model.element_count].copy()
+        ratio = self.read(self._energies.volume_ratio)[0].ravel()[self.model.element_place]
         interface = self.read(self._energies.points)[0].sum(dtype=np.float64)
         return float(elastic), ratio, float(interface)
 
@@ -417,8 +418,8 @@ def parameter_row(model: CuttingModel) -> np.ndarray:
 def _parameter_arrays(model: CuttingModel) -> dict[str, np.ndarray]:
     inverse_mass = np.zeros(len(model.nodes))
     inverse_mass[model.moving] = 1.0 / model.mass[model.moving]
-    volume = model.in_blocks(model.element_volume)
-    real = np.arange(volume.size).reshape(volume.shape) < model.element_count
+    volume = np.zeros((len(model.blocks), STRIP, LANES))
+    volume.ravel()[model.element_place] = model.element_volume
     scales = model.point_scales
     return {
         "P": np.array([model.parameters[name] for name in PARAMETERS]),
@@ -432,7 +433,7 @@ def _parameter_arrays(model: CuttingModel) -> dict[str, np.ndarray]:
         "weight": model.weight,
         "relaxing": model.relaxing,
         "keep": model.keep,
-        "stiff_volume": np.where(real, volume, 0.0),
+        "stiff_volume": volume,
     }
 
 
@@ -460,27 +461,28 @@ def _shapes(arrays: dict[str, np.ndarray]) -> dict[str, tuple[int, ...]]:
     return {name: array.shape for name, array in arrays.items()}
 
 
-def _element_gather(blocks: np.ndarray, count: int, node_count: int) -> dict[str, np.ndarray]:
+def _element_gather(model: CuttingModel) -> dict[str, np.ndarray]:
     """Places of each node's entries in the element forces, in rows of `GATHER`.
 
     Returns:
         First row of each node and the end [N + 1], and the rows [M, GATHER]; what is left of a row
         points behind the forces.
     """
-    B = len(blocks)
-    entry = (
-        np.arange(B)[:, None, None] * 12 * LANES
-        + np.arange(4)[None, :, None] * 3 * LANES
-        + np.arange(LANES)[None, None, :]
-    )
-    real = (np.arange(B)[:, None, None] * LANES + np.arange(LANES)[None, None, :]) < count
-    real = np.broadcast_to(real, blocks.shape)
-    node, entry = blocks[real], entry[real]
+    blocks = model.blocks
+    row = np.arange(blocks.size // LANES).reshape(*blocks.shape[:2], 1)
+    entry = 3 * LANES * row + np.arange(LANES)
+    # What fills up strips and blocks has no force.
+    used = np.zeros((len(blocks), STRIP, LANES), bool)
+    used.ravel()[model.element_place] = True
+    at = np.zeros(blocks.shape, bool)
+    for k in range(STRIP):
+        at[:, k : k + 4] |= used[:, k : k + 1]
+    node, entry = blocks[at], entry[at]
     order = np.argsort(node, kind="stable")
-    number = np.bincount(node, minlength=node_count)
+    number = np.bincount(node, minlength=len(model.nodes))
     start = np.concatenate([[0], np.cumsum(-(-number // GATHER))])
     rank = np.arange(len(node)) - np.repeat(np.cumsum(number) - number, number)
-    rows = np.full(start[-1] * GATHER, B * 12 * LANES)
+    rows = np.full(start[-1] * GATHER, blocks.size * 3)
     rows[start[node[order]] * GATHER + rank] = entry[order]
     return {"element_start": start, "element_entry": rows.reshape(-1, GATHER)}
 

@@ -7,10 +7,16 @@ from typing import Any
 
 import warp as wp
 
-__all__ = ["GATHER", "LANES", "PARAMETERS", "Scalar", "kernel_types"]
+__all__ = ["CORNERS", "GATHER", "LANES", "PARAMETERS", "STRIP", "Scalar", "kernel_types"]
 
 LANES = 8
-"""Elements that a thread handles."""
+"""Strips of elements that a thread handles side by side."""
+
+STRIP = 3
+"""Elements of a strip; see `tetrahedron_strips`."""
+
+CORNERS = STRIP + 3
+"""Nodes of a strip; those of its k-th element begin at the k-th."""
 
 GATHER = 4
 """Element forces that a node adds at a time."""
@@ -69,7 +75,7 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
 
     @wp.struct
     class Mesh:
-        """Elements in blocks of `LANES`, and what acts on each node; see `Workspace`."""
+        """Elements in blocks of `LANES` strips, and what acts on each node; see `Workspace`."""
 
         nodes: wp.array2d(dtype=indices)
         shape: wp.array2d(dtype=lanes)
@@ -112,7 +118,7 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         weight: wp.array2d(dtype=vec3)
         relaxing: wp.array2d(dtype=real)
         keep: wp.array2d(dtype=real)
-        stiff_volume: wp.array2d(dtype=lanes)
+        stiff_volume: wp.array3d(dtype=lanes)
 
     @wp.struct
     class Motion:
@@ -154,11 +160,12 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
 
     @wp.struct
     class Forces:
-        """Forces in a sub-step: of the elements on their corners, also as the rows in which a node
-        finds its entries; on both faces at the cut points, also as one list; of the flanks along
-        Ky, by point and summed. With gradients, what each node got from elements, from the bulk
-        (elements after relaxation) and from points."""
+        """Forces in a sub-step: of the elements on the corners of their strips, also as the rows in
+        which a node finds its entries, and where those corners are; on both faces at the cut
+        points, also as one list; of the flanks along Ky, by point and summed. With gradients, what
+        each node got from elements, from the bulk (elements after relaxation) and from points."""
 
+        corners: wp.array3d(dtype=Vectors)
         elements: wp.array3d(dtype=Vectors)
         rows: wp.array2d(dtype=strided)
         points: wp.array3d(dtype=vec3)
@@ -194,8 +201,8 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
     class Energies:
         """Elastic energy and volume ratio of the elements, recoverable energy of the points."""
 
-        elastic: wp.array3d(dtype=real)
-        volume_ratio: wp.array3d(dtype=real)
+        elastic: wp.array4d(dtype=real)
+        volume_ratio: wp.array4d(dtype=real)
         points: wp.array2d(dtype=real)
 
     @wp.func

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.kernels.types import LANES
+from sliceit_drake.cutting.kernels.types import LANES, STRIP
 from sliceit_drake.cutting.mesh.cut_surface import (
     EdgeTables,
     depth_below,
@@ -15,6 +15,7 @@ from sliceit_drake.cutting.mesh.cut_surface import (
     edge_tables,
 )
 from sliceit_drake.cutting.mesh.split import CutPlane, SplitMesh, split_mesh
+from sliceit_drake.cutting.mesh.strips import tetrahedron_strips
 from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh, boundary_faces
 
 __all__ = ["CutGeometry", "make_cut_geometry"]
@@ -114,20 +115,32 @@ class CutGeometry:
         return float(x.min()), float(x.max())
 
     @functools.cached_property
+    def _strips(self) -> tuple[np.ndarray, np.ndarray]:
+        return tetrahedron_strips(self.tetrahedra)
+
+    @functools.cached_property
     def blocks(self) -> np.ndarray:
-        """Nodes of the elements, eight an entry [B, 4, LANES]; filled up with the last element."""
-        return self.in_blocks(self.tetrahedra).transpose(0, 2, 1)
+        """Nodes of the strips of elements, eight strips an entry [B, CORNERS, LANES].
+
+        Filled up with the last strip.
+        """
+        strips, _ = self._strips
+        fill = np.minimum(np.arange(-(-len(strips) // LANES) * LANES), len(strips) - 1)
+        return strips[fill].reshape(-1, LANES, strips.shape[1]).transpose(0, 2, 1)
+
+    @functools.cached_property
+    def element_place(self) -> np.ndarray:
+        """Where each element stands in arrays [B, STRIP, LANES], counted along all of them [T]."""
+        strip, k = np.divmod(self._strips[1], STRIP)
+        return np.asarray((strip // LANES * STRIP + k) * LANES + strip % LANES)
 
     @functools.cached_property
     def shape(self) -> np.ndarray:
-        """Inverse rest edges by block, row major [B, 9, LANES]."""
-        return self.in_blocks(self.inverse.reshape(-1, 9)).transpose(0, 2, 1)
-
-    def in_blocks(self, values: np.ndarray) -> np.ndarray:
-        """Values of the elements [T, ...] as [B, LANES, ...]."""
-        count = self.element_count
-        fill = np.minimum(np.arange(-(-count // LANES) * LANES), count - 1)
-        return values[fill].reshape(-1, LANES, *values.shape[1:])
+        """Inverse rest edges of each block's elements, row major [B, 9 STRIP, LANES]."""
+        corners = np.stack([self.blocks[:, k : k + 4] for k in range(STRIP)], axis=1)
+        x = self.nodes[corners.transpose(0, 3, 1, 2)]
+        inverse = np.linalg.inv((x[..., 1:, :] - x[..., :1, :]).swapaxes(-1, -2))
+        return inverse.reshape(*inverse.shape[:2], -1).transpose(0, 2, 1)
 
     def to_cut_frame(self, p_F: np.ndarray) -> np.ndarray:
         """Points [..., 3] from F to C."""
