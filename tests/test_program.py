@@ -175,6 +175,12 @@ def test_a_robot_stops_when_nobody_reads_what_it_says():
         run_program(parser, [])
 
 
+def test_a_fault_at_no_time_is_refused(capsys):
+    given = ["emulate", "--arm-alone", "--address", "127.0.0.78", "--inject", "silence@soon"]
+    assert main(given) == 2
+    assert "--inject: 'soon' is no time. Write silence@2.5" in capsys.readouterr().err
+
+
 def test_a_scenario_in_the_place_of_a_command_is_recognised(capsys):
     for given in ("cucumber", "mine.yaml"):
         with pytest.raises(SystemExit, match="2"):

@@ -81,7 +81,11 @@ def run(options: argparse.Namespace) -> int:
     try:
         for text in options.inject:
             fault, _, at = text.partition("@")
-            emulator.faults.inject(fault, float(at) if at else None)
+            try:
+                time = float(at) if at else None
+            except ValueError:
+                raise ValueError(f"{at!r} is no time. Write {fault}@2.5.") from None
+            emulator.faults.inject(fault, time)
     except ValueError as error:
         emulator.close()
         raise ConfigurationError(str(error), field="--inject") from None
