@@ -240,6 +240,7 @@ def test_other_commands_say_what_is_meant_too(tmp_path, capsys):
         (["simulat"], 'Did you mean "simulate"?'),
         (["simulate", "--ouput", "x"], 'Did you mean "--output"?'),
         (["simulate", "--paraview", "vtk"], 'Did you mean "vtu"?'),
+        (["simulate", "--set", "start.clearance", "=", "0.01"], "Write FIELD=VALUE without spaces"),
     ):
         with pytest.raises(SystemExit, match="2"):
             main(given)

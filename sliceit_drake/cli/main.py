@@ -193,8 +193,10 @@ def run_program(parser: argparse.ArgumentParser, arguments: Sequence[str] | None
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     options, unknown = parser.parse_known_args(arguments)
     if unknown:
+        hint = ". Write FIELD=VALUE without spaces" if "=" in vars(options).values() else ""
         # The command's own parser shows its usage.
-        getattr(options, "parser", parser).error(f"unrecognized arguments: {' '.join(unknown)}")
+        command = getattr(options, "parser", parser)
+        command.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
     # `nohup` has one ignored, for a reason.
     ending = [
         number
