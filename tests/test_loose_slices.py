@@ -373,6 +373,26 @@ def test_an_animation_is_written_with_the_force_below_it(run, tmp_path):
     assert ends[-1] > 1.5 * ends[0]
 
 
+def test_ctrl_c_while_the_animation_is_drawn_leaves_the_figure_with_its_picture(
+    run, tmp_path, monkeypatch
+):
+    if not animation.can_draw():
+        pytest.skip(animation.NEEDED)
+    from PIL import Image
+
+    def interrupt(drawn, of):
+        assert (drawn, of) == (1, len(run.film.frames))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run.station, "estimate_error", None)
+    with pytest.raises(KeyboardInterrupt):
+        run.save(tmp_path, replay=False, drawing=interrupt)
+    assert not (tmp_path / "slice.gif").exists()
+    run.plot().savefig(tmp_path / "whole.png", dpi=150)
+    left, whole = (np.asarray(Image.open(tmp_path / f"{n}.png")) for n in ("force", "whole"))
+    np.testing.assert_array_equal(left, whole)
+
+
 def test_without_a_library_that_draws_all_else_is_written_and_the_packages_are_named(
     run, tmp_path, monkeypatch
 ):

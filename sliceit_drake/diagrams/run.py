@@ -2,11 +2,9 @@
 
 import dataclasses as dc
 import gc
-import importlib.metadata
 import json
-import platform
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +14,6 @@ from pydrake.systems.analysis import Simulator, SimulatorStatus
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml, validate
 from sliceit_drake.cutting.foods.food import Food
-from sliceit_drake.cutting.mesh.tetrahedra import MeshError
 from sliceit_drake.cutting.motion import Motion, MotionPlan
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.live_view import LiveControls, make_meshcat
@@ -28,14 +25,19 @@ from sliceit_drake.diagrams.outputs.animation import (
     can_draw,
     write_gif,
 )
-from sliceit_drake.diagrams.outputs.figures import CONTACT_THRESHOLD, plot_force
+from sliceit_drake.diagrams.outputs.figures import plot_force
 from sliceit_drake.diagrams.outputs.measurement_comparison import (
     Comparison,
     can_compare,
     compare_with_measurement,
 )
 from sliceit_drake.diagrams.outputs.run_log import Record
-from sliceit_drake.diagrams.outputs.sequence_report import plot_sequence, slice_reports
+from sliceit_drake.diagrams.outputs.run_summary import (
+    add_discretization_error,
+    run_summary,
+    slice_areas,
+)
+from sliceit_drake.diagrams.outputs.sequence_report import plot_sequence
 from sliceit_drake.diagrams.prepared_food import OwnCutting
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.scenario_diagram import OwnPolicy, ScenarioDiagram
@@ -47,7 +49,6 @@ from sliceit_drake.overrides import Overrides
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.resources import file_or_resource
 from sliceit_drake.systems.agent import AgentConfig
-from sliceit_drake.systems.contact_monitor import UNSTABLE_GAINS
 from sliceit_drake.systems.policy import PolicyConfig, PressByForce
 
 if TYPE_CHECKING:
@@ -56,10 +57,6 @@ if TYPE_CHECKING:
 __all__ = ["Run", "measured_profile", "prepare_run", "simulate"]
 
 CHUNK = 0.02
-CUT_THROUGH = 0.99
-"""Share of a section from which it counts as cut."""
-BOARD_REACHED = 5e-4
-"""Height of the edge over the board below which a longer way down would not help, m."""
 
 
 @dc.dataclass
@@ -159,7 +156,7 @@ class Run:
     def plot(self) -> "Figure":
         """Knife and food, and the force over time and depth; of a sequence slice by slice."""
         record = self.record()
-        return _figure(self, record, _comparison(self, record), self._picture())
+        return _figure(self, record, _comparison(self, record), next(self._pictures(), None))
 
     def summary(self) -> dict:
         """Forces, work, times, margins and versions, as summary.json has them.
@@ -167,8 +164,8 @@ class Run:
         It simulates the cut again on other meshes, for the discretisation error.
         """
         record = self.record()
-        summary = _summary(self, record, _comparison(self, record))
-        _add_discretization_error(self, summary)
+        summary = run_summary(self, record, _comparison(self, record))
+        add_discretization_error(self, summary)
         return summary
 
     def save(
@@ -201,7 +198,7 @@ class Run:
         record.write_csv(folder / "record.csv")
         dump_yaml(_written(self.scenario), folder / "scenario.yaml")
         comparison = _comparison(self, record)
-        summary = _summary(self, record, comparison) | (extra or {})
+        summary = run_summary(self, record, comparison) | (extra or {})
         picture = None
         try:
             if replay and self.meshcat is not None:
@@ -211,12 +208,19 @@ class Run:
                 self.meshcat.PublishRecording()
                 text = self.meshcat.StaticHtml()
                 (folder / "replay.html").write_text(text, encoding="utf-8")
-            _add_discretization_error(self, summary)
-            picture = self._picture()
-            if self.animation and self.film is not None and can_draw():
-                pictures = self.film.draw(self.film.frames, drawing)
-                add_force(pictures, self.film.times, record)
-                write_gif(folder / "slice.gif", pictures, self.film.period)
+            add_discretization_error(self, summary)
+            film = self.film
+            frames = film.frames if film is not None and self.animation else []
+            drawn = self._pictures(frames)
+            picture = next(drawn, None)
+            if film is not None and self.animation and picture is not None:
+                pictures = []
+                for each in drawn:
+                    pictures.append(each)
+                    if drawing is not None:
+                        drawing(len(pictures), len(frames))
+                add_force(pictures, film.times, record)
+                write_gif(folder / "slice.gif", pictures, film.period)
                 summary["animation"] = "slice.gif"
             elif self.animation:
                 summary["animation"] = f"none: {NEEDED}"
@@ -226,12 +230,15 @@ class Run:
             _figure(self, record, comparison, picture).savefig(folder / "force.png", dpi=150)
         return summary
 
-    def _picture(self) -> np.ndarray | None:
-        """The end of a sequence, or else the middle of the cut, where this machine can draw."""
-        if self.film is None or not can_draw():
-            return None
-        frame = None if self.scenario.sequence is not None else self.half_cut
-        return self.film.draw([frame or self.film.frame(self.simulator.get_context())])[0]
+    def _pictures(self, frames: Sequence[Frame] = ()) -> Iterator[np.ndarray]:
+        """Draws the end of a sequence, or else the middle of the cut, and then these frames.
+
+        Gives nothing where there is no film, or where this machine cannot draw.
+        """
+        if self.film is not None and can_draw():
+            first = None if self.scenario.sequence is not None else self.half_cut
+            first = first or self.film.frame(self.simulator.get_context())
+            yield from self.film.draw([first, *frames])
 
 
 def simulate(
@@ -348,7 +355,7 @@ def _figure(
     picture: np.ndarray | None,
 ) -> "Figure":
     title, caption = _title(run), _caption(run, comparison)
-    if areas := _slice_areas(run):
+    if areas := slice_areas(run):
         board = run.scenario.board.height
         return plot_sequence(record, areas, title, board, caption, picture)
     return plot_force(record, title, run.station.food_top(), comparison, caption, picture)
@@ -418,140 +425,3 @@ def _caption(run: Run, comparison: Comparison | None) -> str:
     if run.stopped:
         lines.append(f"Stopped early: {run.stopped}")
     return "\n".join(lines)
-
-
-def _phase_times(mask: np.ndarray, time: np.ndarray) -> list[float] | None:
-    touching = np.flatnonzero(mask)
-    return [float(time[touching[0]]), float(time[touching[-1]])] if len(touching) else None
-
-
-def _summary(run: Run, record: Record, comparison: Comparison | None) -> dict:
-    scenario, station = run.scenario, run.station
-    time = record["time"]
-    food, board = record.vector("food_wrench_f"), record.vector("board_wrench_f")
-    norm = np.linalg.norm(food + board, axis=1)
-    on_food = np.linalg.norm(food, axis=1) > CONTACT_THRESHOLD
-    on_board = np.linalg.norm(board, axis=1) > CONTACT_THRESHOLD
-    contact = norm[on_food | on_board]
-    summary: dict = {
-        "scenario": scenario.name,
-        "stopped": run.stopped,
-        "contact_margin": run.contact_margin and dc.asdict(run.contact_margin),
-        "simulated_time_s": float(time[-1]),
-        "wall_time_s": run.wall_time,
-        "real_time_factor": float(time[-1] / run.wall_time) if run.wall_time else None,
-        "peak_force_N": float(norm.max()),
-        "mean_contact_force_N": float(contact.mean()) if len(contact) else 0.0,
-        "board_peak_N": float(np.linalg.norm(board, axis=1).max()),
-        "board_peak_loss_of_an_impact": station.board_peak_loss,
-        "cut_progress": float(record["cut_progress"][-1]),
-        "phase_times_s": {
-            "food": _phase_times(on_food, time),
-            "board": _phase_times(on_board, time),
-            "motion": _motion_times(run.motion),
-        },
-        "settings": {
-            "exchange_period_s": scenario.exchange_period,
-            "plant_time_step_s": scenario.robot.plant_time_step,
-            "seed": scenario.seed,
-        },
-        "versions": {
-            name: importlib.metadata.version(name)
-            for name in ("sliceit_drake", "drake", "warp-lang", "numpy")
-        }
-        | {"python": platform.python_version()},
-    }
-    if run.own:
-        summary["own"] = run.own
-    summary |= station.cutting.summary(record)
-    if areas := _slice_areas(run):
-        summary["slices"] = [dc.asdict(report) for report in slice_reports(record, areas)]
-    warnings = [*summary.get("warnings", ()), *run.warnings]
-    warnings += [each for each in (_not_cut_through(run, record), _clamped(run)) if each]
-    if warnings:
-        summary["warnings"] = warnings
-    if station.estimate_error is not None:
-        summary["discretization_error"] = None
-    measurement = scenario.measurement
-    if comparison is not None and measurement is not None:
-        used = np.isfinite(comparison.simulated)
-        summary["measurement"] = {
-            "file": measurement.file,
-            "rms_N": comparison.rms,
-            "measured_peak_N": comparison.measured_peak,
-            "simulated_peak_N": comparison.simulated_peak,
-            "fitted_contact_time_s": comparison.contact_time,
-            "height_offset_mm": 1e3 * comparison.contact_time * measurement.speed,
-            "compared_to_depth_mm": 1e3 * float(comparison.depth[used].max()),
-        }
-    return summary
-
-
-def _motion_times(motion: Motion) -> dict[str, list]:
-    """Begin and end of each phase, s; of a phase that occurs again, a list of them."""
-    times: dict[str, list] = {}
-    for label, begin, end in motion.phases:
-        times.setdefault(label, []).append([begin, end])
-    return {label: spans[0] if len(spans) == 1 else spans for label, spans in times.items()}
-
-
-def _slice_areas(run: Run) -> list[float]:
-    """Sections of a sequence's slices, m^2; empty without a sequence."""
-    return run.station.cutting.section_areas() if run.scenario.sequence is not None else []
-
-
-def _add_discretization_error(run: Run, summary: dict) -> None:
-    """What the estimate says; None stays where the run ended early or a policy led."""
-    estimate = run.station.estimate_error
-    # A policy would decide otherwise on another mesh.
-    if estimate is None or run.stopped is not None or run.diagram.policy is not None:
-        return
-    try:
-        summary["discretization_error"] = dc.asdict(estimate())
-    except (CuttingError, MeshError) as problem:
-        summary["discretization_error"] = {"relative_rms": None, "problem": str(problem)}
-
-
-def _clamped(run: Run) -> str | None:
-    """Says that a blade shook in a food which clamps it, and what to change; else None."""
-    food = run.scenario.food
-    if not (run.stopped or "").startswith(UNSTABLE_GAINS) or not isinstance(food, Food):
-        return None
-    if food.held_sides != "both":
-        return None
-    return (
-        "the food is held on both sides of the cut and clamps the blade: with "
-        "food.held_sides=plus one half can give way"
-    )
-
-
-def _not_cut_through(run: Run, record: Record) -> str | None:
-    """Says that a motion's end left the food uncut, and what to change; None where it did not."""
-    scenario, station = run.scenario, run.station
-    # Without an estimate the food has no finite elements, or a robot cuts a real one.
-    if run.stopped or station.estimate_error is None:
-        return None
-    if record["time"][-1] < run.motion.duration - CHUNK:
-        return None
-    if scenario.sequence is not None:
-        shares = [report.cut_share for report in slice_reports(record, _slice_areas(run))]
-    else:
-        shares = [float(record["cut_progress"].max())]
-    uncut = [k for k, share in enumerate(shares) if share < CUT_THROUGH]
-    if not uncut:
-        return None
-    which = f"slice {uncut[0] + 1} is" if len(shares) > 1 else "the food is"
-    edge = record["knife_pose_p_z"].min() - scenario.board.height
-    if scenario.policy is not None or run.diagram.policy is not None:
-        fix = "give the policy more time (policy.duration) or depth (policy.press)"
-    elif edge > BOARD_REACHED:
-        fix = (
-            f"lengthen the way down by {1e3 * edge:.1f} mm (motion.segments.0.distance), or leave "
-            "motion out, which cuts through"
-        )
-    else:
-        fix = "draw the knife along its edge as it presses (!PressAndDraw), or refine food.shape"
-    return (
-        f"{which} not cut through: {100 * shares[uncut[0]]:.0f} % of the section is cut, and the "
-        f"edge came to {1e3 * max(edge, 0.0):.1f} mm above the board. To cut through, {fix}."
-    )

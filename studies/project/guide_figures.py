@@ -91,7 +91,7 @@ def foods_figure() -> Figure:
     for axes, (food, scenario) in zip(figure.subplots(1, 5), SCENARIOS.items(), strict=True):
         film = simulate(scenario, duration=0.02, replay=False, animation=True).film
         assert film is not None
-        axes.imshow(film.draw(film.frames[:1])[0][CROP])
+        axes.imshow(next(film.draw(film.frames[:1]))[CROP])
         axes.set_title(food, fontsize=11)
         axes.axis("off")
     return figure

@@ -9,7 +9,7 @@ import json
 import math
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -140,14 +140,8 @@ class Film:
         """Of the frames, s."""
         return np.array([frame.time for frame in self.frames])
 
-    def draw(
-        self, frames: Sequence[Frame], progress: Callable[[int, int], None] | None = None
-    ) -> list[np.ndarray]:
-        """Pictures of frames of its own [H, W, 3], red, green, blue, 0 to 255.
-
-        Args:
-            frames: What is drawn.
-            progress: Called with the number of pictures, drawn and all, after each.
+    def draw(self, frames: Sequence[Frame]) -> Iterator[np.ndarray]:
+        """Draws frames of its own one by one: [H, W, 3], red, green, blue, 0 to 255.
 
         Call it only where `can_draw`.
         """
@@ -174,17 +168,13 @@ class Film:
         )
         drawn = _Drawn(self._station, context)
         X_WC = self._station.camera_pose()
-        pictures = []
         plant = self._station.plant
         for frame in frames:
             plant.SetPositions(plant.GetMyMutableContextFromRoot(root), frame.joints)
             drawn.show(frame.parts)
             query = scene_graph.get_query_output_port().Eval(context)
             image = query.RenderColorImage(camera, scene_graph.world_frame_id(), X_WC)
-            pictures.append(image.data[:, :, :3].copy())
-            if progress is not None:
-                progress(len(pictures), len(frames))
-        return pictures
+            yield image.data[:, :, :3].copy()
 
 
 @functools.cache
