@@ -283,7 +283,7 @@ def test_applied_force_is_the_food_wrench_at_the_knifes_origin(diagram):
     wrench = run.cutting.GetOutputPort("food_wrench").Eval(run.context)
     applied = AppliedForce(KNIFE_BODY)
     context = applied.CreateDefaultContext()
-    applied.get_input_port().FixValue(context, wrench)
+    applied.get_input_port().FixValue(context, wrench.get_coeffs())
     (force,) = applied.get_output_port().Eval(context)
     assert force.body_index == KNIFE_BODY
     np.testing.assert_array_equal(force.p_BoBq_B, np.zeros(3))

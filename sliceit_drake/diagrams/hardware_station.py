@@ -1,7 +1,6 @@
 """The hardware station: the ports of the simulated one, with a real robot behind them."""
 
 import dataclasses as dc
-from collections.abc import Sequence
 
 import numpy as np
 from pydrake.common.value import Value
@@ -235,7 +234,7 @@ class HardwareStation(Station):
         """Takes in where the robot is; it is moved to the start before."""
         self.rtde.receive(self.rtde.GetMyMutableContextFromRoot(root_context))
 
-    def cutting_columns(self, wrench: Sequence[str]) -> list[str]:
+    def cutting_columns(self) -> list[str]:
         """Empty: there is no port `cutting_state`."""
         return []
 

@@ -1,7 +1,6 @@
 """The simulated station: a Scenario becomes a Diagram."""
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
@@ -133,7 +132,7 @@ class SimulatedStation(Station):
         self.sensor = sensor = WrenchSensor(
             self.plant, self.robot.sensor_weld, scenario.exchange_period, scenario.sensor
         )
-        kinematics = KnifeKinematics(self.robot.knife.index())
+        kinematics = KnifeKinematics(self.plant, self.robot.knife)
         board_contact = BoardContact(
             self.robot.knife.index(), scenario.knife.length, scenario.board.height
         )
@@ -164,12 +163,12 @@ class SimulatedStation(Station):
                 plant.get_body_spatial_velocities_output_port(),
                 kinematics.GetInputPort("body_velocities"),
             ),
-            (self.cutting.GetOutputPort("food_wrench"), applied_force.get_input_port()),
+            (self.cutting.GetOutputPort("food_wrench_vector"), applied_force.get_input_port()),
             (applied_force.get_output_port(), plant.get_applied_spatial_force_input_port()),
         ):
             builder.Connect(source, target)
         for source, *systems in (
-            (plant.get_body_poses_output_port(), kinematics),
+            (plant.get_geometry_pose_output_port(), kinematics),
             (plant.get_contact_results_output_port(), board_contact),
             (plant.get_reaction_forces_output_port(), sensor),
             (kinematics.GetOutputPort("knife_pose"), self.cutting, board_contact),
@@ -255,9 +254,9 @@ class SimulatedStation(Station):
         connect(builder, knife_pose, frames)
         _set_scene(meshcat, self.start_pose)
 
-    def cutting_columns(self, wrench: Sequence[str]) -> list[str]:
-        """Names for the port `cutting_state`: `wrench` [6] for the food's moment and force."""
-        return self.cutting.state_columns(wrench)
+    def cutting_columns(self) -> list[str]:
+        """Names for the port `cutting_state`."""
+        return self.cutting.state_columns()
 
     def SetStart(self, root_context: Context, joints: np.ndarray | None = None) -> None:
         """Puts arm and controller at rest at the start, in the context of the whole diagram.

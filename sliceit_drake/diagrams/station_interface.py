@@ -65,11 +65,8 @@ class Station(Diagram):
         """Puts the station at its start, in the context of the whole diagram."""
         raise NotImplementedError
 
-    def cutting_columns(self, wrench: Sequence[str]) -> list[str]:
-        """Names for the port `cutting_state`: `wrench` [6] for the food's moment and force.
-
-        Empty in a station without this port.
-        """
+    def cutting_columns(self) -> list[str]:
+        """Names for the port `cutting_state`; empty in a station without it."""
         raise NotImplementedError
 
     def descent(self) -> float:

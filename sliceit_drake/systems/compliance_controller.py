@@ -91,7 +91,8 @@ def _load_kernels() -> None:
 class ComplianceUpdate:
     """Room for one update at a time: fill in inputs and state, `run`, read the state.
 
-    A call takes nothing from the calls before it. A deep copy is a new room for the same law.
+    A call takes nothing from the calls before it. A deep copy is a new room for the same law, with
+    the same settings.
     Pairs of vectors have the translational one first and are in the axes of the arm's base B if
     nothing else is said.
 
@@ -132,7 +133,9 @@ class ComplianceUpdate:
             self._capture(config, chain, R_EC)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "ComplianceUpdate":
-        return ComplianceUpdate(*self._law)
+        room = ComplianceUpdate(*self._law)
+        room.settings[:] = self.settings
+        return room
 
     def run(self) -> bool:
         """Advances the state by one update.
@@ -304,8 +307,9 @@ class ComplianceController(LeafSystem):
             lambda context: ComplianceUpdate(config, chain, R_EC),
             {self.nothing_ticket()},
         )
-        # A policy changes these far less often than the controller runs, so they are read only when
-        # they change (at every update if what feeds them depends on the time).
+        # The room with the settings in it. A policy changes them far less often than the controller
+        # runs, so they are read only when they change (at every update if what feeds them depends
+        # on the time).
         setting_ports = [self._target_wrench, *(port for port, _ in self._parameters.values())]
         self._settings = declare_cached(
             self, "settings", self._calc_settings, {port.ticket() for port in setting_ports}
@@ -341,8 +345,7 @@ class ComplianceController(LeafSystem):
         discrete_state.get_mutable_value(self._moving_state)[: self._size] = 0.0
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        room: ComplianceUpdate = self._room.Eval(context)
-        room.settings[:] = self._settings.Eval(context)
+        room: ComplianceUpdate = self._settings.Eval(context)
         if self._config.mode != "force":
             target = self._target_pose.Eval(context).GetAsMatrix4()
             self._X_BW.dot(target, out=room.target)
@@ -365,24 +368,26 @@ class ComplianceController(LeafSystem):
         discrete_state.set_value(self._positions_state, room.q)
         discrete_state.set_value(self._moving_state, room.moving)
 
-    def _calc_settings(self, context: Context) -> np.ndarray:
-        """Returns what `ComplianceUpdate.settings` takes [5, 2, 3]."""
+    def _calc_settings(self, context: Context) -> ComplianceUpdate:
+        """Returns the room, its settings as the ports say."""
         value = {
             name: port.Eval(context) if port.HasValue(context) else default
             for name, (port, default) in self._parameters.items()
         }
         error_scale = value["error_scale"]
-        settings = np.zeros((5, 2, 3))
+        room: ComplianceUpdate = self._room.Eval(context)
+        settings = room.settings
         settings[0] = value["stiffness"].reshape(2, 3)
         settings[1] = value["selection"].reshape(2, 3)
         settings[2] = error_scale * value["p_gains"].reshape(2, 3)
         settings[3] = error_scale * value["d_gains"].reshape(2, 3) / self._config.virtual_time_step
+        settings[4] = 0.0
         if self._target_wrench.HasValue(context):
             # Drake's spatial forces have the moment first.
             settings[4] = self._target_wrench.Eval(context).get_coeffs().reshape(2, 3)[::-1]
             if not self._config.hand_frame_control:
                 settings[4] = settings[4].dot(self._X_BW[:, :3].T)
-        return settings
+        return room
 
     def _commanded_pose(self, context: Context) -> RigidTransform:
         room: ComplianceUpdate = self._room.Eval(context)

@@ -52,6 +52,14 @@ _SPENT = slice(
     _BALANCE.start + BALANCE_NAMES.index("edge"),
     _BALANCE.start + BALANCE_NAMES.index("friction") + 1,
 )
+_PARTS = {
+    "force_components": _COMPONENTS,
+    "balance": _BALANCE,
+    "energy": _ENERGY,
+    "food_index": slice(_FOOD_INDEX, _FOOD_INDEX + 1),
+}
+"""Output ports of parts of the state."""
+
 _balance = operator.attrgetter(*BALANCE_NAMES)
 
 COMPLETE = 0.999
@@ -123,13 +131,8 @@ class CuttingSystem(KnifeForceSystem):
         size = max(s.state_size for s in self.solvers)
         food = self.DeclareDiscreteState(self._padded(self.solvers[0].initial_state(), size))
         self._food = int(food)
-        for name, part in (
-            ("force_components", _COMPONENTS),
-            ("balance", _BALANCE),
-            ("energy", _ENERGY),
-            ("food_index", slice(_FOOD_INDEX, _FOOD_INDEX + 1)),
-        ):
-            self._declare_part(name, part.stop - part.start, lambda kept, part=part: kept[part])
+        for name, part in _PARTS.items():
+            self._declare_part(name, part)
         corners = self._corners = max(len(surface.ends) for surface in self.surfaces)
         state = {
             self.discrete_state_ticket(food),
@@ -152,11 +155,10 @@ class CuttingSystem(KnifeForceSystem):
             "food_index": ["food_index"],
         }
 
-    def state_columns(self, wrench: Sequence[str]) -> list[str]:
+    def state_columns(self) -> list[str]:
         recorded = self.recorded()
-        names = ("force_components", "balance", "energy", "food_index")
-        further = [column for name in names for column in recorded[name]]
-        return [*super().state_columns(wrench), *further, "_spent_before"]
+        further = [column for name in _PARTS for column in recorded[name]]
+        return [*super().state_columns(), *further, "_spent_before"]
 
     def _middle_model(self) -> CuttingModel:
         """The cut; of a sequence, its middle slice, which stands for all."""
@@ -340,14 +342,15 @@ class CuttingSystem(KnifeForceSystem):
     def advance(
         self, context: Context, state: State, X_WK: RigidTransform
     ) -> tuple[np.ndarray, float]:
-        kept, time = self.kept(context), context.get_time()
+        x, time = context.get_discrete_state(), context.get_time()
+        kept = x.value(self._state)
         new = state.get_mutable_discrete_state()
         new_kept = new.get_mutable_value(self._state)
         before, now = int(kept[_FOOD_INDEX]), X_WK.GetAsMatrix34()
         index = self._index_to_cut(context, before, now)
         solver = self.solvers[index]
         if index == before:
-            old = self.food_state(context)
+            old = x.value(self._food)[: solver.state_size]
         else:
             old = solver.initial_state()
             new_kept[_FOOD_INDEX], new_kept[_ENERGY] = index, NO_ENERGY

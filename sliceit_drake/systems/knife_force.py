@@ -1,11 +1,11 @@
 """The ports that every cutting system has; a subclass says what force the food gives."""
 
 import copy
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
-from pydrake.common.value import AbstractValue, Value
+from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce, SpatialVelocity
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce
@@ -18,13 +18,12 @@ from sliceit_drake.systems.declare import declare_output
 
 __all__ = ["KEPT", "AppliedForce", "CuttingSetup", "KnifeForceSystem"]
 
-# Parts of the state, one vector so that an update fetches it once.
-_WRENCH = slice(0, 6)
-_PROGRESS = 6
-_COUPLING = 7
-_LAST_POSE = slice(8, 20)  # X_WK at the last coupling step, row by row.
-_START_TIME = 20
-KEPT = 21
+# Parts of the state beside the wrench, one vector so that an update fetches it once.
+_PROGRESS = 0
+_COUPLING = 1
+_LAST_POSE = slice(2, 14)  # X_WK at the last coupling step, row by row.
+_START_TIME = 14
+KEPT = 15
 """Numbers that every cutting system keeps; those of a subclass stand behind them."""
 
 
@@ -71,42 +70,43 @@ class KnifeForceSystem(ReportingSystem):
         self._velocity_input = self.DeclareAbstractInputPort(
             "knife_velocity", Value(SpatialVelocity.Zero())
         )
-        # A plain number: Drake's index would be made one in each call.
+        # Plain numbers: Drake's indices would be made such in each call.
+        wrench = self.DeclareDiscreteState(6)
+        self._wrench = int(wrench)
         self._state = int(self.DeclareDiscreteState(np.concatenate([np.zeros(KEPT), further])))
-        self._declare_part(
-            "food_wrench", Value(SpatialForce.Zero()), lambda kept: SpatialForce(kept[_WRENCH])
+        declare_output(
+            self,
+            "food_wrench",
+            Value(SpatialForce.Zero()),
+            lambda context: SpatialForce(self.wrench(context)),
+            {self.discrete_state_ticket(wrench)},
         )
-        self._declare_part("food_wrench_vector", 6, lambda kept: kept[_WRENCH])
-        self._declare_part("cut_progress", 1, lambda kept: kept[_PROGRESS : _PROGRESS + 1])
-        self._declare_part("coupling_work_error", 1, lambda kept: kept[_COUPLING : _COUPLING + 1])
+        self.DeclareStateOutputPort("food_wrench_vector", wrench)
+        self._declare_part("cut_progress", slice(_PROGRESS, _PROGRESS + 1))
+        self._declare_part("coupling_work_error", slice(_COUPLING, _COUPLING + 1))
         self.DeclareStateOutputPort("state", DiscreteStateIndex(self._state))
         self.DeclareInitializationUnrestrictedUpdateEvent(self._initialize)
         # An offset of one period would round k + 1 periods otherwise than the plant's steps do, and
         # so see the plant a step ahead at some coupling steps.
         self.DeclarePeriodicUnrestrictedUpdateEvent(exchange_period, 0.0, self._update)
 
-    def _declare_part(
-        self,
-        name: str,
-        example: AbstractValue | int,
-        calc: Callable[[np.ndarray], Any],
-    ) -> None:
-        """Declares an output port, as `declare_output`, of a function of the kept numbers."""
+    def _declare_part(self, name: str, part: slice) -> None:
+        """Declares a part of the kept numbers as an output port."""
         declare_output(
             self,
             name,
-            example,
-            lambda context: calc(self.kept(context)),
+            part.stop - part.start,
+            lambda context: self.kept(context)[part],
             {self.discrete_state_ticket(DiscreteStateIndex(self._state))},
         )
 
-    def state_columns(self, wrench: Sequence[str]) -> list[str]:
-        """Names for the port `state`: `wrench` [6] for moment and force, others as in a record.
+    def state_columns(self) -> list[str]:
+        """Names for the port `state`, as in a record.
 
         What no record shows has a name that begins with an underscore.
         """
         past = [f"_past_{k}" for k in range(_LAST_POSE.start, KEPT)]
-        return [*wrench, "cut_progress", "coupling_work_error", *past]
+        return ["cut_progress", "coupling_work_error", *past]
 
     def start(self, context: Context, state: State, X_WK: RigidTransform) -> None:
         """Called once at initialization; a subclass may check the start and set its state."""
@@ -140,7 +140,7 @@ class KnifeForceSystem(ReportingSystem):
 
     def wrench(self, context: Context) -> np.ndarray:
         """The held wrench F_K_W, moment and force [6]."""
-        return self.kept(context)[_WRENCH]
+        return context.get_discrete_state().value(self._wrench)
 
     def progress(self, context: Context) -> float:
         """The fraction of the section that is cut."""
@@ -151,7 +151,7 @@ class KnifeForceSystem(ReportingSystem):
         kept = self.kept(context).copy()
         kept[: _COUPLING + 1] = 0.0
         context.SetDiscreteState(self._state, kept)
-        for part in parts:
+        for part in (self._wrench, *parts):
             context.SetDiscreteState(part, np.zeros(context.get_discrete_state(part).size()))
 
     def _initialize(self, context: Context, state: State) -> None:
@@ -162,7 +162,8 @@ class KnifeForceSystem(ReportingSystem):
         self.start(context, state, X_WK)
 
     def _update(self, context: Context, state: State) -> EventStatus | None:
-        before = self.kept(context)
+        x = context.get_discrete_state()
+        before = x.value(self._state)
         if context.get_time() <= before[_START_TIME]:
             return EventStatus.DidNothing()
         X_WK = self._pose_input.Eval(context)
@@ -170,11 +171,12 @@ class KnifeForceSystem(ReportingSystem):
         last, now = before[_LAST_POSE].reshape(3, 4), X_WK.GetAsMatrix34()
         turn = small_turn(last[:, :3], now[:, :3])
         moved = np.concatenate([turn, now[:, 3] - last[:, 3]])
-        new = state.get_mutable_discrete_state().get_mutable_value(self._state)
-        new[_COUPLING] = before[_COUPLING] + (before[_WRENCH] - wrench).dot(moved)
-        new[_WRENCH] = wrench
+        x_new = state.get_mutable_discrete_state()
+        new = x_new.get_mutable_value(self._state)
+        new[_COUPLING] = before[_COUPLING] + (x.value(self._wrench) - wrench).dot(moved)
         new[_PROGRESS] = progress
         new[_LAST_POSE] = now.ravel()
+        x_new.set_value(self._wrench, wrench)
         return None
 
     @staticmethod
@@ -186,10 +188,10 @@ class AppliedForce(LeafSystem):
     """Applies the food's wrench to the knife's body in the plant.
 
     Input port:
-        food_wrench: SpatialForce F_K_W of the food on the knife, at Ko, in W.
+        food_wrench_vector: F_K_W of the food on the knife, at Ko, in W: moment and force [6].
 
     Output port:
-        applied_force: The same as a list of one ExternallyAppliedSpatialForce.
+        applied_force: The wrench as a list of one ExternallyAppliedSpatialForce.
 
     Args:
         knife_body: Index of the knife's body, whose frame is K.
@@ -200,11 +202,11 @@ class AppliedForce(LeafSystem):
         self._no_force = ExternallyAppliedSpatialForce()
         self._no_force.body_index = knife_body
         self._no_force.p_BoBq_B = np.zeros(3)
-        self._wrench = self.DeclareAbstractInputPort("food_wrench", Value(SpatialForce.Zero()))
+        self._wrench = self.DeclareVectorInputPort("food_wrench_vector", 6)
         forces = Value[list[ExternallyAppliedSpatialForce]]()
         declare_output(self, "applied_force", forces, self._forces, {self._wrench.ticket()})
 
     def _forces(self, context: Context) -> list[ExternallyAppliedSpatialForce]:
         force = copy.copy(self._no_force)
-        force.F_Bq_W = self._wrench.Eval(context)
+        force.F_Bq_W = SpatialForce(self._wrench.Eval(context))
         return [force]

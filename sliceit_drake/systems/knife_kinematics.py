@@ -2,10 +2,11 @@
 
 import numpy as np
 from pydrake.common.value import Value
+from pydrake.geometry import FramePoseVector
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce, SpatialVelocity
-from pydrake.multibody.plant import ContactResults
-from pydrake.multibody.tree import BodyIndex
+from pydrake.multibody.plant import ContactResults, MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, RigidBody
 from pydrake.systems.framework import Context, LeafSystem
 
 from sliceit_drake.systems.declare import declare_output
@@ -19,10 +20,10 @@ _NO_WRENCH.setflags(write=False)
 
 
 class KnifeKinematics(LeafSystem):
-    """Picks the knife from the plant's lists of poses and velocities.
+    """Picks the knife from what the plant says of all bodies.
 
     Input ports:
-        body_poses: list[RigidTransform] of the plant.
+        geometry_pose: FramePoseVector of the plant; it gives one pose alone.
         body_velocities: list[SpatialVelocity] of the plant.
 
     Output ports:
@@ -30,13 +31,15 @@ class KnifeKinematics(LeafSystem):
         knife_velocity: SpatialVelocity V_WK.
 
     Args:
-        knife_body: Index of the knife's body, whose frame is K.
+        plant: The plant, with the knife's geometry.
+        knife: The knife's body, whose frame is K.
     """
 
-    def __init__(self, knife_body: BodyIndex) -> None:
+    def __init__(self, plant: MultibodyPlant, knife: RigidBody) -> None:
         super().__init__()
-        index = int(knife_body)
-        poses = self.DeclareAbstractInputPort("body_poses", Value[list[RigidTransform]]())
+        index = int(knife.index())
+        frame = plant.GetBodyFrameIdOrThrow(knife.index())
+        poses = self.DeclareAbstractInputPort("geometry_pose", Value(FramePoseVector()))
         velocities = self.DeclareAbstractInputPort(
             "body_velocities", Value[list[SpatialVelocity]]()
         )
@@ -44,7 +47,7 @@ class KnifeKinematics(LeafSystem):
             self,
             "knife_pose",
             Value(RigidTransform()),
-            lambda context: poses.Eval(context)[index],
+            lambda context: poses.Eval(context).value(frame),
             {poses.ticket()},
         )
         declare_output(

@@ -208,7 +208,7 @@ def add_recorder(
         )
     }
     # A port costs more than its numbers do, so one stands for those whose numbers it has.
-    kept = station.cutting_columns(_wrench_columns("food_wrench"))
+    kept = station.cutting_columns()
     ports = {
         name: columns
         for name, columns in vectors.items()
