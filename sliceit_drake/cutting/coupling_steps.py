@@ -4,9 +4,13 @@ import dataclasses as dc
 
 import numpy as np
 
+from sliceit_drake.cutting.kernels.layouts import PointSum
 from sliceit_drake.cutting.workspace import Workspace
 
 __all__ = ["CouplingSteps", "Energies", "EnergyBalance", "run_coupling_steps"]
+
+# Of edge, opening and friction, among the sums over the points.
+_LOSSES = slice(PointSum.EDGE_LOSS, PointSum.FRICTION_LOSS + 1)
 
 
 @dc.dataclass
@@ -118,8 +122,8 @@ def run_coupling_steps(
     steps = []
     for c, (model, row) in enumerate(zip(ws.models, ws.results(), strict=True)):
         at_points, at_nodes = row["point_sums"], row["node_sums"]
-        losses = [at_points[name] for name in ("edge_loss", "opening_loss", "friction_loss")]
-        edge, opening, friction = np.stack(losses, axis=1).sum(0).tolist()
+        sums = at_points.view(float).reshape(ws.coupling_steps, -1)
+        edge, opening, friction = sums[:, _LOSSES].sum(0).tolist()
         balance = EnergyBalance(
             work=float(row["work"].sum()),
             gravity=float(model.weight.ravel() @ (new[c, x] - states[c, x])),

@@ -115,7 +115,8 @@ class CuttingSolver:
         Raises:
             CuttingError: A force is not finite, or the knife left the region that is modelled.
         """
-        R, p = np.array([[start.R, end.R]]), np.array([[start.p, end.p]])
+        R, p = np.empty((1, 2, 3, 3)), np.empty((1, 2, 3))
+        R[0, 0], R[0, 1], p[0, 0], p[0, 1] = start.R, end.R, start.p, end.p
         with self._lock:
             self._take_factors(factors)
             (step,) = run_coupling_steps(self._workspace, state[None], R, p)

@@ -28,11 +28,11 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
-from pydrake.systems.framework import Context, DiscreteStateIndex, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteStateIndex, DiscreteValues
 
 from sliceit_drake.configuration import ConfigurationError, choice, quantity
 from sliceit_drake.cutting.motion import MotionPlan
-from sliceit_drake.systems.declare import declare_cached, declare_output
+from sliceit_drake.systems.declare import PlainSystem, declare_cached, declare_output
 from sliceit_drake.systems.policy import envelope, envelope_time
 
 __all__ = ["ACTIONS", "ERROR", "AgentConfig", "AgentSystem", "Decide", "observation_names"]
@@ -159,7 +159,7 @@ def observation_names(history: int) -> list[str]:
     ]
 
 
-class AgentSystem(LeafSystem):
+class AgentSystem(PlainSystem):
     """Decides at multiples of its period how compliant the knife is and where its target lies.
 
     Errors and offsets are along and about the axes of K as it was at the start: x along the edge,

@@ -20,13 +20,13 @@ import warp as wp
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues
 
 from sliceit_drake.configuration import choice, quantity, validate
 from sliceit_drake.cutting.warp_start import start_warp
 from sliceit_drake.cutting.workspace import LAUNCH_LOCK
 from sliceit_drake.systems.compliance_kernel import MODES, mat34d, place_arm, update_arm
-from sliceit_drake.systems.declare import declare_cached, declare_output
+from sliceit_drake.systems.declare import PlainSystem, declare_cached, declare_output
 from sliceit_drake.systems.ur5e_kinematics import KinematicChain, virtual_bodies
 from sliceit_drake.systems.wrench_sensor import wrench_shift
 
@@ -196,7 +196,7 @@ class ComplianceUpdate:
         self._place, self._update = place.graph, update.graph
 
 
-class ComplianceController(LeafSystem):
+class ComplianceController(PlainSystem):
     """Turns a target pose, a target wrench and a measured wrench into joint positions.
 
     Frames: W world, B base of the arm, E end effector (the knife frame K in a station),

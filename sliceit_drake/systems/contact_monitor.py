@@ -3,10 +3,10 @@
 import dataclasses as dc
 
 import numpy as np
-from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus
 
 from sliceit_drake.configuration import quantity
-from sliceit_drake.systems.declare import declare_output
+from sliceit_drake.systems.declare import PlainSystem, declare_output
 from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig
 
 __all__ = ["UNSTABLE_GAINS", "ContactMonitor", "ContactMonitorConfig"]
@@ -54,7 +54,7 @@ class ContactMonitorConfig:
     to about 100 to 250 N."""
 
 
-class ContactMonitor(LeafSystem):
+class ContactMonitor(PlainSystem):
     """Ends a simulation whose contact force oscillates without dying out.
 
     A stable contact answers a disturbance, such as the knife's arrival on the board, with swings

@@ -7,8 +7,9 @@ from typing import Any, Protocol
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import Context, DiagramBuilder
 
+from sliceit_drake.systems.declare import PlainSystem
 from sliceit_drake.systems.food_look import OTHER
 
 __all__ = ["Columns", "FoodBodyFrame", "FoodPicture", "FrameRecorder", "ReportingSystem"]
@@ -70,7 +71,7 @@ class FoodBodyFrame:
     side: np.ndarray
 
 
-class ReportingSystem(LeafSystem):
+class ReportingSystem(PlainSystem):
     """A system that cuts, and what it tells beyond its ports, for record, picture and summary.
 
     A subclass overrides what it knows. By default there is nothing to tell: a run then has a

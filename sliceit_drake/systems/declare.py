@@ -1,4 +1,4 @@
-"""Declares output ports and cached values of Drake systems by functions that return the value."""
+"""A base class of systems; output ports and cached values by functions that return the value."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +13,18 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
-__all__ = ["declare_cached", "declare_output"]
+__all__ = ["PlainSystem", "declare_cached", "declare_output"]
+
+
+class PlainSystem(LeafSystem):
+    """A system without witness functions.
+
+    After each unrestricted update Drake asks all systems for theirs, and pydrake looks for a method
+    of this name in each: one that is absent costs an exception each time, one that is not written
+    in Python is looked for once.
+    """
+
+    DoGetWitnessFunctions = LeafSystem.GetWitnessFunctions
 
 
 def declare_output(

@@ -10,11 +10,11 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce, SpatialVelocity
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce
 from pydrake.multibody.tree import BodyIndex
-from pydrake.systems.framework import Context, DiscreteStateIndex, EventStatus, LeafSystem, State
+from pydrake.systems.framework import Context, DiscreteStateIndex, EventStatus, State
 
 from sliceit_drake.cutting.motion import small_turn
 from sliceit_drake.systems.cut_report import ReportingSystem
-from sliceit_drake.systems.declare import declare_output
+from sliceit_drake.systems.declare import PlainSystem, declare_output
 
 __all__ = ["KEPT", "AppliedForce", "CuttingSetup", "KnifeForceSystem"]
 
@@ -63,7 +63,7 @@ class KnifeForceSystem(ReportingSystem):
         further: Initial values of the numbers that a subclass keeps behind those of all.
     """
 
-    def __init__(self, exchange_period: float, further: Sequence[float] = ()) -> None:
+    def __init__(self, exchange_period: float, further: Sequence[float] | np.ndarray = ()) -> None:
         super().__init__()
         self.exchange_period = exchange_period
         self._pose_input = self.DeclareAbstractInputPort("knife_pose", Value(RigidTransform()))
@@ -184,7 +184,7 @@ class KnifeForceSystem(ReportingSystem):
         state.get_mutable_discrete_state().set_value(index, value)
 
 
-class AppliedForce(LeafSystem):
+class AppliedForce(PlainSystem):
     """Applies the food's wrench to the knife's body in the plant.
 
     Input port:

@@ -7,9 +7,9 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce, SpatialVelocity
 from pydrake.multibody.plant import ContactResults, MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody
-from pydrake.systems.framework import Context, LeafSystem
+from pydrake.systems.framework import Context
 
-from sliceit_drake.systems.declare import declare_output
+from sliceit_drake.systems.declare import PlainSystem, declare_output
 
 __all__ = ["BoardContact", "KnifeKinematics"]
 
@@ -19,7 +19,7 @@ _NO_WRENCH = np.zeros(6)
 _NO_WRENCH.setflags(write=False)
 
 
-class KnifeKinematics(LeafSystem):
+class KnifeKinematics(PlainSystem):
     """Picks the knife from what the plant says of all bodies.
 
     Input ports:
@@ -59,7 +59,7 @@ class KnifeKinematics(LeafSystem):
         )
 
 
-class BoardContact(LeafSystem):
+class BoardContact(PlainSystem):
     """Sums the point contacts on the knife in the plant's contact results.
 
     Input ports:

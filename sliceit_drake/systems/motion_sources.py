@@ -3,10 +3,10 @@
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.math import SpatialVelocity
-from pydrake.systems.framework import Context, LeafSystem
+from pydrake.systems.framework import Context
 
 from sliceit_drake.cutting.motion import Motion, MotionPlan, Pose
-from sliceit_drake.systems.declare import declare_output
+from sliceit_drake.systems.declare import PlainSystem, declare_output
 
 __all__ = ["MotionSource", "placed_motion"]
 
@@ -16,7 +16,7 @@ def placed_motion(plan: MotionPlan, X_WK: RigidTransform) -> Motion:
     return Motion(plan, Pose(X_WK.rotation().matrix(), X_WK.translation()))
 
 
-class MotionSource(LeafSystem):
+class MotionSource(PlainSystem):
     """A prescribed motion as a source of targets: pose and velocity of the knife over time.
 
     It has no inputs and no state.

@@ -17,11 +17,11 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues
 
 from sliceit_drake.configuration import ConfigurationError, quantity
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan, Segment
-from sliceit_drake.systems.declare import declare_output
+from sliceit_drake.systems.declare import PlainSystem, declare_output
 
 __all__ = [
     "Policy",
@@ -186,7 +186,7 @@ def _legs(corners: _Corners) -> list[tuple[float, float, float]]:
     return legs
 
 
-class PolicySystem(LeafSystem):
+class PolicySystem(PlainSystem):
     """A policy as what drives a station.
 
     It decides at multiples of its period, without a delay in the diagram's time; what it takes of

@@ -10,10 +10,10 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import WeldJoint
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues
 
 from sliceit_drake.configuration import ConfigurationError, quantity
-from sliceit_drake.systems.declare import declare_output
+from sliceit_drake.systems.declare import PlainSystem, declare_output
 
 __all__ = ["WrenchSensor", "WrenchSensorConfig", "wrench_shift"]
 
@@ -84,7 +84,7 @@ class WrenchSensorConfig:
     """Seed of noise and random walk."""
 
 
-class WrenchSensor(LeafSystem):
+class WrenchSensor(PlainSystem):
     """Measures the wrench that the environment exerts on the robot beyond the sensor.
 
     The plant reports the reaction F_C_Jc of the weld: the force of the arm *on the tool* C, at the
