@@ -220,14 +220,14 @@ class SliceAdjoint:
         adjoint = np.zeros(ws.sum_rows.shape[1])
         total, bending = np.zeros(1, POINT_SUMS), np.zeros(1, BLADE_SUMS)
         total["forces"], total["moments"] = of_force / n, of_moment / n
-        points = len(self.model.point_nodes)
-        adjoint[ws.sum_layout["total"]] = np.tile(total.view(float)[:ACCUMULATED], points)
+        blocks = ws.point_blocks
+        adjoint[ws.sum_layout["total"]] = np.tile(total.view(float)[:ACCUMULATED], blocks)
         along = float(of_lateral @ R[:, 1]) / n
         bending["on_knife"], bending["on_blade"] = along, -along
         adjoint[ws.sum_layout["blade"]] = bending.view(float)
         if area > 0.0:
             of_immersed = np.concatenate([of_middle, [-(of_middle @ middle)]]) / area
-            adjoint[ws.sum_layout["immersed"]] = np.tile(of_immersed, points)
+            adjoint[ws.sum_layout["immersed"]] = np.tile(of_immersed, blocks)
         return adjoint, of_lateral * push / n
 
     def _launch_backward(self) -> None:

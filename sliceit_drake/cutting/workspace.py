@@ -18,6 +18,17 @@ from sliceit_drake.cutting.warp_start import start_warp
 
 __all__ = ["LAUNCH_LOCK", "Workspace", "parameter_row"]
 
+POINT_NUMBERS = {
+    "toughness",
+    "flank_scale",
+    "friction_scale",
+    "unloading",
+    "edge_depth",
+    "cohesive_damage",
+    "edge_force",
+}
+"""Arrays with a number for each cut point."""
+
 LAUNCH_LOCK = threading.RLock()
 """Held while kernels are made, in a capture, which takes in the launches of all threads, and in
 launches outside of one."""
@@ -128,6 +139,14 @@ class Workspace:
             setattr(struct, name, self._view(rows, layout[name].start, kind, shape))
         return rows, layout
 
+    def _without_fill(self, layout: dict[str, slice]) -> dict[str, slice]:
+        """The same with numbers by cut point up to the last point."""
+        count = len(self.model.point_nodes)
+        layout = dict(layout)
+        for name in POINT_NUMBERS & layout.keys():
+            layout[name] = slice(layout[name].start, layout[name].start + count)
+        return layout
+
     def _set(self, struct: Any, **values: Any) -> None:
         """Sets constant arrays and numbers of a struct."""
         for name, value in values.items():
@@ -146,6 +165,7 @@ class Workspace:
         m, k, C, K = self.model, self.kernels, self.cuts, self.steps
         N, P, B, E = len(m.nodes), len(m.point_nodes), len(m.blocks), self.coupling_steps
 
+        self.point_blocks = -(-P // LANES)
         self.mesh, self.points = k.Mesh(), k.Points()
         self._set(
             self.mesh,
@@ -159,19 +179,20 @@ class Workspace:
         )
         self._set(
             self.points,
-            nodes=m.point_nodes,
-            weights=m.point_weights,
-            area=m.tables.area,
-            width=m.tables.width,
-            fraction=m.tables.fraction,
-            centroid=m.tables.rise,
-            outline=m.outline,
-            depth=m.point_depth,
+            nodes=in_lanes(m.point_nodes),
+            weights=in_lanes(m.point_weights),
+            area=in_lanes(m.tables.area, 0.0),
+            width=_filled(m.tables.width, 0.0),
+            fraction=_filled(m.tables.fraction, 0.0),
+            centroid=_filled(m.tables.rise, 0.0),
+            outline=_filled(m.outline, 0.0),
+            depth=in_lanes(m.point_depth),
             reach=m.tables.reach,
             per_spacing=1.0 / m.tables.spacing,
         )
         self.parameters, values = k.Parameters(), _parameter_arrays(m)
-        self.parameter_rows, self.parameter_layout = self._rows(self.parameters, _shapes(values))
+        self.parameter_rows, layout = self._rows(self.parameters, _shapes(values))
+        self.parameter_layout = self._without_fill(layout)
 
         self.motion = k.Motion()
         self.motion.substeps, self.motion.period = self.substeps, self.exchange_period
@@ -187,7 +208,8 @@ class Workspace:
         self.slots = [k.State() for _ in range(K + 1 if self._gradients else 1)]
         self.states = []
         for slot in self.slots:
-            rows, self.layout = self._rows(slot, _shapes(values))
+            rows, layout = self._rows(slot, _shapes(values))
+            self.layout = self._without_fill(layout)
             self.states.append(rows)
             self._allocate(slot, ahead=(N,))
 
@@ -197,9 +219,13 @@ class Workspace:
         forces, kinds = k.Forces(), k.Forces.vars
         forces.elements = self._view(self.force, 0, kinds["elements"].type, (B, CORNERS))
         forces.rows = self._view(self.force, 0, kinds["rows"].type, (size + 1,), step=1)
-        self._allocate(forces, corners=(B, CORNERS), points=(P, 2), lateral=(P,))
-        # The same as one list, two entries a point.
-        forces.listed = forces.points.reshape((C, 2 * P))
+        self._at_points = self._array((C, self.point_blocks * 6 * LANES), self.real)
+        forces.points = self._view(self._at_points, 0, kinds["points"].type, (self.point_blocks, 2))
+        size = self._at_points.shape[1] - 2 * LANES
+        forces.point_rows = self._view(
+            self._at_points, 0, kinds["point_rows"].type, (size,), step=1
+        )
+        self._allocate(forces, corners=(B, CORNERS), lateral=(self.point_blocks,))
         # With gradients, what the nodes got in each sub-step is kept.
         self.forces = [k.Forces() for _ in range(K if self._gradients else 1)]
         for kept in self.forces:
@@ -212,8 +238,8 @@ class Workspace:
 
         self.sums, self._results, self._energies = k.Sums(), k.Results(), k.Energies()
         sums = {
-            "total": (E, P, layouts.ACCUMULATED),
-            "immersed": (E, P, 4),
+            "total": (E, self.point_blocks, layouts.ACCUMULATED),
+            "immersed": (E, self.point_blocks, 4),
             "blade": (E, layouts.numbers(layouts.BLADE_SUMS)),
             "board_force": (N, 3),
             "board_loss": (N,),
@@ -225,7 +251,8 @@ class Workspace:
         shapes = {name: layouts.field_shape(self._result_type, name) for name in names}
         self._result_rows, _ = self._rows(self._results, shapes, wp.float64)
         by_element = (B, STRIP, LANES)
-        self._allocate(self._energies, elastic=by_element, volume_ratio=by_element, points=(P,))
+        self._allocate(self._energies, elastic=by_element, volume_ratio=by_element)
+        self._allocate(self._energies, points=(self.point_blocks,))
 
     def set_models(self, models: Sequence[CuttingModel]) -> None:
         """Takes the parameters of other cuts of the same mesh, one for each row."""
@@ -245,7 +272,8 @@ class Workspace:
         if thickness != self._skin_thickness:
             self._skin_thickness = thickness
             with LAUNCH_LOCK:
-                self.points.outline.assign(models[0].outline.astype(self.dtype))
+                outline = _filled(models[0].outline, 0.0)
+                self.points.outline.assign(outline.astype(self.dtype))
         self.models = tuple(models)
         self.write(self.parameter_rows, np.array([parameter_row(m) for m in models]))
 
@@ -312,19 +340,22 @@ class Workspace:
         dt = self.dt if dt is None else dt
         states = [now, after, forces, sums]
         entries, inputs = {
-            "elements": (m.blocks, [now, mesh, parameters, forces]),
-            "step_points": (m.point_nodes, [k, dt, self.points, parameters, self.motion, *states]),
-            "move_nodes": (m.moving, [dt, mesh, parameters, now, forces, sums]),
-            "gather": (m.moving, [mesh, forces]),
-            "relax_nodes": (m.moving, [mesh, parameters, now, after, forces]),
-            "step_nodes": (m.moving, [dt, mesh, parameters, *states]),
-            "gather_adjoint": (m.moving, [mesh, forces, now.ahead.grad]),
-            "push_blade": (None, [forces]),
-            "bend_blade": (None, [k // self.substeps, dt, parameters, *states]),
+            "elements": (len(m.blocks), [now, mesh, parameters, forces]),
+            "step_points": (
+                self.point_blocks,
+                [k, dt, self.points, parameters, self.motion, *states],
+            ),
+            "move_nodes": (len(m.moving), [dt, mesh, parameters, now, forces, sums]),
+            "gather": (len(m.moving), [mesh, forces]),
+            "relax_nodes": (len(m.moving), [mesh, parameters, now, after, forces]),
+            "step_nodes": (len(m.moving), [dt, mesh, parameters, *states]),
+            "gather_adjoint": (len(m.moving), [mesh, forces, now.ahead.grad]),
+            "push_blade": (0, [forces]),
+            "bend_blade": (0, [k // self.substeps, dt, parameters, *states]),
         }[part]
         shape: tuple[int, ...] = (self.cuts,)
-        if entries is not None:
-            threads, per_thread = (1, len(entries)) if self.device.is_cpu else (len(entries), 1)
+        if entries:
+            threads, per_thread = (1, entries) if self.device.is_cpu else (entries, 1)
             shape, inputs = (self.cuts, threads), [*inputs, per_thread]
         self.launch(getattr(self.kernels, part), shape, inputs, adjoint)
 
@@ -392,7 +423,7 @@ class Workspace:
         elements = [state, self.mesh, self.parameters, energies]
         self.launch(kern.element_energy, energies.elastic.shape, elements)
         points = [self.points, self.parameters, self.motion, state, energies]
-        self.launch(kern.point_energy, energies.points.shape, points)
+        self.launch(kern.point_energy, (self.cuts, self.point_blocks), points)
 
     def place_knife(
         self, R: Any, p: Any, v: Any = (0.0, 0.0, 0.0), w: Any = (0.0, 0.0, 0.0)
@@ -407,7 +438,8 @@ class Workspace:
         # A step of no duration changes no history that another call reads.
         with LAUNCH_LOCK:
             self.launch_part("step_points", 0, self.real(0.0))
-        return np.array(self.forces[0].points.numpy()[0], np.float64)
+        forces = np.array(self.forces[0].points.numpy()[0], np.float64)
+        return forces.transpose(0, 3, 1, 2).reshape(-1, 2, 3)[: len(self.model.point_nodes)]
 
 
 def parameter_row(model: CuttingModel) -> np.ndarray:
@@ -424,10 +456,10 @@ def _parameter_arrays(model: CuttingModel) -> dict[str, np.ndarray]:
     return {
         "P": np.array([model.parameters[name] for name in PARAMETERS]),
         "knife": model.knife.parameters(),
-        "toughness": model.toughness,
-        "flank_scale": scales.flank_stiffness,
-        "friction_scale": scales.friction,
-        "unloading": model.unloading,
+        "toughness": in_lanes(model.toughness),
+        "flank_scale": in_lanes(scales.flank_stiffness),
+        "friction_scale": in_lanes(scales.friction),
+        "unloading": in_lanes(model.unloading),
         "inverse_mass": inverse_mass,
         "local_damping": model.local_damping,
         "weight": model.weight,
@@ -438,19 +470,31 @@ def _parameter_arrays(model: CuttingModel) -> dict[str, np.ndarray]:
 
 
 def _initial_arrays(model: CuttingModel) -> dict[str, np.ndarray]:
-    N, P = len(model.nodes), len(model.point_nodes)
+    N, blocks = len(model.nodes), -(-len(model.point_nodes) // LANES)
     return {
         "x": model.nodes,
         "v": np.zeros((N, 3)),
-        "edge_depth": np.full(P, -model.tables.reach),
-        "cohesive_damage": np.zeros(P),
-        "edge_force": np.zeros(P),
-        "edge_direction": np.tile([0.0, 0.0, -1.0], (P, 1)),
-        "slip": np.zeros((P, 2, 3)),
+        "edge_depth": np.full((blocks, LANES), -model.tables.reach),
+        "cohesive_damage": np.zeros((blocks, LANES)),
+        "edge_force": np.zeros((blocks, LANES)),
+        "edge_direction": np.tile([[0.0], [0.0], [-1.0]], (blocks, 1, LANES)),
+        "slip": np.zeros((blocks, 2, 3, LANES)),
         "board_slip": np.zeros((N, 3)),
         "overstress": np.zeros((len(model.relaxing), N, 3)),
         "blade": np.zeros(2),
     }
+
+
+def _filled(values: np.ndarray, fill: float | None = None) -> np.ndarray:
+    """Values by point [P, ...], filled up to whole blocks; with the last one by default."""
+    more = np.full((-len(values) % LANES, *values.shape[1:]), values[-1] if fill is None else fill)
+    return np.concatenate([values, more])
+
+
+def in_lanes(values: np.ndarray, fill: float | None = None) -> np.ndarray:
+    """Values by point [P, ...] as the kernels have them [B, ..., LANES]."""
+    values = _filled(values, fill)
+    return np.moveaxis(values.reshape(-1, LANES, *values.shape[1:]), 1, -1)
 
 
 def _row(arrays: dict[str, np.ndarray]) -> np.ndarray:
@@ -490,12 +534,13 @@ def _element_gather(model: CuttingModel) -> dict[str, np.ndarray]:
 def _point_gather(
     point_nodes: np.ndarray, weights: np.ndarray, node_count: int
 ) -> dict[str, np.ndarray]:
-    """Cut-point forces (2 point + side) that act on each node, and their weights."""
-    P = len(point_nodes)
-    entry = 2 * np.arange(P)[:, None] + np.array([0, 0, 1, 1])
+    """Places of the cut-point forces that act on each node, and their weights."""
+    block, lane = np.divmod(np.arange(len(point_nodes)), LANES)
+    entry = (2 * block[:, None] + np.array([0, 0, 1, 1])) * 3 * LANES + lane[:, None]
     weight = np.tile(weights, (1, 2))
     use = weight > 0.0
-    by_node = coo_array((weight[use], (point_nodes[use], entry[use])), (node_count, 2 * P)).tocsr()
+    by_node = coo_array((weight[use], (point_nodes[use], entry[use]))).tocsr()
+    by_node.resize(node_count, by_node.shape[1])
     return {
         "point_start": by_node.indptr,
         "point_entry": by_node.indices,

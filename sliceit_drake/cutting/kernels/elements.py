@@ -9,7 +9,8 @@ from typing import Any
 
 import warp as wp
 
-from sliceit_drake.cutting.kernels.types import CORNERS, LANES, STRIP, Scalar, kernel_types
+from sliceit_drake.cutting.kernels.lanes import lane_functions
+from sliceit_drake.cutting.kernels.types import CORNERS, STRIP, Scalar, kernel_types
 
 __all__ = ["element_kernels"]
 
@@ -20,38 +21,9 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
     vec3, vec4, mat33, lanes, padded = t.vec3, t.vec4, t.mat33, t.lanes, t.padded
     Vectors, Mesh, Parameters = t.Vectors, t.Mesh, t.Parameters
     State, Forces, Energies = t.State, t.Forces, t.Energies
-
-    @wp.func
-    def dot8(a: Vectors, b: Vectors):
-        products = wp.cw_mul(a, b)
-        return products[0] + products[1] + products[2]
-
-    @wp.func
-    def cross8(a: Vectors, b: Vectors):
-        return wp.matrix_from_rows(
-            wp.cw_mul(a[1], b[2]) - wp.cw_mul(a[2], b[1]),
-            wp.cw_mul(a[2], b[0]) - wp.cw_mul(a[0], b[2]),
-            wp.cw_mul(a[0], b[1]) - wp.cw_mul(a[1], b[0]),
-        )
-
-    @wp.func
-    def scaled8(k: lanes, a: Vectors):
-        return wp.matrix_from_rows(wp.cw_mul(k, a[0]), wp.cw_mul(k, a[1]), wp.cw_mul(k, a[2]))
-
-    @wp.func
-    def corner8(
-        x: wp.array2d(dtype=Any), cut: wp.int32, mesh: Mesh, block: wp.int32, corner: wp.int32
-    ):
-        node = mesh.nodes[block, corner]
-        a = lanes()
-        b = lanes()
-        c = lanes()
-        for lane in range(LANES):
-            p = x[cut, node[lane]]
-            a[lane] = p[0]
-            b[lane] = p[1]
-            c[lane] = p[2]
-        return wp.matrix_from_rows(a, b, c)
+    f = lane_functions(real)
+    dot8, cross8, scaled8, sum8 = f.dot8, f.cross8, f.scaled8, f.sum8
+    gathered8 = f.gathered8
 
     @wp.func
     def gradient8(
@@ -115,7 +87,7 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
         end = wp.min((chunk + 1) * per_thread, mesh.nodes.shape[0])
         for block in range(chunk * per_thread, end):
             for k in range(CORNERS):
-                x[cut, chunk, k] = corner8(state.ahead, cut, mesh, block, k)
+                x[cut, chunk, k] = gathered8(state.ahead, cut, mesh.nodes[block, k])
                 forces.elements[cut, block, k] = Vectors()
             for e in range(STRIP):
                 f0, f1, f2 = gradient8(
@@ -180,21 +152,14 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
         return out
 
     @wp.func
-    def sum8(a: lanes):
-        total = real(0.0)
-        for lane in range(LANES):
-            total += a[lane]
-        return total
-
-    @wp.func
     def strain8(
         x: wp.array2d(dtype=Any), cut: wp.int32, mesh: Mesh, block: wp.int32, element: wp.int32
     ):
         return gradient8(
-            corner8(x, cut, mesh, block, element),
-            corner8(x, cut, mesh, block, element + 1),
-            corner8(x, cut, mesh, block, element + 2),
-            corner8(x, cut, mesh, block, element + 3),
+            gathered8(x, cut, mesh.nodes[block, element]),
+            gathered8(x, cut, mesh.nodes[block, element + 1]),
+            gathered8(x, cut, mesh.nodes[block, element + 2]),
+            gathered8(x, cut, mesh.nodes[block, element + 3]),
             mesh,
             block,
             element,

@@ -81,7 +81,7 @@ NodeSum = _places("NodeSum", NODE_SUMS)
 BladeSum = _places("BladeSum", BLADE_SUMS)
 
 ACCUMULATED = int(PointSum.BURIED_MOMENT)
-"""Numbers that each cut point keeps in `total`; those of `immersed` follow in the sums."""
+"""Numbers that each eight cut points keep in `total`; those of `immersed` follow in the sums."""
 
 
 def numbers(layout: np.dtype) -> int:

@@ -5,6 +5,7 @@ from typing import Any
 
 import warp as wp
 
+from sliceit_drake.cutting.kernels.lanes import lane_functions
 from sliceit_drake.cutting.kernels.layouts import BladeSum
 from sliceit_drake.cutting.kernels.types import LANES, Scalar, kernel_types
 
@@ -15,6 +16,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
     """The kernels for scalars `real`, in the Warp module `module`, with adjoints if `gradients`."""
     t = kernel_types(real)
     vec3, vec4, slide, padded = t.vec3, t.vec4, t.slide, t.padded
+    sum8 = lane_functions(real).sum8
     Mesh, Parameters, State, Forces, Sums = t.Mesh, t.Parameters, t.State, t.Forces, t.Sums
 
     # Nodes slower than this, in m/s, count as at rest.
@@ -46,7 +48,8 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         """Sum of the forces of the cut points on node i."""
         f = vec3()
         for e in range(mesh.point_start[i], mesh.point_start[i + 1]):
-            f += forces.listed[cut, mesh.point_entry[e]] * mesh.point_weight[e]
+            a = forces.point_rows[cut, mesh.point_entry[e]]
+            f += vec3(a[0], a[LANES], a[2 * LANES]) * mesh.point_weight[e]
         return f
 
     @wp.func
@@ -168,7 +171,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         cut = wp.tid()
         F = real(0.0)
         for i in range(forces.lateral.shape[1]):
-            F += forces.lateral[cut, i]
+            F += sum8(forces.lateral[cut, i])
         forces.push[cut] = F
 
     @wp.kernel(enable_backward=gradients, module=module)

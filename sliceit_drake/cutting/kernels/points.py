@@ -1,4 +1,8 @@
-"""Kernels of the cut points: edge, bonds, flank contact, friction, adhesion; and their energy."""
+"""Kernels of the cut points: edge, bonds, flank contact, friction, adhesion; and their energy.
+
+Points are handled eight a thread with eight-wide vectors: where one of them chooses, all compute
+both sides.
+"""
 
 import types
 from typing import Any
@@ -6,8 +10,9 @@ from typing import Any
 import warp as wp
 
 from sliceit_drake.cutting.foods.effects import LINEAR_BELOW
+from sliceit_drake.cutting.kernels.lanes import lane_functions
 from sliceit_drake.cutting.kernels.layouts import PointSum, Section
-from sliceit_drake.cutting.kernels.types import Scalar, kernel_types
+from sliceit_drake.cutting.kernels.types import LANES, Scalar, kernel_types
 
 __all__ = ["point_kernels"]
 
@@ -15,8 +20,11 @@ __all__ = ["point_kernels"]
 def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespace:
     """The kernels for scalars `real`, in the Warp module `module`, with adjoints if `gradients`."""
     t = kernel_types(real)
-    vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
-    slide, TINY = t.slide, t.TINY
+    vec2, vec3, vec4, mat33, TINY = t.vec2, t.vec3, t.vec4, t.mat33, t.TINY
+    lanes, indices, Vectors = t.lanes, t.indices, t.Vectors
+    f = lane_functions(real)
+    dot8, cross8, scaled8, sum8, length8 = f.dot8, f.cross8, f.scaled8, f.sum8, f.length8
+    exp8, pow8, where8, gathered8 = f.exp8, f.pow8, f.where8, f.gathered8
     Points, Parameters, Motion, State = t.Points, t.Parameters, t.Motion, t.State
     Forces, Sums, Energies = t.Forces, t.Sums, t.Energies
     # Without gradients, an effect that is off costs nothing; with them its derivative is wanted.
@@ -33,53 +41,92 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         w: vec3
 
     @wp.func
-    def place(s: real, points: Points):
-        """Interval of the tables, and the fraction of its end, where the edge is s below."""
-        u = (s + points.reach) * points.per_spacing
-        k = wp.clamp(wp.int32(wp.floor(u)), 0, points.fraction.shape[1] - 2)
-        return k, wp.clamp(u - real(k), real(0.0), real(1.0))
+    def positive8(a: lanes):
+        return wp.max(a, lanes(real(0.0)))
 
     @wp.func
-    def table(values: wp.array2d(dtype=real), row: wp.int32, k: wp.int32, w: real):
-        return values[row, k] * (real(1.0) - w) + values[row, k + 1] * w
+    def share8(a: lanes):
+        """Limited to [0, 1]."""
+        return wp.min(positive8(a), lanes(real(1.0)))
 
     @wp.func
-    def intact_fraction(damage: real, onset: real, failure: real):
-        """Secant over initial stiffness of a bilinear bond that spent the share `damage`."""
-        share = real(0.0)
-        if failure > onset:
-            share = onset * (real(1.0) - damage) / (onset + damage * (failure - onset))
-        return share
+    def all8(a: vec3):
+        return wp.outer(a, lanes(real(1.0)))
 
     @wp.func
-    def wedge(y: real, height: real, cut: wp.int32, parameters: Parameters):
-        """Distance to flank or spine on one side of the section and its gradient (y, height).
+    def place8(s: lanes, points: Points):
+        """Intervals of the tables, and the fractions of their ends, where the edge is s below."""
+        u = (s + lanes(points.reach)) * points.per_spacing
+        k = indices()
+        start = lanes()
+        for lane in range(LANES):
+            k[lane] = wp.clamp(wp.int32(wp.floor(u[lane])), 0, points.fraction.shape[1] - 2)
+            start[lane] = real(k[lane])
+        return k, share8(u - start)
+
+    @wp.func
+    def table8(values: wp.array2d(dtype=real), block: wp.int32, k: indices, w: lanes):
+        a = lanes()
+        b = lanes()
+        for lane in range(LANES):
+            a[lane] = values[LANES * block + lane, k[lane]]
+            b[lane] = values[LANES * block + lane, k[lane] + 1]
+        return a + wp.cw_mul(b - a, w)
+
+    @wp.func
+    def intact_fraction8(damage: lanes, onset: real, failure: lanes):
+        """Secant over initial stiffness of bilinear bonds that spent the share `damage`."""
+        one = lanes(real(1.0))
+        opens = failure - one * onset
+        below = one * onset + wp.cw_mul(damage, positive8(opens))
+        return where8(opens, wp.cw_div((one - damage) * onset, below), lanes())
+
+    @wp.func
+    def wedge8(y: lanes, height: lanes, cut: wp.int32, parameters: Parameters):
+        """Distance to flank or spine on one side of the section and its gradient, y and height.
 
         The side is known, so a point that crossed the middle plane is still pushed back to its own
         side. The bevel at the edge is left out: what it does to the food is the work of the edge,
         which the toughness holds; its steep normal would count that twice, in spikes.
         """
+        one = lanes(real(1.0))
         y1 = parameters.knife[cut, Section.SHOULDER]
         h1 = parameters.knife[cut, Section.SHOULDER + 1]
         y2 = parameters.knife[cut, Section.SPINE]
         h2 = parameters.knife[cut, Section.SPINE + 1]
         flank = wp.normalize(vec2(h2 - h1, y1 - y2))
-        to_flank = flank[0] * (y - y1) + flank[1] * (wp.max(height, h1) - h1)
-        to_spine = height - h2
-        phi = wp.max(to_flank, to_spine)
-        n = wp.where(to_spine > to_flank, vec2(real(0.0), real(1.0)), flank)
-        return phi - parameters.knife[cut, Section.EDGE_RADIUS], n
+        to_flank = (y - one * y1) * flank[0] + positive8(height - one * h1) * flank[1]
+        to_spine = height - one * h2
+        spine = to_spine - to_flank
+        phi = wp.max(to_flank, to_spine) - one * parameters.knife[cut, Section.EDGE_RADIUS]
+        return phi, where8(spine, lanes(), one * flank[0]), where8(spine, one, one * flank[1])
 
     @wp.func
-    def on_face(
-        field: wp.array2d(dtype=vec3), cut: wp.int32, i: wp.int32, face: wp.int32, points: Points
+    def slide8(slip: Vectors, step: Vectors, stiffness: lanes, limit: lanes):
+        """As `slide`, for eight points."""
+        one = lanes(real(1.0))
+        trial = slip + step
+        length = length8(trial)
+        reach = wp.cw_div(limit, wp.max(stiffness, one * TINY))
+        slides = length - reach
+        kept = wp.cw_div(reach, where8(slides, length, one))
+        new_slip = scaled8(where8(slides, kept, one), trial)
+        change = new_slip - slip
+        lost = dot8(new_slip, trial - new_slip) + dot8(change, change) * real(0.5)
+        return new_slip, wp.cw_mul(stiffness, where8(slides, lost, lanes()))
+
+    @wp.func
+    def on_face8(
+        field: wp.array2d(dtype=vec3),
+        cut: wp.int32,
+        block: wp.int32,
+        face: wp.int32,
+        points: Points,
     ):
-        """A field of the nodes at a cut point, on the minus (0) or plus (1) side of the cut."""
-        w = points.weights[i]
-        return (
-            field[cut, points.nodes[i, 2 * face]] * w[0]
-            + field[cut, points.nodes[i, 2 * face + 1]] * w[1]
-        )
+        """A field of the nodes at the cut points, on the minus (0) or plus (1) side of the cut."""
+        a = gathered8(field, cut, points.nodes[block, 2 * face])
+        b = gathered8(field, cut, points.nodes[block, 2 * face + 1])
+        return scaled8(points.weights[block, 0], a) + scaled8(points.weights[block, 1], b)
 
     @wp.func
     def outwards(R: mat33, face: wp.int32):
@@ -90,12 +137,13 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
     @wp.func(inline=True)
     def flank_contact(
         cut: wp.int32,
-        i: wp.int32,
+        block: wp.int32,
         face: wp.int32,
-        p: vec3,
-        v: vec3,
+        p: Vectors,
+        v: Vectors,
         knife: KnifePose,
-        stiffness: real,
+        whole: lanes,
+        stiffness: lanes,
         dt: real,
         points: Points,
         parameters: Parameters,
@@ -115,66 +163,65 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         area between the ends of the blade.
         """
         P = parameters.P
-        arm = p - knife.p
+        one = lanes(real(1.0))
+        arm = p - all8(knife.p)
         knife_y = vec3(knife.R[0, 1], knife.R[1, 1], knife.R[2, 1])
         knife_z = vec3(knife.R[0, 2], knife.R[1, 2], knife.R[2, 2])
-        relative = v - knife.v - wp.cross(knife.w, arm) - now.blade[cut, 1] * knife_y
-        slip = now.slip[cut, i, face]
-        whole = points.area[i]
-        depth = -wp.dot(arm, knife_z)
-        k_now, w_now = place(depth, points)
-        k_old, w_old = place(depth + wp.dot(relative, knife_z) * dt, points)
-        area = whole * table(points.fraction, i, k_now, w_now)
-        old_area = whole * table(points.fraction, i, k_old, w_old)
-        growth = table(points.width, i, k_now, w_now)
-        rise = table(points.centroid, i, k_now, w_now)
-        r = wp.transpose(knife.R) * (arm + vec3(real(0.0), real(0.0), rise))
-        between = wp.abs(r[0]) < parameters.knife[cut, Section.HALF_LENGTH]
-        normal_force = vec3()
-        friction_force = vec3()
-        new_slip = vec3()
+        bending = now.blade[cut, 1] * knife_y
+        relative = v - all8(knife.v + bending) - wp.skew(knife.w) * arm
+        slip = now.slip[cut, block, face]
+        depth = -(knife_z * arm)
+        k_now, w_now = place8(depth, points)
+        k_old, w_old = place8(depth + (knife_z * relative) * dt, points)
+        area = wp.cw_mul(whole, table8(points.fraction, block, k_now, w_now))
+        old_area = wp.cw_mul(whole, table8(points.fraction, block, k_old, w_old))
+        growth = table8(points.width, block, k_now, w_now)
+        rise = table8(points.centroid, block, k_now, w_now)
+        r = wp.transpose(knife.R) * (arm + wp.matrix_from_rows(lanes(), lanes(), rise))
+        between = one * parameters.knife[cut, Section.HALF_LENGTH] - wp.max(r[0], -r[0])
+        between_area = where8(between, area, lanes())
+        facing = outwards(knife.R, face)
+        height = -r[2]
+        phi, n_y, n_h = wedge8((r[1] - one * now.blade[cut, 0]) * facing, height, cut, parameters)
+        touching = where8(-phi, between_area, lanes())
+        held = wp.cw_mul(stiffness, touching)
+        n = wp.outer(knife_y, n_y * facing) - wp.outer(knife_z, n_h)
+        N = -wp.cw_mul(held, phi)
+        # The part grows at the edge, where the flank is thinner than at the centroid.
+        thinner = wp.cw_mul(phi, phi * real(0.5) - wp.cw_mul(n[2], height))
+        at_edge = wp.cw_mul(wp.cw_mul(stiffness, growth), thinner)
+        normal_force = scaled8(N, n) + wp.outer(knife_z, where8(touching, at_edge, lanes()))
+        sliding = relative - scaled8(dot8(relative, n), n)
+        extra = wp.max(P[cut, Scalar.STATIC_FRICTION] - P[cut, Scalar.FRICTION], real(0.0))
+        mu = one * P[cut, Scalar.FRICTION]
+        if extra > real(0.0):
+            mu = mu + exp8(length8(sliding) / -P[cut, Scalar.STRIBECK_VELOCITY]) * extra
+        kept = wp.cw_div(old_area, where8(area, area, one))
+        old = scaled8(wp.min(kept, one), slip)
+        old = old - scaled8(dot8(old, n), n)
+        limit = wp.cw_mul(wp.cw_mul(parameters.friction_scale[cut, block], mu), N)
+        limit = limit + touching * P[cut, Scalar.ADHESION]
+        anchored, slid = slide8(old, sliding * dt, held, limit)
+        viscosity = touching * P[cut, Scalar.FLANK_VISCOSITY]
+        if ALL or P[cut, Scalar.FLANK_VISCOSITY] > real(0.0):
+            ratio = dot8(sliding, sliding) / (
+                P[cut, Scalar.FLANK_SPEED] * P[cut, Scalar.FLANK_SPEED]
+            )
+            power = real(0.5) * (P[cut, Scalar.FLANK_EXPONENT] - real(1.0))
+            viscosity = wp.cw_mul(viscosity, pow8(ratio + one * LINEAR, power))
+        friction_force = -scaled8(held, anchored) - scaled8(viscosity, sliding)
+        new_slip = scaled8(where8(touching, one, lanes()), anchored)
         # What the anchor stored, less what it stores when the part in contact has changed.
-        lost = real(0.5) * stiffness * old_area * wp.dot(slip, slip)
-        if area > real(0.0) and between:
-            facing = outwards(knife.R, face)
-            height = -r[2]
-            phi, n2 = wedge(facing * (r[1] - now.blade[cut, 0]), height, cut, parameters)
-            if phi < real(0.0):
-                n = knife.R * vec3(real(0.0), facing * n2[0], -n2[1])
-                N = -stiffness * area * phi
-                # The part grows at the edge, where the flank is thinner than at the centroid.
-                at_edge = stiffness * growth * phi * (real(0.5) * phi - n[2] * height)
-                normal_force = N * n + at_edge * knife_z
-                sliding = relative - wp.dot(relative, n) * n
-                extra = wp.max(P[cut, Scalar.STATIC_FRICTION] - P[cut, Scalar.FRICTION], real(0.0))
-                mu = P[cut, Scalar.FRICTION]
-                if extra > real(0.0):
-                    mu = mu + extra * wp.exp(-wp.length(sliding) / P[cut, Scalar.STRIBECK_VELOCITY])
-                old = slip * wp.min(old_area / area, real(1.0))
-                old = old - wp.dot(old, n) * n
-                limit = parameters.friction_scale[cut, i] * mu * N + P[cut, Scalar.ADHESION] * area
-                anchored, slid = slide(old, sliding * dt, stiffness * area, limit)
-                new_slip = anchored
-                viscosity = P[cut, Scalar.FLANK_VISCOSITY] * area
-                if ALL or viscosity > real(0.0):
-                    ratio = wp.dot(sliding, sliding) / (
-                        P[cut, Scalar.FLANK_SPEED] * P[cut, Scalar.FLANK_SPEED]
-                    )
-                    power = real(0.5) * (P[cut, Scalar.FLANK_EXPONENT] - real(1.0))
-                    viscosity = viscosity * wp.pow(ratio + LINEAR, power)
-                friction_force = -stiffness * area * anchored - viscosity * sliding
-                lost = (
-                    lost
-                    + slid
-                    - real(0.5) * stiffness * area * wp.dot(old, old)
-                    + viscosity * wp.dot(sliding, sliding) * dt
-                )
-        return normal_force, friction_force, new_slip, lost, wp.where(between, area, real(0.0))
+        stored = wp.cw_mul(wp.cw_mul(stiffness, old_area), dot8(slip, slip))
+        stored = stored - wp.cw_mul(held, dot8(old, old))
+        lost = stored * real(0.5) + slid
+        lost = lost + wp.cw_mul(viscosity, dot8(sliding, sliding)) * dt
+        return normal_force, friction_force, new_slip, lost, between_area
 
     @wp.func(inline=True)
-    def advance_point(
+    def advance_points(
         cut: wp.int32,
-        i: wp.int32,
+        block: wp.int32,
         k: wp.int32,
         dt: real,
         points: Points,
@@ -185,146 +232,150 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         forces: Forces,
         sums: Sums,
     ):
-        """One cut point, see `step_points`."""
+        """Eight cut points, see `step_points`."""
         P = parameters.P
-        xm = on_face(now.x, cut, i, 0, points)
-        xp = on_face(now.x, cut, i, 1, points)
-        vm = on_face(now.v, cut, i, 0, points)
-        vp = on_face(now.v, cut, i, 1, points)
-        middle = real(0.5) * (xm + xp)
+        one = lanes(real(1.0))
+        xm = on_face8(now.x, cut, block, 0, points)
+        xp = on_face8(now.x, cut, block, 1, points)
+        vm = on_face8(now.v, cut, block, 0, points)
+        vp = on_face8(now.v, cut, block, 1, points)
         knife = KnifePose(
             motion.R_CK[cut, k], motion.p_CK[cut, k], motion.v_CK[cut, k], motion.w_CK[cut, k]
         )
         knife_x = vec3(knife.R[0, 0], knife.R[1, 0], knife.R[2, 0])
         knife_y = vec3(knife.R[0, 1], knife.R[1, 1], knife.R[2, 1])
         knife_z = vec3(knife.R[0, 2], knife.R[1, 2], knife.R[2, 2])
-        arm = middle - knife.p
-        advance = (knife.v + wp.cross(knife.w, arm) - real(0.5) * (vm + vp)) * dt
-        A = points.area[i]
-        toughness = parameters.toughness[cut, i]
+        arm = (xm + xp) * real(0.5) - all8(knife.p)
+        moved = all8(knife.v) + wp.skew(knife.w) * arm
+        advance = (moved - (vm + vp) * real(0.5)) * dt
+        A = points.area[block]
+        toughness = parameters.toughness[cut, block]
         # s: depth of the edge below the point. Nothing happens beyond the ends of the blade.
-        old_depth = now.edge_depth[cut, i]
-        s = old_depth
-        beyond = wp.abs(wp.dot(arm, knife_x)) >= parameters.knife[cut, Section.HALF_LENGTH]
-        if not beyond:
-            s = -wp.dot(arm, knife_z)
+        old_depth = now.edge_depth[cut, block]
+        along_edge = knife_x * arm
+        half = one * parameters.knife[cut, Section.HALF_LENGTH]
+        within = half - wp.max(along_edge, -along_edge)
+        s = where8(within, -(knife_z * arm), old_depth)
         depth = wp.max(old_depth, s)
-        after.edge_depth[cut, i] = depth
-        k0, w0 = place(old_depth, points)
-        k1, w1 = place(depth, points)
-        D0 = table(points.fraction, i, k0, w0)
-        D = table(points.fraction, i, k1, w1)
+        after.edge_depth[cut, block] = depth
+        k0, w0 = place8(old_depth, points)
+        k1, w1 = place8(depth, points)
+        D0 = table8(points.fraction, block, k0, w0)
+        D = table8(points.fraction, block, k1, w1)
 
         # Bonds of the part that is not cut; its faces may also press on each other.
         gap = xp - xm
-        opening = vec3(gap[0], wp.max(gap[1], real(0.0)), gap[2])
-        length = wp.length(opening)
+        opening = wp.matrix_from_rows(gap[0], positive8(gap[1]), gap[2])
+        length = length8(opening)
         bond = P[cut, Scalar.BOND_STIFFNESS]
         onset = P[cut, Scalar.STRENGTH] / bond
-        failure = real(2.0) * toughness / P[cut, Scalar.STRENGTH]
-        old_damage = now.cohesive_damage[cut, i]
-        damage = wp.max(
-            old_damage,
-            wp.clamp((length - onset) / wp.max(failure - onset, TINY), real(0.0), real(1.0)),
-        )
-        after.cohesive_damage[cut, i] = damage
-        intact = intact_fraction(damage, onset, failure)
+        failure = toughness * (real(2.0) / P[cut, Scalar.STRENGTH])
+        old_damage = now.cohesive_damage[cut, block]
+        opens = wp.max(failure - one * onset, one * TINY)
+        damage = wp.max(old_damage, share8(wp.cw_div(length - one * onset, opens)))
+        after.cohesive_damage[cut, block] = damage
+        intact = intact_fraction8(damage, onset, failure)
         by_edge = P[cut, Scalar.EDGE_SHARE]
-        stiffness = bond * A * (real(1.0) - by_edge * D) * intact
-        closing = bond * A * wp.min(gap[1], real(0.0))
-        pull = stiffness * opening + vec3(real(0.0), closing, real(0.0))
-        opening_loss = toughness * A * (real(1.0) - by_edge * D0) * (damage - old_damage)
+        stiffness = wp.cw_mul(wp.cw_mul(A, one - D * by_edge), intact) * bond
+        closing = wp.cw_mul(A, wp.min(gap[1], lanes())) * bond
+        pull = scaled8(stiffness, opening) + wp.matrix_from_rows(lanes(), closing, lanes())
+        spent = wp.cw_mul(one - D0 * by_edge, damage - old_damage)
+        opening_loss = wp.cw_mul(wp.cw_mul(toughness, A), spent)
 
         # Edge: a force against the edge's direction d, elastic up to R T (d . n), where R is the
         # toughness that opening left less what the bonds that the edge cuts give up. d follows the
         # knife's own motion: with the food's in it, a drawn edge would feel less force the faster
         # the food moves, and chatter. Behind the deepest point there is a slack and then nothing.
-        moved = knife.v + wp.cross(knife.w, arm)
-        along = moved - wp.dot(moved, knife_y) * knife_y
-        speed = wp.length(along)
+        along = moved - wp.outer(knife_y, knife_y * moved)
+        speed = length8(along)
         travel = speed * dt
-        old_direction = now.edge_direction[cut, i]
-        followed = old_direction
-        if travel > real(0.0):
-            keep = wp.exp(-travel / P[cut, Scalar.DIRECTION_LENGTH])
-            followed = keep * old_direction + ((real(1.0) - keep) * dt / travel) * along
-        in_plane = followed - wp.dot(followed, knife_y) * knife_y
-        size = wp.length(in_plane)
-        d = old_direction
-        if size > real(1.0e-6):
-            d = in_plane / size
-        after.edge_direction[cut, i] = d
-        bonded = real(0.5) * by_edge * bond * intact * length * length
-        left = wp.max(by_edge * toughness * (real(1.0) - damage) - bonded, real(0.0))
+        old_direction = now.edge_direction[cut, block]
+        keep = exp8(travel / -P[cut, Scalar.DIRECTION_LENGTH])
+        follow = wp.cw_div((one - keep) * dt, where8(travel, travel, one))
+        followed = scaled8(keep, old_direction) + scaled8(follow, along)
+        in_plane = followed - wp.outer(knife_y, knife_y * followed)
+        size = length8(in_plane)
+        sized = size - one * real(1.0e-6)
+        unit = scaled8(wp.cw_div(one, where8(sized, size, one)), in_plane)
+        d = wp.matrix_from_rows(
+            where8(sized, unit[0], old_direction[0]),
+            where8(sized, unit[1], old_direction[1]),
+            where8(sized, unit[2], old_direction[2]),
+        )
+        after.edge_direction[cut, block] = d
+        bonded = wp.cw_mul(intact, wp.cw_mul(length, length)) * (real(0.5) * by_edge * bond)
+        left = positive8(wp.cw_mul(toughness, one - damage) * by_edge - bonded)
         # The edge cuts what its direction has across it; pressing straight, all.
-        across = wp.max(wp.dot(d, knife_z), real(0.0))
+        across = positive8(knife_z * d)
         effect = across
         if ALL or P[cut, Scalar.SLICE_PUSH_EXPONENT] != real(1.0):
             # Nothing on the way out, where nothing is across, whatever the exponent.
             exponent = real(2.0) * P[cut, Scalar.SLICE_PUSH_EXPONENT] - real(2.0)
-            effect = across * wp.pow(wp.max(across, real(1.0e-3)), exponent)
+            effect = wp.cw_mul(across, pow8(wp.max(across, one * real(1.0e-3)), exponent))
         if ALL or P[cut, Scalar.RATE_EXPONENT] != real(0.0):
-            relative_speed = wp.max(speed / P[cut, Scalar.REFERENCE_SPEED], real(1.0e-3))
-            effect = effect * wp.pow(relative_speed, P[cut, Scalar.RATE_EXPONENT])
+            relative_speed = wp.max(speed / P[cut, Scalar.REFERENCE_SPEED], one * real(1.0e-3))
+            effect = wp.cw_mul(effect, pow8(relative_speed, P[cut, Scalar.RATE_EXPONENT]))
         if ALL or P[cut, Scalar.INITIATION] > real(0.0):
-            below = wp.max(points.depth[i] + depth, real(0.0))
-            left = left + P[cut, Scalar.INITIATION] * wp.exp(
-                -below / P[cut, Scalar.INITIATION_DEPTH]
-            )
-        resistance = left * table(points.width, i, k1, w1)
+            below = positive8(points.depth[block] + depth)
+            started = exp8(below / -P[cut, Scalar.INITIATION_DEPTH])
+            left = left + started * P[cut, Scalar.INITIATION]
+        resistance = wp.cw_mul(left, table8(points.width, block, k1, w1))
         if ALL or P[cut, Scalar.SKIN_TOUGHNESS] > real(0.0):
-            resistance = resistance + P[cut, Scalar.SKIN_TOUGHNESS] * table(
-                points.outline, i, k1, w1
-            )
-        spring = wp.max(parameters.unloading[cut, i], TINY)
-        slack = wp.max(depth - s - P[cut, Scalar.UNLOADING_LENGTH], real(0.0))
-        limit = wp.max(resistance * effect - spring * slack, real(0.0))
-        if beyond:
-            limit = real(0.0)
-        q0 = now.edge_force[cut, i]
-        step = wp.dot(d, advance)
-        q = wp.clamp(q0 + spring * step, real(0.0), limit)
-        after.edge_force[cut, i] = q
-        edge = q * d
-        edge_loss = q * step - real(0.5) * (q * q - q0 * q0) / spring + bonded * A * (D - D0)
+            skin = table8(points.outline, block, k1, w1)
+            resistance = resistance + skin * P[cut, Scalar.SKIN_TOUGHNESS]
+        spring = wp.max(parameters.unloading[cut, block], one * TINY)
+        slack = positive8(depth - s - one * P[cut, Scalar.UNLOADING_LENGTH])
+        limit = positive8(wp.cw_mul(resistance, effect) - wp.cw_mul(spring, slack))
+        limit = where8(within, limit, lanes())
+        q0 = now.edge_force[cut, block]
+        step = dot8(d, advance)
+        q = wp.min(positive8(q0 + wp.cw_mul(spring, step)), limit)
+        after.edge_force[cut, block] = q
+        edge = scaled8(q, d)
+        returned = wp.cw_div(wp.cw_mul(q, q) - wp.cw_mul(q0, q0), spring) * real(0.5)
+        cut_bonds = wp.cw_mul(wp.cw_mul(bonded, A), D - D0)
+        edge_loss = wp.cw_mul(q, step) - returned + cut_bonds
 
         # Flanks on the part that is cut.
-        flank = P[cut, Scalar.FLANK_STIFFNESS] * parameters.flank_scale[cut, i]
+        flank = parameters.flank_scale[cut, block] * P[cut, Scalar.FLANK_STIFFNESS]
         normal_m, friction_m, slip_m, loss_m, area_m = flank_contact(
-            cut, i, 0, xm, vm, knife, flank, dt, points, parameters, now
+            cut, block, 0, xm, vm, knife, A, flank, dt, points, parameters, now
         )
         normal_p, friction_p, slip_p, loss_p, area_p = flank_contact(
-            cut, i, 1, xp, vp, knife, flank, dt, points, parameters, now
+            cut, block, 1, xp, vp, knife, A, flank, dt, points, parameters, now
         )
-        after.slip[cut, i, 0] = slip_m
-        after.slip[cut, i, 1] = slip_p
+        after.slip[cut, block, 0] = slip_m
+        after.slip[cut, block, 1] = slip_p
 
-        forces.points[cut, i, 0] = pull + real(0.5) * edge + normal_m + friction_m
-        forces.points[cut, i, 1] = -pull + real(0.5) * edge + normal_p + friction_p
+        half_edge = edge * real(0.5)
+        forces.points[cut, block, 0] = half_edge + pull + normal_m + friction_m
+        forces.points[cut, block, 1] = half_edge - pull + normal_p + friction_p
 
-        forces.lateral[cut, i] = -wp.dot(normal_m + normal_p + friction_m + friction_p, knife_y)
-
-        origin = knife.p
-        edge_moment = wp.cross(arm, edge)
-        normal_moment = wp.cross(xm - origin, normal_m) + wp.cross(xp - origin, normal_p)
-        friction_moment = wp.cross(xm - origin, friction_m) + wp.cross(xp - origin, friction_p)
         normal = normal_m + normal_p
         friction = friction_m + friction_p
-        coupling_step = k / motion.substeps
+        forces.lateral[cut, block] = -(knife_y * (normal + friction))
+
+        to_m = xm - all8(knife.p)
+        to_p = xp - all8(knife.p)
+        edge_moment = cross8(arm, edge)
+        normal_moment = cross8(to_m, normal_m) + cross8(to_p, normal_p)
+        friction_moment = cross8(to_m, friction_m) + cross8(to_p, friction_p)
+        e = k / motion.substeps
         for c in range(3):
-            sums.total[cut, coupling_step, i, PointSum.FORCES + c] += -edge[c]
-            sums.total[cut, coupling_step, i, PointSum.FORCES + 3 + c] += -normal[c]
-            sums.total[cut, coupling_step, i, PointSum.FORCES + 6 + c] += -friction[c]
-            sums.total[cut, coupling_step, i, PointSum.MOMENTS + c] += -edge_moment[c]
-            sums.total[cut, coupling_step, i, PointSum.MOMENTS + 3 + c] += -normal_moment[c]
-            sums.total[cut, coupling_step, i, PointSum.MOMENTS + 6 + c] += -friction_moment[c]
-        sums.total[cut, coupling_step, i, PointSum.EDGE_LOSS] += edge_loss
-        sums.total[cut, coupling_step, i, PointSum.OPENING_LOSS] += opening_loss
-        sums.total[cut, coupling_step, i, PointSum.FRICTION_LOSS] += loss_m + loss_p
-        sums.total[cut, coupling_step, i, PointSum.CUT_AREA] = A * D
-        a = real(0.5) * (area_m + area_p)
-        b = real(0.5) * (area_m * (xm - origin) + area_p * (xp - origin))
-        sums.immersed[cut, coupling_step, i] = vec4(b[0], b[1], b[2], a)
+            sums.total[cut, e, block, PointSum.FORCES + c] += -sum8(edge[c])
+            sums.total[cut, e, block, PointSum.FORCES + 3 + c] += -sum8(normal[c])
+            sums.total[cut, e, block, PointSum.FORCES + 6 + c] += -sum8(friction[c])
+            sums.total[cut, e, block, PointSum.MOMENTS + c] += -sum8(edge_moment[c])
+            sums.total[cut, e, block, PointSum.MOMENTS + 3 + c] += -sum8(normal_moment[c])
+            sums.total[cut, e, block, PointSum.MOMENTS + 6 + c] += -sum8(friction_moment[c])
+        sums.total[cut, e, block, PointSum.EDGE_LOSS] += sum8(edge_loss)
+        sums.total[cut, e, block, PointSum.OPENING_LOSS] += sum8(opening_loss)
+        sums.total[cut, e, block, PointSum.FRICTION_LOSS] += sum8(loss_m + loss_p)
+        sums.total[cut, e, block, PointSum.CUT_AREA] = sum8(wp.cw_mul(A, D))
+        b = scaled8(area_m, to_m) + scaled8(area_p, to_p)
+        sums.immersed[cut, e, block] = real(0.5) * vec4(
+            sum8(b[0]), sum8(b[1]), sum8(b[2]), sum8(area_m + area_p)
+        )
 
     @wp.kernel(enable_backward=gradients, module=module)
     def step_points(
@@ -346,45 +397,49 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         to `sums.immersed` the moment about Ko of the part of it above the edge, and that part."""
         cut, chunk = wp.tid()
         for i in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, points.area.shape[0])):
-            advance_point(cut, i, k, dt, points, parameters, motion, now, after, forces, sums)
+            advance_points(cut, i, k, dt, points, parameters, motion, now, after, forces, sums)
 
     @wp.kernel(enable_backward=False, module=module)
     def point_energy(
         points: Points, parameters: Parameters, motion: Motion, state: State, energies: Energies
     ):
         """Recoverable energy of each cut point, the knife at its pose in the first sub-step."""
-        cut, i = wp.tid()
+        cut, block = wp.tid()
         P = parameters.P
+        one = lanes(real(1.0))
         R = motion.R_CK[cut, 0]
-        A = points.area[i]
-        k0, w0 = place(state.edge_depth[cut, i], points)
-        D = table(points.fraction, i, k0, w0)
-        gap = on_face(state.x, cut, i, 1, points) - on_face(state.x, cut, i, 0, points)
+        A = points.area[block]
+        k0, w0 = place8(state.edge_depth[cut, block], points)
+        D = table8(points.fraction, block, k0, w0)
+        gap = on_face8(state.x, cut, block, 1, points) - on_face8(state.x, cut, block, 0, points)
         bond = P[cut, Scalar.BOND_STIFFNESS]
         onset = P[cut, Scalar.STRENGTH] / bond
-        failure = real(2.0) * parameters.toughness[cut, i] / P[cut, Scalar.STRENGTH]
-        intact = intact_fraction(state.cohesive_damage[cut, i], onset, failure)
-        opening = vec3(gap[0], wp.max(gap[1], real(0.0)), gap[2])
-        closing = wp.min(gap[1], real(0.0))
-        uncut = (real(1.0) - P[cut, Scalar.EDGE_SHARE] * D) * intact
-        doubled = bond * A * (uncut * wp.dot(opening, opening) + closing * closing)
+        failure = parameters.toughness[cut, block] * (real(2.0) / P[cut, Scalar.STRENGTH])
+        intact = intact_fraction8(state.cohesive_damage[cut, block], onset, failure)
+        opening = wp.matrix_from_rows(gap[0], positive8(gap[1]), gap[2])
+        closing = wp.min(gap[1], lanes())
+        uncut = wp.cw_mul(one - D * P[cut, Scalar.EDGE_SHARE], intact)
+        stretched = wp.cw_mul(uncut, dot8(opening, opening)) + wp.cw_mul(closing, closing)
+        doubled = wp.cw_mul(A, stretched) * bond
         knife_z = vec3(R[0, 2], R[1, 2], R[2, 2])
-        edge = state.edge_force[cut, i]
-        doubled += edge * edge / wp.max(parameters.unloading[cut, i], TINY)
-        flank = P[cut, Scalar.FLANK_STIFFNESS] * parameters.flank_scale[cut, i]
+        edge = state.edge_force[cut, block]
+        spring = wp.max(parameters.unloading[cut, block], one * TINY)
+        doubled = doubled + wp.cw_div(wp.cw_mul(edge, edge), spring)
+        flank = parameters.flank_scale[cut, block] * P[cut, Scalar.FLANK_STIFFNESS]
         for face in range(2):
-            arm = on_face(state.x, cut, i, face, points) - motion.p_CK[cut, 0]
-            k1, w1 = place(-wp.dot(arm, knife_z), points)
-            share = table(points.fraction, i, k1, w1)
-            rise = table(points.centroid, i, k1, w1)
-            r = wp.transpose(R) * (arm + vec3(real(0.0), real(0.0), rise))
-            if share > real(0.0) and wp.abs(r[0]) < parameters.knife[cut, Section.HALF_LENGTH]:
-                y = outwards(R, face) * (r[1] - state.blade[cut, 0])
-                phi, _n = wedge(y, -r[2], cut, parameters)
-                if phi < real(0.0):
-                    held = state.slip[cut, i, face]
-                    doubled += flank * A * share * (phi * phi + wp.dot(held, held))
-        energies.points[cut, i] = real(0.5) * doubled
+            arm = on_face8(state.x, cut, block, face, points) - all8(motion.p_CK[cut, 0])
+            k1, w1 = place8(-(knife_z * arm), points)
+            share = table8(points.fraction, block, k1, w1)
+            rise = table8(points.centroid, block, k1, w1)
+            r = wp.transpose(R) * (arm + wp.matrix_from_rows(lanes(), lanes(), rise))
+            between = one * parameters.knife[cut, Section.HALF_LENGTH] - wp.max(r[0], -r[0])
+            y = (r[1] - one * state.blade[cut, 0]) * outwards(R, face)
+            phi, _n_y, _n_h = wedge8(y, -r[2], cut, parameters)
+            held = state.slip[cut, block, face]
+            touching = where8(-phi, where8(between, wp.cw_mul(A, share), lanes()), lanes())
+            pressed = wp.cw_mul(phi, phi) + dot8(held, held)
+            doubled = doubled + wp.cw_mul(wp.cw_mul(flank, touching), pressed)
+        energies.points[cut, block] = doubled * real(0.5)
 
     out = types.SimpleNamespace(step_points=step_points, point_energy=point_energy)
     if not gradients:
@@ -392,12 +447,14 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
 
     @wp.kernel(enable_backward=False, module=module)
     def spread_adjoint(
-        points: Points, adj_from_points: wp.array2d(dtype=vec3), adj_force: wp.array3d(dtype=vec3)
+        points: Points,
+        adj_from_points: wp.array2d(dtype=vec3),
+        adj_force: wp.array3d(dtype=Vectors),
     ):
         """Adjoint of the forces of the cut points, from those of the nodes that gather them."""
-        cut, i = wp.tid()
+        cut, block = wp.tid()
         for face in range(2):
-            adj_force[cut, i, face] = on_face(adj_from_points, cut, i, face, points)
+            adj_force[cut, block, face] = on_face8(adj_from_points, cut, block, face, points)
 
     out.spread_adjoint = spread_adjoint
     return out

@@ -66,7 +66,7 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
     vec2, vec3, vec4 = (wp.types.vector(n, real) for n in (2, 3, 4))
     mat33 = wp.types.matrix((3, 3), real)
     lanes, indices = wp.types.vector(LANES, real), wp.types.vector(LANES, wp.int32)
-    # From the x component of a nodal force in `elements` to its z component.
+    # From the x component of a force in `Vectors` to its z component.
     strided = wp.types.vector(2 * LANES + 1, real)
     entries = wp.types.vector(GATHER, wp.int32)
     # A vector in each lane, by component.
@@ -90,16 +90,17 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
 
     @wp.struct
     class Points:
-        """The cut points and their tables over [-reach, reach]; see `EdgeTables`."""
+        """The cut points in blocks of `LANES`, and their tables over [-reach, reach]; see
+        `EdgeTables`. What fills up the last block has no area."""
 
-        nodes: wp.array2d(dtype=wp.int32)
-        weights: wp.array(dtype=vec2)
-        area: wp.array(dtype=real)
+        nodes: wp.array2d(dtype=indices)
+        weights: wp.array2d(dtype=lanes)
+        area: wp.array(dtype=lanes)
         width: wp.array2d(dtype=real)
         fraction: wp.array2d(dtype=real)
         centroid: wp.array2d(dtype=real)
         outline: wp.array2d(dtype=real)
-        depth: wp.array(dtype=real)
+        depth: wp.array(dtype=lanes)
         reach: real
         per_spacing: real
 
@@ -109,10 +110,10 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
 
         P: wp.array2d(dtype=real)
         knife: wp.array2d(dtype=real)
-        toughness: wp.array2d(dtype=real)
-        flank_scale: wp.array2d(dtype=real)
-        friction_scale: wp.array2d(dtype=real)
-        unloading: wp.array2d(dtype=real)
+        toughness: wp.array2d(dtype=lanes)
+        flank_scale: wp.array2d(dtype=lanes)
+        friction_scale: wp.array2d(dtype=lanes)
+        unloading: wp.array2d(dtype=lanes)
         inverse_mass: wp.array2d(dtype=real)
         local_damping: wp.array2d(dtype=real)
         weight: wp.array2d(dtype=vec3)
@@ -148,11 +149,11 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
 
         x: wp.array2d(dtype=vec3)
         v: wp.array2d(dtype=vec3)
-        edge_depth: wp.array2d(dtype=real)
-        cohesive_damage: wp.array2d(dtype=real)
-        edge_force: wp.array2d(dtype=real)
-        edge_direction: wp.array2d(dtype=vec3)
-        slip: wp.array3d(dtype=vec3)
+        edge_depth: wp.array2d(dtype=lanes)
+        cohesive_damage: wp.array2d(dtype=lanes)
+        edge_force: wp.array2d(dtype=lanes)
+        edge_direction: wp.array2d(dtype=Vectors)
+        slip: wp.array3d(dtype=Vectors)
         board_slip: wp.array2d(dtype=vec3)
         overstress: wp.array3d(dtype=vec3)
         blade: wp.array2d(dtype=real)
@@ -162,15 +163,15 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
     class Forces:
         """Forces in a sub-step: of the elements on the corners of their strips, also as the rows in
         which a node finds its entries, and where those corners are; on both faces at the cut
-        points, also as one list; of the flanks along Ky, by point and summed. With gradients, what
+        points, also as such rows; of the flanks along Ky, by point and summed. With gradients, what
         each node got from elements, from the bulk (elements after relaxation) and from points."""
 
         corners: wp.array3d(dtype=Vectors)
         elements: wp.array3d(dtype=Vectors)
         rows: wp.array2d(dtype=strided)
-        points: wp.array3d(dtype=vec3)
-        listed: wp.array2d(dtype=vec3)
-        lateral: wp.array2d(dtype=real)
+        points: wp.array3d(dtype=Vectors)
+        point_rows: wp.array2d(dtype=strided)
+        lateral: wp.array2d(dtype=lanes)
         push: wp.array(dtype=real)
         from_elements: wp.array2d(dtype=vec3)
         from_bulk: wp.array2d(dtype=vec3)
@@ -203,7 +204,7 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
 
         elastic: wp.array4d(dtype=real)
         volume_ratio: wp.array4d(dtype=real)
-        points: wp.array2d(dtype=real)
+        points: wp.array2d(dtype=lanes)
 
     @wp.func
     def slide(slip: vec3, step: vec3, stiffness: real, limit: real):
