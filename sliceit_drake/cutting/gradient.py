@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from sliceit_drake.cutting.kernels.layouts import ACCUMULATED, BLADE_SUMS, POINT_SUMS
-from sliceit_drake.cutting.kernels.types import PARAMETERS
+from sliceit_drake.cutting.kernels.layouts import BLADE_SUMS, POINT_SUMS
+from sliceit_drake.cutting.kernels.types import LANES, PARAMETERS
 from sliceit_drake.cutting.knife_path import Mounting
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError
@@ -220,14 +220,14 @@ class SliceAdjoint:
         adjoint = np.zeros(ws.sum_rows.shape[1])
         total, bending = np.zeros(1, POINT_SUMS), np.zeros(1, BLADE_SUMS)
         total["forces"], total["moments"] = of_force / n, of_moment / n
-        blocks = ws.point_blocks
-        adjoint[ws.sum_layout["total"]] = np.tile(total.view(float)[:ACCUMULATED], blocks)
+        if area > 0.0:
+            total["buried_moment"] = of_middle / area
+            total["buried_area"] = -(of_middle @ middle) / area
+        of_block = np.repeat(total.view(float), LANES)
+        adjoint[ws.sum_layout["points"]] = np.tile(of_block, ws.point_blocks)
         along = float(of_lateral @ R[:, 1]) / n
         bending["on_knife"], bending["on_blade"] = along, -along
         adjoint[ws.sum_layout["blade"]] = bending.view(float)
-        if area > 0.0:
-            of_immersed = np.concatenate([of_middle, [-(of_middle @ middle)]]) / area
-            adjoint[ws.sum_layout["immersed"]] = np.tile(of_immersed, blocks)
         return adjoint, of_lateral * push / n
 
     def _launch_backward(self) -> None:

@@ -238,8 +238,7 @@ class Workspace:
 
         self.sums, self._results, self._energies = k.Sums(), k.Results(), k.Energies()
         sums = {
-            "total": (E, self.point_blocks, layouts.ACCUMULATED),
-            "immersed": (E, self.point_blocks, 4),
+            "points": (E, self.point_blocks, layouts.numbers(layouts.POINT_SUMS), LANES),
             "blade": (E, layouts.numbers(layouts.BLADE_SUMS)),
             "board_force": (N, 3),
             "board_loss": (N,),

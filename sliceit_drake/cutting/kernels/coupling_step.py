@@ -8,8 +8,8 @@ from typing import Any
 
 import warp as wp
 
-from sliceit_drake.cutting.kernels.layouts import ACCUMULATED, BladeSum, NodeSum, PointSum
-from sliceit_drake.cutting.kernels.types import kernel_types
+from sliceit_drake.cutting.kernels.layouts import BladeSum, NodeSum, PointSum
+from sliceit_drake.cutting.kernels.types import LANES, kernel_types
 
 __all__ = ["coupling_kernels"]
 
@@ -59,14 +59,12 @@ def coupling_kernels(real: Any, module: str) -> types.SimpleNamespace:
 
     @wp.kernel(enable_backward=False, module=module)
     def add_points(sums: Sums, results: Results):
-        """Sums of `total` and `immersed` over the cut points, a thread for each column."""
+        """Sums over the cut points, a thread for each column."""
         cut, e, j = wp.tid()
         s = float64(0.0)
-        for i in range(sums.total.shape[2]):
-            if j < ACCUMULATED:
-                s += float64(sums.total[cut, e, i, j])
-            else:
-                s += float64(sums.immersed[cut, e, i][j - ACCUMULATED])
+        for block in range(sums.points.shape[2]):
+            for lane in range(LANES):
+                s += float64(sums.points[cut, e, block, j][lane])
         results.point_sums[cut, e, j] = s
 
     @wp.kernel(enable_backward=False, module=module)

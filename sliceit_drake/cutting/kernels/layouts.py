@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 __all__ = [
-    "ACCUMULATED",
     "BLADE_SUMS",
     "KNIFE",
     "NODE_SUMS",
@@ -79,9 +78,6 @@ Section = _places("Section", KNIFE)
 PointSum = _places("PointSum", POINT_SUMS)
 NodeSum = _places("NodeSum", NODE_SUMS)
 BladeSum = _places("BladeSum", BLADE_SUMS)
-
-ACCUMULATED = int(PointSum.BURIED_MOMENT)
-"""Numbers that each eight cut points keep in `total`; those of `immersed` follow in the sums."""
 
 
 def numbers(layout: np.dtype) -> int:

@@ -20,10 +20,10 @@ __all__ = ["point_kernels"]
 def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespace:
     """The kernels for scalars `real`, in the Warp module `module`, with adjoints if `gradients`."""
     t = kernel_types(real)
-    vec2, vec3, vec4, mat33, TINY = t.vec2, t.vec3, t.vec4, t.mat33, t.TINY
+    vec2, vec3, mat33, TINY = t.vec2, t.vec3, t.mat33, t.TINY
     lanes, indices, Vectors = t.lanes, t.indices, t.Vectors
     f = lane_functions(real)
-    dot8, cross8, scaled8, sum8, length8 = f.dot8, f.cross8, f.scaled8, f.sum8, f.length8
+    dot8, cross8, scaled8, length8 = f.dot8, f.cross8, f.scaled8, f.length8
     exp8, pow8, where8, gathered8 = f.exp8, f.pow8, f.where8, f.gathered8
     Points, Parameters, Motion, State = t.Points, t.Parameters, t.Motion, t.State
     Forces, Sums, Energies = t.Forces, t.Sums, t.Energies
@@ -362,20 +362,20 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         friction_moment = cross8(to_m, friction_m) + cross8(to_p, friction_p)
         e = k / motion.substeps
         for c in range(3):
-            sums.total[cut, e, block, PointSum.FORCES + c] += -sum8(edge[c])
-            sums.total[cut, e, block, PointSum.FORCES + 3 + c] += -sum8(normal[c])
-            sums.total[cut, e, block, PointSum.FORCES + 6 + c] += -sum8(friction[c])
-            sums.total[cut, e, block, PointSum.MOMENTS + c] += -sum8(edge_moment[c])
-            sums.total[cut, e, block, PointSum.MOMENTS + 3 + c] += -sum8(normal_moment[c])
-            sums.total[cut, e, block, PointSum.MOMENTS + 6 + c] += -sum8(friction_moment[c])
-        sums.total[cut, e, block, PointSum.EDGE_LOSS] += sum8(edge_loss)
-        sums.total[cut, e, block, PointSum.OPENING_LOSS] += sum8(opening_loss)
-        sums.total[cut, e, block, PointSum.FRICTION_LOSS] += sum8(loss_m + loss_p)
-        sums.total[cut, e, block, PointSum.CUT_AREA] = sum8(wp.cw_mul(A, D))
+            sums.points[cut, e, block, PointSum.FORCES + c] += -edge[c]
+            sums.points[cut, e, block, PointSum.FORCES + 3 + c] += -normal[c]
+            sums.points[cut, e, block, PointSum.FORCES + 6 + c] += -friction[c]
+            sums.points[cut, e, block, PointSum.MOMENTS + c] += -edge_moment[c]
+            sums.points[cut, e, block, PointSum.MOMENTS + 3 + c] += -normal_moment[c]
+            sums.points[cut, e, block, PointSum.MOMENTS + 6 + c] += -friction_moment[c]
+        sums.points[cut, e, block, PointSum.EDGE_LOSS] += edge_loss
+        sums.points[cut, e, block, PointSum.OPENING_LOSS] += opening_loss
+        sums.points[cut, e, block, PointSum.FRICTION_LOSS] += loss_m + loss_p
+        sums.points[cut, e, block, PointSum.CUT_AREA] = wp.cw_mul(A, D)
         b = scaled8(area_m, to_m) + scaled8(area_p, to_p)
-        sums.immersed[cut, e, block] = real(0.5) * vec4(
-            sum8(b[0]), sum8(b[1]), sum8(b[2]), sum8(area_m + area_p)
-        )
+        for c in range(3):
+            sums.points[cut, e, block, PointSum.BURIED_MOMENT + c] = b[c] * real(0.5)
+        sums.points[cut, e, block, PointSum.BURIED_AREA] = (area_m + area_p) * real(0.5)
 
     @wp.kernel(enable_backward=gradients, module=module)
     def step_points(
@@ -392,9 +392,9 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
     ):
         """Edge, opening, self contact, flank contact and friction at each cut point in sub-step k.
 
-        Advances the history of the points. Adds to `sums.total` forces on the knife, their moments
-        about Ko and energies dissipated, and writes the area that is cut; see `POINT_SUMS`. Writes
-        to `sums.immersed` the moment about Ko of the part of it above the edge, and that part."""
+        Advances the history of the points. Adds to `sums.points` forces on the knife, their
+        moments about Ko and energies dissipated, and writes the area that is cut, the moment about
+        Ko of the part of it above the edge, and that part; see `POINT_SUMS`."""
         cut, chunk = wp.tid()
         for i in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, points.area.shape[0])):
             advance_points(cut, i, k, dt, points, parameters, motion, now, after, forces, sums)

@@ -181,8 +181,7 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
     class Sums:
         """What the sub-steps add up at points and nodes and of the blade; see `layouts`."""
 
-        total: wp.array4d(dtype=real)
-        immersed: wp.array3d(dtype=vec4)
+        points: wp.array4d(dtype=lanes)
         blade: wp.array3d(dtype=real)
         board_force: wp.array2d(dtype=vec3)
         board_loss: wp.array2d(dtype=real)
