@@ -9,20 +9,19 @@ decision is timed with the exported network, torch not imported.
 """
 
 import argparse
-import functools
 import os
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
 from studies.marked_page import Place
 from studies.results import add_json_argument, write_results
+from studies.watch import Watch
 
 __all__ = ["PLACE", "add_arguments", "run"]
 
@@ -106,33 +105,6 @@ def update_time(count: int = 200) -> float:
     begin = time.perf_counter()
     model.train(count, config.batch)
     return 1e3 * (time.perf_counter() - begin) / count
-
-
-class Watch:
-    """Time spent in methods, less that in watched methods that they call."""
-
-    def __init__(self) -> None:
-        self.spent: dict[str, float] = {}
-        self._inner: list[float] = []
-
-    def method(self, owner: type, name: str, part: str) -> None:
-        """Watches a method from now on; systems bind theirs when they are made."""
-        original = getattr(owner, name)
-        self.spent.setdefault(part, 0.0)
-
-        @functools.wraps(original)
-        def watched(*arguments: Any, **options: Any) -> Any:
-            self._inner.append(0.0)
-            begin = time.perf_counter()
-            try:
-                return original(*arguments, **options)
-            finally:
-                whole = time.perf_counter() - begin
-                self.spent[part] += whole - self._inner.pop()
-                if self._inner:
-                    self._inner[-1] += whole
-
-        setattr(owner, name, watched)
 
 
 def shares(rounds: int) -> list[tuple[str, ...]]:
