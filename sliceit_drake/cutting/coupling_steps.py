@@ -1,6 +1,7 @@
 """Advances food through coupling steps: forces on the knife, work and dissipation."""
 
 import dataclasses as dc
+import math
 
 import numpy as np
 
@@ -99,7 +100,9 @@ class CouplingSteps:
     @property
     def finite(self) -> bool:
         """Whether the cut has not broken down; limits on forces can hide a state that has."""
-        return bool(np.isfinite(self.wrenches).all() and np.isfinite(self.state).all())
+        # What is not finite makes the sum of squares so, at a fourth of the cost of tests.
+        squares = (each.dot(each) for each in (self.state, self.wrenches.ravel()))
+        return all(map(math.isfinite, squares))
 
 
 def run_coupling_steps(
@@ -126,7 +129,7 @@ def run_coupling_steps(
         edge, opening, friction = sums[:, _LOSSES].sum(0).tolist()
         balance = EnergyBalance(
             work=float(row["work"].sum()),
-            gravity=float(model.weight.ravel() @ (new[c, x] - states[c, x])),
+            gravity=float(model.weight.ravel().dot(new[c, x] - states[c, x])),
             edge=edge,
             opening=opening,
             friction=friction,

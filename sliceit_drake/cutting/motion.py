@@ -75,13 +75,13 @@ class Velocity(typing.NamedTuple):
 
 def small_turn(R0: np.ndarray, R1: np.ndarray) -> np.ndarray:
     """Axis times sine of the angle of the turn from R0 to R1 [3], in the frame of both, rad."""
-    a, b = R0.tolist(), R1.tolist()
-
-    def element(i: int, j: int) -> float:
-        """Element of R1 R0^T."""
-        return b[i][0] * a[j][0] + b[i][1] * a[j][1] + b[i][2] * a[j][2]
-
-    return 0.5 * np.array([element(i, j) - element(j, i) for i, j in ((2, 1), (0, 2), (1, 0))])
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = R0.tolist()
+    (dx, dy, dz), (ex, ey, ez), (fx, fy, fz) = R1.tolist()
+    # Elements of R1 R0^T less those opposite.
+    x = (fx * bx + fy * by + fz * bz) - (ex * cx + ey * cy + ez * cz)
+    y = (dx * cx + dy * cy + dz * cz) - (fx * ax + fy * ay + fz * az)
+    z = (ex * ax + ey * ay + ez * az) - (dx * bx + dy * by + dz * bz)
+    return 0.5 * np.array([x, y, z])
 
 
 @dc.dataclass
@@ -427,7 +427,7 @@ class Motion:
             return self._starts[-1]
         if t <= 0.0:
             return self._starts[0]
-        index = self._index(t)
+        index = bisect.bisect_right(self._begins, t) - 1
         return _compose(self._starts[index], self._paths[index].pose(t - self._begins[index]))
 
     def velocity(self, t: float) -> Velocity:
@@ -560,4 +560,4 @@ def _ramp_time(speed: float, acceleration: float | None) -> float:
 
 def _compose(X_AB: Pose, X_BC: Pose) -> Pose:
     R_AC = X_AB.R if X_BC.R is _NO_TURN else X_AB.R @ X_BC.R
-    return Pose(R_AC, X_AB.p + X_AB.R @ X_BC.p)
+    return Pose(R_AC, X_AB.p + X_AB.R.dot(X_BC.p))

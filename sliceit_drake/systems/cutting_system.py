@@ -29,7 +29,7 @@ from sliceit_drake.systems.cut_report import Columns, FoodBodyFrame
 from sliceit_drake.systems.declare import declare_output
 from sliceit_drake.systems.food_look import OTHER, FoodLook, FoodScene
 from sliceit_drake.systems.food_visualizer import FoodVisualizer, frame_size
-from sliceit_drake.systems.knife_force import KEPT, KnifeForceSystem
+from sliceit_drake.systems.knife_force import KEPT, LAST_POSE, KnifeForceSystem
 
 __all__ = ["BALANCE_NAMES", "COMPLETE", "ENERGY_NAMES", "CuttingSystem"]
 
@@ -355,7 +355,7 @@ class CuttingSystem(KnifeForceSystem):
             old = solver.initial_state()
             new_kept[_FOOD_INDEX], new_kept[_ENERGY] = index, NO_ENERGY
             new_kept[_SPENT_BEFORE] = kept[_SPENT].sum()
-        last = self._in_cut_frame(index, self.last_pose(context))
+        last = self._in_cut_frame(index, kept[LAST_POSE].reshape(3, 4))
         pose = self._in_cut_frame(index, now)
         if self._is_beside(context, pose):
             new_kept[_COMPONENTS] = 0.0

@@ -16,12 +16,13 @@ from sliceit_drake.cutting.motion import small_turn
 from sliceit_drake.systems.cut_report import ReportingSystem
 from sliceit_drake.systems.declare import PlainSystem, declare_output
 
-__all__ = ["KEPT", "AppliedForce", "CuttingSetup", "KnifeForceSystem"]
+__all__ = ["KEPT", "LAST_POSE", "AppliedForce", "CuttingSetup", "KnifeForceSystem"]
 
 # Parts of the state beside the wrench, one vector so that an update fetches it once.
 _PROGRESS = 0
 _COUPLING = 1
-_LAST_POSE = slice(2, 14)  # X_WK at the last coupling step, row by row.
+LAST_POSE = slice(2, 14)
+"""X_WK at the last coupling step, row by row."""
 _START_TIME = 14
 KEPT = 15
 """Numbers that every cutting system keeps; those of a subclass stand behind them."""
@@ -105,7 +106,7 @@ class KnifeForceSystem(ReportingSystem):
 
         What no record shows has a name that begins with an underscore.
         """
-        past = [f"_past_{k}" for k in range(_LAST_POSE.start, KEPT)]
+        past = [f"_past_{k}" for k in range(LAST_POSE.start, KEPT)]
         return ["cut_progress", "coupling_work_error", *past]
 
     def start(self, context: Context, state: State, X_WK: RigidTransform) -> None:
@@ -136,7 +137,7 @@ class KnifeForceSystem(ReportingSystem):
 
     def last_pose(self, context: Context) -> np.ndarray:
         """X_WK at the previous coupling step, as [3, 4]."""
-        return self.kept(context)[_LAST_POSE].reshape(3, 4)
+        return self.kept(context)[LAST_POSE].reshape(3, 4)
 
     def wrench(self, context: Context) -> np.ndarray:
         """The held wrench F_K_W, moment and force [6]."""
@@ -157,7 +158,7 @@ class KnifeForceSystem(ReportingSystem):
     def _initialize(self, context: Context, state: State) -> None:
         X_WK = self._pose_input.Eval(context)
         kept = state.get_mutable_discrete_state().get_mutable_value(self._state)
-        kept[_LAST_POSE] = X_WK.GetAsMatrix34().ravel()
+        kept[LAST_POSE] = X_WK.GetAsMatrix34().ravel()
         kept[_START_TIME] = context.get_time()
         self.start(context, state, X_WK)
 
@@ -168,14 +169,14 @@ class KnifeForceSystem(ReportingSystem):
             return EventStatus.DidNothing()
         X_WK = self._pose_input.Eval(context)
         wrench, progress = self.advance(context, state, X_WK)
-        last, now = before[_LAST_POSE].reshape(3, 4), X_WK.GetAsMatrix34()
+        last, now = before[LAST_POSE].reshape(3, 4), X_WK.GetAsMatrix34()
         turn = small_turn(last[:, :3], now[:, :3])
         moved = np.concatenate([turn, now[:, 3] - last[:, 3]])
         x_new = state.get_mutable_discrete_state()
         new = x_new.get_mutable_value(self._state)
         new[_COUPLING] = before[_COUPLING] + (x.value(self._wrench) - wrench).dot(moved)
         new[_PROGRESS] = progress
-        new[_LAST_POSE] = now.ravel()
+        new[LAST_POSE] = now.ravel()
         x_new.set_value(self._wrench, wrench)
         return None
 
