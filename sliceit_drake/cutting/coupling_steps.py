@@ -5,13 +5,11 @@ import math
 
 import numpy as np
 
-from sliceit_drake.cutting.kernels.layouts import PointSum
 from sliceit_drake.cutting.workspace import Workspace
 
 __all__ = ["CouplingSteps", "Energies", "EnergyBalance", "run_coupling_steps"]
 
-# Of edge, opening and friction, among the sums over the points.
-_LOSSES = slice(PointSum.EDGE_LOSS, PointSum.FRICTION_LOSS + 1)
+_LOSSES = ("edge_loss", "opening_loss", "friction_loss")
 
 
 @dc.dataclass
@@ -125,8 +123,7 @@ def run_coupling_steps(
     steps = []
     for c, (model, row) in enumerate(zip(ws.models, ws.results(), strict=True)):
         at_points, at_nodes = row["point_sums"], row["node_sums"]
-        sums = at_points.view(float).reshape(ws.coupling_steps, -1)
-        edge, opening, friction = sums[:, _LOSSES].sum(0).tolist()
+        edge, opening, friction = (sum(at_points[name].tolist()) for name in _LOSSES)
         balance = EnergyBalance(
             work=float(row["work"].sum()),
             gravity=float(model.weight.ravel().dot(new[c, x] - states[c, x])),

@@ -282,7 +282,8 @@ class Workspace:
 
     def results(self) -> np.ndarray:
         """A copy of what the last launch gave, by name [C]; see `layouts.results`."""
-        return self.read(self._result_rows).copy().view(self._result_type)[:, 0]
+        rows = self.read(self._result_rows).copy()
+        return np.ndarray(len(rows), self._result_type, rows)
 
     def write(self, array: wp.array, values: np.ndarray) -> None:
         """Sets an array from host memory."""
