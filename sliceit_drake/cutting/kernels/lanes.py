@@ -17,6 +17,7 @@ def lane_functions(real: Any) -> types.SimpleNamespace:
     also where it is not chosen."""
     t = kernel_types(real)
     vec3, lanes, indices, Vectors = t.vec3, t.lanes, t.indices, t.Vectors
+    forwards = t.forwards
 
     @wp.func
     def dot8(a: Vectors, b: Vectors):
@@ -77,7 +78,7 @@ def lane_functions(real: Any) -> types.SimpleNamespace:
         b = lanes()
         c = lanes()
         for lane in range(LANES):
-            p = x[cut, node[lane]]
+            p = x[cut, forwards(node[lane])]
             a[lane] = p[0]
             b[lane] = p[1]
             c[lane] = p[2]

@@ -15,7 +15,7 @@ __all__ = ["node_kernels"]
 def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespace:
     """The kernels for scalars `real`, in the Warp module `module`, with adjoints if `gradients`."""
     t = kernel_types(real)
-    vec3, vec4, slide, padded = t.vec3, t.vec4, t.slide, t.padded
+    vec3, vec4, slide, padded, forwards = t.vec3, t.vec4, t.slide, t.padded, t.forwards
     sum8 = lane_functions(real).sum8
     Mesh, Parameters, State, Forces, Sums = t.Mesh, t.Parameters, t.State, t.Forces, t.Sums
 
@@ -34,10 +34,10 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         fz = real(0.0)
         for e in range(mesh.element_start[i], mesh.element_start[i + 1]):
             four = mesh.element_entry[e]
-            a = forces.rows[cut, four[0]]
-            b = forces.rows[cut, four[1]]
-            c = forces.rows[cut, four[2]]
-            d = forces.rows[cut, four[3]]
+            a = forces.rows[cut, forwards(four[0])]
+            b = forces.rows[cut, forwards(four[1])]
+            c = forces.rows[cut, forwards(four[2])]
+            d = forces.rows[cut, forwards(four[3])]
             fx += (a[0] + b[0]) + (c[0] + d[0])
             fy += (a[LANES] + b[LANES]) + (c[LANES] + d[LANES])
             fz += (a[2 * LANES] + b[2 * LANES]) + (c[2 * LANES] + d[2 * LANES])
@@ -48,7 +48,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         """Sum of the forces of the cut points on node i."""
         f = vec3()
         for e in range(mesh.point_start[i], mesh.point_start[i + 1]):
-            a = forces.point_rows[cut, mesh.point_entry[e]]
+            a = forces.point_rows[cut, forwards(mesh.point_entry[e])]
             f += vec3(a[0], a[LANES], a[2 * LANES]) * mesh.point_weight[e]
         return f
 
@@ -158,7 +158,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         cut, chunk = wp.tid()
         end = wp.min((chunk + 1) * per_thread, mesh.moving.shape[0])
         for entry in range(chunk * per_thread, end):
-            i = mesh.moving[entry]
+            i = forwards(mesh.moving[entry])
             force = gather_elements(cut, i, mesh, forces)
             internal = relax(cut, i, force, parameters, state, state)
             external = parameters.weight[cut, i] + gather_points(cut, i, mesh, forces)
@@ -212,7 +212,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         cut, chunk = wp.tid()
         end = wp.min((chunk + 1) * per_thread, mesh.moving.shape[0])
         for entry in range(chunk * per_thread, end):
-            i = mesh.moving[entry]
+            i = forwards(mesh.moving[entry])
             forces.from_elements[cut, i] = gather_elements(cut, i, mesh, forces)
             forces.from_points[cut, i] = gather_points(cut, i, mesh, forces)
 
@@ -229,7 +229,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         cut, chunk = wp.tid()
         end = wp.min((chunk + 1) * per_thread, mesh.moving.shape[0])
         for entry in range(chunk * per_thread, end):
-            i = mesh.moving[entry]
+            i = forwards(mesh.moving[entry])
             force = forces.from_elements[cut, i]
             forces.from_bulk[cut, i] = relax(cut, i, force, parameters, now, after)
 
@@ -248,7 +248,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         cut, chunk = wp.tid()
         end = wp.min((chunk + 1) * per_thread, mesh.moving.shape[0])
         for entry in range(chunk * per_thread, end):
-            i = mesh.moving[entry]
+            i = forwards(mesh.moving[entry])
             internal = forces.from_bulk[cut, i]
             external = parameters.weight[cut, i] + forces.from_points[cut, i]
             step_node(cut, i, internal, external, dt, mesh, parameters, now, after, sums)
@@ -261,7 +261,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         cut, chunk = wp.tid()
         end = wp.min((chunk + 1) * per_thread, mesh.moving.shape[0])
         for entry in range(chunk * per_thread, end):
-            i = mesh.moving[entry]
+            i = forwards(mesh.moving[entry])
             adjoint = gather_elements(cut, i, mesh, forces)
             adj_ahead[cut, i] = adj_ahead[cut, i] + padded(adjoint)
 

@@ -24,6 +24,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
     lanes, indices, Vectors = t.lanes, t.indices, t.Vectors
     f = lane_functions(real)
     dot8, cross8, scaled8, length8 = f.dot8, f.cross8, f.scaled8, f.length8
+    forwards = t.forwards
     exp8, pow8, where8, gathered8 = f.exp8, f.pow8, f.where8, f.gathered8
     Points, Parameters, Motion, State = t.Points, t.Parameters, t.Motion, t.State
     Forces, Sums, Energies = t.Forces, t.Sums, t.Energies
@@ -69,8 +70,10 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         a = lanes()
         b = lanes()
         for lane in range(LANES):
-            a[lane] = values[LANES * block + lane, k[lane]]
-            b[lane] = values[LANES * block + lane, k[lane] + 1]
+            row = forwards(LANES * block + lane)
+            column = forwards(k[lane])
+            a[lane] = values[row, column]
+            b[lane] = values[row, column + 1]
         return a + wp.cw_mul(b - a, w)
 
     @wp.func

@@ -224,6 +224,11 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         return new_slip, stiffness * lost
 
     @wp.func
+    def forwards(index: wp.int32):
+        """An index that is not negative, known as such: Warp counts a negative one from the end."""
+        return index & 0x7FFFFFFF
+
+    @wp.func
     def padded(a: vec3):
         return vec4(a[0], a[1], a[2], real(0.0))
 
