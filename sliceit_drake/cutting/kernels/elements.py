@@ -66,9 +66,16 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
             g = scaled8(m[block, row], p0) + scaled8(m[block, row + 1], p1)
             g = g + scaled8(m[block, row + 2], p2)
             corner = element + k + 1
-            force[cut, block, corner] = force[cut, block, corner] + g
             total += g
-        force[cut, block, element] = force[cut, block, element] - total
+            # The first that has a corner sets what others add to.
+            if k == 2 or element == 0:
+                force[cut, block, corner] = g
+            else:
+                force[cut, block, corner] = force[cut, block, corner] + g
+        if element == 0:
+            force[cut, block, element] = -total
+        else:
+            force[cut, block, element] = force[cut, block, element] - total
 
     @wp.kernel(enable_backward=False, module=module)
     def elements(
@@ -88,7 +95,6 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
         for block in range(chunk * per_thread, end):
             for k in range(CORNERS):
                 x[cut, chunk, k] = gathered8(state.ahead, cut, mesh.nodes[block, k])
-                forces.elements[cut, block, k] = Vectors()
             for e in range(STRIP):
                 f0, f1, f2 = gradient8(
                     x[cut, chunk, e],
@@ -275,8 +281,6 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
         of the forces when the nodes move along that direction.
         """
         cut, block = wp.tid()
-        for k in range(CORNERS):
-            change[cut, block, k] = Vectors()
         for e in range(STRIP):
             f0, f1, f2 = columns8(strain, cut, block, e, 0)
             e0, e1, e2 = columns8(strain, cut, block, e, 3)
