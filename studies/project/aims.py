@@ -134,7 +134,7 @@ def station(docs: Docs) -> tuple[Mapping[str, float], str]:
     if values:
         return values, "benchmarks/station_speed.json"
     found = docs.numbers(
-        "speed.md", r"runs at ([\d.]+) of real time while it cuts, and at ([\d.]+) with the spring"
+        "speed.md", r"runs at ([\d.]+) times real time, and at ([\d.]+) with the spring"
     )
     names = ("real_time_factor", "spring_real_time_factor")
     return dict(zip(names, found or (), strict=False)), "speed.md"

@@ -1,9 +1,9 @@
 """Real-time factor of the station, and where the time of a coupling step goes.
 
-All numbers come from one process on one core, so their ratios hold on any machine. The parts are
-processor times of a run of its own, whose watched methods take a little longer. What Drake computes
-for the inputs of a system, such as the plant's reactions for the sensor, is in the system that
-asked first.
+All numbers come from one process on one core, so their ratios hold on any machine. They are
+processor times of its only thread, since other work on the machine comes and goes. The parts are
+those of a run of its own, whose watched methods take a little longer. What Drake computes for the
+inputs of a system, such as the plant's reactions for the sensor, is in the system that asked first.
 """
 
 import argparse
@@ -56,21 +56,21 @@ PARTS = (
 )
 
 
-def station_time(scenario: Scenario) -> tuple[float, float, int]:
-    """Wall and processor time of a cut of `DURATION`, s, and the number of the food's elements."""
+def station_time(scenario: Scenario) -> tuple[float, int]:
+    """Processor time of a cut of `DURATION`, s, and the number of the food's elements."""
     diagram = ScenarioDiagram(scenario)
     simulator = Simulator(diagram)
     diagram.SetStart(simulator.get_mutable_context())
     simulator.AdvanceTo(WARM_UP)
-    begin, begin_thread = time.perf_counter(), time.thread_time()
+    begin = time.thread_time()
     simulator.AdvanceTo(WARM_UP + DURATION)
-    times = time.perf_counter() - begin, time.thread_time() - begin_thread
+    total = time.thread_time() - begin
     cutting = diagram.station.cutting
     elements = 0
     if isinstance(cutting, CuttingSystem):
         solver = cutting.solver(cutting.GetMyContextFromRoot(simulator.get_context()))
         elements = solver.model.element_count
-    return *times, elements
+    return total, elements
 
 
 def station_parts(scenario: Scenario) -> dict[str, float]:
@@ -93,7 +93,7 @@ def station_parts(scenario: Scenario) -> dict[str, float]:
 
 
 def plant_time(scenario: Scenario) -> float:
-    """Wall time of the arm with its joint controller alone, all of it Drake's C++."""
+    """Processor time of the arm with its joint controller alone, all of it Drake's C++."""
     builder = DiagramBuilder()
     plant, _ = add_plant(builder, scenario.robot)
     robot = add_robot(plant, scenario.robot, scenario.knife, scenario.board)
@@ -103,9 +103,9 @@ def plant_time(scenario: Scenario) -> float:
     builder.Connect(command.get_output_port(), controller.GetInputPort("joint_positions_command"))
     simulator = Simulator(builder.Build())
     simulator.AdvanceTo(0.1)
-    begin = time.perf_counter()
+    begin = time.thread_time()
     simulator.AdvanceTo(0.1 + DURATION)
-    return time.perf_counter() - begin
+    return time.thread_time() - begin
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -137,7 +137,7 @@ def run(options: argparse.Namespace) -> int:
         )
         for _ in range(options.repeat)
     ]
-    total, thread, elements = (min(column) for column in zip(*(t[0] for t in turns), strict=True))
+    total, elements = min(turn[0] for turn in turns)
     spring = min(turn[3] for turn in turns)[0]
     parts = min((turn[1] for turn in turns), key=lambda each: sum(each.values()))
     before = None
@@ -152,7 +152,7 @@ def run(options: argparse.Namespace) -> int:
         plant_step=1e3 * scenario.robot.plant_time_step,
         factor=DURATION / total,
         spring_factor=DURATION / spring,
-        processor=1e6 * thread / steps,
+        time=1e6 * total / steps,
         arm=1e6 * min(turn[2] for turn in turns) / steps,
         parts=parts,
         before=before,
