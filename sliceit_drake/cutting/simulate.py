@@ -104,7 +104,7 @@ def check_in_plane(model: CuttingModel, X_CK: Pose, time: float) -> None:
     px, y, pz = X_CK.p.tolist()
     if pz > model.top or pz < model.bottom - model.knife.height:
         return
-    turn, _, lean = np.abs(X_CK.R[1]).tolist()
+    turn, _, lean = map(abs, X_CK.R[1].tolist())
     offset = abs(y)
     if offset > LATERAL_LIMIT or lean > TILT_LIMIT or turn > TILT_LIMIT:
         raise CuttingError(

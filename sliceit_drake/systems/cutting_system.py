@@ -136,7 +136,7 @@ class CuttingSystem(KnifeForceSystem):
         corners = self._corners = max(len(surface.ends) for surface in self.surfaces)
         state = {
             self.discrete_state_ticket(food),
-            self.discrete_state_ticket(DiscreteStateIndex(self._state)),
+            self.discrete_state_ticket(DiscreteStateIndex(self._kept)),
         }
         declare_output(self, "surface_vertices", 3 * corners, self._surface_vertices, state)
         declare_output(self, "surface_damage", corners, self._surface_damage, state)
@@ -285,7 +285,7 @@ class CuttingSystem(KnifeForceSystem):
         kept = self.kept(context).copy()
         kept[KEPT:] = 0.0
         kept[_ENERGY], kept[_FOOD_INDEX] = NO_ENERGY, index
-        context.SetDiscreteState(self._state, kept)
+        context.SetDiscreteState(self._kept, kept)
 
     def randomize_context(self, context: Context, rng: np.random.Generator) -> None:
         """Puts an uncut food, drawn from the prepared ones, into the context."""
@@ -343,9 +343,9 @@ class CuttingSystem(KnifeForceSystem):
         self, context: Context, state: State, X_WK: RigidTransform
     ) -> tuple[np.ndarray, float]:
         x, time = context.get_discrete_state(), context.get_time()
-        kept = x.value(self._state)
+        kept = x.value(self._kept)
         new = state.get_mutable_discrete_state()
-        new_kept = new.get_mutable_value(self._state)
+        new_kept = new.get_mutable_value(self._kept)
         before, now = int(kept[_FOOD_INDEX]), X_WK.GetAsMatrix34()
         index = self._index_to_cut(context, before, now)
         solver = self.solvers[index]

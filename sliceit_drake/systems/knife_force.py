@@ -56,7 +56,6 @@ class KnifeForceSystem(ReportingSystem):
         cut_progress: Fraction of the section that is cut [1].
         coupling_work_error: Work that the held wrench did on the knife minus work that the food did
             on it [1], J; it comes from the delay of one coupling step.
-
         state: What is kept from one coupling step to the next, see `state_columns`.
 
     Args:
@@ -74,7 +73,7 @@ class KnifeForceSystem(ReportingSystem):
         # Plain numbers: Drake's indices would be made such in each call.
         wrench = self.DeclareDiscreteState(6)
         self._wrench = int(wrench)
-        self._state = int(self.DeclareDiscreteState(np.concatenate([np.zeros(KEPT), further])))
+        self._kept = int(self.DeclareDiscreteState(np.concatenate([np.zeros(KEPT), further])))
         declare_output(
             self,
             "food_wrench",
@@ -85,7 +84,7 @@ class KnifeForceSystem(ReportingSystem):
         self.DeclareStateOutputPort("food_wrench_vector", wrench)
         self._declare_part("cut_progress", slice(_PROGRESS, _PROGRESS + 1))
         self._declare_part("coupling_work_error", slice(_COUPLING, _COUPLING + 1))
-        self.DeclareStateOutputPort("state", DiscreteStateIndex(self._state))
+        self.DeclareStateOutputPort("state", DiscreteStateIndex(self._kept))
         self.DeclareInitializationUnrestrictedUpdateEvent(self._initialize)
         # An offset of one period would round k + 1 periods otherwise than the plant's steps do, and
         # so see the plant a step ahead at some coupling steps.
@@ -98,7 +97,7 @@ class KnifeForceSystem(ReportingSystem):
             name,
             part.stop - part.start,
             lambda context: self.kept(context)[part],
-            {self.discrete_state_ticket(DiscreteStateIndex(self._state))},
+            {self.discrete_state_ticket(DiscreteStateIndex(self._kept))},
         )
 
     def state_columns(self) -> list[str]:
@@ -133,7 +132,7 @@ class KnifeForceSystem(ReportingSystem):
 
     def kept(self, context: Context) -> np.ndarray:
         """The numbers that are kept from one coupling step to the next; a view."""
-        return context.get_discrete_state().value(self._state)
+        return context.get_discrete_state().value(self._kept)
 
     def last_pose(self, context: Context) -> np.ndarray:
         """X_WK at the previous coupling step, as [3, 4]."""
@@ -151,29 +150,30 @@ class KnifeForceSystem(ReportingSystem):
         """Sets wrench, progress, coupling error and a subclass's parts in the context to zero."""
         kept = self.kept(context).copy()
         kept[: _COUPLING + 1] = 0.0
-        context.SetDiscreteState(self._state, kept)
+        context.SetDiscreteState(self._kept, kept)
         for part in (self._wrench, *parts):
             context.SetDiscreteState(part, np.zeros(context.get_discrete_state(part).size()))
 
     def _initialize(self, context: Context, state: State) -> None:
         X_WK = self._pose_input.Eval(context)
-        kept = state.get_mutable_discrete_state().get_mutable_value(self._state)
+        kept = state.get_mutable_discrete_state().get_mutable_value(self._kept)
         kept[LAST_POSE] = X_WK.GetAsMatrix34().ravel()
         kept[_START_TIME] = context.get_time()
         self.start(context, state, X_WK)
 
     def _update(self, context: Context, state: State) -> EventStatus | None:
         x = context.get_discrete_state()
-        before = x.value(self._state)
+        before = x.value(self._kept)
         if context.get_time() <= before[_START_TIME]:
             return EventStatus.DidNothing()
         X_WK = self._pose_input.Eval(context)
         wrench, progress = self.advance(context, state, X_WK)
         last, now = before[LAST_POSE].reshape(3, 4), X_WK.GetAsMatrix34()
-        turn = small_turn(last[:, :3], now[:, :3])
-        moved = np.concatenate([turn, now[:, 3] - last[:, 3]])
+        moved = np.empty(6)
+        moved[:3] = small_turn(last[:, :3], now[:, :3])
+        np.subtract(now[:, 3], last[:, 3], out=moved[3:])
         x_new = state.get_mutable_discrete_state()
-        new = x_new.get_mutable_value(self._state)
+        new = x_new.get_mutable_value(self._kept)
         new[_COUPLING] = before[_COUPLING] + (x.value(self._wrench) - wrench).dot(moved)
         new[_PROGRESS] = progress
         new[LAST_POSE] = now.ravel()
