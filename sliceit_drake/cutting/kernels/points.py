@@ -137,7 +137,8 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         knife hangs upside down in C."""
         return wp.where((R[1, 1] < real(0.0)) == (face == 0), real(1.0), real(-1.0))
 
-    @wp.func(inline=True)
+    # With adjoints inlining gains nothing and doubles the compiler's time.
+    @wp.func(inline=not gradients)
     def flank_contact(
         cut: wp.int32,
         block: wp.int32,
@@ -221,7 +222,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         lost = lost + wp.cw_mul(viscosity, dot8(sliding, sliding)) * dt
         return normal_force, friction_force, new_slip, lost, between_area
 
-    @wp.func(inline=True)
+    @wp.func(inline=not gradients)
     def advance_points(
         cut: wp.int32,
         block: wp.int32,
