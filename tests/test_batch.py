@@ -1,17 +1,18 @@
 """Many slices in one call are the slices one by one."""
 
-import copy
+import types
 
 import numpy as np
 import pytest
 
 from sliceit_drake.cutting.batch import BatchSlice, cut_together, simulate_batch
 from sliceit_drake.cutting.board import Board
-from sliceit_drake.cutting.driver import Driver, Launch
+from sliceit_drake.cutting.driver import Driver
 from sliceit_drake.cutting.foods.effects import Compliance, Effects, Relaxation
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.foods.shapes import Cylinder
+from sliceit_drake.cutting.inertia import Inertia
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan, PressAndDraw
@@ -75,9 +76,13 @@ def test_cuts_side_by_side_are_the_cuts_alone(models, motions, one_by_one):
 
 
 def test_a_slice_that_breaks_down_is_reported_and_disturbs_no_other(models, motions, one_by_one):
-    # Ten times the critical step: quietly unstable masses.
-    broken = copy.copy(models[0])
-    broken.mass = broken.mass * 1e-3
+    def light(step: float) -> types.SimpleNamespace:
+        return types.SimpleNamespace(
+            inertia=Inertia(models[0].with_step(step).inertia.matrix * 1e-3)
+        )
+
+    # Thirty times the critical step.
+    broken = models[0].derive(inertia_of=types.SimpleNamespace(with_step=light))
     results = simulate_batch([broken, models[0]], motions[:1], PERIOD, BOARD)
     assert results[0].failure is not None
     assert "not finite" in results[0].failure
@@ -96,4 +101,4 @@ def test_numbers_of_models_and_motions_must_agree(models, motions):
 def test_a_workspace_refuses_cuts_of_another_mesh(models):
     other = make_food_model(Food(shape=Cylinder(rings=3)), Knife(), Numerics())
     with pytest.raises(ValueError, match="derived from one model"):
-        Driver(PERIOD).workspace([models[0], other], Launch(0, 1))
+        Driver(PERIOD).workspace([models[0], other])

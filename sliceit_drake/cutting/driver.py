@@ -4,7 +4,7 @@ import dataclasses as dc
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.coupling_steps import CouplingSteps, run_coupling_steps
 from sliceit_drake.cutting.knife_path import KnifePath
 from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.cutting.stepping import Stepping
 from sliceit_drake.cutting.workspace import Workspace
 
 __all__ = ["Driver", "DriverPool", "Launch", "even_launches"]
@@ -26,7 +27,7 @@ class Launch(NamedTuple):
     Attributes:
         first: Number of the first.
         coupling_steps: How many.
-        multiple: Duration of each, and of its sub-step, relative to the shortest.
+        multiple: Duration of each, and of its longest sub-step, relative to the shortest.
     """
 
     first: int
@@ -56,15 +57,33 @@ class Driver:
         self.exchange_period = exchange_period
         self._workspaces: dict[tuple, Workspace] = {}
 
-    def workspace(self, models: Sequence[CuttingModel], launch: Launch) -> Workspace:
-        """Device arrays for cuts that are all derived from one model."""
+    def workspace(
+        self,
+        models: Sequence[CuttingModel],
+        coupling_steps: int = 1,
+        multiple: int = 1,
+        substeps: int | None = None,
+    ) -> Workspace:
+        """Device arrays for cuts that are all derived from one model.
+
+        Args:
+            models: The cuts.
+            coupling_steps: That are launched at once.
+            multiple: Their duration relative to the shortest.
+            substeps: Of each; by default as the longest sub-step asks for.
+
+        Raises:
+            TimeStepError: The time step does not divide the coupling period.
+        """
+        period = multiple * self.exchange_period
+        step = multiple * models[0].numerics.time_step if substeps is None else period / substeps
+        models = [model.with_step(step) for model in models]
         model = models[0]
-        size = (len(models), launch.coupling_steps, launch.multiple)
+        size = (len(models), coupling_steps, multiple)
         key = (id(model.split), len(model.relaxing), *size, *dc.astuple(model.numerics))
         ws = self._workspaces.get(key)
         if ws is None:
-            period = launch.multiple * self.exchange_period
-            ws = self._workspaces[key] = Workspace(models, period, launch.coupling_steps)
+            ws = self._workspaces[key] = Workspace(models, period, coupling_steps)
         elif any(old is not new for old, new in zip(ws.models, models, strict=True)):
             ws.set_models(models)
         return ws
@@ -75,7 +94,7 @@ class Driver:
         launches: Iterable[Launch] | None = None,
         board: Board | None = None,
     ) -> Iterator[tuple[Launch, list[CouplingSteps]]]:
-        """Drives uncut foods side by side.
+        """Drives uncut foods side by side, each with the sub-steps that `Stepping` asks for.
 
         Where arm or holder give, a launch is repeated until they hold its force. A launch that
         leaves no cut finite is the last.
@@ -86,41 +105,75 @@ class Driver:
             board: Board under the knives, its height in F; None for none.
 
         Yields:
-            Each launch and what it gives, one a cut.
+            Each launch and what it gives, one a cut. Where sub-steps are shorter than the longest,
+            each coupling step is a launch.
         """
-        models = {1: [path.model for path in paths]}
-        states = None
-        for launch in even_launches(paths) if launches is None else launches:
-            m, last = launch.multiple, launch.first + launch.coupling_steps
-            if m not in models:
-                models[m] = [_with_longer_steps(model, m) for model in models[1]]
-            ws = self.workspace(models[m], launch)
-            if states is None:
-                states = np.tile(ws.initial_state(), (len(paths), 1))
-            # A knife whose motion is over rests at its end.
-            ends = [
-                np.minimum(np.arange(launch.first, last + 1), path.coupling_steps) for path in paths
-            ]
-            R = np.array([path.R_CK[rows] for path, rows in zip(paths, ends, strict=True)])
-            steps: list[CouplingSteps] = []
-            unbalanced = list(range(len(paths)))
-            while unbalanced:
-                p = np.array([path.p_CK[rows] for path, rows in zip(paths, ends, strict=True)])
+        states = np.empty(0)
+        for whole in even_launches(paths) if launches is None else launches:
+            coarse = self.workspace([path.model for path in paths], multiple=whole.multiple)
+            if not len(states):
+                states = np.tile(coarse.initial_state(), (len(paths), 1))
+            for launch, numbers, stepping in self._parts(paths, whole, states, coarse):
+                steps = self._advance(paths, launch, numbers, states, board)
+                for step, values in zip(steps, stepping, strict=True):
+                    step.state[coarse.layout["stepping"]] = values
+                states = np.array([step.state for step in steps])
+                yield launch, steps
+                if not any(step.finite for step in steps):
+                    return
+
+    @staticmethod
+    def _parts(
+        paths: Sequence[KnifePath], whole: Launch, states: np.ndarray, coarse: Workspace
+    ) -> list[tuple[Launch, list[int], np.ndarray]]:
+        """A launch, or each of its coupling steps where a cut needs shorter sub-steps.
+
+        Returns:
+            Launches, the number of sub-steps of each cut [C], and `stepping` after it
+            [C, STEPPING].
+        """
+        first, count, multiple = whole
+        plans = []
+        for path, state in zip(paths, states, strict=True):
+            rule = Stepping.of(path.model, coarse.substeps)
+            before = state[coarse.layout["stepping"]]
+            poses = path.poses(first, count, commanded=True)
+            plans.append(rule.plan(before, *poses, coarse.exchange_period))
+        numbers = [plan[0] for plan in plans]
+        after = np.array([plan[1] for plan in plans])
+        if all(number == coarse.substeps for some in numbers for number in some):
+            return [(whole, [coarse.substeps] * len(paths), after[:, -1])]
+        each = zip(*numbers, strict=True)
+        return [
+            (Launch(first + k, 1, multiple), list(some), after[:, k]) for k, some in enumerate(each)
+        ]
+
+    def _advance(
+        self,
+        paths: Sequence[KnifePath],
+        launch: Launch,
+        numbers: Sequence[int],
+        states: np.ndarray,
+        board: Board | None,
+    ) -> list[CouplingSteps]:
+        """Advances each cut by a launch, with its number of sub-steps."""
+        first, count, multiple = launch
+        models = [path.model for path in paths]
+        steps: list[Any] = [None] * len(paths)
+        unbalanced = set(range(len(paths)))
+        while unbalanced:
+            poses = [path.poses(first, count) for path in paths]
+            R, p = (np.array(some) for some in zip(*poses, strict=True))
+            for number in sorted({numbers[c] for c in unbalanced}):
+                ws = self.workspace(models, count, multiple, number)
                 tried = run_coupling_steps(ws, states, R, p)
-                steps = [tried[c] if c in unbalanced else steps[c] for c in range(len(paths))]
-                forces = [step.wrenches[-1].sum(0)[3:] for step in steps]
-                unbalanced = [
-                    c for c in unbalanced if not paths[c].balanced(last, forces[c], board)
-                ]
-            yield launch, steps
-            if not any(step.finite for step in steps):
-                return
-            states = np.array([step.state for step in steps])
-
-
-def _with_longer_steps(model: CuttingModel, multiple: int) -> CuttingModel:
-    step = multiple * model.numerics.time_step
-    return model.derive(numerics=dc.replace(model.numerics, time_step=step))
+                for c in unbalanced:
+                    if numbers[c] == number:
+                        steps[c] = tried[c]
+            forces = [step.wrenches[-1].sum(0)[3:] for step in steps]
+            last = first + count
+            unbalanced = {c for c in unbalanced if not paths[c].balanced(last, forces[c], board)}
+        return steps
 
 
 class DriverPool:

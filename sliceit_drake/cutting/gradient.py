@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from sliceit_drake.cutting.driver import Driver
 from sliceit_drake.cutting.kernels.layouts import BLADE_SUMS, POINT_SUMS
 from sliceit_drake.cutting.kernels.types import LANES, PARAMETERS
 from sliceit_drake.cutting.knife_path import Mounting
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError
+from sliceit_drake.cutting.stepping import Stepping
 from sliceit_drake.cutting.workspace import Workspace
 
 __all__ = ["SliceAdjoint", "SliceGradient", "SliceRun"]
@@ -27,15 +29,16 @@ class SliceGradient:
     """Derivatives of a function of the wrenches of a slice.
 
     Attributes:
-        row: Derivatives by what the kernels read, in the order of `Workspace.parameter_layout`.
+        rows: Derivatives by what the kernels read, in the order of `Workspace.parameter_layout`, by
+            the sub-step in which they read it, s.
         position: Derivatives by the commanded position of Ko at each coupling step [E + 1, 3], 1/m.
         rotation: Derivatives by the entries of its rotation matrix [E + 1, 3, 3].
         state: Derivatives by the initial state of the food [state_size].
         compliance: Derivatives by the compliances of arm and holder [2], N/m.
-        layout: Where each array stands in `row`.
+        layout: Where each array stands in a row.
     """
 
-    row: np.ndarray
+    rows: dict[float, np.ndarray]
     position: np.ndarray
     rotation: np.ndarray
     state: np.ndarray
@@ -44,7 +47,7 @@ class SliceGradient:
 
     def by(self, name: str) -> np.ndarray:
         """Derivatives by an array of the kernels: "toughness" [P], "P" (see `PARAMETERS`), ..."""
-        return self.row[self.layout[name]]
+        return np.asarray(sum(row[self.layout[name]] for row in self.rows.values()))
 
 
 @dc.dataclass
@@ -54,6 +57,7 @@ class SliceRun:
     Attributes:
         model: The cut.
         wrenches: Mean of each coupling step on the knife, moment about Ko and force in C [E, 6].
+        substeps: Of each coupling step [E].
         states: The food at the ends of the coupling steps [E + 1] of [state_size].
         R, p: Poses of the knife in C there [E + 1, 3, 3] and [E + 1, 3], metres; where arm and
             holder give, relative to the food.
@@ -61,6 +65,7 @@ class SliceRun:
 
     model: CuttingModel
     wrenches: np.ndarray
+    substeps: list[int]
     states: list[np.ndarray]
     R: np.ndarray
     p: np.ndarray
@@ -89,11 +94,12 @@ class SliceAdjoint:
     def __init__(self, model: CuttingModel, exchange_period: float) -> None:
         self.model = model
         self.exchange_period = exchange_period
-        self._w = Workspace([model], exchange_period, gradients=True)
-        self._backward: Any = None
-        ws = self._w
+        self._driver = Driver(exchange_period)
+        # By number of sub-steps.
+        self._workspaces: dict[int, Workspace] = {}
+        self._backward: dict[int, Any] = {}
+        ws = self._driver.workspace([model])
         by_element = ws.parameters.stiff_volume.shape
-        self._forward = Workspace([model], exchange_period)
         self._strain = wp.zeros((*by_element, 6), dtype=ws.kernels.Vectors, device=ws.device)
         self._factors = wp.zeros((*by_element, 4), dtype=ws.kernels.lanes, device=ws.device)
         self._adj_mu, self._adj_lam = (
@@ -121,18 +127,22 @@ class SliceAdjoint:
         """
         model = model or self.model
         _give(model)
-        ws = self._forward
-        ws.set_models([model])
+        ws = self._driver.workspace([model])
+        rule, stepping = Stepping.of(model, ws.substeps), ws.layout["stepping"]
         mounting = Mounting(model.effects, tolerance=1e-12)
         state = ws.initial_state() if state is None else np.asarray(state, ws.dtype)
         count = len(p) - 1
-        run = SliceRun(model, np.empty((count, 6)), [state], np.array(R), np.array(p))
+        run = SliceRun(model, np.empty((count, 6)), [], [state], np.array(R), np.array(p))
         for e in range(count):
+            before, at = run.states[e], slice(e, e + 2)
+            (number,), after = rule.plan(before[stepping], R[at], p[at], self.exchange_period)
+            ws = self._driver.workspace([model], substeps=number)
+            run.substeps.append(number)
             balanced = False
             while not balanced:
                 rise, shift = mounting.given.tolist()
                 run.p[e + 1] = p[e + 1] + [-shift, 0.0, rise]
-                ws.advance(run.states[e][None], run.R[None, e : e + 2], run.p[None, e : e + 2])
+                ws.advance(before[None], run.R[None, e : e + 2], run.p[None, e : e + 2])
                 wrenches = ws.results()["wrenches"][0, 0]
                 if not np.isfinite(wrenches).all():
                     raise CuttingError(f"at {(e + 1) * self.exchange_period:.4g} s {NOT_FINITE}")
@@ -140,16 +150,24 @@ class SliceAdjoint:
                 draw, _, rise = (-run.wrenches[e, 3:]).tolist()
                 balanced = mounting.rigid or mounting.balanced(-rise, draw, 0.0, None)
             run.states.append(ws.read(ws.states[-1])[0].copy())
+            run.states[-1][stepping] = after[0]
         return run
 
     def gradient(self, run: SliceRun, weights: np.ndarray) -> SliceGradient:
         """Gradient of sum(weights * wrenches) of what `run` returned; weights [E, 6]."""
-        ws, count, give = self._w, len(run.wrenches), _give(run.model)
-        ws.set_models([run.model])
-        adj_state, row = np.zeros(ws.state_size), np.zeros(ws.parameter_rows.shape[1])
+        count, give = len(run.wrenches), _give(run.model)
+        for number in set(run.substeps):
+            model = run.model.with_step(self.exchange_period / number)
+            if number not in self._workspaces:
+                self._workspaces[number] = Workspace([model], self.exchange_period, gradients=True)
+            self._workspaces[number].set_models([model])
+        ws = self._workspaces[run.substeps[0]]
+        adj_state = np.zeros(ws.state_size)
+        rows = {number: np.zeros(ws.parameter_rows.shape[1]) for number in run.substeps}
         adj_p, adj_R = np.zeros_like(run.p), np.zeros_like(run.R)
         of_give, axes = np.zeros(3), np.flatnonzero(give)
         for e in reversed(range(count)):
+            ws = self._workspaces[run.substeps[e]]
             ws.advance(run.states[e][None], run.R[None, e : e + 2], run.p[None, e : e + 2])
             back = self._adjoint_of_coupling_step(run, e, weights[e], adj_state)
             if len(axes):
@@ -168,8 +186,9 @@ class SliceAdjoint:
             adj_state = back.state
             adj_p[e : e + 2] += back.p
             adj_R[e : e + 2] += back.R
-            row += back.row
-        return SliceGradient(row, adj_p, adj_R, adj_state, of_give[[2, 0]], ws.parameter_layout)
+            rows[run.substeps[e]] += back.row
+        by_step = {self.exchange_period / number: row for number, row in rows.items()}
+        return SliceGradient(by_step, adj_p, adj_R, adj_state, of_give[[2, 0]], ws.parameter_layout)
 
     def _adjoint_of_coupling_step(
         self, run: SliceRun, e: int, weights: np.ndarray, adj_state: np.ndarray
@@ -180,17 +199,18 @@ class SliceAdjoint:
             weights: Adjoint of its wrench [6].
             adj_state: Adjoint of the state at its end.
         """
-        ws, n, T = self._w, self._w.substeps, self.exchange_period
+        n, T = run.substeps[e], self.exchange_period
+        ws = self._workspaces[n]
         share = np.arange(1, n + 1) / n
         adj_p, adj_R = np.zeros((2, 3)), np.zeros((2, 3, 3))
-        adj_sums, adj_R[1, :, 1] = self._adjoint_of_sums(weights, run.R[e + 1])
-        if self._backward is None:
-            self._backward = ws.captured(self._launch_backward)
+        adj_sums, adj_R[1, :, 1] = self._adjoint_of_sums(ws, weights, run.R[e + 1])
+        if n not in self._backward:
+            self._backward[n] = ws.captured(lambda: self._launch_backward(ws))
         for array in (ws.parameter_rows.grad, self._adj_mu, self._adj_lam):
             array.zero_()
         ws.write(ws.states[-1].grad, adj_state[None])
         ws.write(ws.sum_rows.grad, adj_sums[None])
-        wp.capture_launch(self._backward)
+        wp.capture_launch(self._backward[n])
         motion = ws.read(ws.motion_rows.grad)[0].astype(np.float64)
         by = {name: motion[where].reshape(n, -1) for name, where in ws.motion_layout.items()}
         of_velocity = by["v_CK"].sum(0) / T
@@ -206,9 +226,11 @@ class SliceAdjoint:
             row[scalars + PARAMETERS.index(name)] += adjoint.numpy().astype(np.float64).sum()
         return _Back(ws.read(ws.states[0].grad)[0].astype(np.float64), adj_p, adj_R, row)
 
-    def _adjoint_of_sums(self, weights: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _adjoint_of_sums(
+        self, ws: Workspace, weights: np.ndarray, R: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Adjoint of `knife_wrenches`: of the sums as the workspace holds them, and of Ky."""
-        ws, n = self._w, self._w.substeps
+        n = ws.substeps
         of_moment, of_force = weights[:3], weights[3:]
         (result,) = ws.results()
         blade, sums = result["blade"][0], result["point_sums"][0]
@@ -230,20 +252,30 @@ class SliceAdjoint:
         adjoint[ws.sum_layout["blade"]] = bending.view(float)
         return adjoint, of_lateral * push / n
 
-    def _launch_backward(self) -> None:
-        ws = self._w
+    def _launch_backward(self, ws: Workspace) -> None:
         for array in (*ws.states[:-1], *(slot.ahead for slot in ws.slots), ws.motion_rows):
             array.grad.zero_()
         for k in reversed(range(ws.steps)):
-            self._launch_substep_adjoint(k)
+            self._launch_substep_adjoint(ws, k)
         ws.launch_look_ahead(adjoint=True)
 
-    def _launch_substep_adjoint(self, k: int) -> None:
-        ws, kern, forces = self._w, self._w.kernels, self._w.forces[k]
-        for name in ("lateral", "push", "from_elements", "from_bulk", "from_points"):
+    def _launch_substep_adjoint(self, ws: Workspace, k: int) -> None:
+        kern, forces = ws.kernels, ws.forces[k]
+        for name in (
+            "lateral",
+            "push",
+            "from_elements",
+            "from_bulk",
+            "from_points",
+            "acceleration",
+        ):
             getattr(forces, name).grad.zero_()
-        for part in ("bend_blade", "push_blade", *reversed(ws.node_parts[1:])):
+        for part in ("bend_blade", "push_blade", "step_nodes"):
             ws.launch_part(part, k, adjoint=True)
+        # By hand: the adjoint of a symmetric solve is the solve of the adjoint.
+        solved = [ws.inertia, forces.acceleration.grad, forces.resultant.grad]
+        ws.launch(kern.solve, (ws.cuts,), solved)
+        ws.launch_part("sum_forces", k, adjoint=True)
         spread = [ws.points, forces.from_points.grad, forces.points.grad]
         ws.launch(kern.spread_adjoint, forces.lateral.shape, spread)
         ws.launch_part("step_points", k, adjoint=True)

@@ -51,12 +51,24 @@ class KnifePath:
         self.model = model
         self.R_CK = model.X_FC_rotation.T @ self.R_FK
         self.p_CK = model.to_cut_frame(self.p_FK)
+        self._commanded_p_CK = self.p_CK.copy()
         self._mounting = Mounting(model.effects)
         self.rigid = self._mounting.rigid
 
     def pose(self, k: int) -> Pose:
         """X_CK after k coupling steps."""
         return Pose(self.R_CK[k], self.p_CK[k])
+
+    def poses(
+        self, first: int, count: int, commanded: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """R_CK and p_CK at the ends of `count` coupling steps from the first [count + 1, ...].
+
+        A knife whose motion is over rests at its end. As `commanded` nothing gives.
+        """
+        rows = np.minimum(np.arange(first, first + count + 1), self.coupling_steps)
+        p = self._commanded_p_CK if commanded else self.p_CK
+        return self.R_CK[rows], p[rows]
 
     def board_wrenches(self, board: Board | None) -> np.ndarray:
         """Wrench of the board, its height in F, on the knife at the end of each coupling step

@@ -2,14 +2,17 @@
 
 import copy
 import dataclasses as dc
+import functools
 from typing import Any, Self
 
 import numpy as np
+from scipy.sparse import csc_array
 from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import choice, quantity
 from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.cutting.foods.material import Material
+from sliceit_drake.cutting.inertia import Inertia, assemble
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry
 
@@ -37,16 +40,16 @@ class TimeStepError(ValueError):
 class Numerics:
     """Numerical settings of a cut. Contacts and bonds scale with E over the edge length h."""
 
-    time_step: float = quantity(2.5e-4, "s", low=1e-7, high=5e-3)
-    """Sub-step; must divide the coupling period."""
+    time_step: float = quantity(1e-3, "s", low=1e-7, high=5e-3)
+    """Longest sub-step; must divide the coupling period."""
+    step_by_need: bool = True
+    """Whether sub-steps are shorter where the knife is fast or changes its velocity."""
     mass_scaling: bool = True
-    """Whether masses are raised where the step asks for it; else a step too long is refused."""
+    """Whether inertia is added as the step asks for it; else a step too long is refused."""
     stability_margin: float = quantity(0.8, "", low=0.1, high=0.95)
     """Step over the Gershgorin stability limit."""
     numerical_damping: float = quantity(0.2, "", low=0.0, high=0.5)
     """Viscosity added to the material's, in steps."""
-    local_damping: float = quantity(0.5, "", low=0.0, high=0.9)
-    """Fraction of the unbalanced force that opposes the motion of nodes with scaled masses."""
     bond_stiffness: float = quantity(4.0, "E/h", low=0.01, high=1e3)
     """Stiffness of the uncut faces and of their self contact."""
     flank_stiffness: float = quantity(4.0, "E/h", low=0.01, high=1e3)
@@ -55,7 +58,7 @@ class Numerics:
     """Contact stiffness of the food on the board."""
     board_friction: float = quantity(0.3, "", low=0.0, high=2.0)
     """Friction of food on board."""
-    board_damping_time: float = quantity(5e-3, "s", low=0.0, high=1.0)
+    board_damping_time: float = quantity(5e-4, "s", low=0.0, high=1.0)
     """Damping over stiffness of the food on the board."""
     unloading_length: float = quantity(1e-4, "m", low=1e-6, high=1e-2)
     """Retreat of the edge over which its force vanishes; less where it rises more steeply."""
@@ -89,8 +92,7 @@ class CuttingModel(CutGeometry):
     Attributes:
         material, effects, knife, numerics: What the user gave.
         point_scales: Factors by cut point.
-        true_mass, mass: Lumped true mass and the mass that is stepped [N], kg.
-        local_damping: Fraction of the unbalanced force that opposes a node's motion [N].
+        true_mass: Lumped mass [N], kg.
         weight: Gravity force on each node [N, 3], N, by the true mass.
         toughness: Surface energy of each cut point [P], J/m^2.
         outline: Length of skin per height that the edge cuts, as `EdgeTables.width` [P, G].
@@ -109,8 +111,7 @@ class CuttingModel(CutGeometry):
     numerics: Numerics
     point_scales: PointScales
     true_mass: np.ndarray = dc.field(init=False)
-    mass: np.ndarray = dc.field(init=False)
-    local_damping: np.ndarray = dc.field(init=False)
+    _inertia_of: "CuttingModel | None" = dc.field(init=False, default=None)
     weight: np.ndarray = dc.field(init=False)
     toughness: np.ndarray = dc.field(init=False)
     outline: np.ndarray = dc.field(init=False)
@@ -141,7 +142,8 @@ class CuttingModel(CutGeometry):
         self.relaxing = np.array(effects.relaxation.shares, float)
         self.keep = np.exp(-numerics.time_step / np.array(effects.relaxation.times, float))
         self.parameters = self._parameters()
-        self._scale_masses()
+        self._check_step()
+        self._by_step: dict[str, Self] = {}
 
     def _parameters(self) -> dict[str, float]:
         material, effects, knife, numerics = self.material, self.effects, self.knife, self.numerics
@@ -188,52 +190,102 @@ class CuttingModel(CutGeometry):
             "edge_share": effects.edge.share,
         }
 
-    def _scale_masses(self) -> None:
-        """Sets the masses that are stepped, and the limit of the step.
+    def _check_step(self) -> None:
+        """Sets the limit of the step with true masses.
 
         Raises:
             TimeStepError: The step is beyond the limit and masses are not scaled.
         """
-        material, numerics, parameters = self.material, self.numerics, self.parameters
-        area, adhesion, step = self.tables.area, self.effects.adhesion, numerics.time_step
-        # In a layer between core and rind the stiffer of two elements sets a node's bound.
-        bulk = 0.25 * self.stiffness_bound(self.element_volume, *material.lame())
-        flank = parameters["flank_stiffness"] * self.point_scales.flank_stiffness
-        per_point = area * (2.0 * parameters["bond_stiffness"] + 2.0 * flank) + 0.5 * self.unloading
-        contact = 2.0 * parameters["board_stiffness"] * self.board_area
-        viscous = 2.0 * material.damping_time * bulk
-        dragged = adhesion.viscosity * adhesion.steepest * area
-        ends, shares = self.point_nodes.T.ravel(), np.tile(self.point_weights.T, (2, 1))
-        np.add.at(contact, ends, (per_point * shares).ravel())
-        np.add.at(viscous, ends, (dragged * shares).ravel())
-        # A step margin x is stable if stiff x^2 + viscous x <= mass; explicit damping counts twice.
-        stiff = bulk * (1.0 + 2.0 * numerics.numerical_damping) + 0.25 * contact
-        root = np.sqrt(viscous**2 + 4.0 * stiff * self.true_mass)
-        limit = 2.0 * self.true_mass / (viscous + root)
-        sliver = self.node_volume < SLIVER * self.vertex_volume
-        setting = self.moving[~sliver[self.moving]]
+        numerics, true_mass = self.numerics, self.true_mass
+        stiff, viscous = self._stiffness_bounds()
+        # A step margin x is stable if stiff x^2 + viscous x <= mass.
+        limit = 2.0 * true_mass / (viscous + np.sqrt(viscous**2 + 4.0 * stiff * true_mass))
+        setting = self.moving[~self._slivers[self.moving]]
         if not len(setting):
             setting = self.moving
         worst = setting[int(limit[setting].argmin())]
         self.critical_time_step = critical = numerics.stability_margin * float(limit[worst])
-        if not numerics.mass_scaling and step > critical:
+        if not numerics.mass_scaling and numerics.time_step > critical:
             raise TimeStepError(
-                f"numerics.time_step = {step:.3g} s is beyond the stability limit "
+                f"numerics.time_step = {numerics.time_step:.3g} s is beyond the stability limit "
                 f"{critical:.3g} s, set by the node at {self.nodes[worst]} m of the cut frame "
-                f"(true mass {self.true_mass[worst]:.3g} kg, stiffness bound "
-                f"{4.0 * stiff[worst]:.3g} N/m). Give at most {0.99 * critical:.3g}, a coarser "
-                "mesh, or mass_scaling: true."
+                f"(true mass {true_mass[worst]:.3g} kg, stiffness bound {4.0 * stiff[worst]:.3g} "
+                f"N/m). Give at most {0.99 * critical:.3g}, a coarser mesh, or mass_scaling: true."
             )
-        x = (step if numerics.mass_scaling else critical) / numerics.stability_margin
-        needed = np.maximum(self.true_mass, (stiff * x + viscous) * x)
-        self.mass = np.where(numerics.mass_scaling | sliver, needed, self.true_mass)
-        scaled = self.mass > self.true_mass
-        self.local_damping = np.where(scaled, numerics.local_damping, 0.0)
+
+    @functools.cached_property
+    def inertia(self) -> Inertia:
+        """Mass matrix that is stepped."""
+        numerics = self.numerics
+        if self._inertia_of is not None:
+            return self._inertia_of.with_step(numerics.time_step).inertia
+        if numerics.mass_scaling:
+            return Inertia(self._scaled_masses(numerics.time_step / numerics.stability_margin))
+        stiff, viscous = self._stiffness_bounds()
+        x = self.critical_time_step / numerics.stability_margin
+        needed = np.where(self._slivers, (stiff * x + viscous) * x, 0.0)
+        return Inertia(assemble(self.moving, [], np.maximum(self.true_mass, needed)))
+
+    @functools.cached_property
+    def _slivers(self) -> np.ndarray:
+        """Whether a node is one [N]."""
+        return np.asarray(self.node_volume < SLIVER * self.vertex_volume)
+
+    def _scaled_masses(self, x: float) -> csc_array:
+        """True masses and what keeps a step of `x` over the stability margin, s, stable, kg.
+
+        With f = -K u - C v a step is stable if S >= (x / 2)^2 K + (x / 2) C. Every stiffness that
+        can become active is there from the start.
+        """
+        material, numerics, parameters = self.material, self.numerics, self.parameters
+        mu, lam = material.lame()
+        square, half = 0.25 * x**2, 0.5 * x
+        _, products = self._gradient_products
+        viscous = square * (1.0 + 2.0 * numerics.numerical_damping) + half * material.damping_time
+        modulus = (lam + 2.0 * mu) * self.element_volume
+        bulk = (viscous * modulus)[:, None, None] * products
+        area, adhesion, scales = self.tables.area, self.effects.adhesion, self.point_scales
+        flank = square * parameters["flank_stiffness"] * scales.flank_stiffness * area
+        flank = flank + x * adhesion.viscosity * adhesion.steepest * area
+        bond = square * parameters["bond_stiffness"] * area
+        w, zero = self.point_weights, np.zeros_like(self.point_weights)
+        minus, plus = np.hstack([w, zero]), np.hstack([zero, w])
+        points = sum(
+            stiffness[:, None, None] * row[:, :, None] * row[:, None, :]
+            for stiffness, row in (
+                (bond, plus - minus),
+                (flank, minus),
+                (flank, plus),
+                (square * self.unloading, 0.5 * (minus + plus)),
+            )
+        )
+        board = parameters["board_stiffness"] * self.board_area
+        board = board * (2.0 * square + half * numerics.board_damping_time)
+        parts = [(self.tetrahedra, bulk), (self.point_nodes, points)]
+        return assemble(self.moving, parts, self.true_mass + board)
+
+    def _stiffness_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Gershgorin's bounds of a quarter of the stiffness, N/m, and of half the damping, Ns/m, of
+        each node [N]."""
+        material, numerics, parameters = self.material, self.numerics, self.parameters
+        area, adhesion = self.tables.area, self.effects.adhesion
+        # In a layer between core and rind the stiffer of two elements sets a node's bound.
+        bulk = 0.25 * self.stiffness_bound(self.element_volume, *material.lame())
+        flank = parameters["flank_stiffness"] * self.point_scales.flank_stiffness
+        per_point = area * (2.0 * parameters["bond_stiffness"] + 2.0 * flank) + 0.5 * self.unloading
+        board = parameters["board_stiffness"] * self.board_area
+        contact = 2.0 * board
+        viscous = 2.0 * material.damping_time * bulk + 0.5 * numerics.board_damping_time * board
+        dragged = adhesion.viscosity * adhesion.steepest * area
+        ends, shares = self.point_nodes.T.ravel(), np.tile(self.point_weights.T, (2, 1))
+        np.add.at(contact, ends, (per_point * shares).ravel())
+        np.add.at(viscous, ends, (dragged * shares).ravel())
+        return bulk * (1.0 + 2.0 * numerics.numerical_damping) + 0.25 * contact, viscous
 
     @property
     def mass_ratio(self) -> float:
-        """Stepped over true mass of the moving nodes."""
-        return float(self.mass[self.moving].sum() / self.true_mass[self.moving].sum())
+        """Stepped over true mass of the moving nodes in a translation."""
+        return float(self.inertia.matrix.sum() / self.true_mass[self.moving].sum())
 
     @property
     def strength(self) -> float:
@@ -296,8 +348,23 @@ class CuttingModel(CutGeometry):
         spin = np.linalg.solve(inertia, mass @ np.cross(r, v))
         return R, here - R @ centre, spin, mass @ v / mass.sum() - np.cross(spin, here)
 
-    def derive(self, **changes: Any) -> Self:
+    def with_step(self, step: float) -> Self:
+        """The same cut with another sub-step, s, to six digits; made once."""
+        name = f"{step:.6g}"
+        if name == f"{self.numerics.time_step:.6g}":
+            return self
+        if name not in self._by_step:
+            numerics = dc.replace(self.numerics, time_step=step)
+            self._by_step[name] = self.derive(self._inertia_of, numerics=numerics)
+        return self._by_step[name]
+
+    def derive(self, inertia_of: "CuttingModel | None" = None, **changes: Any) -> Self:
         """The same cut with another material, effects, knife, numerics or point_scales.
+
+        Args:
+            inertia_of: A cut whose mass matrix is stepped; None for what the changes ask for. The
+                difference of two cuts by a parameter is cleaner with one.
+            changes: By name.
 
         Raises:
             TimeStepError: The step is beyond the limit and masses are not scaled.
@@ -307,7 +374,8 @@ class CuttingModel(CutGeometry):
             raise TypeError(f"a cut has no {', '.join(unknown)} to change")
         # With what was computed of the geometry.
         derived = copy.copy(self)
-        vars(derived).update(changes)
+        vars(derived).pop("inertia", None)
+        vars(derived).update(changes, _inertia_of=inertia_of)
         derived.__post_init__()
         return derived
 

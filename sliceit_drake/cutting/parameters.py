@@ -75,8 +75,17 @@ def _child(value: object, part: str, name: str) -> object:
     raise KeyError(f"{name}: there is no {part}")
 
 
-def with_parameters(model: CuttingModel, values: Mapping[str, float | np.ndarray]) -> CuttingModel:
+def with_parameters(
+    model: CuttingModel,
+    values: Mapping[str, float | np.ndarray],
+    inertia_of: CuttingModel | None = None,
+) -> CuttingModel:
     """The same cut with other values of parameters.
+
+    Args:
+        model: The cut.
+        values: By name.
+        inertia_of: See `CuttingModel.derive`.
 
     Raises:
         KeyError: There is no such parameter.
@@ -95,7 +104,7 @@ def with_parameters(model: CuttingModel, values: Mapping[str, float | np.ndarray
             owner[int(last)] = float(new)
         else:
             setattr(owner, last, new if isinstance(new, np.ndarray) else float(new))
-    return model.derive(**changed)
+    return model.derive(inertia_of, **changed)
 
 
 SCALES = {
@@ -130,7 +139,7 @@ def pull_back(
 
     What the kernels read is an explicit, smooth function of each shared parameter, which takes a
     millisecond: its derivative is taken by central differences in double precision. Factors by cut
-    point are differentiated in closed form. The scaled masses follow the parameters.
+    point are differentiated in closed form. The added inertia does not follow the parameters.
 
     Args:
         model: The cut at which `gradient` was taken.
@@ -147,11 +156,11 @@ def pull_back(
             continue
         value = get_parameter(model, name)
         step = 1e-5 * parameter_step(model, name)
-        rows = [
-            parameter_row(with_parameters(model, {name: float(value) + sign * step}))
-            for sign in (1.0, -1.0)
-        ]
-        out[name] = float(gradient.row @ (rows[0] - rows[1])) / (2.0 * step)
+        moved = [with_parameters(model, {name: float(value) + shift}) for shift in (step, -step)]
+        out[name] = 0.0
+        for time_step, by_row in gradient.rows.items():
+            more, less = (parameter_row(each.with_step(time_step)) for each in moved)
+            out[name] += float(by_row @ (more - less)) / (2.0 * step)
     return out
 
 
@@ -162,12 +171,6 @@ def _by_point(model: CuttingModel, gradient: SliceGradient, name: str) -> np.nda
     adjoint = gradient.by(direct).copy()
     if kind == "friction":
         return adjoint
-    # A node's stepped mass holds the stiffness of its points, by their weights.
-    step = model.numerics.time_step / model.numerics.stability_margin
-    by_mass = -gradient.by("inverse_mass") / model.mass**2
-    by_mass = np.where(model.mass > model.true_mass, by_mass, 0.0)
-    ends = np.tile(model.point_weights, (1, 2))
-    by_stiffness = 0.25 * step**2 * (by_mass[model.point_nodes] * ends).sum(1)
     if kind == "toughness":
         by_scale = model.toughness / scales.toughness
         adjoint *= by_scale
@@ -183,11 +186,11 @@ def _by_point(model: CuttingModel, gradient: SliceGradient, name: str) -> np.nda
             width[points, highest] / length,
             (np.diff(width, axis=1) / model.tables.spacing)[points, steepest],
         )
-        by_unloading = gradient.by("unloading") + 0.5 * by_stiffness
-        return adjoint + by_unloading * slope * by_scale
-    flank = model.parameters["flank_stiffness"]
-    adjoint += by_stiffness * 2.0 * flank * area
-    if model.parameters["blade_mass"] > model.knife.lateral_mass():
-        by_blade = float(gradient.by("P")[PARAMETERS.index("blade_mass")])
-        adjoint += by_blade * step**2 * flank * area
+        return adjoint + gradient.by("unloading") * slope * by_scale
+    # The blade's mass that is stepped holds the stiffness of the flanks.
+    blade, flank = PARAMETERS.index("blade_mass"), model.parameters["flank_stiffness"]
+    for time_step, row in gradient.rows.items():
+        if model.with_step(time_step).parameters["blade_mass"] > model.knife.lateral_mass():
+            by_blade = float(row[gradient.layout["P"]][blade])
+            adjoint += by_blade * (time_step / model.numerics.stability_margin) ** 2 * flank * area
     return adjoint

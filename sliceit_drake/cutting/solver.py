@@ -10,6 +10,7 @@ from sliceit_drake.cutting.coupling_steps import CouplingSteps, Energies, run_co
 from sliceit_drake.cutting.driver import Driver
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
+from sliceit_drake.cutting.stepping import Stepping
 from sliceit_drake.cutting.workspace import Workspace, parameter_row
 
 __all__ = ["NOT_FINITE", "CuttingError", "CuttingSolver", "SurfaceFactors"]
@@ -42,8 +43,8 @@ class CuttingSolver:
     """Steps the state of one `CuttingModel`.
 
     The state is one contiguous array [state_size]: positions, velocities, history of the cut
-    points, friction anchors, blade deflection. A call copies it into the workspace that the
-    captured graph is bound to and copies the result out; nothing is carried between calls.
+    points, friction anchors, blade deflection, stepping. A call copies it into the workspace that
+    the captured graph is bound to and copies the result out; nothing is carried between calls.
 
     Args:
         model: The cut.
@@ -56,30 +57,32 @@ class CuttingSolver:
     def __init__(self, model: CuttingModel, exchange_period: float) -> None:
         self.model = model
         self.exchange_period = exchange_period
+        self.driver = Driver(exchange_period)
         self._workspace = Workspace([model], exchange_period)
-        self.substeps = self._workspace.substeps
+        # By number of sub-steps.
+        self._workspaces = {self._workspace.substeps: self._workspace}
+        self._stepping = Stepping.of(model, self._workspace.substeps)
         self.state_size = self._workspace.state_size
         self.dtype = self._workspace.dtype
         self._lock = threading.Lock()
-        self.driver = Driver(exchange_period)
-        # What the workspace holds, to write it only where it changes; each call says what it wants.
-        self._held_factors = UNCHANGED
+        # What workspaces hold, to write it only where it changes; each call says what it wants.
+        self._held_factors: dict[Workspace, SurfaceFactors] = {}
 
     def initial_state(self) -> np.ndarray:
         """The food at rest, to be cut downwards [state_size]."""
         return self._workspace.initial_state()
 
-    def _take_factors(self, factors: SurfaceFactors) -> None:
-        """Gives the workspace, which the caller has locked, the model's surface times `factors`."""
-        if factors == self._held_factors:
+    def _take_factors(self, ws: Workspace, factors: SurfaceFactors) -> None:
+        """Gives a workspace, which the caller has locked, the model's surface times `factors`."""
+        if factors == self._held_factors.get(ws, UNCHANGED):
             return
-        ws, row = self._workspace, parameter_row(self.model)
+        row = parameter_row(ws.models[0])
         row[ws.parameter_layout["toughness"]] *= factors.toughness
         row[ws.parameter_layout["friction_scale"]] *= factors.friction
         # The retreat of a tougher edge must not return more energy than its advance took.
         row[ws.parameter_layout["unloading"]] *= max(1.0, factors.toughness)
         ws.write(ws.parameter_rows, row[None])
-        self._held_factors = factors
+        self._held_factors[ws] = factors
 
     def positions(self, state: np.ndarray) -> np.ndarray:
         """Positions of the computed nodes in C [N, 3], metres."""
@@ -90,8 +93,7 @@ class CuttingSolver:
         return self.field(state, "v").reshape(-1, 3)
 
     def field(self, state: np.ndarray, name: str) -> np.ndarray:
-        """A part of the state by name: x, v, passed, parted, edge_force, heading, slip, board_slip,
-        lag, blade."""
+        """A part of the state by name; see `State` in kernels/types.py."""
         return np.asarray(state[self._workspace.layout[name]])
 
     def compile(self) -> None:
@@ -117,17 +119,24 @@ class CuttingSolver:
         """
         R, p = np.empty((1, 2, 3, 3)), np.empty((1, 2, 3))
         R[0, 0], R[0, 1], p[0, 0], p[0, 1] = start.R, end.R, start.p, end.p
+        place, T = self._workspace.layout["stepping"], self.exchange_period
+        (number,), (stepping,) = self._stepping.plan(state[place], R[0], p[0], T)
         with self._lock:
-            self._take_factors(factors)
-            (step,) = run_coupling_steps(self._workspace, state[None], R, p)
+            ws = self._workspaces.get(number)
+            if ws is None:
+                model = self.model.with_step(T / number)
+                ws = self._workspaces[number] = Workspace([model], T)
+            self._take_factors(ws, factors)
+            (step,) = run_coupling_steps(ws, state[None], R, p)
         if not step.finite:
             raise CuttingError(NOT_FINITE)
+        step.state[place] = stepping
         return step
 
     def _place(self, state: np.ndarray, pose: Pose, factors: SurfaceFactors = UNCHANGED) -> None:
         """Puts food and knife, at rest at `pose`, into the workspace for launches with k = 0."""
         ws = self._workspace
-        self._take_factors(factors)
+        self._take_factors(ws, factors)
         ws.write(ws.states[0], state[None])
         ws.place_knife(pose.R, pose.p)
 
@@ -147,11 +156,10 @@ class CuttingSolver:
         deflection, rate = (float(b) for b in self.field(state, "blade"))
         interface += 0.5 * m.parameters["blade_stiffness"] * deflection**2
         interface += 0.5 * m.parameters["blade_mass"] * rate**2
-        v2 = (self.velocities(state)[m.moving].astype(np.float64) ** 2).sum(1)
         return Energies(
             elastic=elastic,
             interface=interface,
-            kinetic=float(0.5 * m.mass[m.moving] @ v2),
+            kinetic=m.inertia.kinetic_energy(self.velocities(state)[m.moving]),
             least_volume_ratio=float(ratio[least]),
             min_element=least,
         )

@@ -14,6 +14,7 @@ from sliceit_drake.cutting.kernels import layouts
 from sliceit_drake.cutting.kernels.precision import kernels
 from sliceit_drake.cutting.kernels.types import CORNERS, GATHER, LANES, PARAMETERS, STRIP
 from sliceit_drake.cutting.model import CuttingModel, TimeStepError
+from sliceit_drake.cutting.stepping import STEPPING
 from sliceit_drake.cutting.warp_start import start_warp
 
 __all__ = ["LAUNCH_LOCK", "Workspace", "parameter_row"]
@@ -38,7 +39,8 @@ class Workspace:
     """Advances cuts that share a mesh by `coupling_steps` coupling steps a launch.
 
     Each cut C has parameters, motion and state of its own. A state is one row of `state_size`
-    numbers: positions, velocities, history of the cut points, friction anchors, relaxation, blade.
+    numbers: positions, velocities, history of the cut points, friction anchors, relaxation, blade,
+    stepping.
 
     Args:
         models: The cuts; all derived from one model.
@@ -76,7 +78,7 @@ class Workspace:
             start_warp()
             self.kernels = kernels(self.real, gradients)
         self.device = _device(model.numerics.device)
-        self.model = model
+        self.model, self.models = model, ()
         self._gradients = gradients
         self._graph: Any = None
         self._energy_graph: Any = None
@@ -84,9 +86,9 @@ class Workspace:
         # What is allocated during a capture in another thread would be taken for part of it.
         with LAUNCH_LOCK:
             self._make_arrays()
-        # With gradients, what the nodes get is kept, and relaxed in a kernel of its own.
-        relaxation = ("relax_nodes",) if len(model.relaxing) else ()
-        self.node_parts = ("gather", *relaxation, "step_nodes") if gradients else ("move_nodes",)
+        # With gradients, what the nodes get is kept.
+        load = ("gather", "sum_forces") if gradients else ("load_nodes",)
+        self.node_parts = (*load, "solve", "step_nodes")
         self._skin_thickness = model.effects.skin.thickness
         self.set_models(models)
 
@@ -193,6 +195,12 @@ class Workspace:
         self.parameters, values = k.Parameters(), _parameter_arrays(m)
         self.parameter_rows, layout = self._rows(self.parameters, _shapes(values))
         self.parameter_layout = self._without_fill(layout)
+        self.inertia, factors = k.Inertia(), m.inertia.factors
+        places = ("lower_start", "lower_index", "upper_start", "upper_index")
+        self._set(self.inertia, **{name: getattr(factors, name) for name in places})
+        for name in FACTORS:
+            rows = wp.zeros((C, len(getattr(factors, name))), self.real, device=self.device)
+            setattr(self.inertia, name, rows)
 
         self.motion = k.Motion()
         self.motion.substeps, self.motion.period = self.substeps, self.exchange_period
@@ -230,11 +238,10 @@ class Workspace:
         self.forces = [k.Forces() for _ in range(K if self._gradients else 1)]
         for kept in self.forces:
             kept.assign(forces)
-            self._allocate(kept, push=())
+            moving = (len(m.moving),)
+            self._allocate(kept, push=(), from_bulk=(N,), resultant=moving, acceleration=moving)
             if self._gradients:
-                self._allocate(kept, from_elements=(N,), from_bulk=(N,), from_points=(N,))
-                if not len(m.relaxing):
-                    kept.from_bulk = kept.from_elements
+                self._allocate(kept, from_elements=(N,), from_points=(N,))
 
         self.sums, self._results, self._energies = k.Sums(), k.Results(), k.Energies()
         sums = {
@@ -273,8 +280,13 @@ class Workspace:
             with LAUNCH_LOCK:
                 outline = _filled(models[0].outline, 0.0)
                 self.points.outline.assign(outline.astype(self.dtype))
-        self.models = tuple(models)
         self.write(self.parameter_rows, np.array([parameter_row(m) for m in models]))
+        held = [model.inertia for model in self.models]
+        if any(new.inertia is not old for new, old in zip(models, held, strict=False)) or not held:
+            for name in FACTORS:
+                values = np.array([getattr(model.inertia.factors, name) for model in models])
+                self.write(getattr(self.inertia, name), values)
+        self.models = tuple(models)
 
     def initial_state(self) -> np.ndarray:
         """The food at rest, to be cut downwards [state_size]."""
@@ -345,9 +357,10 @@ class Workspace:
                 self.point_blocks,
                 [k, dt, self.points, parameters, self.motion, *states],
             ),
-            "move_nodes": (len(m.moving), [dt, mesh, parameters, now, forces, sums]),
+            "load_nodes": (len(m.moving), [dt, mesh, parameters, now, forces, sums]),
             "gather": (len(m.moving), [mesh, forces]),
-            "relax_nodes": (len(m.moving), [mesh, parameters, now, after, forces]),
+            "sum_forces": (len(m.moving), [dt, mesh, parameters, *states]),
+            "solve": (0, [self.inertia, forces.resultant, forces.acceleration]),
             "step_nodes": (len(m.moving), [dt, mesh, parameters, *states]),
             "gather_adjoint": (len(m.moving), [mesh, forces, now.ahead.grad]),
             "push_blade": (0, [forces]),
@@ -442,14 +455,16 @@ class Workspace:
         return forces.transpose(0, 3, 1, 2).reshape(-1, 2, 3)[: len(self.model.point_nodes)]
 
 
+FACTORS = ("lower", "upper", "inverse_pivot")
+"""Arrays of `inertia.Factors` in which cuts of one mesh differ."""
+
+
 def parameter_row(model: CuttingModel) -> np.ndarray:
     """The numbers that a model gives the kernels, in the order of `Workspace.parameter_layout`."""
     return _row(_parameter_arrays(model))
 
 
 def _parameter_arrays(model: CuttingModel) -> dict[str, np.ndarray]:
-    inverse_mass = np.zeros(len(model.nodes))
-    inverse_mass[model.moving] = 1.0 / model.mass[model.moving]
     volume = np.zeros((len(model.blocks), STRIP, LANES))
     volume.ravel()[model.element_place] = model.element_volume
     scales = model.point_scales
@@ -460,8 +475,6 @@ def _parameter_arrays(model: CuttingModel) -> dict[str, np.ndarray]:
         "flank_scale": in_lanes(scales.flank_stiffness),
         "friction_scale": in_lanes(scales.friction),
         "unloading": in_lanes(model.unloading),
-        "inverse_mass": inverse_mass,
-        "local_damping": model.local_damping,
         "weight": model.weight,
         "relaxing": model.relaxing,
         "keep": model.keep,
@@ -482,6 +495,7 @@ def _initial_arrays(model: CuttingModel) -> dict[str, np.ndarray]:
         "board_slip": np.zeros((N, 3)),
         "overstress": np.zeros((len(model.relaxing), N, 3)),
         "blade": np.zeros(2),
+        "stepping": np.zeros(STEPPING),
     }
 
 

@@ -166,7 +166,8 @@ class Simulator:
         settings = (model.effects, model.knife, model.numerics, self._clock, self._board)
         motion = (job.R, job.p, job.stretches.ends, job.stretches.multiples, job.precision)
         return content_key(
-            self._code, known[1], parameter_row(model), settings, model.outline, *motion
+            *(self._code, known[1], parameter_row(model), model.inertia.matrix.data),
+            *(settings, model.outline, *motion),
         )
 
 

@@ -18,9 +18,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
     vec3, vec4, slide, padded, forwards = t.vec3, t.vec4, t.slide, t.padded, t.forwards
     sum8 = lane_functions(real).sum8
     Mesh, Parameters, State, Forces, Sums = t.Mesh, t.Parameters, t.State, t.Forces, t.Sums
-
-    # Nodes slower than this, in m/s, count as at rest.
-    REST = wp.constant(real(1.0e-5))
+    Inertia = t.Inertia
 
     @wp.func
     def gather_elements(cut: wp.int32, i: wp.int32, mesh: Mesh, forces: Forces):
@@ -71,11 +69,9 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         return f
 
     @wp.func
-    def step_node(
+    def on_board(
         cut: wp.int32,
         i: wp.int32,
-        internal: vec3,
-        external: vec3,
         dt: real,
         mesh: Mesh,
         parameters: Parameters,
@@ -83,69 +79,35 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         after: State,
         sums: Sums,
     ):
-        """One node, semi-implicit Euler; board contact, sums over the launch.
-
-        A fraction of the unbalanced force opposes the node's motion (Cundall's local damping): none
-        in equilibrium, however fast the motion, and the more the larger the inertia."""
+        """Force of the board on node i: pressure with damping that never pulls, and friction."""
         P = parameters.P
-        xi = now.x[cut, i]
-        vi = now.v[cut, i]
-        inverse_mass = parameters.inverse_mass[cut, i]
-        board_area = mesh.board_area[i]
-        f = internal + external
-        pressed = real(0.0)
-        on_food = vec3()
-        loss = real(0.0)
-        n = vec3(mesh.board[0], mesh.board[1], mesh.board[2])
-        if board_area > real(0.0):
-            depth = mesh.board[3] - wp.dot(n, xi)
-            stiffness = P[cut, Scalar.BOARD_STIFFNESS] * board_area
+        force = vec3()
+        area = mesh.board_area[i]
+        if area > real(0.0):
+            n = vec3(mesh.board[0], mesh.board[1], mesh.board[2])
+            v = now.v[cut, i]
+            depth = mesh.board[3] - wp.dot(n, now.x[cut, i])
+            stiffness = P[cut, Scalar.BOARD_STIFFNESS] * area
             old = now.board_slip[cut, i]
             new_slip = vec3()
             loss = real(0.5) * stiffness * wp.dot(old, old)
             if depth > real(0.0):
-                sliding = (vi - wp.dot(vi, n) * n) * dt
-                limit = P[cut, Scalar.BOARD_FRICTION] * stiffness * depth
-                anchored, lost = slide(old, sliding, stiffness, limit)
+                rising = wp.dot(v, n)
+                elastic = stiffness * depth
+                viscosity = stiffness * P[cut, Scalar.BOARD_DAMPING_TIME]
+                pressure = wp.max(elastic - viscosity * rising, real(0.0))
+                limit = P[cut, Scalar.BOARD_FRICTION] * pressure
+                anchored, lost = slide(old, (v - rising * n) * dt, stiffness, limit)
                 new_slip = anchored
-                loss = lost
-                pressed = stiffness * depth
-                on_food = pressed * n - stiffness * anchored
+                force = pressure * n - stiffness * anchored
+                loss = lost + wp.max((elastic - pressure) * rising * dt, real(0.0))
             after.board_slip[cut, i] = new_slip
-        resultant = f + on_food
-        speed = wp.length(vi)
-        drag = vec3()
-        if speed > real(0.0):
-            damping = parameters.local_damping[cut, i]
-            drag = vi * (-damping * wp.length(resultant) / (speed + REST))
-        v1 = vi + (resultant + drag) * (inverse_mass * dt)
-        if pressed > real(0.0):
-            # The board damps the normal motion, implicitly, and does not pull.
-            per_force = inverse_mass * dt
-            viscosity = (
-                P[cut, Scalar.BOARD_STIFFNESS] * board_area * P[cut, Scalar.BOARD_DAMPING_TIME]
-            )
-            normal = wp.dot(v1, n)
-            damped = wp.max(
-                normal / (real(1.0) + viscosity * per_force), normal - pressed * per_force
-            )
-            v1 = v1 + (damped - normal) * n
-            force = (damped - normal) / per_force
-            on_food = on_food + force * n
-            moved = real(0.5) * (wp.dot(vi, n) + damped) * dt
-            loss = loss + wp.max(-force * moved, real(0.0))
-        if board_area > real(0.0):
-            sums.board_force[cut, i] += on_food
+            sums.board_force[cut, i] += force
             sums.board_loss[cut, i] += loss
-        # Trapezoidal rule for the work along the path, summed by parts.
-        sums.internal_work[cut, i] += real(0.5) * wp.dot(internal + drag, vi + v1) * dt
-        x1 = xi + v1 * dt
-        after.v[cut, i] = v1
-        after.x[cut, i] = x1
-        after.ahead[cut, i] = padded(x1 + P[cut, Scalar.DAMPING_TIME] * v1)
+        return force
 
     @wp.kernel(enable_backward=False, module=module)
-    def move_nodes(
+    def load_nodes(
         dt: real,
         mesh: Mesh,
         parameters: Parameters,
@@ -154,7 +116,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         sums: Sums,
         per_thread: wp.int32,
     ):
-        """Gathers the forces of each moving node and steps it in place."""
+        """Gathers the forces on each moving node."""
         cut, chunk = wp.tid()
         end = wp.min((chunk + 1) * per_thread, mesh.moving.shape[0])
         for entry in range(chunk * per_thread, end):
@@ -162,7 +124,53 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
             force = gather_elements(cut, i, mesh, forces)
             internal = relax(cut, i, force, parameters, state, state)
             external = parameters.weight[cut, i] + gather_points(cut, i, mesh, forces)
-            step_node(cut, i, internal, external, dt, mesh, parameters, state, state, sums)
+            external += on_board(cut, i, dt, mesh, parameters, state, state, sums)
+            forces.from_bulk[cut, i] = internal
+            forces.resultant[cut, entry] = padded(internal + external)
+
+    @wp.kernel(enable_backward=False, module=module)
+    def solve(inertia: Inertia, b: wp.array2d(dtype=vec4), y: wp.array2d(dtype=vec4)):
+        """Solves S y = b by the factors of S, which is symmetric: its own adjoint."""
+        cut = wp.tid()
+        count = inertia.inverse_pivot.shape[1]
+        for row in range(count):
+            sum = b[cut, row]
+            for e in range(inertia.lower_start[row], inertia.lower_start[row + 1]):
+                sum -= inertia.lower[cut, e] * y[cut, forwards(inertia.lower_index[e])]
+            y[cut, row] = sum
+        for back in range(count):
+            row = count - 1 - back
+            sum = y[cut, row] * inertia.inverse_pivot[cut, row]
+            for e in range(inertia.upper_start[row], inertia.upper_start[row + 1]):
+                sum -= inertia.upper[cut, e] * y[cut, forwards(inertia.upper_index[e])]
+            y[cut, row] = sum
+
+    @wp.kernel(enable_backward=gradients, module=module)
+    def step_nodes(
+        dt: real,
+        mesh: Mesh,
+        parameters: Parameters,
+        now: State,
+        after: State,
+        forces: Forces,
+        sums: Sums,
+        per_thread: wp.int32,
+    ):
+        """Semi-implicit Euler step of each moving node."""
+        cut, chunk = wp.tid()
+        end = wp.min((chunk + 1) * per_thread, mesh.moving.shape[0])
+        for entry in range(chunk * per_thread, end):
+            i = forwards(mesh.moving[entry])
+            a = forces.acceleration[cut, entry]
+            vi = now.v[cut, i]
+            v1 = vi + dt * vec3(a[0], a[1], a[2])
+            x1 = now.x[cut, i] + dt * v1
+            # Trapezoidal rule for the work along the path, summed by parts.
+            internal = forces.from_bulk[cut, i]
+            sums.internal_work[cut, i] += real(0.5) * wp.dot(internal, vi + v1) * dt
+            after.v[cut, i] = v1
+            after.x[cut, i] = x1
+            after.ahead[cut, i] = padded(x1 + parameters.P[cut, Scalar.DAMPING_TIME] * v1)
 
     # Sums in loops have kernels of their own: an adjoint would not know their value after the loop.
     @wp.kernel(enable_backward=gradients, module=module)
@@ -202,13 +210,19 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         sums.blade[cut, coupling_step, BladeSum.ON_KNIFE] += k * deflection + c * rate
         sums.blade[cut, coupling_step, BladeSum.ON_BLADE] += F
 
-    out = types.SimpleNamespace(move_nodes=move_nodes, push_blade=push_blade, bend_blade=bend_blade)
+    out = types.SimpleNamespace(
+        load_nodes=load_nodes,
+        solve=solve,
+        step_nodes=step_nodes,
+        push_blade=push_blade,
+        bend_blade=bend_blade,
+    )
     if not gradients:
         return out
 
     @wp.kernel(enable_backward=False, module=module)
     def gather(mesh: Mesh, forces: Forces, per_thread: wp.int32):
-        """Gathers the forces of each moving node, for `step_nodes`."""
+        """Gathers the forces of elements and points on each moving node, for `sum_forces`."""
         cut, chunk = wp.tid()
         end = wp.min((chunk + 1) * per_thread, mesh.moving.shape[0])
         for entry in range(chunk * per_thread, end):
@@ -217,24 +231,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
             forces.from_points[cut, i] = gather_points(cut, i, mesh, forces)
 
     @wp.kernel(enable_backward=gradients, module=module)
-    def relax_nodes(
-        mesh: Mesh,
-        parameters: Parameters,
-        now: State,
-        after: State,
-        forces: Forces,
-        per_thread: wp.int32,
-    ):
-        """Force of the bulk on each moving node after relaxation, for `step_nodes`."""
-        cut, chunk = wp.tid()
-        end = wp.min((chunk + 1) * per_thread, mesh.moving.shape[0])
-        for entry in range(chunk * per_thread, end):
-            i = forwards(mesh.moving[entry])
-            force = forces.from_elements[cut, i]
-            forces.from_bulk[cut, i] = relax(cut, i, force, parameters, now, after)
-
-    @wp.kernel(enable_backward=gradients, module=module)
-    def step_nodes(
+    def sum_forces(
         dt: real,
         mesh: Mesh,
         parameters: Parameters,
@@ -244,14 +241,16 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         sums: Sums,
         per_thread: wp.int32,
     ):
-        """Steps the nodes as `move_nodes` does, into other arrays, so that it has an adjoint."""
+        """With `gather` what `load_nodes` does, into other arrays, so that it has an adjoint."""
         cut, chunk = wp.tid()
         end = wp.min((chunk + 1) * per_thread, mesh.moving.shape[0])
         for entry in range(chunk * per_thread, end):
             i = forwards(mesh.moving[entry])
-            internal = forces.from_bulk[cut, i]
+            internal = relax(cut, i, forces.from_elements[cut, i], parameters, now, after)
             external = parameters.weight[cut, i] + forces.from_points[cut, i]
-            step_node(cut, i, internal, external, dt, mesh, parameters, now, after, sums)
+            board = on_board(cut, i, dt, mesh, parameters, now, after, sums)
+            forces.from_bulk[cut, i] = internal
+            forces.resultant[cut, entry] = padded(internal + external + board)
 
     @wp.kernel(enable_backward=False, module=module)
     def gather_adjoint(
@@ -265,6 +264,5 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
             adjoint = gather_elements(cut, i, mesh, forces)
             adj_ahead[cut, i] = adj_ahead[cut, i] + padded(adjoint)
 
-    out.gather, out.relax_nodes = gather, relax_nodes
-    out.step_nodes, out.gather_adjoint = step_nodes, gather_adjoint
+    out.gather, out.sum_forces, out.gather_adjoint = gather, sum_forces, gather_adjoint
     return out

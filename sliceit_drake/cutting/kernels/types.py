@@ -61,7 +61,7 @@ Scalar = enum.IntEnum("Scalar", [name.upper() for name in PARAMETERS], start=0)
 def kernel_types(real: Any) -> types.SimpleNamespace:
     """Types, structs and functions for `real` = wp.float32 or wp.float64, by name.
 
-    The first index of all arrays but those of `Mesh` and `Points` is the cut.
+    The first index of arrays is the cut, but for what belongs to the mesh.
     """
     vec2, vec3, vec4 = (wp.types.vector(n, real) for n in (2, 3, 4))
     mat33 = wp.types.matrix((3, 3), real)
@@ -114,12 +114,22 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         flank_scale: wp.array2d(dtype=lanes)
         friction_scale: wp.array2d(dtype=lanes)
         unloading: wp.array2d(dtype=lanes)
-        inverse_mass: wp.array2d(dtype=real)
-        local_damping: wp.array2d(dtype=real)
         weight: wp.array2d(dtype=vec3)
         relaxing: wp.array2d(dtype=real)
         keep: wp.array2d(dtype=real)
         stiff_volume: wp.array3d(dtype=lanes)
+
+    @wp.struct
+    class Inertia:
+        """Factors of the mass matrix of each cut, see `inertia.Factors`."""
+
+        lower_start: wp.array(dtype=wp.int32)
+        lower_index: wp.array(dtype=wp.int32)
+        upper_start: wp.array(dtype=wp.int32)
+        upper_index: wp.array(dtype=wp.int32)
+        lower: wp.array2d(dtype=real)
+        upper: wp.array2d(dtype=real)
+        inverse_pivot: wp.array2d(dtype=real)
 
     @wp.struct
     class Motion:
@@ -143,6 +153,7 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         fraction of the surface energy spent by opening, the edge's force on the food, its
         direction, and the slip from the friction anchors of both faces; that of the nodes on the
         board; the force that each Maxwell branch has relaxed; the blade's deflection and its rate.
+        `stepping` is not for the kernels, see `stepping`.
         `ahead` holds the positions at which the elements are evaluated, padded to fours, which are
         loaded faster than threes.
         """
@@ -157,14 +168,16 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         board_slip: wp.array2d(dtype=vec3)
         overstress: wp.array3d(dtype=vec3)
         blade: wp.array2d(dtype=real)
+        stepping: wp.array2d(dtype=real)
         ahead: wp.array2d(dtype=vec4)
 
     @wp.struct
     class Forces:
         """Forces in a sub-step: of the elements on the corners of their strips, also as the rows in
         which a node finds its entries, and where those corners are; on both faces at the cut
-        points, also as such rows; of the flanks along Ky, by point and summed. With gradients, what
-        each node got from elements, from the bulk (elements after relaxation) and from points."""
+        points, also as such rows; of the flanks along Ky, by point and summed. By node: from the
+        bulk (elements after relaxation); of those that move, in their order, the resultant, and the
+        acceleration that it gives. With gradients, what each node got from elements and points."""
 
         corners: wp.array3d(dtype=Vectors)
         elements: wp.array3d(dtype=Vectors)
@@ -173,8 +186,10 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         point_rows: wp.array2d(dtype=strided)
         lateral: wp.array2d(dtype=lanes)
         push: wp.array(dtype=real)
-        from_elements: wp.array2d(dtype=vec3)
         from_bulk: wp.array2d(dtype=vec3)
+        resultant: wp.array2d(dtype=vec4)
+        acceleration: wp.array2d(dtype=vec4)
+        from_elements: wp.array2d(dtype=vec3)
         from_points: wp.array2d(dtype=vec3)
 
     @wp.struct

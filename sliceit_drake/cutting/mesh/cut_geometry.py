@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.inertia import elimination_order
 from sliceit_drake.cutting.kernels.types import LANES, STRIP
 from sliceit_drake.cutting.mesh.cut_surface import (
     EdgeTables,
@@ -40,7 +41,8 @@ class CutGeometry:
         X_FC_rotation, X_FC_position: Pose of C in the food frame.
         up: Opposite of gravity [3].
         computed: Node of `split` for each computed node [N].
-        moving: Computed nodes that are not held [K].
+        moving: Computed nodes that are not held, in the order in which their equations are solved
+            [K].
         nodes: Rest positions of computed nodes [N, 3].
         tetrahedra: Computed nodes of the elements [T, 4].
         inverse: Inverse rest edges [T, 3, 3], 1/m.
@@ -251,7 +253,7 @@ def make_cut_geometry(
         X_FC_position=p_FC,
         up=up_C,
         computed=computed,
-        moving=np.flatnonzero(~held_node[computed]),
+        moving=elimination_order(~held_node[computed], np.concatenate([t, point_nodes])),
         nodes=nodes,
         tetrahedra=t,
         inverse=np.linalg.inv(bulk.edges()),

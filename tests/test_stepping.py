@@ -1,0 +1,195 @@
+"""Inertia that is added for longer sub-steps, and sub-steps that the knife's motion asks for."""
+
+import numpy as np
+import pytest
+from scipy.linalg import eigh
+from scipy.sparse import kron
+
+from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.material import Material
+from sliceit_drake.cutting.foods.shapes import Cylinder
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.knife_path import KnifePath
+from sliceit_drake.cutting.model import CuttingModel, Numerics
+from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan, Pose, Retract
+from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
+from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.cutting.stepping import CALM, STEPPING, Stepping
+from sliceit_drake.cutting.workspace import Workspace
+
+PERIOD = 2e-3
+UP = np.diag([1.0, -1.0, -1.0])
+
+
+def cut(held_sides: str = "both", **numerics) -> CuttingModel:
+    food = Food(
+        shape=Cylinder(rings=3, layers=[0.0, 0.004, 0.012]),
+        material=Material(toughness=400.0, friction=0.1),
+        held_sides=held_sides,
+    )
+    return make_food_model(food, Knife(), Numerics(**numerics))
+
+
+def down_and_back(model: CuttingModel, speed: float, acceleration: float | None = None) -> Motion:
+    segments = [
+        ConstantSpeed(distance=0.012, speed=speed, acceleration=acceleration),
+        Retract(distance=0.004, speed=speed, acceleration=acceleration),
+    ]
+    return Motion(MotionPlan(segments), start_pose(model, clearance=5e-4))
+
+
+def force(model: CuttingModel, motion: Motion) -> tuple[np.ndarray, SliceResult]:
+    result = simulate_slice(CuttingSolver(model, PERIOD), motion)
+    return result.food_wrench[:, 3:], result
+
+
+def test_the_factors_solve_the_mass_matrix_on_the_device():
+    model = cut(precision="float64")
+    ws = Workspace([model], PERIOD)
+    count = len(model.moving)
+    b = np.random.default_rng(0).normal(size=(count, 3))
+    ws.write(ws.forces[0].resultant, np.hstack([b, np.zeros((count, 1))])[None])
+    ws.launch_part("solve", 0)
+    y = ws.read(ws.forces[0].acceleration)[0, :, :3]
+    np.testing.assert_allclose(model.inertia.matrix @ y, b, atol=1e-9)
+
+
+def test_where_the_factors_have_entries_depends_on_the_mesh_alone():
+    model = cut()
+    still = model.derive(
+        material=Material(youngs_modulus=2e5, toughness=10.0),
+        numerics=Numerics(time_step=1e-5, flank_stiffness=0.01, bond_stiffness=0.01),
+    )
+    for name in ("lower_start", "lower_index", "upper_start", "upper_index"):
+        some = (getattr(each.inertia.factors, name) for each in (model, still))
+        np.testing.assert_array_equal(*some)
+
+
+@pytest.mark.parametrize("step", [2.5e-4, 1e-3])
+def test_no_frequency_of_the_food_at_rest_is_beyond_what_the_step_follows(step):
+    model = cut(time_step=step, precision="float64", board_friction=0.0)
+    exact = CuttingSolver(model.derive(numerics=numerics_of(model, 1e-9)), 1e-9)
+    far = Pose(UP, np.array([0.0, 0.0, 1.0]))
+    rest, size = exact.initial_state(), 1e-9
+
+    def forces(state: np.ndarray) -> np.ndarray:
+        new = exact.coupling_step(state, far, far).state
+        change = (exact.velocities(new) - exact.velocities(state))[model.moving]
+        return (exact.model.inertia.matrix @ change / 1e-9).ravel()
+
+    columns = []
+    for node in model.moving:
+        for axis in range(3):
+            moved = [rest.copy(), rest.copy()]
+            for state, shift in zip(moved, (size, -size), strict=True):
+                exact.positions(state)[node, axis] += shift
+            columns.append((forces(moved[1]) - forces(moved[0])) / (2.0 * size))
+    stiffness = np.array(columns)
+    stiffness = 0.5 * (stiffness + stiffness.T)
+    inertia = kron(model.inertia.matrix, np.eye(3)).toarray()
+    highest = eigh(stiffness, inertia, eigvals_only=True, subset_by_index=[len(inertia) - 1] * 2)
+    damping = 1.0 + 2.0 * model.numerics.numerical_damping
+    stable = 4.0 / (damping * step**2)
+    assert 0.2 * stable < float(highest[0]) < stable
+
+
+def numerics_of(model: CuttingModel, step: float) -> Numerics:
+    numerics = Numerics(**vars(model.numerics))
+    numerics.time_step, numerics.mass_scaling = step, False
+    return numerics
+
+
+def test_a_translation_away_from_the_cut_keeps_its_true_mass_and_a_rotation_does_not():
+    model = cut(held_sides="none")
+    contact = np.unique(model.point_nodes)
+    free = ~np.isin(model.moving, contact) & (model.board_area[model.moving] == 0.0)
+    assert free.any()
+    stepped, true = model.inertia.matrix @ np.ones(len(free)), model.true_mass[model.moving]
+    np.testing.assert_allclose(stepped[free], true[free], rtol=1e-6)
+    # Turned about the axis of the cylinder.
+    turn = model.nodes[model.moving][:, 2]
+    assert turn @ model.inertia.matrix @ turn > 2.0 * (true @ turn**2)
+
+
+@pytest.mark.parametrize(("speed", "acceleration"), [(0.02, None), (0.1, None), (0.1, 2.0)])
+def test_a_knife_that_turns_round_feels_the_force_of_small_steps(speed, acceleration):
+    model = cut(time_step=1e-3)
+    motion = down_and_back(model, speed, acceleration)
+    reference, _ = force(cut(time_step=4e-5), motion)
+
+    def errors(model: CuttingModel) -> tuple[float, float]:
+        difference = np.linalg.norm(force(model, motion)[0] - reference, axis=1)
+        size = np.linalg.norm(reference, axis=1)
+        rms = float(np.linalg.norm(difference) / np.linalg.norm(size))
+        return rms, float(difference.max() / size.max())
+
+    rms, largest = errors(model)
+    assert rms < 0.015
+    assert largest < 0.1
+    assert errors(cut(time_step=1e-3, step_by_need=False))[1] > 0.1
+
+
+def test_steady_motion_takes_the_longest_steps_and_a_turn_short_ones_for_a_while():
+    model = cut(time_step=1e-3)
+    path = KnifePath(model, down_and_back(model, 0.02), PERIOD)
+    rule = Stepping.of(model, 2)
+    numbers, _ = rule.plan(np.zeros(STEPPING), path.R_CK, path.p_CK, PERIOD)
+    turn = int(path.p_CK[:, 2].argmin())
+    assert set(numbers[:turn]) == {2}
+    assert numbers[turn] >= 8
+    longer = np.flatnonzero(np.diff(numbers[turn:]) < 0)
+    assert np.diff(longer).min() > CALM
+    assert numbers[-1] == 2
+
+
+def test_steps_are_the_same_however_many_are_planned_at_once():
+    model = cut(time_step=1e-3)
+    path = KnifePath(model, down_and_back(model, 0.1, 1.0), PERIOD)
+    rule = Stepping.of(model, 2)
+    numbers, _ = rule.plan(np.zeros(STEPPING), path.R_CK, path.p_CK, PERIOD)
+    state, one_by_one = np.zeros(STEPPING, np.float32), []
+    for k in range(path.coupling_steps):
+        at = slice(k, k + 2)
+        (number,), (after,) = rule.plan(state, path.R_CK[at], path.p_CK[at], PERIOD)
+        state[:] = after
+        one_by_one.append(number)
+    assert len(set(numbers)) > 2
+    assert numbers == one_by_one
+
+
+def test_changing_steps_again_and_again_feeds_no_vibration():
+    model = cut(time_step=1e-3)
+    solver = CuttingSolver(model, PERIOD)
+    rng = np.random.default_rng(3)
+    state, p = solver.initial_state(), np.array([0.0, 0.0, model.top + 5e-4])
+    R = model.X_FC_rotation.T @ start_pose(model, 0.0).R
+    largest, numbers = 0.0, set()
+    for _ in range(400):
+        # At most times the speed stays, so that steps get longer again.
+        if rng.random() < 0.05:
+            speed = rng.choice([-0.1, 0.02, 0.1, 0.15])
+        else:
+            speed = 0.0 if p[2] < model.bottom + 0.005 else 0.01
+        after = p - [0.0, 0.0, speed * PERIOD]
+        step = solver.coupling_step(state, Pose(R, p), Pose(R, after))
+        state, p = step.state, after
+        numbers.add(round(PERIOD / float(solver.field(state, "stepping")[-2])))
+        largest = max(largest, solver.energies(state, Pose(R, p)).kinetic)
+    assert len(numbers) > 3
+    pose = Pose(R, p)
+    for _ in range(30):
+        state = solver.coupling_step(state, pose, pose).state
+    energies = solver.energies(state, pose)
+    assert energies.least_volume_ratio > 0.3
+    assert largest < 0.01
+    assert energies.kinetic < 1e-3 * largest
+
+
+def test_a_hold_of_ten_seconds_neither_creeps_nor_swings():
+    model = cut(time_step=1e-3)
+    segments = [ConstantSpeed(distance=0.012, speed=0.05), Hold(duration=10.0)]
+    motion = Motion(MotionPlan(segments), start_pose(model, clearance=5e-4))
+    vertical = force(model, motion)[0][:, 2]
+    held = vertical[-round(9.9 / PERIOD) :]
+    assert held[0] > 5.0
+    assert np.ptp(held) < 2e-3 * held[0]
