@@ -78,7 +78,8 @@ class Workspace:
             start_warp()
             self.kernels = kernels(self.real, gradients)
         self.device = _device(model.numerics.device)
-        self.model, self.models = model, ()
+        self.model = model
+        self.models: tuple[CuttingModel, ...] = ()
         self._gradients = gradients
         self._graph: Any = None
         self._energy_graph: Any = None
@@ -281,10 +282,10 @@ class Workspace:
                 outline = _filled(models[0].outline, 0.0)
                 self.points.outline.assign(outline.astype(self.dtype))
         self.write(self.parameter_rows, np.array([parameter_row(m) for m in models]))
-        held = [model.inertia for model in self.models]
-        if any(new.inertia is not old for new, old in zip(models, held, strict=False)) or not held:
+        inertia = [model.inertia for model in models]
+        if [id(each) for each in inertia] != [id(model.inertia) for model in self.models]:
             for name in FACTORS:
-                values = np.array([getattr(model.inertia.factors, name) for model in models])
+                values = np.array([getattr(each.factors, name) for each in inertia])
                 self.write(getattr(self.inertia, name), values)
         self.models = tuple(models)
 
