@@ -12,7 +12,7 @@ import functools
 from collections.abc import Iterable
 
 import numpy as np
-from scipy.sparse import coo_array, csc_array, tril
+from scipy.sparse import coo_array, csc_array, csr_array, tril
 from scipy.sparse.linalg import SuperLU, splu
 
 __all__ = ["Factors", "Inertia", "assemble", "elimination_order"]
@@ -22,9 +22,11 @@ __all__ = ["Factors", "Inertia", "assemble", "elimination_order"]
 class Factors:
     """S = L D L' with a lower triangular L of unit diagonal, in the order of elimination.
 
+    Entries of a row come in fours, filled up with zeros.
+
     Attributes:
-        lower_start, lower_index, lower: Rows of L without the diagonal: first entry of each and the
-            end [K + 1], columns and values [Z].
+        lower_start, lower_index, lower: Rows of L without the diagonal: first four of each and the
+            end [K + 1], columns and values [Z, 4].
         upper_start, upper_index, upper: The same of L'.
         inverse_pivot: 1 / D [K], 1/kg.
     """
@@ -60,18 +62,7 @@ class Inertia:
         if (pivot <= 0.0).any() or (lu.perm_r != np.arange(len(pivot))).any():
             raise ValueError("the mass matrix is not positive definite")
         lower = tril(lu.L, -1).tocsr()
-        upper = lower.T.tocsr()
-        for matrix in (lower, upper):
-            matrix.sort_indices()
-        return Factors(
-            lower.indptr,
-            lower.indices,
-            lower.data,
-            upper.indptr,
-            upper.indices,
-            upper.data,
-            1.0 / pivot,
-        )
+        return Factors(*_by_fours(lower, 0), *_by_fours(lower.T.tocsr(), -1), 1.0 / pivot)
 
     def kinetic_energy(self, velocities: np.ndarray) -> float:
         """Of velocities of the moving nodes in the matrix's order [K, 3], m/s; in J."""
@@ -114,6 +105,23 @@ def assemble(
     free = (row >= 0) & (column >= 0)
     shape = (len(moving), len(moving))
     return coo_array((value[free], (row[free], column[free])), shape).tocsc()
+
+
+def _by_fours(matrix: csr_array, fill: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """First four of each row and the end [K + 1], columns [Z, 4] and values [Z, 4].
+
+    Args:
+        matrix: Sparse, square.
+        fill: Column of the zeros that rows are filled up with.
+    """
+    matrix.sort_indices()
+    count = np.diff(matrix.indptr)
+    start = np.concatenate([[0], np.cumsum(-(-count // 4))])
+    place = 4 * np.repeat(start[:-1], count) + np.arange(matrix.nnz)
+    place -= np.repeat(matrix.indptr[:-1], count)
+    columns, values = np.full(4 * start[-1], fill % len(count)), np.zeros(4 * start[-1])
+    columns[place], values[place] = matrix.indices, matrix.data
+    return start, columns.reshape(-1, 4), values.reshape(-1, 4)
 
 
 def _factorized(matrix: csc_array, order: str) -> SuperLU:

@@ -200,7 +200,8 @@ class Workspace:
         places = ("lower_start", "lower_index", "upper_start", "upper_index")
         self._set(self.inertia, **{name: getattr(factors, name) for name in places})
         for name in FACTORS:
-            rows = wp.zeros((C, len(getattr(factors, name))), self.real, device=self.device)
+            dtype = k.Inertia.vars[name].type.dtype
+            rows = wp.zeros((C, len(getattr(factors, name))), dtype, device=self.device)
             setattr(self.inertia, name, rows)
 
         self.motion = k.Motion()

@@ -133,17 +133,34 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         """Solves S y = b by the factors of S, which is symmetric: its own adjoint."""
         cut = wp.tid()
         count = inertia.inverse_pivot.shape[1]
+        # Four sums at a time, none of which waits for another.
         for row in range(count):
-            sum = b[cut, row]
+            first = b[cut, row]
+            second = vec4()
+            third = vec4()
+            fourth = vec4()
             for e in range(inertia.lower_start[row], inertia.lower_start[row + 1]):
-                sum -= inertia.lower[cut, e] * y[cut, forwards(inertia.lower_index[e])]
-            y[cut, row] = sum
+                at = inertia.lower_index[e]
+                L = inertia.lower[cut, e]
+                first -= L[0] * y[cut, forwards(at[0])]
+                second -= L[1] * y[cut, forwards(at[1])]
+                third -= L[2] * y[cut, forwards(at[2])]
+                fourth -= L[3] * y[cut, forwards(at[3])]
+            y[cut, row] = (first + second) + (third + fourth)
         for back in range(count):
             row = count - 1 - back
-            sum = y[cut, row] * inertia.inverse_pivot[cut, row]
+            first = y[cut, row] * inertia.inverse_pivot[cut, row]
+            second = vec4()
+            third = vec4()
+            fourth = vec4()
             for e in range(inertia.upper_start[row], inertia.upper_start[row + 1]):
-                sum -= inertia.upper[cut, e] * y[cut, forwards(inertia.upper_index[e])]
-            y[cut, row] = sum
+                at = inertia.upper_index[e]
+                L = inertia.upper[cut, e]
+                first -= L[0] * y[cut, forwards(at[0])]
+                second -= L[1] * y[cut, forwards(at[1])]
+                third -= L[2] * y[cut, forwards(at[2])]
+                fourth -= L[3] * y[cut, forwards(at[3])]
+            y[cut, row] = (first + second) + (third + fourth)
 
     @wp.kernel(enable_backward=gradients, module=module)
     def step_nodes(

@@ -124,11 +124,11 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         """Factors of the mass matrix of each cut, see `inertia.Factors`."""
 
         lower_start: wp.array(dtype=wp.int32)
-        lower_index: wp.array(dtype=wp.int32)
+        lower_index: wp.array(dtype=entries)
         upper_start: wp.array(dtype=wp.int32)
-        upper_index: wp.array(dtype=wp.int32)
-        lower: wp.array2d(dtype=real)
-        upper: wp.array2d(dtype=real)
+        upper_index: wp.array(dtype=entries)
+        lower: wp.array2d(dtype=vec4)
+        upper: wp.array2d(dtype=vec4)
         inverse_pivot: wp.array2d(dtype=real)
 
     @wp.struct
