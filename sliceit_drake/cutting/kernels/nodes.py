@@ -18,7 +18,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
     vec3, vec4, slide, padded, forwards = t.vec3, t.vec4, t.slide, t.padded, t.forwards
     sum8 = lane_functions(real).sum8
     Mesh, Parameters, State, Forces, Sums = t.Mesh, t.Parameters, t.State, t.Forces, t.Sums
-    Inertia = t.Inertia
+    Inertia, entries = t.Inertia, t.entries
 
     @wp.func
     def gather_elements(cut: wp.int32, i: wp.int32, mesh: Mesh, forces: Forces):
@@ -128,39 +128,54 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
             forces.from_bulk[cut, i] = internal
             forces.resultant[cut, entry] = padded(internal + external)
 
+    # By hand: in Warp's own language its four sums do not become vectors, and take twice as long.
+    @wp.func_native(
+        f"""
+        typedef {"float" if real is wp.float32 else "double"} Real;
+        const int* begin = start.data;
+        const int* at = (const int*)index.data;
+        const Real* L = (const Real*)((const char*)values.data + cut * values.strides[0]);
+        const Real* D = (const Real*)((const char*)scale.data + cut * scale.strides[0]);
+        const Real* B = (const Real*)((const char*)b.data + cut * b.strides[0]);
+        Real* Y = (Real*)((char*)y.data + cut * y.strides[0]);
+        const int count = y.shape[1];
+        for (int k = 0; k < count; ++k) {{
+            const int row = backwards ? count - 1 - k : k;
+            const Real factor = backwards ? D[row] : Real(1);
+            Real s0[4], s1[4] = {{0, 0, 0, 0}}, s2[4] = {{0, 0, 0, 0}}, s3[4] = {{0, 0, 0, 0}};
+            for (int c = 0; c < 4; ++c) s0[c] = factor * B[4 * row + c];
+            for (int e = 4 * begin[row]; e < 4 * begin[row + 1]; e += 4) {{
+                const Real *y0 = Y + 4 * at[e], *y1 = Y + 4 * at[e + 1];
+                const Real *y2 = Y + 4 * at[e + 2], *y3 = Y + 4 * at[e + 3];
+                for (int c = 0; c < 4; ++c) {{
+                    s0[c] -= L[e] * y0[c];
+                    s1[c] -= L[e + 1] * y1[c];
+                    s2[c] -= L[e + 2] * y2[c];
+                    s3[c] -= L[e + 3] * y3[c];
+                }}
+            }}
+            for (int c = 0; c < 4; ++c) Y[4 * row + c] = (s0[c] + s1[c]) + (s2[c] + s3[c]);
+        }}
+        """
+    )
+    def substitute(
+        cut: wp.int32,
+        backwards: wp.bool,
+        start: wp.array(dtype=wp.int32),
+        index: wp.array(dtype=entries),
+        values: wp.array2d(dtype=vec4),
+        scale: wp.array2d(dtype=real),
+        b: wp.array2d(dtype=vec4),
+        y: wp.array2d(dtype=vec4),
+    ): ...
+
     @wp.kernel(enable_backward=False, module=module)
-    def solve(inertia: Inertia, b: wp.array2d(dtype=vec4), y: wp.array2d(dtype=vec4)):
+    def solve(S: Inertia, b: wp.array2d(dtype=vec4), y: wp.array2d(dtype=vec4)):
         """Solves S y = b by the factors of S, which is symmetric: its own adjoint."""
         cut = wp.tid()
-        count = inertia.inverse_pivot.shape[1]
-        # Four sums at a time, none of which waits for another.
-        for row in range(count):
-            first = b[cut, row]
-            second = vec4()
-            third = vec4()
-            fourth = vec4()
-            for e in range(inertia.lower_start[row], inertia.lower_start[row + 1]):
-                at = inertia.lower_index[e]
-                L = inertia.lower[cut, e]
-                first -= L[0] * y[cut, forwards(at[0])]
-                second -= L[1] * y[cut, forwards(at[1])]
-                third -= L[2] * y[cut, forwards(at[2])]
-                fourth -= L[3] * y[cut, forwards(at[3])]
-            y[cut, row] = (first + second) + (third + fourth)
-        for back in range(count):
-            row = count - 1 - back
-            first = y[cut, row] * inertia.inverse_pivot[cut, row]
-            second = vec4()
-            third = vec4()
-            fourth = vec4()
-            for e in range(inertia.upper_start[row], inertia.upper_start[row + 1]):
-                at = inertia.upper_index[e]
-                L = inertia.upper[cut, e]
-                first -= L[0] * y[cut, forwards(at[0])]
-                second -= L[1] * y[cut, forwards(at[1])]
-                third -= L[2] * y[cut, forwards(at[2])]
-                fourth -= L[3] * y[cut, forwards(at[3])]
-            y[cut, row] = (first + second) + (third + fourth)
+        d = S.inverse_pivot
+        substitute(cut, False, S.lower_start, S.lower_index, S.lower, d, b, y)
+        substitute(cut, True, S.upper_start, S.upper_index, S.upper, d, y, y)
 
     @wp.kernel(enable_backward=gradients, module=module)
     def step_nodes(
