@@ -1,4 +1,4 @@
-"""How far the force on the knife depends on the sub-step, with scaled and with true masses."""
+"""How far the force on the knife depends on the sub-step: constant, by need, with true masses."""
 
 import dataclasses as dc
 import os
@@ -16,9 +16,11 @@ from sliceit_drake.cutting.model import CuttingModel, Numerics, TimeStepError
 from sliceit_drake.cutting.motion import Hold, Motion, MotionPlan, PressAndDraw, Retract, Segment
 from sliceit_drake.cutting.simulate import ENERGY_RATIO_LIMIT, energy_ratio
 from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError, CuttingSolver
+from sliceit_drake.cutting.stepping import STEPPING, Stepping
 from studies.pages import table
 
 __all__ = [
+    "LONGEST",
     "STEPS",
     "StepCost",
     "StepResult",
@@ -26,22 +28,28 @@ __all__ = [
     "cost_table",
     "error_table",
     "hold_table",
+    "inertia_by_step_table",
     "inertia_table",
     "largest_table",
-    "mass_table",
+    "need_table",
+    "planned_substeps",
+    "slice_inertia",
     "step_costs",
     "stepping_cases",
     "stepping_study",
     "true_step",
 ]
 
-STEPS = (1e-5, 2e-5, 5e-5, 1e-4, 2.5e-4, 5e-4, 1e-3)
-"""Sub-steps, s. They divide the coupling period."""
+STEPS = (2e-5, 6.25e-5, 1.25e-4, 2.5e-4, 5e-4, 1e-3, 2e-3)
+"""Constant sub-steps, s. They divide the coupling period."""
+LONGEST = Numerics().time_step
+"""Longest sub-step by need, s."""
 
 EXCHANGE = 2e-3
 CLEARANCE = 5e-4
 RAMP = 1.0  # Acceleration of the sequences' knife, m/s^2.
-RETRACT = 0.01  # m.
+RAMPS = (0.5, 2.0)  # At turns, m/s^2.
+RETRACT = 6e-3  # m.
 CHECK_TRAVEL = 2e-4  # Of the knife between two looks at the energies, m.
 SETTLED = 0.02  # After a stop, s: the force drop ends here and creep begins.
 
@@ -84,16 +92,19 @@ class SteppingCase:
 
     @property
     def label(self) -> str:
-        """Food, motion and speed."""
-        return f"{self.food.name}, {self.motion_name}, {1e3 * self.press_speed:g} mm/s"
+        """Food, motion, speed and ramp."""
+        ramp = f", {self.acceleration:g} m/s2" if self.acceleration else ""
+        return f"{self.food.name}, {self.motion_name}, {1e3 * self.press_speed:g} mm/s{ramp}"
 
-    def model(self, step: float, scaled: bool) -> CuttingModel:
-        """The cut at a step.
+    def model(self, step: float, scaled: bool = True, by_need: bool = False) -> CuttingModel:
+        """The cut at a step, constant or the longest by need.
 
         Raises:
             TimeStepError: Beyond the stability limit with true masses.
         """
-        numerics = dc.replace(self.numerics, time_step=step, mass_scaling=scaled)
+        numerics = dc.replace(
+            self.numerics, time_step=step, mass_scaling=scaled, step_by_need=by_need
+        )
         return make_food_model(self.food, self.knife, numerics)
 
     def motion(self, model: CuttingModel) -> Motion:
@@ -120,15 +131,17 @@ class StepResult:
 
     Attributes:
         case: The cut.
-        time_step: s.
+        time_step: The constant one or the longest, s.
         scaled: Whether masses are scaled.
+        by_need: Whether sub-steps are shorter by need.
         reference: Whether this is what the others are compared with.
         refusal: Why it was not computed or broke down, or None.
         rms_error: RMS of the force's difference over RMS of the reference's force.
         largest_difference: N.
         peak: Of the reference's force, N.
         energy_ratio: Largest kinetic over internal energy, looked at every 0.2 mm of travel.
-        mass_ratio: Stepped over true mass.
+        substeps: Mean number of sub-steps of a coupling step.
+        finer: Fraction of coupling steps with more than the fewest.
         force_drop: Force before the stop less force 20 ms after it, N; not a number without hold.
         creep: Change of the force from then to the end of the hold, N; likewise.
         elements: Elements that are computed, and all of the split mesh.
@@ -137,16 +150,23 @@ class StepResult:
     case: SteppingCase
     time_step: float
     scaled: bool
+    by_need: bool = False
     reference: bool = False
     refusal: str | None = None
     rms_error: float = np.nan
     largest_difference: float = np.nan
     peak: float = np.nan
     energy_ratio: float = np.nan
-    mass_ratio: float = np.nan
+    substeps: float = np.nan
+    finer: float = 0.0
     force_drop: float = np.nan
     creep: float = np.nan
     elements: tuple[int, int] = (0, 0)
+
+    @property
+    def column(self) -> tuple[bool, float]:
+        """Place of its column in a table: constant steps first."""
+        return self.by_need, self.time_step
 
     @property
     def too_much_inertia(self) -> bool:
@@ -160,46 +180,58 @@ class StepCost:
 
     Attributes:
         food: Name.
-        time_step: s.
+        time_step: The constant one or the longest, s.
+        by_need: Whether sub-steps are shorter by need.
         elements: Elements that are computed.
         seconds: Wall time of a simulated second, s.
-        substep: Wall time of a sub-step, s.
         spread: Standard deviation over the mean of the repeats.
     """
 
     food: str
     time_step: float
+    by_need: bool
     elements: int
     seconds: float
-    substep: float
     spread: float
+
+    @property
+    def column(self) -> tuple[bool, float]:
+        """Place of its column in a table: constant steps first."""
+        return self.by_need, self.time_step
 
 
 def stepping_cases(
     foods: Sequence[tuple[Food, Knife, Numerics]], speeds: Sequence[float] = (0.02, 0.1)
 ) -> list[SteppingCase]:
-    """For each food and speed: press, that and 10 mm back, draw to 40 %, hold at 30 % of the depth.
+    """For each food: presses, draws, turns round and holds, sudden and on ramps.
 
-    At the fastest the hold is also reached by a ramp. Only that speed is compared with true masses:
-    it is short, and inertia is largest.
+    Turns, 6 mm back from 60 % of the height, are also at 50 and (from 30 %) at 5 mm/s where two
+    speeds are asked for. The fastest are compared with true masses: they are short, and inertia is
+    largest.
     """
     cases = []
     for food, knife, numerics in foods:
         for speed in speeds:
             fastest = speed == max(speeds)
             press = SteppingCase(food, knife, numerics, speed, true_masses=fastest)
-            hold = dc.replace(press, depth=0.3, hold=0.15)
-            back = dc.replace(press, retract=RETRACT)
-            cases += [press, back, dc.replace(press, draw_ratio=1.0, depth=0.4), hold]
+            turn = dc.replace(press, depth=0.6, retract=RETRACT)
+            hold = dc.replace(press, depth=0.4, hold=0.15)
+            cases += [press, dc.replace(press, draw_ratio=1.0, depth=0.5), turn]
+            cases += [dc.replace(turn, acceleration=ramp) for ramp in RAMPS]
+            cases.append(hold)
             if fastest:
                 cases.append(dc.replace(hold, acceleration=RAMP))
+        if len(speeds) > 1:
+            turn = dc.replace(turn, true_masses=False)
+            cases.append(dc.replace(turn, press_speed=0.05))
+            cases.append(dc.replace(turn, press_speed=0.005, depth=0.3))
     return cases
 
 
 def true_step(case: SteppingCase, most: float) -> float:
     """Largest step up to `most` that divides the coupling step and is stable with true masses,
     s."""
-    limit = min(most, 0.99 * case.model(most, True).critical_time_step)
+    limit = min(most, 0.99 * case.model(most).critical_time_step)
     return EXCHANGE / int(np.ceil(EXCHANGE / limit - 1e-9))
 
 
@@ -209,7 +241,7 @@ def stepping_study(
     workers: int | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> list[StepResult]:
-    """Runs the cases at each step, with scaled and where asked with true masses.
+    """Runs the cases at each step and by need, with scaled and where asked with true masses.
 
     Args:
         cases: The cuts.
@@ -218,28 +250,30 @@ def stepping_study(
         progress: Called after each run with the fraction of all sub-steps done.
 
     Returns:
-        Results by case and step. The reference is the first of its case.
+        Results by case and step, the last by need. The reference is the first of its case.
 
     Raises:
         CuttingError: A reference broke down.
     """
     ordered = sorted(steps)
-    runs: list[tuple[SteppingCase, float, bool]] = []
+    runs: list[tuple[SteppingCase, float, bool, bool]] = []
     for case in cases:
         if case.true_masses:
             finest = true_step(case, ordered[0])
-            runs.append((case, finest, False))
-            runs += [(case, step, False) for step in ordered if step > finest]
-        runs += [(case, step, True) for step in ordered]
+            runs.append((case, finest, False, False))
+            runs += [(case, step, False, False) for step in ordered if step > finest]
+        runs += [(case, step, True, False) for step in ordered]
+        runs.append((case, LONGEST, True, True))
 
     def work(index: int) -> float:
-        case, step, _ = runs[index]
-        return ((case.depth * 0.03 + case.retract) / case.press_speed + case.hold) / step
+        case, step, _, by_need = runs[index]
+        duration = (case.depth * 0.03 + case.retract) / case.press_speed + case.hold
+        return duration / (0.4 * step if by_need else step)
 
     total, done = sum(map(work, range(len(runs)))), 0.0
     outcomes: dict[int, tuple[StepResult, np.ndarray]] = {}
     # Kernels are made from their source at the first use, which threads must not do together.
-    CuttingSolver(cases[0].model(ordered[-1], True), EXCHANGE).compile()
+    CuttingSolver(cases[0].model(ordered[-1]), EXCHANGE).compile()
     with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
         # The longest first, so that no thread is left with one at the end.
         longest = sorted(range(len(runs)), key=work, reverse=True)
@@ -251,7 +285,7 @@ def stepping_study(
                 progress(done / total)
     results: list[StepResult] = []
     reference = np.empty(0)
-    for index, (case, _, _) in enumerate(runs):
+    for index, (case, *_) in enumerate(runs):
         result, force = outcomes[index]
         if not results or results[-1].case is not case:
             if result.refusal is not None:
@@ -266,23 +300,26 @@ def stepping_study(
     return results
 
 
-def _run(case: SteppingCase, step: float, scaled: bool) -> tuple[StepResult, np.ndarray]:
+def _run(
+    case: SteppingCase, step: float, scaled: bool, by_need: bool
+) -> tuple[StepResult, np.ndarray]:
     """One run, and the force on the knife at each coupling step [n, 3], N."""
-    result = StepResult(case, step, scaled)
+    result = StepResult(case, step, scaled, by_need)
     try:
-        model = case.model(step, scaled)
+        model = case.model(step, scaled, by_need)
     except TimeStepError:
-        limit = case.model(step, True).critical_time_step
+        limit = case.model(step).critical_time_step
         result.refusal = f"beyond the stability limit {limit:.3g} s"
         return result, np.empty((0, 3))
-    result.mass_ratio = model.mass_ratio
     result.elements = model.element_count, len(model.split.tetrahedra)
     solver = CuttingSolver(model, EXCHANGE)
     motion = case.motion(model)
     path = KnifePath(model, motion, EXCHANGE)
+    poses = path.poses(0, path.coupling_steps, commanded=True)
+    result.substeps, result.finer = planned_substeps(model, *poses)
     spent = ratio = 0.0
     force = np.zeros((path.coupling_steps, 3))
-    block = max(1, round(CHECK_TRAVEL / (case.press_speed * EXCHANGE)))
+    block = max(1, round(CHECK_TRAVEL / (case.press_speed * EXCHANGE))) if path.rigid else 1
     starts = range(0, path.coupling_steps, block)
     launches = [Launch(k, min(block, path.coupling_steps - k)) for k in starts]
     for (k, count, _), (part,) in solver.driver.run([path], launches):
@@ -304,6 +341,36 @@ def _run(case: SteppingCase, step: float, scaled: bool) -> tuple[StepResult, np.
     return result, force
 
 
+def planned_substeps(model: CuttingModel, R: np.ndarray, p: np.ndarray) -> tuple[float, float]:
+    """Mean number of sub-steps of a coupling step, and the fraction that has more than the fewest.
+
+    Args:
+        model: The cut.
+        R, p: Poses X_CK at the ends of coupling steps of 2 ms [E + 1, 3, 3] and [E + 1, 3], metres.
+    """
+    fewest = round(EXCHANGE / model.numerics.time_step)
+    rule = Stepping.of(model, fewest)
+    numbers = np.array(rule.plan(np.zeros(STEPPING), R, p, EXCHANGE)[0])
+    return float(numbers.mean()), float((numbers > fewest).mean())
+
+
+def slice_inertia(model: CuttingModel) -> tuple[float, float]:
+    """Stepped over true inertia of the half that comes off.
+
+    In a translation, and turning about its centre of mass and the direction of the edge.
+    """
+    mine = model.split.node_side[model.computed[model.moving]] == model.free_side
+    mass = np.where(mine, model.true_mass[model.moving], 0.0)
+    nodes = model.nodes[model.moving]
+    axis = np.eye(3)[0]
+    turn = np.cross(axis, nodes - mass @ nodes / mass.sum())
+    translation, rotation = (
+        2.0 * model.inertia.kinetic_energy(v) / float(mass @ (v * v).sum(1))
+        for v in (mine[:, None] * axis, mine[:, None] * turn)
+    )
+    return translation, rotation
+
+
 def step_costs(
     foods: Sequence[tuple[Food, Knife, Numerics]],
     steps: Sequence[float] = STEPS,
@@ -311,7 +378,7 @@ def step_costs(
     repeats: int = 3,
     progress: Callable[[float], None] | None = None,
 ) -> list[StepCost]:
-    """Times a press at 20 mm/s on one thread, the steps in turn and that several times.
+    """Times a press at 20 mm/s on one thread, the steps and by need in turn and that several times.
 
     Args:
         foods: The cuts.
@@ -321,56 +388,63 @@ def step_costs(
         progress: Called after each run with the fraction of all sub-steps done.
     """
     costs, share = [], 0.0
-    work = len(foods) * repeats * sum(1.0 / step for step in steps)
+    columns = [(False, step) for step in steps] + [(True, LONGEST)]
+    work = len(foods) * repeats * sum(1.0 / step for _, step in columns)
     for food in foods:
         case = SteppingCase(*food, press_speed=0.02)
-        solvers = [CuttingSolver(case.model(step, True), EXCHANGE) for step in steps]
+        solvers = [
+            CuttingSolver(case.model(step, by_need=by_need), EXCHANGE) for by_need, step in columns
+        ]
         motion = case.motion(solvers[0].model)
         paths = [KnifePath(solver.model, motion, EXCHANGE) for solver in solvers]
         # As many coupling steps a launch as a slice has between its checks.
         launches = [Launch(k, 10) for k in range(0, round(duration / EXCHANGE), 10)]
         for solver, path in zip(solvers, paths, strict=True):
             next(solver.driver.run([path], launches))
-        wall = np.zeros((repeats, len(steps)))
+        wall = np.zeros((repeats, len(columns)))
         for row in wall:
             for column, (solver, path) in enumerate(zip(solvers, paths, strict=True)):
                 begin = time.perf_counter()
                 for _ in solver.driver.run([path], launches):
                     pass
                 row[column] = time.perf_counter() - begin
-                share += 1.0 / steps[column] / work
+                share += 1.0 / columns[column][1] / work
                 if progress is not None:
                     progress(share)
         seconds = wall / (10 * len(launches) * EXCHANGE)
-        for step, mean, deviation in zip(steps, seconds.mean(0), seconds.std(0), strict=True):
+        for (by_need, step), mean, deviation in zip(
+            columns, seconds.mean(0), seconds.std(0), strict=True
+        ):
             count = solvers[0].model.element_count
             costs.append(
-                StepCost(
-                    food[0].name, step, count, float(mean), float(mean * step), deviation / mean
-                )
+                StepCost(food[0].name, step, by_need, count, float(mean), deviation / mean)
             )
     return costs
 
 
-def _table(first: str, steps: Sequence[float], rows: Sequence[Sequence[str]]) -> str:
-    return table(" | ".join([first, *(f"{step:g} s" for step in steps)]), rows)
+def _heads(columns: Sequence[tuple[bool, float]]) -> list[str]:
+    return ["by need" if by_need else f"{step:g} s" for by_need, step in columns]
+
+
+def _table(first: str, columns: Sequence[tuple[bool, float]], rows: Sequence[Sequence[str]]) -> str:
+    return table(" | ".join([first, *_heads(columns)]), rows)
 
 
 def _by_case(
     results: Sequence[StepResult], first: str, value: Callable[[StepResult], float], digits: int
 ) -> str:
-    """A row for each case and kind of masses, a column for each step."""
-    steps = sorted({r.time_step for r in results if r.scaled})
-    rows: dict[str, dict[float, StepResult]] = {}
+    """A row for each case and kind of masses, a column for each step and one by need."""
+    columns = sorted({r.column for r in results if r.scaled})
+    rows: dict[str, dict[tuple[bool, float], StepResult]] = {}
     for r in results:
         label = r.case.label + ("" if r.scaled else ", true masses")
-        rows.setdefault(label, {})[r.time_step] = r
+        rows.setdefault(label, {})[r.column] = r
     cells = []
     for label, row in rows.items():
         # A row of nothing but refusals, and a reference between the columns, tell nothing.
-        if any(step in row and row[step].refusal is None for step in steps):
-            cells.append([label, *(_cell(row.get(step), value, digits) for step in steps)])
-    return _table(first, steps, cells)
+        if any(c in row and row[c].refusal is None and not row[c].reference for c in columns):
+            cells.append([label, *(_cell(row.get(c), value, digits) for c in columns)])
+    return _table(first, columns, cells)
 
 
 def _cell(r: StepResult | None, value: Callable[[StepResult], float], digits: int) -> str:
@@ -407,41 +481,60 @@ def inertia_table(results: Sequence[StepResult]) -> str:
 def hold_table(results: Sequence[StepResult]) -> str:
     """Drop of the force at a stop and its creep after that, of the reference and of each step."""
     held = [r for r in results if r.case.hold and (r.scaled or r.reference)]
-    steps = sorted({r.time_step for r in held if r.scaled})
+    columns = sorted({r.column for r in held if r.scaled})
     rows = []
     for reference in (r for r in held if r.reference):
         of_case = [r for r in held if r.case is reference.case and r.scaled]
-        cells = {r.time_step: f"{r.force_drop:.3f}, {r.creep:+.4f}" for r in of_case}
+        cells = {r.column: f"{r.force_drop:.3f}, {r.creep:+.4f}" for r in of_case}
         name = f"{reference.case.label} ({reference.force_drop:.3f}, {reference.creep:+.4f})"
-        rows.append([name, *(cells[step] for step in steps)])
-    return _table("drop, creep [N] (reference)", steps, rows)
+        rows.append([name, *(cells[column] for column in columns)])
+    return _table("drop, creep [N] (reference)", columns, rows)
 
 
-def mass_table(results: Sequence[StepResult]) -> str:
-    """Elements, stability limit with true masses, and stepped over true mass, for each food."""
-    scaled = [r for r in results if r.scaled and r.refusal is None]
-    steps = sorted({r.time_step for r in scaled})
-    rows: dict[str, list[str]] = {}
-    for r in scaled:
-        name = r.case.food.name
-        if name in rows and len(rows[name]) == len(steps) + 1:
+def need_table(results: Sequence[StepResult]) -> str:
+    """Sub-steps of the coupling steps by need."""
+    return table(
+        f"by need, at most {LONGEST:g} s | mean number of sub-steps"
+        " | coupling steps with more than the fewest [%]",
+        (
+            (r.case.label, f"{r.substeps:.1f}", f"{100.0 * r.finer:.0f}")
+            for r in results
+            if r.by_need
+        ),
+    )
+
+
+def inertia_by_step_table(
+    foods: Sequence[tuple[Food, Knife, Numerics]], steps: Sequence[float] = STEPS
+) -> str:
+    """Stepped over true inertia of the slices that come off, see `slice_inertia`.
+
+    With all stiffnesses, and with the elements' alone: what touches is hundreds of times softer.
+    """
+    soft = {"bond_stiffness": 0.01, "flank_stiffness": 0.01, "board_stiffness": 0.01}
+    rows = []
+    for food, knife, numerics in foods:
+        if food.held_sides not in ("minus", "plus"):
             continue
-        limit = r.case.model(r.time_step, True).critical_time_step
-        computed, whole = r.elements
-        label = f"{name}: {computed:,} of {whole:,} elements, limit {limit:.2g} s"
-        rows.setdefault(name, [label]).append(f"{r.mass_ratio:,.1f}")
-    return _table("stepped over true mass", steps, list(rows.values()))
+        alone = dc.replace(numerics, unloading_length=1e-2, **soft)
+        for name, settings in (("", numerics), (", elements alone", alone)):
+            case = SteppingCase(food, knife, settings, press_speed=0.02)
+            ratios = zip(*(slice_inertia(case.model(step)) for step in steps), strict=True)
+            for motion, row in zip(("translation", "turning"), ratios, strict=True):
+                label = f"slice of {food.name}, {motion}{name}"
+                rows.append([label, *(f"{ratio:,.1f}" for ratio in row)])
+    return _table("stepped over true inertia", [(False, step) for step in steps], rows)
 
 
 def cost_table(costs: Sequence[StepCost]) -> str:
-    """Cost of a simulated second and of a sub-step."""
-    steps = sorted({c.time_step for c in costs})
+    """Cost of a simulated second."""
+    columns = sorted({c.column for c in costs})
     rows: dict[str, list[str]] = {}
-    for c in sorted(costs, key=lambda c: c.time_step):
-        first = next(d for d in costs if d.food == c.food and d.time_step == steps[0])
+    for c in sorted(costs, key=lambda c: c.column):
+        first = next(d for d in costs if d.food == c.food and d.column == columns[0])
         rows.setdefault(c.food, [f"{c.food}, {c.elements:,} elements"]).append(
-            f"{c.seconds:.3g} s, {100.0 * c.seconds / first.seconds:.3g} %, "
-            f"{1e6 * c.substep:.0f} ± {1e6 * c.substep * c.spread:.0f} us"
+            f"{c.seconds:.3g} ± {c.seconds * c.spread:.1g} s, "
+            f"{100.0 * c.seconds / first.seconds:.3g} %"
         )
-    first_cell = f"wall per simulated second, relative to {steps[0]:g} s, per sub-step"
-    return _table(first_cell, steps, list(rows.values()))
+    first_cell = f"wall per simulated second, relative to {columns[0][1]:g} s"
+    return _table(first_cell, columns, list(rows.values()))

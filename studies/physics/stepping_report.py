@@ -1,9 +1,9 @@
 """How far the force depends on the food's sub-step, and what the step costs.
 
-Presses, draws and holds in three foods at two speeds with steps of 1e-5 to 1e-3 s: scaled masses
-against true ones where the cut is fast, against the finest step where it is slow; then the cucumber
-scenario in the station. Takes some minutes, --quick ten seconds. docs/results/stepping.md explains
-what comes out.
+Presses, draws, turns and holds in three foods at 5 to 100 mm/s, with constant steps of 2e-5 to 2e-3
+s and with steps by need: against true masses where the cut is fast, against the finest step where
+it is slow; some with an effect that is sensitive to the step; then the station. Takes ten minutes,
+--quick half a minute. docs/results/stepping.md explains what comes out.
 """
 
 import argparse
@@ -14,24 +14,31 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.cutting.foods.food import Food
+from sliceit_drake.cutting.foods.effects import Compliance, Effects, Relaxation, Skin
+from sliceit_drake.cutting.foods.food import Food, make_food_model
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
+from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.diagrams.outputs.run_log import Record
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.resources import resource_path
-from studies.figures import BLUE, GREEN, ORANGE, PURPLE, RED, new_figure, save_figure
+from sliceit_drake.systems.cutting_system import COUPLED_STEP, CuttingSystem
+from sliceit_drake.systems.food_look import look_of
+from studies.figures import BLUE, GREEN, ORANGE, RED, new_figure, save_figure
 from studies.pages import publish, table
 from studies.physics import stepping as study
-from studies.physics.stepping import StepCost, StepResult
+from studies.physics.stepping import StepCost, SteppingCase, StepResult
 
 __all__ = [
     "StationStep",
     "add_arguments",
+    "effect_cases",
     "held_half_way",
     "plot_stepping",
     "run",
@@ -43,7 +50,8 @@ __all__ = [
 
 
 FOODS = ("cucumber_measured", "potato_sequence", "tomato_sequence")
-STATION_STEPS = (5e-5, 1e-4, 2.5e-4, 5e-4, 1e-3)
+STATION_STEPS = (6.25e-5, 2.5e-4, COUPLED_STEP, 1e-3)
+NOISE = (0.0, 2e-6, 5e-6, 1e-5)  # Of a measured path, metres.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,12 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--quick",
         action="store_true",
-        help="cucumber at 100 mm/s against scaled masses at 1e-4 s, without the station",
-    )
-    parser.add_argument(
-        "--coarse",
-        action="store_true",
-        help="steps from 5e-5 s against scaled masses at that step, a sixth of the time",
+        help="cucumber at 100 mm/s against scaled masses at 2.5e-4 s, without effects and station",
     )
 
 
@@ -73,10 +76,12 @@ def run(options: argparse.Namespace) -> int:
         for name in (FOODS[:1] if options.quick else FOODS)
     ]
     foods = [sliced_food(scenario) for scenario in scenarios]
-    steps = study.STEPS[3 if options.quick else 2 if options.coarse else 0 :]
+    steps = study.STEPS[3 if options.quick else 0 :]
     cases = study.stepping_cases(foods, (0.1,) if options.quick else (0.02, 0.1))
-    if options.quick or options.coarse:
+    if options.quick:
         cases = [dc.replace(case, true_masses=False) for case in cases]
+    else:
+        cases += effect_cases(foods)
     with _bar("cuts") as bar:
         results = study.stepping_study(cases, steps, progress=_mover(bar))
     with _bar("costs") as bar:
@@ -84,17 +89,20 @@ def run(options: argparse.Namespace) -> int:
     tables = [
         study.error_table(results),
         study.largest_table(results),
+        study.need_table(results),
         study.inertia_table(results),
         study.hold_table(results),
-        study.mass_table(results),
         study.cost_table(costs),
     ]
     stations: list[tuple[str, list[StationStep]]] = []
     if not options.quick:
+        tables.append(study.inertia_by_step_table(foods))
+        policy = load_scenario(resource_path("scenarios/cucumber_policy.yaml"))
         cut = scenarios[0]
         for name, scenario in (
             (cut.name, cut),
             (f"{cut.name}, held half way", held_half_way(cut)),
+            (policy.name, policy),
         ):
             with _bar(f"station, {name}") as bar:
                 stations.append((name, station_steps(scenario, STATION_STEPS, _mover(bar))))
@@ -125,6 +133,8 @@ class StationStep:
         force_error: RMS of the difference of the food's force over RMS of the force.
         largest_difference: Of the force in one coupling step over its peak.
         path_error: Largest distance between the knife's paths, metres.
+        finer: Fraction of coupling steps with more than the fewest sub-steps, by amplitude of the
+            white noise on a path that the rule is given, metres.
         energy_ratio: Largest kinetic over internal energy of the food.
         real_time_factor: Simulated over wall time.
         stopped: Why the run broke off, or None; it is compared as far as it went.
@@ -134,9 +144,32 @@ class StationStep:
     force_error: float
     largest_difference: float
     path_error: float
+    finer: dict[float, float]
     energy_ratio: float
     real_time_factor: float
     stopped: str | None
+
+
+def effect_cases(foods: Sequence[tuple[Food, Knife, Numerics]]) -> list[SteppingCase]:
+    """Cuts with effects that could be sensitive to the step.
+
+    A cucumber that relaxes and one under an arm that gives, and a tomato with a tough skin.
+    """
+    (cucumber, *first), _, (tomato, *last) = foods
+    relaxes = Effects(relaxation=Relaxation(shares=[0.3, 0.2], times=[0.02, 0.5]))
+    gives = Effects(compliance=Compliance(arm=3e-5))
+    tough = Effects(skin=Skin(toughness=1.0))
+    relaxing = dc.replace(cucumber, name="cucumber that relaxes", effects=relaxes)
+    under_arm = dc.replace(cucumber, name="cucumber, arm that gives", effects=gives)
+    skinned = dc.replace(tomato, name="tomato with tough skin", effects=tough)
+    cases = []
+    for speed in (0.02, 0.1):
+        hold = SteppingCase(relaxing, *first, speed, depth=0.4, hold=0.15)
+        turn = SteppingCase(under_arm, *first, speed, depth=0.6, retract=study.RETRACT)
+        press = SteppingCase(skinned, *last, speed)
+        cases += [hold, dc.replace(turn, food=relaxing), press, dc.replace(press, food=under_arm)]
+        cases.append(turn)
+    return cases
 
 
 def sliced_food(scenario: Scenario) -> tuple[Food, Knife, Numerics]:
@@ -180,8 +213,8 @@ def station_steps(
     """Runs a scenario with the arm at several sub-steps.
 
     Args:
-        scenario: A cut.
-        steps: s, finest first: the reference.
+        scenario: A cut by hand-set motion or policy, of one slice.
+        steps: Longest ones, s, finest first: the reference. They may be longer than `COUPLED_STEP`.
         progress: Called after each run with the fraction of all sub-steps done.
 
     Raises:
@@ -193,7 +226,7 @@ def station_steps(
         case = copy.deepcopy(scenario)
         case.measurement = None
         case.numerics.time_step = step
-        run = prepare_run(case)
+        run = prepare_run(case, cutting=_uncapped)
         run.advance()
         if run.stopped and not results:
             raise ConfigurationError(
@@ -214,6 +247,7 @@ def station_steps(
                 force_error=float(np.linalg.norm(difference) / np.linalg.norm(norm[:done])),
                 largest_difference=float(difference.max() / norm.max()),
                 path_error=float(np.linalg.norm(path - true_path[:done], axis=1).max()),
+                finer=_finer(run.station.cutting, record),
                 energy_ratio=float(record["energy_largest_energy_ratio"].max()),
                 real_time_factor=float(record["time"][-1] / run.wall_time),
                 stopped=run.stopped,
@@ -225,15 +259,40 @@ def station_steps(
     return results
 
 
+def _uncapped(scenario: Scenario) -> CuttingSystem:
+    food = scenario.food
+    assert isinstance(food, Food)
+    model = make_food_model(food, scenario.knife, scenario.numerics)
+    solver = CuttingSolver(model, scenario.exchange_period)
+    return CuttingSystem([solver], scenario.X_WF(), look=look_of(food.name))
+
+
+def _finer(cutting: CuttingSystem, record: Record) -> dict[float, float]:
+    """See `StationStep.finer`."""
+    model, X_WF = cutting.solvers[0].model, cutting.food_poses[0]
+    R_FW = X_WF.rotation().matrix().T
+    w, *xyz = record.vector("knife_pose_quat", "wxyz").T
+    R_WK = Rotation.from_quat(np.column_stack([*xyz, w])).as_matrix()
+    R_CK = model.X_FC_rotation.T @ R_FW @ R_WK
+    p_CK = model.to_cut_frame((record.vector("knife_pose_p") - X_WF.translation()) @ R_FW.T)
+    noise = np.random.default_rng(1).normal(size=p_CK.shape)
+    return {size: study.planned_substeps(model, R_CK, p_CK + size * noise)[1] for size in NOISE}
+
+
 def station_table(cases: Sequence[tuple[str, Sequence[StationStep]]]) -> str:
     """Results of `station_steps` by name as a table for people."""
     return table(
         "in the station | step [s] | RMS error [%] | largest difference [% of peak]"
-        " | path error [um] | largest kinetic/internal energy [%] | x real time | ran to the end",
+        " | path error [um] | largest kinetic/internal energy [%]"
+        " | more sub-steps than the fewest, "
+        f"path measured with noise of {', '.join(f'{1e6 * size:g}' for size in NOISE)} um [%]"
+        " | x real time | ran to the end",
         (
             (name, f"{s.time_step:g}", f"{100 * s.force_error:.2f}")
             + (f"{100 * s.largest_difference:.1f}", f"{1e6 * s.path_error:.1f}")
-            + (f"{100 * s.energy_ratio:.3f}", f"{s.real_time_factor:.2f}", s.stopped or "yes")
+            + (f"{100 * s.energy_ratio:.3f}",)
+            + (", ".join(f"{100 * share:.0f}" for share in s.finer.values()),)
+            + (f"{s.real_time_factor:.2f}", s.stopped or "yes")
             for name, steps in cases
             for s in steps
         ),
@@ -242,78 +301,63 @@ def station_table(cases: Sequence[tuple[str, Sequence[StationStep]]]) -> str:
 
 def write_stepping(results: Sequence[StepResult], costs: Sequence[StepCost], file: Path) -> None:
     """Writes a row for each run as CSV, SI units; a cost only where it was timed."""
-    cost = {(c.food, c.time_step): c for c in costs}
+    cost = {(c.food, c.column): c for c in costs}
     fields = (
-        "time_step scaled reference refusal rms_error largest_difference peak energy_ratio "
-        "mass_ratio force_drop creep"
+        "time_step scaled by_need reference refusal rms_error largest_difference peak energy_ratio "
+        "substeps finer force_drop creep"
     ).split()
     with file.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
-        writer.writerow(
-            ["case", *fields, "elements", "all_elements", "wall_per_simulated", "substep_wall"]
-        )
+        writer.writerow(["case", *fields, "elements", "all_elements", "wall_per_simulated"])
         for r in results:
-            timed = cost.get((r.case.food.name, r.time_step)) if r.scaled else None
+            timed = cost.get((r.case.food.name, r.column)) if r.scaled else None
             writer.writerow(
                 [r.case.label]
                 + [getattr(r, name) for name in fields]
                 + list(r.elements)
-                + ([timed.seconds, timed.substep] if timed else ["", ""])
+                + [timed.seconds if timed else ""]
             )
 
 
 def plot_stepping(results: Sequence[StepResult], costs: Sequence[StepCost], file: Path) -> None:
-    """Draws the error over the cost of a simulated second, a panel for each food, scaled masses."""
-    from matplotlib.ticker import NullFormatter
+    """Draws the error over the sub-steps that a simulated second takes, a panel for each food.
 
-    cost = {(c.food, c.time_step): c.seconds for c in costs}
-    foods = list(dict.fromkeys(r.case.food.name for r in results))
-    speeds = sorted({r.case.press_speed for r in results})
-    # Okabe and Ito's palette by motion, marker and line by speed.
+    Lines are constant steps, filled markers steps by need.
+    """
+    foods = list(dict.fromkeys(c.food for c in costs))
+    speeds = sorted({r.case.press_speed for r in results if r.case.food.name in foods})
+    shown_speeds = (speeds[0], speeds[-1]) if len(speeds) < 3 else (0.02, 0.1)
+    # Okabe and Ito's palette by motion, marker and line by speed; ramps are in the tables.
     colours = {"press": BLUE, "press and retract": ORANGE, "draw": GREEN}
-    colours |= {"hold after a sudden stop": RED, "hold after a ramp": PURPLE}
-    styles = dict(zip(speeds, (("--", "o"), ("-", "s")), strict=False))
+    colours["hold after a sudden stop"] = RED
+    styles = dict(zip(shown_speeds, (("--", "o"), ("-", "s")), strict=False))
     figure = new_figure(4.0 * len(foods), 4.6)
     panels = figure.subplots(1, len(foods), sharey=True, squeeze=False)[0]
     for axes, food in zip(panels, foods, strict=True):
         of_food = [r for r in results if r.case.food.name == food and r.scaled]
-        cases = list({id(r.case): r.case for r in of_food}.values())
-        for case in cases:
-            shown = [r for r in of_food if r.case is case and r.rms_error > 0.0]
-            x = [cost[food, r.time_step] for r in shown]
-            y = [100.0 * r.rms_error for r in shown]
+        for case in list({id(r.case): r.case for r in of_food}.values()):
+            if case.acceleration or case.press_speed not in styles:
+                continue
             colour = colours[case.motion_name]
             line, marker = styles[case.press_speed]
+            of_case = [r for r in of_food if r.case is case and r.rms_error > 0.0]
+            for by_need in (False, True):
+                shown = [r for r in of_case if r.by_need is by_need]
+                x = [r.substeps / study.EXCHANGE for r in shown]
+                y = [100.0 * r.rms_error for r in shown]
+                if by_need:
+                    axes.loglog(x, y, marker, color=colour, ms=8, mec="black", zorder=3)
+                else:
+                    axes.loglog(x, y, line, marker=marker, color=colour, lw=1.0, ms=3.5)
             label = f"{case.motion_name}, {1e3 * case.press_speed:g} mm/s"
-            axes.loglog(x, y, line, color=colour, lw=1.2)
-            for r, a, b in zip(shown, x, y, strict=True):
-                inside = "white" if r.too_much_inertia else colour
-                axes.plot(a, b, marker, color=colour, mfc=inside, ms=5)
             axes.plot([], [], line, marker=marker, color=colour, label=label)
-        axes.axhline(2.0, color="0.3", lw=1.0, ls=":")
-        axes.text(0.02, 2.1, "2 %", transform=axes.get_yaxis_transform(), fontsize=8)
-        for step in sorted({r.time_step for r in of_food if r.rms_error > 0.0}):
-            axes.annotate(
-                f"{step:g} s",
-                (cost[food, step], 0.0),
-                xycoords=("data", "axes fraction"),
-                xytext=(0, 4),
-                textcoords="offset points",
-                rotation=90,
-                ha="center",
-                va="bottom",
-                fontsize=7,
-                color="0.35",
-            )
+        axes.axhline(1.0, color="0.3", lw=1.0, ls=":")
+        axes.text(0.02, 1.06, "1 %", transform=axes.get_yaxis_transform(), fontsize=8)
         axes.set_title(food)
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.set_ylim(bottom=1e-3)
-        axes.set_xlabel("wall time per simulated second [s]")
+        axes.set_xlabel("sub-steps per simulated second")
         axes.grid(alpha=0.25, which="major")
     panels[0].set_ylabel("RMS error of the force [%]")
-    figure.suptitle(
-        "Error of the force against cost, scaled masses; hollow: kinetic energy over 5 %, refused"
-    )
+    figure.suptitle("Error of the force: constant sub-steps (lines), by need (large markers)")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
     save_figure(figure, file, 150)
