@@ -142,6 +142,20 @@ def test_steady_motion_takes_the_longest_steps_and_a_turn_short_ones_for_a_while
     assert numbers[-1] == 2
 
 
+def test_kinetic_energy_is_that_of_the_sub_steps_that_were_taken():
+    by_need, constant = cut(time_step=1e-3), cut(time_step=2.5e-4, step_by_need=False)
+    kinetic = []
+    for model in (by_need, constant):
+        solver = CuttingSolver(model, PERIOD)
+        path = KnifePath(model, down_and_back(model, 0.1), PERIOD)
+        state = solver.initial_state()
+        for k in range(10):
+            state = solver.coupling_step(state, path.pose(k), path.pose(k + 1)).state
+        kinetic.append(solver.energies(state, path.pose(10)).kinetic)
+    assert kinetic[0] == pytest.approx(kinetic[1], rel=1e-4)
+    assert kinetic[0] > 0.0
+
+
 def test_steps_are_the_same_however_many_are_planned_at_once():
     model = cut(time_step=1e-3)
     path = KnifePath(model, down_and_back(model, 0.1, 1.0), PERIOD)

@@ -153,13 +153,16 @@ class CuttingSolver:
         anchor = self.field(state, "board_slip").reshape(-1, 3)
         rest = 0.5 * m.parameters["board_stiffness"] * m.board_area
         interface += float(rest @ (depth**2 + (anchor**2).sum(1)))
+        # The inertia that was stepped last.
+        last = float(self.field(state, "stepping")[-2])
+        inertia = (m.with_step(last) if last > 0.0 else m).inertia
         deflection, rate = (float(b) for b in self.field(state, "blade"))
         interface += 0.5 * m.parameters["blade_stiffness"] * deflection**2
         interface += 0.5 * m.parameters["blade_mass"] * rate**2
         return Energies(
             elastic=elastic,
             interface=interface,
-            kinetic=m.inertia.kinetic_energy(self.velocities(state)[m.moving]),
+            kinetic=inertia.kinetic_energy(self.velocities(state)[m.moving]),
             least_volume_ratio=float(ratio[least]),
             min_element=least,
         )
