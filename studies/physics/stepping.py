@@ -40,7 +40,7 @@ __all__ = [
     "true_step",
 ]
 
-STEPS = (2e-5, 6.25e-5, 1.25e-4, 2.5e-4, 5e-4, 1e-3, 2e-3)
+STEPS = (2.5e-5, 1.25e-4, 2.5e-4, 5e-4, 1e-3, 2e-3)
 """Constant sub-steps, s. They divide the coupling period."""
 LONGEST = Numerics().time_step
 """Longest sub-step by need, s."""
@@ -203,11 +203,11 @@ class StepCost:
 def stepping_cases(
     foods: Sequence[tuple[Food, Knife, Numerics]], speeds: Sequence[float] = (0.02, 0.1)
 ) -> list[SteppingCase]:
-    """For each food: presses, draws, turns round and holds, sudden and on ramps.
+    """For each food and speed: press, draw, turn round and hold after a sudden stop.
 
-    Turns, 6 mm back from 60 % of the height, are also at 50 and (from 30 %) at 5 mm/s where two
-    speeds are asked for. The fastest are compared with true masses: they are short, and inertia is
-    largest.
+    The fastest also turn and stop on ramps, and but for those and draws they are compared with true
+    masses: they are short, and inertia is largest. Where there are two speeds, the first food also
+    turns at 5 and 50 mm/s.
     """
     cases = []
     for food, knife, numerics in foods:
@@ -216,15 +216,15 @@ def stepping_cases(
             press = SteppingCase(food, knife, numerics, speed, true_masses=fastest)
             turn = dc.replace(press, depth=0.6, retract=RETRACT)
             hold = dc.replace(press, depth=0.4, hold=0.15)
-            cases += [press, dc.replace(press, draw_ratio=1.0, depth=0.5), turn]
-            cases += [dc.replace(turn, acceleration=ramp) for ramp in RAMPS]
-            cases.append(hold)
+            draw = dc.replace(press, depth=0.5, draw_ratio=1.0, true_masses=False)
+            cases += [press, draw, turn, hold]
             if fastest:
-                cases.append(dc.replace(hold, acceleration=RAMP))
-        if len(speeds) > 1:
-            turn = dc.replace(turn, true_masses=False)
-            cases.append(dc.replace(turn, press_speed=0.05))
-            cases.append(dc.replace(turn, press_speed=0.005, depth=0.3))
+                ramped = [dc.replace(turn, acceleration=ramp) for ramp in RAMPS]
+                ramped.append(dc.replace(hold, acceleration=RAMP))
+                cases += [dc.replace(case, true_masses=False) for case in ramped]
+    if len(speeds) > 1:
+        press = SteppingCase(*foods[0], press_speed=0.05, depth=0.6, retract=RETRACT)
+        cases += [press, dc.replace(press, press_speed=0.005, depth=0.15)]
     return cases
 
 
