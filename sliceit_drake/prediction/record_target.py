@@ -38,9 +38,9 @@ CLEAR = 6e-4
 """Height of the edge over the food above which nothing moves fast, metres."""
 TURN_TRAVEL, TURN_TIME, STILL = 1e-3, 0.03, 2e-5
 """Where the knife turns round in the food, the rows that are not compared: until it is as far back,
-metres, and for as long, s, counted from where it was last as deep but for `STILL`, metres. The
-force turns round over some tenths of a millimetre, in which scaled masses err by half of it
-(docs/results/stepping.md)."""
+metres, and for as long, s, counted from where it was last as deep but for `STILL`, metres. What is
+wrong there is as large as a sensor's noise, and so regular that friction would seem known several
+times too well (docs/explanation/calibration.md)."""
 
 
 class Bench(Protocol):

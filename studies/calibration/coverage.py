@@ -161,7 +161,7 @@ def _press_record(name: str, height: float, speed: float, rate: float) -> SliceR
     time = np.arange(0.0, (height + CLEARANCE - REST) / speed, 1.0 / rate)
     position = np.zeros((len(time), 3))
     position[:, 2] = height + CLEARANCE - speed * time
-    rotation = np.tile(np.eye(3), (len(time), 1, 1))
+    rotation = np.tile(np.diag([1.0, -1.0, -1.0]), (len(time), 1, 1))
     metadata = SliceMetadata(
         name=name,
         condition=f"press at {speed:g} m/s",
