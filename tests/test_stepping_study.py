@@ -25,6 +25,7 @@ from studies.physics.stepping import (
     energy_ratio,
     error_table,
     hold_table,
+    slice_inertia,
     stepping_cases,
     stepping_study,
     true_step,
@@ -54,30 +55,43 @@ def committed_tables():
 
 def test_the_error_grows_with_the_step_and_the_reference_against_itself_is_zero():
     results = stepping_study([FAST], (1e-4, 2e-4, 1e-3))
+    *_, by_need = results
     errors = [r.rms_error for r in results]
     assert results[0].reference
     assert errors[0] == 0.0 and results[0].largest_difference == 0.0
     assert 1e-5 < errors[1] < errors[2] < 0.1
     assert results[0].energy_ratio < results[1].energy_ratio < results[2].energy_ratio
-    assert results[0].mass_ratio < results[2].mass_ratio
+    # By need the steps are as short as the speed asks for.
+    assert by_need.by_need and by_need.time_step == 1e-3
+    assert by_need.rms_error < 0.5 * errors[2]
+    assert by_need.finer == 1.0 and by_need.substeps == pytest.approx(8.0, abs=0.5)
+    assert [r.finer for r in results[:-1]] == [0.0] * 3
+    assert results[0].substeps == 20.0
 
 
-def test_true_masses_are_refused_beyond_their_limit_and_said_so_in_the_table():
+def test_a_fast_cut_is_compared_with_true_masses_at_a_stable_step():
     # So soft that true masses bear 4e-5 s.
     soft = dc.replace(SMALL, material=Material(youngs_modulus=4e4, toughness=10.0, density=470.0))
     case = dc.replace(FAST, food=soft, depth=0.1, true_masses=True)
-    results = stepping_study([case], (4e-5, 1e-3))
-    limit = case.model(1e-3, True).critical_time_step
-    reference, refused, *scaled = results
+    reference, *scaled = stepping_study([case], (4e-5, 1e-3))
     assert reference.reference and not reference.scaled and reference.refusal is None
     assert reference.time_step == true_step(case, 4e-5) == pytest.approx(4e-5)
-    assert not refused.scaled and f"stability limit {limit:.3g} s" in refused.refusal
-    assert np.isnan(refused.rms_error)
-    # Below the limit there is nothing to scale.
-    assert [r.scaled for r in scaled] == [True, True]
-    assert scaled[0].rms_error < 1e-4 < scaled[1].rms_error
-    _, rows = cells(error_table(results))
-    assert rows[f"{case.label}, true masses"] == ["0.00", "unstable"]
+    assert true_step(case, 1e-3) < case.model(1e-3).critical_time_step
+    assert [r.scaled for r in scaled] == [True] * 3
+    assert 0.0 < scaled[0].rms_error < 0.01 < scaled[1].rms_error
+    _, rows = cells(error_table([reference, *scaled]))
+    assert rows == {case.label: [f"{100 * r.rms_error:.2f}" for r in scaled]}
+
+
+def test_a_slice_turns_as_if_it_were_heavier_the_longer_the_step():
+    food = dc.replace(SMALL, held_sides="plus")
+    case = SteppingCase(food, Knife(), Numerics(board_damping_time=0.0), 0.1)
+    ratios = np.array([slice_inertia(case.model(step)) for step in (1e-6, 2.5e-4, 1e-3)])
+    assert np.all(ratios[0] < 1.01)
+    assert np.all(np.diff(ratios, axis=0) > 0.0)
+    # What the step adds goes with its square.
+    added = ratios[1:] - 1.0
+    np.testing.assert_allclose(added[1] / added[0], 16.0, rtol=0.01)
 
 
 def test_results_do_not_depend_on_the_number_of_threads():
@@ -86,14 +100,16 @@ def test_results_do_not_depend_on_the_number_of_threads():
 
 
 def test_a_hold_shows_what_scaled_masses_ring():
-    # The edge unloads over 0.1 mm while the heavy food comes to rest.
+    # The edge unloads over 0.1 mm while the food, heavy in relative motion, comes to rest.
     case = dc.replace(FAST, hold=0.06)
-    fine, coarse = stepping_study([case], (1e-4, 1e-3))
-    assert abs(fine.creep) < 0.01 * fine.peak < abs(coarse.creep)
+    fine, coarse, by_need = stepping_study([case], (1e-4, 1e-3))
+    assert abs(fine.creep) < 1e-4 * fine.peak
+    assert abs(coarse.creep) > 5e-3 * fine.peak
     assert coarse.rms_error > LIMIT
+    assert by_need.rms_error < LIMIT / 2
     press = stepping_study([FAST], (1e-3,))[0]
     assert np.isnan(press.force_drop)
-    _, rows = cells(hold_table([fine, coarse, dc.replace(press, reference=True)]))
+    _, rows = cells(hold_table([fine, coarse, by_need, dc.replace(press, reference=True)]))
     assert len(rows) == 1
 
 
@@ -118,7 +134,7 @@ def test_foods_are_those_that_the_scenarios_cut():
     assert whole.held_sides == "both" and isinstance(whole.shape, Cylinder)
     assert middle.shape.thickness == 3e-3
     labels = [c.label for c in stepping_cases([(whole, Knife(), Numerics())])]
-    assert len(set(labels)) == len(labels) == 9
+    assert len(set(labels)) == len(labels) == 4 + 7 + 2
 
 
 def test_a_scenario_held_half_way_goes_as_far_as_before():
@@ -134,13 +150,13 @@ def test_quick_study_writes_the_kinds_of_tables_that_are_committed(tmp_path, cap
     text = (tmp_path / "stepping.md").read_text(encoding="utf-8")
     assert text.strip() in capsys.readouterr().out
     quick = {t.split("|")[1].strip() for t in text.split("\n\n")}
-    committed = {re.sub("to [0-9e.-]+ s", "to 0.0001 s", name) for name in committed_tables()}
-    assert quick == committed - {"in the station"}
+    committed = {re.sub("to [0-9e.-]+ s", "to 0.00025 s", name) for name in committed_tables()}
+    assert quick == committed - {"in the station", "stepped over true inertia", "before and now"}
     with (tmp_path / "stepping.csv").open() as stream:
         rows = list(csv.DictReader(stream))
-    assert len(rows) == 5 * 4
+    assert len(rows) == 7 * 5
     assert all(float(row["wall_per_simulated"]) > 0.0 for row in rows)
-    assert (tmp_path / "stepping.png").stat().st_size > 1e4
+    assert (tmp_path / "figures/stepping.png").stat().st_size > 1e4
 
 
 def test_in_the_committed_tables_the_default_step_errs_at_most_two_percent():

@@ -12,7 +12,7 @@ from sliceit_drake.cutting.driver import Launch
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.knife_path import KnifePath
-from sliceit_drake.cutting.model import CuttingModel, Numerics, TimeStepError
+from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.cutting.motion import Hold, Motion, MotionPlan, PressAndDraw, Retract, Segment
 from sliceit_drake.cutting.simulate import ENERGY_RATIO_LIMIT, energy_ratio
 from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError, CuttingSolver
@@ -66,8 +66,8 @@ class SteppingCase:
         hold: Rest after a stop there, s; 0 for none.
         retract: Way back from there at the same speed, metres; 0 for none.
         acceleration: Of the ramps, m/s^2; None if the velocity steps.
-        true_masses: Compare with true masses at a stable step, and try them at every step; else
-            compare with scaled masses at the smallest step.
+        true_masses: Compare with true masses at a stable step; else with scaled ones at the
+            smallest step.
     """
 
     food: Food
@@ -135,7 +135,7 @@ class StepResult:
         scaled: Whether masses are scaled.
         by_need: Whether sub-steps are shorter by need.
         reference: Whether this is what the others are compared with.
-        refusal: Why it was not computed or broke down, or None.
+        refusal: Why it broke down, or None.
         rms_error: RMS of the force's difference over RMS of the reference's force.
         largest_difference: N.
         peak: Of the reference's force, N.
@@ -259,9 +259,7 @@ def stepping_study(
     runs: list[tuple[SteppingCase, float, bool, bool]] = []
     for case in cases:
         if case.true_masses:
-            finest = true_step(case, ordered[0])
-            runs.append((case, finest, False, False))
-            runs += [(case, step, False, False) for step in ordered if step > finest]
+            runs.append((case, true_step(case, ordered[0]), False, False))
         runs += [(case, step, True, False) for step in ordered]
         runs.append((case, LONGEST, True, True))
 
@@ -305,12 +303,7 @@ def _run(
 ) -> tuple[StepResult, np.ndarray]:
     """One run, and the force on the knife at each coupling step [n, 3], N."""
     result = StepResult(case, step, scaled, by_need)
-    try:
-        model = case.model(step, scaled, by_need)
-    except TimeStepError:
-        limit = case.model(step).critical_time_step
-        result.refusal = f"beyond the stability limit {limit:.3g} s"
-        return result, np.empty((0, 3))
+    model = case.model(step, scaled, by_need)
     result.elements = model.element_count, len(model.split.tetrahedra)
     solver = CuttingSolver(model, EXCHANGE)
     motion = case.motion(model)
@@ -433,27 +426,16 @@ def _table(first: str, columns: Sequence[tuple[bool, float]], rows: Sequence[Seq
 def _by_case(
     results: Sequence[StepResult], first: str, value: Callable[[StepResult], float], digits: int
 ) -> str:
-    """A row for each case and kind of masses, a column for each step and one by need."""
+    """A row for each case, a column for each step and one by need."""
     columns = sorted({r.column for r in results if r.scaled})
-    rows: dict[str, dict[tuple[bool, float], StepResult]] = {}
+    rows: dict[str, dict[tuple[bool, float], str]] = {}
     for r in results:
-        label = r.case.label + ("" if r.scaled else ", true masses")
-        rows.setdefault(label, {})[r.column] = r
-    cells = []
-    for label, row in rows.items():
-        # A row of nothing but refusals, and a reference between the columns, tell nothing.
-        if any(c in row and row[c].refusal is None and not row[c].reference for c in columns):
-            cells.append([label, *(_cell(row.get(c), value, digits) for c in columns)])
+        row = rows.setdefault(r.case.label, {})
+        if r.scaled:
+            star = "*" if r.too_much_inertia else ""
+            row[r.column] = f"{value(r):.{digits}f}{star}" if r.refusal is None else "broke down"
+    cells = [[label, *(row[column] for column in columns)] for label, row in rows.items()]
     return _table(first, columns, cells)
-
-
-def _cell(r: StepResult | None, value: Callable[[StepResult], float], digits: int) -> str:
-    if r is None:
-        return ""
-    if r.refusal is not None:
-        return "unstable" if r.refusal.startswith("beyond") else "broke down"
-    star = "*" if r.too_much_inertia else ""
-    return f"{value(r):.{digits}f}{star}"
 
 
 def error_table(results: Sequence[StepResult]) -> str:

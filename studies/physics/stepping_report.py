@@ -31,7 +31,7 @@ from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.cutting_system import COUPLED_STEP, CuttingSystem
 from sliceit_drake.systems.food_look import look_of
 from studies.figures import BLUE, GREEN, ORANGE, RED, new_figure, save_figure
-from studies.pages import publish, table
+from studies.pages import publish, render_and_store, table
 from studies.physics import stepping as study
 from studies.physics.stepping import StepCost, SteppingCase, StepResult
 
@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--output",
         metavar="FOLDER",
         type=Path,
-        help="also write stepping.md, stepping.csv and stepping.png there",
+        help="also write stepping.md, data, stepping.csv and figures/stepping.png there",
     )
     parser.add_argument(
         "--quick",
@@ -86,17 +86,21 @@ def run(options: argparse.Namespace) -> int:
         results = study.stepping_study(cases, steps, progress=_mover(bar))
     with _bar("costs") as bar:
         costs = study.step_costs(foods, steps, progress=_mover(bar))
-    tables = [
-        study.error_table(results),
-        study.largest_table(results),
-        study.need_table(results),
-        study.inertia_table(results),
-        study.hold_table(results),
-        study.cost_table(costs),
-    ]
-    stations: list[tuple[str, list[StationStep]]] = []
-    if not options.quick:
-        tables.append(study.inertia_by_step_table(foods))
+    tables = {
+        "errors": study.error_table(results),
+        "largest": study.largest_table(results),
+        "need": study.need_table(results),
+        "energies": study.inertia_table(results),
+        "holds": study.hold_table(results),
+        "costs": study.cost_table(costs),
+    }
+    folder = options.output
+    page = folder and folder / "stepping.md"
+    if options.quick:
+        publish("\n\n".join(tables.values()), page)
+    else:
+        tables["slices"] = study.inertia_by_step_table(foods)
+        stations = []
         policy = load_scenario(resource_path("scenarios/cucumber_policy.yaml"))
         cut = scenarios[0]
         for name, scenario in (
@@ -106,13 +110,13 @@ def run(options: argparse.Namespace) -> int:
         ):
             with _bar(f"station, {name}") as bar:
                 stations.append((name, station_steps(scenario, STATION_STEPS, _mover(bar))))
-        tables.append(station_table(stations))
-    folder = options.output
-    measured = {"costs": costs, "stations": dict(stations)}
-    publish("\n\n".join(tables), folder and folder / "stepping.md", measured)
+        tables["stations"] = station_table(stations)
+        measured = {"costs": costs, "stations": dict(stations)}
+        publish(render_and_store("stepping", page, tables, measured), page)
     if folder is not None:
         write_stepping(results, costs, folder / "stepping.csv")
-        plot_stepping(results, costs, folder / "stepping.png")
+        (folder / "figures").mkdir(exist_ok=True)
+        plot_stepping(results, costs, folder / "figures" / "stepping.png")
     return 0
 
 
@@ -327,6 +331,8 @@ def plot_stepping(results: Sequence[StepResult], costs: Sequence[StepCost], file
 
     Lines are constant steps, filled markers steps by need.
     """
+    from matplotlib.ticker import NullFormatter
+
     foods = list(dict.fromkeys(c.food for c in costs))
     speeds = sorted({r.case.press_speed for r in results if r.case.food.name in foods})
     shown_speeds = (speeds[0], speeds[-1]) if len(speeds) < 3 else (0.02, 0.1)
@@ -334,7 +340,7 @@ def plot_stepping(results: Sequence[StepResult], costs: Sequence[StepCost], file
     colours = {"press": BLUE, "press and retract": ORANGE, "draw": GREEN}
     colours["hold after a sudden stop"] = RED
     styles = dict(zip(shown_speeds, (("--", "o"), ("-", "s")), strict=False))
-    figure = new_figure(4.0 * len(foods), 4.6)
+    figure = new_figure(max(7.0, 4.0 * len(foods)), 4.6)
     panels = figure.subplots(1, len(foods), sharey=True, squeeze=False)[0]
     for axes, food in zip(panels, foods, strict=True):
         of_food = [r for r in results if r.case.food.name == food and r.scaled]
@@ -357,6 +363,7 @@ def plot_stepping(results: Sequence[StepResult], costs: Sequence[StepCost], file
         axes.axhline(1.0, color="0.3", lw=1.0, ls=":")
         axes.text(0.02, 1.06, "1 %", transform=axes.get_yaxis_transform(), fontsize=8)
         axes.set_title(food)
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_xlabel("sub-steps per simulated second")
         axes.grid(alpha=0.25, which="major")
     panels[0].set_ylabel("RMS error of the force [%]")
