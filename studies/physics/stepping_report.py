@@ -157,22 +157,23 @@ class StationStep:
 def effect_cases(foods: Sequence[tuple[Food, Knife, Numerics]]) -> list[SteppingCase]:
     """Cuts with effects that could be sensitive to the step.
 
-    A cucumber that relaxes and one under an arm that gives, and a tomato with a tough skin.
+    A cucumber that relaxes, one with a skin, and one under an arm that gives.
     """
-    (cucumber, *first), _, (tomato, *last) = foods
+    cucumber, *first = foods[0]
     relaxes = Effects(relaxation=Relaxation(shares=[0.3, 0.2], times=[0.02, 0.5]))
     gives = Effects(compliance=Compliance(arm=3e-5))
-    tough = Effects(skin=Skin(toughness=1.0))
+    skin = Effects(skin=Skin(toughness=0.3))
     relaxing = dc.replace(cucumber, name="cucumber that relaxes", effects=relaxes)
     under_arm = dc.replace(cucumber, name="cucumber, arm that gives", effects=gives)
-    skinned = dc.replace(tomato, name="tomato with tough skin", effects=tough)
+    skinned = dc.replace(cucumber, name="cucumber with skin", effects=skin)
     hold = SteppingCase(relaxing, *first, press_speed=0.02, depth=0.4, hold=0.15)
     turn = SteppingCase(under_arm, *first, press_speed=0.1, depth=0.6, retract=study.RETRACT)
-    press = SteppingCase(skinned, *last, press_speed=0.1)
+    press = SteppingCase(skinned, *first, press_speed=0.1)
     return [
         hold,
         dc.replace(hold, press_speed=0.1),
         dc.replace(turn, food=relaxing),
+        dc.replace(press, press_speed=0.02),
         press,
         SteppingCase(under_arm, *first, press_speed=0.1),
         turn,
@@ -361,7 +362,7 @@ def plot_stepping(results: Sequence[StepResult], costs: Sequence[StepCost], file
             label = f"{case.motion_name}, {1e3 * case.press_speed:g} mm/s"
             axes.plot([], [], line, marker=marker, color=colour, label=label)
         axes.axhline(1.0, color="0.3", lw=1.0, ls=":")
-        axes.text(0.02, 1.06, "1 %", transform=axes.get_yaxis_transform(), fontsize=8)
+        axes.text(0.93, 1.06, "1 %", transform=axes.get_yaxis_transform(), fontsize=8)
         axes.set_title(food)
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_xlabel("sub-steps per simulated second")
