@@ -49,7 +49,7 @@ TOPICS: dict[str, tuple[Study, ...]] = {
             "stepping",
             "physics.stepping_report",
             "error of the force against sub-step and cost",
-            "15 min",
+            "10 min",
         ),
         Study(
             "split_step_limit",

@@ -1,8 +1,8 @@
 """Coupling steps that last longer where the knife is slow.
 
-The bulk has no time scale of its own, and what scaled masses do wrong goes with the product of
-speed and sub-step. So coupling step and sub-step of a slow knife are multiples of those of a fast
-one. Time is not bent: speeds, relaxation and whatever else goes by seconds see the recorded ones.
+The bulk has no time scale of its own, and what a sub-step does wrong goes with the way of the knife
+in it. So coupling step and sub-step of a slow knife are multiples of those of a fast one. Time is
+not bent: speeds, relaxation and whatever else goes by seconds see the recorded ones.
 """
 
 import dataclasses as dc
