@@ -103,7 +103,7 @@ BAD = {
         "{numerics: {mass_scaling: false, time_step: 0.001}}",
         ["numerics.time_step", "stability limit"],
     ),
-    "step does not divide": ("{numerics: {time_step: 0.0007}}", ["numerics.time_step", "divide"]),
+    "step does not divide": ("{numerics: {time_step: 0.0003}}", ["numerics.time_step", "divide"]),
     "unreachable": ("{placement: {position: [1.5, -1.5]}}", ["scenario.placement", "cannot put"]),
     "missing mesh": ("{food: {shape: !MeshFile {path: none.msh}}}", ["none.msh"]),
     "unstable gains": (

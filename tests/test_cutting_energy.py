@@ -45,8 +45,8 @@ MOTIONS = {
 
 def run(segments, exchange_period=2e-3, **material):
     food = Food(shape=SHAPE, material=Material(**{"toughness": 400.0, "friction": 0.1} | material))
-    model = make_food_model(food, Knife(), Numerics())
-    solver = CuttingSolver(model, exchange_period)
+    numerics = Numerics(time_step=min(Numerics().time_step, exchange_period))
+    solver = CuttingSolver(model := make_food_model(food, Knife(), numerics), exchange_period)
     motion = Motion(MotionPlan(list(segments)), start_pose(model, clearance=5e-4))
     return model, solver, motion
 
@@ -74,7 +74,6 @@ def test_knife_work_less_everything_else_is_toughness_times_area():
 @pytest.mark.parametrize("name", ["press, hold, retract", "draw to and fro"])
 def test_no_mechanism_gives_energy_back_in_any_sub_step(name):
     _, solver, motion = run(MOTIONS[name], exchange_period=2.5e-4, static_friction=0.15)
-    assert solver.substeps == 1
     model, T = solver.model, solver.exchange_period
     R = model.X_FC_rotation
 

@@ -378,7 +378,7 @@ def test_coupling_work_error_counts_the_work_of_moments_on_a_knife_that_turns():
 
 def test_each_slice_of_a_sequence_is_judged_by_its_own_energies():
     food = Food(shape=Cylinder(diameter=0.016, rings=2, layers=[0.0, 0.004, 0.012]))
-    model = make_food_model(food, Knife(), Numerics())
+    model = make_food_model(food, Knife(), Numerics(step_by_need=False))
     speed, down = 0.1, 0.018
     turns = np.cumsum([0.0, down, down, down]) / speed
 

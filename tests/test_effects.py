@@ -405,7 +405,7 @@ ALL = Effects(
 
 def test_with_all_effects_on_the_energy_balance_closes_and_no_loss_is_negative():
     model = bar(razor=False, friction=0.1).derive(effects=ALL)
-    solver = CuttingSolver(model, PERIOD)
+    solver = CuttingSolver(model.with_step(2.5e-4), PERIOD)
     losses = []
     run = solver.driver.run
 

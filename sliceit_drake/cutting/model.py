@@ -348,6 +348,10 @@ class CuttingModel(CutGeometry):
         spin = np.linalg.solve(inertia, mass @ np.cross(r, v))
         return R, here - R @ centre, spin, mass @ v / mass.sum() - np.cross(spin, here)
 
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy, also in another process, may get other values, and then has other inertia.
+        return {k: v for k, v in vars(self).items() if k != "inertia"} | {"_by_step": {}}
+
     def with_step(self, step: float) -> Self:
         """The same cut with another sub-step, s, to six digits; made once."""
         name = f"{step:.6g}"
@@ -374,7 +378,6 @@ class CuttingModel(CutGeometry):
             raise TypeError(f"a cut has no {', '.join(unknown)} to change")
         # With what was computed of the geometry.
         derived = copy.copy(self)
-        vars(derived).pop("inertia", None)
         vars(derived).update(changes, _inertia_of=inertia_of)
         derived.__post_init__()
         return derived
