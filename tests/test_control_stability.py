@@ -119,7 +119,7 @@ def test_a_clamped_blade_that_cannot_bend_is_refused():
 
 def test_that_blade_would_shake_and_the_run_ends_by_name(monkeypatch):
     scenario = cucumber("knife: {lateral_stiffness: 1.0e+8}", food=STIFF_FOOD)
-    scenario.numerics.time_step = 1e-4
+    scenario.exchange_period = 4e-3
     scenario.motion = MotionPlan(
         [ConstantSpeed(distance=0.0345, speed=0.1, acceleration=2.0), Hold(duration=0.2)]
     )

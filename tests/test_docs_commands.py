@@ -29,7 +29,7 @@ HERE = """
 sliceit simulate
 sliceit simulate cucumber_measured --set calibration=cucumber
 sliceit simulate cucumber_measured --set food.held_sides=plus,food.hold_distance=0.02
-sliceit simulate cucumber_measured --set "{controller: {mode: compliance, error_scale: 0.5, p_gains: [0.05, 0.05, 0.05, 1, 1, 1], stiffness: [5000, 5000, 5000, 100, 100, 100]}}"
+sliceit simulate cucumber_measured --set "{controller: {mode: compliance, error_scale: 0.2, p_gains: [0.05, 0.05, 0.05, 1, 1, 1], stiffness: [5000, 5000, 5000, 100, 100, 100]}}"
 sliceit simulate --set knife_name=nakiri
 sliceit simulate cucumber_spring
 sliceit simulate --set food.material.toughness=300
