@@ -271,7 +271,7 @@ READ_ONLY = {
         python -m studies slicing_ablations --folder output/ablations --output docs/results/learning.md
         python -m studies split_step_limit
         python -m studies stand_in_figure
-        python -m studies station_speed --repeat 6 --before docs/results/station_speed_before.json --json docs/results/benchmarks/station_speed.json --output docs/results/speed.md
+        python -m studies station_speed --repeat 6 --before docs/results/data/before/station_speed.json --json docs/results/benchmarks/station_speed.json --output docs/results/speed.md
         python -m studies station_speed --json docs/results/benchmarks/station_speed.json
         python -m studies unfinished_slices docs/results/slicing_evaluation.jsonl --output docs/results/learning.md
         """,  # noqa: E501

@@ -331,7 +331,7 @@ def test_a_folder_without_a_run_is_left_alone(tmp_path):
 
 
 def test_a_measured_curve_of_another_slice_is_warned_of(tmp_path, capsys):
-    given = ["--set", "food.material.toughness=4000, food.cut_normal=[1, 1, 0]"]
+    given = ["--set", "food.material.toughness=1500, food.cut_normal=[1, 1, 0]"]
     options = ["--duration", "0.8", "--output", str(tmp_path)]
     quick = ["--no-replay", "--no-animation"]
     assert main(["simulate", "cucumber_measured", *quick, *given, *options]) == 0

@@ -61,7 +61,8 @@ class Stepping(NamedTuple):
     def of(cls, model: CuttingModel, coarsest: int) -> "Stepping":
         """The rule for a cut and its number of sub-steps where nothing changes."""
         low, high = model.span
-        top = model.top + model.tables.reach
+        # Tables blur by one spacing.
+        top = model.top + model.tables.spacing
         return cls(0.5 * (high - low), top, coarsest, model.numerics.step_by_need)
 
     def plan(
@@ -89,14 +90,15 @@ class Stepping(NamedTuple):
         for k in range(len(p) - 1):
             v = [(b - a) / period for a, b in zip(ends[k], ends[k + 1], strict=True)]
             speed = max(math.hypot(*v[:3]), math.hypot(*v[3:]))
-            # It has settled to the motion that it starts with, and to none where nothing touches.
-            if last == 0.0 or min(heights[k : k + 2]) > self.top:
-                settled = v
+            # What nothing touches is at rest.
+            in_air = min(heights[k : k + 2]) > self.top
+            if in_air:
+                settled = [0.0] * 6
             # Rounded, so that it is the same whether a state in single precision came between.
             off = [b - round(a, 6) for a, b in zip(settled, v, strict=True)]
             change = max(math.hypot(*off[:3]), math.hypot(*off[3:]))
             least = period * max(speed / TRAVEL, math.sqrt(change / CHANGE))
-            least = min(least, FINEST) if self.by_need else 0.0
+            least = min(least, FINEST) if self.by_need and not in_air else 0.0
             calm = calm + 1 if number > self.coarsest and 2.0 * least < SLACK * number else 0
             if calm > CALM:
                 number, calm = number // 2, 0

@@ -17,7 +17,7 @@ from sliceit_drake.cutting.model import CuttingModel, TimeStepError
 from sliceit_drake.cutting.stepping import STEPPING
 from sliceit_drake.cutting.warp_start import start_warp
 
-__all__ = ["LAUNCH_LOCK", "Workspace", "parameter_row"]
+__all__ = ["LAUNCH_LOCK", "Workspace", "in_lanes", "parameter_row"]
 
 POINT_NUMBERS = {
     "toughness",

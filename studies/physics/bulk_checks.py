@@ -61,7 +61,7 @@ def _forces(solver: CuttingSolver, x: np.ndarray) -> np.ndarray:
     state = solver.initial_state()
     solver.positions(state)[:] = x
     after = solver.velocities(solver.coupling_step(state, FAR, FAR).state)
-    return solver.model.mass[:, None] * after / solver.exchange_period - solver.model.weight
+    return solver.model.true_mass[:, None] * after / solver.exchange_period - solver.model.weight
 
 
 @dc.dataclass
