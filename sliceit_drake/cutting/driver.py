@@ -1,6 +1,5 @@
 """Steps cuts along the paths of their knives: the loop of single slices, batches and jobs."""
 
-import dataclasses as dc
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -80,7 +79,7 @@ class Driver:
         models = [model.with_step(step) for model in models]
         model = models[0]
         size = (len(models), coupling_steps, multiple)
-        key = (id(model.split), len(model.relaxing), *size, *dc.astuple(model.numerics))
+        key = (id(model.split), len(model.relaxing), *size, *vars(model.numerics).values())
         ws = self._workspaces.get(key)
         if ws is None:
             ws = self._workspaces[key] = Workspace(models, period, coupling_steps)
