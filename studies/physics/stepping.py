@@ -493,12 +493,17 @@ def inertia_by_step_table(
 
     With all stiffnesses, and with the elements' alone: what touches is hundreds of times softer.
     """
-    soft = {"bond_stiffness": 0.01, "flank_stiffness": 0.01, "board_stiffness": 0.01}
     rows = []
     for food, knife, numerics in foods:
         if food.held_sides not in ("minus", "plus"):
             continue
-        alone = dc.replace(numerics, unloading_length=1e-2, **soft)
+        alone = dc.replace(
+            numerics,
+            unloading_length=1e-2,
+            bond_stiffness=0.01,
+            flank_stiffness=0.01,
+            board_stiffness=0.01,
+        )
         for name, settings in (("", numerics), (", elements alone", alone)):
             case = SteppingCase(food, knife, settings, press_speed=0.02)
             ratios = zip(*(slice_inertia(case.model(step)) for step in steps), strict=True)

@@ -159,23 +159,25 @@ def effect_cases(foods: Sequence[tuple[Food, Knife, Numerics]]) -> list[Stepping
 
     A cucumber that relaxes, one with a skin, and one under an arm that gives.
     """
-    cucumber, *first = foods[0]
+    cucumber, knife, numerics = foods[0]
     relaxes = Effects(relaxation=Relaxation(shares=[0.3, 0.2], times=[0.02, 0.5]))
     gives = Effects(compliance=Compliance(arm=3e-5))
     skin = Effects(skin=Skin(toughness=0.3))
     relaxing = dc.replace(cucumber, name="cucumber that relaxes", effects=relaxes)
     under_arm = dc.replace(cucumber, name="cucumber, arm that gives", effects=gives)
     skinned = dc.replace(cucumber, name="cucumber with skin", effects=skin)
-    hold = SteppingCase(relaxing, *first, press_speed=0.02, depth=0.4, hold=0.15)
-    turn = SteppingCase(under_arm, *first, press_speed=0.1, depth=0.6, retract=study.RETRACT)
-    press = SteppingCase(skinned, *first, press_speed=0.1)
+    hold = SteppingCase(relaxing, knife, numerics, press_speed=0.02, depth=0.4, hold=0.15)
+    turn = SteppingCase(
+        under_arm, knife, numerics, press_speed=0.1, depth=0.6, retract=study.RETRACT
+    )
+    press = SteppingCase(skinned, knife, numerics, press_speed=0.1)
     return [
         hold,
         dc.replace(hold, press_speed=0.1),
         dc.replace(turn, food=relaxing),
         dc.replace(press, press_speed=0.02),
         press,
-        SteppingCase(under_arm, *first, press_speed=0.1),
+        SteppingCase(under_arm, knife, numerics, press_speed=0.1),
         turn,
     ]
 

@@ -21,7 +21,7 @@ from sliceit_drake.diagrams.stability import ContactMargin
 from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.systems.contact_monitor import UNSTABLE_GAINS
 
-__all__ = ["add_discretization_error", "run_summary", "slice_areas"]
+__all__ = ["FinishedRun", "add_discretization_error", "run_summary", "slice_areas"]
 
 CUT_THROUGH = 0.99
 """Share of a section from which it counts as cut."""
