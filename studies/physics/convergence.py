@@ -24,7 +24,7 @@ class Refinement:
     """Force of one cut at several sizes of mesh or step.
 
     Attributes:
-        size: Relative mesh size, or step in s; the last is the reference.
+        size: Relative mesh size, or longest sub-step in s; the last is the reference.
         elements: That are computed.
         error: RMS difference of the force's norm from the reference, over its RMS; without the
             reference.
@@ -71,7 +71,7 @@ def refine_step(
     divisors: Sequence[int],
     progress: Callable[[], None] | None = None,
 ) -> Refinement:
-    """A press cut with smaller steps, masses scaled to each.
+    """A press cut with smaller longest sub-steps, masses scaled to each.
 
     Args:
         food: To cut.

@@ -29,7 +29,7 @@ EDGE_CASES = ((0, 0.0), (0, 3.0), (1, 0.0), (1, 1.0), (1, 3.0), (2, 0.0), (2, 3.
 FRICTION_CASES = ((4, 0.2, 0.0), (4, 0.2, 1.0), (8, 0.2, 0.0), (8, 0.2, 1.0))
 """Elements across the width, friction and draw ratio."""
 REFINEMENTS = (0.5, 1.0, 2.0, 3.0)
-DIVISORS = (1, 2, 4, 8)
+DIVISORS = (1, 2, 4, 8, 32)
 BEAM = (2, 4, 8)
 DEPTH = 0.0265
 COARSE = 0.5

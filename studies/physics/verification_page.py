@@ -220,7 +220,7 @@ def plot_convergence(results: Mapping[str, Any], file: Path) -> None:
     mesh, step = results["mesh"], results["step"]
     parts = (
         (mesh, 1.0, "edge length over the default [1]", 2.0, "mesh, with the step"),
-        (step, 1e3, "time step [ms]", 1.0, "step, on the default mesh"),
+        (step, 1e3, "longest sub-step [ms]", 1.0, "step, on the default mesh"),
     )
     for axes, (part, scale, label, slope, title) in zip(panels, parts, strict=True):
         size = scale * np.array(part["size"][:-1])
