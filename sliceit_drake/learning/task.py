@@ -114,8 +114,7 @@ class TaskConfig:
     refinement: float = quantity(0.75, "", low=0.3, high=4.0)
     """Elements along an edge, relative to the food's mesh."""
     time_step: float = quantity(2e-3 / 12, "s", low=1e-6, high=2e-3)
-    """Sub-step of the food: two thirds of the station's default, whose scaled masses have more than
-    5 % of the energy for an instant where the fastest agents touch a food."""
+    """Longest sub-step of the food, s."""
     board: Board = dc.field(default_factory=Board)
     sensor: WrenchSensorConfig = dc.field(default_factory=WrenchSensorConfig)
     start: Start = dc.field(default_factory=Start)
