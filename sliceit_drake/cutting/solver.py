@@ -102,7 +102,16 @@ class CuttingSolver:
         `coupling_step` does so at its first call; call this before to keep it out of a measured
         time."""
         with self._lock:
-            self._workspace.capture()
+            # Those that a knife asks for that meets the food or turns round, too.
+            for finer in (1, 2, 4):
+                self._stepped(finer * self._workspace.substeps).capture()
+
+    def _stepped(self, number: int) -> Workspace:
+        """The workspace for a number of sub-steps, with the lock held."""
+        if number not in self._workspaces:
+            model = self.model.with_step(self.exchange_period / number)
+            self._workspaces[number] = Workspace([model], self.exchange_period)
+        return self._workspaces[number]
 
     def coupling_step(
         self, state: np.ndarray, start: Pose, end: Pose, factors: SurfaceFactors = UNCHANGED
@@ -122,10 +131,7 @@ class CuttingSolver:
         place, T = self._workspace.layout["stepping"], self.exchange_period
         (number,), (stepping,) = self._stepping.plan(state[place], R[0], p[0], T)
         with self._lock:
-            ws = self._workspaces.get(number)
-            if ws is None:
-                model = self.model.with_step(T / number)
-                ws = self._workspaces[number] = Workspace([model], T)
+            ws = self._stepped(number)
             self._take_factors(ws, factors)
             (step,) = run_coupling_steps(ws, state[None], R, p)
         if not step.finite:
