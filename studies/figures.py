@@ -1,6 +1,6 @@
 """How figures of the studies are made, styled and saved."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.axes import Axes
@@ -16,8 +16,11 @@ __all__ = [
     "draw_boxes",
     "new_figure",
     "save_figure",
+    "save_guide_figures",
     "tidy",
 ]
+
+GUIDE_FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
 
 BLUE, ORANGE, GREEN, RED, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"
 """Colours of Okabe and Ito, which the colour-blind can tell apart."""
@@ -98,3 +101,9 @@ def save_figure(figure: Figure, file: Path, dpi: int = 130) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(file, dpi=dpi)
     print(f"wrote {file}")
+
+
+def save_guide_figures(figures: Mapping[str, Callable[[], Figure]]) -> None:
+    """Draws pictures of the guides by name, and writes them into the documentation."""
+    for name, draw in figures.items():
+        save_figure(draw(), GUIDE_FIGURES / f"{name}.png", dpi=100)

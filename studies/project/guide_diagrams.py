@@ -6,7 +6,6 @@ docs/figures. Two of them show a slice that is simulated for them.
 
 import argparse
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 
 import meshio
@@ -29,7 +28,7 @@ from studies.figures import (
     RED,
     draw_boxes,
     new_figure,
-    save_figure,
+    save_guide_figures,
     tidy,
 )
 
@@ -44,7 +43,6 @@ __all__ = [
     "scaling_figure",
 ]
 
-FIGURES = Path(__file__).resolve().parents[2] / "docs" / "figures"
 FLESH, STEEL, WOOD, UNCUT = "#cfe3b4", "0.7", "#e2c79c", "#8e4585"
 STOPPED = "#fbe3d6"
 STATES = {
@@ -94,16 +92,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
-    figures: dict[str, Callable[[], Figure]] = {
-        "glossary": glossary_figure,
-        "formats": formats_figure,
-        "hardware": hardware_figure,
-        "scaling": scaling_figure,
-        "paraview": paraview_figure,
-        "next_experiment": next_experiment_figure,
-    }
-    for name, draw in figures.items():
-        save_figure(draw(), FIGURES / f"{name}.png", dpi=100)
+    save_guide_figures(
+        {
+            "glossary": glossary_figure,
+            "formats": formats_figure,
+            "hardware": hardware_figure,
+            "scaling": scaling_figure,
+            "paraview": paraview_figure,
+            "next_experiment": next_experiment_figure,
+        }
+    )
     return 0
 
 

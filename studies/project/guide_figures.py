@@ -5,8 +5,6 @@ Writes foods.png, frames.png, station.png, servo.png and record.png to docs/figu
 
 import argparse
 import itertools
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -24,7 +22,7 @@ from studies.figures import (
     RED,
     draw_boxes,
     new_figure,
-    save_figure,
+    save_guide_figures,
     tidy,
 )
 
@@ -38,7 +36,6 @@ __all__ = [
     "station_figure",
 ]
 
-FIGURES = Path(__file__).resolve().parents[2] / "docs" / "figures"
 SCENARIOS = {
     "cucumber": "cucumber_sequence",
     "carrot": "carrot_sequence",
@@ -73,15 +70,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
-    figures: dict[str, Callable[[], Figure]] = {
-        "foods": foods_figure,
-        "frames": frames_figure,
-        "station": station_figure,
-        "servo": servo_figure,
-        "record": record_figure,
-    }
-    for name, draw in figures.items():
-        save_figure(draw(), FIGURES / f"{name}.png", dpi=100)
+    save_guide_figures(
+        {
+            "foods": foods_figure,
+            "frames": frames_figure,
+            "station": station_figure,
+            "servo": servo_figure,
+            "record": record_figure,
+        }
+    )
     return 0
 
 
