@@ -276,10 +276,15 @@ def test_overrides_are_paths_or_yaml_and_both_together():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (["train", "--set", "task.food=[potato]"], r'task.food: .*Did you mean "task.foods"'),
-        (["train", "--set", "{foods: [potato]}"], "as a path: --set task.foods=VALUE"),
-        (["train", "--steps", "-5"], "steps: -5 is not within"),
-        (["train", "--set", "zzz=3"], "zzz: there is no such field. Known: task, steps"),
+        *(
+            pytest.param(["train", *given], message, marks=pytest.mark.second_tier)  # Has torch.
+            for given, message in [
+                (["--set", "task.food=[potato]"], r'task.food: .*Did you mean "task.foods"'),
+                (["--set", "{foods: [potato]}"], "as a path: --set task.foods=VALUE"),
+                (["--steps", "-5"], "steps: -5 is not within"),
+                (["--set", "zzz=3"], "zzz: there is no such field. Known: task, steps"),
+            ]
+        ),
         (["hardware", "--set-robot", "touch.sped=1"], 'Did you mean "touch.speed"'),
         (["hardware", "--set-robot", "{speed: 1}"], "as a path: --set-robot touch.speed=VALUE"),
         (["hardware", "--set-robot", "touch.speed=1"], "1 m/s is not within"),
