@@ -5,11 +5,10 @@ import math
 
 import numpy as np
 
+from sliceit_drake.cutting.kernels.layouts import BALANCE
 from sliceit_drake.cutting.workspace import Workspace
 
 __all__ = ["CouplingSteps", "Energies", "EnergyBalance", "run_coupling_steps"]
-
-_LOSSES = ("edge_loss", "opening_loss", "friction_loss")
 
 
 @dc.dataclass
@@ -81,14 +80,19 @@ class CouplingSteps:
         wrenches: Mean wrenches by mechanism: edge, flank pressure, friction [E, 3, 6].
         cut: Fraction of the section that the edge has passed [E].
         board_force: Mean force of the board on the food [3], N.
-        balance: Work and dissipation over all coupling steps.
+        works: Work and dissipation over all coupling steps, in J, as `layouts.BALANCE` [8].
     """
 
     state: np.ndarray
     wrenches: np.ndarray
     cut: np.ndarray
     board_force: np.ndarray
-    balance: EnergyBalance
+    works: np.ndarray
+
+    @property
+    def balance(self) -> EnergyBalance:
+        """Work and dissipation over all coupling steps."""
+        return EnergyBalance(**dict(zip(BALANCE.names or (), self.works.tolist(), strict=True)))
 
     @property
     def wrench(self) -> np.ndarray:
@@ -99,8 +103,8 @@ class CouplingSteps:
     def finite(self) -> bool:
         """Whether the cut has not broken down; limits on forces can hide a state that has."""
         # What is not finite makes the sum of squares so, at a fourth of the cost of tests.
-        squares = (each.dot(each) for each in (self.state, self.wrenches.ravel()))
-        return all(map(math.isfinite, squares))
+        wrenches = self.wrenches.ravel()
+        return math.isfinite(self.state.dot(self.state) + wrenches.dot(wrenches))
 
 
 def run_coupling_steps(
@@ -118,23 +122,15 @@ def run_coupling_steps(
         One result a cut; what is not finite is left so.
     """
     ws.advance(states, R, p)
-    new = ws.read(ws.states[0]).copy()
-    x = ws.layout["x"]
-    steps = []
-    for c, (model, row) in enumerate(zip(ws.models, ws.results(), strict=True)):
-        at_points, at_nodes = row["point_sums"], row["node_sums"]
-        edge, opening, friction = (sum(at_points[name].tolist()) for name in _LOSSES)
-        balance = EnergyBalance(
-            work=float(row["work"].sum()),
-            gravity=float(model.weight.ravel().dot(new[c, x] - states[c, x])),
-            edge=edge,
-            opening=opening,
-            friction=friction,
-            board_friction=float(at_nodes["board_loss"]),
-            blade=float(row["blade"]["loss"].sum()),
-            internal=float(at_nodes["internal_work"]),
+    new, rows, at = ws.read(ws.states[-1]).copy(), ws.read(ws.result_rows).copy(), ws.result_layout
+    shape = (ws.coupling_steps, 3, 6)
+    return [
+        CouplingSteps(
+            state,
+            row[at["wrenches"]].reshape(shape),
+            row[at["cut"]] / model.section_area,
+            row[at["board_force"]],
+            row[at["balance"]],
         )
-        cut = at_points["cut_area"] / model.section_area
-        board_force = at_nodes["board_force"] / ws.steps
-        steps.append(CouplingSteps(new[c], row["wrenches"], cut, board_force, balance))
-    return steps
+        for model, state, row in zip(ws.models, new, rows, strict=True)
+    ]

@@ -32,7 +32,7 @@ __all__ = [
     "Segment",
     "Velocity",
     "Waypoints",
-    "small_turn",
+    "small_motion",
 ]
 
 OVERTRAVEL = 2e-4
@@ -73,15 +73,19 @@ class Velocity(typing.NamedTuple):
     v: np.ndarray
 
 
-def small_turn(R0: np.ndarray, R1: np.ndarray) -> np.ndarray:
-    """Axis times sine of the angle of the turn from R0 to R1 [3], in the frame of both, rad."""
-    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = R0.tolist()
-    (dx, dy, dz), (ex, ey, ez), (fx, fy, fz) = R1.tolist()
+def small_motion(X0: np.ndarray, X1: np.ndarray) -> list[float]:
+    """Motion from a pose [3, 4] to another in their common frame.
+
+    Returns:
+        Axis times sine of the angle of the turn [3], rad, and displacement of the origin [3], m.
+    """
+    (ax, ay, az, au), (bx, by, bz, bu), (cx, cy, cz, cu) = X0.tolist()
+    (dx, dy, dz, du), (ex, ey, ez, eu), (fx, fy, fz, fu) = X1.tolist()
     # Elements of R1 R0^T less those opposite.
     x = (fx * bx + fy * by + fz * bz) - (ex * cx + ey * cy + ez * cz)
     y = (dx * cx + dy * cy + dz * cz) - (fx * ax + fy * ay + fz * az)
     z = (ex * ax + ey * ay + ez * az) - (dx * bx + dy * by + dz * bz)
-    return 0.5 * np.array([x, y, z])
+    return [0.5 * x, 0.5 * y, 0.5 * z, du - au, eu - bu, fu - cu]
 
 
 @dc.dataclass

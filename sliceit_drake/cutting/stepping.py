@@ -79,9 +79,11 @@ class Stepping(NamedTuple):
             The numbers [E], the coarsest one times powers of two, and `stepping` after each
             [E, STEPPING].
         """
-        along = self.half_span * R[:, :, 0]
-        ends = np.concatenate([p - along, p + along], axis=1).tolist()
-        heights = p[:, 2].tolist()
+        places, h = p.tolist(), self.half_span
+        ends = [
+            (x - h * a, y - h * b, z - h * c, x + h * a, y + h * b, z + h * c)
+            for (x, y, z), (a, b, c) in zip(places, R[:, :, 0].tolist(), strict=True)
+        ]
         *settled, last, calm = stepping.tolist()
         number = self.coarsest
         if last > 0.0:
@@ -91,7 +93,7 @@ class Stepping(NamedTuple):
             v = [(b - a) / period for a, b in zip(ends[k], ends[k + 1], strict=True)]
             speed = max(math.hypot(*v[:3]), math.hypot(*v[3:]))
             # What nothing touches is at rest.
-            in_air = min(heights[k : k + 2]) > self.top
+            in_air = min(places[k][2], places[k + 1][2]) > self.top
             if in_air:
                 settled = [0.0] * 6
             # Rounded, so that it is the same whether a state in single precision came between.

@@ -257,7 +257,7 @@ class Workspace:
         self._result_type = layouts.results(E)
         names = self._result_type.names or ()
         shapes = {name: layouts.field_shape(self._result_type, name) for name in names}
-        self._result_rows, _ = self._rows(self._results, shapes, wp.float64)
+        self.result_rows, self.result_layout = self._rows(self._results, shapes, wp.float64)
         by_element = (B, STRIP, LANES)
         self._allocate(self._energies, elastic=by_element, volume_ratio=by_element)
         self._allocate(self._energies, points=(self.point_blocks,))
@@ -296,7 +296,7 @@ class Workspace:
 
     def results(self) -> np.ndarray:
         """A copy of what the last launch gave, by name [C]; see `layouts.results`."""
-        rows = self.read(self._result_rows).copy()
+        rows = self.read(self.result_rows).copy()
         return np.ndarray(len(rows), self._result_type, rows)
 
     def write(self, array: wp.array, values: np.ndarray) -> None:
@@ -396,14 +396,17 @@ class Workspace:
         kern, sums, results = self.kernels, self.sums, self._results
         self.sum_rows.zero_()
         self.launch(kern.move_knife, self.motion.R_CK.shape, [self.motion])
+        weights = [self.parameters, results]
+        self.launch(kern.weigh, (self.cuts,), [wp.float64(-1.0), self.slots[0], *weights])
         # Later sub-steps need it for held nodes only, which never move.
         for k in range(len(self.slots)):
             self.launch_look_ahead(k)
         for k in range(self.steps):
             self.launch_substep(k)
         self.launch(kern.add_points, results.point_sums.shape, [sums, results])
-        self.launch(kern.add_nodes, results.node_sums.shape, [sums, results])
         self.launch(kern.knife_wrenches, results.work.shape, [sums, self.motion, results])
+        self.launch(kern.weigh, (self.cuts,), [wp.float64(1.0), self.slots[-1], *weights])
+        self.launch(kern.add_up, (self.cuts,), [sums, self.motion, results])
 
     def advance(self, states: np.ndarray, R: np.ndarray, p: np.ndarray) -> None:
         """Advances all cuts by the workspace's coupling steps.

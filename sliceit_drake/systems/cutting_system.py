@@ -1,8 +1,6 @@
 """The finite-element food as a Drake system."""
 
-import dataclasses as dc
 import functools
-import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,7 +12,7 @@ from pydrake.multibody.math import SpatialVelocity
 from pydrake.systems.framework import Context, DiagramBuilder, DiscreteStateIndex, State
 
 from sliceit_drake.cutting.contact_response import contact_responses
-from sliceit_drake.cutting.coupling_steps import EnergyBalance
+from sliceit_drake.cutting.kernels.layouts import BALANCE
 from sliceit_drake.cutting.mesh.surface import FoodBody, food_body, food_surface
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
@@ -33,7 +31,7 @@ from sliceit_drake.systems.knife_force import KEPT, LAST_POSE, KnifeForceSystem
 
 __all__ = ["BALANCE_NAMES", "COMPLETE", "COUPLED_STEP", "ENERGY_NAMES", "CuttingSystem"]
 
-BALANCE_NAMES = tuple(field.name for field in dc.fields(EnergyBalance))
+BALANCE_NAMES = BALANCE.names or ()
 ENERGY_NAMES = ("elastic", "interface", "kinetic", "largest_energy_ratio", "least_volume_ratio")
 
 MECHANISMS = ("edge", "opening", "friction", "board_friction", "blade")
@@ -59,8 +57,6 @@ _PARTS = {
     "food_index": slice(_FOOD_INDEX, _FOOD_INDEX + 1),
 }
 """Output ports of parts of the state."""
-
-_balance = operator.attrgetter(*BALANCE_NAMES)
 
 COMPLETE = 0.999
 """Fraction of a section from which a slice counts as cut off."""
@@ -125,12 +121,13 @@ class CuttingSystem(KnifeForceSystem):
         self.food_poses = (
             (X_WF,) * len(solvers) if isinstance(X_WF, RigidTransform) else tuple(X_WF)
         )
-        self._R_CW, self._offset, self._X_WC = [], [], []
+        self._R_CW, self._origin, self._X_WC = [], [], []
         for solver, X in zip(self.solvers, self.food_poses, strict=True):
             R_WC = X.rotation().matrix() @ solver.model.X_FC_rotation
             p_WC = X.multiply(solver.model.X_FC_position)
             self._R_CW.append(R_WC.T)
-            self._offset.append(R_WC.T @ p_WC)
+            # Of W in C, as the last column of a pose.
+            self._origin.append(np.column_stack([np.zeros((3, 3)), R_WC.T @ p_WC]))
             self._X_WC.append(RigidTransform(RotationMatrix(R_WC), p_WC))
         self._check_every = max(1, round(check_period / self.exchange_period))
         size = max(s.state_size for s in self.solvers)
@@ -299,15 +296,16 @@ class CuttingSystem(KnifeForceSystem):
     def _in_cut_frame(self, index: int, X_WK: np.ndarray) -> Pose:
         """X_CK from X_WK [3, 4]."""
         X_CK = self._R_CW[index].dot(X_WK)
-        return Pose(X_CK[:, :3], X_CK[:, 3] - self._offset[index])
+        X_CK -= self._origin[index]
+        return Pose(X_CK[:, :3], X_CK[:, 3])
 
     def _index_to_cut(self, context: Context, index: int, X_WK: np.ndarray) -> int:
-        """The food that the next coupling step cuts: this, or the next if the knife is there now.
+        """The food of a sequence that is cut now: this, or the next if the knife is there now.
 
         Raises:
             CuttingError: The knife is in the next plane and has not cut the last section through.
         """
-        if not self._in_sequence or index + 1 == len(self.solvers):
+        if index + 1 == len(self.solvers):
             return index
         model = self.solvers[index + 1].model
         # The coupling step goes from the last pose to this one; tables blur by one spacing.
@@ -325,14 +323,14 @@ class CuttingSystem(KnifeForceSystem):
         return index
 
     def _is_beside(self, context: Context, X_CK: Pose) -> bool:
-        """Whether the blade has left a section that it cut, on the side of the slice.
+        """Whether the blade has left a section of a sequence that it cut, on the slice's side.
 
         It then touches the slice alone, which is off, and the food stays as the blade left it.
 
         Raises:
             CuttingError: It leaves a section that it has not cut through.
         """
-        if not self._in_sequence or X_CK.p[1] > -INDEXED:
+        if X_CK.p[1] > -INDEXED:
             return False
         progress = self.progress(context)
         if progress < COMPLETE and X_CK.p[1] < -LATERAL_LIMIT:
@@ -347,43 +345,41 @@ class CuttingSystem(KnifeForceSystem):
     def advance(
         self, context: Context, state: State, X_WK: RigidTransform
     ) -> tuple[np.ndarray, float]:
-        x, time = context.get_discrete_state(), context.get_time()
-        kept = x.value(self._kept)
-        new = state.get_mutable_discrete_state()
-        new_kept = new.get_mutable_value(self._kept)
-        before, now = int(kept[_FOOD_INDEX]), X_WK.GetAsMatrix34()
-        index = self._index_to_cut(context, before, now)
+        x, time = state.get_mutable_discrete_state(), context.get_time()
+        kept, now = x.get_mutable_value(self._kept), X_WK.GetAsMatrix34()
+        index = before = int(kept[_FOOD_INDEX])
+        if self._in_sequence:
+            index = self._index_to_cut(context, before, now)
         solver = self.solvers[index]
-        if index == before:
-            old = x.value(self._food)[: solver.state_size]
-        else:
-            old = solver.initial_state()
-            new_kept[_FOOD_INDEX], new_kept[_ENERGY] = index, NO_ENERGY
-            new_kept[_SPENT_BEFORE] = kept[_SPENT].sum()
+        food = x.get_mutable_value(self._food)[: solver.state_size]
+        if index != before:
+            food[:] = solver.initial_state()
+            kept[_FOOD_INDEX], kept[_ENERGY] = index, NO_ENERGY
+            kept[_SPENT_BEFORE] = kept[_SPENT].sum()
         last = self._in_cut_frame(index, kept[LAST_POSE].reshape(3, 4))
         pose = self._in_cut_frame(index, now)
-        if self._is_beside(context, pose):
-            new_kept[_COMPONENTS] = 0.0
+        if self._in_sequence and self._is_beside(context, pose):
+            kept[_COMPONENTS] = 0.0
             return np.zeros(6), self.progress(context)
         check_in_plane(solver.model, pose, time)
         try:
-            step = solver.coupling_step(old, last, pose)
+            step = solver.coupling_step(food, last, pose)
         except CuttingError as error:
             raise CuttingError(f"at {time:.4g} s {error}") from error
-        new.get_mutable_value(self._food)[: len(old)] = step.state
+        food[:] = step.state
         R_CW = self._R_CW[index]
-        new_kept[_COMPONENTS] = step.wrenches[-1, :, 3:].dot(R_CW).ravel()
-        new_kept[_BALANCE] += _balance(step.balance)
+        kept[_COMPONENTS] = step.wrenches[-1, :, 3:].dot(R_CW).ravel()
+        kept[_BALANCE] += step.works
         if round(time / self.exchange_period) % self._check_every == 0:
             energies = solver.energies(step.state, pose)
-            spent = float(new_kept[_SPENT].sum() - new_kept[_SPENT_BEFORE])
+            spent = float(kept[_SPENT].sum() - kept[_SPENT_BEFORE])
             ratio = check_energies(energies, spent, solver.model, time)
-            *_, largest_ratio, least_volume_ratio = new_kept[_ENERGY].tolist()
+            *_, largest_ratio, least_volume_ratio = kept[_ENERGY].tolist()
             stored = energies.elastic, energies.interface, energies.kinetic
             largest = max(ratio, largest_ratio)
             least = min(energies.least_volume_ratio, least_volume_ratio)
             # In the order of `ENERGY_NAMES`.
-            new_kept[_ENERGY] = [*stored, largest, least]
+            kept[_ENERGY] = [*stored, largest, least]
         return step.wrench.reshape(2, 3).dot(R_CW).ravel(), float(step.cut[-1])
 
     def _surface_vertices(self, context: Context) -> np.ndarray:

@@ -12,7 +12,7 @@ from pydrake.multibody.plant import ExternallyAppliedSpatialForce
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context, DiscreteStateIndex, EventStatus, State
 
-from sliceit_drake.cutting.motion import small_turn
+from sliceit_drake.cutting.motion import small_motion
 from sliceit_drake.systems.cut_report import ReportingSystem
 from sliceit_drake.systems.declare import PlainSystem, declare_output
 
@@ -162,22 +162,18 @@ class KnifeForceSystem(ReportingSystem):
         self.start(context, state, X_WK)
 
     def _update(self, context: Context, state: State) -> EventStatus | None:
-        x = context.get_discrete_state()
-        before = x.value(self._kept)
-        if context.get_time() <= before[_START_TIME]:
+        x = state.get_mutable_discrete_state()
+        kept = x.get_mutable_value(self._kept)
+        if context.get_time() <= kept[_START_TIME]:
             return EventStatus.DidNothing()
         X_WK = self._pose_input.Eval(context)
-        wrench, progress = self.advance(context, state, X_WK)
-        last, now = before[LAST_POSE].reshape(3, 4), X_WK.GetAsMatrix34()
-        moved = np.empty(6)
-        moved[:3] = small_turn(last[:, :3], now[:, :3])
-        np.subtract(now[:, 3], last[:, 3], out=moved[3:])
-        x_new = state.get_mutable_discrete_state()
-        new = x_new.get_mutable_value(self._kept)
-        new[_COUPLING] = before[_COUPLING] + (x.value(self._wrench) - wrench).dot(moved)
-        new[_PROGRESS] = progress
-        new[LAST_POSE] = now.ravel()
-        x_new.set_value(self._wrench, wrench)
+        new, progress = self.advance(context, state, X_WK)
+        last, now = kept[LAST_POSE].reshape(3, 4), X_WK.GetAsMatrix34()
+        wrench = x.get_mutable_value(self._wrench)
+        kept[_COUPLING] += (wrench - new).dot(small_motion(last, now))
+        kept[_PROGRESS] = progress
+        last[:] = now
+        wrench[:] = new
         return None
 
     @staticmethod

@@ -4,7 +4,7 @@ import numpy as np
 
 from sliceit_drake.cutting.driver import Launch
 from sliceit_drake.cutting.knife_path import KnifePath
-from sliceit_drake.cutting.motion import Motion, Pose, small_turn
+from sliceit_drake.cutting.motion import Motion, Pose, small_motion
 from sliceit_drake.cutting.solver import CuttingSolver
 
 __all__ = ["contact_forces", "contact_sums"]
@@ -23,7 +23,8 @@ def contact_forces(solver: CuttingSolver, state: np.ndarray, start: Pose, end: P
     T, ws = solver.exchange_period, solver._workspace
 
     ws.write(ws.states[0], state[None])
-    ws.place_knife(*end, (end.p - start.p) / T, small_turn(start.R, end.R) / T)
+    motion = np.array(small_motion(np.column_stack(start), np.column_stack(end))) / T
+    ws.place_knife(*end, motion[3:], motion[:3])
     both = ws.point_forces()
     # What is left with the knife beyond the food are the bonds, in the same state.
     ws.place_knife(end.R, end.p + 10.0 * end.R[:, 0])

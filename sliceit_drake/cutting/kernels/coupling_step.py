@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from sliceit_drake.cutting.kernels.layouts import BladeSum, NodeSum, PointSum
+from sliceit_drake.cutting.kernels.layouts import Balance, BladeSum, PointSum
 from sliceit_drake.cutting.kernels.types import LANES, kernel_types
 
 __all__ = ["coupling_kernels"]
@@ -19,6 +19,7 @@ def coupling_kernels(real: Any, module: str) -> types.SimpleNamespace:
     t = kernel_types(real)
     vec3, mat33, vec3d, float64 = t.vec3, t.mat33, wp.vec3d, wp.float64
     Motion, Sums, Results = t.Motion, t.Sums, t.Results
+    State, Parameters = t.State, t.Parameters
 
     @wp.func
     def to_real(a: vec3d):
@@ -68,20 +69,6 @@ def coupling_kernels(real: Any, module: str) -> types.SimpleNamespace:
         results.point_sums[cut, e, j] = s
 
     @wp.kernel(enable_backward=False, module=module)
-    def add_nodes(sums: Sums, results: Results):
-        """Sums over the nodes, see `NODE_SUMS`; a thread for each."""
-        cut, j = wp.tid()
-        s = float64(0.0)
-        for i in range(sums.board_loss.shape[1]):
-            if j < NodeSum.BOARD_LOSS:
-                s += float64(sums.board_force[cut, i][j - NodeSum.BOARD_FORCE])
-            elif j == NodeSum.BOARD_LOSS:
-                s += float64(sums.board_loss[cut, i])
-            else:
-                s += float64(sums.internal_work[cut, i])
-        results.node_sums[cut, j] = s
-
-    @wp.kernel(enable_backward=False, module=module)
     def knife_wrenches(sums: Sums, motion: Motion, results: Results):
         """Mean wrenches on the knife in each coupling step, moment about Ko and force, and its
         work.
@@ -119,10 +106,56 @@ def coupling_kernels(real: Any, module: str) -> types.SimpleNamespace:
                 results.wrenches[cut, e, m, 3 + c] = F
                 power += F * v[c] + M * w[c]
         results.work[cut, e] = -power * motion.period
+        results.cut[cut, e] = results.point_sums[cut, e, PointSum.CUT_AREA]
+
+    @wp.kernel(enable_backward=False, module=module)
+    def weigh(sign: float64, state: State, parameters: Parameters, results: Results):
+        """Work of the food's weight in a motion from the origin to where it is, times a sign; the
+        negative one begins the sum."""
+        cut = wp.tid()
+        gravity = float64(0.0)
+        for i in range(state.x.shape[1]):
+            weight, x = parameters.weight[cut, i], state.x[cut, i]
+            for c in range(3):
+                gravity += float64(weight[c]) * float64(x[c])
+        if sign < float64(0.0):
+            results.balance[cut, Balance.GRAVITY] = -gravity
+        else:
+            results.balance[cut, Balance.GRAVITY] += gravity
+
+    @wp.kernel(enable_backward=False, module=module)
+    def add_up(sums: Sums, motion: Motion, results: Results):
+        """Mean force of the board and balance over all coupling steps, but for gravity."""
+        cut = wp.tid()
+        force, lost, internal = wp.vec3d(), float64(0.0), float64(0.0)
+        for i in range(sums.board_loss.shape[1]):
+            on_node = sums.board_force[cut, i]
+            force += wp.vec3d(float64(on_node[0]), float64(on_node[1]), float64(on_node[2]))
+            lost += float64(sums.board_loss[cut, i])
+            internal += float64(sums.internal_work[cut, i])
+        count = results.work.shape[1]
+        for c in range(3):
+            results.board_force[cut, c] = force[c] / float64(motion.substeps * count)
+        work, edge, opening = float64(0.0), float64(0.0), float64(0.0)
+        friction, blade = float64(0.0), float64(0.0)
+        for e in range(count):
+            work += results.work[cut, e]
+            edge += results.point_sums[cut, e, PointSum.EDGE_LOSS]
+            opening += results.point_sums[cut, e, PointSum.OPENING_LOSS]
+            friction += results.point_sums[cut, e, PointSum.FRICTION_LOSS]
+            blade += results.blade[cut, e, BladeSum.LOSS]
+        results.balance[cut, Balance.WORK] = work
+        results.balance[cut, Balance.EDGE] = edge
+        results.balance[cut, Balance.OPENING] = opening
+        results.balance[cut, Balance.FRICTION] = friction
+        results.balance[cut, Balance.BOARD_FRICTION] = lost
+        results.balance[cut, Balance.BLADE] = blade
+        results.balance[cut, Balance.INTERNAL] = internal
 
     return types.SimpleNamespace(
         move_knife=move_knife,
         add_points=add_points,
-        add_nodes=add_nodes,
         knife_wrenches=knife_wrenches,
+        weigh=weigh,
+        add_up=add_up,
     )

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 
 __all__ = [
+    "BALANCE",
     "BLADE_SUMS",
     "KNIFE",
-    "NODE_SUMS",
     "POINT_SUMS",
+    "Balance",
     "BladeSum",
-    "NodeSum",
     "PointSum",
     "Section",
     "field_shape",
@@ -46,24 +46,37 @@ POINT_SUMS = np.dtype(
 and energies dissipated, each summed over the sub-steps of a coupling step; at its end the area that
 is cut, and the moment about Ko and the size of that part of the flanks which is in the food."""
 
-NODE_SUMS = np.dtype([("board_force", "f8", 3), ("board_loss", "f8"), ("internal_work", "f8")])
-"""Sums over nodes and sub-steps: the board's force on the food, the energy that it dissipates, and
-the work of the bulk's forces."""
-
 BLADE_SUMS = np.dtype([("loss", "f8"), ("on_knife", "f8"), ("on_blade", "f8")])
 """Sums over the sub-steps of a coupling step: energy lost in the bending blade, the force that it
 passes on to the knife's body, and the force of the flanks on it."""
 
+BALANCE = np.dtype(
+    [
+        ("work", "f8"),
+        ("gravity", "f8"),
+        ("edge", "f8"),
+        ("opening", "f8"),
+        ("friction", "f8"),
+        ("board_friction", "f8"),
+        ("blade", "f8"),
+        ("internal", "f8"),
+    ]
+)
+"""Work and dissipation, see `EnergyBalance`."""
+
 
 def results(coupling_steps: int) -> np.dtype:
-    """Results of one cut over E coupling steps; the sums over nodes are those of all of them."""
+    """Results of one cut over E coupling steps: sums and wrenches of each, the area that is cut at
+    its end; the board's mean force on the food, and the balance, over all of them."""
     return np.dtype(
         [
             ("point_sums", POINT_SUMS, (coupling_steps,)),
-            ("node_sums", NODE_SUMS),
             ("blade", BLADE_SUMS, (coupling_steps,)),
             ("wrenches", "f8", (coupling_steps, 3, 6)),
             ("work", "f8", (coupling_steps,)),
+            ("cut", "f8", (coupling_steps,)),
+            ("board_force", "f8", 3),
+            ("balance", BALANCE),
         ]
     )
 
@@ -76,8 +89,8 @@ def _places(name: str, layout: np.dtype) -> Any:
 
 Section = _places("Section", KNIFE)
 PointSum = _places("PointSum", POINT_SUMS)
-NodeSum = _places("NodeSum", NODE_SUMS)
 BladeSum = _places("BladeSum", BLADE_SUMS)
+Balance = _places("Balance", BALANCE)
 
 
 def numbers(layout: np.dtype) -> int:

@@ -207,10 +207,12 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         """See `layouts.results`."""
 
         point_sums: wp.array3d(dtype=wp.float64)
-        node_sums: wp.array2d(dtype=wp.float64)
         blade: wp.array3d(dtype=wp.float64)
         wrenches: wp.array4d(dtype=wp.float64)
         work: wp.array2d(dtype=wp.float64)
+        cut: wp.array2d(dtype=wp.float64)
+        board_force: wp.array2d(dtype=wp.float64)
+        balance: wp.array2d(dtype=wp.float64)
 
     @wp.struct
     class Energies:
