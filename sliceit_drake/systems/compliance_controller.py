@@ -355,9 +355,10 @@ class ComplianceController(PlainSystem):
                 wrench = self._sensor_wrench.Eval(context).get_coeffs()
                 self._wrench_C_from_S.dot(wrench, out=room.sensor_wrench.reshape(6))
         room.measured[:] = self._joint_positions.Eval(context)
-        state = context.get_discrete_state()
-        room.q[:] = state.value(self._positions_state)
-        room.moving[:] = state.value(self._moving_state)
+        # They hold the state.
+        positions = discrete_state.get_mutable_value(self._positions_state)
+        moving = discrete_state.get_mutable_value(self._moving_state)
+        room.q[:], room.moving[:] = positions, moving
         if not room.run():
             raise RuntimeError(
                 f"{self.GetSystemPathname()}: the virtual model has no finite acceleration at "
@@ -365,8 +366,7 @@ class ComplianceController(PlainSystem):
                 f"{room.u.reshape(6)}). An input is not finite, or the loop has diverged: lower "
                 "error_scale or the stiffness."
             )
-        discrete_state.set_value(self._positions_state, room.q)
-        discrete_state.set_value(self._moving_state, room.moving)
+        positions[:], moving[:] = room.q, room.moving
 
     def _calc_settings(self, context: Context) -> ComplianceUpdate:
         """Returns the room, its settings as the ports say."""

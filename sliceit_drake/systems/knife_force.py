@@ -1,6 +1,5 @@
 """The ports that every cutting system has; a subclass says what force the food gives."""
 
-import copy
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -204,6 +203,6 @@ class AppliedForce(PlainSystem):
         declare_output(self, "applied_force", forces, self._forces, {self._wrench.ticket()})
 
     def _forces(self, context: Context) -> list[ExternallyAppliedSpatialForce]:
-        force = copy.copy(self._no_force)
+        force = self._no_force.__copy__()
         force.F_Bq_W = SpatialForce(self._wrench.Eval(context))
         return [force]
