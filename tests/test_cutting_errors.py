@@ -6,7 +6,7 @@ import pytest
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
-from sliceit_drake.cutting.foods.shapes import Box, MeshFile
+from sliceit_drake.cutting.foods.shapes import Box, Cylinder, MeshFile, Remainder
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.mesh.generators import box_mesh
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError, TetrahedralMesh
@@ -128,6 +128,7 @@ def test_a_mesh_file_in_millimetres_names_food_and_factor(tmp_path):
     path = tmp_path / "food.vtk"
     meshio.Mesh(1000.0 * mesh.vertices, [("tetra", mesh.tetrahedra)]).write(path)
     food = Food(name="radish", shape=MeshFile(path=str(path)), cut_point=[0.0, 0.01, 0.0])
+    food.held_sides = "none"
     with pytest.raises(MeshError, match=r"food\.shape of radish.*millimetres\? Scale it by 0\.001"):
         make_food_model(food, Knife(), Numerics())
     food.shape.scale = 1e-3
@@ -148,6 +149,67 @@ def test_a_plane_that_misses_the_food_says_where_the_food_is():
 def test_holding_everything_at_the_cut_is_refused(distance):
     with pytest.raises(ConfigurationError, match=r"food\.hold.*held.*farther from the cut plane"):
         cut(cut_point=[0.0, 2e-3, 0.0], hold_distance=distance)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"hold_distance": 0.04}, r"food\.hold_distance: 0\.04 m.*minus end.*less than 0\.03,"),
+        (
+            {"held_sides": "plus", "hold_distance": 0.05},
+            r"food\.hold_distance: 0\.05 m.*plus end.*less than 0\.03, or hold another side",
+        ),
+        (
+            {"hold_distance_minus": 0.03},
+            r"food\.hold_distance_minus: 0\.03 m.*minus end of",
+        ),
+    ],
+)
+def test_a_clamp_beyond_the_end_of_the_food_is_refused(changes, words):
+    with pytest.raises(ConfigurationError, match=words):
+        cut(**changes)
+
+
+def test_each_side_is_held_from_its_own_distance_on():
+    food = Food(shape=SMALL, hold_distance=0.010, hold_distance_minus=0.02)
+    y = (mesh := SMALL.mesh()).vertices[:, 1]
+    assert np.array_equal(food.held(mesh), (y > 0.010) | (y < -0.02))
+    food.held_sides = "minus"
+    assert np.array_equal(food.held(mesh), y < -0.02)
+    food.hold_distance_minus = None
+    assert np.array_equal(food.held(mesh), y < -0.010)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        Cylinder(diameter=0.03, length=0.1, rings=3),
+        SMALL,
+        Remainder(Cylinder(diameter=0.03, length=0.1, rings=3), position=-0.03),
+    ],
+)
+@pytest.mark.parametrize("refinement", [1.0, 2.0])
+def test_a_food_is_held_where_it_is_said_also_beyond_its_layers(shape, refinement):
+    for distance in (0.0119, 0.0122, 0.0197, 0.025):
+        food = Food(shape=shape, held_sides="plus", hold_distance=distance)
+        mesh = food.mesh(refinement)
+        mesh.check()
+        y = mesh.vertices[:, 1]
+        first = y[food.held(mesh)].min()
+        assert distance < first < distance + 2e-4
+        # No element is a sliver, and none is long, from the cut to the clamp.
+        steps = np.diff(np.unique(y[(y >= 0.0) & (y < first + 1e-9)]))
+        assert 1e-3 < steps.min() and steps.max() < 0.0145 / refinement
+    near = Food(shape=shape, held_sides="plus", hold_distance=0.0119)
+    assert np.array_equal(near.mesh().vertices, shape.mesh().vertices)
+
+
+def test_a_food_that_nothing_holds_is_warned_of():
+    slippery = Numerics(board_friction=0.0)
+    (warning,) = cut(slippery, held_sides="none").model.warnings
+    assert "board_friction = 0: nothing holds the food" in warning
+    assert not cut(held_sides="none").model.warnings
+    assert not cut(slippery, held_sides="minus").model.warnings
 
 
 def test_a_step_beyond_the_limit_names_the_limit_and_the_ways_out():

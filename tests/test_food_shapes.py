@@ -1,4 +1,5 @@
-"""Shapes of foods: tapered roots against the closed form, and what slices leave of each shape."""
+"""Shapes of foods: roots and half cylinders against the closed form, and what slices leave of each
+shape."""
 
 import numpy as np
 import pytest
@@ -8,7 +9,14 @@ from split_measures import area_of_section, material_volumes
 from sliceit_drake.configuration import ConfigurationError, validate
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
-from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid, Remainder, Tapered
+from sliceit_drake.cutting.foods.shapes import (
+    Box,
+    Cylinder,
+    Ellipsoid,
+    HalfCylinder,
+    Remainder,
+    Tapered,
+)
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.mesh.manifold import bodies
 from sliceit_drake.cutting.mesh.split import CutPlane, split_mesh
@@ -17,13 +25,16 @@ from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.diagrams.sequence import SliceSequence
 
 CARROT = Tapered(diameters=[0.014, 0.030], length=0.12)
+HALF = HalfCylinder(radius=0.018, length=0.09, rings=4)
 UP = np.array([0.0, 0.0, 1.0])
 
 SHAPES = {
     "cylinder": Cylinder(diameter=0.03, length=0.08),
+    "half cylinder": HALF,
     "box": Box(size=[0.03, 0.08, 0.02], divisions=[6, 4]),
     "ellipsoid": Ellipsoid(diameters=[0.04, 0.08, 0.03], refinements=2),
     "tapered": Tapered(diameters=[0.015, 0.03], length=0.08),
@@ -34,6 +45,8 @@ def section_area(shape, y: float) -> float:
     """In closed form, m^2."""
     if isinstance(shape, Cylinder):
         return 0.25 * np.pi * shape.diameter**2
+    if isinstance(shape, HalfCylinder):
+        return 0.5 * np.pi * shape.radius**2
     if isinstance(shape, Box):
         return shape.size[0] * shape.size[2]
     if isinstance(shape, Ellipsoid):
@@ -87,6 +100,67 @@ def test_the_outline_of_a_tapered_food_converges_with_the_square_of_its_rings():
 def test_a_pointed_tapered_food_is_refused_with_the_thinnest_end_that_it_can_have():
     with pytest.raises(ConfigurationError, match=r"shape\.diameters\[1\].*too thin.*least 0\.009"):
         validate(Tapered(diameters=[0.03, 0.006]), "shape")
+
+
+@pytest.mark.parametrize("refinement", [0.5, 1.0, 2.0])
+def test_a_half_cylinder_has_the_volume_and_the_sections_of_half_a_cylinder(refinement):
+    mesh = HALF.mesh(refinement)
+    mesh.check()
+    mesh.check_solid()
+    exact = section_area(HALF, 0.0)
+    assert mesh.volumes().sum() == pytest.approx(exact * HALF.length, rel=1e-12)
+    for y in (-0.03, 1e-3, 0.04):
+        split = split_mesh(mesh, CutPlane(np.array([0.0, y, 0.0]), np.array([0, 1.0, 0]), UP))
+        assert area_of_section(split) == pytest.approx(exact, rel=1e-9)
+    # On its flat side, as wide as twice its height.
+    v, r = mesh.vertices, HALF.radius
+    assert v[:, 2].min() == pytest.approx(0.0, abs=1e-15)
+    assert np.ptp(v[v[:, 2] < 1e-12, 0]) == pytest.approx(2.0 * r, rel=0.025)
+    assert v[:, 2].max() == pytest.approx(r, rel=0.025)
+
+
+def quality(mesh: TetrahedralMesh) -> np.ndarray:
+    """Volume over that of a regular tetrahedron with the same mean square edge [T]."""
+    corners = mesh.vertices[mesh.tetrahedra]
+    square = ((corners[:, :, None] - corners[:, None]) ** 2).sum((1, 2, 3)) / 12.0
+    return 6.0 * np.sqrt(2.0) * mesh.volumes() / square**1.5
+
+
+def test_elements_of_a_half_cylinder_are_as_good_as_those_of_a_whole_one():
+    whole = Cylinder(2.0 * HALF.radius, HALF.length, HALF.rings, HALF.layers)
+    half, full = quality(HALF.mesh()), quality(whole.mesh())
+    assert len(full) == 2 * len(half)
+    np.testing.assert_allclose(np.sort(np.tile(half, 2)), np.sort(full), rtol=0.05)
+    # Beside the cut; the layers behind it are thick.
+    assert np.median(half) > 0.1
+
+
+def test_pressing_through_the_half_cylinder_of_a_scenario_takes_toughness_times_its_area():
+    shape = "!HalfCylinder {radius: 0.012, length: 0.06, rings: 4}"
+    scenario = load_scenario(
+        "cucumber_measured",
+        f"{{food: {{shape: {shape}, material: {{friction: 0.0}}, effects: {{}}}}}}",
+    )
+    assert isinstance(scenario.food, Food)
+    model = make_food_model(scenario.food, scenario.knife, scenario.numerics)
+    plan = MotionPlan([ConstantSpeed(distance=model.top + 1e-3, speed=0.02)])
+    result = simulate_slice(CuttingSolver(model, 2e-3), Motion(plan, start_pose(model, 5e-4)))
+    assert result.cut[-1] > 0.999
+    needed = scenario.food.material.toughness * 0.5 * np.pi * 0.012**2
+    assert result.balance.edge + result.balance.opening == pytest.approx(needed, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("tag", "fix"),
+    [
+        ("!Half_Cylinder", 'Did you mean "!HalfCylinder"'),
+        ("!Elipsoid", 'Did you mean "!Ellipsoid"'),
+        ("!Plate", "Known: !Cylinder, !HalfCylinder, !Box"),
+    ],
+)
+def test_a_shape_that_is_not_known_is_refused_with_the_one_that_is_meant(tag, fix):
+    with pytest.raises(ConfigurationError, match=rf"food\.shape: unknown tag {tag}\. {fix}"):
+        load_scenario("cucumber_measured", f"{{food: {{shape: {tag} {{}}}}}}")
 
 
 def sliced(name: str) -> tuple[SliceSequence, Food]:

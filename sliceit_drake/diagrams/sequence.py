@@ -145,7 +145,8 @@ class SliceSequence:
             raise ConfigurationError(
                 "has no body that a sequence can slice",
                 field=f"{where}.food",
-                fix="Give a finite-element food with a Cylinder, Box, Ellipsoid or Tapered.",
+                fix="Give a finite-element food with a Cylinder, HalfCylinder, Box, Ellipsoid or "
+                "Tapered.",
             )
         if food.held_sides != "plus":
             raise ConfigurationError(

@@ -45,8 +45,8 @@ class FoodFacts:
     """
 
     name: str = "unknown"
-    shape: str = choice("unknown", ("cylinder", "box", "ellipsoid", "unknown"))
-    """A cylinder lies along Fy."""
+    shape: str = choice("unknown", ("cylinder", "halfcylinder", "box", "ellipsoid", "unknown"))
+    """Cylinders and halves of them lie along Fy."""
     size: list[float] | None = quantity(None, "m", low=1e-3, high=1.0, size=3)
     """Extent along Fx, Fy, Fz."""
     support: str = choice("unknown", ("clamped_slab", "end_slice", "unknown"))

@@ -157,7 +157,7 @@ class FiniteElementWorld:
         """
         protocol, condition = self.protocol, specimen.condition
         food = scaled_food(protocol.food, condition.width_scale)
-        mesh = food.shape.mesh(self.settings.refinement)
+        mesh = food.mesh(self.settings.refinement)
         nominal = self._section(food, mesh)
         low, high = nominal.model.span
         facts = SliceTruth(

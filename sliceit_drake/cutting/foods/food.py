@@ -5,13 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
-from sliceit_drake.configuration import choice, quantity
+from sliceit_drake.configuration import ConfigurationError, choice, quantity
 from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.foods.shapes import (
     Box,
     Cylinder,
     Ellipsoid,
+    HalfCylinder,
     MeshFile,
     PlainShape,
     Remainder,
@@ -35,7 +36,7 @@ class Food:
     """
 
     name: str = "cucumber"
-    shape: Cylinder | Box | Ellipsoid | Tapered | MeshFile | Remainder = dc.field(
+    shape: Cylinder | HalfCylinder | Box | Ellipsoid | Tapered | MeshFile | Remainder = dc.field(
         default_factory=Cylinder
     )
     material: Material = dc.field(default_factory=Material)
@@ -47,7 +48,9 @@ class Food:
     held_sides: str = choice("both", ("both", "minus", "plus", "none"))
     """Sides of the cut that are held; plus is the side that the normal points to."""
     hold_distance: float = quantity(0.0119, "m", low=0.0, high=1.0)
-    """Held material is farther than this from the cut."""
+    """Held material is farther than this from the cut: where clamp, fingers or holder begin."""
+    hold_distance_minus: float | None = quantity(None, "m", low=0.0, high=1.0)
+    """The same on the minus side, where that is held; null: as `hold_distance`."""
 
     def look_beside(self, file: str | Path) -> None:
         """Lets a mesh be found beside the file that this food was read from."""
@@ -60,15 +63,46 @@ class Food:
             np.array(self.cut_point, float), np.array(self.cut_normal, float), np.array([0, 0, 1.0])
         )
 
+    def clamps(self) -> dict[str, float]:
+        """Distance from the cut at which each side that is held begins to be, metres."""
+        plus, minus = self.hold_distance, self.hold_distance_minus
+        starts = {"minus": plus if minus is None else minus, "plus": plus}
+        return {side: d for side, d in starts.items() if self.held_sides in ("both", side)}
+
+    def mesh(self, refinement: float = 1.0) -> TetrahedralMesh:
+        """The mesh of its shape; what has layers of elements gets more, up to where it is held."""
+        shape, clamps = self.shape, self.clamps()
+        if clamps and not isinstance(shape, Ellipsoid | MeshFile):
+            far = abs(self.cut_point[1]) + max(clamps.values()) + 1e-9
+            edge = (shape.body if isinstance(shape, Remainder) else shape).section_edge
+            if far > max(shape.layers, default=0.0):
+                near = [d for d in shape.layers if d < far - 0.5 * edge] or [0.0]
+                more = int(np.ceil(0.5 * (far - near[-1]) / edge))
+                rest = np.linspace(near[-1], far, more + 1)[1:].tolist()
+                shape = dc.replace(shape, layers=near + rest)
+        return shape.mesh(refinement)
+
     def held(self, mesh: TetrahedralMesh) -> np.ndarray:
-        """Vertices that are held [V]."""
+        """Vertices that are held [V].
+
+        Raises:
+            ConfigurationError: The food ends before a clamp begins.
+        """
         normal = np.array(self.cut_normal, float)
         distance = (mesh.vertices - self.cut_point) @ (normal / np.linalg.norm(normal))
         held = np.zeros(len(distance), bool)
-        if self.held_sides in ("both", "minus"):
-            held |= distance < -self.hold_distance
-        if self.held_sides in ("both", "plus"):
-            held |= distance > self.hold_distance
+        for side, start in self.clamps().items():
+            away = distance if side == "plus" else -distance
+            # A plane that misses the food is another error.
+            if away.min() < 0.0 < away.max() <= start:
+                own = side == "minus" and self.hold_distance_minus is not None
+                raise ConfigurationError(
+                    f"{start:.4g} m lies beyond the {side} end of the food, {away.max():.4g} m from"
+                    " the cut: nothing is held there",
+                    field="food.hold_distance" + ("_minus" if own else ""),
+                    fix=f"Give less than {away.max():.4g}, or hold another side (food.held_sides).",
+                )
+            held |= away > start
         return held
 
 
@@ -95,7 +129,7 @@ def make_food_geometry(food: Food, refinement: float = 1.0) -> CutGeometry:
     Raises:
         MeshError, ConfigurationError: As `make_cut_geometry`.
     """
-    mesh = food.shape.mesh(refinement)
+    mesh = food.mesh(refinement)
     where = f"food.shape of {food.name}"
     if isinstance(food.shape, MeshFile):
         where += f" ({food.shape.path})"

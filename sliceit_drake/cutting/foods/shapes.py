@@ -17,7 +17,16 @@ from sliceit_drake.cutting.mesh.generators import (
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError, TetrahedralMesh
 from sliceit_drake.resources import file_or_resource
 
-__all__ = ["Box", "Cylinder", "Ellipsoid", "MeshFile", "PlainShape", "Remainder", "Tapered"]
+__all__ = [
+    "Box",
+    "Cylinder",
+    "Ellipsoid",
+    "HalfCylinder",
+    "MeshFile",
+    "PlainShape",
+    "Remainder",
+    "Tapered",
+]
 
 MIN_END_RADIUS = 0.3
 """Least radius of a flat end over the greatest, of sliced ellipsoids and tapered foods: towards a
@@ -111,8 +120,38 @@ class Cylinder(PlainShape):
 
 
 @dc.dataclass
+class HalfCylinder(PlainShape):
+    """Half a cylinder along Fy, on its flat side, meshed in rings and graded layers."""
+
+    radius: float = quantity(0.025, "m", low=2.5e-3, high=0.15)
+    """Radius, which is its height."""
+    length: float = quantity(0.1, "m", low=1e-2, high=1.0)
+    """Length."""
+    rings: int = quantity(6, "", low=2, high=40)
+    """Rings of elements across the radius."""
+    layers: list[float] = quantity([0.0, 2.8e-3, 6.4e-3, 12e-3], "m", low=0.0, high=0.5)
+    """Distances of the element layers from y = 0, on both sides; the rest is one layer, and layers
+    beyond the food's end are left out."""
+
+    @property
+    def extent(self) -> list[float]:
+        return [2.0 * self.radius, self.length, self.radius]
+
+    def resized(self, extent: Sequence[float]) -> "HalfCylinder":
+        return dc.replace(self, length=extent[1], radius=extent[2])
+
+    def between(self, y: np.ndarray, refinement: float) -> TetrahedralMesh:
+        rings = max(2, round(self.rings * refinement))
+        return cylinder_mesh(2.0 * self.radius, y, rings, half=True)
+
+    @property
+    def section_edge(self) -> float:
+        return self.radius / self.rings
+
+
+@dc.dataclass
 class Box(PlainShape):
-    """A box with axes of F, centred in x, meshed on a grid."""
+    """A box or plate with axes of F, centred in x, meshed on a grid."""
 
     size: list[float] = quantity([0.027, 0.12, 0.027], "m", low=2e-3, high=1.0, size=3)
     """Extent along x, y, z."""
@@ -308,7 +347,7 @@ class Remainder:
     the cut is the plane y = 0 and the next slice lies on the side y < 0.
     """
 
-    body: Cylinder | Box | Ellipsoid | Tapered = dc.field(default_factory=Cylinder)
+    body: Cylinder | HalfCylinder | Box | Ellipsoid | Tapered = dc.field(default_factory=Cylinder)
     position: float = quantity(0.0, "m", low=-0.5, high=0.5)
     """Place of the next cut, y in the frame of the whole body."""
     thickness: float = quantity(5e-3, "m", low=5e-4, high=0.5)

@@ -59,19 +59,29 @@ def _disc(rings: int) -> tuple[np.ndarray, np.ndarray]:
     return np.array(points), np.array(triangles)
 
 
-def cylinder_mesh(diameter: float, layers: np.ndarray, rings: int) -> TetrahedralMesh:
+def cylinder_mesh(
+    diameter: float, layers: np.ndarray, rings: int, half: bool = False
+) -> TetrahedralMesh:
     """A cylinder along y that lies on z = 0.
 
     Args:
         diameter: Diameter, metres.
         layers: Increasing y coordinates of the mesh layers [L], metres; grade them towards the cut.
         rings: Concentric rings of the section; edges are about diameter / (2 rings).
+        half: Whether only its upper half, on its flat side.
     """
     section, triangles = _disc(rings)
     # The polygon has the circle's area: its corners stand out as much as its sides cut in.
     corners = 6 * rings
     radius = 0.5 * diameter * np.sqrt(np.pi / (0.5 * corners * np.sin(2.0 * np.pi / corners)))
-    section = radius * (section + [0.0, 1.0])
+    if half:
+        # Three of the six sectors, which begin along x once both axes are exchanged.
+        section = section[:, ::-1]
+        upper = triangles[section[triangles, 1].mean(1) > 0.0]
+        used, triangles = np.unique(upper, return_inverse=True)
+        section, triangles = radius * section[used], triangles.reshape(-1, 3)
+    else:
+        section = radius * (section + [0.0, 1.0])
     return _extruded(section, triangles, np.asarray(layers, float))
 
 
