@@ -8,7 +8,7 @@ import pytest
 from held_reaction import held_reaction
 from scipy.optimize import curve_fit
 
-from sliceit_drake.configuration import ConfigurationError, load_yaml
+from sliceit_drake.configuration import ConfigurationError, load_yaml, validate
 from sliceit_drake.cutting.batch import BatchSlice, simulate_batch
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.foods.effects import (
@@ -27,7 +27,7 @@ from sliceit_drake.cutting.foods.effects import (
 )
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
-from sliceit_drake.cutting.foods.shapes import Box, Cylinder
+from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan, Retract
@@ -87,8 +87,8 @@ NULLS = {
     "toughness_rate": Effects(toughness_rate=ToughnessRate(0.0, 0.3)),
     "relaxation": Effects(relaxation=Relaxation([0.0, 0.0], [0.01, 3.0])),
     "skin": Effects(skin=Skin(0.0, 2e-3)),
-    "core": Effects(core=Core(2e-3, 5e-4)),
-    "centre": Effects(centre=Centre(2e-3, 5e-4)),
+    "core": Effects(core=Core(2e-3, 5e-4, offset=[1e-3, -1e-3])),
+    "centre": Effects(centre=Centre(2e-3, 5e-4, offset=[0.0, 1e-3])),
     "bluntness": Effects(bluntness=Bluntness(0.0, 7e-3, 0.0, 2.0, 100)),
     "a sharpened knife": Effects(bluntness=Bluntness(dulling=200.0, dulling_exponent=0.5)),
     "adhesion": Effects(adhesion=Adhesion(0.0, 0.0)),
@@ -224,6 +224,81 @@ def test_a_centre_changes_the_force_on_top_of_the_core_around_it():
     relative = other.edge[inside, 2].mean() / homogeneous.edge[inside, 2].mean()
     assert relative == pytest.approx(1.0, rel=0.03)
     assert base.edge[inside, 2].mean() < 0.8 * other.edge[inside, 2].mean()
+
+
+def test_a_core_off_the_middle_is_tough_and_stiff_where_it_lies():
+    food = Food(shape=Cylinder(diameter=0.04, length=0.08, rings=6))
+    around, ratio, offset = 0.012, 3.0, np.array([0.004, -0.006])
+    food.effects.core = Core(around, 1e-4, ratio, ratio, offset=offset.tolist())
+    food.effects.centre = Centre(around, 1e-4, 2.0, offset=(-offset).tolist())
+    model = make_food_model(food, Knife(), Numerics())
+
+    def inside(places: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        """1 in a circle around what was the middle, 0 beyond it, NaN at its border."""
+        r = np.hypot(*(places[:, [0, 2]] - [0.0, 0.02] - offset).T)
+        core = 0.02 - around
+        return np.select([r < 0.93 * core, r > 1.03 * core], [1.0, 0.0], np.nan)
+
+    points, elements = model.split.points, model.nodes[model.tetrahedra].mean(1)
+    factors = (1.0 + (ratio - 1.0) * inside(points, offset)) * (1.0 + inside(points, -offset))
+    known = ~np.isnan(factors)
+    assert set(factors[known]) >= {1.0, ratio, 2.0}
+    toughness = model.toughness / food.material.toughness
+    np.testing.assert_allclose(toughness[known], factors[known], rtol=1e-3)
+    stiffer = 1.0 + (ratio - 1.0) * inside(elements, offset)
+    known = ~np.isnan(stiffer)
+    assert set(stiffer[known]) == {1.0, ratio}
+    found = model.element_volume / model.stiff_volume
+    np.testing.assert_allclose(found[known], stiffer[known], rtol=1e-3)
+
+
+def test_what_lies_outside_of_the_section_is_no_core():
+    # Behind a cut near the end of an ellipsoid it is thicker than at the cut.
+    food = Food(
+        shape=Ellipsoid([0.04, 0.06, 0.04], refinements=2),
+        cut_point=[0.0, -0.022, 0.0],
+        held_sides="plus",
+        hold_distance=0.02,
+        effects=Effects(core=Core(1e-3, 1e-4, stiffness_ratio=3.0)),
+    )
+    model = make_food_model(food, Knife(), Numerics())
+    radius = 0.02 * np.sqrt(1.0 - (0.022 / 0.03) ** 2)
+    centroids = model.nodes[model.tetrahedra].mean(1)
+    outside = np.hypot(centroids[:, 0], centroids[:, 2] - 0.02) > radius
+    assert outside.any() and not outside.all()
+    stiffer = model.element_volume / model.stiff_volume
+    np.testing.assert_allclose(stiffer[outside], 1.0, rtol=1e-6)
+    assert (stiffer[~outside] > 2.9).any()
+
+
+def test_the_force_meets_a_core_above_the_middle_earlier():
+    up = HEIGHT / 5  # A row of elements: the core is interpolated between cut points.
+    base, middle, above = (
+        simulate(bar(), Effects(core=Core(5e-3, 1e-4, 0.4, offset=[0.0, offset])), press(0.012))
+        if offset is not None
+        else simulate(bar(), Effects(), press(0.012))
+        for offset in (None, 0.0, up)
+    )
+
+    def ratio(other: SliceResult, depth: float) -> float:
+        """Force over that without a core, around a depth."""
+        near = np.abs(depth_of(other) - depth) < 1e-3
+        return float((other.edge[near, 2] / base.edge[near, 2]).mean())
+
+    assert ratio(middle, 0.01) == pytest.approx(ratio(above, 0.01 - up), rel=0.03)
+    assert ratio(middle, 0.01 - up) - ratio(middle, 0.01) > 0.15
+
+
+@pytest.mark.parametrize(
+    ("effects", "words"),
+    [
+        (Effects(core=Core(rind=3e-3, offset=[3e-3, 1e-3])), r"core\.offset.*rind leaves 0\.003 m"),
+        (Effects(centre=Centre(offset=[0.0, -0.02])), r"centre\.offset.*at most 0\.018 m"),
+    ],
+)
+def test_an_inner_part_that_is_moved_out_of_the_food_is_refused(effects, words):
+    with pytest.raises(ConfigurationError, match=words):
+        validate(effects, "food.effects")
 
 
 def test_a_blunt_edge_asks_for_more_where_it_enters_and_a_draw_relieves_it():

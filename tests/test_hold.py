@@ -116,3 +116,17 @@ def test_a_sudden_stop_from_high_speed_gives_the_force_of_small_steps():
         return float(np.sqrt(np.mean(difference**2)) / reference.mean())
 
     assert error(1e-3) < 0.01 < error(1e-3, step_by_need=False)
+
+
+@pytest.mark.parametrize(
+    ("held_sides", "poisson_ratio", "damping_time"),
+    [("none", 0.45, 4e-6), ("plus", 0.48, 4e-6), ("plus", 0.37, 1e-3), ("none", 0.37, 1e-3)],
+)
+def test_a_food_with_a_free_half_rests_at_the_longest_step(held_sides, poisson_ratio, damping_time):
+    # A free part may dilate as a whole, which no other part of the food resists.
+    food = Food(shape=SHAPE, held_sides=held_sides, hold_distance=0.03)
+    food.material.youngs_modulus = 6e5
+    food.material.poisson_ratio, food.material.damping_time = poisson_ratio, damping_time
+    solver, coupling_steps, _, poses = follow([Hold(duration=0.3)], food, 1e-3)
+    kinetic = [solver.energies(coupling_steps[k].state, poses[0]).kinetic for k in (4, 9, 99, 149)]
+    assert 0.0 < kinetic[-1] < 0.2 * max(kinetic[:2])

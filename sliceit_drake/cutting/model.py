@@ -6,7 +6,8 @@ import functools
 from typing import Any, Self
 
 import numpy as np
-from scipy.sparse import csc_array
+from scipy.sparse import csc_array, kron
+from scipy.sparse.linalg import eigsh
 from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import choice, quantity
@@ -30,6 +31,10 @@ GRAVITY = 9.81
 
 SLIVER = 0.1
 """Fraction of a vertex's mass below which a node of one side does not set the step."""
+
+
+BULK_SHARE = 0.95
+"""Share of the stepped masses that the bulk may need where a half of the food is free."""
 
 
 class TimeStepError(ValueError):
@@ -128,9 +133,9 @@ class CuttingModel(CutGeometry):
         self.weight = -GRAVITY * material.density * self.weight_volume[:, None] * self.up
         self.toughness = material.toughness * self.point_scales.toughness
         for part in (effects.core, effects.centre):
-            inside = part.share(self.point_distance)
+            inside = part.share(self.distances_inside(part.offset)[0])
             self.toughness = self.toughness * (1.0 + (part.toughness_ratio - 1.0) * inside)
-        inside = effects.core.share(self.element_distance)
+        inside = effects.core.share(self.distances_inside(effects.core.offset)[1])
         stiffer = effects.core.stiffness_ratio - 1.0
         self.element_volume = self.stiff_volume * (1.0 + stiffer * inside)
         # Never flatter than the rise of the force on the way in: a retreat must not return more
@@ -220,7 +225,8 @@ class CuttingModel(CutGeometry):
         if self._inertia_of is not None:
             return self._inertia_of.with_step(numerics.time_step).inertia
         if numerics.mass_scaling:
-            return Inertia(self._scaled_masses(numerics.time_step / numerics.stability_margin))
+            matrix = self._scaled_masses(numerics.time_step / numerics.stability_margin)
+            return Inertia(matrix * max(1.0, self._bulk_share(matrix) / BULK_SHARE))
         stiff, viscous = self._stiffness_bounds()
         x = self.critical_time_step / numerics.stability_margin
         needed = np.where(self._slivers, (stiff * x + viscous) * x, 0.0)
@@ -264,6 +270,31 @@ class CuttingModel(CutGeometry):
         parts = [(self.tetrahedra, bulk), (self.point_nodes, points)]
         return assemble(self.moving, parts, self.true_mass + board)
 
+    def _bulk_share(self, mass: csc_array) -> float:
+        """Share of a mass matrix [K, K] that the bulk's stiffness and damping need, at most.
+
+        (lam + 2 mu) grad u : grad u bounds the bulk's energy where the surface is held; a part that
+        is free may dilate as a whole, by up to 3 lam + 2 mu. 0 where both halves are held.
+        """
+        held = np.delete(self.split.node_side, self.computed[self.moving])
+        if np.bincount(held, minlength=2).all():
+            return 0.0
+        mu, lam = self.material.lame()
+        half = 0.5 * self.numerics.time_step
+        modulus = (half**2 + half * self.parameters["damping_time"]) * self.element_volume
+        g = np.concatenate([-self.inverse.sum(1, keepdims=True), self.inverse], axis=1)
+        outer = g[:, :, :, None, None] * g[:, None, None]
+        same = self._gradient_products[1][:, :, None, :, None] * np.eye(3)[:, None]
+        part = lam * outer + mu * (outer.swapaxes(2, 4) + same)
+        part = modulus[:, None, None] * part.reshape(-1, 12, 12)
+        along = np.arange(3)
+        nodes = (3 * self.tetrahedra[:, :, None] + along).reshape(-1, 12)
+        moving = (3 * self.moving[:, None] + along).ravel()
+        bulk = assemble(moving, [(nodes, part)], np.zeros(self.nodes.size))
+        start = np.random.default_rng(0).normal(size=len(moving))
+        whole = kron(mass, np.eye(3), format="csc")
+        return float(eigsh(bulk, 1, whole, v0=start, tol=1e-2, return_eigenvectors=False)[0])
+
     def _stiffness_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Gershgorin's bounds of a quarter of the stiffness, N/m, and of half the damping, Ns/m, of
         each node [N]."""
@@ -299,17 +330,24 @@ class CuttingModel(CutGeometry):
     @property
     def warnings(self) -> tuple[str, ...]:
         """Where the computation departs from what the user gave, and how to mend it."""
+        texts = []
+        if len(self.moving) == len(self.computed) and self.numerics.board_friction == 0.0:
+            texts.append(
+                "food.held_sides = none and numerics.board_friction = 0: nothing holds the food, "
+                "and a draw pushes it away. Hold a side, or give the board friction, as 0.3."
+            )
         wanted, used = self.material.strength, self.strength
         if used >= wanted:
-            return ()
+            return tuple(texts)
         stiffness = self.numerics.bond_stiffness * (wanted / used) ** 2
-        return (
+        texts.append(
             f"material.strength = {wanted:.4g} Pa is more than bonds of "
             f"{self.material.toughness:g} J/m2 hold on elements of {1e3 * self.element_size:.3g} "
             f"mm: the faces part at {used:.4g} Pa, with the same toughness. Give strength: "
             f"{0.999 * used:.4g}, or numerics.bond_stiffness: {stiffness:.3g} and a sub-step to "
-            "match.",
+            "match."
         )
+        return tuple(texts)
 
     def edge_forces(self) -> np.ndarray:
         """Greatest force of the edge at each cut point on the grid of its tables [P, G], N.

@@ -99,6 +99,11 @@ class Core:
     """Core over rind."""
     stiffness_ratio: float = quantity(1.0, "", low=0.01, high=10.0)
     """Core over rind."""
+    offset: list[float] = quantity([0.0, 0.0], "m", low=-0.1, high=0.1, size=2)
+    """How far off the middle, along the edge and upwards (x and z of the cut's frame C)."""
+
+    def check(self, where: str) -> None:
+        _check_offset(self.offset, self.rind, "rind", where)
 
     def share(self, distance: np.ndarray) -> np.ndarray:
         """How much of the core is at a distance from the outside: 0 outside, 1 inside."""
@@ -115,10 +120,25 @@ class Centre:
     """Width of the transition."""
     toughness_ratio: float = quantity(1.0, "", low=0.01, high=100.0)
     """Middle over what is around it."""
+    offset: list[float] = quantity([0.0, 0.0], "m", low=-0.1, high=0.1, size=2)
+    """How far off the food's middle, along the edge and upwards (x and z of the cut's frame C)."""
+
+    def check(self, where: str) -> None:
+        _check_offset(self.offset, self.distance, "distance", where)
 
     def share(self, distance: np.ndarray) -> np.ndarray:
         """How much of the middle is at a distance from the outside: 0 outside, 1 inside."""
         return _inside(distance, self.distance, self.transition)
+
+
+def _check_offset(offset: list[float], around: float, name: str, where: str) -> None:
+    """Refuses an inner part that is moved out of the food."""
+    if float(np.hypot(*offset)) > around:
+        raise ConfigurationError(
+            f"{offset} m moves it out of the food, of which {name} leaves {around:g} m around it",
+            field=f"{where}.offset",
+            fix=f"Give an offset of at most {around:g} m, or a greater {where}.{name}.",
+        )
 
 
 def _inside(distance: np.ndarray, start: float, width: float) -> np.ndarray:

@@ -50,7 +50,8 @@ class CutGeometry:
         node_volume: Material volume lumped to the nodes [N], m^3.
         weight_volume: The same for weight, which acts at the material's centroids [N], m^3.
         vertex_volume: Lumped volume of each node's vertex in the uncut mesh [N], m^3.
-        element_distance: Distance of the elements' centroids from the outline, inwards [T], metres.
+        element_distance: Distance of the elements' centroids from the outline, inwards [T], metres;
+            negative outside.
         tables: Edge tables of the cut points.
         point_nodes, point_weights: Embedding of cut points [P, 4] (minus ends, plus ends), [P, 2].
         point_depth: Depth of the cut points below the outline [P], metres.
@@ -143,6 +144,18 @@ class CutGeometry:
         x = self.nodes[corners.transpose(0, 3, 1, 2)]
         inverse = np.linalg.inv((x[..., 1:, :] - x[..., :1, :]).swapaxes(-1, -2))
         return inverse.reshape(*inverse.shape[:2], -1).transpose(0, 2, 1)
+
+    def distances_inside(self, offset: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+        """`point_distance` [P] and `element_distance` [T] from an outline that is moved by `offset`
+        along x and z of C [2], metres."""
+        if not any(offset):
+            return self.point_distance, self.element_distance
+        section = self.split.points[:, [0, 2]]
+        places = (section, self.nodes[self.tetrahedra].mean(1)[:, [0, 2]])
+        points, elements = (
+            distance_inside(section, self.split.triangles, each - offset) for each in places
+        )
+        return points, elements
 
     def to_cut_frame(self, p_F: np.ndarray) -> np.ndarray:
         """Points [..., 3] from F to C."""

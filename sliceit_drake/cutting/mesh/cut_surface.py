@@ -137,12 +137,18 @@ def depth_below(points: np.ndarray, triangles: np.ndarray, positions: np.ndarray
 
 
 def distance_inside(points: np.ndarray, triangles: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Distance of positions [M, 2] from the outline of the section [M], metres."""
+    """Distance of positions [M, 2] from the section's outline [M], metres; negative outside."""
     a, b = (points[_outline_edges(triangles)[:, k]] for k in (0, 1))
     along = b - a
     from_a = positions[:, None] - a
     w = np.clip((from_a * along).sum(-1) / (along**2).sum(-1), 0.0, 1.0)
-    return np.linalg.norm(from_a - w[..., None] * along, axis=-1).min(1)
+    distance = np.linalg.norm(from_a - w[..., None] * along, axis=-1).min(1)
+    # Outside a line upwards crosses the outline an even number of times.
+    x, z = positions[:, 0, None], positions[:, 1, None]
+    beside = (a[:, 0] > x) != (b[:, 0] > x)
+    rise = along[:, 1] / np.where(along[:, 0] == 0.0, 1.0, along[:, 0])
+    above = a[:, 1] + (x - a[:, 0]) * rise > z
+    return np.where((beside & above).sum(1) % 2, distance, -distance)
 
 
 def _outline_tables(points: np.ndarray, triangles: np.ndarray, grid_s: np.ndarray) -> np.ndarray:
