@@ -36,6 +36,8 @@ sliceit simulate --set food.material.toughness=300
 sliceit simulate --set calibration=potato,knife_name=nakiri
 sliceit simulate carrot_sequence --set "{food: {shape: !Tapered {diameters: [0.018, 0.034], length: 0.10}}}"
 sliceit simulate cucumber_measured --set "{food: {cut_normal: [0.2, 1.0, 0.1]}}"
+sliceit simulate cucumber_measured --set "{food: {shape: !HalfCylinder {radius: 0.025, length: 0.10}}}"
+sliceit simulate cucumber_measured --set "{food: {effects: {core: {rind: 0.006, toughness_ratio: 2.0, offset: [0.0, 0.004]}}}}"
 sliceit calibrate --show cucumber
 sliceit calibrate --show NAME
 sliceit diagram --ports
@@ -263,6 +265,7 @@ READ_ONLY = {
         python -m studies faster_draws docs/results/slicing_evaluation.jsonl docs/results/faster_draws.jsonl --output docs/results/learning.md
         python -m studies first_run --json docs/results/benchmarks/first_run.json
         python -m studies foods_page --cut --output docs/reference/foods.md
+        python -m studies foods_page --hold --output docs/reference/foods.md
         python -m studies learning_speed --output docs/results/learning.md --json docs/results/benchmarks/learning_speed.json
         python -m studies policy_and_motion models/policies/cutting_0 --output docs/results/learning.md
         python -m studies safety_layer

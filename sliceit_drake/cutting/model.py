@@ -225,8 +225,13 @@ class CuttingModel(CutGeometry):
         if self._inertia_of is not None:
             return self._inertia_of.with_step(numerics.time_step).inertia
         if numerics.mass_scaling:
-            matrix = self._scaled_masses(numerics.time_step / numerics.stability_margin)
-            return Inertia(matrix * max(1.0, self._bulk_share(matrix) / BULK_SHARE))
+            x = numerics.time_step / numerics.stability_margin
+            matrix = self._scaled_masses(x)
+            share = self._bulk_share(matrix)
+            if share > BULK_SHARE:
+                # By more than in proportion: what else is in the matrix stays.
+                matrix = self._scaled_masses(x, (share / BULK_SHARE) ** 1.5)
+            return Inertia(matrix)
         stiff, viscous = self._stiffness_bounds()
         x = self.critical_time_step / numerics.stability_margin
         needed = np.where(self._slivers, (stiff * x + viscous) * x, 0.0)
@@ -237,7 +242,7 @@ class CuttingModel(CutGeometry):
         """Whether a node is one [N]."""
         return np.asarray(self.node_volume < SLIVER * self.vertex_volume)
 
-    def _scaled_masses(self, x: float) -> csc_array:
+    def _scaled_masses(self, x: float, bulk_factor: float = 1.0) -> csc_array:
         """True masses and what keeps a step of `x` over the stability margin, s, stable, kg.
 
         With f = -K u - C v a step is stable if S >= (x / 2)^2 K + (x / 2) C. Every stiffness that
@@ -248,7 +253,7 @@ class CuttingModel(CutGeometry):
         square, half = 0.25 * x**2, 0.5 * x
         _, products = self._gradient_products
         viscous = square * (1.0 + 2.0 * numerics.numerical_damping) + half * material.damping_time
-        modulus = (lam + 2.0 * mu) * self.element_volume
+        modulus = bulk_factor * (lam + 2.0 * mu) * self.element_volume
         bulk = (viscous * modulus)[:, None, None] * products
         area, adhesion, scales = self.tables.area, self.effects.adhesion, self.point_scales
         flank = square * parameters["flank_stiffness"] * scales.flank_stiffness * area

@@ -1,52 +1,84 @@
 """Tables of foods and knives, for docs/reference/foods.md.
 
 Foods and knives are read from calibration/foods and calibration/knives. --cut presses knives
-through foods as well, without a robot, which takes a minute. --output puts the tables into a
-Markdown file, between lines such as
+through foods as well, without a robot, and --hold a knife through foods that are held at several
+distances, each of which takes a minute. --output puts the tables into a Markdown file, and the
+picture of --hold into docs/figures. The tables go between lines such as
   <!-- foods -->
   <!-- end of foods -->
 """
 
 import argparse
 import dataclasses as dc
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid
 from sliceit_drake.cutting.knife import Knife, load_knife
-from sliceit_drake.cutting.model import Numerics
+from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
-from sliceit_drake.cutting.simulate import simulate_slice
+from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.resources import resource_path, shipped_names
+from studies.figures import BLUE, ORANGE, new_figure, save_guide_figures, tidy
 from studies.marked_page import Place
 from studies.pages import table
 
-__all__ = ["add_arguments", "cut_rows", "foods_table", "knives_table", "run"]
+__all__ = [
+    "HoldCut",
+    "add_arguments",
+    "cut_rows",
+    "foods_table",
+    "hold_cuts",
+    "holds_figure",
+    "knives_table",
+    "run",
+]
 
 PERIOD, SPEED, CLEARANCE = 2e-3, 0.02, 1e-3
+END = 5e-4
+"""Way of the edge above the board over which the end force is the mean, metres."""
+HELD_FOODS = {
+    "cucumber": "{calibration: cucumber}",
+    "plum tomato": "{calibration: tomato, food: {shape: !Ellipsoid {diameters: [0.048, 0.1, 0.048],"
+    " refinements: 3}}}",
+}
+"""What the scenario cucumber_measured is changed to."""
+HOLDS = [("none", 0.0)] + [(sides, d) for sides in ("plus", "both") for d in (0.012, 0.02, 0.04)]
+HELD = {"none": "not held", "plus": "one side", "both": "both sides"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of the study."""
     parser.add_argument("--cut", action="store_true", help="press knives through foods too")
+    parser.add_argument("--hold", action="store_true", help="hold foods at several distances too")
     parser.add_argument("--output", type=Path, metavar="FILE", help="page to write into")
 
 
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
-    cuts = Place("cuts")
+    cuts, holds = Place("cuts"), Place("holds")
     if options.cut:
         cuts.check(options.output)
+    if options.hold:
+        holds.check(options.output)
     for name, text in {"foods": foods_table(), "knives": knives_table()}.items():
         Place(name).show(options.output, text)
     if options.cut:
         cuts.publish(options.output, rows=cut_rows(), speed=SPEED, command=options.command)
+    if options.hold:
+        found = hold_cuts()
+        rows = [cut.row() for cut in found]
+        holds.publish(options.output, rows=rows, speed=SPEED, command=options.command)
+        if options.output is not None:
+            save_guide_figures({"holds": functools.partial(holds_figure, found)})
     return 0
 
 
@@ -140,9 +172,7 @@ def _cuts(food: Food, numerics: Numerics) -> Sequence[tuple[str, ...]]:
         model = make_food_model(food, knife, numerics)
         if knife.height < model.top - model.bottom:
             continue
-        plan = MotionPlan([ConstantSpeed(distance=model.top + CLEARANCE, speed=SPEED)])
-        motion = Motion(plan, start_pose(model, CLEARANCE))
-        result = simulate_slice(CuttingSolver(model, PERIOD), motion)
+        result = _pressed_through(model)
         force = np.linalg.norm(result.food_wrench[:, 3:], axis=1).max()
         work = result.balance.work
         held = "on both sides" if food.held_sides == "both" else "on one side"
@@ -150,3 +180,86 @@ def _cuts(food: Food, numerics: Numerics) -> Sequence[tuple[str, ...]]:
         cells = (f"{force:.1f}", f"{work / model.section_area:.0f}", f"{share:.0f} %")
         rows.append((food.name, held, name, *cells))
     return rows
+
+
+def _pressed_through(model: CuttingModel) -> SliceResult:
+    plan = MotionPlan([ConstantSpeed(distance=model.top + CLEARANCE, speed=SPEED)])
+    motion = Motion(plan, start_pose(model, CLEARANCE))
+    return simulate_slice(CuttingSolver(model, PERIOD), motion)
+
+
+@dc.dataclass
+class HoldCut:
+    """A food that is held somewhere, pressed through.
+
+    Attributes:
+        food: Its name.
+        sides, distance: `Food.held_sides`, and `Food.hold_distance`, metres.
+        depth: Depth of the edge below the top of the food [n], metres.
+        force: Vertical force of the food on the knife [n], N.
+        ahead: How far the edge is below what is cut, in the shape at rest [n], metres.
+        work: Of the knife, J.
+    """
+
+    food: str
+    sides: str
+    distance: float
+    depth: np.ndarray
+    force: np.ndarray
+    ahead: np.ndarray
+    work: float
+
+    def row(self) -> tuple[str, ...]:
+        """Cells of the table."""
+        where = "" if self.sides == "none" else f", from {1e3 * self.distance:g} mm on"
+        end = self.force[self.depth > self.depth[-1] - END].mean()
+        values = f"{self.force.max():.1f}", f"{end:.1f}", f"{self.work:.3f}"
+        return self.food, HELD[self.sides] + where, *values, f"{1e3 * self.ahead.max():.1f}"
+
+
+def hold_cuts() -> list[HoldCut]:
+    """A stiff and a soft food, held on no, one and both sides, near the cut and far from it."""
+    found = []
+    for name, changes in HELD_FOODS.items():
+        scenario = load_scenario("cucumber_measured", changes)
+        assert isinstance(scenario.food, Food)
+        for sides, distance in HOLDS:
+            food = dc.replace(scenario.food, held_sides=sides, hold_distance=distance)
+            model = make_food_model(food, scenario.knife, scenario.numerics)
+            result = _pressed_through(model)
+            depth = model.top - result.position[:, 2]
+            ahead = np.where(depth > 0.0, depth - _cut_depth(model, result.cut), 0.0)
+            # Past the last cut point nothing is left to be ahead of.
+            ahead[result.cut > 0.98] = 0.0
+            force = result.food_wrench[:, 5]
+            work = result.balance.work
+            found.append(HoldCut(name, sides, distance, depth, force, ahead, work))
+    return found
+
+
+def _cut_depth(model: CuttingModel, cut: np.ndarray) -> np.ndarray:
+    """Depth in the section at rest above which fractions [n] of it lie [n], metres."""
+    tables, points = model.tables, model.split.points[:, 2]
+    grid = np.linspace(-tables.reach, tables.reach, tables.width.shape[1])
+    depth = np.linspace(0.0, model.top - model.bottom, 400)
+    rows = zip(points, tables.fraction, tables.area, strict=True)
+    above = sum(a * np.interp(z - model.top + depth, grid, row) for z, row, a in rows)
+    return np.interp(cut, above / model.section_area, depth)
+
+
+def holds_figure(cuts: Sequence[HoldCut]) -> Figure:
+    """Force over depth of each food, by sides and distance."""
+    figure = new_figure(9.6, 3.8)
+    colours = {"none": "0.35", "plus": ORANGE, "both": BLUE}
+    styles = {0.0: "-", 0.012: "-", 0.02: "--", 0.04: ":"}
+    names = list(dict.fromkeys(cut.food for cut in cuts))
+    for axes, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
+        for cut in (cut for cut in cuts if cut.food == name):
+            where = "" if cut.sides == "none" else f", {1e3 * cut.distance:g} mm"
+            style = {"color": colours[cut.sides], "ls": styles[cut.distance], "lw": 1.5}
+            axes.plot(1e3 * cut.depth, cut.force, label=HELD[cut.sides] + where, **style)
+        tidy(axes, name)
+        axes.set(xlabel="depth of the edge [mm]", ylabel="force on the knife [N]", xlim=(0.0, None))
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", frameon=False, title="held from")
+    return figure

@@ -1,6 +1,6 @@
-"""Draws pictures of the guides: foods, frames, the station's loop, the servo, a slice record.
+"""Draws pictures of the guides: foods, shapes, frames, the station's loop, the servo, a record.
 
-Writes foods.png, frames.png, station.png, servo.png and record.png to docs/figures.
+Writes foods.png, shapes.png, frames.png, station.png, servo.png and record.png to docs/figures.
 """
 
 import argparse
@@ -10,6 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid, HalfCylinder, Tapered
+from sliceit_drake.cutting.mesh.tetrahedra import boundary_faces
 from sliceit_drake.diagrams.run import simulate
 from sliceit_drake.records.validation import load_record
 from sliceit_drake.resources import resource_path
@@ -33,6 +35,7 @@ __all__ = [
     "record_figure",
     "run",
     "servo_figure",
+    "shapes_figure",
     "station_figure",
 ]
 
@@ -73,6 +76,7 @@ def run(options: argparse.Namespace) -> int:
     save_guide_figures(
         {
             "foods": foods_figure,
+            "shapes": shapes_figure,
             "frames": frames_figure,
             "station": station_figure,
             "servo": servo_figure,
@@ -91,6 +95,33 @@ def foods_figure() -> Figure:
         axes.imshow(next(film.draw(film.frames[:1]))[CROP])
         axes.set_title(food, fontsize=11)
         axes.axis("off")
+    return figure
+
+
+def shapes_figure() -> Figure:
+    """A food of each shape that is generated, with its mesh, on the same scale."""
+    shapes = {
+        "!Cylinder": Cylinder(),
+        "!HalfCylinder": HalfCylinder(),
+        "!Box": Box([0.04, 0.09, 0.03]),
+        "!Box, a plate": Box([0.06, 0.1, 0.008], [12, 2]),
+        "!Ellipsoid": Ellipsoid([0.05, 0.07, 0.048]),
+        "!Tapered": Tapered(),
+    }
+    figure = new_figure(10.0, 2.2)
+    for k, (name, shape) in enumerate(shapes.items()):
+        mesh = shape.mesh()
+        faces, _ = boundary_faces(mesh.tetrahedra)
+        axes = figure.add_subplot(1, len(shapes), k + 1, projection="3d", proj_type="ortho")
+        axes.view_init(elev=24.0, azim=-55.0)
+        corners = 1e3 * mesh.vertices[faces]
+        axes.add_collection3d(
+            Poly3DCollection(corners, facecolors="#e2f0cf", edgecolors="0.4", lw=0.2, shade=True)
+        )
+        axes.set(xlim=(-45, 45), ylim=(-60, 60), zlim=(0, 50))
+        axes.set_box_aspect((90, 120, 50), zoom=1.45)
+        axes.set_axis_off()
+        axes.set_title(name, fontsize=10)
     return figure
 
 
