@@ -133,7 +133,7 @@ class Centre:
 
 def _check_offset(offset: list[float], around: float, name: str, where: str) -> None:
     """Refuses an inner part that is moved out of the food."""
-    if float(np.hypot(*offset)) > around:
+    if np.linalg.norm(offset) > around:
         raise ConfigurationError(
             f"{offset} m moves it out of the food, of which {name} leaves {around:g} m around it",
             field=f"{where}.offset",
