@@ -7,10 +7,14 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+import threading
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
-__all__ = ["CACHE", "VERBOSE", "start_warp"]
+__all__ = ["CACHE", "CPU_FLAGS", "VERBOSE", "load_modules", "start_warp"]
 
 VERBOSE = "SLICEIT_VERBOSE"
 """Environment variable that lets Warp say what it does; worker processes have it too."""
@@ -18,6 +22,15 @@ VERBOSE = "SLICEIT_VERBOSE"
 CACHE = "WARP_CACHE_PATH"
 NO_GPU = b"NVIDIA CUDA driver"
 """Words of the line that Warp's library prints on a machine without one, whatever its log level."""
+CPU_FLAGS = (
+    "-march=native -ffp-contract=fast"
+    " -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000"
+)
+"""Warp's own, with products and sums fused and the search for vectors as deep as Clang's own. All
+modules have them: LLVM compiles side by side only what has the same flags."""
+
+_LOADING: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
+"""Held while a module is loaded: Warp would compile it twice."""
 
 
 @functools.cache
@@ -38,6 +51,27 @@ def start_warp() -> None:
         warp.config.log_level = warp.LOG_ERROR
     with _without_line(NO_GPU):
         warp.init()
+
+
+def load_modules(names: Sequence[str], device: Any) -> None:
+    """Compiles modules of kernels side by side, once a machine, and loads them, once a process.
+
+    Where another thread is at one of them it is waited for.
+
+    Args:
+        names: Of the modules; `start_warp` was called.
+        device: One of Warp's, or its name.
+    """
+    with ThreadPoolExecutor(2) as threads:
+        for loaded in [threads.submit(_load_module, name, device) for name in names]:
+            loaded.result()
+
+
+def _load_module(name: str, device: Any) -> None:
+    import warp as wp
+
+    with _LOADING[name]:
+        wp.load_module(name, device=device)
 
 
 def _find_cache() -> None:

@@ -15,7 +15,7 @@ from sliceit_drake.cutting.kernels.precision import kernels
 from sliceit_drake.cutting.kernels.types import CORNERS, GATHER, LANES, PARAMETERS, STRIP
 from sliceit_drake.cutting.model import CuttingModel, TimeStepError
 from sliceit_drake.cutting.stepping import STEPPING
-from sliceit_drake.cutting.warp_start import start_warp
+from sliceit_drake.cutting.warp_start import load_modules, start_warp
 
 __all__ = ["LAUNCH_LOCK", "Workspace", "in_lanes", "parameter_row"]
 
@@ -382,7 +382,7 @@ class Workspace:
     def captured(self, launch: Callable[[], None]) -> Any:
         """Graph of the launches that `launch` makes; compiles the kernels, once a machine."""
         with LAUNCH_LOCK:
-            wp.load_module(self.kernels.module, device=self.device)
+            load_modules(self.kernels.modules, self.device)
             with wp.ScopedCapture(device=self.device) as capture:
                 launch()
         return capture.graph

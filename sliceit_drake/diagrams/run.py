@@ -3,19 +3,23 @@
 import dataclasses as dc
 import gc
 import json
+import threading
 import time as clock
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml, validate
 from sliceit_drake.cutting.foods.food import Food
+from sliceit_drake.cutting.kernels.precision import kernels
 from sliceit_drake.cutting.motion import Motion, MotionPlan
 from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.cutting.warp_start import load_modules, start_warp
 from sliceit_drake.diagrams.live_view import LiveControls, make_meshcat
 from sliceit_drake.diagrams.outputs.animation import (
     NEEDED,
@@ -49,6 +53,7 @@ from sliceit_drake.overrides import Overrides
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.resources import file_or_resource
 from sliceit_drake.systems.agent import AgentConfig
+from sliceit_drake.systems.compliance_kernel import update_arm
 from sliceit_drake.systems.policy import PolicyConfig, PressByForce
 
 if TYPE_CHECKING:
@@ -318,6 +323,8 @@ def prepare_run(
         validate(scenario, "scenario")
         policy = None
     profile = measured_profile(scenario)
+    if cutting is None and isinstance(scenario.food, Food) and scenario.numerics.device == "cpu":
+        _start_loading(wp.float32 if scenario.numerics.precision == "float32" else wp.float64)
     station = MakeStation(scenario, meshcat, cutting=cutting, controller=controller)
     diagram = ScenarioDiagram(scenario, station=station, policy=policy)
     margin = check_contact_margin(station) if controller is None else None
@@ -338,6 +345,15 @@ def prepare_run(
     if animation:
         film.look(simulator.get_context())
     return Run(scenario, diagram, simulator, profile, margin, meshcat, film, animation, own)
+
+
+def _start_loading(real: Any) -> None:
+    """Compiles the kernels for the CPU while the station is made; what needs one waits for it."""
+    start_warp()
+    points, others = kernels(real).modules
+    # The controller's is needed first, and the points take longest.
+    names = [update_arm.module.name, points, others]
+    threading.Thread(target=load_modules, args=(names, "cpu")).start()
 
 
 def _written(scenario: Scenario) -> Scenario:

@@ -23,7 +23,7 @@ from pydrake.multibody.math import SpatialForce
 from pydrake.systems.framework import Context, DiscreteValues
 
 from sliceit_drake.configuration import choice, quantity, validate
-from sliceit_drake.cutting.warp_start import start_warp
+from sliceit_drake.cutting.warp_start import load_modules, start_warp
 from sliceit_drake.cutting.workspace import LAUNCH_LOCK
 from sliceit_drake.systems.compliance_kernel import MODES, mat34d, place_arm, update_arm
 from sliceit_drake.systems.declare import PlainSystem, declare_cached, declare_output
@@ -85,7 +85,7 @@ def _load_kernels() -> None:
     """Compiles the kernels, once a machine, and loads them, once a process."""
     with LAUNCH_LOCK:
         start_warp()
-        wp.load_module(update_arm.module, device=_CPU)
+        load_modules([update_arm.module.name], _CPU)
 
 
 class ComplianceUpdate:

@@ -8,7 +8,11 @@ B if nothing else is said. Pairs of vectors have the translational one first. Ar
 
 import warp as wp
 
+from sliceit_drake.cutting.warp_start import CPU_FLAGS
+
 __all__ = ["MODES", "mat34d", "place_arm", "update_arm"]
+
+wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS})
 
 MODES = ("compliance", "motion", "force", "parallel")
 """The kernel knows a mode by its place here."""

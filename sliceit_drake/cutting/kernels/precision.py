@@ -17,27 +17,25 @@ from sliceit_drake.cutting.kernels.elements import element_kernels
 from sliceit_drake.cutting.kernels.nodes import node_kernels
 from sliceit_drake.cutting.kernels.points import point_kernels
 from sliceit_drake.cutting.kernels.types import kernel_types
+from sliceit_drake.cutting.warp_start import CPU_FLAGS
 
 __all__ = ["kernels"]
-
-CPU_FLAGS = (
-    "-march=native -ffp-contract=fast"
-    " -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000"
-)
-"""Warp's own, with products and sums fused and the search for vectors as deep as Clang's own."""
 
 
 @functools.cache
 def kernels(real: Any, gradients: bool = False) -> types.SimpleNamespace:
     """The kernels for `real` = wp.float32 or wp.float64, with adjoints if `gradients`."""
-    # A module for each variant, so that using several compiles none twice.
-    module = f"{__name__}.{real.__name__}{'.gradients' if gradients else ''}"
-    wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS}, wp.get_module(module))
+    # Modules for each variant, so that using several compiles none twice. The points take the
+    # compiler as long as all else, and two modules compile side by side.
+    variant = f"{__name__}.{real.__name__}{'.gradients' if gradients else ''}"
+    modules = points, others = (f"{variant}.points", f"{variant}.others")
+    for module in modules:
+        wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS}, wp.get_module(module))
     return types.SimpleNamespace(
-        module=module,
+        modules=modules,
         **vars(kernel_types(real)),
-        **vars(element_kernels(real, module, gradients)),
-        **vars(point_kernels(real, module, gradients)),
-        **vars(node_kernels(real, module, gradients)),
-        **vars(coupling_kernels(real, module)),
+        **vars(element_kernels(real, others, gradients)),
+        **vars(point_kernels(real, points, gradients)),
+        **vars(node_kernels(real, others, gradients)),
+        **vars(coupling_kernels(real, others)),
     )
