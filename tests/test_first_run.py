@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from sliceit_drake import output_folder
 from sliceit_drake.cli.main import main
 from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.warp_start import load_modules
 from sliceit_drake.cutting.workers import worker_processes
 from sliceit_drake.output_folder import check_output
 from studies.__main__ import main as studies
@@ -95,6 +97,37 @@ def test_without_a_place_for_kernels_a_run_has_its_own_and_warp_says_nothing(tmp
     first, second = done.stderr.splitlines()
     assert str(tmp_path / "home") in first and "WARP_CACHE_PATH" in first
     assert second == "another line"
+
+
+def test_two_modules_of_kernels_are_loaded_side_by_side_and_none_by_two_threads(monkeypatch):
+    together = threading.Barrier(2, timeout=30.0)
+    at_work, twice = set(), []
+
+    def load(name, device):
+        twice.extend({name} & at_work)
+        at_work.add(name)
+        together.wait()  # Breaks where another does not come while this one is at work.
+        at_work.remove(name)
+
+    monkeypatch.setattr("warp.load_module", load)
+    other = threading.Thread(target=load_modules, args=(["a", "b"], "cpu"))
+    other.start()
+    load_modules(["a", "b"], "cpu")
+    other.join()
+    assert twice == [] and not together.broken
+
+
+def test_kernels_start_where_there_is_no_standard_error():
+    code = (
+        "import sys\n"
+        "sys.stderr = None\n"
+        "from sliceit_drake.cutting.warp_start import start_warp\n"
+        "start_warp()\n"
+        "import warp\n"
+        "print(warp.get_device('cpu'))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "cpu\n"
 
 
 def test_a_kill_ends_a_run_as_ctrl_c_does_offline_and_keeps_what_there_is(

@@ -113,6 +113,15 @@ def test_pictures_of_stored_results_say_what_their_pages_say():
     page = (RESULTS / "benchmarks.md").read_text()
     assert f"{reached:.0f} are reached, {missed:.0f} are missed" in page
     assert len(result_figures.scaling_figure().axes[0].lines) == 6
+    (slices,) = result_figures.random_slices_figure().axes
+    page = (RESULTS / "random_slices.md").read_text()
+    for shape, *bars in zip(slices.get_yticklabels(), *slices.containers, strict=True):
+        counts = [f"{bar.get_width():.0f}" for bar in bars]
+        assert f"| {shape.get_text()} | {' | '.join(counts)} |" in page
+    (memory,) = result_figures.endurance_figure().axes
+    held = [f"{1e3 * y:.0f} MB" for y in memory.lines[1].get_ydata()]
+    page = (RESULTS / "endurance.md").read_text()
+    assert f"{held[0]} after the first, {held[1]} half-way and {held[2]} at the end" in page
 
 
 def test_each_motion_of_the_picture_of_proposals_is_one_that_may_be_proposed():

@@ -109,7 +109,7 @@ def _robot(options: argparse.Namespace, config: "ControllerConfig") -> "RobotMod
         return KinematicRobot()
     from sliceit_drake.emulator.station_robot import StationRobot
 
-    print("Preparing (the first run on a machine compiles the kernels, about 8 s)", flush=True)
+    print("Preparing (the first run on a machine compiles the kernels, about 10 s)", flush=True)
     robot = StationRobot(scenario_of(options))
     config.payload, config.payload_cog = robot.payload, robot.payload_cog
     config.is_zeroed = robot.is_zeroed

@@ -99,7 +99,7 @@ def run(options: argparse.Namespace) -> int:
     from sliceit_drake.diagrams.run import prepare_run
 
     meshcat = None if options.no_replay and not options.meshcat else make_meshcat()
-    print("Preparing (the first run on a machine compiles the kernels, about 8 s)", flush=True)
+    print("Preparing (the first run on a machine compiles the kernels, about 10 s)", flush=True)
     prepared = prepare_run(scenario, meshcat, animation=not options.no_animation)
     prepared.warnings += _changes_beside_measurement(options, scenario)
     if options.frames and meshcat is not None:

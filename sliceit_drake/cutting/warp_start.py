@@ -96,7 +96,8 @@ def _find_cache() -> None:
 @contextlib.contextmanager
 def _without_line(words: bytes) -> Iterator[None]:
     """Drops lines with `words` from what libraries print to the standard error meanwhile."""
-    sys.stderr.flush()
+    if sys.stderr is not None:
+        sys.stderr.flush()
     try:
         saved = os.dup(2)
     except OSError:  # There is none.
@@ -110,7 +111,8 @@ def _without_line(words: bytes) -> Iterator[None]:
     try:
         yield
     finally:
-        sys.stderr.flush()
+        if sys.stderr is not None:
+            sys.stderr.flush()
         os.dup2(saved, 2)
         os.close(saved)
         with open(reading, "rb") as caught:

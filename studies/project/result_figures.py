@@ -1,10 +1,12 @@
-"""Draws pictures of results that are stored: intervals of calibrations, many machines, aims.
+"""Draws pictures of results that are stored.
 
-Writes coverage.png, scaling.png and benchmarks.png to docs/results/figures. Nothing is measured.
+Writes coverage.png (intervals of calibrations), scaling.png (many machines), random_slices.png,
+endurance.png and benchmarks.png to docs/results/figures. Nothing is measured.
 """
 
 import argparse
 import json
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -13,7 +15,15 @@ from matplotlib.ticker import MaxNLocator
 from studies.figures import BLUE, GREEN, ORANGE, RED, new_figure, save_figure, tidy
 from studies.project.aims import RESULTS, SECTIONS, Docs
 
-__all__ = ["add_arguments", "aims_figure", "coverage_figure", "run", "scaling_figure"]
+__all__ = [
+    "add_arguments",
+    "aims_figure",
+    "coverage_figure",
+    "endurance_figure",
+    "random_slices_figure",
+    "run",
+    "scaling_figure",
+]
 
 NORMAL_90 = 1.645
 """Half the width of a 90 % interval, in standard deviations."""
@@ -28,6 +38,8 @@ def run(options: argparse.Namespace) -> int:
     for name, draw in (
         ("coverage", coverage_figure),
         ("scaling", scaling_figure),
+        ("random_slices", random_slices_figure),
+        ("endurance", endurance_figure),
         ("benchmarks", aims_figure),
     ):
         save_figure(draw(), RESULTS / "figures" / f"{name}.png", dpi=100)
@@ -56,7 +68,7 @@ def coverage_figure() -> Figure:
 
 def scaling_figure() -> Figure:
     """What more workers bring by the model of the page, and what was measured."""
-    stored = json.loads((RESULTS / "data" / "scaling.json").read_text(encoding="utf-8"))["values"]
+    stored = _values("scaling")
     *rows, _ = stored["model"]["rows"]
     workers = [int(row[0]) for row in rows]
     _, *titles = stored["model"]["titles"]
@@ -78,6 +90,42 @@ def scaling_figure() -> Figure:
     return figure
 
 
+def random_slices_figure() -> Figure:
+    """What came of the random slices of each shape of food."""
+    stored = _values("random_slices")
+    *rows, _ = stored["rows"]
+    shapes, *counts = zip(*rows[::-1], strict=True)
+    figure = new_figure(8.0, 2.4)
+    axes = figure.subplots()
+    left = np.zeros(len(shapes))
+    colours = (BLUE, "0.7", ORANGE, RED)
+    for kind, count, colour in zip(stored["kinds"], counts, colours, strict=True):
+        label = f"{kind} ({sum(count)})"
+        axes.barh(shapes, count, left=left, color=colour, label=label)
+        left += count
+    axes.set_xlabel("slices")
+    axes.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    tidy(axes)
+    return figure
+
+
+def endurance_figure() -> Figure:
+    """Memory over the slices of one station, and what it would be with a new station for each."""
+    stored = _values("endurance")
+    count, (first, *_) = stored["station"], stored["held"]
+    slices = np.linspace(1, count, 50)
+    figure = new_figure(8.0, 3.0)
+    axes = figure.subplots()
+    new = (first + stored["left"] * (slices - 1)) / 1e3
+    axes.plot(slices, new, "--", color=ORANGE, label="a new station for each slice (computed)")
+    held = np.array(stored["held"]) / 1e3
+    axes.plot([1, count / 2, count], held, "o-", color=BLUE, label="one station (measured)")
+    axes.set(xlabel="slices with the arm", ylabel="memory held [GB]", ylim=(0.0, None))
+    axes.legend(frameon=False, fontsize=9)
+    tidy(axes)
+    return figure
+
+
 def aims_figure() -> Figure:
     """How many aims of each kind are reached."""
     docs = Docs(RESULTS)
@@ -94,3 +142,9 @@ def aims_figure() -> Figure:
     axes.legend(frameon=False, fontsize=9)
     tidy(axes)
     return figure
+
+
+def _values(page: str) -> dict[str, Any]:
+    """What a page shows, as it is stored beside it."""
+    text = (RESULTS / "data" / f"{page}.json").read_text(encoding="utf-8")
+    return json.loads(text)["values"]
