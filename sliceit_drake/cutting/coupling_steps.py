@@ -78,6 +78,7 @@ class CouplingSteps:
     Attributes:
         state: The food's new state [state_size].
         wrenches: Mean wrenches by mechanism: edge, flank pressure, friction [E, 3, 6].
+        wrench: Wrench of all mechanisms in the last coupling step [6].
         cut: Fraction of the section that the edge has passed [E].
         board_force: Mean force of the board on the food [3], N.
         works: Work and dissipation over all coupling steps, in J, as `layouts.BALANCE` [8].
@@ -85,6 +86,7 @@ class CouplingSteps:
 
     state: np.ndarray
     wrenches: np.ndarray
+    wrench: np.ndarray
     cut: np.ndarray
     board_force: np.ndarray
     works: np.ndarray
@@ -93,11 +95,6 @@ class CouplingSteps:
     def balance(self) -> EnergyBalance:
         """Work and dissipation over all coupling steps."""
         return EnergyBalance(**dict(zip(BALANCE.names or (), self.works.tolist(), strict=True)))
-
-    @property
-    def wrench(self) -> np.ndarray:
-        """Wrench of all mechanisms in the last coupling step [6]."""
-        return np.asarray(self.wrenches[-1].sum(0))
 
     @property
     def finite(self) -> bool:
@@ -128,6 +125,7 @@ def run_coupling_steps(
         CouplingSteps(
             state,
             row[at["wrenches"]].reshape(shape),
+            row[at["wrench"]][-6:],
             row[at["cut"]] / model.section_area,
             row[at["board_force"]],
             row[at["balance"]],

@@ -126,14 +126,22 @@ class CuttingSolver:
         Raises:
             CuttingError: A force is not finite, or the knife left the region that is modelled.
         """
-        R, p = np.empty((1, 2, 3, 3)), np.empty((1, 2, 3))
-        R[0, 0], R[0, 1], p[0, 0], p[0, 1] = start.R, end.R, start.p, end.p
+        return self.move(state, np.array([start.R, end.R]), np.array([start.p, end.p]), factors)
+
+    def move(
+        self,
+        state: np.ndarray,
+        R: np.ndarray,
+        p: np.ndarray,
+        factors: SurfaceFactors = UNCHANGED,
+    ) -> CouplingSteps:
+        """As `coupling_step`, between poses X_CK given as R [2, 3, 3] and p [2, 3]."""
         place, T = self._workspace.layout["stepping"], self.exchange_period
-        (number,), (stepping,) = self._stepping.plan(state[place], R[0], p[0], T)
+        (number,), (stepping,) = self._stepping.plan(state[place], R, p, T)
         with self._lock:
             ws = self._stepped(number)
             self._take_factors(ws, factors)
-            (step,) = run_coupling_steps(ws, state[None], R, p)
+            (step,) = run_coupling_steps(ws, state[None], R[None], p[None])
         if not step.finite:
             raise CuttingError(NOT_FINITE)
         step.state[place] = stepping

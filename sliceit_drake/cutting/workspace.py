@@ -78,6 +78,7 @@ class Workspace:
             start_warp()
             self.kernels = kernels(self.real, gradients)
         self.device = _device(model.numerics.device)
+        self._on_host = bool(self.device.is_cpu)
         self.model = model
         self.models: tuple[CuttingModel, ...] = ()
         self._gradients = gradients
@@ -301,19 +302,19 @@ class Workspace:
 
     def write(self, array: wp.array, values: np.ndarray) -> None:
         """Sets an array from host memory."""
-        if self.device.is_cpu:
+        if self._on_host:
             self.read(array)[...] = values
         else:
             array.assign(values)
 
     def read(self, array: wp.array) -> np.ndarray:
         """An array in host memory; on the CPU a view, made once."""
-        if not self.device.is_cpu:
-            return array.numpy()
         key = (array.ptr, array.shape)
-        if key not in self._views:
-            self._views[key] = array.numpy()
-        return self._views[key]
+        if (view := self._views.get(key)) is None:
+            view = array.numpy()
+            if self._on_host:
+                self._views[key] = view
+        return view
 
     def launch(
         self, kernel: Any, shape: tuple[int, ...], inputs: list[Any], adjoint: bool = False

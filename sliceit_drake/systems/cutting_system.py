@@ -356,18 +356,20 @@ class CuttingSystem(KnifeForceSystem):
             food[:] = solver.initial_state()
             kept[_FOOD_INDEX], kept[_ENERGY] = index, NO_ENERGY
             kept[_SPENT_BEFORE] = kept[_SPENT].sum()
-        last = self._in_cut_frame(index, kept[LAST_POSE].reshape(3, 4))
-        pose = self._in_cut_frame(index, now)
+        R_CW = self._R_CW[index]
+        X_CK = R_CW @ np.array([kept[LAST_POSE].reshape(3, 4), now])
+        X_CK -= self._origin[index]
+        R, p = X_CK[:, :, :3], X_CK[:, :, 3]
+        pose = Pose(R[1], p[1])
         if self._in_sequence and self._is_beside(context, pose):
             kept[_COMPONENTS] = 0.0
             return np.zeros(6), self.progress(context)
         check_in_plane(solver.model, pose, time)
         try:
-            step = solver.coupling_step(food, last, pose)
+            step = solver.move(food, R, p)
         except CuttingError as error:
             raise CuttingError(f"at {time:.4g} s {error}") from error
         food[:] = step.state
-        R_CW = self._R_CW[index]
         kept[_COMPONENTS] = step.wrenches[-1, :, 3:].dot(R_CW).ravel()
         kept[_BALANCE] += step.works
         if round(time / self.exchange_period) % self._check_every == 0:

@@ -105,6 +105,9 @@ def coupling_kernels(real: Any, module: str) -> types.SimpleNamespace:
                 results.wrenches[cut, e, m, c] = M
                 results.wrenches[cut, e, m, 3 + c] = F
                 power += F * v[c] + M * w[c]
+        for c in range(6):
+            total = results.wrenches[cut, e, 0, c] + results.wrenches[cut, e, 1, c]
+            results.wrench[cut, e, c] = total + results.wrenches[cut, e, 2, c]
         results.work[cut, e] = -power * motion.period
         results.cut[cut, e] = results.point_sums[cut, e, PointSum.CUT_AREA]
 

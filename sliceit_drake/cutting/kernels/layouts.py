@@ -73,6 +73,7 @@ def results(coupling_steps: int) -> np.dtype:
             ("point_sums", POINT_SUMS, (coupling_steps,)),
             ("blade", BLADE_SUMS, (coupling_steps,)),
             ("wrenches", "f8", (coupling_steps, 3, 6)),
+            ("wrench", "f8", (coupling_steps, 6)),
             ("work", "f8", (coupling_steps,)),
             ("cut", "f8", (coupling_steps,)),
             ("board_force", "f8", 3),

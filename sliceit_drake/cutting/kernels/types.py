@@ -209,6 +209,7 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         point_sums: wp.array3d(dtype=wp.float64)
         blade: wp.array3d(dtype=wp.float64)
         wrenches: wp.array4d(dtype=wp.float64)
+        wrench: wp.array3d(dtype=wp.float64)
         work: wp.array2d(dtype=wp.float64)
         cut: wp.array2d(dtype=wp.float64)
         board_force: wp.array2d(dtype=wp.float64)
