@@ -199,6 +199,7 @@ sphinx-build -W -c docs . output/docs
 # Read by their parser and no further.
 READ_ONLY = {
     "installs": """
+        pip install -c constraints.txt --no-compile -e .
         pip install -c constraints.txt -e .
         pip install -c constraints.txt -e '.[docs]'
         pip install -c constraints.txt -e '.[learn]'
