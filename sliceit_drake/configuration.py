@@ -281,7 +281,11 @@ def _range_text(rule: _Quantity, lead: str) -> str:
 
 
 def load_yaml(
-    schema: type, file: str | Path | None, defaults: Any = None, overrides_text: str | None = None
+    schema: type,
+    file: str | Path | None,
+    defaults: Any = None,
+    overrides_text: str | None = None,
+    overrides_source: str = "overrides",
 ) -> Any:
     """Reads a configuration from a YAML file, and validates it.
 
@@ -292,6 +296,7 @@ def load_yaml(
             None for the defaults of `schema`.
         overrides_text: YAML text merged over the file, such as ``"{food: {height: 0.03}}"``. A
             list in it replaces the whole list.
+        overrides_source: Where that text comes from, for errors.
 
     Returns:
         The validated configuration, an instance of `schema`. `defaults` is left unchanged.
@@ -306,7 +311,7 @@ def load_yaml(
     if file is not None:
         config = merge_yaml(config, _read_text(Path(file)), str(file), _root(config), origins)
     if overrides_text is not None and overrides_text.strip():
-        config = merge_yaml(config, overrides_text, "overrides", _root(config), origins)
+        config = merge_yaml(config, overrides_text, overrides_source, _root(config), origins)
     try:
         validate(config, _root(config))
     except ConfigurationError as error:

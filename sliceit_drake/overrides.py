@@ -50,10 +50,12 @@ class Replacements:
 
     Attributes:
         texts: YAML of whole fields, to be merged in turn before `set_in`.
+        source: Where they come from, for errors: the option, or "overrides" of a dictionary.
     """
 
     def __init__(self, overrides: Overrides, schema: type, option: str = "--set") -> None:
         self.texts: list[str] = []
+        self.source = "overrides" if isinstance(overrides, Mapping) else option
         self._schema, self._option = schema, option
         self._values: dict[str, Any] = {}
         self._written: dict[str, str] = {}
@@ -79,16 +81,17 @@ class Replacements:
             ConfigurationError: Naming file, field and fix.
         """
         try:
-            loaded = load_yaml(self._schema, file, given, self.texts[0] if self.texts else None)
-            for text in self.texts[1:]:
-                loaded = load_yaml(self._schema, None, loaded, text)
+            first, *others = self.texts or [None]
+            loaded = load_yaml(self._schema, file, given, first, self.source)
+            for text in others:
+                loaded = load_yaml(self._schema, None, loaded, text, self.source)
         except ConfigurationError as error:
             top, _, name = (error.field or "").partition(".")
             like = path_that_is_meant(self._schema() if given is None else given, name)
             if "." in name or not error.problem.startswith("unknown field") or "." not in str(like):
                 raise
             write = f"Write it below {str(like).rpartition('.')[0]}."
-            if "overrides" in str(error.source):
+            if str(error.source).startswith(self.source):
                 write = f"Write it as a path: {self._option} {like}=VALUE."
             raise ConfigurationError(
                 error.problem,

@@ -559,6 +559,7 @@ def test_updates_are_made_while_the_environment_steps():
 # --- What is left.
 
 
+@pytest.mark.filterwarnings("error::UserWarning")
 @pytest.mark.parametrize("history", [3, 12])
 def test_an_exported_policy_decides_as_the_actor(tmp_path, history):
     agent = AgentConfig(history=history, network=str(tmp_path / "policy.onnx"))

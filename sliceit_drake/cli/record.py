@@ -43,6 +43,7 @@ from sliceit_drake.cli.arguments import (
     protocol_file,
 )
 from sliceit_drake.cli.progress import StageBars
+from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.output_folder import check_output
 from sliceit_drake.resources import shipped_names
 
@@ -124,8 +125,13 @@ def _protocol(options: argparse.Namespace) -> "Protocol":
     from sliceit_drake.diagrams.scenario_file import scenario_file, top_fields
     from sliceit_drake.stand_in.protocol import load_protocol, protocol_of_scenario
 
-    is_shipped = options.protocol in shipped_names(PROTOCOLS)
-    file = protocol_file(options) if is_shipped else scenario_file(options.protocol)
+    protocols = shipped_names(PROTOCOLS)
+    try:
+        is_shipped = options.protocol in protocols
+        file = protocol_file(options) if is_shipped else scenario_file(options.protocol)
+    except ConfigurationError as error:
+        fix = f"{error.fix} Or give a protocol: {', '.join(protocols)}, or a file of yours."
+        raise ConfigurationError(error.problem, source=error.source, fix=fix) from None
     if "conditions" in top_fields(file):
         return load_protocol(str(file))
     scenario = load_scenario(file)

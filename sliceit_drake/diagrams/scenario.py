@@ -209,7 +209,8 @@ def _load(file: Path | None, given: Scenario, replacements: Replacements) -> Sce
             ) from None
         if file is None or not error.problem.startswith("unknown field of Scenario"):
             raise
-        other = None if "overrides" in str(error.source) else other_kind(file, field_names(given))
+        in_file = not str(error.source).startswith(replacements.source)
+        other = other_kind(file, field_names(given)) if in_file else None
         if other is None:
             raise
         raise ConfigurationError(other[0], source=str(file), fix=other[1]) from None

@@ -51,7 +51,9 @@ class TemporalConvolution(nn.Module):
 
     def forward(self, history: torch.Tensor) -> torch.Tensor:
         """From [batch, length, channels], the newest last, to [batch, features]."""
-        x = nn.functional.pad(history, (0, 0, self.padding, 0))
+        # Padding is exported as a slice that goes backwards, of which the exporter warns.
+        before = history.new_zeros(history.shape[0], self.padding, self.channels)
+        x = torch.cat([before, history], dim=1)
         for kernel, level in zip(self._kernels, self.levels, strict=True):
             # Every tap that the last output needs, and no other: kernels side by side.
             x = torch.relu(level(x.reshape(x.shape[0], x.shape[1] // kernel, -1)))
