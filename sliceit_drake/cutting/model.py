@@ -6,14 +6,13 @@ import functools
 from typing import Any, Self
 
 import numpy as np
-from scipy.sparse import csc_array, kron
-from scipy.sparse.linalg import eigsh
+from scipy.sparse import csc_array
 from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import choice, quantity
 from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.cutting.foods.material import Material
-from sliceit_drake.cutting.inertia import Inertia, assemble
+from sliceit_drake.cutting.inertia import Inertia, assemble, largest_share
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry
 
@@ -288,17 +287,19 @@ class CuttingModel(CutGeometry):
         half = 0.5 * self.numerics.time_step
         modulus = (half**2 + half * self.parameters["damping_time"]) * self.element_volume
         g = np.concatenate([-self.inverse.sum(1, keepdims=True), self.inverse], axis=1)
-        outer = g[:, :, :, None, None] * g[:, None, None]
-        same = self._gradient_products[1][:, :, None, :, None] * np.eye(3)[:, None]
-        part = lam * outer + mu * (outer.swapaxes(2, 4) + same)
-        part = modulus[:, None, None] * part.reshape(-1, 12, 12)
-        along = np.arange(3)
-        nodes = (3 * self.tetrahedra[:, :, None] + along).reshape(-1, 12)
-        moving = (3 * self.moving[:, None] + along).ravel()
-        bulk = assemble(moving, [(nodes, part)], np.zeros(self.nodes.size))
-        start = np.random.default_rng(0).normal(size=len(moving))
-        whole = kron(mass, np.eye(3), format="csc")
-        return float(eigsh(bulk, 1, whole, v0=start, tol=1e-2, return_eigenvectors=False)[0])
+        rows = np.broadcast_to(np.arange(3 * len(g)).reshape(-1, 1, 3), g.shape)
+        columns = np.broadcast_to(self.tetrahedra[:, :, None], g.shape)
+        entries = g.ravel(), (rows.ravel(), columns.ravel())
+        gradient = csc_array(entries, (3 * len(g), len(self.nodes)))[:, self.moving].tocsr()
+        back = gradient.T.tocsr()
+
+        def forces(motion: np.ndarray) -> np.ndarray:
+            strain = (gradient @ motion).reshape(-1, 3, 3)
+            stress = mu * (strain + strain.swapaxes(1, 2))
+            stress += lam * strain.trace(axis1=1, axis2=2)[:, None, None] * np.eye(3)
+            return np.asarray(back @ (modulus[:, None, None] * stress).reshape(-1, 3))
+
+        return largest_share(forces, mass)
 
     def _stiffness_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Gershgorin's bounds of a quarter of the stiffness, N/m, and of half the damping, Ns/m, of

@@ -9,7 +9,7 @@ from sliceit_drake.configuration import ConfigurationError, load_yaml, quantity,
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.cutting.foods.food import Food
-from sliceit_drake.cutting.foods.shapes import Cylinder, PlainShape
+from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid, HalfCylinder, PlainShape
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.motion import MotionPlan
 from sliceit_drake.diagrams.scenario import Placement, Preparation, Scenario, Start
@@ -188,7 +188,7 @@ def section_size(food: Food, scale: float = 1.0) -> tuple[float, float]:
     return _plain_shape(food).scaled(scale).section
 
 
-def _plain_shape(food: Food) -> PlainShape:
+def _plain_shape(food: Food) -> Cylinder | HalfCylinder | Box | Ellipsoid:
     if isinstance(food.shape, PlainShape):
         return food.shape
     raise ConfigurationError(
