@@ -81,9 +81,9 @@ class Replacements:
             ConfigurationError: Naming file, field and fix.
         """
         try:
-            first, *others = self.texts or [None]
+            first = self.texts[0] if self.texts else None
             loaded = load_yaml(self._schema, file, given, first, self.source)
-            for text in others:
+            for text in self.texts[1:]:
                 loaded = load_yaml(self._schema, None, loaded, text, self.source)
         except ConfigurationError as error:
             top, _, name = (error.field or "").partition(".")

@@ -370,7 +370,7 @@ def test_a_run_plots_itself_and_says_whose_parameters_it_had(watched):
     assert figure._supxlabel.get_text().startswith("Parameters set by hand: E = 2.6e+06 Pa")
     calibrated = dc.replace(run.scenario, calibration="potato")
     text = dc.replace(run, scenario=calibrated).plot()._supxlabel.get_text()
-    assert text.startswith("Calibrated food potato: ")
+    assert text.startswith("Parameters of the food potato: ")
 
 
 def test_a_station_built_by_hand_looks_at_the_knife_too():

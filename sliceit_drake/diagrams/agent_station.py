@@ -91,7 +91,7 @@ class AgentStation(Diagram):
         """Starts a slice anew: everything random is drawn, the knife at rest at its start.
 
         Args:
-            simulator: Of this diagram.
+            simulator: A simulator of this diagram.
             rng: Where all numbers come from.
             shift: Of the knife from the start, in its frame; None for none.
 

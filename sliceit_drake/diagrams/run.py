@@ -427,7 +427,7 @@ def _caption(run: Run, comparison: Comparison | None) -> str:
     lines = []
     if described := run.station.cutting.describe():
         named = run.scenario.calibration
-        source = "Parameters set by hand" if named is None else f"Calibrated food {named}"
+        source = "Parameters set by hand" if named is None else f"Parameters of the food {named}"
         lines.append(f"{source}: {described}")
     if run.own:
         put_in = ", ".join(f"{kind} {name}" for kind, name in run.own.items())
