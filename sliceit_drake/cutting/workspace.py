@@ -419,7 +419,8 @@ class Workspace:
             R: Rotations of the knives in C at the ends of the coupling steps [C, E + 1, 3, 3].
             p: Positions of Ko there [C, E + 1, 3], metres.
         """
-        self.capture()
+        if self._graph is None:
+            self.capture()
         # Held nodes are never written, so every slot needs them.
         for state in self.states:
             self.write(state, states)
