@@ -44,7 +44,7 @@ REST = "Drake: plant, servo, events, record"
 PARTS = (
     (Workspace, "advance", "kernels of the food"),
     (Workspace, "stored_energies", "kernels of the food"),
-    (CuttingSolver, "coupling_step", SOLVER),
+    (CuttingSolver, "move", SOLVER),
     (CuttingSolver, "energies", SOLVER),
     (KnifeForceSystem, "_update", "cutting system"),
     (WrenchSensor, "_update", "wrench sensor, reactions of the plant"),
