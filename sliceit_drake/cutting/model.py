@@ -105,8 +105,6 @@ class CuttingModel(CutGeometry):
         relaxing: Fractions of the modulus that relax [M].
         keep: What a sub-step leaves of each branch's force [M].
         parameters: Scalars by name, see `PARAMETERS`.
-        critical_time_step: Stability limit with the true masses, including the margin, s. Slivers
-            do not count: nodes with less than `SLIVER` of their vertex's mass get what they need.
     """
 
     material: Material
@@ -124,7 +122,6 @@ class CuttingModel(CutGeometry):
     relaxing: np.ndarray = dc.field(init=False)
     keep: np.ndarray = dc.field(init=False)
     parameters: dict[str, float] = dc.field(init=False)
-    critical_time_step: float = dc.field(init=False)
 
     def __post_init__(self) -> None:
         material, effects, numerics = self.material, self.effects, self.numerics
@@ -144,10 +141,16 @@ class CuttingModel(CutGeometry):
         steepest = (np.diff(force, axis=1) / self.tables.spacing).max(1)
         self.unloading = np.maximum(force.max(1) / numerics.unloading_length, steepest)
         self.relaxing = np.array(effects.relaxation.shares, float)
-        self.keep = np.exp(-numerics.time_step / np.array(effects.relaxation.times, float))
-        self.parameters = self._parameters()
-        self._check_step()
         self._by_step: dict[str, Self] = {}
+        self._set_step()
+
+    def _set_step(self) -> None:
+        """Sets what depends on the sub-step."""
+        step, times = self.numerics.time_step, np.array(self.effects.relaxation.times, float)
+        self.keep = np.exp(-step / times)
+        self.parameters = self._parameters()
+        if not self.numerics.mass_scaling and step > self.critical_time_step:
+            raise self._too_long()
 
     def _parameters(self) -> dict[str, float]:
         material, effects, knife, numerics = self.material, self.effects, self.knife, self.numerics
@@ -194,28 +197,34 @@ class CuttingModel(CutGeometry):
             "edge_share": effects.edge.share,
         }
 
-    def _check_step(self) -> None:
-        """Sets the limit of the step with true masses.
+    @functools.cached_property
+    def critical_time_step(self) -> float:
+        """Stability limit with the true masses, including the margin, s.
 
-        Raises:
-            TimeStepError: The step is beyond the limit and masses are not scaled.
+        Slivers do not count: nodes with less than `SLIVER` of their vertex's mass get what they
+        need.
         """
-        numerics, true_mass = self.numerics, self.true_mass
+        return self.numerics.stability_margin * float(self._stable_steps.min())
+
+    @property
+    def _stable_steps(self) -> np.ndarray:
+        """The stability limit without the margin by moving node [K], s; none for slivers."""
+        mass = self.true_mass
         stiff, viscous = self._stiffness_bounds()
-        # A step margin x is stable if stiff x^2 + viscous x <= mass.
-        limit = 2.0 * true_mass / (viscous + np.sqrt(viscous**2 + 4.0 * stiff * true_mass))
-        setting = self.moving[~self._slivers[self.moving]]
-        if not len(setting):
-            setting = self.moving
-        worst = setting[int(limit[setting].argmin())]
-        self.critical_time_step = critical = numerics.stability_margin * float(limit[worst])
-        if not numerics.mass_scaling and numerics.time_step > critical:
-            raise TimeStepError(
-                f"numerics.time_step = {numerics.time_step:.3g} s is beyond the stability limit "
-                f"{critical:.3g} s, set by the node at {self.nodes[worst]} m of the cut frame "
-                f"(true mass {true_mass[worst]:.3g} kg, stiffness bound {4.0 * stiff[worst]:.3g} "
-                f"N/m). Give at most {0.99 * critical:.3g}, a coarser mesh, or mass_scaling: true."
-            )
+        # A step x is stable if stiff x^2 + viscous x <= mass.
+        limit = 2.0 * mass / (viscous + np.sqrt(viscous**2 + 4.0 * stiff * mass))
+        sliver = self._slivers[self.moving]
+        return np.where(sliver & ~sliver.all(), np.inf, limit[self.moving])
+
+    def _too_long(self) -> TimeStepError:
+        node = self.moving[int(self._stable_steps.argmin())]
+        critical, stiff = self.critical_time_step, self._stiffness_bounds()[0][node]
+        return TimeStepError(
+            f"numerics.time_step = {self.numerics.time_step:.3g} s is beyond the stability limit "
+            f"{critical:.3g} s, set by the node at {self.nodes[node]} m of the cut frame "
+            f"(true mass {self.true_mass[node]:.3g} kg, stiffness bound {4.0 * stiff:.3g} "
+            f"N/m). Give at most {0.99 * critical:.3g}, a coarser mesh, or mass_scaling: true."
+        )
 
     @functools.cached_property
     def inertia(self) -> Inertia:
@@ -394,7 +403,8 @@ class CuttingModel(CutGeometry):
 
     def __getstate__(self) -> dict[str, Any]:
         # A copy, also in another process, may get other values, and then has other inertia.
-        return {k: v for k, v in vars(self).items() if k != "inertia"} | {"_by_step": {}}
+        own = ("inertia", "critical_time_step")
+        return {k: v for k, v in vars(self).items() if k not in own} | {"_by_step": {}}
 
     def with_step(self, step: float) -> Self:
         """The same cut with another sub-step, s, to six digits; made once."""
@@ -402,8 +412,9 @@ class CuttingModel(CutGeometry):
         if name == f"{self.numerics.time_step:.6g}":
             return self
         if name not in self._by_step:
-            numerics = dc.replace(self.numerics, time_step=step)
-            self._by_step[name] = self.derive(self._inertia_of, numerics=numerics)
+            other = self._by_step[name] = copy.copy(self)
+            other.numerics = dc.replace(self.numerics, time_step=step)
+            other._set_step()
         return self._by_step[name]
 
     def derive(self, inertia_of: "CuttingModel | None" = None, **changes: Any) -> Self:
