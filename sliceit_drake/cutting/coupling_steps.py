@@ -82,6 +82,9 @@ class CouplingSteps:
         cut: Fraction of the section that the edge has passed [E].
         board_force: Mean force of the board on the food [3], N.
         works: Work and dissipation over all coupling steps, in J, as `layouts.BALANCE` [8].
+        added_force: Forces of the inertia that is added to the true masses, in the last sub-step of
+            each coupling step: sum of their components' magnitudes over all nodes [E], N.
+        substeps: Of each.
     """
 
     state: np.ndarray
@@ -90,6 +93,8 @@ class CouplingSteps:
     cut: np.ndarray
     board_force: np.ndarray
     works: np.ndarray
+    added_force: np.ndarray
+    substeps: int
 
     @property
     def balance(self) -> EnergyBalance:
@@ -129,6 +134,8 @@ def run_coupling_steps(
             row[at["cut"]] / model.section_area,
             row[at["board_force"]],
             row[at["balance"]],
+            row[at["added_force"]],
+            ws.substeps,
         )
         for model, state, row in zip(ws.models, new, rows, strict=True)
     ]

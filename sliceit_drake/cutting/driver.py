@@ -92,6 +92,7 @@ class Driver:
         paths: Sequence[KnifePath],
         launches: Iterable[Launch] | None = None,
         board: Board | None = None,
+        substeps: Sequence[np.ndarray] | None = None,
     ) -> Iterator[tuple[Launch, list[CouplingSteps]]]:
         """Drives uncut foods side by side, each with the sub-steps that `Stepping` asks for.
 
@@ -102,6 +103,8 @@ class Driver:
             paths: Of the knives, one a cut; the cuts are all derived from one model.
             launches: Each is taken once the one before it was yielded; `even_launches` by default.
             board: Board under the knives, its height in F; None for none.
+            substeps: Numbers that are taken instead, one a coupling step [E] of each cut: those of
+                a run from which this one differs a little.
 
         Yields:
             Each launch and what it gives, one a cut. Where sub-steps are shorter than the longest,
@@ -112,54 +115,78 @@ class Driver:
             coarse = self.workspace([path.model for path in paths], multiple=whole.multiple)
             if not len(states):
                 states = np.tile(coarse.initial_state(), (len(paths), 1))
-            for launch, numbers, stepping in self._parts(paths, whole, states, coarse):
-                steps = self._advance(paths, launch, numbers, states, board)
-                for step, values in zip(steps, stepping, strict=True):
-                    step.state[coarse.layout["stepping"]] = values
+            waiting = [whole]
+            while waiting:
+                launch = waiting.pop(0)
+                steps = self._advance(paths, launch, states, coarse, board, substeps)
+                if steps is None:
+                    first, count, multiple = launch
+                    waiting = [Launch(first + k, 1, multiple) for k in range(count)]
+                    continue
                 states = np.array([step.state for step in steps])
                 yield launch, steps
                 if not any(step.finite for step in steps):
                     return
 
-    @staticmethod
-    def _parts(
-        paths: Sequence[KnifePath], whole: Launch, states: np.ndarray, coarse: Workspace
-    ) -> list[tuple[Launch, list[int], np.ndarray]]:
-        """A launch, or each of its coupling steps where a cut needs shorter sub-steps.
-
-        Returns:
-            Launches, the number of sub-steps of each cut [C], and `stepping` after it
-            [C, STEPPING].
-        """
-        first, count, multiple = whole
-        plans = []
-        for path, state in zip(paths, states, strict=True):
-            rule = Stepping.of(path.model, coarse.substeps)
-            before = state[coarse.layout["stepping"]]
-            poses = path.poses(first, count, commanded=True)
-            plans.append(rule.plan(before, *poses, coarse.exchange_period))
-        numbers = [plan[0] for plan in plans]
-        after = np.array([plan[1] for plan in plans])
-        if all(number == coarse.substeps for some in numbers for number in some):
-            return [(whole, [coarse.substeps] * len(paths), after[:, -1])]
-        each = zip(*numbers, strict=True)
-        return [
-            (Launch(first + k, 1, multiple), list(some), after[:, k]) for k, some in enumerate(each)
-        ]
-
     def _advance(
+        self,
+        paths: Sequence[KnifePath],
+        launch: Launch,
+        states: np.ndarray,
+        coarse: Workspace,
+        board: Board | None,
+        substeps: Sequence[np.ndarray] | None,
+    ) -> list[CouplingSteps] | None:
+        """Advances each cut by a launch; None where one of several coupling steps needs more
+        sub-steps than the fewest, those of `coarse`, in a cut."""
+        first, count, _ = launch
+        place, T = coarse.layout["stepping"], coarse.exchange_period
+        rules = [Stepping.of(path.model, coarse.substeps) for path in paths]
+        numbers, after = [], []
+        for c, (rule, path) in enumerate(zip(rules, paths, strict=True)):
+            poses = path.poses(first, count, commanded=True)
+            planned, stepping = rule.plan(states[c, place], *poses, T)
+            if substeps is not None:
+                # Those of a knife whose motion is over do not matter.
+                given = substeps[c][first : first + count].tolist() or [coarse.substeps]
+                planned = given + [given[-1]] * (count - len(given))
+                stepping[-1][-2] = T / planned[-1]
+            if count > 1 and any(number != coarse.substeps for number in planned):
+                return None
+            numbers.append(planned[-1])
+            after.append(stepping[-1])
+        steps: list[Any] = [None] * len(paths)
+        repeated = set(range(len(paths)))
+        while repeated:
+            self._balance(paths, launch, numbers, states, board, steps, set(repeated))
+            if substeps is not None:
+                break
+            for c in list(repeated):
+                wanted = rules[c].again(numbers[c], steps[c].added_force.tolist(), after[c])
+                if wanted == numbers[c]:
+                    repeated.remove(c)
+                elif count > 1:
+                    return None
+                else:
+                    numbers[c] = wanted
+                    paths[c].undo(first + 1)
+        for step, values in zip(steps, after, strict=True):
+            step.state[place] = values
+        return steps
+
+    def _balance(
         self,
         paths: Sequence[KnifePath],
         launch: Launch,
         numbers: Sequence[int],
         states: np.ndarray,
         board: Board | None,
-    ) -> list[CouplingSteps]:
-        """Advances each cut by a launch, with its number of sub-steps."""
+        steps: list[Any],
+        unbalanced: set[int],
+    ) -> None:
+        """Advances some cuts by a launch, each with its number of sub-steps, into `steps`."""
         first, count, multiple = launch
         models = [path.model for path in paths]
-        steps: list[Any] = [None] * len(paths)
-        unbalanced = set(range(len(paths)))
         while unbalanced:
             poses = [path.poses(first, count) for path in paths]
             R, p = (np.array(some) for some in zip(*poses, strict=True))
@@ -169,10 +196,12 @@ class Driver:
                 for c in unbalanced:
                     if numbers[c] == number:
                         steps[c] = tried[c]
-            forces = [step.wrenches[-1].sum(0)[3:] for step in steps]
             last = first + count
-            unbalanced = {c for c in unbalanced if not paths[c].balanced(last, forces[c], board)}
-        return steps
+            unbalanced = {
+                c
+                for c in unbalanced
+                if not paths[c].balanced(last, steps[c].wrenches[-1].sum(0)[3:], board)
+            }
 
 
 class DriverPool:

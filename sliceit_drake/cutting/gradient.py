@@ -135,11 +135,10 @@ class SliceAdjoint:
         run = SliceRun(model, np.empty((count, 6)), [], [state], np.array(R), np.array(p))
         for e in range(count):
             before, at = run.states[e], slice(e, e + 2)
-            (number,), after = rule.plan(before[stepping], R[at], p[at], self.exchange_period)
-            ws = self._driver.workspace([model], substeps=number)
-            run.substeps.append(number)
+            (number,), (after,) = rule.plan(before[stepping], R[at], p[at], self.exchange_period)
             balanced = False
             while not balanced:
+                ws = self._driver.workspace([model], substeps=number)
                 rise, shift = mounting.given.tolist()
                 run.p[e + 1] = p[e + 1] + [-shift, 0.0, rise]
                 ws.advance(before[None], run.R[None, e : e + 2], run.p[None, e : e + 2])
@@ -149,8 +148,15 @@ class SliceAdjoint:
                 run.wrenches[e] = wrenches.sum(0)
                 draw, _, rise = (-run.wrenches[e, 3:]).tolist()
                 balanced = mounting.rigid or mounting.balanced(-rise, draw, 0.0, None)
+                if balanced:
+                    added = ws.results()["added_force"][0].tolist()
+                    wanted = rule.again(number, added, after)
+                    if wanted != number:
+                        number, balanced = wanted, False
+                        mounting.undo()
+            run.substeps.append(number)
             run.states.append(ws.read(ws.states[-1])[0].copy())
-            run.states[-1][stepping] = after[0]
+            run.states[-1][stepping] = after
         return run
 
     def gradient(self, run: SliceRun, weights: np.ndarray) -> SliceGradient:

@@ -95,13 +95,21 @@ class KnifePath:
         rise = float((self.model.X_FC_rotation @ force)[2])
         height = float(self._commands[k, 2])
         done = self._mounting.balanced(rise, -float(force[0]), height, board)
-        at = k + 1 if done else k
-        if at <= self.coupling_steps:
-            rise, shift = self._mounting.given.tolist()
-            self.p_FK[at] = self._commands[at] + [0.0, 0.0, rise]
-            self.p_CK[at] = self.model.to_cut_frame(self.p_FK[at])
-            self.p_CK[at, 0] -= shift
+        self._give(k + 1 if done else k)
         return done
+
+    def undo(self, k: int) -> None:
+        """Takes back that the mounting holds the k-th coupling step, which is to be repeated."""
+        if not self.rigid and k <= self.coupling_steps:
+            self._mounting.undo()
+            self._give(k)
+
+    def _give(self, k: int) -> None:
+        if k <= self.coupling_steps:
+            rise, shift = self._mounting.given.tolist()
+            self.p_FK[k] = self._commands[k] + [0.0, 0.0, rise]
+            self.p_CK[k] = self.model.to_cut_frame(self.p_FK[k])
+            self.p_CK[k, 0] -= shift
 
 
 class Mounting:
@@ -129,8 +137,10 @@ class Mounting:
         self._slipped, self._slipping = 0.0, False
         self._slope = np.zeros((2, 2))
         self._begin()
+        self._before = self._start
 
     def _begin(self) -> None:
+        self._start = self.given, self._slipped, self._slipping, self._slope
         self._tried: tuple[np.ndarray, np.ndarray] | None = None
         self._attempts = 0
         self._between = np.array([[-np.inf] * 2, [np.inf] * 2])
@@ -210,8 +220,14 @@ class Mounting:
             return np.inf
         return self._slip.resistance * (self._slip.remaining if self._slipping else 1.0)
 
+    def undo(self) -> None:
+        """Goes back to what the coupling step that was balanced last began with."""
+        self.given, self._slipped, self._slipping, self._slope = self._before
+        self._begin()
+
     def _settle(self) -> None:
         """Takes what was found: the food slips, or holds again."""
+        self._before = self._start
         if self._holder > 0.0:
             shift, limit = float(self.given[1]), self._limit()
             pull = (shift - self._slipped) / self._holder

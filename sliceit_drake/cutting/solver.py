@@ -137,11 +137,15 @@ class CuttingSolver:
     ) -> CouplingSteps:
         """As `coupling_step`, between poses X_CK given as R [2, 3, 3] and p [2, 3]."""
         place, T = self._workspace.layout["stepping"], self.exchange_period
-        (number,), (stepping,) = self._stepping.plan(state[place], R, p, T)
+        (wanted,), (stepping,) = self._stepping.plan(state[place], R, p, T)
+        number = 0
         with self._lock:
-            ws = self._stepped(number)
-            self._take_factors(ws, factors)
-            (step,) = run_coupling_steps(ws, state[None], R[None], p[None])
+            while number != wanted:
+                number = wanted
+                ws = self._stepped(number)
+                self._take_factors(ws, factors)
+                (step,) = run_coupling_steps(ws, state[None], R[None], p[None])
+                wanted = self._stepping.again(number, step.added_force.tolist(), stepping)
         if not step.finite:
             raise CuttingError(NOT_FINITE)
         step.state[place] = stepping

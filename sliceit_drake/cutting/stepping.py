@@ -1,19 +1,22 @@
-"""How many sub-steps a coupling step takes: more where the knife's velocity has changed.
+"""How many sub-steps a coupling step takes: more where the knife or the food changes its velocity.
 
 Inertia that is added to the relative motion of nodes (`inertia`) errs where they accelerate. Food
 at the blade follows a knife that stops or turns over some tenths of a millimetre of its way, or
 some milliseconds. So each of two points of the edge has a velocity that the food has settled to,
 which follows its own, and sub-steps are the shorter the more the two differ.
 
-What decides is the knife's motion alone: the same steps are taken whatever the food's parameters,
-so that differences of two slices have no steps in them, and a gradient goes back by those of its
-slice.
+What the food does by itself, as when a skin gives way, is not known before. A coupling step at
+whose end the added inertia takes much force is repeated from its beginning with shorter sub-steps.
+Where the food does no such thing the knife's motion alone decides: the same steps are taken
+whatever the food's parameters, so that differences of two slices have no steps in them. A gradient
+goes back by the steps of its slice.
 
 Inertia grows with the sub-step, and what still swings when it grows swings with more energy. So
 sub-steps get longer by a factor of two at a time, some coupling steps after they could.
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +33,8 @@ TRAVEL = 4e-5
 """Most way of the knife in a sub-step, metres."""
 CHANGE = 1.6e-9
 """Most of: the velocity that food has not settled to times the square of a sub-step, m s."""
+EVENT = 0.25
+"""Most force of the added inertia, over the mean force to cut through the section."""
 SETTLING_WAY = 1e-3
 """Way of the knife over which the food settles to a new velocity, metres."""
 SETTLING_TIME = 10e-3
@@ -50,12 +55,14 @@ class Stepping(NamedTuple):
         top: Height in C above which the knife touches nothing, metres.
         coarsest: Sub-steps of a coupling step where nothing changes.
         by_need: `numerics.step_by_need`.
+        force: Mean force to cut through the section, N.
     """
 
     half_span: float
     top: float
     coarsest: int
     by_need: bool
+    force: float
 
     @classmethod
     def of(cls, model: CuttingModel, coarsest: int) -> "Stepping":
@@ -63,7 +70,8 @@ class Stepping(NamedTuple):
         low, high = model.span
         # Tables blur by one spacing.
         top = model.top + model.tables.spacing
-        return cls(0.5 * (high - low), top, coarsest, model.numerics.step_by_need)
+        force = float(model.toughness @ model.tables.area) / (model.top - model.bottom)
+        return cls(0.5 * (high - low), top, coarsest, model.numerics.step_by_need, force)
 
     def plan(
         self, stepping: np.ndarray, R: np.ndarray, p: np.ndarray, period: float
@@ -112,3 +120,25 @@ class Stepping(NamedTuple):
             numbers.append(number)
             after.append([*settled, last, calm])
         return numbers, after
+
+    def again(self, number: int, added: Sequence[float], stepping: list[float]) -> int:
+        """Number of sub-steps with which a coupling step is to be repeated; its own if it is not.
+
+        Args:
+            number: Its own.
+            added: Force of the added inertia at its end, or of each of several with that number,
+                N; see `CouplingSteps`.
+            stepping: What `plan` gave after it; gets what follows from the force.
+        """
+        need = 0.0
+        for force in added:
+            # What broke down does so however short the steps.
+            if self.by_need and math.isfinite(force):
+                need = max(need, number * math.sqrt(force / (EVENT * max(self.force, 1e-6))))
+        if number > self.coarsest and 2.0 * need >= number:
+            stepping[-1] = 0.0
+        more = number
+        while more < min(need, FINEST):
+            more *= 2
+        stepping[-2] *= number / more
+        return more

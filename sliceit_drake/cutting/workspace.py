@@ -363,6 +363,10 @@ class Workspace:
             "load_nodes": (len(m.moving), [dt, mesh, parameters, now, forces, sums]),
             "gather": (len(m.moving), [mesh, forces]),
             "sum_forces": (len(m.moving), [dt, mesh, parameters, *states]),
+            "weigh_added_inertia": (
+                0,
+                [k // self.substeps, parameters, forces, self._results],
+            ),
             "solve": (0, [self.inertia, forces.resultant, forces.acceleration]),
             "step_nodes": (len(m.moving), [dt, mesh, parameters, *states]),
             "gather_adjoint": (len(m.moving), [mesh, forces, now.ahead.grad]),
@@ -404,6 +408,8 @@ class Workspace:
             self.launch_look_ahead(k)
         for k in range(self.steps):
             self.launch_substep(k)
+            if (k + 1) % self.substeps == 0:
+                self.launch_part("weigh_added_inertia", k)
         self.launch(kern.add_points, results.point_sums.shape, [sums, results])
         self.launch(kern.knife_wrenches, results.work.shape, [sums, self.motion, results])
         self.launch(kern.weigh, (self.cuts,), [wp.float64(1.0), self.slots[-1], *weights])
@@ -485,6 +491,7 @@ def _parameter_arrays(model: CuttingModel) -> dict[str, np.ndarray]:
         "weight": model.weight,
         "relaxing": model.relaxing,
         "keep": model.keep,
+        "mass": model.true_mass[model.moving],
         "stiff_volume": volume,
     }
 

@@ -78,6 +78,7 @@ def results(coupling_steps: int) -> np.dtype:
             ("cut", "f8", (coupling_steps,)),
             ("board_force", "f8", 3),
             ("balance", BALANCE),
+            ("added_force", "f8", (coupling_steps,)),
         ]
     )
 

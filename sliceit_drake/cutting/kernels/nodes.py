@@ -18,7 +18,8 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
     vec3, vec4, slide, padded, forwards = t.vec3, t.vec4, t.slide, t.padded, t.forwards
     sum8 = lane_functions(real).sum8
     Mesh, Parameters, State, Forces, Sums = t.Mesh, t.Parameters, t.State, t.Forces, t.Sums
-    Inertia, entries = t.Inertia, t.entries
+    Inertia, Results, entries = t.Inertia, t.Results, t.entries
+    real_name = "float" if real is wp.float32 else "double"
 
     @wp.func
     def gather_elements(cut: wp.int32, i: wp.int32, mesh: Mesh, forces: Forces):
@@ -131,7 +132,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
     # By hand: in Warp's own language its four sums do not become vectors, and take twice as long.
     @wp.func_native(
         f"""
-        typedef {"float" if real is wp.float32 else "double"} Real;
+        typedef {real_name} Real;
         const int* begin = start.data;
         const int* at = (const int*)index.data;
         const Real* L = (const Real*)((const char*)values.data + cut * values.strides[0]);
@@ -168,6 +169,38 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         b: wp.array2d(dtype=vec4),
         y: wp.array2d(dtype=vec4),
     ): ...
+
+    # Sums of four, which become vectors.
+    @wp.func_native(
+        f"""
+        typedef {real_name} Real;
+        const Real* M = (const Real*)((const char*)mass.data + cut * mass.strides[0]);
+        const Real* B = (const Real*)((const char*)b.data + cut * b.strides[0]);
+        const Real* Y = (const Real*)((const char*)y.data + cut * y.strides[0]);
+        Real sum[4] = {{0, 0, 0, 0}};
+        for (int k = 0; k < mass.shape[1]; ++k)
+            for (int c = 0; c < 4; ++c) {{
+                const Real force = B[4 * k + c] - M[k] * Y[4 * k + c];
+                sum[c] += force < Real(0) ? -force : force;
+            }}
+        return sum[0] + sum[1] + sum[2];
+        """
+    )
+    def sum_added(
+        cut: wp.int32,
+        mass: wp.array2d(dtype=real),
+        b: wp.array2d(dtype=vec4),
+        y: wp.array2d(dtype=vec4),
+    ) -> real: ...
+
+    @wp.kernel(enable_backward=False, module=module)
+    def weigh_added_inertia(
+        coupling_step: wp.int32, parameters: Parameters, forces: Forces, results: Results
+    ):
+        """Sums the forces of the inertia that is added to the true masses, S a - M a."""
+        cut = wp.tid()
+        total = sum_added(cut, parameters.mass, forces.resultant, forces.acceleration)
+        results.added_force[cut, coupling_step] = wp.float64(total)
 
     @wp.kernel(enable_backward=False, module=module)
     def solve(S: Inertia, b: wp.array2d(dtype=vec4), y: wp.array2d(dtype=vec4)):
@@ -245,6 +278,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
     out = types.SimpleNamespace(
         load_nodes=load_nodes,
         solve=solve,
+        weigh_added_inertia=weigh_added_inertia,
         step_nodes=step_nodes,
         push_blade=push_blade,
         bend_blade=bend_blade,

@@ -117,6 +117,7 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         weight: wp.array2d(dtype=vec3)
         relaxing: wp.array2d(dtype=real)
         keep: wp.array2d(dtype=real)
+        mass: wp.array2d(dtype=real)
         stiff_volume: wp.array3d(dtype=lanes)
 
     @wp.struct
@@ -214,6 +215,7 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         cut: wp.array2d(dtype=wp.float64)
         board_force: wp.array2d(dtype=wp.float64)
         balance: wp.array2d(dtype=wp.float64)
+        added_force: wp.array2d(dtype=wp.float64)
 
     @wp.struct
     class Energies:
