@@ -142,6 +142,7 @@ class StepResult:
         energy_ratio: Largest kinetic over internal energy, looked at every 0.2 mm of travel.
         substeps: Mean number of sub-steps of a coupling step.
         finer: Fraction of coupling steps with more than the fewest.
+        by_event: Fraction with more than the knife's motion asks for.
         force_drop: Force before the stop less force 20 ms after it, N; not a number without hold.
         creep: Change of the force from then to the end of the hold, N; likewise.
         elements: Elements that are computed, and all of the split mesh.
@@ -159,6 +160,7 @@ class StepResult:
     energy_ratio: float = np.nan
     substeps: float = np.nan
     finer: float = 0.0
+    by_event: float = 0.0
     force_drop: float = np.nan
     creep: float = np.nan
     elements: tuple[int, int] = (0, 0)
@@ -308,8 +310,8 @@ def _run(
     solver = CuttingSolver(model, EXCHANGE)
     motion = case.motion(model)
     path = KnifePath(model, motion, EXCHANGE)
-    poses = path.poses(0, path.coupling_steps, commanded=True)
-    result.substeps, result.finer = planned_substeps(model, *poses)
+    planned = planned_substeps(model, *path.poses(0, path.coupling_steps, commanded=True))
+    taken = np.empty(path.coupling_steps, int)
     spent = ratio = 0.0
     force = np.zeros((path.coupling_steps, 3))
     block = max(1, round(CHECK_TRAVEL / (case.press_speed * EXCHANGE))) if path.rigid else 1
@@ -320,10 +322,14 @@ def _run(
         if not part.finite:
             result.refusal = f"until {end * EXCHANGE:.4g} s {NOT_FINITE}"
             return result, np.empty((0, 3))
+        taken[k:end] = part.substeps
         force[k:end] = part.wrenches.sum(1)[:, 3:]
         spent += part.balance.edge + part.balance.opening + part.balance.friction
         ratio = max(ratio, energy_ratio(solver.energies(part.state, path.pose(end)), spent, model))
     result.energy_ratio = ratio
+    result.substeps = float(taken.mean())
+    result.finer = float((taken > round(EXCHANGE / step)).mean())
+    result.by_event = float((taken > planned).mean())
     if case.hold:
         norm = np.linalg.norm(force, axis=1)
         # Row k is the mean over the coupling step that ends at (k + 1) EXCHANGE.
@@ -334,8 +340,8 @@ def _run(
     return result, force
 
 
-def planned_substeps(model: CuttingModel, R: np.ndarray, p: np.ndarray) -> tuple[float, float]:
-    """Mean number of sub-steps of a coupling step, and the fraction that has more than the fewest.
+def planned_substeps(model: CuttingModel, R: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Numbers of sub-steps of the coupling steps that the knife's motion asks for [E].
 
     Args:
         model: The cut.
@@ -343,8 +349,7 @@ def planned_substeps(model: CuttingModel, R: np.ndarray, p: np.ndarray) -> tuple
     """
     fewest = round(EXCHANGE / model.numerics.time_step)
     rule = Stepping.of(model, fewest)
-    numbers = np.array(rule.plan(np.zeros(STEPPING), R, p, EXCHANGE)[0])
-    return float(numbers.mean()), float((numbers > fewest).mean())
+    return np.array(rule.plan(np.zeros(STEPPING), R, p, EXCHANGE)[0])
 
 
 def slice_inertia(model: CuttingModel) -> tuple[float, float]:
@@ -477,9 +482,11 @@ def need_table(results: Sequence[StepResult]) -> str:
     """Sub-steps of the coupling steps by need."""
     return table(
         f"by need, at most {LONGEST:g} s | mean number of sub-steps"
-        " | coupling steps with more than the fewest [%]",
+        " | coupling steps with more than the fewest [%]"
+        " | with more than the knife's motion asks for [%]",
         (
-            (r.case.label, f"{r.substeps:.1f}", f"{100.0 * r.finer:.0f}")
+            (r.case.label, f"{r.substeps:.1f}")
+            + (f"{100.0 * r.finer:.0f}", f"{100.0 * r.by_event:.0f}")
             for r in results
             if r.by_need
         ),

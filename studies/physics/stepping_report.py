@@ -1,6 +1,6 @@
 """How far the force depends on the food's sub-step, and what the step costs.
 
-Presses, draws, turns and holds in three foods at 5 to 100 mm/s, with constant steps of 2e-5 to 2e-3
+Presses, draws, turns and holds in five foods at 5 to 100 mm/s, with constant steps of 2e-5 to 2e-3
 s and with steps by need: against true masses where the cut is fast, against the finest step where
 it is slow; some with an effect that is sensitive to the step; then the station. Takes ten minutes,
 --quick half a minute. docs/results/stepping.md explains what comes out.
@@ -50,6 +50,8 @@ __all__ = [
 
 
 FOODS = ("cucumber_measured", "potato_sequence", "tomato_sequence")
+HELD_OUT = ("carrot_sequence", "apple")
+"""Foods on which no constant of the rule was chosen."""
 STATION_STEPS = (6.25e-5, 2.5e-4, COUPLED_STEP, 1e-3)
 NOISE = (0.0, 2e-6, 5e-6, 1e-5)  # Of a measured path, metres.
 
@@ -77,7 +79,11 @@ def run(options: argparse.Namespace) -> int:
     ]
     foods = [sliced_food(scenario) for scenario in scenarios]
     steps = study.STEPS[2 if options.quick else 0 :]
-    cases = study.stepping_cases(foods, (0.1,) if options.quick else (0.02, 0.1))
+    others = []
+    for name in () if options.quick else HELD_OUT:
+        food, knife, numerics = sliced_food(load_scenario(resource_path(f"scenarios/{name}.yaml")))
+        others.append((dc.replace(food, name=f"{food.name} (held out)"), knife, numerics))
+    cases = study.stepping_cases(foods + others, (0.1,) if options.quick else (0.02, 0.1))
     if options.quick:
         cases = [dc.replace(case, true_masses=False) for case in cases]
     else:
@@ -286,7 +292,11 @@ def _finer(cutting: CuttingSystem, record: Record) -> dict[float, float]:
     R_CK = model.X_FC_rotation.T @ R_FW @ R_WK
     p_CK = model.to_cut_frame((record.vector("knife_pose_p") - X_WF.translation()) @ R_FW.T)
     noise = np.random.default_rng(1).normal(size=p_CK.shape)
-    return {size: study.planned_substeps(model, R_CK, p_CK + size * noise)[1] for size in NOISE}
+    finer = {}
+    for size in NOISE:
+        numbers = study.planned_substeps(model, R_CK, p_CK + size * noise)
+        finer[size] = float((numbers > study.EXCHANGE / model.numerics.time_step + 0.5).mean())
+    return finer
 
 
 def station_table(cases: Sequence[tuple[str, Sequence[StationStep]]]) -> str:
@@ -314,7 +324,7 @@ def write_stepping(results: Sequence[StepResult], costs: Sequence[StepCost], fil
     cost = {(c.food, c.column): c for c in costs}
     fields = (
         "time_step scaled by_need reference refusal rms_error largest_difference peak energy_ratio "
-        "substeps finer force_drop creep"
+        "substeps finer by_event force_drop creep"
     ).split()
     with file.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
