@@ -113,7 +113,8 @@ class Case:
         model = model or self.model
         if same_inertia and model is not self.model:
             model = model.derive(inertia_of=self.model)
-        run = self.adjoint.run(self.R if R is None else R, self.p if p is None else p, model)
+        R, p = self.R if R is None else R, self.p if p is None else p
+        run = self.adjoint.run(R, p, model, substeps=self.run.substeps)
         return float((self.weights * run.wrenches).sum())
 
 
@@ -163,6 +164,28 @@ def test_gradients_by_all_parameters_are_those_of_differences(everything):
     assert not wrong
     assert len(names) - len(small) >= 25
     assert set(small) <= NOT_RESOLVED
+
+
+@pytest.mark.parametrize("name", ["material.toughness", "effects.skin.toughness"])
+def test_gradients_hold_where_the_skin_gives_way(name):
+    model = cut(Effects(skin=Skin(3.0)))
+    depth = 4e-5 * np.arange(91)
+    p = np.array([0.0, 0.0, model.top + 1e-4]) - np.outer(depth, [0.0, 0.0, 1.0])
+    R = np.tile(np.diag([1.0, -1.0, -1.0]), (len(p), 1, 1))
+    adjoint = SliceAdjoint(model, PERIOD)
+    run = adjoint.run(R, p)
+    assert max(run.substeps[20:]) >= 16
+    weights = np.zeros((len(p) - 1, 6))
+    weights[:, 5] = 1.0
+    gradient = adjoint.gradient(run, weights)
+    snap = Case(model, adjoint, R, p, weights, run, gradient)
+    x, size = get_parameter(model, name), parameter_step(model, name)
+    middle, spread = plateau(
+        quotients(lambda h: snap.value(with_parameters(model, {name: x + h * size})))
+    )
+    exact = pull_back(model, gradient, [name])[name] * size
+    assert spread < 0.01 * abs(middle)
+    assert exact == pytest.approx(middle, rel=1e-3, abs=spread)
 
 
 @pytest.mark.parametrize("name", ["material.youngs_modulus", "material.toughness"])

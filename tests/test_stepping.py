@@ -5,6 +5,10 @@ import pytest
 from scipy.linalg import eigh
 from scipy.sparse import kron
 
+from sliceit_drake.cutting.batch import cut_together
+from sliceit_drake.cutting.coupling_steps import CouplingSteps
+from sliceit_drake.cutting.driver import Driver, Launch
+from sliceit_drake.cutting.foods.effects import Compliance, Effects, Skin
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.foods.shapes import Cylinder
@@ -14,18 +18,19 @@ from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan, Pose, Retract
 from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
-from sliceit_drake.cutting.stepping import CALM, STEPPING, Stepping
+from sliceit_drake.cutting.stepping import CALM, FINEST, STEPPING, Stepping
 from sliceit_drake.cutting.workspace import Workspace
 
 PERIOD = 2e-3
 UP = np.diag([1.0, -1.0, -1.0])
 
 
-def cut(held_sides: str = "both", **numerics) -> CuttingModel:
+def cut(held_sides: str = "both", effects: Effects | None = None, **numerics) -> CuttingModel:
     food = Food(
         shape=Cylinder(rings=3, layers=[0.0, 0.004, 0.012]),
         material=Material(toughness=400.0, friction=0.1),
         held_sides=held_sides,
+        effects=effects or Effects(),
     )
     return make_food_model(food, Knife(), Numerics(**numerics))
 
@@ -209,3 +214,105 @@ def test_a_hold_of_ten_seconds_neither_creeps_nor_swings():
     held = vertical[-round(9.9 / PERIOD) :]
     assert held[0] > 5.0
     assert np.ptp(held) < 2e-3 * held[0]
+
+
+# It gives way when the knife is 3 mm deep.
+SKIN = Skin(toughness=1.0)
+
+
+def press(model: CuttingModel) -> Motion:
+    return Motion(MotionPlan([ConstantSpeed(distance=0.006, speed=0.02)]), start_pose(model, 5e-4))
+
+
+def taken(model: CuttingModel, substeps: list[int] | None = None) -> list[CouplingSteps]:
+    """The coupling steps of a press one by one."""
+    path = KnifePath(model, press(model), PERIOD)
+    launches = [Launch(k, 1) for k in range(path.coupling_steps)]
+    given = None if substeps is None else [np.array(substeps)]
+    run = Driver(PERIOD).run([path], launches, substeps=given)
+    return [step for _, (step,) in run]
+
+
+def forces(steps: list[CouplingSteps]) -> np.ndarray:
+    return np.array([step.wrench[3:] for step in steps])
+
+
+@pytest.fixture(scope="module")
+def snap() -> list[CouplingSteps]:
+    return taken(cut(effects=Effects(skin=SKIN)))
+
+
+def test_a_skin_that_gives_way_is_cut_with_short_steps_until_the_food_is_calm(snap):
+    skinned = Effects(skin=SKIN)
+    plain, model = cut(), cut(effects=skinned)
+    path = KnifePath(model, press(model), PERIOD)
+    planned, _ = Stepping.of(model, 2).plan(np.zeros(STEPPING), path.R_CK, path.p_CK, PERIOD)
+    numbers = np.array([step.substeps for step in snap])
+    # The knife's motion alone decides without the skin, and with it until it gives way.
+    assert [step.substeps for step in taken(plain)] == planned
+    event = int((numbers >= 16).argmax())
+    assert event > 40
+    assert max(numbers[:event]) == max(planned)
+    assert numbers[event - 5 : event].tolist() == [2] * 5
+    assert numbers.max() <= FINEST
+    assert numbers[-1] <= 4
+    true = forces(taken(cut(effects=skinned, time_step=1e-4, step_by_need=False)))
+    constant = forces(taken(cut(effects=skinned, step_by_need=False)))
+    by_need, without = (np.linalg.norm(f - true) for f in (forces(snap), constant))
+    assert by_need < 0.06 * np.linalg.norm(true)
+    assert by_need < 0.4 * without
+
+
+def test_a_discarded_attempt_is_in_no_book_and_its_kinetic_energy_in_no_check():
+    model = cut(effects=Effects(skin=SKIN))
+    result = simulate_slice(CuttingSolver(model, PERIOD), press(model), check_period=PERIOD)
+    assert abs(result.balance.residual(result.energies)) < 5e-3 * result.balance.work
+    assert result.energy_ratio < 0.05
+    constant = cut(effects=Effects(skin=SKIN), step_by_need=False)
+    heavy = simulate_slice(CuttingSolver(constant, PERIOD), press(constant), check_period=PERIOD)
+    assert heavy.energy_ratio > 3.0 * result.energy_ratio
+
+
+def test_a_snap_is_the_same_in_the_station_and_side_by_side_with_other_cuts(snap):
+    model = cut(effects=Effects(skin=SKIN))
+    solver = CuttingSolver(model, PERIOD)
+    path, state = KnifePath(model, press(model), PERIOD), None
+    for k, expected in enumerate(snap):
+        state = solver.initial_state() if state is None else state
+        step = solver.coupling_step(state, path.pose(k), path.pose(k + 1))
+        np.testing.assert_array_equal(step.state, expected.state)
+        assert step.substeps == expected.substeps
+        state = step.state
+    tougher = model.derive(effects=Effects(skin=Skin(toughness=1.2)))
+    alone, other = (cut_together(Driver(PERIOD), [m], [press(m)])[0] for m in (model, tougher))
+    both = cut_together(Driver(PERIOD), [model, tougher], [press(model)] * 2)
+    for one, beside in zip((alone, other), both, strict=True):
+        np.testing.assert_array_equal(one.food_wrench, beside.food_wrench)
+    there = alone.food_wrench[:, 3:] @ model.X_FC_rotation
+    np.testing.assert_allclose(there, forces(snap), rtol=1e-9, atol=1e-9)
+
+
+def test_given_steps_are_taken_whatever_the_food_does(snap):
+    numbers = [step.substeps for step in snap]
+    again = taken(cut(effects=Effects(skin=SKIN)), numbers)
+    np.testing.assert_array_equal(forces(again), forces(snap))
+    firmer = taken(cut(effects=Effects(skin=Skin(toughness=1.1))), numbers)
+    assert [step.substeps for step in firmer] == numbers
+
+
+def test_an_arm_that_gives_holds_the_force_of_the_steps_that_are_repeated():
+    effects = Effects(skin=SKIN, compliance=Compliance(arm=2e-5))
+    model = cut(effects=effects)
+    path = KnifePath(model, press(model), PERIOD)
+    numbers, rises = [], []
+    commands = path.p_FK[:, 2].copy()
+    for launch, (step,) in Driver(PERIOD).run([path]):
+        numbers.append(step.substeps)
+        rise = path.p_FK[launch.first + 1, 2] - commands[launch.first + 1]
+        force = (model.X_FC_rotation @ step.wrench[3:])[2]
+        rises.append((rise, 2e-5 * force))
+    assert max(numbers) >= 16
+    rise, held = np.array(rises).T
+    close = np.abs(rise - held) < 2e-4 * 2e-5 * np.maximum(1.0, held / 2e-5)
+    # Where the force jumps there is no balance, but a displacement at which it jumps.
+    assert close.mean() > 0.95

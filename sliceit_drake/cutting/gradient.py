@@ -7,6 +7,7 @@ coupling step."""
 
 import dataclasses as dc
 import typing
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -112,6 +113,7 @@ class SliceAdjoint:
         p: np.ndarray,
         model: CuttingModel | None = None,
         state: np.ndarray | None = None,
+        substeps: Sequence[int] | None = None,
     ) -> SliceRun:
         """Simulates a slice.
 
@@ -120,6 +122,8 @@ class SliceAdjoint:
             p: Positions of Ko in C there [E + 1, 3], metres.
             model: A cut derived from that of the constructor; None for that.
             state: The food before; None for at rest.
+            substeps: Numbers that are taken instead of those by need, one a coupling step [E]: for
+                differences of slices, which must not differ in them.
 
         Raises:
             CuttingError: A force is not finite.
@@ -136,6 +140,9 @@ class SliceAdjoint:
         for e in range(count):
             before, at = run.states[e], slice(e, e + 2)
             (number,), (after,) = rule.plan(before[stepping], R[at], p[at], self.exchange_period)
+            if substeps is not None:
+                number = substeps[e]
+                after[-2] = self.exchange_period / number
             balanced = False
             while not balanced:
                 ws = self._driver.workspace([model], substeps=number)
@@ -148,7 +155,7 @@ class SliceAdjoint:
                 run.wrenches[e] = wrenches.sum(0)
                 draw, _, rise = (-run.wrenches[e, 3:]).tolist()
                 balanced = mounting.rigid or mounting.balanced(-rise, draw, 0.0, None)
-                if balanced:
+                if balanced and substeps is None:
                     added = ws.results()["added_force"][0].tolist()
                     wanted = rule.again(number, added, after)
                     if wanted != number:
