@@ -63,7 +63,6 @@ def record(
         depth=depth,
         path=np.clip(depth, 0.0, None),
         in_contact=contact,
-        compared=np.ones(len(time), bool),
         measured=(force + y)[:, None],
         predicted=force[:, None],
         columns=table,

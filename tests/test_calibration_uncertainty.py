@@ -16,6 +16,8 @@ from sliceit_drake.configuration import ConfigurationError, dump_yaml, load_yaml
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.prediction.noise import NoiseModel, group_series
 from studies.calibration.coverage import (
+    OTHERS,
+    Found,
     Problem,
     Replicate,
     coverage_page,
@@ -37,7 +39,7 @@ class MapModel:
         self.depth = self.time * 0.02
         self.measured = np.zeros(len(self.time))
         self.used = np.ones(len(self.time), bool)
-        self.tried = []
+        self.tried, self.step_unknown = [], []
 
     def split(self, entries):
         ends = np.cumsum(np.bincount(self.record_of))[:-1]
@@ -54,6 +56,9 @@ class MapModel:
             step[k] = 1e-6
             columns.append((self.function(unit + step) - self.function(unit - step)) / 2e-6)
         return self.function(unit) - self.measured, np.array(columns).T
+
+    def without_step_error(self, unit):
+        return self
 
     def nuisance_jacobian(self, unit):
         return np.zeros((len(self.time), 0))
@@ -156,6 +161,13 @@ def test_a_single_record_is_said_to_tell_nothing_of_how_slices_differ():
     posterior = estimate(model, truth).posterior
     assert posterior.record_variation is None
     assert any("no cut was repeated" in line for line in posterior.remarks())
+
+
+def test_a_record_that_breaks_down_with_small_sub_steps_is_noted():
+    model, truth = small_model(shapes(120, 2))
+    model.step_unknown = ["one"]
+    notes = estimate(model, truth).posterior.notes
+    assert any("one: breaks down with small sub-steps" in line for line in notes)
 
 
 def test_what_only_enters_in_a_combination_is_named():
@@ -335,7 +347,18 @@ def test_parameters_of_simulated_cuts_are_found_within_their_intervals():
 def test_a_coverage_study_goes_on_from_its_file_and_refuses_that_of_another(tmp_path):
     problem, names = Problem(), ["material.friction", "height_offset:0-0"]
     done = [
-        Replicate(k, repr(problem), names, *[[0.5, 0.5]] * 3, [True, k > 0], 0.05, 0.02, 0.1)
+        Replicate(
+            *[[0.5, 0.5]] * 2,
+            [True, k > 0],
+            k,
+            repr(problem),
+            names,
+            [0.5, 0.5],
+            {name: Found([0.5, 0.5], [0.5, 0.5], [k > 0, True]) for name in OTHERS},
+            0.05,
+            0.02,
+            0.1,
+        )
         for k in range(2)
     ]
     file = tmp_path / "coverage.jsonl"
@@ -346,4 +369,4 @@ def test_a_coverage_study_goes_on_from_its_file_and_refuses_that_of_another(tmp_
     assert "| material.friction | 2 of 2 | 100 % |" in page
     assert "| height_offset | 1 of 2 | 50 % |" in page and "**75.0 %**, outside" in page
     with pytest.raises(ConfigurationError, match="another problem"):
-        coverage_study(Problem(records=2), 2, file)
+        coverage_study(Problem(records=3), 2, file)

@@ -37,7 +37,6 @@ def record(number: int, height: float, rng: np.random.Generator) -> RecordSensit
         depth=depth,
         path=depth,
         in_contact=np.ones(len(depth), bool),
-        compared=np.ones(len(depth), bool),
         measured=measured[:, None],
         predicted=force[:, None],
         columns=column[:, None, :],

@@ -69,7 +69,6 @@ def record(number: int, hidden: dict[str, float]) -> RecordSensitivity:
         depth=DEPTH,
         path=DEPTH,
         in_contact=np.ones(ROWS, bool),
-        compared=np.ones(ROWS, bool),
         measured=y[:, None],
         predicted=np.zeros((ROWS, 1)),
         columns=table,

@@ -30,7 +30,10 @@ NO_ADJOINT = ("effects.skin.thickness",)
 STEP = 1e-3
 """Step of these differences, in the unit range."""
 
-KEPT = 200
+REFERENCE_STEP = 2.5e-5
+"""Sub-step, and its double, that show what the usual one does wrong, s."""
+
+KEPT = 300
 """Slices that are kept in memory: a step's Jacobian needs what its residuals have simulated."""
 
 HEIGHT, SPEED = "height_offset", "speed_factor"
@@ -112,6 +115,8 @@ class Predictor:
         used, record_of, time, depth: Of each entry of `measured` [M]: whether it counts, index of
             its record, time in it, s, and depth of the edge, metres.
         conditions: Of each record. Records of one condition are replicates; "" is none.
+        step_error: What is taken off the predictions [M], N; see `without_step_error`.
+        step_unknown: Records whose error could not be found, so that nothing is taken off.
     """
 
     def __init__(
@@ -143,9 +148,12 @@ class Predictor:
         self.parameters = self._list_parameters()
         sizes = [t.measured.size for t in self.targets]
         self.record_of = np.repeat(np.arange(len(sizes)), sizes)
-        self.used, self.time, self.depth = map(self._by_entry, ("compared", "time", "depth"))
+        self.time, self.depth = map(self._by_entry, ("time", "depth"))
+        self.used = np.ones(len(self.time), bool)
         self.conditions = [t.record.metadata.condition for t in self.targets]
         self.point_factors: dict[str, np.ndarray] = {}
+        self.step_error = np.zeros(self.measured.size)
+        self.step_unknown: list[str] = []
         self._simulator = Simulator(clock, self.board, workers=workers, kept=KEPT)
         self._adjoints: dict[int, SliceAdjoint] = {}
 
@@ -226,8 +234,15 @@ class Predictor:
         R, p = target.R[target.coupling_steps], self._positions(target, values)
         return Job(model, R, p, target.stretches, target.record.name, "float64")
 
-    def predict(self, units: Sequence[np.ndarray]) -> list[list[Prediction]]:
-        """Forces at several places in the ranges, each [d]: for each, one prediction a record."""
+    def predict(
+        self, units: Sequence[np.ndarray], step: float | None = None
+    ) -> list[list[Prediction]]:
+        """Forces at several places in the ranges, each [d]: for each, one prediction a record.
+
+        Args:
+            units: The places.
+            step: Sub-step, s; the predictor's by default.
+        """
         jobs, failures = [], []
         for unit in units:
             values = self.values(unit)
@@ -235,6 +250,7 @@ class Predictor:
                 model, failure = target.model, None
                 try:
                     model = self.model(target, values)
+                    model = model.with_step(step or model.numerics.time_step)
                 except TimeStepError as error:
                     failure = str(error)
                 jobs.append(self._job(target, model, values))
@@ -258,9 +274,30 @@ class Predictor:
         p = job.p.copy()
         p[1:, 2] += result.rise
         wrench = result.parts.sum(1) + target.board(self.board, job.R, p)
-        smooth = target.compare_forces(wrench[:, 3:])
+        smooth = self._smooth(target, wrench[:, 3:])
         wave = self._oscillation(target, smooth)
         return Prediction(wave.factor(target.time)[:, None] * smooth, cut, wave, smooth, None)
+
+    def _smooth(self, target: RecordTarget, force: np.ndarray) -> np.ndarray:
+        """Channels at the rows [m, c] from forces of the coupling steps [E, 3], in F, N."""
+        error = self.split(self.step_error)[self.targets.index(target)]
+        return target.compare_forces(force) - error
+
+    def without_step_error(self, unit: np.ndarray) -> "Predictor":
+        """The same predictor less what its sub-step does wrong at a place [d].
+
+        The scheme is of first order, so that forces at two small steps h and 2 h tell those at none
+        (Richardson 1911): 2 f(h) - f(2 h). The error is taken to be the same near the place.
+        """
+        other = copy.copy(self)
+        other.step_error = np.zeros(self.measured.size)
+        rows = [other.predict([unit], s)[0] for s in (None, REFERENCE_STEP, 2.0 * REFERENCE_STEP)]
+        usual, fine, double = (np.concatenate([p.smooth.ravel() for p in row]) for row in rows)
+        error = usual - (2.0 * fine - double)
+        other.step_error = np.nan_to_num(error)
+        unknown = np.unique(self.record_of[np.isnan(error)])
+        other.step_unknown = [self.targets[k].record.name for k in unknown]
+        return other
 
     def _oscillation(self, target: RecordTarget, smooth: np.ndarray) -> Oscillation:
         if self.setup.oscillation is None:
@@ -289,7 +326,8 @@ class Predictor:
     def mean_square_and_gradient(self, unit: np.ndarray) -> tuple[float, np.ndarray]:
         """Mean square of the used residuals [N^2] at places [d], and its gradient by them.
 
-        The gradient is exact (the solver's adjoint) but for `NO_ADJOINT`.
+        The gradient is exact (the solver's adjoint, for which the added inertia is a constant) but
+        for `NO_ADJOINT`.
 
         Raises:
             CuttingError: A slice broke down.
@@ -330,7 +368,7 @@ class Predictor:
             R_FC = model.X_FC_rotation
             board = target.board(self.board, job.R, job.p)
             force = run.wrenches[:, 3:] @ R_FC.T + board[:, 3:]
-            smooth = target.compare_forces(force)
+            smooth = self._smooth(target, force)
             factor = self._oscillation(target, smooth).factor(target.time)[:, None]
             residual = used * (factor * smooth - target.measured)
             total += float((residual**2).sum())

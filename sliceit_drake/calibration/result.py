@@ -158,17 +158,6 @@ def _plot_record(target: RecordTarget, predicted: np.ndarray, upper: "Axes", low
     lower.set(xlabel="time [s]", ylabel="rest [N]")
     for axis in (upper, lower):
         axis.grid(alpha=0.25)
-        axis.fill_between(
-            target.time,
-            0.0,
-            1.0,
-            where=(~target.compared).tolist(),
-            transform=axis.get_xaxis_transform(),
-            color="#94a3b8",
-            alpha=0.35,
-            lw=0.0,
-            label="" if target.compared.all() or axis is lower else "turns round: not compared",
-        )
     upper.legend(frameon=False)
     if len(channels) > 1:
         lower.legend(frameon=False, fontsize=7, ncols=3)

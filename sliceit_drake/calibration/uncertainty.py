@@ -139,7 +139,7 @@ def estimate(model: Predictor, unit: np.ndarray, rounds: int = ROUNDS) -> Estima
     squares) plus the prior of a uniform range, which has variance 1/12 about its middle: what the
     data do not determine stays as wide as its range. Where samples are autocorrelated and slices
     differ, this is not the fit of least squares; the posterior notes where the two are further
-    apart than noise explains.
+    apart than noise explains. What the sub-step does wrong at `unit` is taken off the predictions.
 
     Args:
         unit: A good fit, such as that of least squares [d].
@@ -148,7 +148,9 @@ def estimate(model: Predictor, unit: np.ndarray, rounds: int = ROUNDS) -> Estima
     Raises:
         CuttingError: A slice breaks down near `unit`.
     """
-    at = linearise(model, np.clip(unit, 0.0, 1.0))
+    start = np.clip(unit, 0.0, 1.0)
+    model = model.without_step_error(start)
+    at = linearise(model, start)
     problem = _noise_problem(model, at)
     noise = problem.fit()
     for _ in range(rounds):
@@ -210,6 +212,11 @@ def _posterior(
         notes.append(
             "no cut was repeated: how much slices differ is unknown, and the intervals hold for "
             "the slices that were measured"
+        )
+    if model.step_unknown:
+        notes.append(
+            f"{', '.join(model.step_unknown)}: breaks down with small sub-steps, so that the error "
+            "of the usual ones is not known and not in the intervals"
         )
     sd = np.sqrt(np.diag(covariance))
     for k, parameter in enumerate(parameters):

@@ -23,7 +23,7 @@ from sliceit_drake.records.preprocessing import as_measured
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.tables import interpolated
 
-__all__ = ["CHANNELS", "Bench", "Meshing", "RecordTarget", "make_targets", "turning"]
+__all__ = ["CHANNELS", "Bench", "Meshing", "RecordTarget", "make_targets"]
 
 CHANNELS = ("force_x", "force_y", "force_z", "torque_y")
 """Compared components, in F: along the edge, normal to the blade, vertical, N; moment about Ko and
@@ -36,11 +36,6 @@ CLEARANCE = 5e-4
 record's own height, metres."""
 CLEAR = 6e-4
 """Height of the edge over the food above which nothing moves fast, metres."""
-TURN_TRAVEL, TURN_TIME, STILL = 1e-3, 0.03, 2e-5
-"""Where the knife turns round in the food, the rows that are not compared: until it is as far back,
-metres, and for as long, s, counted from where it was last as deep but for `STILL`, metres. What is
-wrong there is as large as a sensor's noise, and so regular that friction would seem known several
-times too well (docs/explanation/calibration.md)."""
 
 
 class Bench(Protocol):
@@ -85,8 +80,8 @@ class RecordTarget:
             near the food. A zero of the sensor shows in the air; a fit to food has nothing there.
 
     Raises:
-        ConfigurationError: The knife starts in the food, or never comes near it and `near_food` is
-            set.
+        ConfigurationError: The knife starts in the food, is upside down at it, or never comes near
+            it and `near_food` is set.
 
     Attributes:
         record, models, clock: As given.
@@ -98,7 +93,6 @@ class RecordTarget:
         time: Of the rows [m], s.
         measured: Channels at the rows [m, c].
         depth: Of the edge below the top of the food at the rows [m], metres.
-        compared: Whether a row counts in a fit [m]: not where the knife turns round in the food.
         phase: Label at the rows [m]; "" for none.
         grid: Even times of the coupling steps [N + 1], s; row 0 is the first row of the record.
         R, p: Pose X_FK at `grid`.
@@ -136,7 +130,6 @@ class RecordTarget:
         height = p[:, 2] - self._top
         rows = self._near(height) if near_food else slice(None)
         self.time, self.depth = record.time[rows], -height[rows]
-        self.compared = ~turning(self.time, self.depth)
         # It ends with the last row: a knife that stopped there would show weight and speed that it
         # never had.
         first, last = record.time[0], record.time[-1]
@@ -205,6 +198,14 @@ class RecordTarget:
                 source=self.record.file or self.record.name,
                 field="p_WK_z",
                 fix="Record from before the first contact, or correct food.position.",
+            )
+        upright = self.R[low, 2, 2] < 0.0
+        if not upright.all():
+            raise ConfigurationError(
+                f"the knife is upside down at the food, {self.grid[low[upright.argmin()]]:.4g} s",
+                source=self.record.file or self.record.name,
+                field="quat_WK_w",
+                fix="z of K points from the spine to the edge, down in a cut: correct quat_WK.",
             )
         moved = np.linalg.norm(np.diff(self.p, axis=0), axis=1)
         turned = np.linalg.norm(np.diff(self.R, axis=0), axis=(1, 2)) * 0.5 * self.knife.length
@@ -363,25 +364,8 @@ class RecordTarget:
         return np.asarray(mask[np.clip(k, 0, len(mask) - 1)])
 
     def rms_error(self, predicted: np.ndarray) -> float:
-        """Root mean square over the compared rows of channels [m, c], N."""
-        rest = (predicted - self.measured)[self.compared]
-        return float(np.sqrt(np.mean(rest**2)))
-
-
-def turning(time: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Whether the knife has just turned back in the food, at samples [m] of its depth, metres."""
-    found, deepest, is_down = np.zeros(len(depth), bool), 0, True
-    for k in range(len(depth)):
-        if is_down == (depth[k] > depth[deepest]):
-            deepest = k
-        elif abs(depth[deepest] - depth[k]) > TURN_TRAVEL:
-            if is_down and depth[deepest] > 0.0:
-                bottom = np.flatnonzero(depth[deepest : k + 1] > depth[deepest] - STILL)
-                first = deepest + int(bottom[-1])
-                after = np.searchsorted(time, time[first] + TURN_TIME, side="right")
-                found[first : max(k, int(after))] = True
-            deepest, is_down = k, not is_down
-    return found
+        """Root mean square over the channels [m, c], N."""
+        return float(np.sqrt(np.mean((predicted - self.measured) ** 2)))
 
 
 def make_targets(

@@ -70,6 +70,7 @@ def profile_likelihood(
     names = [p.name for p in model.parameters]
     if name not in names:
         raise ValueError(f"there is no parameter {name!r} among {', '.join(names)}")
+    model = model.without_step_error(found.unit)
     k, z = names.index(name), float(ndtri(0.5 + level / 2.0))
     sd = float(np.sqrt(found.covariance[k, k]))
     widening = float(np.sqrt(found.posterior.covariance[k][k])) / sd

@@ -15,8 +15,6 @@ __all__ = [
     "replicates",
 ]
 
-NOT_COMPARED = 1e4
-"""Standard deviation of a row that does not count, N and Nm."""
 KINK_TIME = 0.02
 """By which the time of a jump of the force may be wrong, s."""
 
@@ -72,7 +70,6 @@ class RecordSensitivity:
         depth: Of the edge below the top of the food [m], metres.
         path: Way of the knife since the start [m], metres.
         in_contact: Whether food or board touch the knife [m].
-        compared: Whether a row counts [m]: not where the knife turns round in the food.
         measured, predicted: [m, c], N and Nm.
         columns: Changes of the prediction [m, c, K].
         even: Even parts of the changes [m, c, K]; 0 where there is none.
@@ -88,7 +85,6 @@ class RecordSensitivity:
     depth: np.ndarray
     path: np.ndarray
     in_contact: np.ndarray
-    compared: np.ndarray
     measured: np.ndarray
     predicted: np.ndarray
     columns: np.ndarray
@@ -111,8 +107,7 @@ class RecordSensitivity:
         return self.channels.index("force_z") if "force_z" in self.channels else 0
 
     def kinks(self) -> np.ndarray:
-        """Largest second difference of the prediction within `KINK_TIME` of each row [m, c];
-        `NOT_COMPARED` where a row does not count.
+        """Largest second difference of the prediction within `KINK_TIME` of each row [m, c].
 
         Where the force jumps (the edge leaves the board, the knife turns round), a sample is as
         wrong as the jump is large if it comes a row too early; elsewhere this is next to nothing.
@@ -120,8 +115,7 @@ class RecordSensitivity:
         bend = np.zeros_like(self.predicted)
         bend[1:-1] = np.abs(np.diff(self.predicted, 2, axis=0))
         step = float(np.median(np.diff(self.time)))
-        bend = maximum_filter1d(bend, 2 * round(KINK_TIME / step) + 1, axis=0)
-        return np.where(self.compared[:, None], bend, NOT_COMPARED)
+        return np.asarray(maximum_filter1d(bend, 2 * round(KINK_TIME / step) + 1, axis=0))
 
 
 @dc.dataclass

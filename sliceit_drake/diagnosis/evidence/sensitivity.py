@@ -301,7 +301,6 @@ class _Computation:
             depth=target.depth,
             path=np.interp(target.time, target.grid, way),
             in_contact=in_contact,
-            compared=target.compared,
             measured=target.measured,
             predicted=predicted,
             columns=nothing,

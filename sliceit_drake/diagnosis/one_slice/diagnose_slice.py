@@ -112,7 +112,7 @@ def diagnose_slice(
         progress=lambda done, total: show("simulations", done, total),
     )
     whole = found.records[0]
-    kept = whole.compared & (whole.time < whole.time[-1] - END)
+    kept = whole.time < whole.time[-1] - END
     found = _rows(found, kept)
     precision = np.array([1.0 / u.spread**2 for u in fit.unknowns])
     own = [k for k, u in enumerate(fit.unknowns) if u.kind == "own"]

@@ -219,7 +219,7 @@ class _Fitter:
         """Fits all rows from places of unknowns."""
         theta = np.array([np.clip(start.get(u.name, 0.0), u.low, u.high) for u in self.unknowns])
         (predicted,) = self.predict([theta])
-        everything = self.target.compared
+        everything = np.ones(len(self.target.time), bool)
         cost = self.cost(theta, predicted, everything)
         if not np.isfinite(cost):
             raise CuttingError(
@@ -242,7 +242,7 @@ class _Fitter:
         predicts. The first step is taken even where it makes the rest a little worse: as good a
         fit to the rest as it can tell, and one without the rows.
         """
-        theta, predicted, others = self.theta, self.predicted, ~rows & self.target.compared
+        theta, predicted, others = self.theta, self.predicted, ~rows
         shared = np.array([u.kind != "own" for u in self.unknowns])
         cost = AS_GOOD * self.cost(theta, predicted, others)
         for _ in range(HELD_OUT_STEPS):

@@ -79,8 +79,7 @@ class OneSlice:
     def error(self, predicted: np.ndarray, rows: np.ndarray | None = None) -> float:
         """RMS error of the forces of a prediction, N."""
         rest = (self.record.measured - predicted)[:, self.record.forces]
-        compared = self.record.compared
-        rest = rest[compared if rows is None else compared & rows]
+        rest = rest if rows is None else rest[rows]
         return float(np.sqrt((rest**2).sum(1).mean())) if len(rest) else 0.0
 
     def by_depth(self) -> list[tuple[str, int, float, float, float]]:
