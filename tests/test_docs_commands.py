@@ -244,7 +244,7 @@ READ_ONLY = {
     "a study of minutes to hours, whose results stand in docs": """
         python -m studies calibration --output FOLDER
         python -m studies control --output FOLDER
-        python -m studies coverage --replicates 7 --output docs/results
+        python -m studies coverage --replicates 12 --output docs/results
         python -m studies disect --output docs/results
         python -m studies hidden --output output/hidden --seed 1 --replicates 100
         python -m studies identifiability --output docs/results/identifiability.md --figure docs/results/figures/identifiability.png

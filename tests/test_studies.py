@@ -103,7 +103,8 @@ def test_pictures_of_stored_results_say_what_their_pages_say():
     rows = re.findall(
         r"^\| material\.(\w+) \| (\d+) of (\d+) ", (RESULTS / "coverage.md").read_text(), re.M
     )
-    for axes, (name, inside, count) in zip(coverage.axes, rows, strict=True):
+    # The first table; those below it are of other estimates.
+    for axes, (name, inside, count) in zip(coverage.axes, rows[:3], strict=True):
         assert axes.get_title(loc="left") == name
         points = [line for line in axes.lines if line.get_marker() == "."]
         assert len(points) == int(count)
