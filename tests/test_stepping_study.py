@@ -18,7 +18,6 @@ from sliceit_drake.cutting.simulate import check_energies
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.resources import resource_path
-from sliceit_drake.systems.cutting_system import COUPLED_STEP
 from studies.__main__ import main
 from studies.physics.stepping import (
     STEPS,
@@ -190,11 +189,11 @@ def test_in_the_committed_tables_sub_steps_by_need_err_as_little_as_asked_for():
             assert float(largest[name][-1]) <= 10.0, name
 
 
-def test_in_the_committed_tables_a_robots_food_errs_little_up_to_its_longest_step():
+def test_in_the_committed_tables_a_robots_food_errs_little_at_any_step():
     _, *rows = committed_tables()["in the station"].split("\n")[1:]
     errors = {}
     for row in rows:
         _, step, rms, *_ = (cell.strip() for cell in row.strip("| ").split("|"))
         errors.setdefault(float(step), []).append(float(rms))
-    assert max(errors[COUPLED_STEP]) <= 0.2
-    assert max(errors[1e-3]) > 3.0
+    assert max(map(max, errors.values())) <= 0.2
+    assert 1e-3 in errors

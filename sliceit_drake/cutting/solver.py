@@ -10,7 +10,7 @@ from sliceit_drake.cutting.coupling_steps import CouplingSteps, Energies, run_co
 from sliceit_drake.cutting.driver import Driver
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
-from sliceit_drake.cutting.stepping import Stepping
+from sliceit_drake.cutting.stepping import EVENT, Stepping
 from sliceit_drake.cutting.workspace import Workspace, parameter_row
 
 __all__ = ["NOT_FINITE", "CuttingError", "CuttingSolver", "SurfaceFactors"]
@@ -49,19 +49,20 @@ class CuttingSolver:
     Args:
         model: The cut.
         exchange_period: Duration of one `coupling_step`, s; the time step must divide it.
+        event: See `stepping.EVENT`.
 
     Raises:
         TimeStepError: The time step does not divide the coupling period.
     """
 
-    def __init__(self, model: CuttingModel, exchange_period: float) -> None:
+    def __init__(self, model: CuttingModel, exchange_period: float, event: float = EVENT) -> None:
         self.model = model
         self.exchange_period = exchange_period
         self.driver = Driver(exchange_period)
         self._workspace = Workspace([model], exchange_period)
         # By number of sub-steps.
         self._workspaces = {self._workspace.substeps: self._workspace}
-        self._stepping = Stepping.of(model, self._workspace.substeps)
+        self._stepping = Stepping.of(model, self._workspace.substeps, event)
         self.state_size = self._workspace.state_size
         self.dtype = self._workspace.dtype
         self._lock = threading.Lock()

@@ -23,7 +23,7 @@ import numpy as np
 
 from sliceit_drake.cutting.model import CuttingModel
 
-__all__ = ["STEPPING", "Stepping"]
+__all__ = ["EVENT", "STEPPING", "Stepping"]
 
 STEPPING = 8
 """Numbers that a state holds: the velocities of the edge's two points that the food has settled to,
@@ -55,7 +55,7 @@ class Stepping(NamedTuple):
         top: Height in C above which the knife touches nothing, metres.
         coarsest: Sub-steps of a coupling step where nothing changes.
         by_need: `numerics.step_by_need`.
-        force: Mean force to cut through the section, N.
+        force: Most force of the added inertia, N.
     """
 
     half_span: float
@@ -65,12 +65,12 @@ class Stepping(NamedTuple):
     force: float
 
     @classmethod
-    def of(cls, model: CuttingModel, coarsest: int) -> "Stepping":
-        """The rule for a cut and its number of sub-steps where nothing changes."""
+    def of(cls, model: CuttingModel, coarsest: int, event: float = EVENT) -> "Stepping":
+        """The rule for a cut, its number of sub-steps where nothing changes, and `EVENT`."""
         low, high = model.span
         # Tables blur by one spacing.
         top = model.top + model.tables.spacing
-        force = float(model.toughness @ model.tables.area) / (model.top - model.bottom)
+        force = event * float(model.toughness @ model.tables.area) / (model.top - model.bottom)
         return cls(0.5 * (high - low), top, coarsest, model.numerics.step_by_need, force)
 
     def plan(
@@ -134,7 +134,7 @@ class Stepping(NamedTuple):
         for force in added:
             # What broke down does so however short the steps.
             if self.by_need and math.isfinite(force):
-                need = max(need, number * math.sqrt(force / (EVENT * max(self.force, 1e-6))))
+                need = max(need, number * math.sqrt(force / max(self.force, 1e-6)))
         if number > self.coarsest and 2.0 * need >= number:
             stepping[-1] = 0.0
         more = number

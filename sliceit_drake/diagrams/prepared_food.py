@@ -22,7 +22,7 @@ from sliceit_drake.cutting.motion import Motion, MotionPlan
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.plant.knife_body import blade_surface
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.systems.cutting_system import COMPLETE, COUPLED_STEP, CuttingSystem
+from sliceit_drake.systems.cutting_system import COMPLETE, COUPLED_EVENT, CuttingSystem
 from sliceit_drake.systems.food_look import look_of
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 from sliceit_drake.systems.loose_slices import LooseSlices, SliceBody
@@ -201,8 +201,7 @@ def _(food: Food, scenario: Scenario) -> PreparedFood:
             prepare_cut(cut, each.material, scenario.knife, numerics, each.effects)
             for cut, each in zip(cuts, foods, strict=True)
         ]
-        step = min(numerics.time_step, COUPLED_STEP)
-        solvers = [CuttingSolver(m.with_step(step), scenario.exchange_period) for m in models]
+        solvers = [CuttingSolver(m, scenario.exchange_period, COUPLED_EVENT) for m in models]
         in_sequence = sequence is not None
         return CuttingSystem(solvers, poses, in_sequence=in_sequence, look=look_of(food.name))
 

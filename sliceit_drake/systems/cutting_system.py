@@ -29,7 +29,7 @@ from sliceit_drake.systems.food_look import OTHER, FoodLook, FoodScene
 from sliceit_drake.systems.food_visualizer import FoodVisualizer, frame_size
 from sliceit_drake.systems.knife_force import KEPT, LAST_POSE, KnifeForceSystem
 
-__all__ = ["BALANCE_NAMES", "COMPLETE", "COUPLED_STEP", "ENERGY_NAMES", "CuttingSystem"]
+__all__ = ["BALANCE_NAMES", "COMPLETE", "COUPLED_EVENT", "ENERGY_NAMES", "CuttingSystem"]
 
 BALANCE_NAMES = BALANCE.names or ()
 ENERGY_NAMES = ("elastic", "interface", "kinetic", "largest_energy_ratio", "least_volume_ratio")
@@ -65,9 +65,9 @@ INDEXED = 5e-4
 """Distance of the blade from the next cut plane at which the knife counts as indexed, metres."""
 
 
-COUPLED_STEP = 5e-4
-"""Longest sub-step of a food that a robot cuts, s. With a longer one the blade, which hangs on an
-arm that gives, swings sideways where it turns round at the board (docs/results/stepping.md)."""
+COUPLED_EVENT = 0.05
+"""`stepping.EVENT` of a food that a robot cuts: the blade hangs on an arm that gives, and swings
+sideways where it turns round at the board (docs/results/stepping.md)."""
 
 
 class CuttingSystem(KnifeForceSystem):

@@ -19,17 +19,15 @@ from tqdm import tqdm
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.effects import Compliance, Effects, Relaxation, Skin
-from sliceit_drake.cutting.foods.food import Food, make_food_model
+from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
-from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.outputs.run_log import Record
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.resources import resource_path
-from sliceit_drake.systems.cutting_system import COUPLED_STEP, CuttingSystem
-from sliceit_drake.systems.food_look import look_of
+from sliceit_drake.systems.cutting_system import CuttingSystem
 from studies.figures import BLUE, GREEN, ORANGE, RED, new_figure, save_figure
 from studies.pages import publish, render_and_store, table
 from studies.physics import stepping as study
@@ -52,7 +50,7 @@ __all__ = [
 FOODS = ("cucumber_measured", "potato_sequence", "tomato_sequence")
 HELD_OUT = ("carrot_sequence", "apple")
 """Foods on which no constant of the rule was chosen."""
-STATION_STEPS = (6.25e-5, 2.5e-4, COUPLED_STEP, 1e-3)
+STATION_STEPS = (6.25e-5, 2.5e-4, 5e-4, 1e-3)
 NOISE = (0.0, 2e-6, 5e-6, 1e-5)  # Of a measured path, metres.
 
 
@@ -230,7 +228,7 @@ def station_steps(
 
     Args:
         scenario: A cut by hand-set motion or policy, of one slice.
-        steps: Longest ones, s, finest first: the reference. They may be longer than `COUPLED_STEP`.
+        steps: Longest ones, s, finest first: the reference.
         progress: Called after each run with the fraction of all sub-steps done.
 
     Raises:
@@ -242,7 +240,7 @@ def station_steps(
         case = copy.deepcopy(scenario)
         case.measurement = None
         case.numerics.time_step = step
-        run = prepare_run(case, cutting=_uncapped)
+        run = prepare_run(case)
         run.advance()
         if run.stopped and not results:
             raise ConfigurationError(
@@ -273,14 +271,6 @@ def station_steps(
         if progress is not None:
             progress(share)
     return results
-
-
-def _uncapped(scenario: Scenario) -> CuttingSystem:
-    food = scenario.food
-    assert isinstance(food, Food)
-    model = make_food_model(food, scenario.knife, scenario.numerics)
-    solver = CuttingSolver(model, scenario.exchange_period)
-    return CuttingSystem([solver], scenario.X_WF(), look=look_of(food.name))
 
 
 def _finer(cutting: CuttingSystem, record: Record) -> dict[float, float]:
