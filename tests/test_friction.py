@@ -123,3 +123,27 @@ def test_friction_turns_with_the_motion(pressed):
     up = whole.friction[(whole.time > 1.3 * turn) & (whole.time < 1.6 * turn), 2]
     assert down.min() > 0.0
     assert up.max() < 0.0
+
+
+def slow_friction(static_friction, step):
+    """Friction over normal force of a knife that slides in at 2 mm/s."""
+    material = Material(
+        toughness=0.0,
+        friction=FRICTION,
+        static_friction=static_friction,
+        stribeck_velocity=0.01,
+    )
+    shape = Box(size=[0.02, 0.1, 0.03], divisions=[4, 6], layers=[0.0, 0.006, 0.012])
+    food = Food(shape=shape, material=material)
+    model = make_food_model(food, Knife(length=0.3), Numerics(time_step=step))
+    plan = MotionPlan([ConstantSpeed(distance=0.0025, speed=2e-3)])
+    motion = Motion(plan, start_pose(model, clearance=5e-4))
+    result = simulate_slice(CuttingSolver(model, 2e-3), motion)
+    deep = result.position[:, 2] < 0.03 - 1e-3
+    return result.friction[deep, 2].mean() / result.normal[deep, 2].mean()
+
+
+@pytest.mark.parametrize("step", [1e-3, 2.5e-4, 5e-5])
+def test_static_friction_does_not_depend_on_the_sub_step(step):
+    ratio = slow_friction(2.0 * FRICTION, step) / slow_friction(0.0, 1e-3)
+    assert ratio == pytest.approx(1.0 + np.exp(-0.2), rel=0.02)

@@ -1,5 +1,7 @@
 """Steps and meshes: what is stable, what is refused, how far the force is from converged."""
 
+import dataclasses as dc
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.cutting.model import Numerics, TimeStepError
+from sliceit_drake.cutting.model import SOFTEST, Numerics, TimeStepError
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
@@ -88,3 +90,16 @@ def test_estimated_error_of_the_default_mesh_is_at_most_three_percent_and_honest
         < estimate.relative_rms
         < 3.0 * relative_rms(default, fine)
     )
+
+
+def test_a_food_too_soft_for_its_mesh_is_warned_of():
+    h = make_food_model(SMALL, Knife(), Numerics()).element_size
+    warnings = {}
+    for softness in (0.9 * SOFTEST, 1.1 * SOFTEST):
+        material = dc.replace(SMALL.material, youngs_modulus=400.0 / (softness * h), strength=1e4)
+        warnings[softness > SOFTEST] = make_food_model(
+            dc.replace(SMALL, material=material), Knife(), Numerics()
+        ).warnings
+    assert warnings[False] == ()
+    (warning,) = warnings[True]
+    assert f"toughness in the food over E h is {1.1 * SOFTEST:.2g}" in warning

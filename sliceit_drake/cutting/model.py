@@ -18,6 +18,7 @@ from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry
 
 __all__ = [
     "GRAVITY",
+    "SOFTEST",
     "CuttingModel",
     "Numerics",
     "PointScales",
@@ -31,6 +32,8 @@ GRAVITY = 9.81
 SLIVER = 0.1
 """Fraction of a vertex's mass below which a node of one side does not set the step."""
 
+SOFTEST = 0.5
+"""Toughness over Young's modulus and edge length, R / (E h), up to which the edge's work is R A."""
 
 BULK_SHARE = 0.95
 """Share of the stepped masses that the bulk may need where a half of the food is free."""
@@ -351,17 +354,25 @@ class CuttingModel(CutGeometry):
                 "food.held_sides = none and numerics.board_friction = 0: nothing holds the food, "
                 "and a draw pushes it away. Hold a side, or give the board friction, as 0.3."
             )
+        size = self.element_size
         wanted, used = self.material.strength, self.strength
-        if used >= wanted:
-            return tuple(texts)
-        stiffness = self.numerics.bond_stiffness * (wanted / used) ** 2
-        texts.append(
-            f"material.strength = {wanted:.4g} Pa is more than bonds of "
-            f"{self.material.toughness:g} J/m2 hold on elements of {1e3 * self.element_size:.3g} "
-            f"mm: the faces part at {used:.4g} Pa, with the same toughness. Give strength: "
-            f"{0.999 * used:.4g}, or numerics.bond_stiffness: {stiffness:.3g} and a sub-step to "
-            "match."
-        )
+        if used < wanted:
+            stiffness = self.numerics.bond_stiffness * (wanted / used) ** 2
+            texts.append(
+                f"material.strength = {wanted:.4g} Pa is more than bonds of "
+                f"{self.material.toughness:g} J/m2 hold on elements of {1e3 * size:.3g} mm: the "
+                f"faces part at {used:.4g} Pa, with the same toughness. Give strength: "
+                f"{0.999 * used:.4g}, or numerics.bond_stiffness: {stiffness:.3g} and a sub-step "
+                "to match."
+            )
+        softness = float(self.toughness.max()) / (self.material.youngs_modulus * size)
+        if softness > SOFTEST:
+            texts.append(
+                f"the greatest toughness in the food over E h is {softness:.2g}: the edge deforms "
+                f"the food by more than its mesh of {1e3 * size:.3g} mm is verified to follow, "
+                f"{SOFTEST:g}, and its work may be more than R A. Give a stiffer or less tough "
+                "food; a coarser mesh bears more, a finer one less."
+            )
         return tuple(texts)
 
     def edge_forces(self) -> np.ndarray:

@@ -172,7 +172,8 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         knife_y = vec3(knife.R[0, 1], knife.R[1, 1], knife.R[2, 1])
         knife_z = vec3(knife.R[0, 2], knife.R[1, 2], knife.R[2, 2])
         bending = now.blade[cut, 1] * knife_y
-        relative = v - all8(knife.v + bending) - wp.skew(knife.w) * arm
+        moved = all8(knife.v + bending) + wp.skew(knife.w) * arm
+        relative = v - moved
         slip = now.slip[cut, block, face]
         depth = -(knife_z * arm)
         k_now, w_now = place8(depth, points)
@@ -199,7 +200,10 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         extra = wp.max(P[cut, Scalar.STATIC_FRICTION] - P[cut, Scalar.FRICTION], real(0.0))
         mu = one * P[cut, Scalar.FRICTION]
         if extra > real(0.0):
-            mu = mu + exp8(length8(sliding) / -P[cut, Scalar.STRIBECK_VELOCITY]) * extra
+            # By the knife's own speed: with the food's in it, friction that falls with the speed
+            # would drive a vibration, the faster the shorter the step.
+            speed = length8(moved - scaled8(dot8(moved, n), n))
+            mu = mu + exp8(speed / -P[cut, Scalar.STRIBECK_VELOCITY]) * extra
         kept = wp.cw_div(old_area, where8(area, area, one))
         old = scaled8(wp.min(kept, one), slip)
         old = old - scaled8(dot8(old, n), n)
