@@ -52,6 +52,12 @@ TOPICS: dict[str, tuple[Study, ...]] = {
             "10 min",
         ),
         Study(
+            "contact",
+            "physics.contact_convergence",
+            "force against the stiffness of the flanks' contact and the mesh",
+            "2 min",
+        ),
+        Study(
             "split_step_limit",
             "physics.split_step_limit",
             "stable step of cuts by random planes",

@@ -257,6 +257,7 @@ READ_ONLY = {
     "measures times or draws figures, whose results stand in docs": """
         python -m studies batch_speed --output docs/results/speed.md
         python -m studies condensed_scheme
+        python -m studies contact --output docs/results/contact.md
         python -m studies cutting_speed --json docs/results/benchmarks/cutting_speed.json
         python -m studies cutting_speed --repeats 3 --output docs/results/figures/cutting_speed.png
         python -m studies diagnosis_speed --json docs/results/benchmarks/diagnosis_speed.json
