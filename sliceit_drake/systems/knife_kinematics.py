@@ -101,17 +101,19 @@ class BoardContact(PlainSystem):
         lowest = X_WK[2, 3] - abs(X_WK[2, 0]) * self._half_length
         if lowest >= self._near_height:
             return _NO_WRENCH
-        moment, force = np.zeros(3), np.zeros(3)
-        results = self._results.Eval(context)
+        results, wrench = self._results.Eval(context), np.zeros(6)
+        ox, oy, oz = X_WK[:, 3].tolist()
         for i in range(results.num_point_pair_contacts()):
             info = results.point_pair_contact_info(i)
             # contact_force acts on body B of the pair.
             if info.bodyB_index() == self._knife_body:
-                f = info.contact_force()
+                fx, fy, fz = info.contact_force().tolist()
             elif info.bodyA_index() == self._knife_body:
-                f = -info.contact_force()
+                fx, fy, fz = (-info.contact_force()).tolist()
             else:
                 continue
-            force += f
-            moment += np.cross(info.contact_point() - X_WK[:, 3], f)
-        return np.concatenate([moment, force])
+            x, y, z = info.contact_point().tolist()
+            x, y, z = x - ox, y - oy, z - oz
+            # By hand, a tenth of the time of `np.cross`.
+            wrench += [y * fz - z * fy, z * fx - x * fz, x * fy - y * fx, fx, fy, fz]
+        return wrench
