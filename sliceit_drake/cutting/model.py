@@ -50,7 +50,7 @@ class Numerics:
     time_step: float = quantity(1e-3, "s", low=1e-7, high=5e-3)
     """Longest sub-step; must divide the coupling period."""
     step_by_need: bool = True
-    """Whether sub-steps are shorter where the knife is fast or changes its velocity."""
+    """Whether sub-steps are shorter where knife or food change their velocity."""
     mass_scaling: bool = True
     """Whether inertia is added as the step asks for it; else a step too long is refused."""
     stability_margin: float = quantity(0.8, "", low=0.1, high=0.95)
