@@ -170,7 +170,8 @@ def test_in_the_committed_tables_sub_steps_by_need_err_as_little_as_asked_for():
     head, rms = cells(tables["RMS error [%]"])
     assert head[1:] == [*(f"{step:g} s" for step in STEPS), "by need"]
     _, largest = cells(tables["largest difference [% of peak]"])
-    assert {name.split(",")[0] for name in rms} >= {"cucumber", "potato", "tomato"}
+    held_out = {"carrot (held out)", "apple (held out)"}
+    assert {name.split(",")[0] for name in rms} >= {"cucumber", "potato", "tomato"} | held_out
     # A soft food without damping rings (docs/results/stepping.md).
     ringing = {"press, 100 mm/s": 1.0}
     ringing |= {
@@ -178,13 +179,13 @@ def test_in_the_committed_tables_sub_steps_by_need_err_as_little_as_asked_for():
         "hold after a ramp, 100 mm/s, 1 m/s2": 1.5,
     }
     misses = {f"tomato, {motion}": limit for motion, limit in ringing.items()}
-    # A skin that gives way is faster than what the knife's motion tells.
-    misses |= {f"cucumber with skin, press, {speed} mm/s": 2.0 for speed in (20, 100)}
+    # A skin that gives way a coupling step late.
+    misses["cucumber with skin, press, 20 mm/s"] = 1.0
     for name, row in rms.items():
         turns, holds = "retract" in name, "hold" in name
         limit = misses.get(name, 1.5 if turns else 1.0 if holds else 0.5)
         # A star would mark what a simulation refuses.
-        assert float(row[-1].removesuffix("*") if "skin" in name else row[-1]) <= limit, name
+        assert float(row[-1]) <= limit, name
         if turns:
             assert float(largest[name][-1]) <= 10.0, name
 
