@@ -398,7 +398,8 @@ def step_costs(
         # As many coupling steps a launch as a slice has between its checks.
         launches = [Launch(k, 10) for k in range(0, round(duration / EXCHANGE), 10)]
         for solver, path in zip(solvers, paths, strict=True):
-            next(solver.driver.run([path], launches))
+            # Once before, for what is made for the first slice.
+            list(solver.driver.run([path], launches))
         wall = np.zeros((repeats, len(columns)))
         for row in wall:
             for column, (solver, path) in enumerate(zip(solvers, paths, strict=True)):
