@@ -36,7 +36,7 @@ from sliceit_drake.cutting.parameters import (
 from sliceit_drake.cutting.solver import CuttingSolver
 
 PERIOD = 2e-3
-STEPS = (3e-4, 1e-4, 3e-5, 1e-5, 3e-6)
+STEPS = (1e-4, 1e-5, 3e-6, 1e-6, 3e-7, 1e-7)
 NOT_RESOLVED = {
     "material.density",
     "effects.adhesion.exponent",

@@ -125,7 +125,7 @@ def test_energy_ratio_is_the_one_that_a_simulation_checks():
     energies = solver.energies(state, end)
     ratio = energy_ratio(energies, 1e-3, model)
     assert ratio > 0.0
-    assert ratio == check_energies(energies, 1e-3, model, 0.0)
+    assert ratio == check_energies(energies, 1e-3, model, 0.0, 0.5)
 
 
 def test_foods_are_those_that_the_scenarios_cut():

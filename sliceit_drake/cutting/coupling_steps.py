@@ -20,6 +20,7 @@ class Energies:
         interface: Energy of bonds, contacts, friction anchors, the edge's unloading and the bent
             blade.
         kinetic: Energy of the stepped (scaled) mass.
+        debt: Work that the edge owes for the area that it has cut.
         least_volume_ratio: Smallest J of all elements.
         min_element: Element that has it.
     """
@@ -27,6 +28,7 @@ class Energies:
     elastic: float
     interface: float
     kinetic: float
+    debt: float
     least_volume_ratio: float
     min_element: int
 

@@ -275,22 +275,22 @@ class SliceAdjoint:
     def _launch_substep_adjoint(self, ws: Workspace, k: int) -> None:
         kern, forces = ws.kernels, ws.forces[k]
         for name in (
-            "lateral",
-            "push",
+            "at_points",
+            "totals",
             "from_elements",
             "from_bulk",
             "from_points",
             "acceleration",
         ):
             getattr(forces, name).grad.zero_()
-        for part in ("bend_blade", "push_blade", "step_nodes"):
+        for part in ("step_blade_and_front", "total_points", "step_nodes"):
             ws.launch_part(part, k, adjoint=True)
         # By hand: the adjoint of a symmetric solve is the solve of the adjoint.
         solved = [ws.inertia, forces.acceleration.grad, forces.resultant.grad]
         ws.launch(kern.solve, (ws.cuts,), solved)
         ws.launch_part("sum_forces", k, adjoint=True)
         spread = [ws.points, forces.from_points.grad, forces.points.grad]
-        ws.launch(kern.spread_adjoint, forces.lateral.shape, spread)
+        ws.launch(kern.spread_adjoint, forces.at_points.shape[:2], spread)
         ws.launch_part("step_points", k, adjoint=True)
         strain, factors, direction = self._strain, self._factors, forces.from_elements.grad
         adjoints = [ws.parameters.stiff_volume.grad, self._adj_mu, self._adj_lam]

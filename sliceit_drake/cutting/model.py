@@ -29,6 +29,10 @@ __all__ = [
 GRAVITY = 9.81
 """Acceleration of gravity, as Drake's plants have it, m/s^2."""
 
+DEBT_LENGTH = 2.0
+"""Way of the edge over which it makes up for work that it owes, in mean lengths of edges of the
+mesh: more than its rows are apart, for the elastic energy of the food swings with them."""
+
 SLIVER = 0.1
 """Fraction of a vertex's mass below which a node of one side does not set the step."""
 
@@ -177,8 +181,9 @@ class CuttingModel(CutGeometry):
             "friction": material.friction,
             "static_friction": material.static_friction,
             "stribeck_velocity": material.stribeck_velocity,
-            "unloading_length": numerics.unloading_length,
             "direction_length": numerics.direction_length,
+            "debt_length": DEBT_LENGTH * self.element_size,
+            "unheld": float(len(self.moving) == len(self.nodes)),
             "board_stiffness": numerics.board_stiffness * scale,
             "board_friction": numerics.board_friction,
             "board_damping_time": numerics.board_damping_time,

@@ -15,6 +15,8 @@ from sliceit_drake.cutting.motion import Motion, Pose
 from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError, CuttingSolver
 
 __all__ = [
+    "COMPLETE",
+    "DEBT_LIMIT",
     "ENERGY_RATIO_LIMIT",
     "LATERAL_LIMIT",
     "SliceForces",
@@ -28,6 +30,10 @@ __all__ = [
 
 ENERGY_RATIO_LIMIT = 0.05
 """Kinetic over internal energy above which scaled masses are not quasi-static."""
+DEBT_LIMIT = 0.02
+"""Part of the work of cutting a section through that the edge may still owe when it is cut."""
+COMPLETE = 0.999
+"""Fraction of a section from which it counts as cut through."""
 LATERAL_LIMIT = 3e-3
 """Greatest distance of the blade from the cut plane, metres."""
 TILT_LIMIT = 0.15
@@ -138,13 +144,14 @@ def energy_ratio(energies: Energies, dissipated: float, model: CuttingModel) -> 
 
 
 def check_energies(
-    energies: Energies, dissipated: float, model: CuttingModel, time: float
+    energies: Energies, dissipated: float, model: CuttingModel, time: float, cut: float
 ) -> float:
-    """Refuses inverted elements and too much kinetic energy.
+    """Refuses inverted elements, too much kinetic energy, and a section cut for too little work.
 
     Args:
         energies, dissipated, model: As for `energy_ratio`.
         time: For the message, s.
+        cut: Fraction of the section that is cut.
 
     Returns:
         Their `energy_ratio`.
@@ -160,6 +167,15 @@ def check_energies(
             f"{energies.least_volume_ratio:.3g}): the edge deforms the food more than its mesh can "
             f"follow. Toughness / (E h) is {softness:.2g}; above about 0.5 elements at the edge "
             "invert. Use a stiffer or less tough food; a finer mesh alone rarely helps."
+        )
+    owed = energies.debt / max(float(model.toughness @ model.tables.area), 1e-9)
+    if cut >= COMPLETE and owed > DEBT_LIMIT:
+        raise CuttingError(
+            f"at {time:.4g} s the section is cut, and the edge has done {100 * owed:.1f} % less "
+            f"work than its toughness asks for, more than {100 * DEBT_LIMIT:.0f} %: the food has "
+            "moved with the knife, back and forth or as a whole, faster than the edge's direction "
+            "follows. Hold the food (food.held_sides, numerics.board_friction), saw by more than "
+            "the food gives, or use a smaller numerics.time_step."
         )
     ratio = energy_ratio(energies, dissipated, model)
     if ratio > ENERGY_RATIO_LIMIT:
@@ -222,7 +238,7 @@ def simulate_slice(
             travel, last_check = 0.0, end
             energies = solver.energies(state, path.pose(end))
             spent = balance.edge + balance.opening + balance.friction
-            ratio = max(ratio, check_energies(energies, spent, model, end * T))
+            ratio = max(ratio, check_energies(energies, spent, model, end * T, cut[end - 1]))
     return SliceResult(
         time=np.arange(1, count + 1) * T,
         position=path.p_FK[1:],

@@ -8,6 +8,7 @@ import numpy as np
 
 from sliceit_drake.cutting.coupling_steps import CouplingSteps, Energies, run_coupling_steps
 from sliceit_drake.cutting.driver import Driver
+from sliceit_drake.cutting.kernels.layouts import Front
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.stepping import EVENT, Stepping
@@ -182,6 +183,7 @@ class CuttingSolver:
             elastic=elastic,
             interface=interface,
             kinetic=inertia.kinetic_energy(self.velocities(state)[m.moving]),
+            debt=float(self.field(state, "front")[Front.DEBT]),
             least_volume_ratio=float(ratio[least]),
             min_element=least,
         )

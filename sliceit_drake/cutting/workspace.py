@@ -191,6 +191,7 @@ class Workspace:
             centroid=_filled(m.tables.rise, 0.0),
             outline=_filled(m.outline, 0.0),
             depth=in_lanes(m.point_depth),
+            rest=in_lanes(m.split.points),
             reach=m.tables.reach,
             per_spacing=1.0 / m.tables.spacing,
         )
@@ -236,13 +237,16 @@ class Workspace:
         forces.point_rows = self._view(
             self._at_points, 0, kinds["point_rows"].type, (size,), step=1
         )
-        self._allocate(forces, corners=(B, CORNERS), lateral=(self.point_blocks,))
+        totals = (layouts.numbers(layouts.POINT_TOTALS),)
+        self._allocate(forces, corners=(B, CORNERS), at_points=(self.point_blocks, *totals))
         # With gradients, what the nodes got in each sub-step is kept.
         self.forces = [k.Forces() for _ in range(K if self._gradients else 1)]
         for kept in self.forces:
             kept.assign(forces)
             moving = (len(m.moving),)
-            self._allocate(kept, push=(), from_bulk=(N,), resultant=moving, acceleration=moving)
+            self._allocate(
+                kept, totals=totals, from_bulk=(N,), resultant=moving, acceleration=moving
+            )
             if self._gradients:
                 self._allocate(kept, from_elements=(N,), from_points=(N,))
 
@@ -370,8 +374,8 @@ class Workspace:
             "solve": (0, [self.inertia, forces.resultant, forces.acceleration]),
             "step_nodes": (len(m.moving), [dt, mesh, parameters, *states]),
             "gather_adjoint": (len(m.moving), [mesh, forces, now.ahead.grad]),
-            "push_blade": (0, [forces]),
-            "bend_blade": (0, [k // self.substeps, dt, parameters, *states]),
+            "total_points": (0, [forces]),
+            "step_blade_and_front": (0, [k // self.substeps, dt, parameters, *states]),
         }[part]
         shape: tuple[int, ...] = (self.cuts,)
         if entries:
@@ -381,7 +385,13 @@ class Workspace:
 
     def launch_substep(self, k: int) -> None:
         """One sub-step."""
-        for part in ("elements", "step_points", *self.node_parts, "push_blade", "bend_blade"):
+        for part in (
+            "elements",
+            "step_points",
+            *self.node_parts,
+            "total_points",
+            "step_blade_and_front",
+        ):
             self.launch_part(part, k)
 
     def captured(self, launch: Callable[[], None]) -> Any:
@@ -509,6 +519,7 @@ def _initial_arrays(model: CuttingModel) -> dict[str, np.ndarray]:
         "board_slip": np.zeros((N, 3)),
         "overstress": np.zeros((len(model.relaxing), N, 3)),
         "blade": np.zeros(2),
+        "front": np.zeros(layouts.numbers(layouts.FRONT)),
         "stepping": np.zeros(STEPPING),
     }
 

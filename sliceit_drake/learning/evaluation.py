@@ -11,6 +11,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput
 
+from sliceit_drake.cutting.simulate import COMPLETE
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.agent_station import add_agent
 from sliceit_drake.diagrams.prepared_food import OwnCutting
@@ -18,7 +19,6 @@ from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.learning.task import Limits
 from sliceit_drake.systems.agent import AgentConfig, Decide
-from sliceit_drake.systems.cutting_system import COMPLETE
 
 __all__ = ["LIMITS", "SliceMetrics", "SliceTrace", "cut_slice", "slice_metrics"]
 

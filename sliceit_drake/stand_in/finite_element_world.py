@@ -259,7 +259,9 @@ class _FiniteElementRun(Run):
             if self.since_check > CHECK_TRAVEL:
                 self.since_check = 0.0
                 energies = self.solver.energies(self.state, pose, factors)
-                check_energies(energies, self.spent, self.model, now.time + now.period)
+                check_energies(
+                    energies, self.spent, self.model, now.time + now.period, self.cut_fraction
+                )
             if pose.p[2] < geometry.top:
                 self.travel += moved
                 self.swept += 2.0 * moved * self.section.width(float(pose.p[2]))

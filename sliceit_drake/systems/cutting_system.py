@@ -17,6 +17,7 @@ from sliceit_drake.cutting.mesh.surface import FoodBody, food_body, food_surface
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.simulate import (
+    COMPLETE,
     LATERAL_LIMIT,
     check_clear,
     check_energies,
@@ -57,9 +58,6 @@ _PARTS = {
     "food_index": slice(_FOOD_INDEX, _FOOD_INDEX + 1),
 }
 """Output ports of parts of the state."""
-
-COMPLETE = 0.999
-"""Fraction of a section from which a slice counts as cut off."""
 
 INDEXED = 5e-4
 """Distance of the blade from the next cut plane at which the knife counts as indexed, metres."""
@@ -375,7 +373,7 @@ class CuttingSystem(KnifeForceSystem):
         if round(time / self.exchange_period) % self._check_every == 0:
             energies = solver.energies(step.state, pose)
             spent = float(kept[_SPENT].sum() - kept[_SPENT_BEFORE])
-            ratio = check_energies(energies, spent, solver.model, time)
+            ratio = check_energies(energies, spent, solver.model, time, float(step.cut[-1]))
             *_, largest_ratio, least_volume_ratio = kept[_ENERGY].tolist()
             stored = energies.elastic, energies.interface, energies.kinetic
             largest = max(ratio, largest_ratio)

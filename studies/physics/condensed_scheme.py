@@ -270,7 +270,7 @@ class Contacts:
             K[:, 1, a, 0, a] -= stiff[:, a]
 
         left = np.maximum(R * (1.0 - parted) - 0.5 * bond * intact * length**2, 0.0)
-        slack = np.maximum(passed - s - P["unloading_length"], 0.0)
+        slack = np.maximum(passed - s - m.numerics.unloading_length, 0.0)
         limit = np.maximum(left * T - m.unloading * slack, 0.0)
         trial = h.edge + m.unloading * (s - h.s)
         # The first step has no step before it; the edge is above the food then.

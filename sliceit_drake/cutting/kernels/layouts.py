@@ -8,11 +8,15 @@ import numpy as np
 __all__ = [
     "BALANCE",
     "BLADE_SUMS",
+    "FRONT",
     "KNIFE",
     "POINT_SUMS",
+    "POINT_TOTALS",
     "Balance",
     "BladeSum",
+    "Front",
     "PointSum",
+    "PointTotal",
     "Section",
     "field_shape",
     "numbers",
@@ -63,6 +67,39 @@ BALANCE = np.dtype(
     ]
 )
 """Work and dissipation, see `EnergyBalance`."""
+POINT_TOTALS = np.dtype(
+    [
+        ("push", "f8"),
+        ("width", "f8"),
+        ("place", "f8"),
+        ("square", "f8"),
+        ("sunk", "f8"),
+        ("leant", "f8"),
+        ("drawn", "f8"),
+        ("travel", "f8"),
+        ("limit", "f8"),
+        ("owed", "f8"),
+    ]
+)
+"""Totals over the cut points in a sub-step: the force of the flanks on the blade along Ky; weighted
+by the width that each point carries at the front of the cut 1, x at rest, its square, the
+displacement along Kz, that times x, the velocity along Kx, and the edge's travel; what the edge's
+force may be, N; and the work that it should have done less what it did, J."""
+
+FRONT = np.dtype(
+    [
+        ("sunk", "f8"),
+        ("slope", "f8"),
+        ("drift", "f8"),
+        ("drift_ahead", "f8"),
+        ("debt", "f8"),
+        ("raised", "f8"),
+    ]
+)
+"""The front of the cut: the food's displacement along Kz at x = 0, metres, and its slope along x;
+the velocity along Kx at which food that nothing holds slides, m/s, filtered and with a lead; the
+work that the edge owes for the area that it has cut, J, and by what fraction its force is
+raised."""
 
 
 def results(coupling_steps: int) -> np.dtype:
@@ -90,6 +127,8 @@ def _places(name: str, layout: np.dtype) -> Any:
 
 
 Section = _places("Section", KNIFE)
+PointTotal = _places("PointTotal", POINT_TOTALS)
+Front = _places("Front", FRONT)
 PointSum = _places("PointSum", POINT_SUMS)
 BladeSum = _places("BladeSum", BLADE_SUMS)
 Balance = _places("Balance", BALANCE)

@@ -6,10 +6,17 @@ from typing import Any
 import warp as wp
 
 from sliceit_drake.cutting.kernels.lanes import lane_functions
-from sliceit_drake.cutting.kernels.layouts import BladeSum
+from sliceit_drake.cutting.kernels.layouts import BladeSum, Front, PointTotal
 from sliceit_drake.cutting.kernels.types import LANES, Scalar, kernel_types
 
 __all__ = ["node_kernels"]
+
+LEAST_SPREAD = 5e-4
+"""Half width below which the food at the front of a cut counts as level, metres."""
+DRIFT_LENGTH = 5e-4
+"""Travel of the edge over which the drift of unheld food is filtered, metres."""
+DRIFT_LEAD = 1e-3
+"""Time by which the drift is led, s: without it, food that slides swings in the filter."""
 
 
 def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespace:
@@ -20,6 +27,9 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
     Mesh, Parameters, State, Forces, Sums = t.Mesh, t.Parameters, t.State, t.Forces, t.Sums
     Inertia, Results, entries = t.Inertia, t.Results, t.entries
     real_name = "float" if real is wp.float32 else "double"
+    LEAST_WIDTH, LEAST_FORCE = wp.constant(real(1.0e-6)), wp.constant(real(1.0e-9))
+    LEVER = wp.constant(real(LEAST_SPREAD**2))
+    DRIFT, LEAD = wp.constant(real(DRIFT_LENGTH)), wp.constant(real(DRIFT_LEAD))
 
     @wp.func
     def gather_elements(cut: wp.int32, i: wp.int32, mesh: Mesh, forces: Forces):
@@ -237,18 +247,56 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
             after.x[cut, i] = x1
             after.ahead[cut, i] = padded(x1 + parameters.P[cut, Scalar.DAMPING_TIME] * v1)
 
+    @wp.func
+    def follow_front(
+        cut: wp.int32,
+        dt: real,
+        parameters: Parameters,
+        now: State,
+        after: State,
+        forces: Forces,
+    ):
+        """Steps the front of the cut, see `FRONT`, from the totals over the points."""
+        P = parameters.P
+        width = forces.totals[cut, PointTotal.WIDTH]
+        slope = now.front[cut, Front.SLOPE]
+        sunk = now.front[cut, Front.SUNK]
+        old_drift = now.front[cut, Front.DRIFT]
+        drift = old_drift
+        if width > LEAST_WIDTH:
+            # The straight line that is nearest to the displacements.
+            place = forces.totals[cut, PointTotal.PLACE] / width
+            spread = forces.totals[cut, PointTotal.SQUARE] / width - place * place
+            mean = forces.totals[cut, PointTotal.SUNK] / width
+            leant = forces.totals[cut, PointTotal.LEANT] / width - place * mean
+            slope = leant / (wp.max(spread, real(0.0)) + LEVER)
+            sunk = mean - slope * place
+            drawn = P[cut, Scalar.UNHELD] * forces.totals[cut, PointTotal.DRAWN] / width
+            travel = forces.totals[cut, PointTotal.TRAVEL] / width
+            drift = drawn + wp.exp(-travel / DRIFT) * (old_drift - drawn)
+        after.front[cut, Front.SLOPE] = slope
+        after.front[cut, Front.SUNK] = sunk
+        after.front[cut, Front.DRIFT] = drift
+        after.front[cut, Front.DRIFT_AHEAD] = drift + LEAD * (drift - old_drift) / dt
+        debt = now.front[cut, Front.DEBT] + forces.totals[cut, PointTotal.OWED]
+        after.front[cut, Front.DEBT] = debt
+        least = wp.max(forces.totals[cut, PointTotal.LIMIT], LEAST_FORCE)
+        raised = debt / (P[cut, Scalar.DEBT_LENGTH] * least)
+        after.front[cut, Front.RAISED] = wp.clamp(raised, real(-0.5), real(1.0))
+
     # Sums in loops have kernels of their own: an adjoint would not know their value after the loop.
     @wp.kernel(enable_backward=gradients, module=module)
-    def push_blade(forces: Forces):
-        """Force of the flanks on the blade."""
+    def total_points(forces: Forces):
+        """Totals over the cut points, see `POINT_TOTALS`."""
         cut = wp.tid()
-        F = real(0.0)
-        for i in range(forces.lateral.shape[1]):
-            F += sum8(forces.lateral[cut, i])
-        forces.push[cut] = F
+        for j in range(wp.static(len(PointTotal))):
+            total = real(0.0)
+            for i in range(forces.at_points.shape[1]):
+                total += sum8(forces.at_points[cut, i, j])
+            forces.totals[cut, j] = total
 
     @wp.kernel(enable_backward=gradients, module=module)
-    def bend_blade(
+    def step_blade_and_front(
         coupling_step: wp.int32,
         dt: real,
         parameters: Parameters,
@@ -257,12 +305,12 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         forces: Forces,
         sums: Sums,
     ):
-        """Steps the blade's lateral deflection and its rate, pushed by the flanks.
+        """Steps the blade's lateral deflection and its rate, pushed by the flanks, and the front.
 
         Adds to `sums.blade`, see `BLADE_SUMS`.
         """
         cut = wp.tid()
-        F = forces.push[cut]
+        F = forces.totals[cut, PointTotal.PUSH]
         m = parameters.P[cut, Scalar.BLADE_MASS]
         c = parameters.P[cut, Scalar.BLADE_DAMPING]
         k = parameters.P[cut, Scalar.BLADE_STIFFNESS]
@@ -274,14 +322,15 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         sums.blade[cut, coupling_step, BladeSum.LOSS] += c * rate * rate * dt
         sums.blade[cut, coupling_step, BladeSum.ON_KNIFE] += k * deflection + c * rate
         sums.blade[cut, coupling_step, BladeSum.ON_BLADE] += F
+        follow_front(cut, dt, parameters, now, after, forces)
 
     out = types.SimpleNamespace(
         load_nodes=load_nodes,
         solve=solve,
         weigh_added_inertia=weigh_added_inertia,
         step_nodes=step_nodes,
-        push_blade=push_blade,
-        bend_blade=bend_blade,
+        total_points=total_points,
+        step_blade_and_front=step_blade_and_front,
     )
     if not gradients:
         return out

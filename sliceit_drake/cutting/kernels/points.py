@@ -11,7 +11,7 @@ import warp as wp
 
 from sliceit_drake.cutting.foods.effects import LINEAR_BELOW
 from sliceit_drake.cutting.kernels.lanes import lane_functions
-from sliceit_drake.cutting.kernels.layouts import PointSum, Section
+from sliceit_drake.cutting.kernels.layouts import Front, PointSum, PointTotal, Section
 from sliceit_drake.cutting.kernels.types import LANES, Scalar, kernel_types
 
 __all__ = ["point_kernels"]
@@ -258,12 +258,17 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         advance = (moved - (vm + vp) * real(0.5)) * dt
         A = points.area[block]
         toughness = parameters.toughness[cut, block]
-        # s: depth of the edge below the point. Nothing happens beyond the ends of the blade.
+        # s: depth of the edge below the point in the food at rest, whose displacement at the edge
+        # is `at_front`; with the point's own one the T would not sum to the width. Nothing happens
+        # beyond the ends of the blade.
         old_depth = now.edge_depth[cut, block]
         along_edge = knife_x * arm
         half = one * parameters.knife[cut, Section.HALF_LENGTH]
         within = half - wp.max(along_edge, -along_edge)
-        s = where8(within, -(knife_z * arm), old_depth)
+        rest = points.rest[block]
+        sunk = knife_z * ((xm + xp) * real(0.5) - rest)
+        at_front = one * now.front[cut, Front.SUNK] + rest[0] * now.front[cut, Front.SLOPE]
+        s = where8(within, sunk - at_front - knife_z * arm, old_depth)
         depth = wp.max(old_depth, s)
         after.edge_depth[cut, block] = depth
         k0, w0 = place8(old_depth, points)
@@ -292,11 +297,14 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
 
         # Edge: a force against the edge's direction d, elastic up to R T (d . n), where R is the
         # toughness that opening left less what the bonds that the edge cuts give up. d follows the
-        # knife's own motion: with the food's in it, a drawn edge would feel less force the faster
-        # the food moves, and chatter. Behind the deepest point there is a slack and then nothing.
+        # knife's own motion on its way in, past the drift of food that slides: with the local
+        # velocity of the food in it, a drawn edge would feel less force the faster the food moves,
+        # and chatter. Behind the deepest point the limit falls as the force does.
         along = moved - wp.outer(knife_y, knife_y * moved)
+        along = along - wp.outer(knife_x, one * now.front[cut, Front.DRIFT_AHEAD])
         speed = length8(along)
-        travel = speed * dt
+        inwards = knife_z * along + speed * real(1.0e-3)
+        travel = where8(inwards, speed * dt, lanes())
         old_direction = now.edge_direction[cut, block]
         keep = exp8(travel / -P[cut, Scalar.DIRECTION_LENGTH])
         follow = wp.cw_div((one - keep) * dt, where8(travel, travel, one))
@@ -315,25 +323,29 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         left = positive8(wp.cw_mul(toughness, one - damage) * by_edge - bonded)
         # The edge cuts what its direction has across it; pressing straight, all.
         across = positive8(knife_z * d)
-        effect = across
+        worth = one
         if ALL or P[cut, Scalar.SLICE_PUSH_EXPONENT] != real(1.0):
-            # Nothing on the way out, where nothing is across, whatever the exponent.
             exponent = real(2.0) * P[cut, Scalar.SLICE_PUSH_EXPONENT] - real(2.0)
-            effect = wp.cw_mul(across, pow8(wp.max(across, one * real(1.0e-3)), exponent))
+            worth = pow8(wp.max(across, one * real(1.0e-3)), exponent)
         if ALL or P[cut, Scalar.RATE_EXPONENT] != real(0.0):
             relative_speed = wp.max(speed / P[cut, Scalar.REFERENCE_SPEED], one * real(1.0e-3))
-            effect = wp.cw_mul(effect, pow8(relative_speed, P[cut, Scalar.RATE_EXPONENT]))
+            worth = wp.cw_mul(worth, pow8(relative_speed, P[cut, Scalar.RATE_EXPONENT]))
         if ALL or P[cut, Scalar.INITIATION] > real(0.0):
             below = positive8(points.depth[block] + depth)
             started = exp8(below / -P[cut, Scalar.INITIATION_DEPTH])
             left = left + started * P[cut, Scalar.INITIATION]
-        resistance = wp.cw_mul(left, table8(points.width, block, k1, w1))
+        width = table8(points.width, block, k1, w1)
+        resistance = wp.cw_mul(left, width)
+        due = wp.cw_mul(wp.cw_mul(left, A), D - D0)
         if ALL or P[cut, Scalar.SKIN_TOUGHNESS] > real(0.0):
             skin = table8(points.outline, block, k1, w1)
             resistance = resistance + skin * P[cut, Scalar.SKIN_TOUGHNESS]
+            due = due + wp.cw_mul(skin, depth - old_depth) * P[cut, Scalar.SKIN_TOUGHNESS]
+        resistance = wp.cw_mul(wp.cw_mul(worth, across), resistance)
         spring = wp.max(parameters.unloading[cut, block], one * TINY)
-        slack = positive8(depth - s - one * P[cut, Scalar.UNLOADING_LENGTH])
-        limit = positive8(wp.cw_mul(resistance, effect) - wp.cw_mul(spring, slack))
+        limit = positive8(
+            resistance * (real(1.0) + now.front[cut, Front.RAISED]) - wp.cw_mul(spring, depth - s)
+        )
         limit = where8(within, limit, lanes())
         q0 = now.edge_force[cut, block]
         step = dot8(d, advance)
@@ -342,7 +354,8 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         edge = scaled8(q, d)
         returned = wp.cw_div(wp.cw_mul(q, q) - wp.cw_mul(q0, q0), spring) * real(0.5)
         cut_bonds = wp.cw_mul(wp.cw_mul(bonded, A), D - D0)
-        edge_loss = wp.cw_mul(q, step) - returned + cut_bonds
+        paid = wp.cw_mul(q, step) - returned
+        edge_loss = paid + cut_bonds
 
         # Flanks on the part that is cut.
         flank = parameters.flank_scale[cut, block] * P[cut, Scalar.FLANK_STIFFNESS]
@@ -361,7 +374,18 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
 
         normal = normal_m + normal_p
         friction = friction_m + friction_p
-        forces.lateral[cut, block] = -(knife_y * (normal + friction))
+        weighted = wp.cw_mul(width, rest[0])
+        drawn = (knife_x * (vm + vp)) * real(0.5)
+        forces.at_points[cut, block, PointTotal.PUSH] = -(knife_y * (normal + friction))
+        forces.at_points[cut, block, PointTotal.WIDTH] = width
+        forces.at_points[cut, block, PointTotal.PLACE] = weighted
+        forces.at_points[cut, block, PointTotal.SQUARE] = wp.cw_mul(weighted, rest[0])
+        forces.at_points[cut, block, PointTotal.SUNK] = wp.cw_mul(width, sunk)
+        forces.at_points[cut, block, PointTotal.LEANT] = wp.cw_mul(weighted, sunk)
+        forces.at_points[cut, block, PointTotal.DRAWN] = wp.cw_mul(width, drawn)
+        forces.at_points[cut, block, PointTotal.TRAVEL] = wp.cw_mul(width, travel)
+        forces.at_points[cut, block, PointTotal.LIMIT] = resistance
+        forces.at_points[cut, block, PointTotal.OWED] = wp.cw_mul(worth, due) - paid
 
         to_m = xm - all8(knife.p)
         to_p = xp - all8(knife.p)

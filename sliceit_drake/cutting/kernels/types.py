@@ -31,8 +31,9 @@ PARAMETERS = (
     "friction",
     "static_friction",
     "stribeck_velocity",
-    "unloading_length",
     "direction_length",
+    "debt_length",
+    "unheld",
     "board_stiffness",
     "board_friction",
     "board_damping_time",
@@ -101,6 +102,7 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         centroid: wp.array2d(dtype=real)
         outline: wp.array2d(dtype=real)
         depth: wp.array(dtype=lanes)
+        rest: wp.array(dtype=Vectors)
         reach: real
         per_spacing: real
 
@@ -153,8 +155,8 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         Positions, velocities; at the cut points the largest depth of the edge below the point, the
         fraction of the surface energy spent by opening, the edge's force on the food, its
         direction, and the slip from the friction anchors of both faces; that of the nodes on the
-        board; the force that each Maxwell branch has relaxed; the blade's deflection and its rate.
-        `stepping` is not for the kernels, see `stepping`.
+        board; the force that each Maxwell branch has relaxed; the blade's deflection and its rate;
+        the front of the cut, see `FRONT`. `stepping` is not for the kernels, see `stepping`.
         `ahead` holds the positions at which the elements are evaluated, padded to fours, which are
         loaded faster than threes.
         """
@@ -169,6 +171,7 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         board_slip: wp.array2d(dtype=vec3)
         overstress: wp.array3d(dtype=vec3)
         blade: wp.array2d(dtype=real)
+        front: wp.array2d(dtype=real)
         stepping: wp.array2d(dtype=real)
         ahead: wp.array2d(dtype=vec4)
 
@@ -176,17 +179,18 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
     class Forces:
         """Forces in a sub-step: of the elements on the corners of their strips, also as the rows in
         which a node finds its entries, and where those corners are; on both faces at the cut
-        points, also as such rows; of the flanks along Ky, by point and summed. By node: from the
-        bulk (elements after relaxation); of those that move, in their order, the resultant, and the
-        acceleration that it gives. With gradients, what each node got from elements and points."""
+        points, also as such rows; what the points add to the totals, and these, see `POINT_TOTALS`.
+        By node: from the bulk (elements after relaxation); of those that move, in their order, the
+        resultant, and the acceleration that it gives. With gradients, what each node got from
+        elements and points."""
 
         corners: wp.array3d(dtype=Vectors)
         elements: wp.array3d(dtype=Vectors)
         rows: wp.array2d(dtype=strided)
         points: wp.array3d(dtype=Vectors)
         point_rows: wp.array2d(dtype=strided)
-        lateral: wp.array2d(dtype=lanes)
-        push: wp.array(dtype=real)
+        at_points: wp.array3d(dtype=lanes)
+        totals: wp.array2d(dtype=real)
         from_bulk: wp.array2d(dtype=vec3)
         resultant: wp.array2d(dtype=vec4)
         acceleration: wp.array2d(dtype=vec4)

@@ -1,0 +1,136 @@
+"""The edge pays the toughness for the area that it cuts, evenly, whatever the food does."""
+
+import dataclasses as dc
+
+import numpy as np
+import pytest
+
+from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
+from sliceit_drake.cutting.foods.material import Material
+from sliceit_drake.cutting.foods.shapes import Box
+from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.model import Numerics
+from sliceit_drake.cutting.motion import (
+    ConstantSpeed,
+    Motion,
+    MotionPlan,
+    PressAndDraw,
+    Retract,
+    Segment,
+)
+from sliceit_drake.cutting.simulate import SliceResult, check_energies, simulate_slice
+from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
+
+TOUGHNESS = 300.0
+WIDTH, HEIGHT = 0.024, 0.030
+COARSE = ([5, 6], [0.0, 0.004, 0.012])
+FINE = ([9, 11], [0.0, 0.0025, 0.0055, 0.012])
+
+
+def cut_box(
+    segments: list[Segment],
+    mesh: tuple[list[int], list[float]] = COARSE,
+    offset: float = 0.0,
+    held: str = "both",
+    numerics: Numerics | None = None,
+    **material: float,
+) -> SliceResult:
+    """Cuts a box with a blade that is too thin to wedge it open, without flank friction."""
+    divisions, layers = mesh
+    values = {"youngs_modulus": 2e6, "toughness": TOUGHNESS, "friction": 0.0} | material
+    food = Food(
+        shape=Box([WIDTH, 0.1, HEIGHT], divisions, layers),
+        material=Material(**values),
+        held_sides=held,
+    )
+    knife = Knife(length=0.4, spine_thickness=4e-4)
+    model = make_food_model(food, knife, numerics or Numerics())
+    motion = Motion(MotionPlan(segments), start_pose(model, 5e-4, offset))
+    return simulate_slice(CuttingSolver(model, 2e-3), motion)
+
+
+def press(draw_ratio: float = 0.0, depth: float = HEIGHT + 4e-3) -> list[Segment]:
+    return [
+        ConstantSpeed(
+            direction=[draw_ratio, 0.0, 1.0],
+            duration=depth / 0.02,
+            acceleration=None,
+            speed=0.02 * np.hypot(1.0, draw_ratio),
+        )
+    ]
+
+
+def within(result: SliceResult, low: float, high: float) -> np.ndarray:
+    """Rows in which the edge is between two fractions of the height deep."""
+    depth = 1.0 - result.position[:, 2] / HEIGHT
+    return (depth > low) & (depth < high)
+
+
+@pytest.mark.parametrize(
+    ("modulus", "toughness", "mesh"),
+    [(1e7, 300.0, COARSE), (2e5, 300.0, COARSE), (1e5, 300.0, COARSE), (2e5, 100.0, FINE)],
+)
+def test_the_force_has_no_sawtooth_at_the_rows_of_elements(modulus, toughness, mesh):
+    result = cut_box(press(), mesh, youngs_modulus=modulus, toughness=toughness)
+    rows = within(result, 0.4, 0.85)
+    depth, force = result.position[rows, 2], result.edge[rows, 2]
+    trend = np.polyval(np.polyfit(depth, force, 3), depth)
+    assert np.abs(force - trend).max() < 0.01 * force.mean()
+    area = WIDTH * HEIGHT
+    assert result.balance.edge == pytest.approx(toughness * area, rel=0.01)
+
+
+@pytest.mark.parametrize("draw_ratio", [0.7, 1.0])
+def test_food_that_slides_with_the_knife_is_cut_for_its_toughness(draw_ratio):
+    result = cut_box(
+        press(draw_ratio),
+        offset=-0.5 * draw_ratio * HEIGHT,
+        held="none",
+        numerics=Numerics(time_step=2e-4, direction_length=2e-5),
+    )
+    # It slides as fast as leaves the edge a force along it that friction on the board bears.
+    friction, full = Numerics().board_friction, TOUGHNESS * WIDTH
+    rows = within(result, 0.3, 0.7)
+    assert result.edge[rows, 2].mean() == pytest.approx(full / (1 + friction**2), rel=0.03)
+    assert -result.edge[rows, 0].mean() == pytest.approx(0.3 * full / (1 + friction**2), rel=0.1)
+    assert result.balance.edge == pytest.approx(TOUGHNESS * WIDTH * HEIGHT, rel=0.02)
+
+
+@pytest.mark.parametrize(("modulus", "xi"), [(1e7, 5.0), (2e6, 2.0)])
+def test_sawing_of_a_small_amplitude_has_the_force_and_the_work_of_its_slice_push_ratio(
+    modulus, xi
+):
+    amplitude, speed = 3e-4, 5e-3
+    frequency = xi * speed / (2.0 * np.pi * amplitude)
+    saw = PressAndDraw(speed, HEIGHT + 2e-3, amplitude=amplitude, frequency=frequency)
+    # By default the direction follows more slowly, for a knife on an arm that gives.
+    result = cut_box([saw], youngs_modulus=modulus, numerics=Numerics(direction_length=2e-5))
+    by_default = cut_box([saw], youngs_modulus=modulus)
+    phase = np.linspace(0.0, np.pi, 2001)
+    exact = TOUGHNESS * WIDTH * (1.0 / (1.0 + (xi * np.cos(phase)) ** 2)).mean()
+    force = result.edge[within(result, 0.25, 0.75), 2].mean()
+    assert force == pytest.approx(exact, rel=0.05)
+    for each in (result, by_default):
+        assert each.balance.edge == pytest.approx(TOUGHNESS * WIDTH * HEIGHT, rel=0.02)
+
+
+def test_coming_back_to_the_bottom_of_a_cut_costs_nothing():
+    down = ConstantSpeed(distance=0.015, speed=0.02, acceleration=0.5)
+    chop = [
+        Retract(distance=0.004, speed=0.04, acceleration=0.5),
+        ConstantSpeed(distance=0.004, speed=0.04, acceleration=0.5),
+    ]
+    once, often = cut_box([down]), cut_box([down, *(10 * chop)])
+    assert often.balance.edge == pytest.approx(once.balance.edge, rel=0.01)
+
+
+def test_a_section_that_is_cut_for_too_little_work_is_refused():
+    result = cut_box(press())
+    food = Food(shape=Box([WIDTH, 0.1, HEIGHT], *COARSE), material=Material(toughness=TOUGHNESS))
+    model = make_food_model(food, Knife(), Numerics())
+    area = float(model.tables.area.sum())
+    check_energies(result.energies, result.balance.edge, model, 1.0, 1.0)
+    poor = dc.replace(result.energies, debt=0.021 * TOUGHNESS * area)
+    check_energies(poor, result.balance.edge, model, 1.0, 0.9)
+    with pytest.raises(CuttingError, match=r"2\.1 % less work .* Hold the food"):
+        check_energies(poor, result.balance.edge, model, 1.0, 1.0)
