@@ -50,6 +50,7 @@ def test_a_slice_is_the_same_for_the_same_numbers():
         (lambda r: r.cut.__setitem__(slice(None), np.minimum(r.cut, 0.5)), "50.0 % are cut"),
         (lambda r: setattr(r.balance, "work", 1.5 * r.balance.work), "energy balance lacks"),
         (lambda r: setattr(r.balance, "friction", -1e-3), "friction gives energy"),
+        (lambda r: setattr(r.balance, "edge", 0.5 * r.balance.edge), "toughness times the area"),
     ],
 )
 def test_what_no_slice_may_do_is_unexplained(change, said, monkeypatch):

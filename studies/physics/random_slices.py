@@ -24,7 +24,7 @@ from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError
 from sliceit_drake.cutting.model import CuttingModel, Numerics, TimeStepError
 from sliceit_drake.cutting.motion import Hold, Motion, MotionPlan, PressAndDraw, Retract, Segment
-from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
+from sliceit_drake.cutting.simulate import COMPLETE, DEBT_LIMIT, SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
 from sliceit_drake.cutting.workers import worker_processes
 from studies.pages import publish, render_and_store
@@ -96,6 +96,7 @@ class RandomSlice:
         food, knife, numerics: As in a scenario.
         speed: Of the press, m/s.
         draw_ratio: Draw over press speed.
+        amplitude, frequency: Of sawing along the edge, metres and Hz.
         hold: At the board, s.
     """
 
@@ -105,6 +106,8 @@ class RandomSlice:
     speed: float
     draw_ratio: float
     hold: float
+    amplitude: float = 0.0
+    frequency: float = 1.0
 
 
 @dc.dataclass
@@ -163,11 +166,12 @@ def draw_slice(rng: np.random.Generator) -> RandomSlice:
             density=between(400.0, 1200.0),
             toughness=scales(20.0, 800.0),
             strength=scales(5e4, 2e6),
-            friction=between(0.0, 0.6),
+            friction=(friction := between(0.0, 0.6)),
+            static_friction=float(rng.choice([0.0, 1.5])) * friction,
         ),
         cut_point=[0.0, between(-0.01, 0.01), 0.0],
         cut_normal=normal if is_oblique else [0.0, 1.0, 0.0],
-        held_sides=str(rng.choice(["both", "minus", "plus"])),
+        held_sides=str(rng.choice(["both", "minus", "plus", "none"])),
         hold_distance=between(0.008, 0.015),
     )
     knife = Knife(
@@ -183,6 +187,8 @@ def draw_slice(rng: np.random.Generator) -> RandomSlice:
         speed=scales(5e-3, 0.1),
         draw_ratio=float(rng.choice([0.0, between(-2.0, 2.0)])),
         hold=between(0.0, 0.1),
+        amplitude=float(rng.choice([0.0, scales(1e-3, 1e-2)])),
+        frequency=scales(1.0, 5.0),
     )
 
 
@@ -201,7 +207,14 @@ def cut_random_slice(case: RandomSlice) -> Outcome:
         start = start_pose(model, CLEARANCE)
         distance = -start.p[2] / start.R[2, 2] + OVERTRAVEL
         segments: list[Segment] = [
-            PressAndDraw(case.speed, distance, case.draw_ratio, acceleration=2.0),
+            PressAndDraw(
+                case.speed,
+                distance,
+                case.draw_ratio,
+                case.amplitude,
+                case.frequency,
+                acceleration=2.0,
+            ),
             *([Hold(case.hold)] if case.hold > 0.01 else []),
             Retract(0.5 * distance, 0.1, acceleration=2.0),
         ]
@@ -233,6 +246,9 @@ def _wrong(result: SliceResult, model: CuttingModel) -> str:
     for name in ("edge", "opening", "friction", "board_friction"):
         if getattr(balance, name) < -1e-9:
             return f"{name} gives energy: {getattr(balance, name):.3g} J"
+    paid = (balance.edge + balance.opening) / float(model.toughness @ model.tables.area)
+    if result.cut[-1] >= COMPLETE and paid < 1.0 - DEBT_LIMIT:
+        return f"edge and opening do {100 * paid:.1f} % of the toughness times the area"
     lack = abs(balance.residual(result.energies)) / max(abs(balance.work), 1e-6)
     if lack > IMBALANCE:
         return f"the energy balance lacks {100 * lack:.1f} % of the knife's work"
