@@ -204,7 +204,7 @@ def test_the_filters_of_a_record_are_repeated_on_its_prediction(part, off):
     """At the end of a record that ends in the cut, too."""
     (record,) = bench_records(1, noise=1e-6)
     record = record.between(0.0, part * record.time[-1])
-    filtered = low_pass(record, 8.0)
+    filtered = low_pass(record, 7.0)
     ends = []
     for r in (record, filtered):
         predictor = Predictor(coarse_setup(), [r])
@@ -352,7 +352,9 @@ def test_a_held_out_record_may_have_a_parameter_that_no_fitted_one_has(records):
     assert np.isfinite(error)
 
 
-def test_a_calibration_recovers_what_made_the_records_within_its_intervals(records, tmp_path):
+def test_a_calibration_recovers_what_made_the_records_within_its_intervals(tmp_path):
+    # The error of the calibration's sub-steps is taken off, so that the bench must have little.
+    records = bench_records(2, time_step=5e-5)
     options = CalibrationOptions(trials=24, steps=6, starts=1, workers=1, blocks=3)
     setup = coarse_setup(search_time_step=1e-3)
     result = calibrate(setup, records[:1], tmp_path, options, held_out=records[1:])
@@ -389,7 +391,7 @@ def test_a_calibration_recovers_what_made_the_records_within_its_intervals(recor
     assert not (tmp_path / "other" / "trials.log").exists()
     spread = [loaded.distribution.draw(np.random.default_rng(k), 1)[0] for k in range(50)]
     for name in TRUTH:
-        assert np.mean([d[name] for d in spread]) == pytest.approx(start[name], rel=0.05)
+        assert np.mean([d[name] for d in spread]) == pytest.approx(TRUTH[name], rel=0.05)
 
 
 def test_a_strength_that_the_mesh_cannot_carry_stands_in_table_and_summary(records, tmp_path):

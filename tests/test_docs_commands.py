@@ -51,6 +51,7 @@ TESTED = {
     ],
     "tests/test_readme.py::test_the_table_is_what_the_measured_slice_gives": [
         "sliceit simulate cucumber_measured",
+        "sliceit simulate cucumber_measured --no-replay --no-animation",
     ],
     "tests/test_named_food.py::test_the_apple_is_cut_by_a_knife_that_is_higher_and_the_arm_"
     "reaches_its_start": ["sliceit simulate apple"],

@@ -8,6 +8,7 @@ from pydrake.systems.analysis import InitializeParams, Simulator
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.foods.shapes import Ellipsoid, Remainder
+from sliceit_drake.cutting.simulate import COMPLETE
 from sliceit_drake.diagrams.outputs.sequence_report import slice_reports
 from sliceit_drake.diagrams.plant.surroundings import FINGERTIPS, HoldingArm
 from sliceit_drake.diagrams.run import prepare_run
@@ -15,7 +16,6 @@ from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.diagrams.scenario_diagram import ScenarioDiagram
 from sliceit_drake.diagrams.sequence import SliceSequence
 from sliceit_drake.resources import resource_path
-from sliceit_drake.systems.cutting_system import COMPLETE
 
 SMALL = """
 food: {shape: !Cylinder {diameter: 0.016, length: 0.05, rings: 2}}

@@ -19,10 +19,11 @@ from sliceit_drake.cutting.foods.spring_food import SpringFood
 from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry
 from sliceit_drake.cutting.model import prepare_cut
 from sliceit_drake.cutting.motion import Motion, MotionPlan
+from sliceit_drake.cutting.simulate import COMPLETE
 from sliceit_drake.cutting.solver import CuttingSolver
 from sliceit_drake.diagrams.plant.knife_body import blade_surface
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.systems.cutting_system import COMPLETE, COUPLED_EVENT, CuttingSystem
+from sliceit_drake.systems.cutting_system import COUPLED_EVENT, CuttingSystem
 from sliceit_drake.systems.food_look import look_of
 from sliceit_drake.systems.knife_force import KnifeForceSystem
 from sliceit_drake.systems.loose_slices import LooseSlices, SliceBody

@@ -30,7 +30,7 @@ from sliceit_drake.systems.food_look import OTHER, FoodLook, FoodScene
 from sliceit_drake.systems.food_visualizer import FoodVisualizer, frame_size
 from sliceit_drake.systems.knife_force import KEPT, LAST_POSE, KnifeForceSystem
 
-__all__ = ["BALANCE_NAMES", "COMPLETE", "COUPLED_EVENT", "ENERGY_NAMES", "CuttingSystem"]
+__all__ = ["BALANCE_NAMES", "COUPLED_EVENT", "ENERGY_NAMES", "CuttingSystem"]
 
 BALANCE_NAMES = BALANCE.names or ()
 ENERGY_NAMES = ("elastic", "interface", "kinetic", "largest_energy_ratio", "least_volume_ratio")

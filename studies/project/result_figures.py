@@ -1,7 +1,7 @@
 """Draws pictures of results that are stored.
 
 Writes coverage.png (intervals of calibrations), scaling.png (many machines), random_slices.png,
-endurance.png and benchmarks.png to docs/results/figures. Nothing is measured.
+endurance.png, contact.png and benchmarks.png to docs/results/figures. Nothing is measured.
 """
 
 import argparse
@@ -18,6 +18,7 @@ from studies.project.aims import RESULTS, SECTIONS, Docs
 __all__ = [
     "add_arguments",
     "aims_figure",
+    "contact_figure",
     "coverage_figure",
     "endurance_figure",
     "random_slices_figure",
@@ -40,6 +41,7 @@ def run(options: argparse.Namespace) -> int:
         ("scaling", scaling_figure),
         ("random_slices", random_slices_figure),
         ("endurance", endurance_figure),
+        ("contact", contact_figure),
         ("benchmarks", aims_figure),
     ):
         save_figure(draw(), RESULTS / "figures" / f"{name}.png", dpi=100)
@@ -123,6 +125,24 @@ def endurance_figure() -> Figure:
     axes.set(xlabel="slices with the arm", ylabel="memory held [GB]", ylim=(0.0, None))
     axes.legend(frameon=False, fontsize=9)
     tidy(axes)
+    return figure
+
+
+def contact_figure() -> Figure:
+    """What a stiffer contact and a finer mesh change of the force, and of its friction."""
+    rows = _values("contact")["rows"]
+    figure = new_figure(9.0, 2.8)
+    variants = ("contact 4 times as stiff", "16 times as stiff", "mesh twice as fine")
+    for k, axes in enumerate(figure.subplots(1, 3, sharey=True)):
+        cells = [row[2 + k].replace("(", "").replace(" %", "").split() for row in rows[::-1]]
+        friction, force = ([float(cell[n].strip(")")) for cell in cells] for n in (1, 0))
+        place = np.arange(len(rows))
+        axes.barh(place + 0.2, force, 0.4, color=BLUE, label="vertical force")
+        axes.barh(place - 0.2, friction, 0.4, color=ORANGE, label="friction of the flanks")
+        axes.axvline(0.0, color="k", lw=0.8)
+        axes.set(xlabel="change [%]", yticks=place, yticklabels=[row[0] for row in rows[::-1]])
+        tidy(axes, variants[k])
+    figure.axes[1].legend(frameon=False, fontsize=8)
     return figure
 
 
