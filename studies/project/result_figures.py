@@ -142,7 +142,8 @@ def contact_figure() -> Figure:
         axes.axvline(0.0, color="k", lw=0.8)
         axes.set(xlabel="change [%]", yticks=place, yticklabels=[row[0] for row in rows[::-1]])
         tidy(axes, variants[k])
-    figure.axes[1].legend(frameon=False, fontsize=8)
+    handles = figure.axes[0].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside upper right", ncols=2, frameon=False, fontsize=9)
     return figure
 
 
