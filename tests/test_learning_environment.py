@@ -164,7 +164,7 @@ def test_a_guard_of_the_simulation_terminates_with_the_reward_of_a_collision(mon
         raise CuttingError("an element is inverted")
 
     with monkeypatch.context() as patch:
-        patch.setattr(CuttingSolver, "coupling_step", fail)
+        patch.setattr(CuttingSolver, "move", fail)
         observation, reward, terminated, truncated, info = env.step(PRESS)
     assert (terminated, truncated, info["end"]) == (True, False, "guard")
     assert info["guard_error"] == "CuttingError"
