@@ -52,14 +52,20 @@ class EdgeTables:
         """Length of a skin per height that each point carries, as `width` [P, G].
 
         Each piece of the outline counts over `thickness` of depth below (the upper) or above (the
-        lower outline) it: a level one would else ask for all of its work at once.
+        lower outline) it: a level one would else ask for all of its work at once. What that
+        leaves beyond the grid counts on it.
         """
         grid = np.linspace(-self.reach, self.reach, self.width.shape[1])
         upper, lower = (
             np.array([np.interp(grid + shift, grid, row) for row in rows])
             for rows, shift in zip(self.outline, (-thickness, thickness), strict=True)
         )
-        return np.asarray(self.outline[0] - upper + lower - self.outline[1]) / thickness
+        skin = self.outline[0] - upper + lower - self.outline[1]
+        # Tables hold on beyond the grid with their values at its ends.
+        skin[:, [0, -1]] = 0.0
+        total = self.spacing * skin.sum(1, keepdims=True)
+        length = self.outline[:, :, -1].sum(0)[:, None]
+        return np.asarray(skin * np.divide(length, total, out=total, where=total > 0.0))
 
 
 def edge_tables(points: np.ndarray, triangles: np.ndarray, grid: int = 97) -> EdgeTables:
