@@ -5,9 +5,10 @@ import dataclasses as dc
 import numpy as np
 import pytest
 
+from sliceit_drake.cutting.foods.effects import Effects, Skin
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
-from sliceit_drake.cutting.foods.shapes import Box
+from sliceit_drake.cutting.foods.shapes import Box, Cylinder
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import (
@@ -78,6 +79,22 @@ def test_the_force_has_no_sawtooth_at_the_rows_of_elements(modulus, toughness, m
     assert np.abs(force - trend).max() < 0.01 * force.mean()
     area = WIDTH * HEIGHT
     assert result.balance.edge == pytest.approx(toughness * area, rel=0.01)
+
+
+@pytest.mark.parametrize("step", [2.5e-4, 1e-3])
+def test_food_under_a_skin_does_not_vibrate_with_the_edge(step):
+    food = Food(
+        shape=Cylinder(rings=3, layers=[0.0, 0.004, 0.012]),
+        material=Material(toughness=400.0, friction=0.1),
+        effects=Effects(skin=Skin(1.0)),
+    )
+    model = make_food_model(food, Knife(), Numerics(time_step=step, step_by_need=False))
+    motion = Motion(MotionPlan(press(depth=1.4e-3)), start_pose(model, 5e-4))
+    # Each sub-step's force.
+    force = simulate_slice(CuttingSolver(model, step), motion).food_wrench[:, 5]
+    force = force[force > 5.0]
+    assert force[-1] > 10.0
+    assert np.diff(force, 2).std() < 0.1 * np.diff(force).mean()
 
 
 @pytest.mark.parametrize("draw_ratio", [0.7, 1.0])

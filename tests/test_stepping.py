@@ -253,7 +253,8 @@ def test_a_skin_that_gives_way_is_cut_with_short_steps_until_the_food_is_calm(sn
     event = int((numbers >= 16).argmax())
     assert event > 40
     assert max(numbers[:event]) == max(planned)
-    assert numbers[event - 5 : event].tolist() == [2] * 5
+    # Under the skin the food gives along the whole edge, which two sub-steps follow too roughly.
+    assert numbers[event - 5 : event].tolist() == [4] * 5
     assert numbers.max() <= FINEST
     assert numbers[-1] <= 4
     true = forces(taken(cut(effects=skinned, time_step=1e-4, step_by_need=False)))

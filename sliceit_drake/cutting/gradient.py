@@ -283,7 +283,7 @@ class SliceAdjoint:
             "acceleration",
         ):
             getattr(forces, name).grad.zero_()
-        for part in ("step_blade_and_front", "total_points", "step_nodes"):
+        for part in ("step_blade_and_front", "total_points", "place_points", "step_nodes"):
             ws.launch_part(part, k, adjoint=True)
         # By hand: the adjoint of a symmetric solve is the solve of the adjoint.
         solved = [ws.inertia, forces.acceleration.grad, forces.resultant.grad]

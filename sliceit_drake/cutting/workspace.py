@@ -374,6 +374,10 @@ class Workspace:
             "solve": (0, [self.inertia, forces.resultant, forces.acceleration]),
             "step_nodes": (len(m.moving), [dt, mesh, parameters, *states]),
             "gather_adjoint": (len(m.moving), [mesh, forces, now.ahead.grad]),
+            "place_points": (
+                self.point_blocks,
+                [k, self.points, self.motion, after, forces],
+            ),
             "total_points": (0, [forces]),
             "step_blade_and_front": (0, [k // self.substeps, dt, parameters, *states]),
         }[part]
@@ -389,6 +393,7 @@ class Workspace:
             "elements",
             "step_points",
             *self.node_parts,
+            "place_points",
             "total_points",
             "step_blade_and_front",
         ):

@@ -266,9 +266,8 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         half = one * parameters.knife[cut, Section.HALF_LENGTH]
         within = half - wp.max(along_edge, -along_edge)
         rest = points.rest[block]
-        sunk = knife_z * ((xm + xp) * real(0.5) - rest)
         at_front = one * now.front[cut, Front.SUNK] + rest[0] * now.front[cut, Front.SLOPE]
-        s = where8(within, sunk - at_front - knife_z * arm, old_depth)
+        s = where8(within, knife_z * (all8(knife.p) - rest) - at_front, old_depth)
         depth = wp.max(old_depth, s)
         after.edge_depth[cut, block] = depth
         k0, w0 = place8(old_depth, points)
@@ -374,14 +373,8 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
 
         normal = normal_m + normal_p
         friction = friction_m + friction_p
-        weighted = wp.cw_mul(width, rest[0])
         drawn = (knife_x * (vm + vp)) * real(0.5)
         forces.at_points[cut, block, PointTotal.PUSH] = -(knife_y * (normal + friction))
-        forces.at_points[cut, block, PointTotal.WIDTH] = width
-        forces.at_points[cut, block, PointTotal.PLACE] = weighted
-        forces.at_points[cut, block, PointTotal.SQUARE] = wp.cw_mul(weighted, rest[0])
-        forces.at_points[cut, block, PointTotal.SUNK] = wp.cw_mul(width, sunk)
-        forces.at_points[cut, block, PointTotal.LEANT] = wp.cw_mul(weighted, sunk)
         forces.at_points[cut, block, PointTotal.DRAWN] = wp.cw_mul(width, drawn)
         forces.at_points[cut, block, PointTotal.TRAVEL] = wp.cw_mul(width, travel)
         forces.at_points[cut, block, PointTotal.LIMIT] = resistance
@@ -431,6 +424,35 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         for i in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, points.area.shape[0])):
             advance_points(cut, i, k, dt, points, parameters, motion, now, after, forces, sums)
 
+    @wp.kernel(enable_backward=gradients, module=module)
+    def place_points(
+        k: wp.int32,
+        points: Points,
+        motion: Motion,
+        after: State,
+        forces: Forces,
+        per_thread: wp.int32,
+    ):
+        """What each cut point adds to the place of the front, where sub-step k has moved it.
+
+        A front that lags behind the nodes by a sub-step drives a vibration."""
+        cut, chunk = wp.tid()
+        R = motion.R_CK[cut, k]
+        knife_z = vec3(R[0, 2], R[1, 2], R[2, 2])
+        for i in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, points.area.shape[0])):
+            k1, w1 = place8(after.edge_depth[cut, i], points)
+            width = table8(points.width, i, k1, w1)
+            middle = (
+                on_face8(after.x, cut, i, 0, points) + on_face8(after.x, cut, i, 1, points)
+            ) * real(0.5)
+            sunk = knife_z * (middle - points.rest[i])
+            weighted = wp.cw_mul(width, points.rest[i][0])
+            forces.at_points[cut, i, PointTotal.WIDTH] = width
+            forces.at_points[cut, i, PointTotal.PLACE] = weighted
+            forces.at_points[cut, i, PointTotal.SQUARE] = wp.cw_mul(weighted, points.rest[i][0])
+            forces.at_points[cut, i, PointTotal.SUNK] = wp.cw_mul(width, sunk)
+            forces.at_points[cut, i, PointTotal.LEANT] = wp.cw_mul(weighted, sunk)
+
     @wp.kernel(enable_backward=False, module=module)
     def point_energy(
         points: Points, parameters: Parameters, motion: Motion, state: State, energies: Energies
@@ -473,7 +495,9 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
             doubled = doubled + wp.cw_mul(wp.cw_mul(flank, touching), pressed)
         energies.points[cut, block] = doubled * real(0.5)
 
-    out = types.SimpleNamespace(step_points=step_points, point_energy=point_energy)
+    out = types.SimpleNamespace(
+        step_points=step_points, place_points=place_points, point_energy=point_energy
+    )
     if not gradients:
         return out
 
