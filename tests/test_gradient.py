@@ -75,7 +75,7 @@ def cut(effects: Effects | None = None, precision: str = "float64") -> CuttingMo
             static_friction=0.2,
             stribeck_velocity=0.1,
             strength=1e5,
-            damping_time=8e-4,
+            damping_time=1.1e-3,
         ),
         effects=effects or Effects(),
     )
