@@ -102,9 +102,10 @@ class MeasuredFood:
         return load_force_profile(resource_path(self.measurement.file))
 
     def motion(self, model: CuttingModel, profile: ForceProfile) -> Motion:
-        """Straight down at the record's speed for its duration."""
+        """Straight down at the record's speed, as deep as it goes where it begins at contact."""
         speed = self.measurement.speed
-        distance = speed * float(profile.time[-1] - profile.time[0]) + CLEARANCE
+        above = model.top - self.diameter + CLEARANCE
+        distance = speed * float(profile.time[-1] - profile.time[0]) + above
         plan = MotionPlan([ConstantSpeed(distance=distance, speed=speed)])
         return Motion(plan, start_pose(model, CLEARANCE))
 
