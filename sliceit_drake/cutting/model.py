@@ -135,10 +135,12 @@ class CuttingModel(CutGeometry):
         self.true_mass = material.density * self.node_volume
         self.weight = -GRAVITY * material.density * self.weight_volume[:, None] * self.up
         self.toughness = material.toughness * self.point_scales.toughness
-        for part in (effects.core, effects.centre):
-            inside = part.share(self.distances_inside(part.offset)[0])
+        points, elements = self.distances_inside(effects.core.offset)
+        centred, _ = self.distances_inside(effects.centre.offset)
+        for part, distance in ((effects.core, points), (effects.centre, centred)):
+            inside = part.share(distance)
             self.toughness = self.toughness * (1.0 + (part.toughness_ratio - 1.0) * inside)
-        inside = effects.core.share(self.distances_inside(effects.core.offset)[1])
+        inside = effects.core.share(elements)
         stiffer = effects.core.stiffness_ratio - 1.0
         self.element_volume = self.stiff_volume * (1.0 + stiffer * inside)
         # Never flatter than the rise of the force on the way in: a retreat must not return more
@@ -183,7 +185,7 @@ class CuttingModel(CutGeometry):
             "stribeck_velocity": material.stribeck_velocity,
             "direction_length": numerics.direction_length,
             "debt_length": DEBT_LENGTH * self.element_size,
-            "unheld": float(len(self.moving) == len(self.nodes)),
+            "unheld": float(self.unheld),
             "board_stiffness": numerics.board_stiffness * scale,
             "board_friction": numerics.board_friction,
             "board_damping_time": numerics.board_damping_time,
@@ -297,8 +299,7 @@ class CuttingModel(CutGeometry):
         (lam + 2 mu) grad u : grad u bounds the bulk's energy where the surface is held; a part that
         is free may dilate as a whole, by up to 3 lam + 2 mu. 0 where both halves are held.
         """
-        held = np.delete(self.split.node_side, self.computed[self.moving])
-        if np.bincount(held, minlength=2).all():
+        if self.held_nodes.all():
             return 0.0
         mu, lam = self.material.lame()
         half = 0.5 * self.numerics.time_step
@@ -337,6 +338,11 @@ class CuttingModel(CutGeometry):
         return bulk * (1.0 + 2.0 * numerics.numerical_damping) + 0.25 * contact, viscous
 
     @property
+    def work_through(self) -> float:
+        """Work of cutting the whole section, R A, J."""
+        return float(self.toughness @ self.tables.area)
+
+    @property
     def mass_ratio(self) -> float:
         """Stepped over true mass of the moving nodes in a translation."""
         return float(self.inertia.matrix.sum() / self.true_mass[self.moving].sum())
@@ -354,7 +360,7 @@ class CuttingModel(CutGeometry):
     def warnings(self) -> tuple[str, ...]:
         """Where the computation departs from what the user gave, and how to mend it."""
         texts = []
-        if len(self.moving) == len(self.computed) and self.numerics.board_friction == 0.0:
+        if self.unheld and self.numerics.board_friction == 0.0:
             texts.append(
                 "food.held_sides = none and numerics.board_friction = 0: nothing holds the food, "
                 "and a draw pushes it away. Hold a side, or give the board friction, as 0.3."

@@ -138,7 +138,7 @@ def energy_ratio(energies: Energies, dissipated: float, model: CuttingModel) -> 
 
     Of the internal energy, `dissipated` is that since the start, J.
     """
-    through = float(model.toughness @ model.tables.area)
+    through = model.work_through
     internal = max(energies.elastic + energies.interface + dissipated, 0.01 * through, 1e-9)
     return energies.kinetic / internal
 
@@ -168,7 +168,7 @@ def check_energies(
             f"follow. Toughness / (E h) is {softness:.2g}; above about 0.5 elements at the edge "
             "invert. Use a stiffer or less tough food; a finer mesh alone rarely helps."
         )
-    owed = energies.debt / max(float(model.toughness @ model.tables.area), 1e-9)
+    owed = energies.debt / max(model.work_through, 1e-9)
     if cut >= COMPLETE and owed > DEBT_LIMIT:
         raise CuttingError(
             f"at {time:.4g} s the section is cut, and the edge has done {100 * owed:.1f} % less "

@@ -70,7 +70,7 @@ class Stepping(NamedTuple):
         low, high = model.span
         # Tables blur by one spacing.
         top = model.top + model.tables.spacing
-        force = event * float(model.toughness @ model.tables.area) / (model.top - model.bottom)
+        force = event * model.work_through / (model.top - model.bottom)
         return cls(0.5 * (high - low), top, coarsest, model.numerics.step_by_need, force)
 
     def plan(

@@ -246,7 +246,7 @@ def _wrong(result: SliceResult, model: CuttingModel) -> str:
     for name in ("edge", "opening", "friction", "board_friction"):
         if getattr(balance, name) < -1e-9:
             return f"{name} gives energy: {getattr(balance, name):.3g} J"
-    paid = (balance.edge + balance.opening) / float(model.toughness @ model.tables.area)
+    paid = (balance.edge + balance.opening) / model.work_through
     if result.cut[-1] >= COMPLETE and paid < 1.0 - DEBT_LIMIT:
         return f"edge and opening do {100 * paid:.1f} % of the toughness times the area"
     lack = abs(balance.residual(result.energies)) / max(abs(balance.work), 1e-6)

@@ -93,8 +93,18 @@ class CutGeometry:
     def free_side(self) -> int:
         """The half that comes off where one alone is held: 0 for that at y < 0, 1 for the other."""
         # Elements across a slanting cut may hold the free half by some nodes as well.
+        return int(self.held_nodes.argmin())
+
+    @property
+    def held_nodes(self) -> np.ndarray:
+        """Number of nodes of each half that do not move [2]: that at y < 0, the other."""
         sides = np.delete(self.split.node_side, self.computed[self.moving])
-        return int(np.bincount(sides, minlength=2).argmin())
+        return np.bincount(sides, minlength=2)
+
+    @property
+    def unheld(self) -> bool:
+        """Whether all nodes can move."""
+        return len(self.moving) == len(self.nodes)
 
     @functools.cached_property
     def section_area(self) -> float:
