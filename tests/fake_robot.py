@@ -19,7 +19,7 @@ class FakeRobot:
         self.q, self.qd, self.target, self.pace = list(q), [0.0] * 6, list(q), pace
         self._law = ServoLaw(ServoConfig(), 0.002)
         self._state = self._law.state_at_rest(q)
-        self.wrench = [0.0] * 6
+        self.wrench, self._noise = [0.0] * 6, 1e-9
         self.runtime, self.bits, self.connected, self.accepts = PLAYING, 1, True, True
         self.payload = (1.2, 0.0, 0.0, 0.06)
         self.call_time = 0.0
@@ -72,8 +72,11 @@ class FakeRobot:
 
     def read(self):
         self._read_time = self.time
+        # No two readings of a sensor are the same.
+        self._noise = -self._noise
+        wrench = [x + self._noise * self._read_time for x in self.wrench]
         return RobotState(
-            self._read_time, self.q, self.qd, self.wrench, self.runtime, self.bits, self.payload
+            self._read_time, self.q, self.qd, wrench, self.runtime, self.bits, self.payload
         )
 
     def is_connected(self):

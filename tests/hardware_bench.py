@@ -17,7 +17,7 @@ CUCUMBER = resource_path("scenarios/cucumber_measured.yaml")
 # A whole slice, board included, of 432 tetrahedra, in 1.4 s.
 SLICE = """{
   food: {shape: !Cylinder
-    {diameter: 0.027, length: 0.12, rings: 2, layers: [0.0, 0.0028, 0.0064, 0.012]}},
+    {diameter: 0.027, length: 0.12, rings: 2, layers: [0.0, 0.006, 0.0095, 0.012]}},
   start: {clearance: 0.002}, measurement: null,
   motion: {segments: [
     !ConstantSpeed {distance: 0.0292, speed: 0.04, acceleration: 0.5, label: slice},

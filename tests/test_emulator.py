@@ -1,5 +1,7 @@
 """The emulated controller: its bytes, its program, its ports, and the true clients at them."""
 
+import contextlib
+import math
 import random
 import socket
 import struct
@@ -10,6 +12,7 @@ import pytest
 from emulator_bench import Bench, RawClient, ScriptBench, free_address
 from pydrake.systems.analysis import Simulator
 
+from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.plant.robot_plant import RobotConfig
 from sliceit_drake.diagrams.scenario import load_scenario
@@ -651,16 +654,109 @@ def test_the_remaining_faults_do_what_they_say():
 
 @pytest.mark.parametrize(
     "fault",
-    ["thunder", "silence", "silence:-1", "drop_packets:2", "close:door", "emergency_stop:5"],
+    [
+        "thunder",
+        "silence",
+        "silence:-1",
+        "drop_packets:2",
+        "close:door",
+        "emergency_stop:5",
+        "shows:nothing:0",
+        "shows:actual_q:no",
+        "shows:robot_mode:nan",
+        "shows:robot_mode:-1",
+        "shows:safety_mode:flipped",
+        "frame_size:65536",
+    ],
 )
 def test_a_fault_that_makes_no_sense_is_refused(fault):
     with Bench() as bench, pytest.raises(ConfigurationError, match="inject"):
         bench.inject(fault)
 
 
+@pytest.mark.parametrize("at", [math.nan, math.inf, -math.inf])
+def test_a_time_that_never_comes_is_refused_and_blocks_no_later_fault(at):
+    with Bench() as bench:
+        with pytest.raises(ConfigurationError, match="is no time"):
+            bench.inject("protective_stop", at)
+        bench.inject("emergency_stop")
+        bench.cycles(1)
+        assert bench.controller.safety == SafetyMode.ROBOT_EMERGENCY_STOP
+
+
+@pytest.mark.parametrize(
+    ("variable", "how", "shown"),
+    [
+        ("actual_q", "flipped", -np.array(START)), ("actual_q", "+0.5", np.array(START) + 0.5),
+        ("actual_qd", "3", np.full(6, 3.0)), ("robot_mode", "5", 5), ("actual_q", "true", START),
+    ],
+)  # fmt: skip
+def test_a_variable_is_shown_otherwise_than_it_is_and_the_arm_stays(variable, how, shown):
+    with Bench() as bench:
+        bench.inject(f"shows:{variable}:{how}")
+        bench.cycles(2)
+        assert bench.controller.outputs[variable] == pytest.approx(shown)
+        assert bench.controller.robot.state.positions == pytest.approx(np.array(START))
+
+
+HOSTILE = {
+    "a recipe too long for a frame": (
+        30004, encode_frame(PackageType.SETUP_OUTPUTS, np.array([500.0], ">f8").tobytes()
+                            + b",".join([b"actual_q"] * 1500))),
+    "a frame without a size": (30004, b"\0\0\0\0"),
+    "a frame cut short": (30004, encode_frame(PackageType.SETUP_OUTPUTS, b"\1")),
+    "deep JSON": (30099, b"[" * 100_000 + b"\n"),
+    "a time that is none": (30099, b'{"inject": "normal", "at": NaN}\n'),
+    "a time too long": (30099, b'{"inject": "normal", "at": 1' + b"0" * 400 + b"}\n"),
+    "a line without an end": (30099, b"x" * ((1 << 20) + 1)),
+    "bytes that are no text": (29999, bytes(range(256)) * 40),
+    "a register far away": (
+        30003, b"def x():\n# float register offset\n a = 99999999\n"
+        b"# RTDE Control script - Main loop\nend\n"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_input_is_refused_and_the_others_are_served(name):
+    port, data = HOSTILE[name]
+    with Bench() as bench:
+        other = RawClient(bench)
+        recipe = other.read_from("timestamp", ["DOUBLE"])
+        attacker = socket.create_connection((bench.address, port))
+        attacker.settimeout(0.01)
+        attacker.setblocking(False)
+        for _ in range(200):
+            with contextlib.suppress(BlockingIOError, ConnectionError):
+                data = data[attacker.send(data) :]
+            bench.serve()
+            if not data:
+                break
+        bench.cycles(5)
+        attacker.close()
+        bench.cycles(5)
+        assert len(other.data(recipe)) == 10, "the emulator goes on for its other clients"
+        assert bench.controller.runtime.name == "STOPPED"
+
+
+def test_a_frame_that_claims_another_size_goes_out_once():
+    with Bench() as bench:
+        client = RawClient(bench)
+        client.read_from("timestamp", ["DOUBLE"])
+        bench.inject("frame_size:2")
+        bench.cycles(2)
+        with pytest.raises(FrameError, match="2 bytes"):
+            client.frames()
+
+
+def test_an_address_that_others_reach_has_to_be_asked_for_twice(capsys):
+    assert main(["emulate", "--arm-alone", "--address", "0.0.0.0"]) == 2
+    assert "--open-to-the-network" in capsys.readouterr().err
+
+
 def test_every_fault_of_the_table_can_be_injected():
     arguments = {
         "silence": ":1", "drop_packets": ":0.1", "late_packets": ":0.1", "close": ":rtde",
+        "late_inputs": ":0.1", "frame_size": ":2", "shows": ":actual_q:frozen",
         "refuse": ":1", "wrong_payload": ":1", "sensor_bias": ":1", "model": ":UR3",
     }  # fmt: skip
     with Bench() as bench:

@@ -27,7 +27,7 @@ pytestmark = [pytest.mark.second_tier, pytest.mark.usefixtures("no_test_hangs")]
 CUCUMBER_POLICY = resource_path("scenarios/cucumber_policy.yaml")
 POLICY = """{
   food: {shape: !Cylinder
-    {diameter: 0.027, length: 0.12, rings: 2, layers: [0.0, 0.0028, 0.0064, 0.012]}},
+    {diameter: 0.027, length: 0.12, rings: 2, layers: [0.0, 0.006, 0.0095, 0.012]}},
   start: {clearance: 0.002},
   policy: {duration: 1.2, press: 0.0292, draw: 0.005, speed: 0.08, decide:
     {fastest: 0.04, force: 25.0, draw_ratio: 0.2, cut_time: 0.8, lift_speed: 0.06}}}"""

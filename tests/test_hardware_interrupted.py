@@ -86,7 +86,8 @@ def test_a_program_that_ends_on_the_way_to_the_start_stops_the_arm(number, emula
     # 60 mm take 3 s at that speed. By the controller's log: a busy machine asks late.
     assert entries[0][0] - moving["time"] < 1.0, status["log"]
     stopped = [text for _, text in entries]
-    assert ("RTDE watchdog" in " ".join(stopped)) == (number == signal.SIGKILL), stopped
+    is_by_others = any("RTDE watchdog" in t or "by the dashboard" in t for t in stopped)
+    assert is_by_others == (number == signal.SIGKILL), stopped
 
 
 @pytest.mark.parametrize("typed", ["no", None], ids=["another word", "closed terminal"])
@@ -113,3 +114,26 @@ def test_a_program_that_runs_on_the_robot_is_not_replaced(emulator):
         assert not any("replaced" in text for text in log)
         type_(first, "move")
         wait_for(emulator, lambda status: np.abs(status["velocities"]).max() > 0.01)
+
+
+@pytest.mark.parametrize("how", ["SIGKILL", "a frame of a wrong size"])
+def test_a_crash_at_the_question_stops_the_robots_program_and_says_so(how, emulator):
+    # No watchdog is set yet: nobody but the supervisor stops the program.
+    with hardware(emulator, "--move-to-start") as process:
+        read_until(process, 'Type "move"')
+        if how == "SIGKILL":
+            process.kill()
+        else:
+            emulator.pendant.inject("frame_size:2")
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(5.0)
+            with contextlib.suppress(BrokenPipeError):
+                type_(process, "move")
+        status = wait_for(emulator, lambda status: status["runtime_state"] == "STOPPED")
+        printed = process.stdout.read()
+    assert is_still(status)
+    if process.returncode < 0:
+        assert "HAS CRASHED. The robot's program was stopped through its dashboard" in printed
+        assert any("stopped by the dashboard" in text for _, text in status["log"])
+    else:
+        assert "STOPPED" in printed or "Not confirmed" in printed

@@ -2,11 +2,13 @@
 
 import argparse
 import dataclasses as dc
+import errno
 import io
 import json
 import os
 import threading
 import time as clock
+from functools import partial
 
 import numpy as np
 import pytest
@@ -19,8 +21,10 @@ from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.hardware_station import RobotConnection
 from sliceit_drake.diagrams.outputs.slice_record_of_run import slice_record_of
+from sliceit_drake.diagrams.run import Run
 from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.hardware.checks import check_facts, check_start
+from sliceit_drake.hardware.client import is_loopback
 from sliceit_drake.hardware.hardware_config import (
     HardwareConfig,
     differing,
@@ -125,7 +129,7 @@ def test_a_fault_ends_the_run_with_its_reason_and_keeps_the_record(robot, tmp_pa
     def fail():
         robot.bits = 1 << 2 | 1 << 10
 
-    robot.later(0.1, fail)
+    robot.later(0.3, fail)
     run = hardware.execute(3.0)
     assert run.stopped.startswith("safety_status") and "protective stop" in run.stopped
     assert robot.stopped.is_set()
@@ -182,8 +186,8 @@ def test_old_readings_of_the_sensor_are_not_taken_for_a_zero(robot):
     hardware = hardware_run(robot)
     robot.frozen = True
     checks = hardware.check_at_start()
-    assert failed(checks) == ["force after zeroing"]
-    assert "0 of 50 readings" in checks[-1].found
+    assert failed(checks) == ["force before zeroing"]
+    assert "0 of 50 readings" in checks[-1].found and "zero" not in robot.log
 
 
 def test_a_plan_out_of_limits_is_refused_before_the_word(twin, robot):
@@ -215,6 +219,82 @@ def test_a_pipe_moves_an_emulated_robot_but_no_other(robot, monkeypatch, capsys,
     run = checked_run(robot, tmp_path)
     assert run.stopped is None
     assert len(robot.sent) > 20
+
+
+@pytest.mark.parametrize(
+    ("host", "is_ours"),
+    [
+        ("127.0.0.1", True), ("127.9.8.7", True), ("::1", True), ("localhost", False),
+        ("127.evil.example", False), ("127.1.evil", False), ("10.0.0.5", False), ("", False),
+    ],
+)  # fmt: skip
+def test_only_a_numeric_loopback_address_is_of_this_machine(host, is_ours):
+    assert is_loopback(host) == is_ours
+
+
+def test_with_a_full_disk_the_operator_reads_of_the_stop_and_has_the_log(
+    robot, monkeypatch, capsys, tmp_path
+):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def stop():
+        raise RuntimeError("no answer")
+
+    monkeypatch.setattr(Run, "save", full)
+    monkeypatch.setattr("sys.stdin", io.StringIO("slice\n"))
+    robot.stop = stop
+    robot.later(0.6, lambda: setattr(robot, "bits", 1 << 2))
+    with pytest.raises(OSError, match="No space"):
+        checked_run(robot, tmp_path, 2.0)
+    printed = capsys.readouterr().out
+    assert printed.index("STOPPED: safety_status") < printed.index("NOT ALL IS WRITTEN")
+    assert "DID NOT CONFIRM THAT ITS PROGRAM IS STOPPED (no answer)" in printed
+    assert len((tmp_path / "robot.csv").read_text().splitlines()) > 50
+
+
+def test_a_run_that_is_interrupted_again_and_again_keeps_its_log(
+    robot, monkeypatch, capsys, tmp_path
+):
+    sleep = clock.sleep
+
+    def impatient(seconds):
+        if threading.current_thread() is threading.main_thread():
+            raise KeyboardInterrupt
+        sleep(seconds)
+
+    def interrupt(run, now, wall):
+        monkeypatch.setattr("sliceit_drake.hardware.rtde_link.clock.sleep", impatient)
+        raise KeyboardInterrupt
+
+    hardware = hardware_run(robot)
+    execute = hardware.execute
+    hardware.execute = lambda duration, show: execute(duration, partial(interrupt, show))
+    monkeypatch.setattr("sys.stdin", io.StringIO("slice\n"))
+    operated = OperatedRobot(EMULATED, hardware.config, PACE)
+    with pytest.raises(KeyboardInterrupt):
+        operated.checked_run(hardware, tmp_path, 2.0)
+    monkeypatch.undo()
+    assert "STOPPED: interrupted by the user, more than once" in capsys.readouterr().out
+    assert (tmp_path / "robot.csv").exists() and robot.stopped.wait(2.0)
+
+
+def test_a_contact_after_zeroing_is_found_before_it_moves(robot, monkeypatch, capsys, tmp_path):
+    def typed(_):
+        robot.wrench = [0.0, 0.0, 40.0, 0.0, 0.0, 0.0]
+        return "slice"
+
+    monkeypatch.setattr("builtins.input", typed)
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    made = checked_run(robot, tmp_path)
+    assert "force after zeroing: " in made.stopped
+    assert robot.sent == [] and robot.watchdog is None
+
+
+def test_a_contact_is_not_zeroed_away(robot):
+    robot.wrench = [0.0, 0.0, 40.0, 0.0, 0.0, 0.0]
+    assert failed(hardware_run(robot).check_at_start()) == ["force before zeroing"]
+    assert "zero" not in robot.log
 
 
 def test_a_word_typed_before_the_question_does_not_answer_it(monkeypatch):

@@ -25,7 +25,9 @@ def make_layer(**changes):
 
 
 def state(time, q, wrench=(0.0,) * 6, qd=(0.0,) * 6, runtime=PLAYING, bits=1):
-    return RobotState(time, list(q), list(qd), list(wrench), runtime, bits)
+    # No two readings of a sensor are the same.
+    wrench = [x + 1e-9 * math.sin(1e4 * time + 1.0) for x in wrench]
+    return RobotState(time, list(q), list(qd), wrench, runtime, bits)
 
 
 def at_height(q, height):

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 from sliceit_drake.cli.arguments import add_scenario_arguments, scenario_of
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.emulator.fault_table import faults_as_text
+from sliceit_drake.hardware.client import is_loopback
 
 if TYPE_CHECKING:
     from sliceit_drake.emulator.controller import ControllerConfig
@@ -38,6 +39,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--address",
         default="127.0.0.1",
         help="where to listen (default 127.0.0.1); 127.0.0.2 and so on for more emulators",
+    )
+    parser.add_argument(
+        "--open-to-the-network",
+        action="store_true",
+        help="allow an --address that others can reach; nothing asks who they are",
     )
     parser.add_argument(
         "--pace", type=float, default=1.0, metavar="X", help="times real time (default 1)"
@@ -71,6 +77,13 @@ def run(options: argparse.Namespace) -> int:
     from sliceit_drake.emulator.controller import ControllerConfig
     from sliceit_drake.emulator.emulator import ControllerClock, Emulator
 
+    if not is_loopback(options.address) and not options.open_to_the_network:
+        raise ConfigurationError(
+            f"{options.address} is no loopback address: others may reach the emulator there, and "
+            "nothing asks who they are",
+            field="--address",
+            fix="Give 127.0.0.1, or add --open-to-the-network.",
+        )
     clock = ControllerClock(pace=options.pace, lockstep=options.lockstep)
     config = ControllerConfig(version=_version(options.version))
     robot = _robot(options, config)

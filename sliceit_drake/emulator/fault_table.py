@@ -22,6 +22,11 @@ _MEANINGS = {
     "close:rtde|dashboard|script[:reset]": (
         "the connections of a service are closed; clients may connect again"
     ),
+    "late_inputs:SECONDS": "what clients send comes late",
+    "frame_size:BYTES": "the header of the next data package claims a size that is not its own",
+    "shows:VARIABLE:frozen|flipped|true|NUMBER|+NUMBER": (
+        "an output variable of RTDE is shown otherwise than it is, each of its elements"
+    ),
     "refuse:SECONDS": "new connections are turned away for a time",
     "frequency_125": "data packages come with 125 Hz at most, as from a CB3",
     "wrong_payload:KILOGRAMS": "the payload is set to a mass and stays so, whatever clients set",

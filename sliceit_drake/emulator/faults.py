@@ -76,6 +76,12 @@ class FaultInjector:
                 partial(setattr, rtde, "drop_share"),
             ),
             "late_packets": (_value(float, _is_amount), partial(setattr, rtde, "delay")),
+            "late_inputs": (_value(float, _is_amount), partial(setattr, rtde, "input_delay")),
+            "frame_size": (
+                _value(int, lambda size: 0 <= size <= 0xFFFF),
+                partial(setattr, rtde, "next_size"),
+            ),
+            "shows": (self._what_is_shown, self._show),
             "close": (self._service_to_close, self._close),
             "frequency_125": (_nothing, partial(setattr, rtde, "frequency_limit", _CB3_RATE)),
             "wrong_payload": (_value(float, _is_amount), self._lock_payload),
@@ -92,7 +98,7 @@ class FaultInjector:
             at: Controller time, s; None for the next cycle.
 
         Raises:
-            ConfigurationError: There is no such fault, or its argument is wrong.
+            ConfigurationError: There is no such fault, or its argument or time is wrong.
         """
         name, _, argument = fault.partition(":")
         if name not in FAULTS:
@@ -106,6 +112,8 @@ class FaultInjector:
             raise ConfigurationError(
                 f"{fault!r} is not understood", field="inject", fix=f"Write {FAULTS[name]}."
             ) from None
+        if at is not None and not math.isfinite(at):
+            raise ConfigurationError(f"{at} is no time", field="at", fix="Give seconds.")
         self._at(self._controller.time if at is None else at, action, fault)
 
     def apply(self) -> None:
@@ -142,6 +150,37 @@ class FaultInjector:
     def _close(self, service: Service, reset: bool) -> None:
         for connection in self._hub.connections(service):
             connection.close(reset)
+
+    def _what_is_shown(self, argument: str) -> tuple[str, str, float]:
+        name, _, how = argument.partition(":")
+        value = self._controller.outputs[name]
+        number = 0.0 if how in ("frozen", "flipped", "true") else float(how)
+        first = value[0] if isinstance(value, list | tuple) else value
+        # What is an integer has to stay one that the wire holds.
+        is_whole = number.is_integer() and 0.0 <= number < 1 << 30 and how != "flipped"
+        if not (is_whole or isinstance(first, float)):
+            raise ValueError(argument)
+        return name, how, number
+
+    def _show(self, name: str, how: str, number: float) -> None:
+        self._controller.shown.pop(name, None)
+        if how == "true":
+            return
+        held = self._controller.outputs[name]
+
+        def each(change: Callable[[Any], Any], value: Any) -> object:
+            kind = type(value[0] if isinstance(value, list | tuple) else value)
+            if isinstance(value, list | tuple):
+                return [kind(change(x)) for x in value]
+            return kind(change(value))
+
+        changes: dict[str, Callable[[Any], object]] = {
+            "frozen": lambda value: held,
+            "flipped": partial(each, lambda x: -x),
+        }
+        add = partial(each, lambda x: x + number)
+        other = add if how.startswith("+") else partial(each, lambda x: number)
+        self._controller.shown[name] = changes.get(how, other)
 
     def _lock_payload(self, mass: float) -> None:
         self._controller.payload_is_locked = False

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from sliceit_drake.emulator.variables import TYPES
 
 __all__ = [
+    "LONGEST_PAYLOAD",
     "FrameError",
     "PackageType",
     "Recipe",
@@ -20,6 +21,7 @@ __all__ = [
 ]
 
 _HEADER = struct.Struct(">HB")
+LONGEST_PAYLOAD = 0xFFFF - _HEADER.size
 
 
 class FrameError(ValueError):
@@ -46,8 +48,8 @@ def encode_frame(kind: int, payload: bytes = b"") -> bytes:
         FrameError: The payload is longer than a frame holds.
     """
     size = _HEADER.size + len(payload)
-    if size > 0xFFFF:
-        raise FrameError(f"a frame holds 65532 bytes of payload, not {len(payload)}")
+    if len(payload) > LONGEST_PAYLOAD:
+        raise FrameError(f"a frame holds {LONGEST_PAYLOAD} bytes of payload, not {len(payload)}")
     return _HEADER.pack(size, kind) + payload
 
 

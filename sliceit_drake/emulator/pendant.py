@@ -16,6 +16,7 @@ from sliceit_drake.emulator.faults import FaultInjector
 __all__ = ["PENDANT_PORT", "Pendant"]
 
 PENDANT_PORT = 30099
+_LONGEST_LINE = 1 << 20
 
 
 class Pendant(Service):
@@ -34,6 +35,8 @@ class Pendant(Service):
     def received(self, connection: Connection) -> None:
         while (line := take_until(connection.unread, b"\n")) is not None:
             connection.send(json.dumps(self._answer(line)).encode() + b"\n")
+        if len(connection.unread) > _LONGEST_LINE:
+            connection.close()
 
     def _answer(self, line: bytes) -> dict[str, object]:
         try:
@@ -55,5 +58,5 @@ class Pendant(Service):
             else:
                 raise ValueError("a request has one of inject, status, fresh_food, stop")
             return {"ok": True}
-        except (ValueError, TypeError, ConfigurationError) as error:
+        except (ValueError, TypeError, OverflowError, RecursionError, ConfigurationError) as error:
             return {"ok": False, "error": str(error)}

@@ -36,12 +36,14 @@ class ArmState:
         wrench: What the sensor at the flange feels [6]: force, N, and moment about the flange, Nm,
             of all beyond it on the arm, in the flange's axes.
         torques: Torques of the joints [6], Nm.
+        zero: What the sensor has subtracted from `wrench` [6], the same way.
     """
 
     positions: np.ndarray
     velocities: np.ndarray
     wrench: np.ndarray
     torques: np.ndarray
+    zero: np.ndarray = dc.field(default_factory=lambda: np.zeros(6))
 
 
 class RobotModel(Protocol):

@@ -8,6 +8,7 @@ import struct
 from sliceit_drake.emulator.connections import Connection, Service
 from sliceit_drake.emulator.controller import Controller
 from sliceit_drake.emulator.frames import (
+    LONGEST_PAYLOAD,
     FrameError,
     PackageType,
     Recipe,
@@ -52,6 +53,8 @@ class RtdeServer(Service):
         frequency_limit: Highest frequency that clients get, Hz.
         drop_share: Fraction of the data packages, in and out, that gets lost (a fault).
         delay: Controller time by which data packages come late, in and out, s (a fault).
+        input_delay: The same of those that come in alone, s (a fault).
+        next_size: Size that the header of the next data package claims, bytes (a fault), or None.
         packages_in: Data packages that have arrived and fit their recipe, lost and late ones too.
         command_counts: Number of them by the value that they had for the command register.
         last_command: Last such value that was not 0, which clears a command or feeds the watchdog.
@@ -60,7 +63,8 @@ class RtdeServer(Service):
 
     def __init__(self, controller: Controller) -> None:
         self.frequency_limit = RATE
-        self.drop_share = self.delay = 0.0
+        self.drop_share = self.delay = self.input_delay = 0.0
+        self.next_size: int | None = None
         self.packages_in = 0
         self.command_counts: collections.Counter[int] = collections.Counter()
         self.last_command = 0
@@ -117,6 +121,8 @@ class RtdeServer(Service):
                 session.due -= 1.0
                 if not self._is_lost():
                     data = encode_frame(PackageType.DATA, b"\x01" + session.outputs.pack(values))
+                    if self.next_size is not None:
+                        data, self.next_size = struct.pack(">H", self.next_size) + data[2:], None
                     session.ready.append((controller.time + self.delay, data))
             has_sent = False
             while session.ready and session.ready[0][0] <= controller.time:
@@ -171,6 +177,9 @@ class RtdeServer(Service):
         types = [output_type(name, self._controller.config.version) for name in names]
         accepted = NOT_FOUND not in types and 0.0 < frequency <= self.frequency_limit
         session.outputs = Recipe(names, types) if accepted else None
+        if session.outputs is not None and session.outputs.size > LONGEST_PAYLOAD - 1:
+            session.outputs = None
+            raise FrameError(f"a package of {len(names)} variables is too long for a frame")
         session.frequency, session.due = frequency, 0.0
         return bytes([accepted]) + ",".join(types).encode()
 
@@ -200,7 +209,8 @@ class RtdeServer(Service):
                 self.last_command = command or self.last_command
         if self._is_lost():
             return
-        if self.delay > 0.0 or self._late_inputs:
-            self._late_inputs.append((self._controller.time + self.delay, values))
+        delay = max(self.delay, self.input_delay)
+        if delay > 0.0 or self._late_inputs:
+            self._late_inputs.append((self._controller.time + delay, values))
         else:
             self._controller.registers.write(values, self._controller.time)

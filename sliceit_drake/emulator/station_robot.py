@@ -220,11 +220,13 @@ class StationRobot:
         plant, arm = self._station.plant, self._station.robot.arm
         port = self._station.sensor.GetOutputPort("sensor_wrench")
         wrench = port.Eval(self._sensor_context)
+        zero = self._station.sensor.zero(self._sensor_context)
         return ArmState(
             plant.GetPositions(self._plant_context, arm),
             plant.GetVelocities(self._plant_context, arm),
             np.concatenate([wrench.translational(), wrench.rotational()]),
             self._torques.Eval(self._arm_context),
+            np.concatenate([zero[3:], zero[:3]]),
         )
 
     def _check_servo(self, servo: ServoConfig | None) -> None:

@@ -5,9 +5,19 @@ import math
 from collections.abc import Sequence
 
 from sliceit_drake.hardware.client import RobotFacts, RobotState
+from sliceit_drake.hardware.edge_kinematics import EdgeKinematics
 from sliceit_drake.hardware.hardware_config import HardwareConfig
+from sliceit_drake.hardware.readings import pose_difference, weight_in_flange
 
-__all__ = ["Check", "check_facts", "check_payload", "check_sensor", "check_start"]
+__all__ = [
+    "Check",
+    "check_facts",
+    "check_kinematics",
+    "check_payload",
+    "check_sensor",
+    "check_start",
+    "check_unzeroed",
+]
 
 
 @dc.dataclass(frozen=True)
@@ -143,6 +153,46 @@ def check_sensor(
             fix,
         ),
     ]
+
+
+def check_unzeroed(
+    states: Sequence[RobotState], kinematics: EdgeKinematics, config: HardwareConfig, least: int
+) -> Check:
+    """The force before zeroing, which would hide a contact: the raw one less the payload's weight.
+
+    Where the robot does not show it, the force that counts is taken. For `least` see
+    `check_sensor`.
+    """
+    name, count, total = "force before zeroing", len(states), [0.0] * 3
+    if count < least:
+        fix = "Check the network; the readings may be old."
+        return Check(name, False, f"{count} of {least} readings came", fix)
+    for state in states:
+        force, weight = state.raw_wrench or state.wrench, [0.0] * 3
+        if state.raw_wrench is not None and state.payload is not None:
+            weight = weight_in_flange(state, kinematics)
+        total = [total[k] + (force[k] - weight[k]) / count for k in range(3)]
+    return Check(
+        name,
+        math.hypot(*total) <= config.unzeroed_force,
+        f"{math.hypot(*total):.2f} N without the payload's weight, allowed "
+        f"{config.unzeroed_force:g}",
+        "Does the knife touch something? Is the payload right? Zeroing would hide it.",
+    )
+
+
+def check_kinematics(state: RobotState, config: HardwareConfig) -> Check:
+    """The robot's own pose of its flange against the nominal kinematics, by which we plan."""
+    doubt = pose_difference(state, config.limits.kinematics)
+    found = "they agree" if doubt is None else doubt.detail
+    if state.tcp_pose is None:
+        found = "the robot does not say"
+    return Check(
+        "kinematics",
+        doubt is None,
+        found,
+        "Set the tool centre point to the flange; measure the board with the same arm.",
+    )
 
 
 def check_start(state: RobotState, start: Sequence[float], config: HardwareConfig) -> list[Check]:

@@ -1,10 +1,12 @@
 """Interface of a robot as the link needs it, so that tests and other libraries can stand in."""
 
 import dataclasses as dc
+import ipaddress
 from typing import NamedTuple, Protocol
 
 __all__ = [
     "PLAYING",
+    "RUNNING",
     "RUNTIME_STATES",
     "SAFE_BITS",
     "RobotClient",
@@ -16,6 +18,7 @@ __all__ = [
 ]
 
 PLAYING = 2
+RUNNING = 7
 RUNTIME_STATES = ("stopping", "stopped", "playing", "pausing", "paused", "resuming")
 
 SAFETY_BITS = (
@@ -52,6 +55,12 @@ class RobotState(NamedTuple):
         safety_bits: The controller's safety_status_bits.
         payload: Mass that the controller subtracts, kg, and its centre in the flange, m [4]; None
             where it is not read.
+        target_q: Joint positions that the controller itself aims at [6], rad.
+        raw_wrench: What the sensor shows without payload and zeroing, in the flange's axes [6].
+        tcp_pose: Where the controller has its tool centre point in the base: position, m, and
+            rotation vector, rad [6].
+        speed: Product of its speed scaling and of the speed slider, 1 for 100 %.
+        robot_mode: Its mode; `RUNNING` if it may move. None like the four before where not read.
     """
 
     time: float
@@ -61,6 +70,11 @@ class RobotState(NamedTuple):
     runtime_state: int
     safety_bits: int
     payload: tuple[float, ...] | None = None
+    target_q: list[float] | None = None
+    raw_wrench: list[float] | None = None
+    tcp_pose: list[float] | None = None
+    speed: float | None = None
+    robot_mode: int | None = None
 
 
 def safety_text(bits: int) -> str:
@@ -146,5 +160,11 @@ class RobotClient(Protocol):
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address is of this machine, as an emulated controller's is."""
-    return host == "localhost" or host.startswith("127.")
+    """Whether this is a numeric loopback address, as an emulated controller's is.
+
+    A name is none, not even localhost: what it stands for can change, to a tunnel for example.
+    """
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

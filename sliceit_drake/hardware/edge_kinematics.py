@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["EdgeKinematics", "EdgePose", "flange_pose"]
+__all__ = ["EdgeKinematics", "EdgePose", "flange_pose", "singular_margin"]
 
 # Universal Robots, "DH parameters for calculations of kinematics and dynamics", UR5e, metres.
 D1, A2, A3, D4, D5, D6 = 0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996
@@ -67,6 +67,18 @@ def flange_pose(q: Sequence[float]) -> tuple[float, ...]:
     )
 
 
+def singular_margin(q: Sequence[float]) -> float:
+    """How far joint positions `q` [6], rad, are from the arm's three singularities.
+
+    Returns:
+        The least of |sin q5| (wrist), |sin q3| (elbow) and the distance, m, of the wrist from a
+        plane through the first joint's axis (shoulder); 0 at a singularity.
+    """
+    q23 = q[1] + q[2]
+    reach = A2 * math.cos(q[1]) + A3 * math.cos(q23) + D5 * math.sin(q23 + q[3])
+    return min(abs(math.sin(q[4])), abs(math.sin(q[2])), abs(reach))
+
+
 class EdgeKinematics:
     """The edge of a knife on a UR5e's flange.
 
@@ -74,11 +86,15 @@ class EdgeKinematics:
         X_WB: Pose of the arm's base in the world [3 or 4, 4].
         X_TK: Pose of the knife frame in the flange frame [3 or 4, 4].
         length: Length of the edge, m; its middle is Ko, Kx along it, Kz from spine to edge.
+
+    Attributes:
+        gravity: Acceleration of gravity in the arm's base [3], m/s2.
     """
 
     def __init__(self, X_WB: ArrayLike, X_TK: ArrayLike, length: float) -> None:
         base, tool = np.asarray(X_WB, float), np.asarray(X_TK, float)
         self._R = [tuple(row) for row in base[:3, :3].tolist()]
+        self.gravity = (-9.81 * base[2, :3]).tolist()
         self._p = tuple(base[:3, 3].tolist())
         half = 0.5 * length * tool[:3, 0]
         self._heel = tuple((tool[:3, 3] - half).tolist())

@@ -75,6 +75,26 @@ class SafetyLimits:
     """Distance of a joint from the target sent before."""
     state_age: float = quantity(0.01, "s", low=0.002, high=0.2)
     """Time in which the controller's clock must go on, and its longest jump."""
+    measured_margin: float = quantity(2e-3, "m", low=0.0, high=0.05)
+    """How far beyond workspace and board_depth the edge may be measured; commands may not."""
+    measured_speed: float = quantity(1.5, "", low=1.0, high=5.0)
+    """How much faster than joint_speed and knife_speed the arm may be measured."""
+    singular_margin: float = quantity(0.1, "", low=0.0, high=0.5)
+    """Least distance of the arm from a singularity: sines of elbow and wrist, shoulder in m."""
+    force_age: float = quantity(0.02, "s", low=0.002, high=1.0)
+    """Longest time in which the force readings are the same to the last digit."""
+    force_rate: float = quantity(5000.0, "N/s", low=100.0, high=1e5)
+    """Fastest change of the force between two readings; a board of 30 kN/m at 0.15 m/s: 4500."""
+    raw_force: float = quantity(5.0, "N", low=0.5, high=250.0)
+    """How far the raw force and the one that counts may come apart, for longer than force_age."""
+    felt_force: float = quantity(0.1, "N", low=0.0, high=10.0)
+    """Change of the force that the knife must have felt at blind_depth in a food."""
+    blind_depth: float = quantity(5e-3, "m", low=0.0, high=0.05)
+    """Depth of the edge in a food at which felt_force must have been felt."""
+    read_back: float = quantity(2e-3, "rad", low=1e-4, high=0.1)
+    """How far the robot's own joint targets may be from all that was sent a moment before."""
+    kinematics: float = quantity(5e-3, "m", low=1e-4, high=0.05)
+    """How far the robot's own flange may be from where the nominal kinematics have it."""
     command_age: float = quantity(0.01, "s", low=0.002, high=0.2)
     """Controller time between the measurement that a command answers and its sending."""
 
@@ -147,6 +167,8 @@ class HardwareConfig:
     """How far its centre of gravity may be off."""
     board_height: float | None = quantity(None, "m", low=-1.0, high=2.0)
     """Measured height of the board's surface in the world; null: unknown, nothing moves."""
+    unzeroed_force: float = quantity(10.0, "N", low=0.1, high=50.0)
+    """Most that the sensor may show in the air before zeroing, less the payload's weight."""
     sensor_force: float = quantity(3.0, "N", low=0.1, high=20.0)
     """Most that the sensor may show in the air after zeroing."""
     sensor_torque: float = quantity(0.5, "Nm", low=0.01, high=5.0)

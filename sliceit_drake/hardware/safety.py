@@ -11,13 +11,15 @@ from typing import NamedTuple
 from sliceit_drake.configuration import ConfigurationError, validate
 from sliceit_drake.hardware.client import (
     PLAYING,
+    RUNNING,
     RUNTIME_STATES,
     SAFE_BITS,
     RobotState,
     safety_text,
 )
-from sliceit_drake.hardware.edge_kinematics import EdgeKinematics, EdgePose
+from sliceit_drake.hardware.edge_kinematics import EdgeKinematics, EdgePose, singular_margin
 from sliceit_drake.hardware.hardware_config import SafetyLimits
+from sliceit_drake.hardware.readings import ReadingCheck
 
 __all__ = ["Decision", "LatchedError", "SafetyLayer", "Stop", "robot_fault"]
 
@@ -87,6 +89,7 @@ class SafetyLayer:
         board_height: Height of the board's surface in the world, m.
         start: Joint positions around which `SafetyLimits.joint_window` lies [6], rad.
         period: Period of the controller, s.
+        food_top: Height of the food's top in the world, m; None where there is no food.
 
     Raises:
         ConfigurationError: A limit is out of its range, or a number is none.
@@ -99,6 +102,7 @@ class SafetyLayer:
         board_height: float,
         start: Sequence[float],
         period: float = 0.002,
+        food_top: float | None = None,
     ) -> None:
         # A NaN would be a limit that nothing breaks, wherever it came from.
         validate(limits, "limits")
@@ -107,7 +111,8 @@ class SafetyLayer:
                 f"start {list(start)} or board height {board_height} are not known",
                 fix="Give 6 finite numbers and one.",
             )
-        self.limits, self.period = limits, period
+        self.limits, self.period, self._food_top = limits, period, food_top
+        self._readings: ReadingCheck | None = None
         self._kinematics = kinematics
         window = limits.joint_window
         self._lower = [max(a, s - window) for a, s in zip(limits.joint_lower, start, strict=True)]
@@ -151,7 +156,7 @@ class SafetyLayer:
         """
         if self._stop is not None:
             raise LatchedError(f"The safety layer is latched ({self._stop}); start a new run.")
-        self._armed, self._payload = False, None
+        self._armed, self._payload, self._readings = False, None, None
         stop = robot_fault(state) or self._measurement_fault(state)
         if stop is None:
             self._q, self._v = [float(x) for x in state.q], [0.0] * 6
@@ -167,6 +172,9 @@ class SafetyLayer:
                     "at rest", "a joint moves at the start", fastest, _REST_SPEED, "rad/s",
                     state.time,
                 )  # fmt: skip
+        if stop is None:
+            self._readings = ReadingCheck(self.limits, self._kinematics, self._food_top, state)
+            stop = self._doubt(state)
         if stop is not None:
             self._stop = stop
             return stop
@@ -237,7 +245,7 @@ class SafetyLayer:
             stop = robot_fault(state) or self._clock_fault(state)
             if stop is not None:
                 return stop
-            self._last, self._time = state, time
+            before, self._last, self._time = self._last, state, time
             stop = self._measurement_fault(state)
             if stop is not None:
                 return stop
@@ -248,7 +256,13 @@ class SafetyLayer:
                         "tracking_error", f"joint {j + 1} is off its target", error,
                         limits.tracking_error, "rad", time,
                     )  # fmt: skip
+            stop = self._motion_fault(state, before) or self._doubt(state)
+            if stop is not None:
+                return stop
         age = time - command_time
+        if age < -_ROUNDING:
+            detail = f"the command answers a measurement {-age:.4g} s ahead of the newest"
+            return Stop("command_age", detail, age, 0.0, time, True)
         if not age <= limits.command_age + _ROUNDING:
             return self._breach(
                 "command_age", "no new command in time", age, limits.command_age, "s", time
@@ -284,6 +298,37 @@ class SafetyLayer:
                 "torque", "the tool meets a torque", torque, self.limits.torque, "Nm", state.time
             )
         return self._payload_fault(state)
+
+    def _motion_fault(self, state: RobotState, before: RobotState | None) -> Stop | None:
+        """The measured edge and speeds, with a margin: the limits of commands alone bound neither.
+
+        The limits of force and torque, and those of the joints, hold for what is measured as well.
+        """
+        limits, time, factor = self.limits, state.time, self.limits.measured_speed
+        for j in range(6):
+            speed, most = abs(state.qd[j]), factor * self._speed[j]
+            if speed > most:
+                return self._breach(
+                    "measured_speed", f"joint {j + 1} is measured to move", speed, most, "rad/s",
+                    time,
+                )  # fmt: skip
+        edge = self._kinematics.edge(state.q)
+        if before is not None and time > before.time:
+            last, dt = self._kinematics.edge(before.q), time - before.time
+            speed = max(math.dist(edge[0], last[0]), math.dist(edge[1], last[1])) / dt
+            if speed > factor * limits.knife_speed:
+                return self._breach(
+                    "measured_speed", "the knife is measured to move", speed,
+                    factor * limits.knife_speed, "m/s", time,
+                )  # fmt: skip
+        margin = -limits.measured_margin
+        return self._edge_fault(edge, "the measured arm", time, margin, -limits.tracking_error)
+
+    def _doubt(self, state: RobotState) -> Stop | None:
+        """A reading that cannot be true; the arm then brakes by what was sent, and holds."""
+        assert self._readings is not None
+        doubt = self._readings.doubt(state, self._q)
+        return None if doubt is None else Stop(*doubt, state.time, True)
 
     def _payload_fault(self, state: RobotState) -> Stop | None:
         """The force readings jump with the payload that the controller subtracts."""
@@ -391,6 +436,18 @@ class SafetyLayer:
                 return self._breach(
                     "joint_lower", f"joint {j + 1} of {what}", q[j], self._lower[j], "rad", time
                 )
+        distance = singular_margin(q)
+        if distance < self.limits.singular_margin:
+            return self._breach(
+                "singular_margin", f"the distance from a singularity of {what}", distance,
+                self.limits.singular_margin, "", time,
+            )  # fmt: skip
+        return self._edge_fault(edge, what, time, margin, margin)
+
+    def _edge_fault(
+        self, edge: EdgePose, what: str, time: float, margin: float, tilt_margin: float
+    ) -> Stop | None:
+        """Limits of the edge, all narrower by a margin, m, and of the tilt (in its cosine)."""
         heel, tip, down = edge
         low, high = self._low, self._high
         for k in range(3):
@@ -408,7 +465,7 @@ class SafetyLayer:
             return self._breach(
                 "board_depth", f"the edge's height at {what}", lowest, self._floor, "m", time
             )
-        if down < self._down + margin:
+        if down < self._down + tilt_margin:
             angle = math.acos(max(-1.0, min(1.0, down)))
             return self._breach(
                 "tilt", f"the blade's tilt at {what}", angle, self.limits.tilt, "rad", time
@@ -434,11 +491,14 @@ class SafetyLayer:
 
 
 def robot_fault(state: RobotState) -> Stop | None:
-    """Why nothing may be sent to a robot: its safety status, or a program that does not play."""
+    """Why nothing may be sent to a robot: safety status, mode, or a program that does not play."""
     bits = state.safety_bits
     if bits & ~SAFE_BITS or not bits & SAFE_BITS:
         detail = f"the robot reports {safety_text(bits)}"
         return Stop("safety_status", detail, bits, SAFE_BITS, state.time, False)
+    if state.robot_mode not in (None, RUNNING):
+        detail = f"the robot's mode is {state.robot_mode}, wanted {RUNNING} (running)"
+        return Stop("robot_mode", detail, float(state.robot_mode), RUNNING, state.time, False)
     runtime = state.runtime_state
     if runtime != PLAYING:
         known = 0 <= runtime < len(RUNTIME_STATES)

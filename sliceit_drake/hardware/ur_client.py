@@ -63,6 +63,7 @@ class UrClient:
                 raise RuntimeError("it refuses to stream at 500 Hz; is it an e-Series robot?")
             self._refuse_stopped_robot()
             self._refuse_running_program()
+            self._has_raw_wrench = self._shows_raw_wrench()
             step = "taking control (ports 30003 and 30004)"
             self._control = rtde_control.RTDEControlInterface(host, RATE)
         except RuntimeError as error:
@@ -98,6 +99,14 @@ class UrClient:
                 )
             time.sleep(0.05)
 
+    def _shows_raw_wrench(self) -> bool:
+        # Before PolyScope 5.9 a robot does not have it, and the getter of ur_rtde raises.
+        try:
+            self._receive.getFtRawWrench()
+        except RuntimeError:
+            return False
+        return True
+
     def timestamp(self) -> float:
         return self._receive.getTimestamp()
 
@@ -115,6 +124,11 @@ class UrClient:
                 receive.getRuntimeState(),
                 receive.getSafetyStatusBits(),
                 (receive.getPayload(), *receive.getPayloadCog()),
+                receive.getTargetQ(),
+                receive.getFtRawWrench() if self._has_raw_wrench else None,
+                receive.getActualTCPPose(),
+                receive.getSpeedScalingCombined(),
+                receive.getRobotMode(),
             )
             if receive.getTimestamp() == before:
                 break

@@ -71,7 +71,7 @@ class BoardTouch:
             hardware.client, make_safety_layer(hardware.twin, limits, floor),
             hardware.config.watchdog, hardware.pace,
         )  # fmt: skip
-        status = link.start()
+        link.start()
         depths = touch.speed * self.plan.time
 
         def path(way: float) -> np.ndarray:
@@ -79,7 +79,7 @@ class BoardTouch:
 
         reason = "the touch ended by an error"
         try:
-            problem = hardware.not_ready(status.state)
+            problem = hardware.not_ready(link)
             if problem is not None:
                 raise TouchError(problem)
             with steady_python():

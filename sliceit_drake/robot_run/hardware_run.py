@@ -13,7 +13,12 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 
 from sliceit_drake.cutting.motion import Motion
-from sliceit_drake.diagrams.hardware_station import PERIOD, HardwareStation, RobotConnection
+from sliceit_drake.diagrams.hardware_station import (
+    PERIOD,
+    HardwareStation,
+    RobotConnection,
+    make_edge_kinematics,
+)
 from sliceit_drake.diagrams.run import Run, measured_profile
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.scenario_diagram import ScenarioDiagram
@@ -23,14 +28,17 @@ from sliceit_drake.diagrams.station import MakeStation
 from sliceit_drake.hardware.checks import (
     Check,
     check_facts,
+    check_kinematics,
     check_payload,
     check_sensor,
     check_start,
+    check_unzeroed,
 )
 from sliceit_drake.hardware.client import RobotClient, RobotState
 from sliceit_drake.hardware.hardware_config import HardwareConfig
 from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.interruption import raise_if_interrupted
+from sliceit_drake.output_folder import remove_results
 from sliceit_drake.robot_run.plan_check import JointPlan, check_plan, plan_joints
 from sliceit_drake.systems.agent import AgentSystem
 from sliceit_drake.systems.motion_sources import placed_motion
@@ -76,7 +84,8 @@ class HardwareRun:
 
     def check_facts(self) -> list[Check]:
         """Checks of the robot itself."""
-        return check_facts(self.client.facts(), self.config)
+        checks = check_facts(self.client.facts(), self.config)
+        return [*checks, check_kinematics(self.client.read(), self.config)]
 
     def check_before(self) -> list[Check]:
         """Checks that need nothing to be done to the robot."""
@@ -90,16 +99,34 @@ class HardwareRun:
         start = self.twin.start_joints.tolist()
         checks = check_start(self.client.read(), start, self.config)
         if all(check.passed for check in checks):
+            states, kinematics = self._some_states(), make_edge_kinematics(self.twin)
+            checks.append(check_unzeroed(states, kinematics, self.config, SENSOR_SAMPLES))
+        if all(check.passed for check in checks):
             self.client.zero_sensor()
             checks += check_sensor(self._some_states(), self.config, SENSOR_SAMPLES)
         return checks
 
-    def not_ready(self, state: RobotState) -> str | None:
-        """What has changed while the operator read the plan, or None: the arm, or the payload."""
+    def not_ready(self, link: RobotLink) -> str | None:
+        """What has changed while the operator read the plan: the arm, its payload, a contact.
+
+        Returns:
+            The first check that does not pass, in words; None if all do.
+        """
         start = self.twin.start_joints.tolist()
+        states: list[RobotState] = []
+        status = link.latest()
+        while len(states) < SENSOR_SAMPLES:
+            newer = link.wait(status, NO_DATA / self.pace)
+            if newer is None:
+                break
+            states.append(newer.state)
+            status = newer
+        state = status.state
         checks = [
             *check_start(state, start, self.config),
             *check_payload(state.payload, self.config),
+            check_kinematics(state, self.config),
+            *check_sensor(states, self.config, SENSOR_SAMPLES),
         ]
         return next((str(check) for check in checks if not check.passed), None)
 
@@ -171,7 +198,7 @@ class HardwareRun:
         rtde = station.rtde
         own = rtde.GetMyMutableContextFromRoot(context)
         if moves:
-            stop = self.not_ready(link.latest().state) or link.arm()
+            stop = self.not_ready(link) or link.arm()
             if stop is not None:
                 run.stopped = str(stop)
                 rtde.receive(own)
@@ -258,12 +285,13 @@ def write_hardware_outputs(hardware: HardwareRun, directory: Path) -> dict:
     """
     run, link = hardware.run, hardware.link
     assert run is not None and link is not None, "execute first"
+    directory.mkdir(parents=True, exist_ok=True)
+    remove_results(directory)
+    link.write_log(directory / "robot.csv")  # First: what comes later needs more time and room.
     meshcat = hardware.twin.meshcat
     if meshcat is not None:
         _draw(hardware, meshcat)
-    summary = run.save(directory, extra={"robot": link.timing()})
-    link.write_log(directory / "robot.csv")
-    return summary
+    return run.save(directory, extra={"robot": link.timing()})
 
 
 def _draw(hardware: HardwareRun, meshcat: Meshcat) -> None:

@@ -1,6 +1,7 @@
 """A robot whose motions an operator confirms: connect, check, show, ask for the word, move."""
 
 import dataclasses as dc
+import signal
 import sys
 import termios
 from collections.abc import Iterator, Sequence
@@ -16,7 +17,8 @@ from sliceit_drake.hardware.client import RobotClient, is_loopback
 from sliceit_drake.hardware.guarded_touch import TouchError
 from sliceit_drake.hardware.hardware_config import HardwareConfig, differing
 from sliceit_drake.hardware.rtde_link import RobotLink
-from sliceit_drake.interruption import catch_signals
+from sliceit_drake.hardware.supervisor import Supervisor
+from sliceit_drake.interruption import catch_signals, handle_signals
 from sliceit_drake.robot_run.board_touch import BoardTouch, check_height
 from sliceit_drake.robot_run.hardware_run import (
     HardwareRun,
@@ -191,11 +193,12 @@ class OperatedRobot:
         """
         from sliceit_drake.hardware.ur_client import UrClient
 
-        with catch_signals():
+        with catch_signals(), Supervisor(self.host) as supervisor:
             print(f"Connecting to {self.host}", flush=True)
             config = self.config
             client = UrClient(self.host, config.lookahead_time, config.gain, pace=self.pace)
             try:
+                supervisor.begin()
                 yield client
             finally:
                 client.close()
@@ -232,11 +235,20 @@ def _slice(hardware: HardwareRun, duration: float, directory: Path) -> Run:
         def show(time: float, wall: float) -> None:
             bar.update(time - bar.n)
 
-        made = hardware.execute(duration, show)
-    summary = write_hardware_outputs(hardware, directory)
+        try:
+            made = hardware.execute(duration, show)
+        except KeyboardInterrupt:
+            _keep_log(hardware, directory)
+            raise
+    # Before any file: a full disk, or a record that takes long, must not keep it from the operator.
     if made.stopped:
         print(f"STOPPED: {made.stopped}")
-        print(_stopped_text(hardware.link))
+        print(_stopped_text(hardware.link), flush=True)
+    try:
+        summary = write_hardware_outputs(hardware, directory)
+    except OSError as error:
+        print(f"NOT ALL IS WRITTEN: {directory}: {error.strerror}. Make room before the next run.")
+        raise
     robot = summary["robot"]
     print(
         f"Peak force {summary['peak_force_N']:.1f} N; {robot['cycles']:.0f} cycles, "
@@ -244,6 +256,16 @@ def _slice(hardware: HardwareRun, duration: float, directory: Path) -> Run:
         f"(99 %), {1e3 * robot['lateness_max_s']:.2f} ms at most"
     )
     return made
+
+
+def _keep_log(hardware: HardwareRun, directory: Path) -> None:
+    """What is left of a run that was interrupted again while it stopped; not to be interrupted."""
+    with handle_signals((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), lambda *_: None):
+        print("STOPPED: interrupted by the user, more than once")
+        print(_stopped_text(hardware.link), flush=True)
+        if hardware.link is not None:
+            directory.mkdir(parents=True, exist_ok=True)
+            hardware.link.write_log(directory / "robot.csv")
 
 
 def ask(word: str, is_emulated: bool) -> bool:

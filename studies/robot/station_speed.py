@@ -44,6 +44,7 @@ REST = "Drake: plant, servo, events, record"
 PARTS = (
     (Workspace, "advance", "kernels of the food"),
     (Workspace, "stored_energies", "kernels of the food"),
+    (CuttingSolver, "plan", SOLVER),
     (CuttingSolver, "move", SOLVER),
     (CuttingSolver, "energies", SOLVER),
     (KnifeForceSystem, "_update", "cutting system"),

@@ -1,0 +1,94 @@
+"""A process beside a run that stops the robot if the run's process dies, and says so.
+
+ur_rtde can end a process in the middle of a motion, by an abort or a segmentation fault; then no
+line of Python runs there any more. This process only reads a pipe from it. If the pipe ends
+without the word that all is done, it stops the robot's program through the dashboard server.
+"""
+
+import contextlib
+import socket
+import subprocess
+import sys
+import time
+
+__all__ = ["Supervisor", "stop_by_dashboard"]
+
+DASHBOARD_PORT = 29999
+PATIENCE = 15.0
+"""How long a controller is asked that does not answer, s."""
+_CONTROL, _DONE = b"control\n", b"done\n"
+
+
+class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
+    """Watches over this process from another; a context manager.
+
+    Args:
+        host: Address of the robot.
+    """
+
+    def __init__(self, host: str) -> None:
+        # In a session of its own, so that Ctrl-C and a closed terminal do not reach it.
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "sliceit_drake.hardware.supervisor", host],
+            stdin=subprocess.PIPE, start_new_session=True,
+        )  # fmt: skip
+
+    def begin(self) -> None:
+        """Says that this process controls the robot now: its end stops the robot."""
+        self._say(_CONTROL)
+
+    def _say(self, word: bytes) -> None:
+        assert self._process.stdin is not None
+        # If it was ended the run goes on as without it: the robot's watchdog is still there.
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.write(word)
+            self._process.stdin.flush()
+
+    def __exit__(self, *_: object) -> None:
+        self._say(_DONE)
+        self._process.communicate()
+
+
+def stop_by_dashboard(host: str) -> str | None:
+    """Stops the robot's program through its dashboard server, as often as it has to be asked.
+
+    Returns:
+        Why it is not known to be stopped, or None.
+    """
+    problem, end = "", time.monotonic() + PATIENCE
+    while time.monotonic() < end:
+        try:
+            with socket.create_connection((host, DASHBOARD_PORT), 2.0) as connection:
+                lines = connection.makefile("rwb")
+                lines.readline()
+                for question in (b"stop\n", b"running\n"):
+                    lines.write(question)
+                    lines.flush()
+                    problem = lines.readline().decode("utf-8", "replace").strip()
+                if problem.lower() == "program running: false":
+                    return None
+        except OSError as error:
+            problem = str(error)
+        time.sleep(0.1)
+    return problem or "it does not answer"
+
+
+def _watch(host: str) -> None:
+    """Waits for the end of the process that has the other end of standard input."""
+    said = sys.stdin.buffer.read()
+    if not said.startswith(_CONTROL) or said.endswith(_DONE):
+        return
+    problem = stop_by_dashboard(host)
+    text = "THE PROGRAM THAT DROVE THE ROBOT HAS CRASHED. "
+    if problem is None:
+        text += "The robot's program was stopped through its dashboard. Find the cause first."
+    else:
+        text += (
+            f"THE ROBOT DID NOT CONFIRM THAT ITS PROGRAM IS STOPPED ({problem}). Use the "
+            "emergency stop before you go near it."
+        )
+    print(f"\n{text}", file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    _watch(sys.argv[1])
