@@ -5,7 +5,7 @@ import numpy as np
 from sliceit_drake.cutting.kernels.types import CORNERS, LANES
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.cutting.solver import CuttingSolver, SurfaceFactors
-from sliceit_drake.cutting.workspace import LAUNCH_LOCK
+from sliceit_drake.cutting.warp_start import LAUNCH_LOCK
 
 
 def held_reaction(solver: CuttingSolver, state: np.ndarray, pose: Pose) -> np.ndarray:

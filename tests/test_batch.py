@@ -7,13 +7,14 @@ import pytest
 
 from sliceit_drake.cutting.batch import BatchSlice, cut_together, simulate_batch
 from sliceit_drake.cutting.board import Board
-from sliceit_drake.cutting.driver import Driver
+from sliceit_drake.cutting.driver import Driver, Launch
 from sliceit_drake.cutting.foods.effects import Compliance, Effects, Relaxation
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.foods.shapes import Cylinder
 from sliceit_drake.cutting.inertia import Inertia
 from sliceit_drake.cutting.knife import Knife
+from sliceit_drake.cutting.knife_path import KnifePath
 from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan, PressAndDraw
 from sliceit_drake.cutting.parameters import with_parameters
@@ -73,6 +74,27 @@ def test_cuts_side_by_side_are_the_cuts_alone(models, motions, one_by_one):
     results = cut_together(Driver(PERIOD), models[:2], motions[:2], BOARD)
     for result, alone in zip(results, one_by_one, strict=False):
         np.testing.assert_array_equal(table(result), alone)
+
+
+@pytest.mark.parametrize(("speed", "together"), [(0.02, 25), (0.045, 10), (0.1, 5), (0.11, 1)])
+def test_a_slice_is_the_same_however_many_coupling_steps_are_launched_at_once(
+    models, speed, together
+):
+    plan = MotionPlan([ConstantSpeed(distance=0.02, speed=speed, acceleration=None)])
+    path = KnifePath(models[2], Motion(plan, start_pose(models[2], 1e-3)), PERIOD)
+    alone = [Launch(k, 1) for k in range(path.coupling_steps)]
+    launched = [list(Driver(PERIOD).run([path], each, BOARD)) for each in (alone, None)]
+    one_by_one, at_once = [
+        np.concatenate([step.wrenches for _, (step,) in run]) for run in launched
+    ]
+    np.testing.assert_array_equal(at_once, one_by_one)
+    for run in launched:
+        np.testing.assert_array_equal(run[-1][1][0].state, launched[0][-1][1][0].state)
+    assert max(launch.coupling_steps for launch, _ in launched[1]) == together
+    firsts = [launch.first for launch, _ in launched[1]]
+    counts = [launch.coupling_steps for launch, _ in launched[1]]
+    np.testing.assert_array_equal(np.cumsum([0, *counts[:-1]]), firsts)
+    assert sum(counts) == path.coupling_steps
 
 
 def test_a_slice_that_breaks_down_is_reported_and_disturbs_no_other(models, motions, one_by_one):

@@ -104,8 +104,8 @@ def test_rigid_arm_without_lag_has_the_limit_of_one_axis_by_hand():
 def test_default_cut_has_a_margin_far_above_two():
     margin = check_contact_margin(MakeStation(cucumber()))
     assert margin.food is not None
-    assert margin.food > 10.0
-    assert margin.board > 10.0
+    assert margin.food >= 10.0
+    assert margin.board >= 10.0
     # Sideways the slab clamps the blade, whose bending (20 kN/m) gives way.
     assert 1e4 < margin.stiffness[1] < 2e4
 

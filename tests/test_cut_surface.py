@@ -32,9 +32,12 @@ def planes(name: str) -> list[CutPlane]:
     return [ALIGNED, *tilted]
 
 
-def cut(mesh: TetrahedralMesh, plane: CutPlane) -> tuple[SplitMesh, EdgeTables]:
+def cut(
+    mesh: TetrahedralMesh, plane: CutPlane, spread: float = 0.0
+) -> tuple[SplitMesh, EdgeTables]:
     split = split_mesh(mesh, plane)
-    return split, edge_tables(split.points[:, [0, 2]], split.triangles)
+    groups = split.nearest_vertex
+    return split, edge_tables(split.points[:, [0, 2]], split.triangles, spread, groups)
 
 
 def section_width(mesh: TetrahedralMesh, plane: CutPlane, heights: np.ndarray) -> np.ndarray:
@@ -96,6 +99,30 @@ def test_each_point_carries_its_area_and_never_pulls(name):
             expected[triangle] += third
         np.testing.assert_allclose(tables.area, expected, rtol=1e-9, atol=1e-18)
         assert tables.area.sum() == pytest.approx(area_of_section(split), rel=1e-12)
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_spread_tables_keep_the_areas_and_the_sections_width(name):
+    for plane in planes(name)[:3]:
+        _, sharp = cut(MESHES[name], plane)
+        split, tables = cut(MESHES[name], plane, 6e-3)
+        assert tables.spacing == pytest.approx(sharp.spacing, rel=1e-12)
+        assert (tables.width >= 0.0).all()
+        cells = 0.5 * (tables.width[:, 1:] + tables.width[:, :-1]) * tables.spacing
+        np.testing.assert_allclose(cells.sum(1), sharp.area, rtol=1e-9)
+        np.testing.assert_allclose(tables.fraction[:, -1], 1.0, rtol=1e-9)
+        # Each point is loaded over more of the way, and less at a time.
+        inner = sharp.area > 0.5 * sharp.area.max()
+        assert (tables.width.max(1)[inner] < sharp.width.max(1)[inner]).all()
+        z = split.points[:, 2]
+        heights = np.linspace(z.min(), z.max(), 61)[3:-3] + 1e-7
+        both = [
+            np.array([interpolated(t, t.width, z - h).sum() for h in heights])
+            for t in (sharp, tables)
+        ]
+        np.testing.assert_allclose(both[1], both[0], atol=0.03 * both[0].max())
+        above = interpolated(tables, tables.width, z - z.max() - 4.0 * tables.spacing)
+        assert (above < 1e-12).all()
 
 
 @pytest.mark.parametrize("name", MESHES)

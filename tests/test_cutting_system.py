@@ -11,6 +11,7 @@ from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
 
+from sliceit_drake.cutting.foods.effects import Effects, Resting, SlicePush
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.shapes import Box, Cylinder
 from sliceit_drake.cutting.knife import Knife
@@ -148,6 +149,30 @@ def alone(solvers):
 def test_the_same_input_gives_the_same_force_bit_for_bit(diagram, alone):
     for (food, velocity), expected in zip(MOTIONS, alone, strict=True):
         same(Slice(diagram, food, velocity).advance(LENGTH).result(), expected)
+
+
+def test_what_changes_the_force_of_a_cut_does_so_step_by_step(solvers, alone):
+    """The pull of a draw, and a force that fades, as over the whole series at once; the food itself
+    goes on as without them."""
+    effects = Effects(slice_push=SlicePush(pull=0.3), resting=Resting([0.2, 0.1], [0.01, 0.1]))
+    effects.resting.travel = 0.05
+    velocity = np.array(MOTIONS[1][1])
+    changed, plain = (
+        Slice(build([CuttingSolver(model, PERIOD)]), 0, velocity)
+        for model in (solvers[0].model.derive(effects=effects), solvers[0].model)
+    )
+    parts = []
+    for _ in range(LENGTH):
+        changed.advance(1)
+        components = plain.advance(1).cutting.GetOutputPort("force_components").Eval(plain.context)
+        parts.append(np.column_stack([np.zeros((3, 3)), components.reshape(3, 3)]))
+    same([changed.result()[1]], [plain.result()[1]])
+    speed, edge = np.full(LENGTH, np.linalg.norm(velocity)), np.tile([1.0, 0.0, 0.0], (LENGTH, 1))
+    expected, faded = effects.changed(np.array(parts), edge, speed, PERIOD)
+    assert np.array(changed.wrenches)[:, 3:] == pytest.approx(expected.sum(1)[:, 3:], abs=1e-4)
+    assert changed.cutting.kept(changed.context)[-2:] == pytest.approx(faded)
+    drawn = np.abs(np.array(changed.wrenches)[-20:, 3] / np.array(plain.wrenches)[-20:, 3])
+    assert (drawn > 1.1).all()
 
 
 def test_two_contexts_of_one_diagram_do_not_disturb_each_other(diagram, alone):
@@ -378,7 +403,7 @@ def test_coupling_work_error_counts_the_work_of_moments_on_a_knife_that_turns():
 
 def test_each_slice_of_a_sequence_is_judged_by_its_own_energies():
     food = Food(shape=Cylinder(diameter=0.016, rings=2, layers=[0.0, 0.004, 0.012]))
-    model = make_food_model(food, Knife(), Numerics(step_by_need=False))
+    model = make_food_model(food, Knife(), Numerics(step_by_need=False, time_step=5e-4))
     speed, down = 0.1, 0.018
     turns = np.cumsum([0.0, down, down, down]) / speed
 

@@ -62,13 +62,14 @@ def test_the_sum_of_norms_is_never_less_than_the_resultant():
     model = bar()
     resultant, norms = both_measures(model, along(model, direction=(1.0, 0.0, 1.0)))
     assert norms[-1] > 0.0 and norms[0] == 0.0
-    # Two percent, for one is the coupling step's mean and the other its end.
-    assert np.all(norms >= 0.98 * resultant)
+    # Two percent, for one is the coupling step's mean and the other its end. The blade shares added
+    # inertia with faces that it does not touch yet, and its spring then has up to 0.1 mN.
+    assert np.all(norms >= 0.98 * resultant - 2e-4)
     assert norms[-1] > 1.5 * resultant[-1]
 
 
 def test_parallel_contacts_have_a_sum_of_norms_that_is_their_resultant():
-    model = bar(RAZOR, friction=0.0, flank_stiffness=0.01)
+    model = bar(RAZOR, friction=0.0, flank_length=0.4)
     resultant, norms = both_measures(model, along(model))
     assert resultant[-1] == pytest.approx(TOUGHNESS * 0.02, rel=0.1)
     assert norms[-1] == pytest.approx(resultant[-1], rel=0.01)
@@ -92,7 +93,7 @@ def test_contact_forces_add_up_to_the_force_on_the_knife():
 
 @pytest.mark.parametrize("share", [0.0, 0.4])
 def test_the_edge_takes_its_share_and_leaves_the_rest_to_opening(share):
-    model = bar(RAZOR, share, friction=0.0, flank_stiffness=0.01)
+    model = bar(RAZOR, share, friction=0.0, flank_length=0.4)
     result = cut(model, depth=0.0156)
     balance = result.balance
     whole = TOUGHNESS * model.section_area
@@ -114,7 +115,7 @@ def test_bonds_that_the_edge_left_are_torn_apart_by_a_thick_blade():
 
 
 def test_bonds_that_hold_behind_the_edge_store_what_the_energy_balance_says():
-    model = bar(Knife(length=0.4, spine_thickness=0.006), 0.0, friction=0.0, time_step=2.5e-4)
+    model = bar(Knife(length=0.4, spine_thickness=0.002), 0.0, friction=0.0, time_step=2.5e-4)
     result = cut(model, depth=0.01)
     assert result.cut[-1] > 0.5 and result.balance.opening == 0.0
     assert abs(result.balance.residual(result.energies)) < 0.003 * result.balance.work
@@ -129,13 +130,13 @@ def test_the_case_holds_disects_parameters_per_area():
     assert springs.count == disect.spring_count(6, 5)
     bond, flank = (springs.per_area(k) for k in (springs.stiffness, springs.contact_stiffness))
     assert given.bond_stiffness * unit == pytest.approx(bond, rel=2e-3)
-    assert given.flank_stiffness * unit == pytest.approx(flank, rel=2e-3)
+    assert case.food.material.youngs_modulus / given.flank_length == pytest.approx(flank, rel=2e-3)
     assert given.board_stiffness * unit == pytest.approx(1000.0 / 36e-6, rel=5e-3)
     assert material.friction == pytest.approx(springs.friction_at(0.05), rel=1e-3)
     entered = load_reference().foods[0]
     E, nu = disect.small_strain_moduli(entered.youngs_modulus, entered.poisson_ratio)
     assert (material.youngs_modulus, material.poisson_ratio) == pytest.approx((E, nu), rel=1e-3)
-    toughness, strength = disect.opening_law(springs, 1.88e-4)
+    toughness, strength = disect.opening_law(springs, 1.982e-4)
     assert (material.toughness, material.strength) == pytest.approx((toughness, strength), rel=0.01)
 
 
@@ -161,7 +162,8 @@ def test_the_opening_law_with_disects_parameters_has_disects_force(runs):
     reference, ours, stiffer, stiff = runs
     theirs = reference.runs[0]
     assert ours.norms[-1] == pytest.approx(theirs.sum_end, rel=0.01)
-    assert ours.at(disect.MIDDLE, ours.norms) == pytest.approx(theirs.sum_middle, rel=0.03)
+    # Springs press there as soon as the knife touches them, and here by the part that is cut.
+    assert ours.at(disect.MIDDLE, ours.norms) == pytest.approx(theirs.sum_middle, rel=0.04)
     assert ours.vertical[-1] == pytest.approx(theirs.vertical_end, rel=0.01)
     assert stiffer.norms.max() == pytest.approx(stiff.sum_peak, rel=0.02)
     assert stiffer.vertical.max() == pytest.approx(stiff.vertical_peak, rel=0.02)
@@ -174,7 +176,7 @@ def test_the_springs_of_the_case_open_as_far_as_its_toughness_says(runs):
         reference.springs, nominal, nominal, ours.offset, ours.slope
     )
     assert delay == pytest.approx(nominal.break_delay)
-    assert opened == pytest.approx(1.88e-4, rel=0.02)
+    assert opened == pytest.approx(1.982e-4, rel=0.02)
     other = dc.replace(nominal, spring_factor=4.0, time_step=0.25 * nominal.time_step)
     again = disect.break_opening(reference.springs, nominal, other, ours.offset, ours.slope)
     assert again == pytest.approx((delay, opened)), "four times as stiff, four times as often"

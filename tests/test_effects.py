@@ -609,3 +609,130 @@ def test_a_wrong_value_is_refused_with_its_field_and_a_fix(text):
         load_yaml(Effects, None, overrides_text=text)
     assert (error.value.field or "").removeprefix("effects.").startswith(WRONG[text])
     assert error.value.fix
+
+
+PLAIN = [0.0, 0.004, 0.01]
+FINER = [0.0, 0.0028, 0.0064, 0.012]
+
+
+def punctured(rings=6, layers=PLAIN, speed=0.02, load=800.0) -> float:
+    """Greatest force on a round food, before its skin gives way, N."""
+    food = Food(
+        shape=Cylinder(diameter=0.048, length=0.05, rings=rings, layers=layers),
+        material=Material(youngs_modulus=1e6, toughness=400.0, friction=0.0, damping_time=1e-3),
+        effects=Effects(skin=Skin(5e-4 * load, 5e-4)),
+        held_sides="none",
+    )
+    model = make_food_model(food, Knife(), Numerics(time_step=5e-4))
+    press = ConstantSpeed(distance=5e-3, speed=speed, acceleration=None)
+    start = start_pose(model, 5e-4)
+    force = simulate_slice(CuttingSolver(model, PERIOD), Motion(MotionPlan([press]), start))
+    force = force.food_wrench[:, 5]
+    before = force.argmax()
+    # It snaps: the edge goes through the skin along all that it presses on.
+    assert force[before + 1 :].min() < 0.75 * force[before]
+    return force[before]
+
+
+def test_a_round_food_gives_way_under_its_skin_until_the_line_load_of_its_puncture():
+    force = punctured()
+    # Of any mesh and knife speed. The blade presses on more of a skin that holds more.
+    assert punctured(layers=FINER) == pytest.approx(force, rel=0.07)
+    assert punctured(speed=0.06) == pytest.approx(force, rel=0.07)
+    assert punctured(load=1200.0) > 1.5 * force
+
+
+def test_each_end_of_a_piece_of_skin_carries_half_of_it():
+    food = Food(shape=Cylinder(diameter=0.048, length=0.05, rings=6, layers=PLAIN))
+    tables = make_food_model(food, Knife(), Numerics()).tables
+    assert Skin(0.4, 5e-4).line_load == pytest.approx(800.0)
+    perimeter = 36 * 0.048 * np.sin(np.pi / 36)
+    assert 0.5 * tables.outline.sum() == pytest.approx(perimeter, rel=5e-3)
+    lower = 0.5 * (tables.outline * tables.lower).sum()
+    assert lower == pytest.approx(0.5 * perimeter, rel=0.1)
+
+
+@pytest.mark.parametrize("modulus", [5e5, 2e6])
+@pytest.mark.parametrize("divisions", [[4, 5], [8, 5]])
+@pytest.mark.parametrize("step", [2.5e-4, 5e-4])
+def test_a_level_skin_is_punctured_at_its_line_load_times_its_length(modulus, divisions, step):
+    skin, toughness = Skin(0.1, 5e-4), 10.0
+    food = Food(
+        shape=Box(size=[WIDTH, 0.1, HEIGHT], divisions=divisions, layers=[0.0, 0.004, 0.012]),
+        material=Material(modulus, toughness=toughness, friction=0.0, damping_time=1e-3),
+        effects=Effects(skin=skin),
+    )
+    model = make_food_model(food, bar().knife, Numerics(time_step=step))
+    force = simulate_slice(CuttingSolver(model, PERIOD), motion(model, press(3e-3))).edge[:, 2]
+    # Below it the edge goes on through flesh and the skin of both sides.
+    inside = toughness * WIDTH + 2.0 * skin.toughness
+    assert force.max() == pytest.approx(skin.line_load * WIDTH + inside, rel=0.025)
+    assert force[-1] == pytest.approx(inside, rel=0.1)
+
+
+@pytest.mark.parametrize("layers", [PLAIN, FINER])
+def test_a_skin_holds_its_line_load_along_the_edge_that_has_entered_it(layers):
+    skin = Skin(0.4, 5e-4)
+    food = Food(
+        shape=Cylinder(diameter=0.048, length=0.05, rings=6, layers=layers),
+        material=Material(1e6, toughness=10.0, friction=0.0, damping_time=1e-3),
+        effects=Effects(skin=skin),
+    )
+    model = make_food_model(food, Knife(), Numerics(time_step=5e-4))
+    solver = CuttingSolver(model, PERIOD)
+    result = simulate_slice(solver, motion(model, press(1.5e-3)))
+    tables = model.tables
+    entered = solver.field(result.state, "skin_depth").ravel()[: len(tables.area)]
+    along = np.linspace(0.0, 1.0, 501)
+    # Both ends of a piece hold half of it.
+    beside = entered[tables.beside][..., None]
+    between = beside + (entered[:, None, None] - beside) * along
+    inside = (between > 0.0) & (between < skin.thickness)
+    length = 0.5 * (tables.outline * (1.0 - tables.lower) * inside.mean(2)).sum()
+    assert 4e-3 < length < 0.02
+    assert result.edge[-1, 2] == pytest.approx(skin.line_load * length, rel=0.02)
+
+
+def test_a_skin_that_snaps_dissipates_its_toughness_times_the_outline():
+    balances = []
+    for skin in (Skin(), Skin(0.4, 5e-4)):
+        food = Food(
+            shape=Cylinder(diameter=0.048, length=0.05, rings=6, layers=PLAIN),
+            material=Material(1e6, toughness=400.0, friction=0.0, damping_time=1e-3),
+            effects=Effects(skin=skin),
+        )
+        model = make_food_model(food, Knife(), Numerics(time_step=5e-4))
+        result = simulate_slice(CuttingSolver(model, PERIOD), motion(model, press(0.05)))
+        balances.append(result.balance.edge + result.balance.opening)
+    work = skin.toughness * 0.5 * model.tables.outline.sum()
+    assert balances[1] - balances[0] == pytest.approx(work, rel=0.02)
+
+
+def test_a_soft_food_with_a_skin_is_punctured_on_any_mesh_where_its_wall_is_stiff():
+    shapes = [
+        Cylinder(diameter=0.048, length=0.05, rings=rings, layers=layers)
+        for rings, layers in ((4, [0.0, 0.004, 0.01]), (6, [0.0, 0.002, 0.006, 0.012]))
+    ]
+    wall = Core(rind=6e-3, stiffness_ratio=0.15)
+    for shape in shapes:
+        models = [
+            make_food_model(
+                Food(
+                    shape=shape,
+                    material=Material(
+                        youngs_modulus=E, toughness=200.0, damping_time=1e-3, friction=0.1
+                    ),
+                    effects=Effects(skin=Skin(0.4, 5e-4), core=core),
+                    held_sides="none",
+                ),
+                Knife(),
+                Numerics(board_friction=0.6),
+            )
+            for E, core in ((2.5e5, Core()), (8e5, wall))
+        ]
+        assert ["folds around the edge" in " ".join(m.warnings) for m in models] == [True, False]
+        press = ConstantSpeed(distance=1.2e-2, speed=0.02, acceleration=None)
+        motion = Motion(MotionPlan([press]), start_pose(models[1], 5e-4))
+        result = simulate_slice(CuttingSolver(models[1], PERIOD), motion)
+        assert result.food_wrench[:, 5].max() > result.food_wrench[-1, 5] + 2.0
+        assert result.energies.least_volume_ratio > 0.5

@@ -71,7 +71,7 @@ def forces(solver: CuttingSolver, x: np.ndarray, v: np.ndarray | float = 0.0) ->
     change = solver.velocities(new) - solver.velocities(state)
     model = solver.model
     momentum = np.zeros_like(change)
-    momentum[model.moving] = model.inertia.matrix @ change[model.moving]
+    momentum[model.moving] = model.inertia.of_nodes @ change[model.moving]
     return momentum / solver.exchange_period - model.weight
 
 
@@ -249,7 +249,7 @@ def test_free_body_falls_with_its_true_mass():
     t, dt = 4 * solver.exchange_period, model.numerics.time_step
     mass = 1000.0 * 0.02 * 0.04 * 0.015
     down = -model.X_FC_rotation.T @ [0.0, 0.0, 1.0]
-    stepped = model.inertia.matrix.sum(0)
+    stepped = model.inertia.of_nodes.sum(0)
     momentum = stepped @ solver.velocities(state)[model.moving]
     np.testing.assert_allclose(momentum, mass * 9.81 * t * down, atol=1e-9 * mass * 9.81 * t)
     fallen = stepped @ (solver.positions(state) - model.nodes)[model.moving] / mass

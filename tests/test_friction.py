@@ -5,12 +5,13 @@ import pytest
 
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
-from sliceit_drake.cutting.foods.shapes import Box
+from sliceit_drake.cutting.foods.shapes import Box, Cylinder
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan, Pose, Retract
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
+from studies.physics.contact_convergence import contact_force
 
 FRICTION = 0.2
 
@@ -147,3 +148,16 @@ def slow_friction(static_friction, step):
 def test_static_friction_does_not_depend_on_the_sub_step(step):
     ratio = slow_friction(2.0 * FRICTION, step) / slow_friction(0.0, 1e-3)
     assert ratio == pytest.approx(1.0 + np.exp(-0.2), rel=0.02)
+
+
+@pytest.mark.parametrize("held", ["both", "plus"])
+def test_force_converges_with_the_contact_and_with_the_mesh(held):
+    shape = Cylinder(rings=3, layers=[0.0, 0.004, 0.012])
+    material = Material(youngs_modulus=6e5, toughness=240.0, friction=0.3)
+    food = Food(shape=shape, material=material, held_sides=held)
+    default = contact_force(food)
+    assert default.friction > 0.2 * default.total
+    stiffer, finer = contact_force(food, stiffness=4.0), contact_force(food, refinement=2.0)
+    assert stiffer.total == pytest.approx(default.total, rel=0.02)
+    # The mesh is coarser than the default one, which is within 2 % (docs/results/contact.md).
+    assert finer.total == pytest.approx(default.total, rel=0.04)

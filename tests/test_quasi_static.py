@@ -14,7 +14,7 @@ from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
 
 
-@pytest.mark.parametrize("held_sides", ["both", "minus"])
+@pytest.mark.parametrize("held_sides", ["both", "minus", "none"])
 @pytest.mark.parametrize("depth", [0.008, 0.020])
 def test_knife_wrench_equals_the_reaction_of_clamp_and_board(held_sides, depth):
     food = Food(

@@ -1,5 +1,8 @@
 """Inertia that is added for longer sub-steps, and sub-steps that the knife's motion asks for."""
 
+import dataclasses as dc
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from scipy.linalg import eigh
@@ -12,12 +15,15 @@ from sliceit_drake.cutting.foods.effects import Compliance, Effects, Skin
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.foods.shapes import Cylinder
+from sliceit_drake.cutting.inertia import Inertia, assemble
+from sliceit_drake.cutting.kernels.layouts import Planned
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.knife_path import KnifePath
 from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan, Pose, Retract
+from sliceit_drake.cutting.parameters import with_parameters
 from sliceit_drake.cutting.simulate import SliceResult, simulate_slice
-from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
 from sliceit_drake.cutting.stepping import CALM, FINEST, STEPPING, Stepping
 from sliceit_drake.cutting.workspace import Workspace
 
@@ -51,7 +57,7 @@ def force(model: CuttingModel, motion: Motion) -> tuple[np.ndarray, SliceResult]
 def test_the_factors_solve_the_mass_matrix_on_the_device():
     model = cut(precision="float64")
     ws = Workspace([model], PERIOD)
-    count = len(model.moving)
+    count = len(model.moving) + 1
     b = np.random.default_rng(0).normal(size=(count, 3))
     ws.write(ws.forces[0].resultant, np.hstack([b, np.zeros((count, 1))])[None])
     ws.launch_part("solve", 0)
@@ -63,11 +69,23 @@ def test_where_the_factors_have_entries_depends_on_the_mesh_alone():
     model = cut()
     still = model.derive(
         material=Material(youngs_modulus=2e5, toughness=10.0),
-        numerics=Numerics(time_step=1e-5, flank_stiffness=0.01, bond_stiffness=0.01),
+        numerics=Numerics(time_step=1e-5, flank_length=0.1, bond_stiffness=0.01),
     )
     for name in ("lower_start", "lower_index", "upper_start", "upper_index"):
         some = (getattr(each.inertia.factors, name) for each in (model, still))
         np.testing.assert_array_equal(*some)
+
+
+def test_entries_that_cancel_keep_their_place_in_the_factors():
+    def matrix(coupling: float) -> Inertia:
+        blocks = [np.array([[[2.0, c], [c, 2.0]]]) for c in (0.5, coupling)]
+        four = [(np.array([[0, 1]]), b) for b in blocks] + [(np.array([[1, 2]]), blocks[0])]
+        return Inertia(assemble(np.arange(3), four, np.ones(3)))
+
+    one, other = matrix(-0.5), matrix(0.1)
+    assert one.matrix.nnz == other.matrix.nnz
+    shapes = [[part.shape for part in vars(each.factors).values()] for each in (one, other)]
+    assert shapes[0] == shapes[1]
 
 
 @pytest.mark.parametrize("step", [2.5e-4, 1e-3])
@@ -80,7 +98,7 @@ def test_no_frequency_of_the_food_at_rest_is_beyond_what_the_step_follows(step):
     def forces(state: np.ndarray) -> np.ndarray:
         new = exact.coupling_step(state, far, far).state
         change = (exact.velocities(new) - exact.velocities(state))[model.moving]
-        return (exact.model.inertia.matrix @ change / 1e-9).ravel()
+        return (exact.model.inertia.of_nodes @ change / 1e-9).ravel()
 
     columns = []
     for node in model.moving:
@@ -91,7 +109,7 @@ def test_no_frequency_of_the_food_at_rest_is_beyond_what_the_step_follows(step):
             columns.append((forces(moved[1]) - forces(moved[0])) / (2.0 * size))
     stiffness = np.array(columns)
     stiffness = 0.5 * (stiffness + stiffness.T)
-    inertia = kron(model.inertia.matrix, np.eye(3)).toarray()
+    inertia = kron(model.inertia.of_nodes, np.eye(3)).toarray()
     highest = eigh(stiffness, inertia, eigvals_only=True, subset_by_index=[len(inertia) - 1] * 2)
     damping = 1.0 + 2.0 * model.numerics.numerical_damping
     stable = 4.0 / (damping * step**2)
@@ -109,11 +127,11 @@ def test_a_translation_away_from_the_cut_keeps_its_true_mass_and_a_rotation_does
     contact = np.unique(model.point_nodes)
     free = ~np.isin(model.moving, contact) & (model.board_area[model.moving] == 0.0)
     assert free.any()
-    stepped, true = model.inertia.matrix @ np.ones(len(free)), model.true_mass[model.moving]
+    stepped, true = model.inertia.of_nodes @ np.ones(len(free)), model.true_mass[model.moving]
     np.testing.assert_allclose(stepped[free], true[free], rtol=1e-6)
     # Turned about the axis of the cylinder.
     turn = model.nodes[model.moving][:, 2]
-    assert turn @ model.inertia.matrix @ turn > 2.0 * (true @ turn**2)
+    assert turn @ model.inertia.of_nodes @ turn > 2.0 * (true @ turn**2)
 
 
 @pytest.mark.parametrize(("speed", "acceleration"), [(0.02, None), (0.1, None), (0.1, 2.0)])
@@ -149,6 +167,47 @@ def test_steady_motion_takes_the_longest_steps_and_a_turn_short_ones_for_a_while
     assert numbers[-1] == 2
 
 
+def test_a_steady_draw_takes_the_longest_steps_that_its_way_allows():
+    model = cut(time_step=1e-3)
+    p = np.array([0.0, 0.0, model.top + 2e-4]) + np.outer(np.arange(60), [2e-4, 0.0, -2e-4])
+    R = np.tile(UP, (len(p), 1, 1))
+    numbers, _ = Stepping.of(model, 2).plan(np.zeros(STEPPING), R, p, PERIOD)
+    assert max(numbers) > 8
+    assert set(numbers[30:]) == {8}
+
+
+@pytest.mark.parametrize("damping_time", [3e-3, 1e-2])
+def test_food_with_much_damping_that_is_held_on_both_sides_is_calm_at_short_steps(damping_time):
+    model = cut()
+    model = model.derive(material=dc.replace(model.material, damping_time=damping_time))
+    path = KnifePath(model, press(model), PERIOD)
+    short = np.full(path.coupling_steps, FINEST)
+    wrenches = [
+        np.array([step.wrench[3:] for step in taken(model, numbers)])
+        for numbers in (short, short // 4)
+    ]
+    difference = np.linalg.norm(wrenches[0] - wrenches[1])
+    assert difference < 2e-3 * np.linalg.norm(wrenches[0])
+
+
+def test_in_differences_the_added_inertia_follows_the_modulus():
+    """Its force errs in proportion, so that the force scales with the food as it should."""
+    name, size = "material.youngs_modulus", 0.02
+
+    def change(model: CuttingModel, fixed: bool) -> np.ndarray:
+        ends = []
+        for sign in (1.0, -1.0):
+            values = {name: model.material.youngs_modulus * np.exp(sign * size)}
+            moved = with_parameters(model, values, model if fixed else None)
+            ends.append(forces(taken(moved)))
+        return (ends[0] - ends[1]) / (2.0 * size)
+
+    true = change(cut(time_step=1e-4, step_by_need=False, precision="float64"), True)
+    follows, fixed = (change(cut(precision="float64"), each) for each in (False, True))
+    assert np.linalg.norm(follows - true) < 0.04 * np.linalg.norm(true)
+    assert np.linalg.norm(fixed - follows) > 0.08 * np.linalg.norm(true)
+
+
 def test_kinetic_energy_is_that_of_the_sub_steps_that_were_taken():
     by_need, constant = cut(time_step=1e-3), cut(time_step=2.5e-4, step_by_need=False)
     kinetic = []
@@ -156,9 +215,12 @@ def test_kinetic_energy_is_that_of_the_sub_steps_that_were_taken():
         solver = CuttingSolver(model, PERIOD)
         path = KnifePath(model, down_and_back(model, 0.1), PERIOD)
         state = solver.initial_state()
-        for k in range(30):
+        by_step = []
+        for k in range(60):
             state = solver.coupling_step(state, path.pose(k), path.pose(k + 1)).state
-        kinetic.append(solver.energies(state, path.pose(30)).kinetic)
+            by_step.append(solver.energies(state, path.pose(k + 1)).kinetic)
+        # Once sub-steps of 1 ms have become as short as the others.
+        kinetic.append(np.mean(by_step[20:]))
     assert kinetic[0] == pytest.approx(kinetic[1], rel=0.1)
     assert kinetic[0] > 0.0
 
@@ -194,11 +256,12 @@ def test_changing_steps_again_and_again_feeds_no_vibration():
         after = p - [0.0, 0.0, speed * PERIOD]
         step = solver.coupling_step(state, Pose(R, p), Pose(R, after))
         state, p = step.state, after
-        numbers.add(round(PERIOD / float(solver.field(state, "stepping")[-2])))
+        numbers.add(round(PERIOD / float(solver.field(state, "stepping")[Planned.SUB_STEP])))
         largest = max(largest, solver.energies(state, Pose(R, p)).kinetic)
     assert len(numbers) > 3
     pose = Pose(R, p)
-    for _ in range(30):
+    # The added inertia lets food and blade ring sideways for long: their energy halves in 100 ms.
+    for _ in range(200):
         state = solver.coupling_step(state, pose, pose).state
     energies = solver.energies(state, pose)
     assert energies.least_volume_ratio > 0.3
@@ -217,14 +280,14 @@ def test_a_hold_of_ten_seconds_neither_creeps_nor_swings():
 
 
 # It gives way when the knife is 3 mm deep.
-SKIN = Skin(toughness=1.0)
+SKIN = Skin(toughness=0.55)
 
 
 def press(model: CuttingModel) -> Motion:
     return Motion(MotionPlan([ConstantSpeed(distance=0.006, speed=0.02)]), start_pose(model, 5e-4))
 
 
-def taken(model: CuttingModel, substeps: list[int] | None = None) -> list[CouplingSteps]:
+def taken(model: CuttingModel, substeps: Sequence[int] | None = None) -> list[CouplingSteps]:
     """The coupling steps of a press one by one."""
     path = KnifePath(model, press(model), PERIOD)
     launches = [Launch(k, 1) for k in range(path.coupling_steps)]
@@ -270,8 +333,9 @@ def test_a_discarded_attempt_is_in_no_book_and_its_kinetic_energy_in_no_check():
     assert abs(result.balance.residual(result.energies)) < 5e-3 * result.balance.work
     assert result.energy_ratio < 0.05
     constant = cut(effects=Effects(skin=SKIN), step_by_need=False)
-    heavy = simulate_slice(CuttingSolver(constant, PERIOD), press(constant), check_period=PERIOD)
-    assert heavy.energy_ratio > 3.0 * result.energy_ratio
+    # More than what is accepted, 5 %.
+    with pytest.raises(CuttingError, match="kinetic energy is .* more than 5 %"):
+        simulate_slice(CuttingSolver(constant, PERIOD), press(constant), check_period=PERIOD)
 
 
 def test_a_snap_is_the_same_in_the_station_and_side_by_side_with_other_cuts(snap):
@@ -284,7 +348,7 @@ def test_a_snap_is_the_same_in_the_station_and_side_by_side_with_other_cuts(snap
         np.testing.assert_array_equal(step.state, expected.state)
         assert step.substeps == expected.substeps
         state = step.state
-    tougher = model.derive(effects=Effects(skin=Skin(toughness=1.2)))
+    tougher = model.derive(effects=Effects(skin=Skin(toughness=0.6)))
     alone, other = (cut_together(Driver(PERIOD), [m], [press(m)])[0] for m in (model, tougher))
     both = cut_together(Driver(PERIOD), [model, tougher], [press(model)] * 2)
     for one, beside in zip((alone, other), both, strict=True):

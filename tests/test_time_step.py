@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 
 from sliceit_drake.cutting.discretization import estimate_discretization_error
+from sliceit_drake.cutting.foods.effects import Effects, Skin
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
-from sliceit_drake.cutting.foods.shapes import Cylinder
+from sliceit_drake.cutting.foods.shapes import Box, Cylinder
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import SOFTEST, Numerics, TimeStepError
 from sliceit_drake.cutting.motion import ConstantSpeed, Motion, MotionPlan
 from sliceit_drake.cutting.simulate import simulate_slice
 from sliceit_drake.cutting.solver import CuttingSolver
+from sliceit_drake.cutting.workspace import Workspace
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.resources import resource_path
 
@@ -52,6 +54,23 @@ def test_scaled_masses_give_the_force_of_the_true_ones():
     assert step < 3e-5
     assert result.energy_ratio < 1e-4
     assert relative_rms(scaled, true) < 0.02
+
+
+@pytest.mark.parametrize(("precision", "tolerance"), [("float32", 5e-6), ("float64", 1e-13)])
+@pytest.mark.parametrize("refinement", [0.5, 1.5])
+def test_accelerations_solve_the_mass_matrix(precision, tolerance, refinement):
+    model = make_food_model(SMALL, Knife(), Numerics(precision=precision), refinement)
+    # The smallest is all inverted.
+    assert (len(model.inertia.factors.inverse_pivot) == 0) == (refinement < 1.0)
+    ws = Workspace([model], 2e-3)
+    ws.capture()
+    force = np.zeros((1, len(model.moving) + 1, 4))
+    force[..., :3] = np.random.default_rng(1).normal(size=(*force.shape[:2], 3))
+    ws.write(ws.forces[0].resultant, force)
+    ws.launch_part("solve", 0)
+    found = ws.read(ws.forces[0].acceleration)[0]
+    exact = np.linalg.solve(model.inertia.matrix.toarray(), force[0])
+    np.testing.assert_allclose(found, exact, rtol=0.0, atol=tolerance * np.abs(exact).max())
 
 
 def test_a_step_beyond_the_limit_is_refused_with_the_limit():
@@ -103,3 +122,29 @@ def test_a_food_too_soft_for_its_mesh_is_warned_of():
     assert warnings[False] == ()
     (warning,) = warnings[True]
     assert f"toughness in the food over E h is {1.1 * SOFTEST:.2g}" in warning
+    advised = Numerics(edge_spread=float(warning.split("edge_spread: ")[1].rstrip(".")))
+    assert make_food_model(dc.replace(SMALL, material=material), Knife(), advised).warnings == ()
+
+
+def test_a_plate_that_an_edge_presses_onto_the_board_is_warned_of():
+    material = Material(youngs_modulus=1e5, toughness=350.0, strength=1e4)
+    layers = [0.0, 0.003, 0.013, 0.05]
+    thick, thin = (
+        Food(shape=Box([0.06, 0.12, height], [8, rows], layers), material=material)
+        for height, rows in ((0.03, 8), (0.005, 2))
+    )
+    (softness,) = make_food_model(thick, Knife(), Numerics()).warnings
+    assert "edge_spread" in softness
+    for spread in (0.0, 0.01):
+        (warning,) = make_food_model(thin, Knife(), Numerics(edge_spread=spread)).warnings
+        assert "E is 3.5 mm in a section that is 5 mm high" in warning
+
+
+def test_a_food_that_may_come_apart_under_its_skin_is_warned_of():
+    shape = Box([0.06, 0.12, 0.03], [8, 8], [0.0, 0.003, 0.013, 0.05])
+    for load, warned in ((70.0, False), (90.0, True)):
+        material = Material(1e6, toughness=40.0, strength=100.0 / 0.03)
+        effects = Effects(skin=Skin(1e-3 * load, 1e-3))
+        food = Food(shape=shape, material=material, effects=effects)
+        texts = make_food_model(food, Knife(), Numerics()).warnings
+        assert ["holds 90 N/m, 0.9 times" in text for text in texts] == [True] * warned

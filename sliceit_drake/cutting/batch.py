@@ -59,9 +59,7 @@ def simulate_batch(
     for c, model in enumerate(models):
         key: object = c
         if model.numerics.device != "cpu":
-            # Cuts that advance side by side share the skin's tables.
-            thickness = model.effects.skin.thickness
-            key = (id(model.split), len(model.relaxing), thickness, *dc.astuple(model.numerics))
+            key = (id(model.split), len(model.relaxing), *dc.astuple(model.numerics))
         groups.setdefault(key, []).append(c)
 
     def run(driver: Driver, members: list[int]) -> list[BatchSlice]:
@@ -90,17 +88,17 @@ def cut_together(
     T = driver.exchange_period
     paths = [KnifePath(m, x, T) for m, x in zip(models, motions, strict=True)]
     count = max(path.coupling_steps for path in paths)
-    wrenches = np.full((len(models), count, 6), np.nan)
+    wrenches = np.full((len(models), count, 3, 6), np.nan)
     cut = np.full((len(models), count), np.nan)
     for launch, steps in driver.run(paths, board=board):
         at = slice(launch.first, launch.first + launch.coupling_steps)
         for c, step in enumerate(steps):
-            wrenches[c, at] = step.wrenches.sum(1) if step.finite else np.nan
+            wrenches[c, at] = step.wrenches if step.finite else np.nan
             cut[c, at] = step.cut
     slices = []
     for c, path in enumerate(paths):
         n = path.coupling_steps
-        food = (wrenches[c, :n].reshape(n, 2, 3) @ path.model.X_FC_rotation.T).reshape(n, 6)
+        food = path.in_food(wrenches[c, :n]).sum(1)
         finite = np.isfinite(food).all(1)
         failure = None
         if not finite.all():

@@ -2,6 +2,8 @@
 
 import dataclasses as dc
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +22,11 @@ class Energies:
         interface: Energy of bonds, contacts, friction anchors, the edge's unloading and the bent
             blade.
         kinetic: Energy of the stepped (scaled) mass.
+        added: The part of it that the true masses do not have.
+        sub_step: The last, s.
         debt: Work that the edge owes for the area that it has cut.
+        slope: Of the front of the cut against the food at rest: the tangent of the angle by which
+            the food has turned in the plane of the cut.
         least_volume_ratio: Smallest J of all elements.
         min_element: Element that has it.
     """
@@ -28,7 +34,10 @@ class Energies:
     elastic: float
     interface: float
     kinetic: float
+    added: float
+    sub_step: float
     debt: float
+    slope: float
     least_volume_ratio: float
     min_element: int
 
@@ -70,6 +79,10 @@ class EnergyBalance:
         return self.work + self.gravity - stored - spent - self.damping(energies)
 
 
+def _part(name: str, *shape: int) -> Any:
+    return property(lambda steps: steps.row[steps.places[name]].reshape(shape))
+
+
 @dc.dataclass
 class CouplingSteps:
     """Result of E coupling steps in a row.
@@ -87,16 +100,34 @@ class CouplingSteps:
         added_force: Forces of the inertia that is added to the true masses, in the last sub-step of
             each coupling step: sum of their components' magnitudes over all nodes [E], N.
         substeps: Of each.
+        section_area: Area of the section, m2.
+        row, places: The numbers that the others are, and where in them each stands; see
+            `layouts.results`.
     """
 
     state: np.ndarray
-    wrenches: np.ndarray
-    wrench: np.ndarray
-    cut: np.ndarray
-    board_force: np.ndarray
-    works: np.ndarray
-    added_force: np.ndarray
     substeps: int
+    section_area: float
+    row: np.ndarray
+    places: Mapping[str, slice]
+
+    wrenches = _part("wrenches", -1, 3, 6)
+    board_force = _part("board_force", -1)
+    works = _part("balance", -1)
+    added_force = _part("added_force", -1)
+
+    @property
+    def wrench(self) -> np.ndarray:
+        return self.row[self.places["wrench"]][-6:]
+
+    @property
+    def cut(self) -> np.ndarray:
+        return self.row[self.places["cut"]] / self.section_area
+
+    @property
+    def progress(self) -> float:
+        """Last of `cut`."""
+        return float(self.row[self.places["cut"].stop - 1]) / self.section_area
 
     @property
     def balance(self) -> EnergyBalance:
@@ -107,7 +138,7 @@ class CouplingSteps:
     def finite(self) -> bool:
         """Whether the cut has not broken down; limits on forces can hide a state that has."""
         # What is not finite makes the sum of squares so, at a fourth of the cost of tests.
-        wrenches = self.wrenches.ravel()
+        wrenches = self.row[self.places["wrenches"]]
         return math.isfinite(self.state.dot(self.state) + wrenches.dot(wrenches))
 
 
@@ -126,18 +157,8 @@ def run_coupling_steps(
         One result a cut; what is not finite is left so.
     """
     ws.advance(states, R, p)
-    new, rows, at = ws.read(ws.states[-1]).copy(), ws.read(ws.result_rows).copy(), ws.result_layout
-    shape = (ws.coupling_steps, 3, 6)
+    new, rows = ws.read(ws.states[-1]).copy(), ws.read(ws.result_rows).copy()
     return [
-        CouplingSteps(
-            state,
-            row[at["wrenches"]].reshape(shape),
-            row[at["wrench"]][-6:],
-            row[at["cut"]] / model.section_area,
-            row[at["board_force"]],
-            row[at["balance"]],
-            row[at["added_force"]],
-            ws.substeps,
-        )
+        CouplingSteps(state, ws.substeps, model.section_area, row, ws.result_layout)
         for model, state, row in zip(ws.models, new, rows, strict=True)
     ]

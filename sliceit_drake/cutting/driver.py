@@ -107,21 +107,27 @@ class Driver:
                 a run from which this one differs a little.
 
         Yields:
-            Each launch and what it gives, one a cut. Where sub-steps are shorter than the longest,
-            each coupling step is a launch.
+            Each launch and what it gives, one a cut. Where the number of sub-steps changes, each
+            coupling step is a launch.
         """
         states = np.empty(0)
+        by_substeps: dict[int, list[Stepping]] = {}
         for whole in even_launches(paths) if launches is None else launches:
             coarse = self.workspace([path.model for path in paths], multiple=whole.multiple)
             if not len(states):
                 states = np.tile(coarse.initial_state(), (len(paths), 1))
             waiting = [whole]
+            if (n := coarse.substeps) not in by_substeps:
+                by_substeps[n] = [Stepping.of(path.model, n) for path in paths]
             while waiting:
                 launch = waiting.pop(0)
-                steps = self._advance(paths, launch, states, coarse, board, substeps)
+                rules = by_substeps[n]
+                steps = self._advance(paths, launch, states, coarse, rules, board, substeps)
                 if steps is None:
                     first, count, multiple = launch
-                    waiting = [Launch(first + k, 1, multiple) for k in range(count)]
+                    fewer = 5 if count > 5 and count % 5 == 0 else 1
+                    starts = range(first, first + count, fewer)
+                    waiting[:0] = [Launch(k, fewer, multiple) for k in starts]
                     continue
                 states = np.array([step.state for step in steps])
                 yield launch, steps
@@ -134,24 +140,23 @@ class Driver:
         launch: Launch,
         states: np.ndarray,
         coarse: Workspace,
+        rules: Sequence[Stepping],
         board: Board | None,
         substeps: Sequence[np.ndarray] | None,
     ) -> list[CouplingSteps] | None:
-        """Advances each cut by a launch; None where one of several coupling steps needs more
-        sub-steps than the fewest, those of `coarse`, in a cut."""
+        """Advances each cut by a launch; None where several coupling steps need other numbers of
+        sub-steps in a cut."""
         first, count, _ = launch
         place, T = coarse.layout["stepping"], coarse.exchange_period
-        rules = [Stepping.of(path.model, coarse.substeps) for path in paths]
         numbers, after = [], []
         for c, (rule, path) in enumerate(zip(rules, paths, strict=True)):
-            poses = path.poses(first, count, commanded=True)
-            planned, stepping = rule.plan(states[c, place], *poses, T)
+            poses, given = path.poses(first, count, commanded=True), None
             if substeps is not None:
                 # Those of a knife whose motion is over do not matter.
-                given = substeps[c][first : first + count].tolist() or [coarse.substeps]
-                planned = given + [given[-1]] * (count - len(given))
-                stepping[-1][-2] = T / planned[-1]
-            if count > 1 and any(number != coarse.substeps for number in planned):
+                rows = np.minimum(np.arange(first, first + count), len(substeps[c]) - 1)
+                given = substeps[c][rows].tolist()
+            planned, stepping = rule.plan(states[c, place], *poses, T, given)
+            if count > 1 and any(number != planned[0] for number in planned):
                 return None
             numbers.append(planned[-1])
             after.append(stepping[-1])
@@ -162,11 +167,12 @@ class Driver:
             if substeps is not None:
                 break
             for c in list(repeated):
+                unchanged = list(after[c])
                 wanted = rules[c].again(numbers[c], steps[c].added_force.tolist(), after[c])
+                if count > 1 and after[c] != unchanged:
+                    return None
                 if wanted == numbers[c]:
                     repeated.remove(c)
-                elif count > 1:
-                    return None
                 else:
                     numbers[c] = wanted
                     paths[c].undo(first + 1)
@@ -198,9 +204,7 @@ class Driver:
                         steps[c] = tried[c]
             last = first + count
             unbalanced = {
-                c
-                for c in unbalanced
-                if not paths[c].balanced(last, steps[c].wrenches[-1].sum(0)[3:], board)
+                c for c in unbalanced if not paths[c].balanced(last, steps[c].wrench[3:], board)
             }
 
 

@@ -139,10 +139,10 @@ class SliceAdjoint:
         run = SliceRun(model, np.empty((count, 6)), [], [state], np.array(R), np.array(p))
         for e in range(count):
             before, at = run.states[e], slice(e, e + 2)
-            (number,), (after,) = rule.plan(before[stepping], R[at], p[at], self.exchange_period)
-            if substeps is not None:
-                number = substeps[e]
-                after[-2] = self.exchange_period / number
+            given = None if substeps is None else substeps[e : e + 1]
+            (number,), (after,) = rule.plan(
+                before[stepping], R[at], p[at], self.exchange_period, given
+            )
             balanced = False
             while not balanced:
                 ws = self._driver.workspace([model], substeps=number)
@@ -288,6 +288,7 @@ class SliceAdjoint:
         # By hand: the adjoint of a symmetric solve is the solve of the adjoint.
         solved = [ws.inertia, forces.acceleration.grad, forces.resultant.grad]
         ws.launch(kern.solve, (ws.cuts,), solved)
+        ws.launch_part("push_blade", k, adjoint=True)
         ws.launch_part("sum_forces", k, adjoint=True)
         spread = [ws.points, forces.from_points.grad, forces.points.grad]
         ws.launch(kern.spread_adjoint, forces.at_points.shape[:2], spread)

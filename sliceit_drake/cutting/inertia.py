@@ -1,10 +1,11 @@
-"""Mass matrix of the nodes that move, and its factors.
+"""Mass matrix of the nodes that move and of the blade, and its factors.
 
 Selective mass scaling (Olovsson, Simonsson and Unosson, Int. J. Numer. Meth. Eng. 63, 2005; Tkachuk
 and Bischoff, Comput. Mech. 52, 2013) adds inertia to the relative motion of neighbouring nodes: to
 the lumped true masses M a part of a bound K of the stiffness, S = M + (x / 2)^2 K. All frequencies
 of S are then below 2 / x, while a translation and what deforms slowly keep their true masses.
-Rotations do not.
+Rotations do not. The blade is one of the neighbours: flanks and faces are light where they move
+together. It has only y in truth; along x and z it follows the faces without a force.
 """
 
 import dataclasses as dc
@@ -12,23 +13,35 @@ import functools
 from collections.abc import Callable, Iterable
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.sparse import coo_array, csc_array, csr_array, tril
 from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 
-__all__ = ["Factors", "Inertia", "assemble", "elimination_order", "largest_share"]
+__all__ = ["WIDTH", "Factors", "Inertia", "assemble", "elimination_order", "largest_share"]
+
+WIDTH = 32
+"""Rows of an inverse that are multiplied at once."""
+COST_OF_ROW = 10.0
+"""Of a row in substitutions, forwards and backwards, over that of an entry."""
+COST_OF_PRODUCT = 0.1
+"""Of an entry of an inverse, over that of an entry in substitutions."""
 
 
 @dc.dataclass(frozen=True)
 class Factors:
-    """S = L D L' with a lower triangular L of unit diagonal, in the order of elimination.
+    """S = L D L', with a lower triangular L of unit diagonal, up to the last rows, in the order of
+    elimination.
 
-    Entries of a row come in fours, filled up with zeros.
+    What is left of S for the last E of the K + 1 rows, in which there are few zeros, is inverted
+    instead. Entries of a row come in fours, filled up with zeros.
 
     Attributes:
-        lower_start, lower_index, lower: Rows of L without the diagonal: first four of each and the
-            end [K + 1], columns and values [Z, 4].
+        lower_start, lower_index, lower: Rows of L without the diagonal and the last E columns:
+            first four of each and the end [K + 2], columns and values [Z, 4].
         upper_start, upper_index, upper: The same of L'.
-        inverse_pivot: 1 / D [K], 1/kg.
+        inverse_pivot: 1 / D before the last rows [K + 1 - E], 1/kg.
+        inverse: Of what is left for the last rows, row by row, each filled up with zeros to a
+            multiple of `WIDTH` [E * F], 1/kg.
     """
 
     lower_start: np.ndarray
@@ -38,14 +51,15 @@ class Factors:
     upper_index: np.ndarray
     upper: np.ndarray
     inverse_pivot: np.ndarray
+    inverse: np.ndarray
 
 
 @dc.dataclass(frozen=True)
 class Inertia:
-    """Mass matrix of the moving nodes, one for x, y and z alike.
+    """Mass matrix of the moving nodes and of the blade, one for x, y and z alike.
 
     Attributes:
-        matrix: S [K, K], kg, the nodes in their order of elimination.
+        matrix: S [K + 1, K + 1], kg, the nodes in their order of elimination, the blade last.
     """
 
     matrix: csc_array
@@ -61,13 +75,37 @@ class Inertia:
         pivot = lu.U.diagonal()
         if (pivot <= 0.0).any() or (lu.perm_r != np.arange(len(pivot))).any():
             raise ValueError("the mass matrix is not positive definite")
-        lower = tril(lu.L, -1).tocsr()
-        return Factors(*_by_fours(lower, 0), *_by_fours(lower.T.tocsr(), -1), 1.0 / pivot)
+        lower = tril(lu.L, -1).tocsc()
+        first = _first_inverted(np.diff(lower.indptr))
+        last = solve_triangular(
+            lower[first:, first:].toarray(),
+            np.eye(len(pivot) - first),
+            lower=True,
+            unit_diagonal=True,
+        )
+        inverse = last.T @ (last / pivot[first:, None])
+        inverse = np.pad(inverse, [(0, 0), (0, -len(inverse) % WIDTH)])
+        lower.data[lower.indptr[first] :] = 0.0
+        lower.eliminate_zeros()
+        rows, columns = _by_fours(lower.tocsr(), 0), _by_fours(lower.T.tocsr(), -1)
+        return Factors(*rows, *columns, 1.0 / pivot[:first], inverse.ravel())
 
-    def kinetic_energy(self, velocities: np.ndarray) -> float:
-        """Of velocities of the moving nodes in the matrix's order [K, 3], m/s; in J."""
+    @functools.cached_property
+    def of_nodes(self) -> csc_array:
+        """That of the nodes alone, where no force acts on the blade [K, K], kg."""
+        blade = self.matrix[:-1, [-1]]
+        return csc_array(self.matrix[:-1, :-1] - blade @ blade.T / self.matrix[-1, -1])
+
+    def kinetic_energy(self, velocities: np.ndarray, blade: float | None = None) -> float:
+        """Of velocities of the moving nodes in the matrix's order [K, 3] and of the blade along y,
+        m/s; in J. Without the blade's, it follows the nodes."""
         v = np.asarray(velocities, np.float64)
-        return float(0.5 * (v * (self.matrix @ v)).sum())
+        energy = 0.5 * (v * (self.of_nodes @ v)).sum()
+        if blade is not None:
+            heavy = self.matrix[-1, -1]
+            ahead = blade + float((self.matrix[[-1], :-1] @ v[:, 1])[0]) / heavy
+            energy += 0.5 * heavy * ahead**2
+        return float(energy)
 
 
 def elimination_order(moves: np.ndarray, four: np.ndarray) -> np.ndarray:
@@ -104,15 +142,18 @@ def assemble(
     row, column, value = (np.concatenate(each) for each in (rows, columns, values))
     free = (row >= 0) & (column >= 0)
     shape = (len(moving), len(moving))
-    return coo_array((value[free], (row[free], column[free])), shape).tocsc()
+    matrix = coo_array((value[free], (row[free], column[free])), shape).tocsc()
+    # What happens to cancel keeps its place: factors have none for zeros.
+    matrix.data[matrix.data == 0.0] = 1e-40
+    return matrix
 
 
 def largest_share(forces: Callable[[np.ndarray], np.ndarray], mass: csc_array) -> float:
     """Largest eigenvalue of linear, symmetric forces with respect to a mass matrix, to about 1 %.
 
     Args:
-        forces: What gives them [K, 3] for a motion of the nodes [K, 3].
-        mass: One for x, y and z alike [K, K], the nodes in their order of elimination.
+        forces: What gives them [K + 1, 3] for a motion of nodes and blade [K + 1, 3].
+        mass: See `Inertia`.
     """
     factors, n = _factorized(mass, "NATURAL"), 3 * mass.shape[0]
     stiffness, inertia, inverse = (
@@ -124,6 +165,17 @@ def largest_share(forces: Callable[[np.ndarray], np.ndarray], mass: csc_array) -
         stiffness, 1, inertia, v0=start, tol=1e-2, Minv=inverse, return_eigenvectors=False
     )
     return float(found[0])
+
+
+def _first_inverted(entries: np.ndarray) -> int:
+    """Row from which the rest is inverted: where the solve is fastest.
+
+    Args:
+        entries: Of L below the diagonal by column [K + 1].
+    """
+    rows = np.arange(len(entries))
+    substituted = np.cumsum(entries + COST_OF_ROW) - entries - COST_OF_ROW
+    return int((substituted + COST_OF_PRODUCT * (len(entries) - rows) ** 2).argmin())
 
 
 def _by_fours(matrix: csr_array, fill: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

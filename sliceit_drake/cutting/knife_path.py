@@ -14,8 +14,8 @@ __all__ = ["CHECK_TRAVEL", "KnifePath", "Mounting", "PosedMotion"]
 
 CHECK_TRAVEL = 1e-3
 """Travel of the knife between two checks of the energies, metres."""
-BLOCK = 10
-"""Coupling steps that are advanced at once where nothing stands against it."""
+BLOCKS = (25, 10, 5)
+"""Numbers of coupling steps that are advanced at once where nothing stands against it."""
 ATTEMPTS = 40
 """Most evaluations of a coupling step; what is left is made up for by the next, which starts
 anew."""
@@ -54,6 +54,8 @@ class KnifePath:
         self._commanded_p_CK = self.p_CK.copy()
         self._mounting = Mounting(model.effects)
         self.rigid = self._mounting.rigid
+        steps = np.linalg.norm(np.diff(self.p_FK, axis=0), axis=1)
+        self._travel = np.concatenate([[0.0], np.cumsum(steps)])
 
     def pose(self, k: int) -> Pose:
         """X_CK after k coupling steps."""
@@ -77,12 +79,27 @@ class KnifePath:
             return np.zeros((self.coupling_steps, 6))
         return board_wrenches(board, self.model.knife, self.R_FK, self.p_FK, self._period)
 
+    def in_food(self, wrenches: np.ndarray) -> np.ndarray:
+        """Wrenches by mechanism [E, 3, 6] in F from those of the cut in C, with the effects that
+        change its force."""
+        turned = wrenches.reshape(-1, 3, 2, 3) @ self.model.X_FC_rotation.T
+        parts = turned.reshape(-1, 3, 6)
+        if self.model.effects.changes_force:
+            n = len(parts)
+            speed = np.diff(self._travel[: n + 1]) / self._period
+            edge = self.R_FK[1 : n + 1, :, 0]
+            parts, _ = self.model.effects.changed(parts, edge, speed, self._period)
+        return parts
+
     def block(self, k: int) -> int:
         """How many coupling steps from the k-th can be advanced at once, without a check."""
-        if not self.rigid or k + BLOCK > self.coupling_steps:
-            return 1
-        steps = np.diff(self.p_FK[k : k + BLOCK + 1], axis=0)
-        return BLOCK if float(np.linalg.norm(steps, axis=1).sum()) < CHECK_TRAVEL else 1
+        ends = np.array(BLOCKS) + k
+        fits = self.rigid & (ends <= self.coupling_steps)
+        start, *at = self._travel[np.minimum([k, *ends], self.coupling_steps)]
+        travel = np.array(at) - start
+        # To rounding: a constant speed that is a whole number of mm/s fits as a rule.
+        fits &= travel < CHECK_TRAVEL + 1e-9
+        return BLOCKS[int(fits.argmax())] if fits.any() else 1
 
     def balanced(self, k: int, force: np.ndarray, board: Board | None) -> bool:
         """Whether arm and holder hold the force on the knife [3], N, in C, of the k-th coupling

@@ -10,11 +10,12 @@ from scipy.sparse import csc_array
 from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import choice, quantity
-from sliceit_drake.cutting.foods.effects import Effects
+from sliceit_drake.cutting.foods.effects import Effects, Section
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.inertia import Inertia, assemble, largest_share
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.mesh.cut_geometry import CutGeometry
+from sliceit_drake.cutting.mesh.cut_surface import edge_tables
 
 __all__ = [
     "GRAVITY",
@@ -29,15 +30,33 @@ __all__ = [
 GRAVITY = 9.81
 """Acceleration of gravity, as Drake's plants have it, m/s^2."""
 
-DEBT_LENGTH = 2.0
-"""Way of the edge over which it makes up for work that it owes, in mean lengths of edges of the
-mesh: more than its rows are apart, for the elastic energy of the food swings with them."""
+DEBT_LENGTH = 2.5
+"""Way of the edge over which it makes up for work that it owes, in rows of the section's triangles:
+more than one, for the elastic energy of the food swings with them."""
+
+FOLLOWS = 0.75
+"""Travel past a soft food over which the edge's direction follows, in `Numerics.edge_spread`: less,
+and a draw swings with the food; more, and strokes feel it further."""
+DRIFT_LENGTH = 5e-4
+"""Travel of the edge over which the drift of unheld food is filtered, metres."""
+DRIFT_LEAD = 1e-3
+"""Time by which it is led, s: without it, food that slides swings in the filter."""
 
 SLIVER = 0.1
 """Fraction of a vertex's mass below which a node of one side does not set the step."""
 
+LEAN = 0.15
+"""Angle between a flank and the cut plane for which added inertia suffices, rad."""
+
 SOFTEST = 0.5
-"""Toughness over Young's modulus and edge length, R / (E h), up to which the edge's work is R A."""
+"""Greatest toughness over Young's modulus, R / E, at which the edge's force is verified, over the
+length by which the mesh follows an edge or `Numerics.edge_spread`."""
+SOFTEST_UNDER_SKIN = 0.3
+"""The same of a skin's line load over Young's modulus; a spread does not help there."""
+
+SPLITS = 0.8
+"""Line load of a skin over the strength and height of a food, from which on the food may come apart
+under its skin before the edge is through that."""
 
 BULK_SHARE = 0.95
 """Share of the stepped masses that the bulk may need where a half of the food is free."""
@@ -49,7 +68,7 @@ class TimeStepError(ValueError):
 
 @dc.dataclass
 class Numerics:
-    """Numerical settings of a cut. Contacts and bonds scale with E over the edge length h."""
+    """Numerical settings of a cut. Board and bonds scale with E over the edge length h."""
 
     time_step: float = quantity(1e-3, "s", low=1e-7, high=5e-3)
     """Longest sub-step; must divide the coupling period."""
@@ -60,11 +79,13 @@ class Numerics:
     stability_margin: float = quantity(0.8, "", low=0.1, high=0.95)
     """Step over the Gershgorin stability limit."""
     numerical_damping: float = quantity(0.2, "", low=0.0, high=0.5)
-    """Viscosity added to the material's, in steps."""
+    """Viscosity of bulk and flank contact beside the material's, in steps."""
     bond_stiffness: float = quantity(4.0, "E/h", low=0.01, high=1e3)
     """Stiffness of the uncut faces and of their self contact."""
-    flank_stiffness: float = quantity(4.0, "E/h", low=0.01, high=1e3)
-    """Contact stiffness of the flanks, also in friction."""
+    flank_length: float = quantity(2e-4, "m", low=1e-6, high=1.0)
+    """Length that E over it is the flanks' contact stiffness per area."""
+    anchor_length: float = quantity(1e-3, "m", low=1e-6, high=1.0)
+    """Length that E over it is the stiffness of the flanks' friction per area until it slides."""
     board_stiffness: float = quantity(1.0, "E/h", low=0.01, high=1e3)
     """Contact stiffness of the food on the board."""
     board_friction: float = quantity(0.3, "", low=0.0, high=2.0)
@@ -73,6 +94,9 @@ class Numerics:
     """Damping over stiffness of the food on the board."""
     unloading_length: float = quantity(1e-4, "m", low=1e-6, high=1e-2)
     """Retreat of the edge over which its force vanishes; less where it rises more steeply."""
+    edge_spread: float = quantity(0.0, "m", low=0.0, high=0.05)
+    """Depth above and below the edge over which its force is spread: 2 toughness / E if soft. The
+    edge's direction then follows its motion past the food, which may move with the blade."""
     direction_length: float = quantity(2e-4, "m", low=1e-7, high=1e-2)
     """Travel over which the edge's direction follows."""
     precision: str = choice("float32", ("float32", "float64"))
@@ -106,7 +130,8 @@ class CuttingModel(CutGeometry):
         true_mass: Lumped mass [N], kg.
         weight: Gravity force on each node [N, 3], N, by the true mass.
         toughness: Surface energy of each cut point [P], J/m^2.
-        outline: Length of skin per height that the edge cuts, as `EdgeTables.width` [P, G].
+        toughness_by_scale: Its derivative by the point's scale [P], J/m^2.
+        flank_scale: Factors on the contact stiffness of the flanks [P].
         unloading: Slope of the edge's force when it retreats [P], N/m.
         element_volume: Stiff volume of the elements times their modulus over the material's [T].
         relaxing: Fractions of the modulus that relax [M].
@@ -123,7 +148,8 @@ class CuttingModel(CutGeometry):
     _inertia_of: "CuttingModel | None" = dc.field(init=False, default=None)
     weight: np.ndarray = dc.field(init=False)
     toughness: np.ndarray = dc.field(init=False)
-    outline: np.ndarray = dc.field(init=False)
+    toughness_by_scale: np.ndarray = dc.field(init=False)
+    flank_scale: np.ndarray = dc.field(init=False)
     unloading: np.ndarray = dc.field(init=False)
     element_volume: np.ndarray = dc.field(init=False)
     relaxing: np.ndarray = dc.field(init=False)
@@ -134,24 +160,54 @@ class CuttingModel(CutGeometry):
         material, effects, numerics = self.material, self.effects, self.numerics
         self.true_mass = material.density * self.node_volume
         self.weight = -GRAVITY * material.density * self.weight_volume[:, None] * self.up
-        self.toughness = material.toughness * self.point_scales.toughness
+        if self.tables.spread != numerics.edge_spread:
+            split = self.split
+            section, groups = split.points[:, [0, 2]], split.nearest_vertex
+            self.tables = edge_tables(section, split.triangles, numerics.edge_spread, groups)
+        self.toughness_by_scale = np.full(len(self.point_depth), material.toughness)
+        self.flank_scale = self.point_scales.flank_stiffness
+        if effects.section != Section():
+            height = self.split.points[:, 2] - self.bottom
+            width = effects.section.width(2.0 * height / (self.top - self.bottom) - 1.0)
+            self.toughness_by_scale = self.toughness_by_scale * width
+            self.flank_scale = self.flank_scale * width
+        excess = self._excess()
         points, elements = self.distances_inside(effects.core.offset)
         centred, _ = self.distances_inside(effects.centre.offset)
         for part, distance in ((effects.core, points), (effects.centre, centred)):
-            inside = part.share(distance)
-            self.toughness = self.toughness * (1.0 + (part.toughness_ratio - 1.0) * inside)
+            factor = 1.0 + (part.toughness_ratio - 1.0) * part.share(distance)
+            self.toughness_by_scale, excess = self.toughness_by_scale * factor, excess * factor
+        self.toughness = self.toughness_by_scale * self.point_scales.toughness + excess
         inside = effects.core.share(elements)
         stiffer = effects.core.stiffness_ratio - 1.0
         self.element_volume = self.stiff_volume * (1.0 + stiffer * inside)
         # Never flatter than the rise of the force on the way in: a retreat must not return more
         # energy than the advance took.
-        self.outline = self.tables.skin(effects.skin.thickness)
         force = self.edge_forces()
         steepest = (np.diff(force, axis=1) / self.tables.spacing).max(1)
         self.unloading = np.maximum(force.max(1) / numerics.unloading_length, steepest)
         self.relaxing = np.array(effects.relaxation.shares, float)
         self._by_step: dict[str, Self] = {}
         self._set_step()
+
+    def _excess(self) -> np.ndarray:
+        """Toughness beyond the material's, near the outside and near the top [P], J/m^2: by what
+        the effects ask for in all, whatever the mesh makes of its shape."""
+        tables, outside = self.tables, self.effects.outside
+        out = np.zeros(len(self.point_depth))
+        if outside.toughness > 0.0:
+            outline = float(tables.outline.sum()) / 2.0
+            shape = np.exp(-self.point_distance / outside.thickness)
+            out += outside.toughness * outline * shape / float(tables.area @ shape)
+        grid = np.linspace(-tables.reach, tables.reach, tables.width.shape[1])
+        depths = self.top - self.split.points[:, 2]
+        for initiation, depth in self.effects.entry.excesses():
+            if initiation > 0.0:
+                below = np.maximum(depths[:, None] + grid, 0.0)
+                work = float((np.exp(-below / depth) * tables.width).sum()) * tables.spacing
+                shape = np.exp(-np.maximum(depths, 0.0) / depth)
+                out += initiation * work * shape / float(tables.area @ shape)
+        return out
 
     def _set_step(self) -> None:
         """Sets what depends on the sub-step."""
@@ -168,9 +224,6 @@ class CuttingModel(CutGeometry):
         weakest = min(1.0, effects.core.toughness_ratio) * min(1.0, effects.centre.toughness_ratio)
         weakest = max(material.toughness * weakest, 1e-12)
         mu, lam = material.stable_neo_hookean()
-        stiffness = numerics.flank_stiffness * scale
-        flank = float((stiffness * self.point_scales.flank_stiffness) @ self.tables.area)
-        blade_need = 0.25 * (4.0 * flank + knife.lateral_stiffness)
         step = numerics.time_step
         return {
             "mu": mu,
@@ -179,25 +232,26 @@ class CuttingModel(CutGeometry):
             "bond_stiffness": bond,
             # A bond holds up to a quarter of its opening at failure, 2 R / strength, or less.
             "strength": min(material.strength, 0.5 * float(np.sqrt(2.0 * weakest * bond))),
-            "flank_stiffness": stiffness,
+            "flank_stiffness": material.youngs_modulus / numerics.flank_length,
+            "contact_damping": numerics.numerical_damping,
+            "anchor_stiffness": material.youngs_modulus / numerics.anchor_length,
             "friction": material.friction,
             "static_friction": material.static_friction,
             "stribeck_velocity": material.stribeck_velocity,
-            "direction_length": numerics.direction_length,
-            "debt_length": DEBT_LENGTH * self.element_size,
-            "unheld": float(self.unheld),
+            "direction_length": max(numerics.direction_length, FOLLOWS * numerics.edge_spread),
+            "debt_length": DEBT_LENGTH * self.row_height,
+            "drift_rate": 1.0 / DRIFT_LENGTH if self.unheld else 1e9 * (numerics.edge_spread > 0.0),
+            "drift_lead": DRIFT_LEAD * self.unheld,
             "board_stiffness": numerics.board_stiffness * scale,
             "board_friction": numerics.board_friction,
             "board_damping_time": numerics.board_damping_time,
             "blade_stiffness": knife.lateral_stiffness,
             "blade_damping": knife.lateral_stiffness * knife.lateral_relaxation_time,
-            "blade_mass": max(
-                knife.lateral_mass(), blade_need * (step / numerics.stability_margin) ** 2
-            ),
             "rate_exponent": effects.toughness_rate.exponent,
             "reference_speed": effects.toughness_rate.reference_speed,
             "slice_push_exponent": effects.slice_push.exponent,
             "skin_toughness": effects.skin.toughness,
+            "skin_thickness": effects.skin.thickness,
             "adhesion": effects.adhesion.stress,
             "flank_viscosity": effects.adhesion.viscosity,
             "flank_exponent": effects.adhesion.exponent,
@@ -253,7 +307,20 @@ class CuttingModel(CutGeometry):
         stiff, viscous = self._stiffness_bounds()
         x = self.critical_time_step / numerics.stability_margin
         needed = np.where(self._slivers, (stiff * x + viscous) * x, 0.0)
-        return Inertia(assemble(self.moving, [], np.maximum(self.true_mass, needed)))
+        flank = self.parameters["flank_stiffness"] * self.flank_scale
+        blade = float(flank @ self.tables.area) * x**2 + self._bending(x)
+        diagonal = np.maximum(self.true_mass, needed)
+        return Inertia(self._with_blade([], diagonal, max(blade, self.knife.lateral_mass())))
+
+    def _bending(self, x: float) -> float:
+        """What the blade's spring and damper add to its entry, kg; see `_scaled_masses`."""
+        knife = self.knife
+        return (0.25 * x**2 + 0.5 * x * knife.lateral_relaxation_time) * knife.lateral_stiffness
+
+    def _with_blade(self, parts: Any, diagonal: np.ndarray, entry: float) -> csc_array:
+        """See `assemble`; the blade is the node after the last, with its own entry, kg."""
+        moving = np.append(self.moving, len(diagonal))
+        return assemble(moving, parts, np.append(diagonal, entry))
 
     @functools.cached_property
     def _slivers(self) -> np.ndarray:
@@ -270,37 +337,46 @@ class CuttingModel(CutGeometry):
         mu, lam = material.lame()
         square, half = 0.25 * x**2, 0.5 * x
         _, products = self._gradient_products
-        viscous = square * (1.0 + 2.0 * numerics.numerical_damping) + half * material.damping_time
+        damped = square * (1.0 + 2.0 * numerics.numerical_damping)
+        viscous = damped + half * material.damping_time
         modulus = bulk_factor * (lam + 2.0 * mu) * self.element_volume
         bulk = (viscous * modulus)[:, None, None] * products
-        area, adhesion, scales = self.tables.area, self.effects.adhesion, self.point_scales
-        flank = square * parameters["flank_stiffness"] * scales.flank_stiffness * area
-        flank = flank + x * adhesion.viscosity * adhesion.steepest * area
+        area, adhesion = self.tables.area, self.effects.adhesion
+        scaled = damped * self.flank_scale * area
+        flank = parameters["flank_stiffness"] * scaled
+        # Friction acts against the knife's body. So does the part of the pressure that is not
+        # along y: the flanks lean a little, and so may the knife.
+        anchor = (parameters["anchor_stiffness"] + LEAN**2 * parameters["flank_stiffness"]) * scaled
+        anchor = anchor + x * adhesion.viscosity * adhesion.steepest * area
         bond = square * parameters["bond_stiffness"] * area
         w, zero = self.point_weights, np.zeros_like(self.point_weights)
-        minus, plus = np.hstack([w, zero]), np.hstack([zero, w])
+        none = zero[:, :1]
+        minus, plus = np.hstack([w, zero, none]), np.hstack([zero, w, none])
+        blade = np.hstack([zero, zero, none + 1.0])
+        ends = np.column_stack([self.point_nodes, np.full(len(w), len(self.nodes))])
         points = sum(
             stiffness[:, None, None] * row[:, :, None] * row[:, None, :]
             for stiffness, row in (
                 (bond, plus - minus),
-                (flank, minus),
-                (flank, plus),
+                (flank, minus - blade),
+                (flank, plus - blade),
+                (anchor, minus),
+                (anchor, plus),
                 (square * self.unloading, 0.5 * (minus + plus)),
             )
         )
         board = parameters["board_stiffness"] * self.board_area
         board = board * (2.0 * square + half * numerics.board_damping_time)
-        parts = [(self.tetrahedra, bulk), (self.point_nodes, points)]
-        return assemble(self.moving, parts, self.true_mass + board)
+        parts = [(self.tetrahedra, bulk), (ends, points)]
+        entry = self.knife.lateral_mass() + self._bending(x)
+        return self._with_blade(parts, self.true_mass + board, entry)
 
     def _bulk_share(self, mass: csc_array) -> float:
-        """Share of a mass matrix [K, K] that the bulk's stiffness and damping need, at most.
+        """Share of the mass matrix that the stiffness and damping of the bulk need, at most.
 
         (lam + 2 mu) grad u : grad u bounds the bulk's energy where the surface is held; a part that
-        is free may dilate as a whole, by up to 3 lam + 2 mu. 0 where both halves are held.
+        is free may dilate, by up to 3 lam + 2 mu.
         """
-        if self.held_nodes.all():
-            return 0.0
         mu, lam = self.material.lame()
         half = 0.5 * self.numerics.time_step
         modulus = (half**2 + half * self.parameters["damping_time"]) * self.element_volume
@@ -312,10 +388,11 @@ class CuttingModel(CutGeometry):
         back = gradient.T.tocsr()
 
         def forces(motion: np.ndarray) -> np.ndarray:
-            strain = (gradient @ motion).reshape(-1, 3, 3)
+            strain = (gradient @ motion[:-1]).reshape(-1, 3, 3)
             stress = mu * (strain + strain.swapaxes(1, 2))
             stress += lam * strain.trace(axis1=1, axis2=2)[:, None, None] * np.eye(3)
-            return np.asarray(back @ (modulus[:, None, None] * stress).reshape(-1, 3))
+            of_nodes = back @ (modulus[:, None, None] * stress).reshape(-1, 3)
+            return np.vstack([of_nodes, np.zeros(3)])
 
         return largest_share(forces, mass)
 
@@ -326,7 +403,8 @@ class CuttingModel(CutGeometry):
         area, adhesion = self.tables.area, self.effects.adhesion
         # In a layer between core and rind the stiffer of two elements sets a node's bound.
         bulk = 0.25 * self.stiffness_bound(self.element_volume, *material.lame())
-        flank = parameters["flank_stiffness"] * self.point_scales.flank_stiffness
+        damped = 1.0 + 2.0 * numerics.numerical_damping
+        flank = damped * parameters["flank_stiffness"] * self.flank_scale
         per_point = area * (2.0 * parameters["bond_stiffness"] + 2.0 * flank) + 0.5 * self.unloading
         board = parameters["board_stiffness"] * self.board_area
         contact = 2.0 * board
@@ -335,7 +413,7 @@ class CuttingModel(CutGeometry):
         ends, shares = self.point_nodes.T.ravel(), np.tile(self.point_weights.T, (2, 1))
         np.add.at(contact, ends, (per_point * shares).ravel())
         np.add.at(viscous, ends, (dragged * shares).ravel())
-        return bulk * (1.0 + 2.0 * numerics.numerical_damping) + 0.25 * contact, viscous
+        return bulk * damped + 0.25 * contact, viscous
 
     @property
     def work_through(self) -> float:
@@ -345,7 +423,23 @@ class CuttingModel(CutGeometry):
     @property
     def mass_ratio(self) -> float:
         """Stepped over true mass of the moving nodes in a translation."""
-        return float(self.inertia.matrix.sum() / self.true_mass[self.moving].sum())
+        return float(self.inertia.of_nodes.sum() / self.true_mass[self.moving].sum())
+
+    @property
+    def _edge_scale(self) -> float:
+        """Length by which the mesh follows an edge, h, metres: the mean edge of its elements, or
+        one and a half rows of the section, if these are finer."""
+        return min(self.element_size, 1.5 * self.row_height)
+
+    @property
+    def softness(self) -> float:
+        """Greatest toughness over Young's modulus and the mesh's length at the edge, R / (E h)."""
+        return float(self.toughness.max()) / (self.material.youngs_modulus * self._edge_scale)
+
+    @property
+    def skin_softness(self) -> float:
+        """A skin's line load over Young's modulus of what is under it and the same length."""
+        return self.effects.skin.line_load / (self.material.youngs_modulus * self._edge_scale)
 
     @property
     def strength(self) -> float:
@@ -376,26 +470,52 @@ class CuttingModel(CutGeometry):
                 f"{0.999 * used:.4g}, or numerics.bond_stiffness: {stiffness:.3g} and a sub-step "
                 "to match."
             )
-        softness = float(self.toughness.max()) / (self.material.youngs_modulus * size)
-        if softness > SOFTEST:
+        height, load = self.top - self.bottom, self.effects.skin.line_load
+        if load > SPLITS * self.strength * height:
             texts.append(
-                f"the greatest toughness in the food over E h is {softness:.2g}: the edge deforms "
-                f"the food by more than its mesh of {1e3 * size:.3g} mm is verified to follow, "
-                f"{SOFTEST:g}, and its work may be more than R A. Give a stiffer or less tough "
-                "food; a coarser mesh bears more, a finer one less."
+                f"the skin holds {load:.3g} N/m, {load / (self.strength * height):.2g} times "
+                "strength times height: the food may come apart under it ahead of the edge. Use a "
+                "stronger food, or a skin that is thicker or less tough."
+            )
+        if self.wide_spread > height:
+            texts.append(
+                f"toughness / E is {1e3 * self.softness * self._edge_scale:.2g} mm in a section "
+                f"that is {1e3 * height:.3g} mm high: the edge presses such a food onto the board "
+                "before it cuts it. Use a stiffer or less tough food."
+            )
+        elif self.softness > SOFTEST * max(1.0, self.numerics.edge_spread / self._edge_scale):
+            texts.append(
+                f"the greatest toughness in the food over E h is {self.softness:.2g}: the edge "
+                f"deforms the food by more than its mesh of {1e3 * self._edge_scale:.3g} mm is "
+                f"verified to follow, {SOFTEST:g}, and its force may jump. Give "
+                f"numerics.edge_spread: {self.wide_spread:.3g}."
+            )
+        if self.skin_softness > SOFTEST_UNDER_SKIN:
+            stiff = self.material.youngs_modulus * self.skin_softness / SOFTEST_UNDER_SKIN
+            texts.append(
+                f"the skin's toughness / thickness over E h is {self.skin_softness:.2g}: until it "
+                "is punctured it folds around the edge by more than the mesh is verified to "
+                f"follow, {SOFTEST_UNDER_SKIN:g}. Give what is under it material.youngs_modulus: "
+                f"{1.01 * stiff:.3g}, and a soft inside by effects.core.stiffness_ratio."
             )
         return tuple(texts)
+
+    @property
+    def wide_spread(self) -> float:
+        """The `Numerics.edge_spread` that a food as soft as this one needs, metres."""
+        return 1.01 * self.softness * self._edge_scale / SOFTEST
 
     def edge_forces(self) -> np.ndarray:
         """Greatest force of the edge at each cut point on the grid of its tables [P, G], N.
 
-        Pressing, at the speed of reference.
+        Pressing, at the speed of reference; of a skin all that the point carries.
         """
         tables, effects = self.tables, self.effects
         grid = np.linspace(-tables.reach, tables.reach, tables.width.shape[1])
         below = np.maximum(self.point_depth[:, None] + grid, 0.0)
         work = self.toughness[:, None] + effects.bluntness.excess(below)
-        return np.asarray(work * tables.width + effects.skin.toughness * self.outline)
+        skin = effects.skin.line_load * 0.5 * tables.outline.sum(1, keepdims=True)
+        return np.asarray(work * tables.width + skin)
 
     def rigid_motion(
         self, positions: np.ndarray, velocities: np.ndarray

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from sliceit_drake.cutting.gradient import SliceGradient
-from sliceit_drake.cutting.kernels.types import PARAMETERS
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.workspace import parameter_row
 
@@ -30,7 +29,16 @@ POINT_PARAMETERS = (
 """Parameters with a value for each cut point."""
 
 # How the cut is computed, not what is cut; a number of slices; an event.
-NUMERICAL = ("time_step", "stability_margin", "slices", "slip", "thickness")
+NUMERICAL = (
+    "time_step",
+    "stability_margin",
+    "flank_length",
+    "anchor_length",
+    "edge_spread",
+    "slices",
+    "slip",
+    "thickness",
+)
 COMPLIANCES = ("effects.compliance.arm", "effects.compliance.holder")
 
 
@@ -111,6 +119,9 @@ SCALES = {
     "effects.skin.toughness": 0.1,
     "effects.bluntness.initiation": 10.0,
     "effects.bluntness.dulling": 10.0,
+    "effects.outside.toughness": 0.1,
+    "effects.entry.initiation": 10.0,
+    "effects.entry.dulling": 10.0,
     "effects.adhesion.stress": 100.0,
     "effects.adhesion.viscosity": 1e3,
     "effects.compliance.arm": 1e-6,
@@ -166,13 +177,12 @@ def pull_back(
 
 def _by_point(model: CuttingModel, gradient: SliceGradient, name: str) -> np.ndarray:
     kind = name.split(".")[1]
-    scales, area = model.point_scales, model.tables.area
     direct = {"toughness": "toughness", "friction": "friction_scale"}.get(kind, "flank_scale")
     adjoint = gradient.by(direct).copy()
     if kind == "friction":
         return adjoint
     if kind == "toughness":
-        by_scale = model.toughness / scales.toughness
+        by_scale = model.toughness_by_scale
         adjoint *= by_scale
         force = model.edge_forces()
         rise = np.diff(force, axis=1) / model.tables.spacing
@@ -187,10 +197,4 @@ def _by_point(model: CuttingModel, gradient: SliceGradient, name: str) -> np.nda
             (np.diff(width, axis=1) / model.tables.spacing)[points, steepest],
         )
         return adjoint + gradient.by("unloading") * slope * by_scale
-    # The blade's mass that is stepped holds the stiffness of the flanks.
-    blade, flank = PARAMETERS.index("blade_mass"), model.parameters["flank_stiffness"]
-    for time_step, row in gradient.rows.items():
-        if model.with_step(time_step).parameters["blade_mass"] > model.knife.lateral_mass():
-            by_blade = float(row[gradient.layout["P"]][blade])
-            adjoint += by_blade * (time_step / model.numerics.stability_margin) ** 2 * flank * area
-    return adjoint
+    return adjoint * model.flank_scale / model.point_scales.flank_stiffness

@@ -20,7 +20,6 @@ class PlannedSlice:
         height: Height of the food's section, metres; of the bare board where its top would be.
         knife: The knife.
         board: What the food lies on; the top is its height in the world.
-        flank_stiffness: See `Numerics`.
         position: Origin of F in the world [3], metres; None if any place will do.
         yaw: Direction of Fx in the world, rad.
         clearance: Height of the edge above the food at the start, metres.
@@ -36,7 +35,6 @@ class PlannedSlice:
     height: float
     knife: Knife
     board: Board
-    flank_stiffness: float
     position: list[float] | None
     yaw: float
     clearance: float

@@ -29,9 +29,13 @@ __all__ = [
 ]
 
 ENERGY_RATIO_LIMIT = 0.05
-"""Kinetic over internal energy above which scaled masses are not quasi-static."""
+"""Kinetic energy of the added inertia, over the internal energy, above which scaled masses are not
+quasi-static."""
 DEBT_LIMIT = 0.02
 """Part of the work of cutting a section through that the edge may still owe when it is cut."""
+TURN_LIMIT = 0.5
+"""Tangent of the angle by which the food may have turned in the plane of the cut: the front of the
+cut is followed for small ones."""
 COMPLETE = 0.999
 """Fraction of a section from which it counts as cut through."""
 LATERAL_LIMIT = 3e-3
@@ -146,7 +150,8 @@ def energy_ratio(energies: Energies, dissipated: float, model: CuttingModel) -> 
 def check_energies(
     energies: Energies, dissipated: float, model: CuttingModel, time: float, cut: float
 ) -> float:
-    """Refuses inverted elements, too much kinetic energy, and a section cut for too little work.
+    """Refuses inverted elements, food that has turned, too little work of the edge, and too much
+    energy of added inertia.
 
     Args:
         energies, dissipated, model: As for `energy_ratio`.
@@ -160,29 +165,42 @@ def check_energies(
         CuttingError: With time, element and cause.
     """
     if energies.least_volume_ratio <= 0.0:
-        stiffness = model.material.youngs_modulus * model.element_size
-        softness = model.material.toughness / stiffness
         raise CuttingError(
             f"at {time:.4g} s element {energies.min_element} is inverted (volume ratio "
             f"{energies.least_volume_ratio:.3g}): the edge deforms the food more than its mesh can "
-            f"follow. Toughness / (E h) is {softness:.2g}; above about 0.5 elements at the edge "
-            "invert. Use a stiffer or less tough food; a finer mesh alone rarely helps."
+            f"follow. Toughness / (E h) is {model.softness:.2g}, and a skin's line load / (E h) "
+            f"{model.skin_softness:.2g}; above about 0.5 and 0.3 elements at the edge invert. Give "
+            f"numerics.edge_spread: {model.wide_spread:.3g}, or a stiffer wall under a skin. Use a "
+            "stiffer or less tough food where that is too wide; a finer mesh alone rarely helps."
+        )
+    if cut < COMPLETE and abs(energies.slope) > TURN_LIMIT:
+        raise CuttingError(
+            f"at {time:.4g} s the food has turned by {np.degrees(np.arctan(energies.slope)):.3g} "
+            "degrees in the plane of the cut: it rolls under the knife, and the cut follows small "
+            "turns only. Hold the food (food.held_sides), or draw less."
         )
     owed = energies.debt / max(model.work_through, 1e-9)
-    if cut >= COMPLETE and owed > DEBT_LIMIT:
+    advice = "saw by more than the food gives,"
+    if model.numerics.edge_spread == 0.0:
+        advice = f"{advice} give numerics.edge_spread: {model.wide_spread:.3g} for sawing,"
+    # On what is left the edge does up to twice the work.
+    if owed > DEBT_LIMIT + 2.0 * (1.0 - cut):
         raise CuttingError(
-            f"at {time:.4g} s the section is cut, and the edge has done {100 * owed:.1f} % less "
-            f"work than its toughness asks for, more than {100 * DEBT_LIMIT:.0f} %: the food has "
-            "moved with the knife, back and forth or as a whole, faster than the edge's direction "
-            "follows. Hold the food (food.held_sides, numerics.board_friction), saw by more than "
-            "the food gives, or use a smaller numerics.time_step."
+            f"at {time:.4g} s {100 * cut:.3g} % of the section are cut, and the edge has done "
+            f"{100 * owed:.1f} % less work than its toughness asks for, more than it can make up: "
+            "the food has moved with the knife, back and forth or as a whole, faster than the "
+            "edge's direction follows. Hold the food (food.held_sides, numerics.board_friction), "
+            f"{advice} or use a smaller numerics.time_step."
         )
     ratio = energy_ratio(energies, dissipated, model)
-    if ratio > ENERGY_RATIO_LIMIT:
+    # Food that itself moves fast, as where it slides, has its true mass.
+    excess = ratio * energies.added / max(energies.kinetic, 1e-30)
+    if excess > ENERGY_RATIO_LIMIT:
         raise CuttingError(
-            f"at {time:.4g} s the kinetic energy is {100 * ratio:.1f} % of the internal energy, "
-            f"more than {100 * ENERGY_RATIO_LIMIT:.0f} %: scaled masses are not quasi-static here. "
-            "Use a smaller numerics.time_step or a slower motion."
+            f"at {time:.4g} s the added inertia's kinetic energy is {100 * excess:.1f} % of the "
+            f"internal energy, more than {100 * ENERGY_RATIO_LIMIT:.0f} %: scaled masses are not "
+            "quasi-static here. Use a smaller numerics.time_step than the sub-step here, "
+            f"{energies.sub_step:.3g} s, or a slower motion."
         )
     return ratio
 
@@ -207,12 +225,11 @@ def simulate_slice(
     """
     model, T = solver.model, solver.exchange_period
     path = KnifePath(model, motion, T)
-    count, R_FC = path.coupling_steps, model.X_FC_rotation
+    count = path.coupling_steps
     every = max(1, round(check_period / T))
     check_clear(model, path.pose(0))
     balance = EnergyBalance()
-    food_wrench, mechanisms = np.zeros((count, 6)), np.zeros((count, 3, 3))
-    cut = np.zeros(count)
+    wrenches, cut = np.zeros((count, 3, 6)), np.zeros(count)
     ratio = travel = 0.0
     last_check = 0
 
@@ -227,9 +244,7 @@ def simulate_slice(
             raise CuttingError(f"at {(k + 1) * T:.4g} s {NOT_FINITE}")
         at, state = slice(k, k + block), step.state
         balance += step.balance
-        parts = step.wrenches.reshape(block, 3, 2, 3) @ R_FC.T
-        food_wrench[at] = parts.sum(1).reshape(block, 6)
-        mechanisms[at] = parts[:, :, 1]
+        wrenches[at] = step.wrenches
         cut[at] = step.cut
         end = k + block
         moved = np.diff(path.p_FK[k : end + 1], axis=0)
@@ -239,10 +254,12 @@ def simulate_slice(
             energies = solver.energies(state, path.pose(end))
             spent = balance.edge + balance.opening + balance.friction
             ratio = max(ratio, check_energies(energies, spent, model, end * T, cut[end - 1]))
+    parts = path.in_food(wrenches)
+    mechanisms = parts[:, :, 3:]
     return SliceResult(
         time=np.arange(1, count + 1) * T,
         position=path.p_FK[1:],
-        food_wrench=food_wrench,
+        food_wrench=parts.sum(1),
         board_wrench=path.board_wrenches(board),
         edge=mechanisms[:, 0],
         normal=mechanisms[:, 1],

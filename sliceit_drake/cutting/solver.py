@@ -8,10 +8,10 @@ import numpy as np
 
 from sliceit_drake.cutting.coupling_steps import CouplingSteps, Energies, run_coupling_steps
 from sliceit_drake.cutting.driver import Driver
-from sliceit_drake.cutting.kernels.layouts import Front
+from sliceit_drake.cutting.kernels.layouts import Front, Planned
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.motion import Pose
-from sliceit_drake.cutting.stepping import EVENT, Stepping
+from sliceit_drake.cutting.stepping import EVENT, IN_CUT, Frame, PlanRoom, Stepping
 from sliceit_drake.cutting.workspace import Workspace, parameter_row
 
 __all__ = ["NOT_FINITE", "CuttingError", "CuttingSolver", "SurfaceFactors"]
@@ -128,29 +128,41 @@ class CuttingSolver:
         Raises:
             CuttingError: A force is not finite, or the knife left the region that is modelled.
         """
-        return self.move(state, np.array([start.R, end.R]), np.array([start.p, end.p]), factors)
+        before, after = (np.column_stack([pose.R, pose.p]) for pose in (start, end))
+        return self.move(state, self.plan(state, before, after), factors)
+
+    def plan(
+        self, state: np.ndarray, start: np.ndarray, end: np.ndarray, frame: Frame = IN_CUT
+    ) -> PlanRoom:
+        """Poses of the knife in C and number of sub-steps, until the next plan in this thread.
+
+        Args:
+            state: The food's state [state_size].
+            start, end: Poses X_AK at the ends of a coupling step [3, 4].
+            frame: A.
+        """
+        stepping = state[self._workspace.layout["stepping"]]
+        room = self._stepping.room(1, stepping, self.exchange_period)
+        room.X_AK[0], room.X_AK[1] = start, end
+        room.run(frame)
+        return room
 
     def move(
-        self,
-        state: np.ndarray,
-        R: np.ndarray,
-        p: np.ndarray,
-        factors: SurfaceFactors = UNCHANGED,
+        self, state: np.ndarray, plan: PlanRoom, factors: SurfaceFactors = UNCHANGED
     ) -> CouplingSteps:
-        """As `coupling_step`, between poses X_CK given as R [2, 3, 3] and p [2, 3]."""
-        place, T = self._workspace.layout["stepping"], self.exchange_period
-        (wanted,), (stepping,) = self._stepping.plan(state[place], R, p, T)
-        number = 0
+        """As `coupling_step`, by a plan; wrenches are in the axes of its frame."""
+        stepping, wanted, number = plan.after[0], int(plan.numbers[0]), 0
         with self._lock:
             while number != wanted:
                 number = wanted
                 ws = self._stepped(number)
                 self._take_factors(ws, factors)
-                (step,) = run_coupling_steps(ws, state[None], R[None], p[None])
+                ws.take_axes(plan.frame.R_AC)
+                (step,) = run_coupling_steps(ws, state[None], plan.R, plan.p)
                 wanted = self._stepping.again(number, step.added_force.tolist(), stepping)
         if not step.finite:
             raise CuttingError(NOT_FINITE)
-        step.state[place] = stepping
+        step.state[self._workspace.layout["stepping"]] = stepping
         return step
 
     def _place(self, state: np.ndarray, pose: Pose, factors: SurfaceFactors = UNCHANGED) -> None:
@@ -174,16 +186,22 @@ class CuttingSolver:
         rest = 0.5 * m.parameters["board_stiffness"] * m.board_area
         interface += float(rest @ (depth**2 + (anchor**2).sum(1)))
         # The inertia that was stepped last.
-        last = float(self.field(state, "stepping")[-2])
-        inertia = (m.with_step(last) if last > 0.0 else m).inertia
+        last = float(self.field(state, "stepping")[Planned.SUB_STEP]) or m.numerics.time_step
+        v = self.velocities(state)[m.moving].astype(float)
         deflection, rate = (float(b) for b in self.field(state, "blade"))
         interface += 0.5 * m.parameters["blade_stiffness"] * deflection**2
-        interface += 0.5 * m.parameters["blade_mass"] * rate**2
+        toward = rate * float(np.sign(pose.R[1, 1]))
+        kinetic = m.with_step(last).inertia.kinetic_energy(v, toward)
+        true = m.true_mass[m.moving] @ (v**2).sum(1) + m.knife.lateral_mass() * rate**2
+        front = self.field(state, "front")
         return Energies(
             elastic=elastic,
             interface=interface,
-            kinetic=inertia.kinetic_energy(self.velocities(state)[m.moving]),
-            debt=float(self.field(state, "front")[Front.DEBT]),
+            kinetic=kinetic,
+            added=kinetic - 0.5 * float(true),
+            sub_step=last,
+            debt=float(front[Front.DEBT]),
+            slope=float(front[Front.SLOPE]),
             least_volume_ratio=float(ratio[least]),
             min_element=least,
         )

@@ -16,18 +16,23 @@ sub-steps get longer by a factor of two at a time, some coupling steps after the
 """
 
 import math
+import threading
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import warp as wp
 
+from sliceit_drake.cutting.kernels.layouts import PLANNED, Planned, numbers
+from sliceit_drake.cutting.kernels.precision import kernels
+from sliceit_drake.cutting.kernels.types import mat34d
 from sliceit_drake.cutting.model import CuttingModel
+from sliceit_drake.cutting.warp_start import LAUNCH_LOCK, load_modules, shared, start_warp
 
-__all__ = ["EVENT", "STEPPING", "Stepping"]
+__all__ = ["EVENT", "IN_CUT", "STEPPING", "Frame", "PlanRoom", "Stepping"]
 
-STEPPING = 8
-"""Numbers that a state holds: the velocities of the edge's two points that the food has settled to,
-in C, m/s; its last sub-step, s, or 0; coupling steps in which it could have been twice as long."""
+STEPPING = numbers(PLANNED)
+"""How many numbers `PLANNED` has."""
 
 TRAVEL = 4e-5
 """Most way of the knife in a sub-step, metres."""
@@ -42,9 +47,77 @@ SETTLING_TIME = 10e-3
 FINEST = 64
 """Most sub-steps of a coupling step."""
 SLACK = 0.8
-"""Part of the longest sub-step that is allowed to which one may be doubled."""
+"""Part of the longest sub-step that food which settles allows, to which one may be doubled."""
 CALM = 5
 """Coupling steps in which a sub-step could be twice as long before it is."""
+
+
+_ROOMS = threading.local()
+
+
+class Frame(NamedTuple):
+    """A frame A in which poses are given, and in whose axes wrenches are.
+
+    Attributes:
+        X_CA: Its pose in C [3, 4], m.
+        R_AC: Its rotation's inverse [3, 3].
+    """
+
+    X_CA: np.ndarray
+    R_AC: np.ndarray
+
+
+IN_CUT = Frame(np.eye(3, 4), np.eye(3))
+"""C itself."""
+
+
+class PlanRoom:
+    """Room for the plan of some coupling steps; each use fills it before it reads anything.
+
+    Attributes:
+        rule: Input: numbers of `Stepping`, and the duration of a coupling step, s [5].
+        frame: Input: that of the poses.
+        X_AK: Input: poses at the steps' ends [E + 1, 3, 4], m.
+        stepping: Input: see `PLANNED`, before them.
+        R, p: Poses X_CK [1, E + 1, 3, 3] and [1, E + 1, 3], m.
+        numbers: Of sub-steps [E].
+        after: `stepping` after each [E, STEPPING].
+    """
+
+    def __init__(self, coupling_steps: int, real: Any) -> None:
+        ends = coupling_steps + 1
+        limits = TRAVEL, CHANGE, SETTLING_WAY, SETTLING_TIME, FINEST, SLACK, CALM
+        self._limits = np.array(limits, float)
+        self.rule, self.stepping = np.zeros(5), np.zeros(STEPPING)
+        self.frame, self.X_AK = IN_CUT, np.zeros((ends, 3, 4))
+        self._X_CA = IN_CUT.X_CA.copy()
+        self.R, self.p = np.zeros((1, ends, 3, 3)), np.zeros((1, ends, 3))
+        self.numbers = np.zeros(coupling_steps, np.int32)
+        self.after = np.zeros((coupling_steps, STEPPING))
+        # What is launched during a capture in another thread would be taken for part of it.
+        with LAUNCH_LOCK:
+            start_warp()
+            found = kernels(real)
+            load_modules(found.modules[1:], "cpu")
+            # The graph holds addresses alone.
+            self._arrays = [
+                *(shared(values) for values in (self._limits, self.rule)),
+                *(shared(values, mat34d) for values in (self._X_CA[None], self.X_AK)),
+                shared(self.stepping),
+                shared(self.R[0], wp.mat33d),
+                shared(self.p[0], wp.vec3d),
+                shared(self.numbers, wp.int32),
+                shared(self.after),
+            ]
+            with wp.ScopedCapture(device="cpu") as capture:
+                wp.launch(found.plan_steps, dim=1, inputs=self._arrays, device="cpu")
+        self._graph = capture.graph
+
+    def run(self, frame: Frame) -> None:
+        """Plans, from what was put in and poses in a frame."""
+        if frame is not self.frame:
+            self.frame, self._X_CA[:] = frame, frame.X_CA
+        wp.capture_launch(self._graph)
 
 
 class Stepping(NamedTuple):
@@ -56,6 +129,7 @@ class Stepping(NamedTuple):
         coarsest: Sub-steps of a coupling step where nothing changes.
         by_need: `numerics.step_by_need`.
         force: Most force of the added inertia, N.
+        real: Scalar of the cut's kernels, among which `plan_steps` is.
     """
 
     half_span: float
@@ -63,6 +137,7 @@ class Stepping(NamedTuple):
     coarsest: int
     by_need: bool
     force: float
+    real: Any
 
     @classmethod
     def of(cls, model: CuttingModel, coarsest: int, event: float = EVENT) -> "Stepping":
@@ -71,55 +146,50 @@ class Stepping(NamedTuple):
         # Tables blur by one spacing.
         top = model.top + model.tables.spacing
         force = event * model.work_through / (model.top - model.bottom)
-        return cls(0.5 * (high - low), top, coarsest, model.numerics.step_by_need, force)
+        numerics = model.numerics
+        real = wp.float32 if numerics.precision == "float32" else wp.float64
+        return cls(0.5 * (high - low), top, coarsest, numerics.step_by_need, force, real)
 
     def plan(
-        self, stepping: np.ndarray, R: np.ndarray, p: np.ndarray, period: float
+        self,
+        stepping: np.ndarray,
+        R: np.ndarray,
+        p: np.ndarray,
+        period: float,
+        given: Sequence[int] | None = None,
     ) -> tuple[list[int], list[list[float]]]:
         """Numbers of sub-steps of coupling steps in a row.
 
         Args:
-            stepping: See `STEPPING`, before them.
+            stepping: See `PLANNED`, before them.
             R, p: Poses X_CK at their ends [E + 1, 3, 3] and [E + 1, 3], metres.
             period: Duration of each, s.
+            given: Numbers [E] that are taken instead, those of a run from which this one differs a
+                little; None for none.
 
         Returns:
             The numbers [E], the coarsest one times powers of two, and `stepping` after each
             [E, STEPPING].
         """
-        places, h = p.tolist(), self.half_span
-        ends = [
-            (x - h * a, y - h * b, z - h * c, x + h * a, y + h * b, z + h * c)
-            for (x, y, z), (a, b, c) in zip(places, R[:, :, 0].tolist(), strict=True)
-        ]
-        *settled, last, calm = stepping.tolist()
-        number = self.coarsest
-        if last > 0.0:
-            number = max(number, 2 ** round(math.log2(period / last / number)) * number)
-        numbers, after = [], []
-        for k in range(len(p) - 1):
-            v = [(b - a) / period for a, b in zip(ends[k], ends[k + 1], strict=True)]
-            speed = max(math.hypot(*v[:3]), math.hypot(*v[3:]))
-            # What nothing touches is at rest.
-            in_air = min(places[k][2], places[k + 1][2]) > self.top
-            if in_air:
-                settled = [0.0] * 6
-            # Rounded, so that it is the same whether a state in single precision came between.
-            off = [b - round(a, 6) for a, b in zip(settled, v, strict=True)]
-            change = max(math.hypot(*off[:3]), math.hypot(*off[3:]))
-            least = period * max(speed / TRAVEL, math.sqrt(change / CHANGE))
-            least = min(least, FINEST) if self.by_need and not in_air else 0.0
-            calm = calm + 1 if number > self.coarsest and 2.0 * least < SLACK * number else 0
-            if calm > CALM:
-                number, calm = number // 2, 0
-            while number < least:
-                number *= 2
-            keep = math.exp(-speed * period / SETTLING_WAY - period / SETTLING_TIME)
-            settled = [b - keep * d for b, d in zip(v, off, strict=True)]
-            last = period / number
-            numbers.append(number)
-            after.append([*settled, last, calm])
-        return numbers, after
+        room = self.room(len(p) - 1, stepping, period)
+        room.X_AK[:, :, :3], room.X_AK[:, :, 3] = R, p
+        room.run(IN_CUT)
+        taken, after = room.numbers.tolist(), room.after.tolist()
+        if given is not None:
+            taken = list(given)
+            for row, number in zip(after, taken, strict=True):
+                row[Planned.SUB_STEP] = period / number
+        return taken, after
+
+    def room(self, coupling_steps: int, stepping: np.ndarray, period: float) -> PlanRoom:
+        """This thread's room for a plan of so many steps, all but the poses put in; see `plan`."""
+        rooms, key = vars(_ROOMS), f"{coupling_steps} {self.real.__name__}"
+        if key not in rooms:
+            rooms[key] = PlanRoom(coupling_steps, self.real)
+        room: PlanRoom = rooms[key]
+        room.rule[:] = self.half_span, self.top, self.coarsest, self.by_need, period
+        room.stepping[:] = stepping
+        return room
 
     def again(self, number: int, added: Sequence[float], stepping: list[float]) -> int:
         """Number of sub-steps with which a coupling step is to be repeated; its own if it is not.
@@ -136,9 +206,9 @@ class Stepping(NamedTuple):
             if self.by_need and math.isfinite(force):
                 need = max(need, number * math.sqrt(force / max(self.force, 1e-6)))
         if number > self.coarsest and 2.0 * need >= number:
-            stepping[-1] = 0.0
+            stepping[Planned.CALM] = 0.0
         more = number
         while more < min(need, FINEST):
             more *= 2
-        stepping[-2] *= number / more
+        stepping[Planned.SUB_STEP] *= number / more
         return more

@@ -14,7 +14,11 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-__all__ = ["CACHE", "CPU_FLAGS", "VERBOSE", "load_modules", "start_warp"]
+__all__ = ["CACHE", "CPU_FLAGS", "LAUNCH_LOCK", "VERBOSE", "load_modules", "shared", "start_warp"]
+
+LAUNCH_LOCK = threading.RLock()
+"""Held while kernels are made, in a capture, which takes in the launches of all threads, and in
+launches outside of one."""
 
 VERBOSE = "SLICEIT_VERBOSE"
 """Environment variable that lets Warp say what it does; worker processes have it too."""
@@ -65,6 +69,14 @@ def load_modules(names: Sequence[str], device: Any) -> None:
     with ThreadPoolExecutor(2) as threads:
         for loaded in [threads.submit(_load_module, name, device) for name in names]:
             loaded.result()
+
+
+def shared(values: Any, dtype: Any = float) -> Any:
+    """A Warp array in the memory of a NumPy array, on the CPU; `float` are double."""
+    import warp as wp
+
+    dtype = wp.float64 if dtype is float else dtype
+    return wp.array(values, dtype=dtype, device="cpu", copy=False)
 
 
 def _load_module(name: str, device: Any) -> None:

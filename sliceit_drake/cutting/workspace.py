@@ -1,7 +1,6 @@
 """Device arrays of one or many cuts of one mesh, and the launches that advance them."""
 
 import math
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -15,9 +14,9 @@ from sliceit_drake.cutting.kernels.precision import kernels
 from sliceit_drake.cutting.kernels.types import CORNERS, GATHER, LANES, PARAMETERS, STRIP
 from sliceit_drake.cutting.model import CuttingModel, TimeStepError
 from sliceit_drake.cutting.stepping import STEPPING
-from sliceit_drake.cutting.warp_start import load_modules, start_warp
+from sliceit_drake.cutting.warp_start import LAUNCH_LOCK, load_modules, start_warp
 
-__all__ = ["LAUNCH_LOCK", "Workspace", "in_lanes", "parameter_row"]
+__all__ = ["Workspace", "in_lanes", "parameter_row"]
 
 POINT_NUMBERS = {
     "toughness",
@@ -25,14 +24,12 @@ POINT_NUMBERS = {
     "friction_scale",
     "unloading",
     "edge_depth",
+    "skin_depth",
+    "last_skin_depth",
     "cohesive_damage",
     "edge_force",
 }
 """Arrays with a number for each cut point."""
-
-LAUNCH_LOCK = threading.RLock()
-"""Held while kernels are made, in a capture, which takes in the launches of all threads, and in
-launches outside of one."""
 
 
 class Workspace:
@@ -91,7 +88,6 @@ class Workspace:
         # With gradients, what the nodes get is kept.
         load = ("gather", "sum_forces") if gradients else ("load_nodes",)
         self.node_parts = (*load, "solve", "step_nodes")
-        self._skin_thickness = model.effects.skin.thickness
         self.set_models(models)
 
     def _array(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
@@ -189,7 +185,9 @@ class Workspace:
             width=_filled(m.tables.width, 0.0),
             fraction=_filled(m.tables.fraction, 0.0),
             centroid=_filled(m.tables.rise, 0.0),
-            outline=_filled(m.outline, 0.0),
+            beside=in_lanes(m.tables.beside),
+            outline=in_lanes(m.tables.outline, 0.0),
+            lower=in_lanes(m.tables.lower),
             depth=in_lanes(m.point_depth),
             rest=in_lanes(m.split.points),
             reach=m.tables.reach,
@@ -205,11 +203,16 @@ class Workspace:
             dtype = k.Inertia.vars[name].type.dtype
             rows = wp.zeros((C, len(getattr(factors, name))), dtype, device=self.device)
             setattr(self.inertia, name, rows)
+        self._allocate(self.inertia, last=(len(m.moving) + 1 - len(factors.inverse_pivot),))
 
         self.motion = k.Motion()
+        self.motion.done = wp.zeros(2, dtype=wp.int32, device=self.device)
+        self._rounds_left = wp.zeros(2, dtype=wp.int32, device=self.device)
         self.motion.substeps, self.motion.period = self.substeps, self.exchange_period
         # At the ends of the coupling steps, as they are given.
-        self._allocate(self.motion, R=(E + 1,), p=(E + 1,))
+        self._allocate(self.motion, R_AC=(), R=(E + 1,), p=(E + 1,))
+        self._axes: Any = None
+        self.take_axes(np.eye(3))
         motion = {"R_CK": (K, 9), "p_CK": (K, 3), "v_CK": (K, 3), "w_CK": (K, 3)}
         self.motion_rows, self.motion_layout = self._rows(self.motion, motion)
 
@@ -243,7 +246,7 @@ class Workspace:
         self.forces = [k.Forces() for _ in range(K if self._gradients else 1)]
         for kept in self.forces:
             kept.assign(forces)
-            moving = (len(m.moving),)
+            moving = (len(m.moving) + 1,)
             self._allocate(
                 kept, totals=totals, from_bulk=(N,), resultant=moving, acceleration=moving
             )
@@ -271,29 +274,27 @@ class Workspace:
         """Takes the parameters of other cuts of the same mesh, one for each row."""
         if len(models) != self.cuts:
             raise ValueError(f"{len(models)} models for {self.cuts} cuts")
-        thickness = models[0].effects.skin.thickness
         for model in models:
-            if (
-                model.split is not self.model.split
-                or len(model.relaxing) != len(self.model.relaxing)
-                or model.effects.skin.thickness != thickness
+            if model.split is not self.model.split or len(model.relaxing) != len(
+                self.model.relaxing
             ):
                 raise ValueError(
-                    "the cuts must be derived from one model and have as many relaxation times and "
-                    "the same thickness of skin"
+                    "the cuts must be derived from one model and have as many relaxation times"
                 )
-        if thickness != self._skin_thickness:
-            self._skin_thickness = thickness
-            with LAUNCH_LOCK:
-                outline = _filled(models[0].outline, 0.0)
-                self.points.outline.assign(outline.astype(self.dtype))
         self.write(self.parameter_rows, np.array([parameter_row(m) for m in models]))
         inertia = [model.inertia for model in models]
         if [id(each) for each in inertia] != [id(model.inertia) for model in self.models]:
             for name in FACTORS:
                 values = np.array([getattr(each.factors, name) for each in inertia])
-                self.write(getattr(self.inertia, name), values)
+                if values.size:
+                    self.write(getattr(self.inertia, name), values)
         self.models = tuple(models)
+
+    def take_axes(self, R_AC: np.ndarray) -> None:
+        """Gives wrenches in the axes of a frame A from now on; R_AC [3, 3] is not to be changed."""
+        if R_AC is not self._axes:
+            self._axes = R_AC
+            self.write(self.motion.R_AC, np.tile(R_AC, (self.cuts, 1, 1)))
 
     def initial_state(self) -> np.ndarray:
         """The food at rest, to be cut downwards [state_size]."""
@@ -367,10 +368,7 @@ class Workspace:
             "load_nodes": (len(m.moving), [dt, mesh, parameters, now, forces, sums]),
             "gather": (len(m.moving), [mesh, forces]),
             "sum_forces": (len(m.moving), [dt, mesh, parameters, *states]),
-            "weigh_added_inertia": (
-                0,
-                [k // self.substeps, parameters, forces, self._results],
-            ),
+            "weigh_added_inertia": (0, [k, parameters, self.motion, forces, self._results]),
             "solve": (0, [self.inertia, forces.resultant, forces.acceleration]),
             "step_nodes": (len(m.moving), [dt, mesh, parameters, *states]),
             "gather_adjoint": (len(m.moving), [mesh, forces, now.ahead.grad]),
@@ -379,7 +377,8 @@ class Workspace:
                 [k, self.points, self.motion, after, forces],
             ),
             "total_points": (0, [forces]),
-            "step_blade_and_front": (0, [k // self.substeps, dt, parameters, *states]),
+            "push_blade": (0, [k, parameters, self.motion, now, forces]),
+            "step_blade_and_front": (0, [k, dt, parameters, self.motion, *states]),
         }[part]
         shape: tuple[int, ...] = (self.cuts,)
         if entries:
@@ -392,6 +391,7 @@ class Workspace:
         for part in (
             "elements",
             "step_points",
+            "push_blade",
             *self.node_parts,
             "place_points",
             "total_points",
@@ -421,14 +421,36 @@ class Workspace:
         # Later sub-steps need it for held nodes only, which never move.
         for k in range(len(self.slots)):
             self.launch_look_ahead(k)
-        for k in range(self.steps):
-            self.launch_substep(k)
-            if (k + 1) % self.substeps == 0:
-                self.launch_part("weigh_added_inertia", k)
+        if self._on_host and not self._gradients:
+            # A loop is captured faster.
+            self._launch_loop(1, self.coupling_steps, self._launch_coupling_step)
+            self.motion.done.zero_()
+        else:
+            for k in range(self.steps):
+                self.launch_substep(k)
+                if (k + 1) % self.substeps == 0:
+                    self.launch_part("weigh_added_inertia", k)
         self.launch(kern.add_points, results.point_sums.shape, [sums, results])
         self.launch(kern.knife_wrenches, results.work.shape, [sums, self.motion, results])
         self.launch(kern.weigh, (self.cuts,), [wp.float64(1.0), self.slots[-1], *weights])
         self.launch(kern.add_up, (self.cuts,), [sums, self.motion, results])
+
+    def _launch_coupling_step(self) -> None:
+        self._launch_loop(0, self.substeps, lambda: self.launch_substep(0))
+        # That of the last sub-step that is done.
+        self.launch_part("weigh_added_inertia", -1)
+
+    def _launch_loop(self, loop: int, rounds: int, launch: Callable[[], None]) -> None:
+        """Launches a loop, within a graph, which counts its rounds in `motion.done`."""
+        left = self._rounds_left[loop : loop + 1]
+
+        def launch_round() -> None:
+            launch()
+            counters = [loop, self._rounds_left, self.motion.done]
+            self.launch(self.kernels.count, (1,), counters)
+
+        left.fill_(rounds)
+        wp.capture_while(left, launch_round)
 
     def advance(self, states: np.ndarray, R: np.ndarray, p: np.ndarray) -> None:
         """Advances all cuts by the workspace's coupling steps.
@@ -462,7 +484,7 @@ class Workspace:
     def _launch_energies(self) -> None:
         kern, state, energies = self.kernels, self.slots[0], self._energies
         elements = [state, self.mesh, self.parameters, energies]
-        self.launch(kern.element_energy, energies.elastic.shape, elements)
+        self.launch(kern.element_energy, (self.cuts, len(self.model.blocks)), elements)
         points = [self.points, self.parameters, self.motion, state, energies]
         self.launch(kern.point_energy, (self.cuts, self.point_blocks), points)
 
@@ -472,7 +494,10 @@ class Workspace:
         """Gives all knives one pose in C, velocity of Ko and angular velocity."""
         for name, value in zip(("R_CK", "p_CK", "v_CK", "w_CK"), (R, p, v, w), strict=True):
             array = getattr(self.motion, name)
-            self.write(array, np.broadcast_to(value, (*array.shape, *np.shape(value))))
+            if self._on_host:
+                self.write(array, value)
+            else:
+                self.write(array, np.broadcast_to(value, (*array.shape, *np.shape(value))))
 
     def point_forces(self) -> np.ndarray:
         """Forces on both faces at the cut points of the first cut [P, 2, 3], N."""
@@ -483,7 +508,7 @@ class Workspace:
         return forces.transpose(0, 3, 1, 2).reshape(-1, 2, 3)[: len(self.model.point_nodes)]
 
 
-FACTORS = ("lower", "upper", "inverse_pivot")
+FACTORS = ("lower", "upper", "inverse_pivot", "inverse")
 """Arrays of `inertia.Factors` in which cuts of one mesh differ."""
 
 
@@ -495,13 +520,12 @@ def parameter_row(model: CuttingModel) -> np.ndarray:
 def _parameter_arrays(model: CuttingModel) -> dict[str, np.ndarray]:
     volume = np.zeros((len(model.blocks), STRIP, LANES))
     volume.ravel()[model.element_place] = model.element_volume
-    scales = model.point_scales
     return {
         "P": np.array([model.parameters[name] for name in PARAMETERS]),
         "knife": model.knife.parameters(),
         "toughness": in_lanes(model.toughness),
-        "flank_scale": in_lanes(scales.flank_stiffness),
-        "friction_scale": in_lanes(scales.friction),
+        "flank_scale": in_lanes(model.flank_scale),
+        "friction_scale": in_lanes(model.point_scales.friction),
         "unloading": in_lanes(model.unloading),
         "weight": model.weight,
         "relaxing": model.relaxing,
@@ -517,6 +541,8 @@ def _initial_arrays(model: CuttingModel) -> dict[str, np.ndarray]:
         "x": model.nodes,
         "v": np.zeros((N, 3)),
         "edge_depth": np.full((blocks, LANES), -model.tables.reach),
+        "skin_depth": np.full((blocks, LANES), -1.0),
+        "last_skin_depth": np.full((blocks, LANES), -1.0),
         "cohesive_damage": np.zeros((blocks, LANES)),
         "edge_force": np.zeros((blocks, LANES)),
         "edge_direction": np.tile([[0.0], [0.0], [-1.0]], (blocks, 1, LANES)),

@@ -23,9 +23,9 @@ from pydrake.multibody.math import SpatialForce
 from pydrake.systems.framework import Context, DiscreteValues
 
 from sliceit_drake.configuration import choice, quantity, validate
-from sliceit_drake.cutting.warp_start import load_modules, start_warp
-from sliceit_drake.cutting.workspace import LAUNCH_LOCK
-from sliceit_drake.systems.compliance_kernel import MODES, mat34d, place_arm, update_arm
+from sliceit_drake.cutting.kernels.types import mat34d
+from sliceit_drake.cutting.warp_start import LAUNCH_LOCK, load_modules, shared, start_warp
+from sliceit_drake.systems.compliance_kernel import MODES, place_arm, update_arm
 from sliceit_drake.systems.declare import PlainSystem, declare_cached, declare_output
 from sliceit_drake.systems.ur5e_kinematics import KinematicChain, virtual_bodies
 from sliceit_drake.systems.wrench_sensor import wrench_shift
@@ -100,11 +100,14 @@ class ComplianceUpdate:
         config: Mode and steps of the law; the values for input ports are not read.
         chain: The arm of n joints.
         R_EC: Rotation of the compliance reference C in the end effector E [3, 3].
+        X_BA: Pose of the frame A in which the target is given [3, 4]; None for B itself.
+        to_C: Matrix [6, 6] from the sensor's wrench, as it is given, to force and moment about Co
+            in C; None for such.
 
     Attributes:
         measured: Input: measured joint positions [n], rad.
-        target: Input: target pose X_BE [3, 4]; not used in force mode.
-        sensor_wrench: Input: about Co in C [2, 3]; not used in motion mode.
+        target: Input: target pose X_AE [3, 4]; not used in force mode.
+        sensor_wrench: Input [6]; not used in motion mode.
         settings: Input: stiffness in C, selection, P gains times the error scale, D gains times the
             error scale over the time step, target wrench [5, 2, 3].
         q: State: joint positions of the virtual model [n], rad.
@@ -115,22 +118,33 @@ class ComplianceUpdate:
     """
 
     def __init__(
-        self, config: ComplianceControllerConfig, chain: KinematicChain, R_EC: np.ndarray
+        self,
+        config: ComplianceControllerConfig,
+        chain: KinematicChain,
+        R_EC: np.ndarray,
+        X_BA: np.ndarray | None = None,
+        to_C: np.ndarray | None = None,
     ) -> None:
-        self._law = config, chain, R_EC
+        self._law = config, chain, R_EC, X_BA, to_C
         n = len(chain.joints)
         self.measured, self.q = np.zeros((2, n))
         # Velocities and error side by side, so that they are copied at once.
         self.moving = np.zeros(n + 6)
         self.v, self.error = self.moving[:n], self.moving[n:].reshape(2, 3)
         self.target, self.settings = np.zeros((3, 4)), np.zeros((5, 2, 3))
-        self.sensor_wrench, self.u = np.zeros((2, 2, 3))
+        self.sensor_wrench, self.u = np.zeros(6), np.zeros((2, 3))
         self._R_BL, self._p_BL = np.zeros((n + 1, 3, 3)), np.zeros((n + 1, 3))
         self._failed = np.zeros(1, np.int32)
         _load_kernels()
         # What is launched during a capture in another thread would be taken for part of it.
         with LAUNCH_LOCK:
-            self._capture(config, chain, R_EC)
+            self._capture(
+                config,
+                chain,
+                R_EC,
+                np.eye(3, 4) if X_BA is None else X_BA,
+                np.eye(6) if to_C is None else to_C,
+            )
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "ComplianceUpdate":
         room = ComplianceUpdate(*self._law)
@@ -153,22 +167,27 @@ class ComplianceUpdate:
         return np.column_stack([self._R_BL[-1], self._p_BL[-1]])
 
     def _capture(
-        self, config: ComplianceControllerConfig, chain: KinematicChain, R_EC: np.ndarray
+        self,
+        config: ComplianceControllerConfig,
+        chain: KinematicChain,
+        R_EC: np.ndarray,
+        X_BA: np.ndarray,
+        to_C: np.ndarray,
     ) -> None:
         n, joints = len(self.q), chain.joints
         poses = [joint.X_PL for joint in joints] + [chain.X_LE or RigidTransform()]
         arm = [
-            _shared(self.q),
-            _shared(np.array([X.rotation().matrix() for X in poses]), wp.mat33d),
-            _shared(np.array([X.translation() for X in poses]), wp.vec3d),
-            _shared(self._R_BL, wp.mat33d),
-            _shared(self._p_BL, wp.vec3d),
+            shared(self.q),
+            shared(np.array([X.rotation().matrix() for X in poses]), wp.mat33d),
+            shared(np.array([X.translation() for X in poses]), wp.vec3d),
+            shared(self._R_BL, wp.mat33d),
+            shared(self._p_BL, wp.vec3d),
         ]
         inputs = [
             *arm,
-            *(_shared(values) for values in virtual_bodies(chain, config.link_mass)),
-            _shared(np.array([joint.lower for joint in joints])),
-            _shared(np.array([joint.upper for joint in joints])),
+            *(shared(values) for values in virtual_bodies(chain, config.link_mass)),
+            shared(np.array([joint.lower for joint in joints])),
+            shared(np.array([joint.upper for joint in joints])),
             MODES.index(config.mode),
             1 if config.mode == "force" else config.iterations,
             config.virtual_time_step,
@@ -176,16 +195,18 @@ class ComplianceUpdate:
             _KDL_THRESHOLD if config.dead_zones else _ROUNDING_THRESHOLD,
             config.hand_frame_control,
             wp.mat33d(*R_EC.ravel()),
-            _shared(self.measured),
-            _shared(self.target[None], mat34d),
-            _shared(self.sensor_wrench, wp.vec3d),
-            *(_shared(setting, wp.vec3d) for setting in self.settings),
-            _shared(self.v),
-            _shared(self.error, wp.vec3d),
-            _shared(self.u, wp.vec3d),
+            mat34d(*X_BA.ravel()),
+            shared(to_C),
+            shared(self.measured),
+            shared(self.target[None], mat34d),
+            shared(self.sensor_wrench),
+            *(shared(setting, wp.vec3d) for setting in self.settings),
+            shared(self.v),
+            shared(self.error, wp.vec3d),
+            shared(self.u, wp.vec3d),
             wp.zeros((n, n), dtype=wp.float64, device=_CPU),
             wp.zeros(n, dtype=wp.float64, device=_CPU),
-            _shared(self._failed, wp.int32),
+            shared(self._failed, wp.int32),
         ]
         # The graphs hold addresses alone.
         self._arrays = inputs
@@ -279,7 +300,7 @@ class ComplianceController(PlainSystem):
         if X_ES is None:
             X_ES = RigidTransform() if chain.X_LE is None else chain.X_LE.inverse()
         # A wrench of Drake's has the moment first, here the force is.
-        self._wrench_C_from_S = np.roll(wrench_shift(X_EC.InvertAndCompose(X_ES)), 3, axis=0)
+        to_C = np.roll(wrench_shift(X_EC.InvertAndCompose(X_ES)), 3, axis=0)
 
         size = len(chain.joints)
         wrench = Value(SpatialForce.Zero())
@@ -304,7 +325,7 @@ class ComplianceController(PlainSystem):
         self._room = declare_cached(
             self,
             "room for an update",
-            lambda context: ComplianceUpdate(config, chain, R_EC),
+            lambda context: ComplianceUpdate(config, chain, R_EC, self._X_BW, to_C),
             {self.nothing_ticket()},
         )
         # The room with the settings in it. A policy changes them far less often than the controller
@@ -347,13 +368,12 @@ class ComplianceController(PlainSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         room: ComplianceUpdate = self._settings.Eval(context)
         if self._config.mode != "force":
-            target = self._target_pose.Eval(context).GetAsMatrix4()
-            self._X_BW.dot(target, out=room.target)
+            room.target[:] = self._target_pose.Eval(context).GetAsMatrix34()
         if self._config.mode != "motion":
-            room.sensor_wrench[:] = 0.0
-            if self._sensor_wrench.HasValue(context):
-                wrench = self._sensor_wrench.Eval(context).get_coeffs()
-                self._wrench_C_from_S.dot(wrench, out=room.sensor_wrench.reshape(6))
+            has_sensor = self._sensor_wrench.HasValue(context)
+            room.sensor_wrench[:] = (
+                self._sensor_wrench.Eval(context).get_coeffs() if has_sensor else 0.0
+            )
         room.measured[:] = self._joint_positions.Eval(context)
         # They hold the state.
         positions = discrete_state.get_mutable_value(self._positions_state)
@@ -393,8 +413,3 @@ class ComplianceController(PlainSystem):
         room: ComplianceUpdate = self._room.Eval(context)
         room.q[:] = context.get_discrete_state(self._positions_state).value()
         return self._X_WB @ RigidTransform(room.place())
-
-
-def _shared(values: np.ndarray, dtype: Any = wp.float64) -> wp.array:
-    """A Warp array in the memory of a NumPy array."""
-    return wp.array(values, dtype=dtype, device=_CPU, copy=False)

@@ -8,9 +8,10 @@ B if nothing else is said. Pairs of vectors have the translational one first. Ar
 
 import warp as wp
 
+from sliceit_drake.cutting.kernels.types import mat34d, origin_of, rotation_of
 from sliceit_drake.cutting.warp_start import CPU_FLAGS
 
-__all__ = ["MODES", "mat34d", "place_arm", "update_arm"]
+__all__ = ["MODES", "place_arm", "update_arm"]
 
 wp.set_module_options({"cpu_compiler_flags": CPU_FLAGS})
 
@@ -29,7 +30,6 @@ Vectors = wp.array(dtype=wp.vec3d)
 Rotations = wp.array(dtype=wp.mat33d)
 Matrix = wp.array2d(dtype=wp.float64)
 
-mat34d = wp.types.matrix((3, 4), wp.float64)
 """Three rows of a rigid transform, in doubles."""
 
 # A pose error is limited to this length [m] and to this angle [rad].
@@ -182,9 +182,11 @@ def update_arm(
     threshold: wp.float64,
     hand_frame_control: wp.bool,
     R_EC: wp.mat33d,
+    X_BA: mat34d,
+    to_C: Matrix,
     measured: Numbers,
     target: wp.array(dtype=mat34d),
-    sensor_wrench: Vectors,
+    sensor_wrench: Numbers,
     stiffness: Vectors,
     selection: Vectors,
     proportional: Vectors,
@@ -202,11 +204,9 @@ def update_arm(
     It stops where the acceleration is not finite, with that step's q and u.
     """
     n = q.shape[0]
-    X = target[0]
-    R_target = wp.mat33d(
-        X[0, 0], X[0, 1], X[0, 2], X[1, 0], X[1, 1], X[1, 2], X[2, 0], X[2, 1], X[2, 2]
-    )
-    p_target = wp.vec3d(X[0, 3], X[1, 3], X[2, 3])
+    R_BA = rotation_of(X_BA)
+    R_target = R_BA * rotation_of(target[0])
+    p_target = R_BA * origin_of(target[0]) + origin_of(X_BA)
     failed[0] = 0
     # The first error is that of the pose which the model reached in the last update, although
     # everything else is taken at the measured joints, as in the reference implementation.
@@ -231,7 +231,11 @@ def update_arm(
             f_target = target_wrench[row]
             if hand_frame_control:
                 f_target = R_BE * f_target
-            f = R_BC * sensor_wrench[row] + f_target
+            sensed = wp.vec3d()
+            for c in range(3):
+                for k in range(6):
+                    sensed[c] += to_C[3 * row + c, k] * sensor_wrench[k]
+            f = R_BC * sensed + f_target
             spring = R_BC * wp.cw_mul(stiffness[row], wp.transpose(R_BC) * pose_error)
             e = spring + f
             if mode == MOTION:

@@ -24,6 +24,7 @@ from sliceit_drake.cutting.simulate import (
     check_in_plane,
 )
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
+from sliceit_drake.cutting.stepping import Frame
 from sliceit_drake.systems.cut_report import Columns, FoodBodyFrame
 from sliceit_drake.systems.declare import declare_output
 from sliceit_drake.systems.food_look import OTHER, FoodLook, FoodScene
@@ -63,7 +64,7 @@ INDEXED = 5e-4
 """Distance of the blade from the next cut plane at which the knife counts as indexed, metres."""
 
 
-COUPLED_EVENT = 0.05
+COUPLED_EVENT = 0.1
 """`stepping.EVENT` of a food that a robot cuts: the blade hangs on an arm that gives, and swings
 sideways where it turns round at the board (docs/results/stepping.md)."""
 
@@ -110,23 +111,23 @@ class CuttingSystem(KnifeForceSystem):
         in_sequence: bool = False,
         look: FoodLook = OTHER,
     ) -> None:
-        further = np.zeros(_SPENT_BEFORE + 1 - KEPT)
+        # Behind the rest, how far each branch of `effects.resting` has come.
+        branches = max(len(s.model.effects.resting.shares) for s in solvers)
+        further = np.zeros(_SPENT_BEFORE + 1 - KEPT + branches)
         further[_ENERGY.start - KEPT : _ENERGY.stop - KEPT] = NO_ENERGY
         super().__init__(solvers[0].exchange_period, further)
         self.solvers = tuple(solvers)
         self.surfaces = tuple(food_surface(s.model) for s in solvers)
-        self._in_sequence, self._look = in_sequence, look
+        self._in_sequence, self._look, self._branches = in_sequence, look, branches
         self.food_poses = (
             (X_WF,) * len(solvers) if isinstance(X_WF, RigidTransform) else tuple(X_WF)
         )
-        self._R_CW, self._origin, self._X_WC = [], [], []
+        self._frames, self._X_WC = [], []
         for solver, X in zip(self.solvers, self.food_poses, strict=True):
             R_WC = X.rotation().matrix() @ solver.model.X_FC_rotation
             p_WC = X.multiply(solver.model.X_FC_position)
-            self._R_CW.append(R_WC.T)
-            # Of W in C, as the last column of a pose.
-            self._origin.append(np.column_stack([np.zeros((3, 3)), R_WC.T @ p_WC]))
             self._X_WC.append(RigidTransform(RotationMatrix(R_WC), p_WC))
+            self._frames.append(Frame(self._X_WC[-1].inverse().GetAsMatrix34(), R_WC))
         self._check_every = max(1, round(check_period / self.exchange_period))
         size = max(s.state_size for s in self.solvers)
         food = self.DeclareDiscreteState(self._padded(self.solvers[0].initial_state(), size))
@@ -158,7 +159,8 @@ class CuttingSystem(KnifeForceSystem):
     def state_columns(self) -> list[str]:
         recorded = self.recorded()
         further = [column for name in _PARTS for column in recorded[name]]
-        return [*super().state_columns(), *further, "_spent_before"]
+        faded = [f"_faded_{k}" for k in range(self._branches)]
+        return [*super().state_columns(), *further, "_spent_before", *faded]
 
     def _middle_model(self) -> CuttingModel:
         """The cut; of a sequence, its middle slice, which stands for all."""
@@ -293,9 +295,9 @@ class CuttingSystem(KnifeForceSystem):
 
     def _in_cut_frame(self, index: int, X_WK: np.ndarray) -> Pose:
         """X_CK from X_WK [3, 4]."""
-        X_CK = self._R_CW[index].dot(X_WK)
-        X_CK -= self._origin[index]
-        return Pose(X_CK[:, :3], X_CK[:, 3])
+        X_CW = self._frames[index].X_CA
+        X_CK = X_CW[:, :3].dot(X_WK)
+        return Pose(X_CK[:, :3], X_CK[:, 3] + X_CW[:, 3])
 
     def _index_to_cut(self, context: Context, index: int, X_WK: np.ndarray) -> int:
         """The food of a sequence that is cut now: this, or the next if the knife is there now.
@@ -354,33 +356,40 @@ class CuttingSystem(KnifeForceSystem):
             food[:] = solver.initial_state()
             kept[_FOOD_INDEX], kept[_ENERGY] = index, NO_ENERGY
             kept[_SPENT_BEFORE] = kept[_SPENT].sum()
-        R_CW = self._R_CW[index]
-        X_CK = R_CW @ np.array([kept[LAST_POSE].reshape(3, 4), now])
-        X_CK -= self._origin[index]
-        R, p = X_CK[:, :, :3], X_CK[:, :, 3]
-        pose = Pose(R[1], p[1])
+            kept[_SPENT_BEFORE + 1 :] = 0.0
+        last = kept[LAST_POSE].reshape(3, 4)
+        plan = solver.plan(food, last, now, self._frames[index])
+        pose = Pose(plan.R[0, 1], plan.p[0, 1])
         if self._in_sequence and self._is_beside(context, pose):
             kept[_COMPONENTS] = 0.0
             return np.zeros(6), self.progress(context)
         check_in_plane(solver.model, pose, time)
         try:
-            step = solver.move(food, R, p)
+            step = solver.move(food, plan)
         except CuttingError as error:
             raise CuttingError(f"at {time:.4g} s {error}") from error
         food[:] = step.state
-        kept[_COMPONENTS] = step.wrenches[-1, :, 3:].dot(R_CW).ravel()
+        wrench, parts, effects = step.wrench, step.wrenches, solver.model.effects
+        if effects.changes_force:
+            faded = kept[_SPENT_BEFORE + 1 :][: len(effects.resting.shares)]
+            speed = np.linalg.norm(now[None, :, 3] - last[:, 3], axis=1) / self.exchange_period
+            parts, faded[:] = effects.changed(
+                parts, now[None, :, 0], speed, self.exchange_period, faded
+            )
+            wrench = parts[-1].sum(0)
+        kept[_COMPONENTS].reshape(3, 3)[:] = parts[-1, :, 3:]
         kept[_BALANCE] += step.works
         if round(time / self.exchange_period) % self._check_every == 0:
             energies = solver.energies(step.state, pose)
             spent = float(kept[_SPENT].sum() - kept[_SPENT_BEFORE])
-            ratio = check_energies(energies, spent, solver.model, time, float(step.cut[-1]))
+            ratio = check_energies(energies, spent, solver.model, time, step.progress)
             *_, largest_ratio, least_volume_ratio = kept[_ENERGY].tolist()
             stored = energies.elastic, energies.interface, energies.kinetic
             largest = max(ratio, largest_ratio)
             least = min(energies.least_volume_ratio, least_volume_ratio)
             # In the order of `ENERGY_NAMES`.
             kept[_ENERGY] = [*stored, largest, least]
-        return step.wrench.reshape(2, 3).dot(R_CW).ravel(), float(step.cut[-1])
+        return wrench, step.progress
 
     def _surface_vertices(self, context: Context) -> np.ndarray:
         surface, solver = self.surfaces[self.food_index(context)], self.solver(context)

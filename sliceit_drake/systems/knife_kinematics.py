@@ -81,7 +81,7 @@ class BoardContact(PlainSystem):
 
     def __init__(self, knife_body: BodyIndex, edge_length: float, board_height: float) -> None:
         super().__init__()
-        self._knife_body = knife_body
+        self._knife_body = int(knife_body)
         self._half_length = 0.5 * edge_length
         self._near_height = board_height + NEAR_BOARD
         self._results = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
@@ -101,19 +101,20 @@ class BoardContact(PlainSystem):
         lowest = X_WK[2, 3] - abs(X_WK[2, 0]) * self._half_length
         if lowest >= self._near_height:
             return _NO_WRENCH
-        results, wrench = self._results.Eval(context), np.zeros(6)
+        # Plain numbers, which cost a fraction of arrays of three.
+        results, total = self._results.Eval(context), [0.0] * 6
         ox, oy, oz = X_WK[:, 3].tolist()
         for i in range(results.num_point_pair_contacts()):
             info = results.point_pair_contact_info(i)
-            # contact_force acts on body B of the pair.
-            if info.bodyB_index() == self._knife_body:
-                fx, fy, fz = info.contact_force().tolist()
-            elif info.bodyA_index() == self._knife_body:
-                fx, fy, fz = (-info.contact_force()).tolist()
-            else:
+            fx, fy, fz = info.contact_force().tolist()
+            # It acts on body B of the pair.
+            if int(info.bodyA_index()) == self._knife_body:
+                fx, fy, fz = -fx, -fy, -fz
+            elif int(info.bodyB_index()) != self._knife_body:
                 continue
             x, y, z = info.contact_point().tolist()
             x, y, z = x - ox, y - oy, z - oz
             # By hand, a tenth of the time of `np.cross`.
-            wrench += [y * fz - z * fy, z * fx - x * fz, x * fy - y * fx, fx, fy, fz]
-        return wrench
+            one = (y * fz - z * fy, z * fx - x * fz, x * fy - y * fx, fx, fy, fz)
+            total = [a + b for a, b in zip(total, one, strict=True)]
+        return np.array(total)

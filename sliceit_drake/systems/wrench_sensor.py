@@ -13,6 +13,7 @@ from pydrake.multibody.tree import WeldJoint
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues
 
 from sliceit_drake.configuration import ConfigurationError, quantity
+from sliceit_drake.cutting.bench_errors import SensorErrors, filter_share
 from sliceit_drake.systems.declare import PlainSystem, declare_output
 
 __all__ = ["WrenchSensor", "WrenchSensorConfig", "wrench_shift"]
@@ -104,6 +105,9 @@ class WrenchSensor(PlainSystem):
     it is set by the discrete update at the beginning of the coupling step's last plant step:
     whatever reads it at the coupling step, in an unrestricted or a discrete update, finds it.
 
+    What `errors` say acts on the wrench before it is filtered and tared; bias and drift are added
+    after taring.
+
     Inputs:
         reaction_forces: The plant's port of that name.
 
@@ -120,6 +124,8 @@ class WrenchSensor(PlainSystem):
         weld: Joint between the arm (parent) and the tool (child).
         exchange_period: Period of the readings, seconds; a multiple of the plant's time step.
         config: The sensor's imperfections.
+        errors: What it shows otherwise, in the knife's axes about Ko.
+        X_SK: Pose of the knife in the sensor's frame.
 
     Raises:
         ConfigurationError: If the periods do not fit, or the plant's ports are sampled.
@@ -131,6 +137,8 @@ class WrenchSensor(PlainSystem):
         weld: WeldJoint,
         exchange_period: float,
         config: WrenchSensorConfig,
+        errors: SensorErrors | None = None,
+        X_SK: RigidTransform | None = None,
     ) -> None:
         super().__init__()
         self._hold = max(1, round(config.sample_period / exchange_period))
@@ -169,6 +177,16 @@ class WrenchSensor(PlainSystem):
         self._walk *= math.sqrt(exchange_period)
         self._is_walking = bool(self._walk.any())
         rate = np.concatenate([config.moment_drift_rate, config.force_drift_rate])
+        # Filters in a row, each of its state.
+        self._late_share, stages = 1.0, 0
+        if errors is not None and errors != SensorErrors():
+            to_sensor = wrench_shift(X_SK or RigidTransform())
+            turned = np.kron(np.eye(2), errors.matrix())
+            self._on_arm = to_sensor @ turned @ np.linalg.inv(to_sensor) @ self._on_arm
+            self._bias = self._bias + to_sensor[:, 3:] @ errors.force_bias
+            rate = rate + to_sensor[:, 3:] @ errors.force_drift_rate
+            self._late_share = filter_share(errors, exchange_period)
+            stages = errors.delay_stages if errors.delay > 0.0 else 0
         self._drift_step = rate * exchange_period
         self._resolution = np.repeat([config.moment_resolution, config.force_resolution], 3)
         self._is_coarse = bool(self._resolution.any())
@@ -183,9 +201,10 @@ class WrenchSensor(PlainSystem):
         on_the_way = round(config.delay / exchange_period, 9)
         self._late_part = on_the_way % 1.0
         self._line = slice(size, size + 6 * (math.ceil(on_the_way) + 1) if on_the_way else size)
-        self._size = self._line.stop
+        self._late = slice(self._line.stop, self._line.stop + 6 * stages)
+        self._size = self._late.stop
         self._is_imperfect = (
-            self._is_noisy or self._is_coarse or self._hold > 1 or self._size > _STATE_SIZE
+            self._is_noisy or self._is_coarse or self._hold > 1 or self._line.stop > _STATE_SIZE
         )
         self._tare_at_start = config.tare_at_start
         turn = 2.0 * math.pi * config.cutoff_frequency * exchange_period
@@ -223,21 +242,32 @@ class WrenchSensor(PlainSystem):
             x[_ZERO] = x[_FILTERED] - self._bias
             x[self._drift] = 0.0
 
+    def zero(self, context: Context) -> np.ndarray:
+        """What is subtracted from each reading: moment and force [6]; of its own context."""
+        return context.get_discrete_state(self._state).value()[_ZERO]
+
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         # The whole list crosses into Python for the one wrench wanted; no port gives less.
         reaction = self._reactions.Eval(context)[self._index].get_coeffs()
         x = discrete_state.get_mutable_value(self._state)
-        total = x[_SUM]
-        total += reaction
-        x[_COUNT] += 1.0
-        if x[_COUNT] == self._steps:
-            self._read(context, x, discrete_state.get_mutable_value(self._reading))
+        count = x[_COUNT] + 1.0
+        if count > 1.0:
+            reaction = reaction + x[_SUM]
+        if count < self._steps:
+            x[_SUM], x[_COUNT] = reaction, count
+            return
+        x[_COUNT] = 0.0
+        self._read(context, x, self._on_arm.dot(reaction), discrete_state)
 
-    def _read(self, context: Context, x: np.ndarray, reading: np.ndarray) -> None:
-        wrench = self._on_arm.dot(x[_SUM])
-        x[: _COUNT + 1] = 0.0
+    def _read(
+        self, context: Context, x: np.ndarray, wrench: np.ndarray, discrete_state: DiscreteValues
+    ) -> None:
+        reading = discrete_state.get_mutable_value(self._reading)
         x[_READINGS] += 1.0
         is_first = x[_READINGS] == 1.0
+        for late in x[self._late].reshape(-1, 6):
+            late += (1.0 if is_first else self._late_share) * (wrench - late)
+            wrench = late
         if is_first:
             x[_ZERO] = wrench * self._tare_at_start - self._bias
         elif self._filter_share < 1.0:

@@ -277,7 +277,8 @@ def as_run(
     toughness, strength = opening_law(springs, opened, run.spring_factor)
     friction = springs.friction_at(run.speed)
     new = with_material(case, toughness=toughness, strength=strength, friction=friction)
-    new = with_contact(new, run.spring_factor, "bond_stiffness")
+    bonds = run.spring_factor * new.numerics.bond_stiffness
+    new = dc.replace(new, numerics=dc.replace(new.numerics, bond_stiffness=bonds))
     return _at_speed(with_contact(new, run.contact_factor), run.speed)
 
 
@@ -343,10 +344,10 @@ def _with_whole_copies(model: CuttingModel) -> CuttingModel:
     return dc.replace(model, stiff_volume=whole, node_volume=node_volume)
 
 
-def with_contact(case: Case, factor: float, name: str = "flank_stiffness") -> Case:
-    """A stiffness of the numerics times a factor."""
-    value = factor * getattr(case.numerics, name)
-    return dc.replace(case, numerics=dc.replace(case.numerics, **{name: value}))
+def with_contact(case: Case, factor: float) -> Case:
+    """The flanks' contact as stiff as it is times a factor."""
+    length = case.numerics.flank_length / factor
+    return dc.replace(case, numerics=dc.replace(case.numerics, flank_length=length))
 
 
 def with_material(case: Case, **values: float) -> Case:
@@ -377,9 +378,9 @@ def refined(case: Case, factor: int) -> Case:
 
 
 def _rescaled(case: Case, ratio: float) -> Case:
-    for name in ("bond_stiffness", "flank_stiffness", "board_stiffness"):
-        case = with_contact(case, ratio, name)
-    return case
+    names = ("bond_stiffness", "board_stiffness")
+    changed = {name: ratio * getattr(case.numerics, name) for name in names}
+    return dc.replace(case, numerics=dc.replace(case.numerics, **changed))
 
 
 def spring_count(cells_along: int, cells_high: int) -> int:

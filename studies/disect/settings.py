@@ -93,7 +93,7 @@ SETTINGS: tuple[tuple[str, str, str], ...] = (
     (
         "contact stiffness",
         "not noted, 1,430 N/m by fit",
-        "`numerics.flank_stiffness`, per area: 1.5e8 Pa/m",
+        "E over `numerics.flank_length`, per area: 1.5e8 Pa/m",
     ),
     (
         "contact damping",

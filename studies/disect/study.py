@@ -366,11 +366,12 @@ def _measured_curves(case: MeasuredFood, reference: Reference) -> MeasuredCurves
     target = dc.replace(profile, force=profile.references["DiSECt"])
     entered = next(f for f in reference.foods if f.name == case.food.name)
     alone = _opening_alone(case, disect.small_strain_moduli(*_moduli(entered)), reference)
+    edge = make_food_model(alone.food, Knife(), alone.numerics).element_size
     tried: list[tuple[float, float, Curve, Curve]] = []
 
     def error(log_stiffness: float) -> float:
         stiffness = float(math.exp(log_stiffness))
-        numerics = dc.replace(alone.numerics, flank_stiffness=stiffness)
+        numerics = dc.replace(alone.numerics, flank_length=edge / stiffness)
         try:
             depth, force, norms = cut(dc.replace(alone, numerics=numerics))
         except CuttingError:

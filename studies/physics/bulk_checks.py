@@ -63,7 +63,7 @@ def _forces(solver: CuttingSolver, x: np.ndarray) -> np.ndarray:
     after = solver.velocities(solver.coupling_step(state, FAR, FAR).state)
     model, momentum = solver.model, np.zeros_like(after)
     # Beside the cut, slivers of elements are heavier than their true mass.
-    momentum[model.moving] = model.inertia.matrix @ after[model.moving]
+    momentum[model.moving] = model.inertia.of_nodes @ after[model.moving]
     return momentum / solver.exchange_period - model.weight
 
 

@@ -72,10 +72,8 @@ def foods() -> list[Food]:
 
 def contact_force(food: Food, stiffness: float = 1.0, refinement: float = 1.0) -> ContactForce:
     """The force of a press at 20 mm/s to the end of `DEPTH`; see `ContactForce`."""
-    default = Numerics(time_step=STEP)
-    coarse = make_food_model(food, Knife(), default)
-    finer = make_food_model(food, Knife(), default, refinement).element_size / coarse.element_size
-    numerics = dc.replace(default, flank_stiffness=stiffness * finer * default.flank_stiffness)
+    numerics = Numerics(time_step=STEP)
+    numerics.flank_length /= stiffness
     model = make_food_model(food, Knife(), numerics, refinement)
     height = model.top - model.bottom
     plan = MotionPlan([ConstantSpeed(distance=DEPTH[1] * height + 5e-4, speed=0.02)])

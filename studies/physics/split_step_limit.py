@@ -51,13 +51,13 @@ def limits(
     """Limits of the `names`: "all" terms, "bulk" alone, or the bulk and one of `TERMS`, s."""
     geometry = make_cut_geometry(mesh, plane, held=np.zeros(len(mesh.vertices), bool))
     every = Numerics(mass_scaling=True)
-    none = dc.replace(every, bond_stiffness=NONE, flank_stiffness=NONE, board_stiffness=NONE)
+    none = dc.replace(every, bond_stiffness=NONE, flank_length=1.0 / NONE, board_stiffness=NONE)
     soft = dc.replace(material, toughness=0.0)
     cases = {
         "all": (every, material),
         "bulk": (none, soft),
         "bond": (dc.replace(none, bond_stiffness=every.bond_stiffness), soft),
-        "flank": (dc.replace(none, flank_stiffness=every.flank_stiffness), soft),
+        "flank": (dc.replace(none, flank_length=every.flank_length), soft),
         "edge": (none, material),
         "board": (dc.replace(none, board_stiffness=every.board_stiffness), soft),
     }

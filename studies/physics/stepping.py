@@ -172,7 +172,7 @@ class StepResult:
 
     @property
     def too_much_inertia(self) -> bool:
-        """Whether a simulation would refuse the kinetic energy."""
+        """Whether the kinetic energy is more than a simulation grants to added inertia."""
         return self.energy_ratio > ENERGY_RATIO_LIMIT
 
 
@@ -509,7 +509,7 @@ def inertia_by_step_table(
             numerics,
             unloading_length=1e-2,
             bond_stiffness=0.01,
-            flank_stiffness=0.01,
+            flank_length=0.1,
             board_stiffness=0.01,
         )
         for name, settings in (("", numerics), (", elements alone", alone)):

@@ -5,6 +5,7 @@ import dataclasses as dc
 from pathlib import Path
 
 from sliceit_drake.configuration import ConfigurationError, did_you_mean, load_yaml, quantity
+from sliceit_drake.cutting.bench_errors import BenchErrors
 from sliceit_drake.cutting.foods.distribution import ParameterDistribution
 from sliceit_drake.cutting.foods.effects import Compliance
 from sliceit_drake.cutting.foods.food import Food
@@ -26,6 +27,7 @@ class CalibratedFood:
         knife: The knife that the records were taken with, as far as known.
         distribution: Joint distribution of the parameters; randomisation draws from it.
         spring: The spring-only baseline from the same records, or null.
+        bench: What the bench of the records does otherwise than is assumed.
         records: Records that it was calibrated on, or the sources of a food without records.
         date, command: When and how it was calibrated.
         note: What it cannot be used for.
@@ -33,10 +35,9 @@ class CalibratedFood:
 
     food: Food = dc.field(default_factory=Food)
     knife: Knife = dc.field(default_factory=Knife)
-    flank_stiffness: float = quantity(4.0, "E/h", low=0.01, high=1e3)
-    """Flank stiffness of the numerics, a parameter of the food as well."""
     distribution: ParameterDistribution = dc.field(default_factory=ParameterDistribution)
     spring: SpringFood | None = None
+    bench: BenchErrors = dc.field(default_factory=BenchErrors)
     rms_error: float | None = quantity(None, "N", low=0.0, high=1e6)
     """On the records."""
     held_out_error: float | None = quantity(None, "N", low=0.0, high=1e6)

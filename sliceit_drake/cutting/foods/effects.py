@@ -4,6 +4,8 @@ Forms and their signatures in measured forces are those of docs/explanation/phys
 """
 
 import dataclasses as dc
+from collections.abc import Mapping
+from typing import Self
 
 import numpy as np
 
@@ -18,7 +20,11 @@ __all__ = [
     "Core",
     "Edge",
     "Effects",
+    "Entry",
+    "Outside",
     "Relaxation",
+    "Resting",
+    "Section",
     "Skin",
     "SlicePush",
     "Slip",
@@ -55,6 +61,11 @@ class Relaxation:
     times: list[float] = dc.field(default_factory=list)
     """Relaxation times, s."""
 
+    def joined(self, branches: Mapping[float, float]) -> Self:
+        """The same with further branches: shares by time, s."""
+        shares = [*self.shares, *branches.values()]
+        return dc.replace(self, shares=shares, times=[*self.times, *branches])
+
     def check(self, where: str) -> None:
         if len(self.shares) != len(self.times):
             raise ConfigurationError(
@@ -77,14 +88,106 @@ class Relaxation:
             )
 
 
+RESTING = 2e-4
+"""Speed below which a knife rests, m/s."""
+
+
+@dc.dataclass
+class Resting(Relaxation):
+    """Force on a knife that rests in the food: around an edge at rest the food flows, where one
+    that moves always meets fresh food.
+
+    Each share of the food's force fades with its time while the knife rests, and comes back over
+    `travel`. A decade apart, branches together follow a power law of time within a few per cent.
+    """
+
+    travel: float = quantity(5e-4, "m", low=1e-6, high=0.1)
+    """Way of the knife over which a force that faded comes back to 1 - 1/e."""
+
+    def faded(
+        self, held: np.ndarray, speed: float, touches: bool, period: float
+    ) -> tuple[np.ndarray, float]:
+        """How far each branch has come [M], and the share of the force that is gone, at the end of
+        a coupling step in which the knife moves at `speed`, m/s; `touches` food or not."""
+        times = np.array(self.times, float)
+        if touches and speed < RESTING:
+            held = 1.0 - (1.0 - held) * np.exp(-period / times)
+        else:
+            held = held * np.exp(-speed * period / self.travel)
+        return held, float(np.array(self.shares) @ held)
+
+
+@dc.dataclass
+class Section:
+    """A section that is wider below, or in the middle, than its shape says: cut points stand for
+    more of it, or less."""
+
+    taper: float = quantity(0.0, "", low=-0.5, high=0.5)
+    """Share by which it is wider at the bottom, and less wide at the top."""
+    belly: float = quantity(0.0, "", low=-0.5, high=0.5)
+    """Twice the share by which it is wider in the middle, and less wide at top and bottom."""
+
+    def width(self, up: np.ndarray) -> np.ndarray:
+        """Factor on the width at heights from -1, the bottom, to 1, the top."""
+        up = np.clip(up, -1.0, 1.0)
+        return np.asarray(1.0 - self.taper * up + self.belly * (0.5 - up**2))
+
+
+@dc.dataclass
+class Outside:
+    """Food that is tougher towards the outside by exp(-distance / thickness): all that parts there,
+    by the edge or ahead of it, where `Skin` is cut by the edge alone."""
+
+    toughness: float = quantity(0.0, "J/m", low=0.0, high=100.0)
+    """Energy per length of outline, more than the food's."""
+    thickness: float = quantity(1e-3, "m", low=5e-5, high=2e-2)
+    """Distance from the outside over which it falls to 1/e."""
+
+
+@dc.dataclass
+class Entry:
+    """Food that is harder to begin to cut: all that parts near the top is tougher, by the edge or
+    ahead of it, where `Bluntness` is of the edge alone and of each place of the outside.
+
+    The excess is that of a blunt edge, and after n slices that of one that has dulled.
+    """
+
+    initiation: float = quantity(0.0, "J/m2", low=0.0, high=1e5)
+    """Excess over R where the edge enters the food."""
+    depth: float = quantity(2e-3, "m", low=1e-4, high=0.05)
+    """Depth over which it falls to 1/e."""
+    dulling: float = quantity(0.0, "J/m2", low=0.0, high=1e5)
+    """Growth of the excess by ten slices."""
+    dulling_depth: float = quantity(2e-3, "m", low=1e-4, high=0.05)
+    """Depth over which that falls to 1/e."""
+    dulling_exponent: float = quantity(1.0, "", low=0.1, high=3.0)
+    """Exponent of the slice number."""
+    slices: int = quantity(0, "", low=0, high=100000)
+    """Slices cut since sharpening; a record that gives them takes the place of this."""
+
+    def excesses(self) -> list[tuple[float, float]]:
+        """Excess at the top, J/m^2, and depth, metres, of each of the two."""
+        grown = self.dulling * (self.slices / 10.0) ** self.dulling_exponent
+        return [(self.initiation, self.depth), (grown, self.dulling_depth)]
+
+
 @dc.dataclass
 class Skin:
-    """A skin around the section, cut on the way in and on the way out."""
+    """A skin around the section, cut on the way in and on the way out.
+
+    It is punctured where the edge presses on it with its `line_load`: a round soft food gives way
+    around the blade until then.
+    """
 
     toughness: float = quantity(0.0, "J/m", low=0.0, high=100.0)
     """Energy per length of skin: its toughness x thickness."""
     thickness: float = quantity(3e-4, "m", low=5e-5, high=5e-3)
-    """Depth over which a level skin is cut."""
+    """Depth of the edge over which a level skin is cut."""
+
+    @property
+    def line_load(self) -> float:
+        """Force per length of edge that punctures it, N/m."""
+        return self.toughness / self.thickness
 
 
 @dc.dataclass
@@ -204,6 +307,8 @@ class SlicePush:
 
     exponent: float = quantity(1.0, "", low=0.5, high=3.0)
     """1 for Atkins' law."""
+    pull: float = quantity(0.0, "", low=-1.0, high=1.0)
+    """Share by which the edge pulls along itself more than xi times the press."""
 
 
 @dc.dataclass
@@ -248,6 +353,10 @@ class Effects:
     edge: Edge = dc.field(default_factory=Edge)
     toughness_rate: ToughnessRate = dc.field(default_factory=ToughnessRate)
     relaxation: Relaxation = dc.field(default_factory=Relaxation)
+    resting: Resting = dc.field(default_factory=Resting)
+    section: Section = dc.field(default_factory=Section)
+    outside: Outside = dc.field(default_factory=Outside)
+    entry: Entry = dc.field(default_factory=Entry)
     skin: Skin = dc.field(default_factory=Skin)
     core: Core = dc.field(default_factory=Core)
     centre: Centre = dc.field(default_factory=Centre)
@@ -264,3 +373,47 @@ class Effects:
                 field=f"{where}.slip.resistance",
                 fix=f"Give {where}.compliance.holder, as 2e-5 m/N.",
             )
+
+    @property
+    def changes_force(self) -> bool:
+        """Whether the force of the cut is changed once more, by `changed`."""
+        return bool(self.slice_push.pull or any(self.resting.shares))
+
+    def of_cut(self) -> "Effects":
+        """Those that act in the cut itself, without what `changed` does to its force."""
+        if not self.changes_force:
+            return self
+        push = dc.replace(self.slice_push, pull=0.0)
+        return dc.replace(self, slice_push=push, resting=Resting())
+
+    def changed(
+        self,
+        parts: np.ndarray,
+        edge: np.ndarray,
+        speed: np.ndarray,
+        period: float,
+        held: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The wrenches of a cut with what changes its force.
+
+        Args:
+            parts: By edge, flank pressure, friction, moment about Ko and force, of coupling steps
+                [N, 3, 6], in any axes.
+            edge: Direction of the edge Kx in these axes [N, 3].
+            speed: Of Ko [N], m/s.
+            period: Of the coupling steps, s.
+            held: How far each branch of `resting` has come before [M]; not at all by default.
+
+        Returns:
+            The wrenches [N, 3, 6], and how far each branch has come [M].
+        """
+        along = np.einsum("nc,nc->n", parts[:, 0, 3:], edge)
+        out = parts.copy()
+        out[:, 0, 3:] += self.slice_push.pull * along[:, None] * edge
+        held = np.zeros(len(self.resting.shares)) if held is None else held
+        if any(self.resting.shares):
+            touches = np.abs(parts[:, :, 3:]).max((1, 2)) > 1e-9
+            for k, (v, touching) in enumerate(zip(speed.tolist(), touches.tolist(), strict=True)):
+                held, gone = self.resting.faded(held, v, touching, period)
+                out[k] -= gone * parts[k]
+        return out, held

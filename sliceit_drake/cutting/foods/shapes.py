@@ -100,7 +100,7 @@ class Cylinder(PlainShape):
     """Length."""
     rings: int = quantity(4, "", low=2, high=40)
     """Rings of elements across the radius."""
-    layers: list[float] = quantity([0.0, 2.8e-3, 6.4e-3, 12e-3], "m", low=0.0, high=0.5)
+    layers: list[float] = quantity([0.0, 6e-3, 9.5e-3, 12e-3], "m", low=0.0, high=0.5)
     """Distances of the element layers from y = 0, on both sides; the rest is one layer, and layers
     beyond the food's end are left out."""
 
@@ -129,7 +129,7 @@ class HalfCylinder(PlainShape):
     """Length."""
     rings: int = quantity(6, "", low=2, high=40)
     """Rings of elements across the radius."""
-    layers: list[float] = quantity([0.0, 2.8e-3, 6.4e-3, 12e-3], "m", low=0.0, high=0.5)
+    layers: list[float] = quantity([0.0, 6e-3, 9.5e-3, 12e-3], "m", low=0.0, high=0.5)
     """Distances of the element layers from y = 0, on both sides; the rest is one layer, and layers
     beyond the food's end are left out."""
 
@@ -157,7 +157,7 @@ class Box(PlainShape):
     """Extent along x, y, z."""
     divisions: list[int] = quantity([8, 8], "", low=1, high=1000, size=2)
     """Elements along x and along z."""
-    layers: list[float] = quantity([0.0, 2.8e-3, 6.4e-3, 12e-3], "m", low=0.0, high=0.5)
+    layers: list[float] = quantity([0.0, 6e-3, 9.5e-3, 12e-3], "m", low=0.0, high=0.5)
     """Distances of the element layers from y = 0, on both sides; the rest is one layer, and layers
     beyond the food's end are left out."""
 
@@ -232,7 +232,7 @@ class Tapered(_Body):
     """Length."""
     rings: int = quantity(4, "", low=2, high=40)
     """Rings of elements across the radius."""
-    layers: list[float] = quantity([0.0, 2.8e-3, 6.4e-3, 12e-3], "m", low=0.0, high=0.5)
+    layers: list[float] = quantity([0.0, 6e-3, 9.5e-3, 12e-3], "m", low=0.0, high=0.5)
     """Distances of the element layers from y = 0, on both sides; the rest is one layer, and layers
     beyond the food's end are left out."""
 

@@ -8,10 +8,13 @@ from typing import Any
 
 import warp as wp
 
-from sliceit_drake.cutting.kernels.layouts import Balance, BladeSum, PointSum
-from sliceit_drake.cutting.kernels.types import LANES, kernel_types
+from sliceit_drake.cutting.kernels.layouts import Balance, BladeSum, Planned, PointSum
+from sliceit_drake.cutting.kernels.types import LANES, kernel_types, mat34d, origin_of, rotation_of
 
 __all__ = ["coupling_kernels"]
+
+LEAST_BURIED = 1e-8
+"""Area of buried flanks up to which the moment of a blade that rings fades in, m^2."""
 
 
 def coupling_kernels(real: Any, module: str) -> types.SimpleNamespace:
@@ -20,6 +23,7 @@ def coupling_kernels(real: Any, module: str) -> types.SimpleNamespace:
     vec3, mat33, vec3d, float64 = t.vec3, t.mat33, wp.vec3d, wp.float64
     Motion, Sums, Results = t.Motion, t.Sums, t.Results
     State, Parameters = t.State, t.Parameters
+    LEAST_AREA = wp.constant(float64(LEAST_BURIED))
 
     @wp.func
     def to_real(a: vec3d):
@@ -33,6 +37,12 @@ def coupling_kernels(real: Any, module: str) -> types.SimpleNamespace:
         twice = vec3d(turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1])
         v = (motion.p[cut, e + 1] - motion.p[cut, e]) / motion.period
         return v, twice * (float64(0.5) / motion.period)
+
+    @wp.func
+    def micro(v: vec3d):
+        """Rounded to 1e-6."""
+        scale = float64(1.0e6)
+        return vec3d(wp.rint(scale * v[0]), wp.rint(scale * v[1]), wp.rint(scale * v[2])) / scale
 
     @wp.kernel(enable_backward=False, module=module)
     def move_knife(motion: Motion):
@@ -58,6 +68,85 @@ def coupling_kernels(real: Any, module: str) -> types.SimpleNamespace:
         motion.v_CK[cut, k] = to_real(v)
         motion.w_CK[cut, k] = to_real(w)
 
+    @wp.func
+    def larger(a: vec3d, b: vec3d):
+        return wp.max(wp.length(a), wp.length(b))
+
+    @wp.kernel(enable_backward=False, module=module)
+    def plan_steps(
+        limits: wp.array(dtype=float64),
+        rule: wp.array(dtype=float64),
+        X_CA: wp.array(dtype=mat34d),
+        X_AK: wp.array(dtype=mat34d),
+        stepping: wp.array(dtype=float64),
+        R: wp.array(dtype=wp.mat33d),
+        p: wp.array(dtype=vec3d),
+        numbers: wp.array(dtype=wp.int32),
+        after: wp.array2d(dtype=float64),
+    ):
+        """Poses of the knife in C, and sub-steps of the coupling steps between them, in one thread.
+
+        See `Stepping`; `limits` are travel, change, settling way, settling time, most sub-steps,
+        slack, calm; `rule` is half the span, top, coarsest number, by need, period.
+        """
+        R_CA, p_CA = rotation_of(X_CA[0]), origin_of(X_CA[0])
+        for k in range(R.shape[0]):
+            R[k] = R_CA * rotation_of(X_AK[k])
+            p[k] = R_CA * origin_of(X_AK[k]) + p_CA
+        half_span, period = rule[0], rule[4]
+        before = vec3d(stepping[0], stepping[1], stepping[2])
+        behind = vec3d(stepping[3], stepping[4], stepping[5])
+        last, calm = stepping[Planned.SUB_STEP], float64(stepping[Planned.CALM])
+        coarsest = wp.int32(rule[2])
+        number = coarsest
+        if last > float64(0.0):
+            doubled = wp.int32(wp.rint(wp.log2(period / last / rule[2])))
+            for _k in range(doubled):
+                number = number * 2
+        for k in range(numbers.shape[0]):
+            x0 = half_span * vec3d(R[k][0, 0], R[k][1, 0], R[k][2, 0])
+            x1 = half_span * vec3d(R[k + 1][0, 0], R[k + 1][1, 0], R[k + 1][2, 0])
+            v0 = ((p[k + 1] - x1) - (p[k] - x0)) / period
+            v1 = ((p[k + 1] + x1) - (p[k] + x0)) / period
+            speed = larger(v0, v1)
+            # What nothing touches is at rest.
+            in_air = wp.min(p[k][2], p[k + 1][2]) > rule[1]
+            if in_air:
+                before = vec3d()
+                behind = vec3d()
+            # Rounded, so that it is the same whether a state in single precision came between.
+            off0 = v0 - micro(before)
+            off1 = v1 - micro(behind)
+            change = larger(off0, off1)
+            way, unsettled = float64(0.0), float64(0.0)
+            if rule[3] != float64(0.0) and not in_air:
+                way, unsettled = period * speed / limits[0], period * wp.sqrt(change / limits[1])
+            least = wp.min(wp.max(way, unsettled), limits[4])
+            longer = float64(2.0) * wp.max(way, unsettled / limits[5])
+            calm += float64(1.0)
+            if number == coarsest or longer >= float64(number):
+                calm = float64(0.0)
+            if calm > limits[6]:
+                number = number / 2
+                calm = float64(0.0)
+            while float64(number) < least:
+                number = number * 2
+            keep = wp.exp(-speed * period / limits[2] - period / limits[3])
+            before = v0 - keep * off0
+            behind = v1 - keep * off1
+            numbers[k] = number
+            for c in range(3):
+                after[k, c] = before[c]
+                after[k, 3 + c] = behind[c]
+            after[k, Planned.SUB_STEP] = period / float64(number)
+            after[k, Planned.CALM] = calm
+
+    @wp.kernel(enable_backward=False, module=module)
+    def count(loop: wp.int32, left: wp.array(dtype=wp.int32), done: wp.array(dtype=wp.int32)):
+        """Counts a round of a loop, over sub-steps or over coupling steps."""
+        left[loop] -= 1
+        done[loop] += 1
+
     @wp.kernel(enable_backward=False, module=module)
     def add_points(sums: Sums, results: Results):
         """Sums over the cut points, a thread for each column."""
@@ -73,8 +162,8 @@ def coupling_kernels(real: Any, module: str) -> types.SimpleNamespace:
         """Mean wrenches on the knife in each coupling step, moment about Ko and force, and its
         work.
 
-        By edge, flank pressure with the blade's bending, friction. Moments are about Ko at each
-        sub-step; its mean position is half a period back.
+        By edge, flank pressure with the blade's bending, friction, in the axes of A. Moments are
+        about Ko at each sub-step; its mean position is half a period back.
         """
         cut, e = wp.tid()
         n = float64(motion.substeps)
@@ -86,25 +175,26 @@ def coupling_kernels(real: Any, module: str) -> types.SimpleNamespace:
         on_knife = results.blade[cut, e, BladeSum.ON_KNIFE]
         push = (on_knife - results.blade[cut, e, BladeSum.ON_BLADE]) / n
         lateral = push * vec3d(end[0, 1], end[1, 1], end[2, 1])
-        area = results.point_sums[cut, e, PointSum.BURIED_AREA]
-        moment = vec3d()
-        if area > float64(0.0):
-            middle = vec3d()
-            for c in range(3):
-                middle[c] = results.point_sums[cut, e, PointSum.BURIED_MOMENT + c]
-            moment = wp.cross(middle / area, lateral)
+        area = wp.max(results.point_sums[cut, e, PointSum.BURIED_AREA], LEAST_AREA)
+        middle = vec3d()
+        for c in range(3):
+            middle[c] = results.point_sums[cut, e, PointSum.BURIED_MOMENT + c]
+        moment = wp.cross(middle / area, lateral)
         v, w = rates(motion, cut, e)
         power = float64(0.0)
         for m in range(3):
+            M, F = vec3d(), vec3d()
             for c in range(3):
-                M = results.point_sums[cut, e, PointSum.MOMENTS + 3 * m + c] / n
-                F = results.point_sums[cut, e, PointSum.FORCES + 3 * m + c] / n
+                M[c] = results.point_sums[cut, e, PointSum.MOMENTS + 3 * m + c] / n
+                F[c] = results.point_sums[cut, e, PointSum.FORCES + 3 * m + c] / n
                 if m == 1:
-                    M += moment[c]
-                    F += lateral[c]
-                results.wrenches[cut, e, m, c] = M
-                results.wrenches[cut, e, m, 3 + c] = F
-                power += F * v[c] + M * w[c]
+                    M[c] += moment[c]
+                    F[c] += lateral[c]
+                power += F[c] * v[c] + M[c] * w[c]
+            M, F = motion.R_AC[cut] * M, motion.R_AC[cut] * F
+            for c in range(3):
+                results.wrenches[cut, e, m, c] = M[c]
+                results.wrenches[cut, e, m, 3 + c] = F[c]
         for c in range(6):
             total = results.wrenches[cut, e, 0, c] + results.wrenches[cut, e, 1, c]
             results.wrench[cut, e, c] = total + results.wrenches[cut, e, 2, c]
@@ -157,6 +247,8 @@ def coupling_kernels(real: Any, module: str) -> types.SimpleNamespace:
 
     return types.SimpleNamespace(
         move_knife=move_knife,
+        plan_steps=plan_steps,
+        count=count,
         add_points=add_points,
         knife_wrenches=knife_wrenches,
         weigh=weigh,

@@ -10,7 +10,7 @@ from typing import Any
 import warp as wp
 
 from sliceit_drake.cutting.kernels.lanes import lane_functions
-from sliceit_drake.cutting.kernels.types import CORNERS, STRIP, Scalar, kernel_types
+from sliceit_drake.cutting.kernels.types import CORNERS, LANES, STRIP, Scalar, kernel_types
 
 __all__ = ["element_kernels"]
 
@@ -129,27 +129,30 @@ def element_kernels(real: Any, module: str, gradients: bool) -> types.SimpleName
     @wp.kernel(enable_backward=False, module=module)
     def element_energy(state: State, mesh: Mesh, parameters: Parameters, energies: Energies):
         """Elastic energy and volume ratio J of each element."""
-        cut, block, e, lane = wp.tid()
+        cut, block = wp.tid()
         mu = parameters.P[cut, Scalar.MU]
         lam = parameters.P[cut, Scalar.LAM]
-        o = state.x[cut, mesh.nodes[block, e][lane]]
-        a = state.x[cut, mesh.nodes[block, e + 1][lane]] - o
-        b = state.x[cut, mesh.nodes[block, e + 2][lane]] - o
-        c = state.x[cut, mesh.nodes[block, e + 3][lane]] - o
-        M = mat33()
-        for k in range(9):
-            M[k // 3, k % 3] = mesh.shape[block, 9 * e + k][lane]
-        F = wp.matrix_from_cols(a, b, c) * M
-        Ic = wp.ddot(F, F)
-        J = wp.determinant(F)
         alpha = real(1.0) + real(0.75) * mu / lam
-        psi = real(0.5) * (
-            mu * (Ic - real(3.0))
-            + lam * ((J - alpha) * (J - alpha) - (real(1.0) - alpha) * (real(1.0) - alpha))
-            - mu * wp.log(real(0.25) * (Ic + real(1.0)))
-        )
-        energies.elastic[cut, block, e, lane] = parameters.stiff_volume[cut, block, e][lane] * psi
-        energies.volume_ratio[cut, block, e, lane] = J
+        for i in range(LANES * STRIP):
+            e, lane = i / LANES, i % LANES
+            o = state.x[cut, mesh.nodes[block, e][lane]]
+            a = state.x[cut, mesh.nodes[block, e + 1][lane]] - o
+            b = state.x[cut, mesh.nodes[block, e + 2][lane]] - o
+            c = state.x[cut, mesh.nodes[block, e + 3][lane]] - o
+            M = mat33()
+            for k in range(9):
+                M[k // 3, k % 3] = mesh.shape[block, 9 * e + k][lane]
+            F = wp.matrix_from_cols(a, b, c) * M
+            Ic = wp.ddot(F, F)
+            J = wp.determinant(F)
+            psi = real(0.5) * (
+                mu * (Ic - real(3.0))
+                + lam * ((J - alpha) * (J - alpha) - (real(1.0) - alpha) * (real(1.0) - alpha))
+                - mu * wp.log(real(0.25) * (Ic + real(1.0)))
+            )
+            volume = parameters.stiff_volume[cut, block, e][lane]
+            energies.elastic[cut, block, e, lane] = volume * psi
+            energies.volume_ratio[cut, block, e, lane] = J
 
     out = types.SimpleNamespace(
         elements=elements, look_ahead=look_ahead, element_energy=element_energy

@@ -10,11 +10,13 @@ __all__ = [
     "BLADE_SUMS",
     "FRONT",
     "KNIFE",
+    "PLANNED",
     "POINT_SUMS",
     "POINT_TOTALS",
     "Balance",
     "BladeSum",
     "Front",
+    "Planned",
     "PointSum",
     "PointTotal",
     "Section",
@@ -101,6 +103,11 @@ the velocity along Kx at which food that nothing holds slides, m/s, filtered and
 work that the edge owes for the area that it has cut, J, and by what fraction its force is
 raised."""
 
+PLANNED = np.dtype([("before", "f8", 3), ("behind", "f8", 3), ("sub_step", "f8"), ("calm", "f8")])
+"""What a state holds of its sub-steps: the velocities of the edge's two points that the food has
+settled to, in C, m/s; its last sub-step, s, or 0; coupling steps in which it could have been twice
+as long."""
+
 
 def results(coupling_steps: int) -> np.dtype:
     """Results of one cut over E coupling steps: sums and wrenches of each, the area that is cut at
@@ -129,6 +136,7 @@ def _places(name: str, layout: np.dtype) -> Any:
 Section = _places("Section", KNIFE)
 PointTotal = _places("PointTotal", POINT_TOTALS)
 Front = _places("Front", FRONT)
+Planned = _places("Planned", PLANNED)
 PointSum = _places("PointSum", POINT_SUMS)
 BladeSum = _places("BladeSum", BLADE_SUMS)
 Balance = _places("Balance", BALANCE)

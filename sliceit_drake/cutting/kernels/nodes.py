@@ -5,6 +5,7 @@ from typing import Any
 
 import warp as wp
 
+from sliceit_drake.cutting.inertia import WIDTH
 from sliceit_drake.cutting.kernels.lanes import lane_functions
 from sliceit_drake.cutting.kernels.layouts import BladeSum, Front, PointTotal
 from sliceit_drake.cutting.kernels.types import LANES, Scalar, kernel_types
@@ -13,10 +14,6 @@ __all__ = ["node_kernels"]
 
 LEAST_SPREAD = 5e-4
 """Half width below which the food at the front of a cut counts as level, metres."""
-DRIFT_LENGTH = 5e-4
-"""Travel of the edge over which the drift of unheld food is filtered, metres."""
-DRIFT_LEAD = 1e-3
-"""Time by which the drift is led, s: without it, food that slides swings in the filter."""
 
 
 def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespace:
@@ -29,28 +26,30 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
     real_name = "float" if real is wp.float32 else "double"
     LEAST_WIDTH, LEAST_FORCE = wp.constant(real(1.0e-6)), wp.constant(real(1.0e-9))
     LEVER = wp.constant(real(LEAST_SPREAD**2))
-    DRIFT, LEAD = wp.constant(real(DRIFT_LENGTH)), wp.constant(real(DRIFT_LEAD))
+    Motion = t.Motion
 
-    @wp.func
-    def gather_elements(cut: wp.int32, i: wp.int32, mesh: Mesh, forces: Forces):
+    @wp.func_native(
+        f"""
+        typedef {real_name} Real;
+        const int *start = mesh.element_start.data, *at = (const int*)mesh.element_entry.data;
+        const Real* F = (const Real*)((const char*)forces.rows.data + cut * forces.rows.strides[0]);
+        Real x = 0, y = 0, z = 0;
+        for (int e = 4 * start[i]; e < 4 * start[i + 1]; e += 4) {{
+            const Real *a = F + at[e], *b = F + at[e + 1], *c = F + at[e + 2], *d = F + at[e + 3];
+            x += (a[0] + b[0]) + (c[0] + d[0]);
+            y += (a[{LANES}] + b[{LANES}]) + (c[{LANES}] + d[{LANES}]);
+            z += (a[{2 * LANES}] + b[{2 * LANES}]) + (c[{2 * LANES}] + d[{2 * LANES}]);
+        }}
+        return {{x, y, z}};
+        """
+    )
+    def gather_elements(cut: wp.int32, i: wp.int32, mesh: Mesh, forces: Forces) -> vec3:
         """Sum of the element forces on node i.
 
         Row k of `forces.rows` begins at the k-th number of the elements' forces. Entries come in
         fours, filled up with a row of zeros.
         """
-        fx = real(0.0)
-        fy = real(0.0)
-        fz = real(0.0)
-        for e in range(mesh.element_start[i], mesh.element_start[i + 1]):
-            four = mesh.element_entry[e]
-            a = forces.rows[cut, forwards(four[0])]
-            b = forces.rows[cut, forwards(four[1])]
-            c = forces.rows[cut, forwards(four[2])]
-            d = forces.rows[cut, forwards(four[3])]
-            fx += (a[0] + b[0]) + (c[0] + d[0])
-            fy += (a[LANES] + b[LANES]) + (c[LANES] + d[LANES])
-            fz += (a[2 * LANES] + b[2 * LANES]) + (c[2 * LANES] + d[2 * LANES])
-        return vec3(fx, fy, fz)
+        ...
 
     @wp.func
     def gather_points(cut: wp.int32, i: wp.int32, mesh: Mesh, forces: Forces):
@@ -59,24 +58,6 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         for e in range(mesh.point_start[i], mesh.point_start[i + 1]):
             a = forces.point_rows[cut, forwards(mesh.point_entry[e])]
             f += vec3(a[0], a[LANES], a[2 * LANES]) * mesh.point_weight[e]
-        return f
-
-    @wp.func
-    def relax(
-        cut: wp.int32, i: wp.int32, force: vec3, parameters: Parameters, now: State, after: State
-    ):
-        """Force of the bulk on node i after relaxation, from that of the instantaneous moduli.
-
-        Each Maxwell branch carries its fraction of the force less what has relaxed: `overstress`,
-        the force filtered with the branch's time."""
-        f = force
-        for m in range(parameters.relaxing.shape[1]):
-            overstress = (
-                parameters.keep[cut, m] * now.overstress[cut, m, i]
-                + (real(1.0) - parameters.keep[cut, m]) * force
-            )
-            after.overstress[cut, m, i] = overstress
-            f = f - parameters.relaxing[cut, m] * overstress
         return f
 
     @wp.func
@@ -117,6 +98,38 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
             sums.board_loss[cut, i] += loss
         return force
 
+    @wp.func
+    def load(
+        cut: wp.int32,
+        entry: wp.int32,
+        elements: vec3,
+        points: vec3,
+        dt: real,
+        mesh: Mesh,
+        parameters: Parameters,
+        now: State,
+        after: State,
+        forces: Forces,
+        sums: Sums,
+    ):
+        """Forces on a moving node, from those of elements, by instantaneous moduli, and cut points.
+
+        Each Maxwell branch carries its fraction of the elements' less what has relaxed:
+        `overstress`, the force filtered with the branch's time."""
+        i = forwards(mesh.moving[entry])
+        internal = elements
+        for m in range(parameters.relaxing.shape[1]):
+            overstress = (
+                parameters.keep[cut, m] * now.overstress[cut, m, i]
+                + (real(1.0) - parameters.keep[cut, m]) * elements
+            )
+            after.overstress[cut, m, i] = overstress
+            internal = internal - parameters.relaxing[cut, m] * overstress
+        external = parameters.weight[cut, i] + points
+        external += on_board(cut, i, dt, mesh, parameters, now, after, sums)
+        forces.from_bulk[cut, i] = internal
+        forces.resultant[cut, entry] = padded(internal + external)
+
     @wp.kernel(enable_backward=False, module=module)
     def load_nodes(
         dt: real,
@@ -132,12 +145,9 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         end = wp.min((chunk + 1) * per_thread, mesh.moving.shape[0])
         for entry in range(chunk * per_thread, end):
             i = forwards(mesh.moving[entry])
-            force = gather_elements(cut, i, mesh, forces)
-            internal = relax(cut, i, force, parameters, state, state)
-            external = parameters.weight[cut, i] + gather_points(cut, i, mesh, forces)
-            external += on_board(cut, i, dt, mesh, parameters, state, state, sums)
-            forces.from_bulk[cut, i] = internal
-            forces.resultant[cut, entry] = padded(internal + external)
+            elements = gather_elements(cut, i, mesh, forces)
+            points = gather_points(cut, i, mesh, forces)
+            load(cut, entry, elements, points, dt, mesh, parameters, state, state, forces, sums)
 
     # By hand: in Warp's own language its four sums do not become vectors, and take twice as long.
     @wp.func_native(
@@ -149,7 +159,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         const Real* D = (const Real*)((const char*)scale.data + cut * scale.strides[0]);
         const Real* B = (const Real*)((const char*)b.data + cut * b.strides[0]);
         Real* Y = (Real*)((char*)y.data + cut * y.strides[0]);
-        const int count = y.shape[1];
+        const int count = backwards ? scale.shape[1] : y.shape[1];
         for (int k = 0; k < count; ++k) {{
             const int row = backwards ? count - 1 - k : k;
             const Real factor = backwards ? D[row] : Real(1);
@@ -180,6 +190,37 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         y: wp.array2d(dtype=vec4),
     ): ...
 
+    # Sums of as many as a vector holds, by component.
+    @wp.func_native(
+        f"""
+        typedef {real_name} Real;
+        const int count = S.last.shape[1], before = y.shape[1] - count;
+        const int stride = S.inverse.shape[1] / count;
+        const Real* W = (const Real*)((const char*)S.inverse.data + cut * S.inverse.strides[0]);
+        Real* B = (Real*)((char*)S.last.data + cut * S.last.strides[0]);
+        Real* Y = (Real*)((char*)y.data + cut * y.strides[0]) + 4 * before;
+        for (int k = 0; k < 4 * count; ++k) B[k] = Y[k];
+        for (int i = 0; i < count; i += {WIDTH}) {{
+            Real s0[{WIDTH}] = {{0}}, s1[{WIDTH}] = {{0}}, s2[{WIDTH}] = {{0}};
+            for (int j = 0; j < count; ++j) {{
+                const Real* w = W + j * stride + i;
+                for (int c = 0; c < {WIDTH}; ++c) s0[c] += w[c] * B[4 * j];
+                for (int c = 0; c < {WIDTH}; ++c) s1[c] += w[c] * B[4 * j + 1];
+                for (int c = 0; c < {WIDTH}; ++c) s2[c] += w[c] * B[4 * j + 2];
+            }}
+            const int rows = count - i < {WIDTH} ? count - i : {WIDTH};
+            for (int c = 0; c < rows; ++c) {{
+                Y[4 * (i + c)] = s0[c];
+                Y[4 * (i + c) + 1] = s1[c];
+                Y[4 * (i + c) + 2] = s2[c];
+            }}
+        }}
+        """
+    )
+    def multiply_last(cut: wp.int32, S: Inertia, y: wp.array2d(dtype=vec4)):
+        """Multiplies the last rows of y with their inverse, which is symmetric."""
+        ...
+
     # Sums of four, which become vectors.
     @wp.func_native(
         f"""
@@ -205,12 +246,12 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
 
     @wp.kernel(enable_backward=False, module=module)
     def weigh_added_inertia(
-        coupling_step: wp.int32, parameters: Parameters, forces: Forces, results: Results
+        k: wp.int32, parameters: Parameters, motion: Motion, forces: Forces, results: Results
     ):
         """Sums the forces of the inertia that is added to the true masses, S a - M a."""
         cut = wp.tid()
         total = sum_added(cut, parameters.mass, forces.resultant, forces.acceleration)
-        results.added_force[cut, coupling_step] = wp.float64(total)
+        results.added_force[cut, (k + motion.done[0]) / motion.substeps] = wp.float64(total)
 
     @wp.kernel(enable_backward=False, module=module)
     def solve(S: Inertia, b: wp.array2d(dtype=vec4), y: wp.array2d(dtype=vec4)):
@@ -218,6 +259,7 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         cut = wp.tid()
         d = S.inverse_pivot
         substitute(cut, False, S.lower_start, S.lower_index, S.lower, d, b, y)
+        multiply_last(cut, S, y)
         substitute(cut, True, S.upper_start, S.upper_index, S.upper, d, y, y)
 
     @wp.kernel(enable_backward=gradients, module=module)
@@ -248,6 +290,13 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
             after.ahead[cut, i] = padded(x1 + parameters.P[cut, Scalar.DAMPING_TIME] * v1)
 
     @wp.func
+    def along_y(motion: Motion, cut: wp.int32, k: wp.int32):
+        """Whether Ky is along y of C or against it: to the cosine of the blade's lean, which the
+        model bounds, they are the same direction."""
+        across = motion.R_CK[cut, k + motion.done[0]][1, 1]
+        return wp.where(across < real(0.0), real(-1.0), real(1.0))
+
+    @wp.func
     def follow_front(
         cut: wp.int32,
         dt: real,
@@ -271,13 +320,15 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
             leant = forces.totals[cut, PointTotal.LEANT] / width - place * mean
             slope = leant / (wp.max(spread, real(0.0)) + LEVER)
             sunk = mean - slope * place
-            drawn = P[cut, Scalar.UNHELD] * forces.totals[cut, PointTotal.DRAWN] / width
+            drawn = forces.totals[cut, PointTotal.DRAWN] / width
             travel = forces.totals[cut, PointTotal.TRAVEL] / width
-            drift = drawn + wp.exp(-travel / DRIFT) * (old_drift - drawn)
+            kept = wp.exp(-travel * P[cut, Scalar.DRIFT_RATE])
+            drift = drawn + kept * (old_drift - drawn)
         after.front[cut, Front.SLOPE] = slope
         after.front[cut, Front.SUNK] = sunk
         after.front[cut, Front.DRIFT] = drift
-        after.front[cut, Front.DRIFT_AHEAD] = drift + LEAD * (drift - old_drift) / dt
+        lead = P[cut, Scalar.DRIFT_LEAD] * (drift - old_drift) / dt
+        after.front[cut, Front.DRIFT_AHEAD] = drift + lead
         debt = now.front[cut, Front.DEBT] + forces.totals[cut, PointTotal.OWED]
         after.front[cut, Front.DEBT] = debt
         least = wp.max(forces.totals[cut, PointTotal.LIMIT], LEAST_FORCE)
@@ -286,10 +337,30 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
 
     # Sums in loops have kernels of their own: an adjoint would not know their value after the loop.
     @wp.kernel(enable_backward=gradients, module=module)
-    def total_points(forces: Forces):
-        """Totals over the cut points, see `POINT_TOTALS`."""
+    def push_blade(
+        k: wp.int32,
+        parameters: Parameters,
+        motion: Motion,
+        now: State,
+        forces: Forces,
+    ):
+        """Force of the flanks on the blade, and its resultant with spring and damper along y."""
         cut = wp.tid()
-        for j in range(wp.static(len(PointTotal))):
+        F = real(0.0)
+        for i in range(forces.at_points.shape[1]):
+            F += sum8(forces.at_points[cut, i, PointTotal.PUSH])
+        forces.totals[cut, PointTotal.PUSH] = F
+        F -= parameters.P[cut, Scalar.BLADE_STIFFNESS] * now.blade[cut, 0]
+        F -= parameters.P[cut, Scalar.BLADE_DAMPING] * now.blade[cut, 1]
+        last = forces.resultant.shape[1] - 1
+        F *= along_y(motion, cut, k)
+        forces.resultant[cut, last] = vec4(real(0.0), F, real(0.0), real(0.0))
+
+    @wp.kernel(enable_backward=gradients, module=module)
+    def total_points(forces: Forces):
+        """Totals over the cut points but for the push, which `push_blade` needs before."""
+        cut = wp.tid()
+        for j in range(wp.static(PointTotal.PUSH + 1), wp.static(len(PointTotal))):
             total = real(0.0)
             for i in range(forces.at_points.shape[1]):
                 total += sum8(forces.at_points[cut, i, j])
@@ -297,9 +368,10 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
 
     @wp.kernel(enable_backward=gradients, module=module)
     def step_blade_and_front(
-        coupling_step: wp.int32,
+        k: wp.int32,
         dt: real,
         parameters: Parameters,
+        motion: Motion,
         now: State,
         after: State,
         forces: Forces,
@@ -311,21 +383,23 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         """
         cut = wp.tid()
         F = forces.totals[cut, PointTotal.PUSH]
-        m = parameters.P[cut, Scalar.BLADE_MASS]
         c = parameters.P[cut, Scalar.BLADE_DAMPING]
-        k = parameters.P[cut, Scalar.BLADE_STIFFNESS]
-        pushed = now.blade[cut, 1] + dt * (F - k * now.blade[cut, 0]) / m
-        rate = pushed / (real(1.0) + dt * c / m)
+        stiffness = parameters.P[cut, Scalar.BLADE_STIFFNESS]
+        last = forces.acceleration.shape[1] - 1
+        a = forces.acceleration[cut, last]
+        rate = now.blade[cut, 1] + dt * a[1] * along_y(motion, cut, k)
         deflection = now.blade[cut, 0] + dt * rate
         after.blade[cut, 1] = rate
         after.blade[cut, 0] = deflection
-        sums.blade[cut, coupling_step, BladeSum.LOSS] += c * rate * rate * dt
-        sums.blade[cut, coupling_step, BladeSum.ON_KNIFE] += k * deflection + c * rate
-        sums.blade[cut, coupling_step, BladeSum.ON_BLADE] += F
+        e = (k + motion.done[0]) / motion.substeps
+        sums.blade[cut, e, BladeSum.LOSS] += c * rate * rate * dt
+        sums.blade[cut, e, BladeSum.ON_KNIFE] += stiffness * deflection + c * rate
+        sums.blade[cut, e, BladeSum.ON_BLADE] += F
         follow_front(cut, dt, parameters, now, after, forces)
 
     out = types.SimpleNamespace(
         load_nodes=load_nodes,
+        push_blade=push_blade,
         solve=solve,
         weigh_added_inertia=weigh_added_inertia,
         step_nodes=step_nodes,
@@ -361,11 +435,8 @@ def node_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespa
         end = wp.min((chunk + 1) * per_thread, mesh.moving.shape[0])
         for entry in range(chunk * per_thread, end):
             i = forwards(mesh.moving[entry])
-            internal = relax(cut, i, forces.from_elements[cut, i], parameters, now, after)
-            external = parameters.weight[cut, i] + forces.from_points[cut, i]
-            board = on_board(cut, i, dt, mesh, parameters, now, after, sums)
-            forces.from_bulk[cut, i] = internal
-            forces.resultant[cut, entry] = padded(internal + external + board)
+            elements, points = forces.from_elements[cut, i], forces.from_points[cut, i]
+            load(cut, entry, elements, points, dt, mesh, parameters, now, after, forces, sums)
 
     @wp.kernel(enable_backward=False, module=module)
     def gather_adjoint(

@@ -16,6 +16,9 @@ from sliceit_drake.cutting.kernels.types import LANES, Scalar, kernel_types
 
 __all__ = ["point_kernels"]
 
+LEVEL_RISE = 1e-4
+"""Least difference of height between the ends of a piece of skin, m."""
+
 
 def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamespace:
     """The kernels for scalars `real`, in the Warp module `module`, with adjoints if `gradients`."""
@@ -77,6 +80,29 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         return a + wp.cw_mul(b - a, w)
 
     @wp.func
+    def number8(values: wp.array2d(dtype=lanes), cut: wp.int32, point: indices):
+        a = lanes()
+        for lane in range(LANES):
+            n = forwards(point[lane])
+            a[lane] = values[cut, n / LANES][n % LANES]
+        return a
+
+    @wp.func
+    def under8(a: lanes, b: lanes, thickness: real):
+        """Integral of 1 - u where a + (b - a) u, u in [0, 1], is from 0 to the thickness.
+
+        What is level is taken to rise a little, so that the edge's spring can follow the force.
+        """
+        one = lanes(real(1.0))
+        level = one * real(LEVEL_RISE)
+        rise = b - a
+        rise = where8(wp.max(rise, -rise) - level, rise, level)
+        u = share8(wp.cw_div(-a, rise))
+        w = share8(wp.cw_div(one * thickness - a, rise))
+        part = w - u - (wp.cw_mul(w, w) - wp.cw_mul(u, u)) * real(0.5)
+        return wp.max(part, -part)
+
+    @wp.func
     def intact_fraction8(damage: lanes, onset: real, failure: lanes):
         """Secant over initial stiffness of bilinear bonds that spent the share `damage`."""
         one = lanes(real(1.0))
@@ -85,12 +111,16 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         return where8(opens, wp.cw_div((one - damage) * onset, below), lanes())
 
     @wp.func
-    def wedge8(y: lanes, height: lanes, cut: wp.int32, parameters: Parameters):
-        """Distance to flank or spine on one side of the section and its gradient, y and height.
+    def wedge8(y: lanes, height: lanes, share: lanes, cut: wp.int32, parameters: Parameters):
+        """Distance to flank or spine on one side of the section and its gradient, y and height; and
+        the thickness of the flank continued to the edge.
+
+        The flank counts with the part `share` of its thickness, but with its own direction.
 
         The side is known, so a point that crossed the middle plane is still pushed back to its own
-        side. The bevel at the edge is left out: what it does to the food is the work of the edge,
-        which the toughness holds; its steep normal would count that twice, in spikes.
+        side. The bevel at the edge is left out, and the flank goes on to the edge: what the bevel
+        does to the food is the work of the edge, which the toughness holds; its steep normal would
+        count that twice, in spikes.
         """
         one = lanes(real(1.0))
         y1 = parameters.knife[cut, Section.SHOULDER]
@@ -98,25 +128,31 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         y2 = parameters.knife[cut, Section.SPINE]
         h2 = parameters.knife[cut, Section.SPINE + 1]
         flank = wp.normalize(vec2(h2 - h1, y1 - y2))
-        to_flank = (y - one * y1) * flank[0] + positive8(height - one * h1) * flank[1]
-        to_spine = height - one * h2
+        radius = parameters.knife[cut, Section.EDGE_RADIUS]
+        at_edge = y1 * flank[0] + h1 * flank[1] + radius
+        to_flank = y * flank[0] - wp.cw_mul(share, one * at_edge - height * flank[1])
+        to_spine = height - one * (h2 + radius)
         spine = to_spine - to_flank
-        phi = wp.max(to_flank, to_spine) - one * parameters.knife[cut, Section.EDGE_RADIUS]
-        return phi, where8(spine, lanes(), one * flank[0]), where8(spine, one, one * flank[1])
+        phi = wp.max(to_flank, to_spine)
+        n_y = where8(spine, lanes(), one * flank[0])
+        return phi, n_y, where8(spine, one, one * flank[1]), at_edge
 
     @wp.func
-    def slide8(slip: Vectors, step: Vectors, stiffness: lanes, limit: lanes):
-        """As `slide`, for eight points."""
+    def slide8(slip: Vectors, step: Vectors, stiffness: lanes, limit: lanes, damping: real):
+        """Coulomb friction by an elastic anchor with damping, a number of sub-steps, up to a limit.
+
+        Returns: force over stiffness, new slip, energy lost.
+        """
         one = lanes(real(1.0))
-        trial = slip + step
+        trial = slip + step * (real(1.0) + damping)
         length = length8(trial)
         reach = wp.cw_div(limit, wp.max(stiffness, one * TINY))
-        slides = length - reach
-        kept = wp.cw_div(reach, where8(slides, length, one))
-        new_slip = scaled8(where8(slides, kept, one), trial)
+        kept = wp.cw_div(reach, where8(length - reach, length, one))
+        held = scaled8(where8(length - reach, kept, one), trial)
+        new_slip = (held + slip * damping) / (real(1.0) + damping)
         change = new_slip - slip
-        lost = dot8(new_slip, trial - new_slip) + dot8(change, change) * real(0.5)
-        return new_slip, wp.cw_mul(stiffness, where8(slides, lost, lanes()))
+        lost = dot8(held, step - change) + dot8(change, change) * (damping + real(0.5))
+        return held, new_slip, wp.cw_mul(stiffness, lost)
 
     @wp.func
     def on_face8(
@@ -148,6 +184,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         knife: KnifePose,
         whole: lanes,
         stiffness: lanes,
+        anchor: lanes,
         dt: real,
         points: Points,
         parameters: Parameters,
@@ -158,13 +195,16 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         A part of the face's area is above the edge: `area` now, `old_area` before the sub-step. It
         goes by the depth of the edge below this face, not below the middle of both: a piece that is
         cut off leaves the other where it is. The mean of the flank's thickness over that part is
-        that at its centroid, `rise` above the point, for the flank is straight.
+        that at its centroid, `rise` above the point, for the flank is straight. Ahead of the edge
+        the cut is closed: what the flank asks of the point is the mean over all of its area. A
+        sliver that the edge has just passed would else open all of it at once, and the force would
+        hardly converge with the stiffness.
 
         The normal force is minus the gradient of 1/2 stiffness area depth^2, `growth` of the area
         with the depth of the edge included: a knife at rest then puts no energy into a vibration.
 
-        Returns: normal force and friction force on the food, new slip, energy lost by friction,
-        area between the ends of the blade.
+        Returns: normal force and friction force on the food, new slip, energy lost by friction
+        and by the damping of the contact, area between the ends of the blade.
         """
         P = parameters.P
         one = lanes(real(1.0))
@@ -178,7 +218,8 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         depth = -(knife_z * arm)
         k_now, w_now = place8(depth, points)
         k_old, w_old = place8(depth + (knife_z * relative) * dt, points)
-        area = wp.cw_mul(whole, table8(points.fraction, block, k_now, w_now))
+        share = table8(points.fraction, block, k_now, w_now)
+        area = wp.cw_mul(whole, share)
         old_area = wp.cw_mul(whole, table8(points.fraction, block, k_old, w_old))
         growth = table8(points.width, block, k_now, w_now)
         rise = table8(points.centroid, block, k_now, w_now)
@@ -187,16 +228,21 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         between_area = where8(between, area, lanes())
         facing = outwards(knife.R, face)
         height = -r[2]
-        phi, n_y, n_h = wedge8((r[1] - one * now.blade[cut, 0]) * facing, height, cut, parameters)
+        y = (r[1] - one * now.blade[cut, 0]) * facing
+        phi, n_y, n_h, at_edge = wedge8(y, height, share, cut, parameters)
         touching = where8(-phi, between_area, lanes())
-        held = wp.cw_mul(stiffness, touching)
+        held = wp.cw_mul(anchor, touching)
         n = wp.outer(knife_y, n_y * facing) - wp.outer(knife_z, n_h)
-        N = -wp.cw_mul(held, phi)
-        # The part grows at the edge, where the flank is thinner than at the centroid.
-        thinner = wp.cw_mul(phi, phi * real(0.5) - wp.cw_mul(n[2], height))
-        at_edge = wp.cw_mul(wp.cw_mul(stiffness, growth), thinner)
-        normal_force = scaled8(N, n) + wp.outer(knife_z, where8(touching, at_edge, lanes()))
-        sliding = relative - scaled8(dot8(relative, n), n)
+        pressing = wp.cw_mul(stiffness, touching)
+        apart = dot8(relative, n)
+        elastic = -wp.cw_mul(pressing, phi)
+        N = positive8(elastic - wp.cw_mul(pressing, apart) * (P[cut, Scalar.CONTACT_DAMPING] * dt))
+        # The part grows at the edge, by what is as thick as the flank is there.
+        grows = wp.cw_mul(phi, phi * real(0.5) - share * at_edge)
+        down = wp.cw_mul(wp.cw_mul(stiffness, growth), grows) - wp.cw_mul(wp.cw_mul(N, n_h), share)
+        normal_force = wp.outer(knife_y, wp.cw_mul(N, n_y) * facing)
+        normal_force = normal_force + wp.outer(knife_z, where8(touching, down, lanes()))
+        sliding = relative - scaled8(apart, n)
         extra = wp.max(P[cut, Scalar.STATIC_FRICTION] - P[cut, Scalar.FRICTION], real(0.0))
         mu = one * P[cut, Scalar.FRICTION]
         if extra > real(0.0):
@@ -209,7 +255,8 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         old = old - scaled8(dot8(old, n), n)
         limit = wp.cw_mul(wp.cw_mul(parameters.friction_scale[cut, block], mu), N)
         limit = limit + touching * P[cut, Scalar.ADHESION]
-        anchored, slid = slide8(old, sliding * dt, held, limit)
+        damping = P[cut, Scalar.CONTACT_DAMPING]
+        anchored, kept_slip, slid = slide8(old, sliding * dt, held, limit, damping)
         viscosity = touching * P[cut, Scalar.FLANK_VISCOSITY]
         if ALL or P[cut, Scalar.FLANK_VISCOSITY] > real(0.0):
             ratio = dot8(sliding, sliding) / (
@@ -218,12 +265,13 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
             power = real(0.5) * (P[cut, Scalar.FLANK_EXPONENT] - real(1.0))
             viscosity = wp.cw_mul(viscosity, pow8(ratio + one * LINEAR, power))
         friction_force = -scaled8(held, anchored) - scaled8(viscosity, sliding)
-        new_slip = scaled8(where8(touching, one, lanes()), anchored)
+        new_slip = scaled8(where8(touching, one, lanes()), kept_slip)
         # What the anchor stored, less what it stores when the part in contact has changed.
-        stored = wp.cw_mul(wp.cw_mul(stiffness, old_area), dot8(slip, slip))
+        stored = wp.cw_mul(wp.cw_mul(anchor, old_area), dot8(slip, slip))
         stored = stored - wp.cw_mul(held, dot8(old, old))
         lost = stored * real(0.5) + slid
         lost = lost + wp.cw_mul(viscosity, dot8(sliding, sliding)) * dt
+        lost = lost + wp.cw_mul(elastic - N, apart) * dt
         return normal_force, friction_force, new_slip, lost, between_area
 
     @wp.func(inline=not gradients)
@@ -336,15 +384,32 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         width = table8(points.width, block, k1, w1)
         resistance = wp.cw_mul(left, width)
         due = wp.cw_mul(wp.cw_mul(left, A), D - D0)
-        if ALL or P[cut, Scalar.SKIN_TOUGHNESS] > real(0.0):
-            skin = table8(points.outline, block, k1, w1)
-            resistance = resistance + skin * P[cut, Scalar.SKIN_TOUGHNESS]
-            due = due + wp.cw_mul(skin, depth - old_depth) * P[cut, Scalar.SKIN_TOUGHNESS]
         resistance = wp.cw_mul(wp.cw_mul(worth, across), resistance)
         spring = wp.max(parameters.unloading[cut, block], one * TINY)
         limit = positive8(
             resistance * (real(1.0) + now.front[cut, Front.RAISED]) - wp.cw_mul(spring, depth - s)
         )
+        # A skin bends ahead of the front: it holds, and gives way, where the edge meets it. Of the
+        # outline to the points beside counts what the edge has entered by up to the thickness. They
+        # are taken to have moved as this one: a limit that lags behind drives a vibration.
+        old_skin_depth = now.skin_depth[cut, block]
+        below_skin = -(knife_z * arm)
+        skin_depth = wp.max(old_skin_depth, where8(within, below_skin, old_skin_depth))
+        after.skin_depth[cut, block] = skin_depth
+        if ALL or P[cut, Scalar.SKIN_TOUGHNESS] > real(0.0):
+            thickness = P[cut, Scalar.SKIN_THICKNESS]
+            skin = lanes()
+            for j in range(2):
+                entered = points.lower[block, j] * thickness + (skin_depth - old_skin_depth)
+                beside = number8(now.last_skin_depth, cut, points.beside[block, j]) + entered
+                part = under8(old_skin_depth + entered, beside, thickness)
+                skin = skin + wp.cw_mul(points.outline[block, j], part)
+            skin = skin * (P[cut, Scalar.SKIN_TOUGHNESS] / thickness)
+            due = due + wp.cw_mul(skin, wp.min(skin_depth - old_skin_depth, one * thickness))
+            skin = wp.cw_mul(wp.cw_mul(worth, across), skin)
+            resistance = resistance + skin
+            # In this order of the two, a skin of nothing has the gradient of some.
+            limit = limit + wp.max(lanes(), skin - wp.cw_mul(spring, skin_depth - below_skin))
         limit = where8(within, limit, lanes())
         q0 = now.edge_force[cut, block]
         step = dot8(d, advance)
@@ -358,11 +423,12 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
 
         # Flanks on the part that is cut.
         flank = parameters.flank_scale[cut, block] * P[cut, Scalar.FLANK_STIFFNESS]
+        anchor = parameters.flank_scale[cut, block] * P[cut, Scalar.ANCHOR_STIFFNESS]
         normal_m, friction_m, slip_m, loss_m, area_m = flank_contact(
-            cut, block, 0, xm, vm, knife, A, flank, dt, points, parameters, now
+            cut, block, 0, xm, vm, knife, A, flank, anchor, dt, points, parameters, now
         )
         normal_p, friction_p, slip_p, loss_p, area_p = flank_contact(
-            cut, block, 1, xp, vp, knife, A, flank, dt, points, parameters, now
+            cut, block, 1, xp, vp, knife, A, flank, anchor, dt, points, parameters, now
         )
         after.slip[cut, block, 0] = slip_m
         after.slip[cut, block, 1] = slip_p
@@ -421,8 +487,9 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         moments about Ko and energies dissipated, and writes the area that is cut, the moment about
         Ko of the part of it above the edge, and that part; see `POINT_SUMS`."""
         cut, chunk = wp.tid()
+        step = k + motion.done[0]
         for i in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, points.area.shape[0])):
-            advance_points(cut, i, k, dt, points, parameters, motion, now, after, forces, sums)
+            advance_points(cut, i, step, dt, points, parameters, motion, now, after, forces, sums)
 
     @wp.kernel(enable_backward=gradients, module=module)
     def place_points(
@@ -437,9 +504,10 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
 
         A front that lags behind the nodes by a sub-step drives a vibration."""
         cut, chunk = wp.tid()
-        R = motion.R_CK[cut, k]
+        R = motion.R_CK[cut, k + motion.done[0]]
         knife_z = vec3(R[0, 2], R[1, 2], R[2, 2])
         for i in range(chunk * per_thread, wp.min((chunk + 1) * per_thread, points.area.shape[0])):
+            after.last_skin_depth[cut, i] = after.skin_depth[cut, i]
             k1, w1 = place8(after.edge_depth[cut, i], points)
             width = table8(points.width, i, k1, w1)
             middle = (
@@ -479,7 +547,7 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
         edge = state.edge_force[cut, block]
         spring = wp.max(parameters.unloading[cut, block], one * TINY)
         doubled = doubled + wp.cw_div(wp.cw_mul(edge, edge), spring)
-        flank = parameters.flank_scale[cut, block] * P[cut, Scalar.FLANK_STIFFNESS]
+        scale = parameters.flank_scale[cut, block]
         for face in range(2):
             arm = on_face8(state.x, cut, block, face, points) - all8(motion.p_CK[cut, 0])
             k1, w1 = place8(-(knife_z * arm), points)
@@ -488,11 +556,12 @@ def point_kernels(real: Any, module: str, gradients: bool) -> types.SimpleNamesp
             r = wp.transpose(R) * (arm + wp.matrix_from_rows(lanes(), lanes(), rise))
             between = one * parameters.knife[cut, Section.HALF_LENGTH] - wp.max(r[0], -r[0])
             y = (r[1] - one * state.blade[cut, 0]) * outwards(R, face)
-            phi, _n_y, _n_h = wedge8(y, -r[2], cut, parameters)
+            phi, _n_y, _n_h, _at_edge = wedge8(y, -r[2], share, cut, parameters)
             held = state.slip[cut, block, face]
             touching = where8(-phi, where8(between, wp.cw_mul(A, share), lanes()), lanes())
-            pressed = wp.cw_mul(phi, phi) + dot8(held, held)
-            doubled = doubled + wp.cw_mul(wp.cw_mul(flank, touching), pressed)
+            pressed = wp.cw_mul(phi, phi) * P[cut, Scalar.FLANK_STIFFNESS]
+            pressed = pressed + dot8(held, held) * P[cut, Scalar.ANCHOR_STIFFNESS]
+            doubled = doubled + wp.cw_mul(wp.cw_mul(scale, touching), pressed)
         energies.points[cut, block] = doubled * real(0.5)
 
     out = types.SimpleNamespace(

@@ -22,9 +22,14 @@ from sliceit_drake.cutting.warp_start import CPU_FLAGS
 __all__ = ["kernels"]
 
 
-@functools.cache
 def kernels(real: Any, gradients: bool = False) -> types.SimpleNamespace:
     """The kernels for `real` = wp.float32 or wp.float64, with adjoints if `gradients`."""
+    return _kernels(real, gradients)
+
+
+# One set for each variant: kernels that are made while another thread loads their module miss it.
+@functools.cache
+def _kernels(real: Any, gradients: bool) -> types.SimpleNamespace:
     # Modules for each variant, so that using several compiles none twice. The points take the
     # compiler as long as all else, and two modules compile side by side.
     variant = f"{__name__}.{real.__name__}{'.gradients' if gradients else ''}"

@@ -7,7 +7,18 @@ from typing import Any
 
 import warp as wp
 
-__all__ = ["CORNERS", "GATHER", "LANES", "PARAMETERS", "STRIP", "Scalar", "kernel_types"]
+__all__ = [
+    "CORNERS",
+    "GATHER",
+    "LANES",
+    "PARAMETERS",
+    "STRIP",
+    "Scalar",
+    "kernel_types",
+    "mat34d",
+    "origin_of",
+    "rotation_of",
+]
 
 LANES = 8
 """Strips of elements that a thread handles side by side."""
@@ -21,6 +32,24 @@ CORNERS = STRIP + 3
 GATHER = 4
 """Element forces that a node adds at a time."""
 
+mat34d: Any = wp.types.matrix((3, 4), wp.float64)
+"""A pose: rotation and, as the last column, position."""
+
+
+@wp.func
+def rotation_of(X: mat34d):
+    """R_AB of a pose X_AB."""
+    return wp.mat33d(
+        X[0, 0], X[0, 1], X[0, 2], X[1, 0], X[1, 1], X[1, 2], X[2, 0], X[2, 1], X[2, 2]
+    )
+
+
+@wp.func
+def origin_of(X: mat34d):
+    """p_AB of a pose X_AB, metres."""
+    return wp.vec3d(X[0, 3], X[1, 3], X[2, 3])
+
+
 PARAMETERS = (
     "mu",
     "lam",
@@ -28,22 +57,25 @@ PARAMETERS = (
     "bond_stiffness",
     "strength",
     "flank_stiffness",
+    "anchor_stiffness",
+    "contact_damping",
     "friction",
     "static_friction",
     "stribeck_velocity",
     "direction_length",
     "debt_length",
-    "unheld",
+    "drift_rate",
+    "drift_lead",
     "board_stiffness",
     "board_friction",
     "board_damping_time",
     "blade_stiffness",
     "blade_damping",
-    "blade_mass",
     "rate_exponent",
     "reference_speed",
     "slice_push_exponent",
     "skin_toughness",
+    "skin_thickness",
     "adhesion",
     "flank_viscosity",
     "flank_exponent",
@@ -91,8 +123,8 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
 
     @wp.struct
     class Points:
-        """The cut points in blocks of `LANES`, and their tables over [-reach, reach]; see
-        `EdgeTables`. What fills up the last block has no area."""
+        """The cut points in blocks of `LANES`, and their tables over [-reach, reach] and outline;
+        see `EdgeTables`. What fills up the last block has no area."""
 
         nodes: wp.array2d(dtype=indices)
         weights: wp.array2d(dtype=lanes)
@@ -100,7 +132,9 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         width: wp.array2d(dtype=real)
         fraction: wp.array2d(dtype=real)
         centroid: wp.array2d(dtype=real)
-        outline: wp.array2d(dtype=real)
+        beside: wp.array2d(dtype=indices)
+        outline: wp.array2d(dtype=lanes)
+        lower: wp.array2d(dtype=lanes)
         depth: wp.array(dtype=lanes)
         rest: wp.array(dtype=Vectors)
         reach: real
@@ -124,7 +158,8 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
 
     @wp.struct
     class Inertia:
-        """Factors of the mass matrix of each cut, see `inertia.Factors`."""
+        """Factors of the mass matrix of each cut, see `inertia.Factors`; and room for what is
+        multiplied with the inverse."""
 
         lower_start: wp.array(dtype=wp.int32)
         lower_index: wp.array(dtype=entries)
@@ -133,18 +168,23 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         lower: wp.array2d(dtype=vec4)
         upper: wp.array2d(dtype=vec4)
         inverse_pivot: wp.array2d(dtype=real)
+        inverse: wp.array2d(dtype=real)
+        last: wp.array2d(dtype=vec4)
 
     @wp.struct
     class Motion:
         """Poses of the knife at the ends of the coupling steps, and in each sub-step its pose at
-        the end, velocity of Ko and angular velocity."""
+        the end, velocity of Ko and angular velocity; axes in which wrenches are given; and how many
+        sub-steps and coupling steps a launch that loops has done so far [2]."""
 
+        R_AC: wp.array(dtype=wp.mat33d)
         R: wp.array2d(dtype=wp.mat33d)
         p: wp.array2d(dtype=wp.vec3d)
         R_CK: wp.array2d(dtype=mat33)
         p_CK: wp.array2d(dtype=vec3)
         v_CK: wp.array2d(dtype=vec3)
         w_CK: wp.array2d(dtype=vec3)
+        done: wp.array(dtype=wp.int32)
         substeps: wp.int32
         period: wp.float64
 
@@ -152,11 +192,13 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
     class State:
         """The food.
 
-        Positions, velocities; at the cut points the largest depth of the edge below the point, the
-        fraction of the surface energy spent by opening, the edge's force on the food, its
-        direction, and the slip from the friction anchors of both faces; that of the nodes on the
-        board; the force that each Maxwell branch has relaxed; the blade's deflection and its rate;
-        the front of the cut, see `FRONT`. `stepping` is not for the kernels, see `stepping`.
+        Positions, velocities; at the cut points the largest depth of the edge below the point in
+        the food at rest; that where the point is, for the skin, and the same before the sub-step,
+        for the points beside; the fraction of the surface energy spent by opening, the edge's force
+        on the food, its direction, and the slip from the friction anchors of both faces; that of
+        the nodes on the board; the force that each Maxwell branch has relaxed; the blade's
+        deflection and its rate; the front of the cut, see `FRONT`.
+        `stepping` is not for the kernels, see `stepping`.
         `ahead` holds the positions at which the elements are evaluated, padded to fours, which are
         loaded faster than threes.
         """
@@ -164,6 +206,8 @@ def kernel_types(real: Any) -> types.SimpleNamespace:
         x: wp.array2d(dtype=vec3)
         v: wp.array2d(dtype=vec3)
         edge_depth: wp.array2d(dtype=lanes)
+        skin_depth: wp.array2d(dtype=lanes)
+        last_skin_depth: wp.array2d(dtype=lanes)
         cohesive_damage: wp.array2d(dtype=lanes)
         edge_force: wp.array2d(dtype=lanes)
         edge_direction: wp.array2d(dtype=Vectors)

@@ -112,6 +112,14 @@ class CutGeometry:
         return float(self.tables.area.sum())
 
     @functools.cached_property
+    def row_height(self) -> float:
+        """Mean height of the section's triangles by their area, metres."""
+        corners = self.split.points[self.split.triangles]
+        along = np.diff(corners, axis=1)
+        areas = np.linalg.norm(np.cross(along[:, 0], along[:, 1]), axis=1)
+        return float(np.average(np.ptp(corners[..., 2], axis=1), weights=areas))
+
+    @functools.cached_property
     def top(self) -> float:
         """Height of the highest cut point in C, metres."""
         return float(self.split.points[:, 2].max())
@@ -285,7 +293,7 @@ def make_cut_geometry(
         weight_volume=weight_volume,
         vertex_volume=uncut.lumped(uncut.volumes())[split.node_source[computed]],
         element_distance=distance_inside(section, split.triangles, nodes[t].mean(1)[:, [0, 2]]),
-        tables=edge_tables(section, split.triangles),
+        tables=edge_tables(section, split.triangles, groups=split.nearest_vertex),
         point_nodes=point_nodes,
         point_weights=split.point_weights,
         point_depth=depth_below(section, split.triangles, section),

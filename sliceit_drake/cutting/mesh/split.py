@@ -95,6 +95,12 @@ class SplitMesh:
     vertex_position: np.ndarray
     source_tetrahedra: np.ndarray
 
+    @property
+    def nearest_vertex(self) -> np.ndarray:
+        """Vertex of the original mesh to which each cut point is the nearest along its edge [P]."""
+        end = self.point_weights.argmax(1)
+        return np.asarray(self.node_source[self.point_nodes[np.arange(len(end)), 0, end]])
+
 
 def _minority_part(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Volume share and barycentric centroid of the part above 0 of tetrahedra [K, 4].
