@@ -13,11 +13,8 @@ from sliceit_drake.diagnosis.evidence.columns import Sensitivities
 from sliceit_drake.diagnosis.evidence.held_out import fitted_changes, held_out_gain
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.noise_levels import ChannelNoise
-from sliceit_drake.diagnosis.evidence.verdict import (
-    checked_out_of_sample,
-    effect_in_noise,
-    reach_verdict,
-)
+from sliceit_drake.diagnosis.evidence.verdict import reach_verdict
+from studies.hidden_effects.sizes import effect_in_noise
 
 
 def problem(
@@ -110,32 +107,6 @@ def test_a_hidden_cause_is_named_with_its_size_and_its_class(hidden, name):
     gain = held_out_gain(found, [(finding.evidence.name, finding.evidence.scan)])
     assert gain.share > 0.8 and gain.after < gain.before
     assert gain.after == pytest.approx(NOISE, rel=0.3)
-    assert checked_out_of_sample(verdict, gain, found) is verdict
-
-
-def test_a_cause_that_foretells_no_other_record_is_unknown():
-    found = problem(20, rate=2.0)
-    verdict = reach_verdict(found, 60)
-    (finding,) = verdict.findings
-    gain = held_out_gain(found, [(finding.evidence.name, finding.evidence.scan)])
-    poor = dc.replace(gain, share=0.5, interval=(0.4, 0.7))
-    assert gain.before > gain.floor
-    assert checked_out_of_sample(verdict, poor, found).kind == "unknown"
-    assert "50 %" in checked_out_of_sample(verdict, poor, found).reason
-    # What is not sure to be too little is enough.
-    assert checked_out_of_sample(verdict, dc.replace(poor, interval=(0.2, 1.1)), found) is verdict
-    # What is done where the force jumps is not in that error.
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(found, "calm", lambda record: record.depth < 0.1 * record.depth.max())
-        assert checked_out_of_sample(verdict, poor, found) is verdict
-    # Nothing of what is no larger than the noise can be foretold.
-    assert (
-        checked_out_of_sample(verdict, dc.replace(poor, before=0.9 * poor.floor), found) is verdict
-    )
-    # Nor what differs from record to record.
-    evidence = finding.evidence
-    evidence.columns = [dc.replace(c, per_record=True) for c in evidence.columns]
-    assert checked_out_of_sample(verdict, poor, found) is verdict
 
 
 def test_two_hidden_causes_are_both_named():
@@ -152,6 +123,11 @@ def test_without_three_slices_of_a_cut_it_asks_for_more():
     verdict = reach_verdict(problem(50, replicates=2, rate=3.0), 60)
     assert verdict.kind == "too_few_replicates"
     assert verdict.slices_needed == 1
+
+
+def test_without_replicates_what_is_left_may_be_how_slices_vary():
+    verdict = reach_verdict(problem(51, replicates=1), 60)
+    assert (verdict.kind, verdict.names, verdict.slices_needed) == ("nothing", [], 2)
 
 
 def test_a_shift_of_a_base_parameter_is_no_cause():

@@ -20,6 +20,7 @@ from sliceit_drake.diagnosis.causes import BUILT_IN
 from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
 from sliceit_drake.diagnosis.registry import dry_run, load_cause
 from sliceit_drake.records.slice_record import SliceRecord, write_record
+from sliceit_drake.records.validation import load_records
 
 CUCUMBER = Food(name="cucumber")
 
@@ -78,7 +79,7 @@ FORCES = ("force_x", "force_y", "force_z")
         (FORCES, lambda x: 1e-3 * x, ("kN", "1000")),
         (FORCES, lambda x: -x, ("wrench.sign: by_knife",)),
         (FORCES, lambda x: 0.0 * x + 3.0, ("in every row",)),
-        (FORCES, lambda x: np.where(np.arange(len(x))[:, None] == 7, np.nan, x), ("line 9",)),
+        (("p_WK_z",), lambda x: np.where(np.arange(len(x))[:, None] == 7, np.nan, x), ("line 9",)),
         (("p_WK_x", "p_WK_y", "p_WK_z"), lambda x: 1e3 * x, ("mm", "1000")),
         (("time",), lambda x: 1e3 * x, ("ms", "1000")),
     ],
@@ -90,6 +91,21 @@ def test_a_table_that_cannot_be_is_named_with_what_to_do(
     edit_table(folder / "slice_1.csv", names, change)
     said = refused(folder, capsys, monkeypatch)
     assert "slice_1.csv" in said and all(word in said for word in words)
+
+
+def test_rows_without_a_reading_are_left_out_and_said(folder):
+    lost = range(700, 704)
+    edit_table(
+        folder / "slice_1.csv",
+        ("force_z",),
+        lambda x: np.where(np.isin(np.arange(len(x)), lost)[:, None], np.nan, x),
+    )
+    records = load_records(folder)
+    assert len(records[0]) - len(records[1]) == len(lost)
+    assert np.array_equal(records[1].time, np.delete(records[0].time, lost))
+    assert np.isfinite(records[1].force).all()
+    said = [text for text in check_records(records, CUCUMBER) if "rows are missing" in text]
+    assert len(said) == 1 and "slice_1 4 of 1500" in said[0]
 
 
 def test_degrees_are_named_with_the_value_in_radians(folder, capsys, monkeypatch):

@@ -15,7 +15,7 @@ from sliceit_drake.diagnosis.diagnose import setup_of_food
 from sliceit_drake.diagnosis.evidence.columns import Sensitivities
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
-from sliceit_drake.diagnosis.evidence.verdict import CLASS_ANGLE, reach_verdict
+from sliceit_drake.diagnosis.evidence.verdict import CLASS_ANGLE, LAW, reach_verdict
 from sliceit_drake.diagnosis.experiments import next_experiment as proposing
 from sliceit_drake.diagnosis.experiments.designs import Scale, menu
 from sliceit_drake.diagnosis.experiments.next_experiment import next_experiment
@@ -57,7 +57,7 @@ def diagnosis_of(found: Sensitivities) -> Diagnosis:
 
 
 def cut(protocol: Protocol, folder: Path, seed: int) -> Path:
-    record_session(protocol, folder, ["skin"], seed=seed, settings=WORLD)
+    record_session(protocol, folder, ["skin:1.0"], seed=seed, settings=WORLD)
     return folder
 
 
@@ -81,7 +81,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     with pytest.MonkeyPatch.context() as patch:
         # The whole menu would take a minute.
         patch.setattr(proposing, "menu", lambda s: [e for e in menu(s) if e.name in MENU])
-        proposal = next_experiment(diagnosis, records, workers=2)
+        proposal = next_experiment(diagnosis, records, cache=folder / "cache", workers=2)
     return Bench(
         folder,
         records,
@@ -99,13 +99,26 @@ def test_the_proposed_motion_parts_causes_of_one_class(bench):
     (finding,) = bench.diagnosis.verdict.findings
     assert finding.evidence.name in ("skin", "core")
     assert bench.proposal.kind == "split"
-    ways = [pair(bench.proposal, *names) for names in (("skin", "core"), ("core", "skin"))]
+    parted = (("skin", "core"), ("core", "skin"), ("skin", LAW))
+    ways = [pair(bench.proposal, *names) for names in parted]
     assert min(p.before for p in ways) < CLASS_ANGLE
     assert all(p.parts and p.after > CLASS_ANGLE + 5.0 for p in ways)
-    # Nothing but the skin's absence tells a skin from a tough rind.
-    assert bench.proposal.steps[0].experiment.peeled
+    # By the force along the edge, of which a press has none.
+    assert bench.proposal.steps[0].experiment.name == "draw_1"
     assert 3 <= bench.proposal.steps[0].slices <= 12
     assert all(p.gain > NEEDED and p.gain_per_slice > 0.0 for p in ways)
+
+
+def test_of_presses_the_peeled_one_parts_a_skin_from_a_core(bench, monkeypatch):
+    """Nothing but the skin's absence tells a skin from a tough rind by the vertical force."""
+    presses = ("fast", "peeled")
+    monkeypatch.setattr(proposing, "menu", lambda s: [e for e in menu(s) if e.name in presses])
+    proposal = next_experiment(
+        bench.diagnosis, bench.records, cache=bench.folder / "cache", workers=2
+    )
+    assert proposal.steps[0].experiment.peeled
+    ways = [pair(proposal, *names) for names in (("skin", "core"), ("core", "skin"))]
+    assert all(p.parts for p in ways)
 
 
 def test_the_proposed_slices_find_what_was_hidden(bench):

@@ -133,6 +133,14 @@ def nan_burst(table: SliceTable) -> None:
     table.columns["force_z"][row : row + 40] = np.nan
 
 
+def mostly_nan(table: SliceTable) -> None:
+    table.columns["force_z"][::2] = np.nan
+
+
+def nan_pose(table: SliceTable) -> None:
+    table.columns["p_WK_z"][600:640] = np.nan
+
+
 def no_tare(table: SliceTable) -> None:
     table.columns["force_z"] += 2.5
 
@@ -295,7 +303,9 @@ def scale(table: SliceTable, names: tuple[str, ...], factor: float) -> None:
         (degrees, "error", "degrees", "line 2: q_6: -150 rad is more.*Is it in degrees"),
         (time_backwards, "error", "time", "line 702: time: 0.9 s goes back from 1.398 s"),
         (time_repeated, "error", "time", "line 702: time: 1.398 s repeats 1.398 s"),
-        (nan_burst, "error", "gap", "lines 602 to 641: force_z: 40 of 1500 rows"),
+        (nan_burst, "warning", "no reading", "lines 602 to 641: 40 of 1500 rows have no finite wr"),
+        (mostly_nan, "error", "gap", "line 1500: force_z: 1 of 1500 rows"),
+        (nan_pose, "error", "gap", "lines 602 to 641: p_WK_z: 40 of 1500 rows"),
         (no_tare, "warning", "no tare", "lines 2 to 251: force_z: .*2.5 N.*tared is yes. Apply"),
         (no_tare_said, "warning", "no tare", "wrench.tared is no. Apply the step tare"),
         (flipped_sign, "error", "flipped sign", "lines 252 to 926: force_z.*Write wrench.sign: by"),
@@ -370,7 +380,8 @@ FAULTS = {
     "millimetres": millimetres,
     "milliseconds": milliseconds,
     "time": time_backwards,
-    "gap": nan_burst,
+    "gap": nan_pose,
+    "no reading": nan_burst,
     "no tare": no_tare,
     "flipped sign": flipped_sign,
     "clipped": clipped_at_an_unknown_range,

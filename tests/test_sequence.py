@@ -62,8 +62,8 @@ def test_every_slice_is_cut_off_and_the_last_food_is_reached(indexed):
     assert [report.cut_share for report in reports] == pytest.approx([1.0, 1.0], abs=1e-3)
     # The next food is uncut and gives no force when it is taken.
     taken = int(np.argmax(record["food_index"] == 1))
-    assert record["cut_progress"][taken - 1] > COMPLETE and record["cut_progress"][taken] == 0.0
-    assert not record.vector("food_wrench_f")[taken].any()
+    assert record["cut_progress"][taken - 1] > COMPLETE and record["cut_progress"][taken] < 1e-12
+    assert np.abs(record.vector("food_wrench_f")[taken]).max() < 1e-3
 
 
 def test_slices_of_a_uniform_body_have_the_same_force(indexed):

@@ -197,7 +197,7 @@ def test_a_draw_that_turns_round_turns_the_force_over_the_travel_that_finite_ele
     along = bench.run(motion.duration)[:, 3]
     calibrated = load_calibrated_food("cucumber")
     food = calibrated.apply_to(calibrated.food)
-    numerics = Numerics(flank_stiffness=calibrated.flank_stiffness)
+    numerics = Numerics()
     model = make_food_model(food, calibrated.knife, numerics)
     start = start_pose(model, CLEARANCE, offset=-0.01)
     elements = simulate_slice(CuttingSolver(model, PERIOD), Motion(MotionPlan(path), start))

@@ -4,7 +4,8 @@ RECORDS_DIR holds slice records (docs/reference/records.md), or is one; best thr
 condition at several speeds, with a hold, a withdrawal and draws. Writes to DIR:
   diagnosis.json  verdict, evidence, values, errors
   report.html     prediction against measurement, evidence, angles between causes; opens anywhere
-  extended.yaml   the food with the cause in it: `calibration: DIR/extended.yaml` in a scenario
+  extended.yaml   the food and its bench with the cause in them: `calibration: DIR/extended.yaml`
+                  in a scenario
 
 The verdict is one of: nothing beyond noise; a cause (or two) with size; a class of causes that
 these records cannot tell apart, and the experiment that would; unknown; too few replicates. For a
@@ -149,6 +150,7 @@ def _diagnose(
             result, records, settings["cache"], settings["workers"], show
         )
         result.next_experiment.write(options.next_experiment, scenario_of_slice)
+    print(result.sentence())
     print(result.table())
     result.save(options.output, not options.no_report)
     report = "" if options.no_report else ", report.html"

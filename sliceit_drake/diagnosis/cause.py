@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.bench_errors import BenchErrors
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
@@ -48,6 +49,10 @@ EXPERIMENTS = {
 }
 """What a cause may name as the experiment that reveals it."""
 
+BENCH = "bench."
+MOVING = ("bench.board.height", "bench.arm.", "bench.mounting.")
+"""Parameters of the bench that change how the knife moves in the food."""
+
 Values = Mapping[str, float]
 """Parameters of a cause by name and, where there is a scan, its value by its name."""
 
@@ -61,7 +66,8 @@ class CauseParameter:
         size: A size that matters and is plausible before any measurement, from the null.
         low, high: Range.
         null: Value at which the cause is absent.
-        adds_to: Dotted name of the parameter of the cut to which it is added; "" for none.
+        adds_to: Dotted name of the parameter of the cut to which it is added, or of the bench, as
+            "bench.sensor.gain", in all axes; "" for none.
     """
 
     name: str
@@ -94,18 +100,22 @@ class Scan:
     Attributes:
         name, unit: Of the number.
         values: What is tried.
+        sets: Dotted name of the parameter that it is where the cause is there, as `adds_to`; ""
+            for none.
     """
 
     name: str
     unit: str
     values: tuple[float, ...]
+    sets: str = ""
 
 
 class Cause:
     """One way in which measured slices may differ from the base model.
 
-    Hooks change nothing where all values are at their null. Unless they are overridden, `model`
-    adds each parameter to the one of the cut that its `adds_to` names, and the others do nothing.
+    Hooks change nothing where all values are at their null. Unless they are overridden, `model` and
+    `bench` add each parameter to the one that its `adds_to` names, and the others do nothing. What
+    these two change an extended food holds; what `motion` and `wrench` do it cannot.
 
     Attributes:
         name: Short and unique, with underscores.
@@ -139,12 +149,20 @@ class Cause:
     @property
     def simulates(self) -> bool:
         """Whether its slices must be simulated; else it only changes wrenches that are there."""
-        return self.changes_model or type(self).motion is not Cause.motion
+        moves = any(p.adds_to.startswith(MOVING) for p in self.parameters)
+        return self.changes_model or moves or type(self).motion is not Cause.motion
 
     @property
     def changes_model(self) -> bool:
         """Whether it acts in the cut."""
-        return type(self).model is not Cause.model or any(p.adds_to for p in self.parameters)
+        adds = any(p.adds_to and not p.adds_to.startswith(BENCH) for p in self.parameters)
+        return type(self).model is not Cause.model or adds
+
+    @property
+    def expressible(self) -> bool:
+        """Whether a food with its bench can hold all that it does."""
+        hooks = type(self).motion, type(self).wrench
+        return not self.per_record and hooks == (Cause.motion, Cause.wrench)
 
     @property
     def adapts(self) -> bool:
@@ -176,21 +194,29 @@ class Cause:
 
     def model(self, model: CuttingModel, values: Values, facts: SliceFacts) -> CuttingModel:
         """The cut with the cause in it, derived from the cut without."""
+        added, chosen = self._changes(values, False)
+        added = {name: float(get_parameter(model, name)) + x for name, x in added.items()}
+        return with_parameters(model, added | chosen) if added else model
+
+    def bench(self, bench: BenchErrors, values: Values) -> BenchErrors:
+        """The bench with the cause in it."""
+        added, chosen = self._changes(values, True)
+        return bench.changed(added, chosen) if added else bench
+
+    def _changes(self, values: Values, of_bench: bool) -> tuple[dict[str, float], dict[str, float]]:
+        """What is added to parameters of the cut, or of the bench, and what they are set to."""
         added = {
-            p.adds_to: float(get_parameter(model, p.adds_to)) + values[p.name]
+            p.adds_to.removeprefix(BENCH): values[p.name]
             for p in self.parameters
-            if p.adds_to and values[p.name] != p.null
+            if p.adds_to and p.adds_to.startswith(BENCH) == of_bench and values[p.name] != p.null
         }
-        return with_parameters(model, added) if added else model
+        if self.scan is None or not self.scan.sets or self.scan.sets.startswith(BENCH) != of_bench:
+            return added, {}
+        return added, {self.scan.sets.removeprefix(BENCH): values[self.scan.name]}
 
     def absorbed(self, base: Sequence[str]) -> bool:
         """Whether it is the same thing as one of these base parameters."""
         return not {*self.absorbed_by, *(p.adds_to for p in self.parameters)}.isdisjoint(base)
-
-    def extension(self, model: CuttingModel, values: Values) -> CuttingModel:
-        """The cut with the cause in material and effects alone, as the food of a scenario has it;
-        the same cut if it is not of the food."""
-        return self.model(model, values, SliceFacts())
 
     def motion(
         self,

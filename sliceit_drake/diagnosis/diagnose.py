@@ -13,7 +13,7 @@ from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.own_values import at_own_values
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
-from sliceit_drake.diagnosis.evidence.verdict import ALARM, reach_verdict
+from sliceit_drake.diagnosis.evidence.verdict import DecisionRule, reach_verdict
 from sliceit_drake.diagnosis.input_checks import check_records, without_lone_torques
 from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import open_causes
@@ -40,11 +40,13 @@ def setup_of_food(
     food: CalibratedFood, refinement: float = 1.0, free: Sequence[ParameterRange] = BASE
 ) -> CalibrationSetup:
     """The setup in which a calibrated food is diagnosed: its values, with some parameters free."""
-    setup = CalibrationSetup(
-        food=food.food, knife=food.knife, parameters=list(free), refinement=refinement
+    return CalibrationSetup(
+        food=food.food,
+        knife=food.knife,
+        bench=food.bench,
+        parameters=list(free),
+        refinement=refinement,
     )
-    setup.numerics.flank_stiffness = food.flank_stiffness
-    return setup
 
 
 def diagnose(
@@ -81,11 +83,12 @@ def diagnose(
             fix=f"Give at least {MIN_RECORDS}, better 3 of each condition; `diagnose_slice` says"
             " what one slice shows.",
         )
-    if replicates * ALARM < 1.0:
+    alarm = DecisionRule.alarm
+    if replicates * alarm < 1.0:
         raise ConfigurationError(
-            f"{replicates} replicates of the bootstrap cannot show a p-value of {ALARM:g}",
+            f"{replicates} replicates of the bootstrap cannot show a p-value of {alarm:g}",
             field="--replicates",
-            fix=f"Give at least {round(1.0 / ALARM)}.",
+            fix=f"Give at least {round(1.0 / alarm)}.",
         )
     remarks = check_records(records, setup.food, other_food)
     records = without_lone_torques(records)
@@ -105,7 +108,7 @@ def diagnose(
             "No condition was repeated: noise is from what is rough in the residuals, and how "
             "slices vary is unknown. Repeat each cut at least 3 times."
         )
-    steps = 2 * replicates
+    steps = (DecisionRule.most + 1) * replicates
     done = [0]
 
     def count(more: int) -> None:
@@ -123,7 +126,7 @@ def diagnose(
         gain=None,
         remarks=remarks,
     )
-    if verdict.findings:
+    if verdict.names:
         predictor = SlicePredictor(setup, records, cache=cache, workers=workers)
         result.confirm(predictor, seed, lambda done, total: show("confirmation", done, total))
     return result
@@ -135,10 +138,12 @@ def _shifts(
     """Factors of the base parameters and their relative standard errors, causes in the model."""
     found = problem.found
     shared = [k for k in found.of_causes(causes) if not found.columns[k].per_record]
-    columns = [*problem.baseline, *shared]
-    own, variance = problem.own_prior()
-    total = problem.reduced(own, variance).sum(0)
-    theta, covariance = problem.fit_shared(total, columns)
+    columns = [
+        *problem.base,
+        *(k for k in problem.with_causes(shared).shared if k not in problem.base),
+    ]
+    model = problem.with_causes(shared)
+    theta, covariance = problem.fit_shared(problem.weighted(model).total, columns, model.prior)
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     out = {}
     for i, k in enumerate(problem.base):

@@ -14,6 +14,7 @@ import numpy as np
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.foods.shapes import PlainShape
+from sliceit_drake.prediction.noise import without_spikes
 from sliceit_drake.prediction.placement import is_bare
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.records.validation import check_record
@@ -27,6 +28,14 @@ CONTACT = 0.1
 CUTTING = ("slice", "second_pass", "hold", "retract")
 EARLY, LATE = 2e-3, 0.5
 """How far above the food contact may begin, metres, and how deep in it, of its height."""
+LEAST_ROWS = 40
+"""Rows of a record from which noise can be told from a force."""
+OFF_BOARD = 5e-3
+"""Distance of a food from its board that is more than an error of measurement, metres."""
+DROPPED = 1e-3
+"""Fraction of missing rows that is said."""
+LONG_GAP = 6.0
+"""Rows from which on a gap is reported as one."""
 SAME_SPEED, SAME_DRAW = 0.1, 0.1
 """Differences that cuts of one condition may have, relative and absolute."""
 UNNAMED = ("", "unknown")
@@ -57,7 +66,15 @@ def check_records(
         _check_force(record)
         if not is_bare(record):
             _check_contact(record, food)
-    remarks = [*_conditions(records), *_knives(records), *_torques(records), *_warnings(records)]
+        _check_board(record, records)
+    remarks = [
+        *_conditions(records),
+        *_spikes(records),
+        *_dropped(records),
+        *_knives(records),
+        *_torques(records),
+        *_warnings(records),
+    ]
     return list(dict.fromkeys(remarks))
 
 
@@ -168,6 +185,13 @@ def _check_channels(records: Sequence[SliceRecord]) -> None:
 
 
 def _check_force(record: SliceRecord) -> None:
+    if len(record) < LEAST_ROWS:
+        raise ConfigurationError(
+            f"has {len(record)} rows, too few to tell a force from its noise",
+            source=_file(record),
+            field="time",
+            fix=f"Give at least {LEAST_ROWS} rows, at the sensor's own rate.",
+        )
     if float(np.ptp(record.force_magnitude)) < 1e-9:
         raise ConfigurationError(
             "has a constant force: there is nothing to compare",
@@ -177,13 +201,62 @@ def _check_force(record: SliceRecord) -> None:
         )
 
 
+def _check_board(record: SliceRecord, records: Sequence[SliceRecord]) -> None:
+    """Refuses a board that is not where the food lies, its own or where it has none that of the
+    others."""
+    facts = record.metadata
+    known = [r.metadata.food.position for r in (record, *records) if not is_bare(r)]
+    heights = [position[2] for position in known if position is not None]
+    unknown = {"board_height", "food.position"} & set(facts.unknown)
+    if facts.board_height is None or unknown or not heights:
+        return
+    above = heights[0] - facts.board_height
+    if abs(above) > OFF_BOARD:
+        raise ConfigurationError(
+            f"is {facts.board_height:g} m, and the food, whose position is on the board, is at"
+            f" {heights[0]:g} m: {1e3 * abs(above):.3g} mm {'above' if above > 0 else 'below'} it",
+            source=_facts_file(record),
+            field="board_height",
+            fix="Correct board_height or food.position; both are in the world frame, in metres.",
+        )
+
+
+def _spikes(records: Sequence[SliceRecord]) -> list[str]:
+    found = []
+    for record in records:
+        force = record.force_magnitude[:, None] if record.force is None else record.force
+        count = int((without_spikes(force)[1] > 0.0).any(1).sum())
+        if count:
+            found.append(f"{record.name} {count} of {len(record)}")
+    if not found:
+        return []
+    return [
+        f"{_some(found)}: rows in which the force stands out from those before and after, as a"
+        " sensor's or a bus's fault does. They count for little; check the cable if there are many."
+    ]
+
+
+def _dropped(records: Sequence[SliceRecord]) -> list[str]:
+    found = []
+    for record in records:
+        steps = np.diff(record.time) / np.median(np.diff(record.time))
+        # Longer gaps are findings of the record itself.
+        missing = int((np.rint(steps[steps < LONG_GAP]) - 1.0).clip(0.0).sum())
+        if missing > DROPPED * len(record):
+            found.append(f"{record.name} {missing} of {len(record) + missing}")
+    if not found:
+        return []
+    return [f"{_some(found)}: rows are missing; what is there is used at its own times."]
+
+
 def _check_contact(record: SliceRecord, food: Food) -> None:
     """Refuses a record that begins in the food, or whose knife is not where its force is."""
     if not record.phase("slice").any():
         return
-    force = record.force_magnitude
+    force = without_spikes(record.force_magnitude[:, None])[0][:, 0]
     if record.force is not None:
-        force = np.linalg.norm(record.force - record.force[:3].mean(axis=0), axis=1)
+        clean, _ = without_spikes(record.force)
+        force = np.linalg.norm(clean - clean[:3].mean(axis=0), axis=1)
     peak = float(force.max())
     facts = record.metadata
     if record.force is None and force[:3].mean() > BEGUN * peak:

@@ -1,5 +1,6 @@
 """Predicts slices at a point: base parameters, how slices differ, causes at values."""
 
+import copy
 import dataclasses as dc
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -7,6 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from sliceit_drake.calibration.setup import CalibrationSetup
+from sliceit_drake.cutting.bench_errors import ArmErrors, BenchErrors
+from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.diagnosis.cause import Cause
@@ -64,6 +67,7 @@ class Point:
         values: Base parameters by dotted name; those of the setup's food otherwise.
         records: Values of `RECORD_EFFECTS` by the record's name; 0 otherwise.
         causes: What acts beside the base model, in the order in which it acts.
+        rigid: Whether the arm is taken not to give.
         meshing: How finely; the predictor's first by default.
         only: Records to predict, by number; all by default.
     """
@@ -71,6 +75,7 @@ class Point:
     values: Mapping[str, float] = dc.field(default_factory=dict)
     records: Mapping[str, Mapping[str, float]] = dc.field(default_factory=dict)
     causes: tuple[ActiveCause, ...] = ()
+    rigid: bool = False
     meshing: Meshing | None = None
     only: tuple[int, ...] | None = None
 
@@ -79,7 +84,8 @@ class SlicePredictor:
     """Predicts records at points. Equal slices are simulated once.
 
     Args:
-        setup: Food at its calibrated values, knife, board, base parameters.
+        setup: Food at its calibrated values, knife, board, what the bench does otherwise, base
+            parameters.
         records: What is predicted.
         meshings: How finely; the first is the default of a point.
         clock: How time is divided.
@@ -106,6 +112,13 @@ class SlicePredictor:
         self.board = dc.replace(setup.board, height=0.0)
         self.simulator = Simulator(self.clock, self.board, runs, workers)
         self._boards: dict[bytes, np.ndarray] = {}
+
+    def of(self, setup: CalibrationSetup) -> "SlicePredictor":
+        """What predicts the same records by another food or bench, sharing what was simulated."""
+        other = copy.copy(self)
+        other.setup, records = setup, [target.record for target in self.targets]
+        other.targets = make_targets(setup, records, self.meshings, self.clock)
+        return other
 
     def record_effects(self, target: RecordTarget) -> tuple[RecordEffect, ...]:
         """What may differ in a record from others like it."""
@@ -158,6 +171,13 @@ class SlicePredictor:
             simulated.result = result
         return plan
 
+    def bench(self, point: Point) -> BenchErrors:
+        """What the bench does otherwise at a point."""
+        bench = self.setup.bench
+        for active in point.causes:
+            bench = active.cause.bench(bench, active.values)
+        return dc.replace(bench, arm=ArmErrors()) if point.rigid else bench
+
     def model(self, point: Point, target: RecordTarget) -> CuttingModel:
         """The cut of a record at a point."""
         model = target.models[point.meshing or self.meshings[0]]
@@ -171,6 +191,12 @@ class SlicePredictor:
         model = with_parameters(model, factors) if factors else model
         for active in point.causes:
             model = active.cause.model(model, active.values, active.cause.visible(target.facts))
+        bench = self.bench(point)
+        given = {"arm": bench.arm.compliance, "holder": bench.mounting.compliance}
+        more = {f"effects.compliance.{name}": x for name, x in given.items() if x}
+        if more:
+            more = {name: float(get_parameter(model, name)) + x for name, x in more.items()}
+            model = with_parameters(model, more)
         return target.as_cut(model)
 
     def _slice(self, point: Point, number: int) -> "_Slice":
@@ -190,14 +216,25 @@ class SlicePredictor:
             R, p = active.cause.motion(
                 R, p, target.grid, values, active.cause.visible(target.facts), force
             )
+        bench = self.bench(point)
+        p = p - np.array([0.0, 0.0, bench.board.height]) if bench.board.height else p
+        if bench.arm != ArmErrors():
+            parts = self.series(dc.replace(point, rigid=True), number).parts
+            pressed = np.sum([parts[name][:, 5] for name in parts if name != "weight"], axis=0)
+            rise = bench.arm.rise(p[:, 2], self.clock.period, pressed, target.facts.food)
+            p = p + rise[:, None] * [0.0, 0.0, 1.0]
         if target.stretches is None:
-            return _Slice(None, R, p)
+            return _Slice(None, R, p, Effects())
         at_food = p if target.height_unknown else p - np.array([0.0, 0.0, height])
         # A knife whose record is over rests.
         ends = np.minimum(target.stretches.ends, len(p) - 1)
         model, name = self.model(point, target), target.facts.name
-        job = Job(model, R[ends], at_food[ends], target.stretches, name)
-        return _Slice(job, R, p)
+        effects, cut = model.effects, model
+        if effects.changes_force:
+            cut = copy.copy(model)
+            cut.effects = effects.of_cut()
+        job = Job(cut, R[ends], at_food[ends], target.stretches, name)
+        return _Slice(job, R, p, effects)
 
     def _series(self, point: Point, target: RecordTarget, simulated: "_Slice") -> ForceSeries:
         R, p, result = simulated.R, simulated.p, simulated.result
@@ -207,18 +244,31 @@ class SlicePredictor:
         key = R.tobytes() + p.tobytes()
         if key not in self._boards:
             self._boards[key] = target.board(self.board, R, p)
-        series = target.series(result, self._boards[key])
-        for active in point.causes:
-            facts = active.cause.visible(target.facts)
-            series.wrench = active.cause.wrench(series, active.values, facts)
+        series = target.series(result, self._boards[key], simulated.effects)
+        series.wrench = self.shown(series, target, point)
         return series
+
+    def shown(self, series: ForceSeries, target: RecordTarget, point: Point) -> np.ndarray:
+        """The wrench of a series of a record as it would be measured at a point [N, 6]."""
+        wrench, facts = series.wrench, target.facts
+        tared = facts.tared
+        series.wrench = self.bench(point).shown(
+            series.parts, series.R, series.v, series.time, tared
+        )
+        for active in point.causes:
+            out = active.cause.wrench(series, active.values, active.cause.visible(facts))
+            series.wrench = out
+        shown, series.wrench = series.wrench, wrench
+        return shown
 
 
 @dc.dataclass
 class _Slice:
-    """A job, none without food; the poses of the knife over the board at the grid; its result."""
+    """A job, none without food; the poses of the knife over the board at the grid; the effects of
+    the food; its result."""
 
     job: Job | None
     R: np.ndarray
     p: np.ndarray
+    effects: Effects
     result: JobResult | None = None

@@ -1,6 +1,5 @@
 """The result of a diagnosis: its table, figures, files and the extended food."""
 
-import copy
 import dataclasses as dc
 import datetime
 import json
@@ -13,17 +12,22 @@ import numpy as np
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import dump_yaml
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
-from sliceit_drake.cutting.foods.food import make_food_model
-from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.evidence.confirm import Confirmation, confirm
 from sliceit_drake.diagnosis.evidence.held_out import HeldOutGain, held_out_gain, held_out_share
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
-from sliceit_drake.diagnosis.evidence.verdict import Finding, Verdict, checked_out_of_sample
+from sliceit_drake.diagnosis.evidence.verdict import LAW, Finding, Verdict
 from sliceit_drake.diagnosis.experiments.proposal import NextExperiment
+from sliceit_drake.diagnosis.extension import extended_food, predicting_by
 from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import is_users
-from sliceit_drake.diagnosis.report import evidence_figure, records_figure, report_html
+from sliceit_drake.diagnosis.report import (
+    evidence_figure,
+    overview_figure,
+    records_figure,
+    report_html,
+    sentence,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,10 +46,13 @@ class Diagnosis:
         causes: All that were tested, by name.
         shifts: Changes of the base parameters with the verdict's causes in the model, by name:
             factor (log scale) and its standard error.
-        gain: Error on records that were left out; None if nothing is named.
+        gain: Error on records that were left out, by the extended food; None if nothing is named
+            that it can hold.
         remarks: What a reader must know.
         confirmation: What simulations with the named causes say; None before, or if none is named
             whose numbers all records share.
+        extension: The moments as the extended food predicts them; None if nothing is named that it
+            can hold.
         next_experiment: What to cut next, where that was asked for.
     """
 
@@ -57,6 +64,7 @@ class Diagnosis:
     gain: HeldOutGain | None
     remarks: list[str]
     confirmation: Confirmation | None = None
+    extension: LinearProblem | None = None
     next_experiment: NextExperiment | None = None
 
     def confirm(
@@ -65,15 +73,13 @@ class Diagnosis:
         seed: int = 0,
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
-        """Simulates the records with what is named, measures its worth, and judges by that."""
+        """Simulates the records with what is named, and measures its worth."""
         findings = self.verdict.findings
         shared = [f for f in findings if not f.evidence.per_record]
         if shared:
             chosen = [(self.causes[f.evidence.name], self.values(f)) for f in shared]
             self.confirmation = confirm(self.problem, predictor, chosen, progress)
-        simulated = None
         if self.confirmation is not None and self.confirmation.holds:
-            simulated = self.confirmation.problem
             factors = self.confirmation.factors
             self.shifts = {n: (factors.get(n, f), error) for n, (f, error) in self.shifts.items()}
         elif self.confirmation is not None:
@@ -81,8 +87,12 @@ class Diagnosis:
                 "A simulation with the cause in it gains less than half of what its derivatives "
                 "promise: take the values for a direction."
             )
-        self.gain = held_out_gain(self.problem, self.verdict.named, seed, simulated)
-        self.verdict = checked_out_of_sample(self.verdict, self.gain, self.problem)
+        held = [f for f in findings if self.causes[f.evidence.name].expressible]
+        if held:
+            food, _ = self._extension(held)
+            self.extension = predicting_by(self.problem, predictor, food)
+            named = [f.evidence.cause for f in held]
+            self.gain = held_out_gain(self.problem, named, seed, self.extension)
 
     def values(self, finding: Finding) -> dict[str, float]:
         """Parameters of a finding's cause."""
@@ -95,6 +105,10 @@ class Diagnosis:
             values[p.name] = p.within(p.null + coefficient * column.size)
         return values
 
+    def sentence(self) -> str:
+        """The result in a breath."""
+        return sentence(self)
+
     def table(self) -> str:
         """The result in a minute."""
         v, lines = self.verdict, []
@@ -102,10 +116,10 @@ class Diagnosis:
         lines.append(f"{count} records of {kinds} conditions")
         lines.append(f"Verdict: {v.kind.replace('_', ' ')}: {v.reason}")
         for finding in v.findings:
-            lines += self._lines(finding, v.kind != "unknown")
+            lines += self._lines(finding)
         lines.append(
-            f"All that the simulation gets wrong: {v.misfit:.2f} of the in-contact noise"
-            f" (p = {v.screening.misfit_p_value:.3f})"
+            f"The simulation by itself: wrong by {100 * v.own_error:.1f} % of the force, "
+            f"{v.misfit:.2f} of the noise, in contact"
         )
         if self.gain is not None:
             g = self.gain
@@ -136,6 +150,11 @@ class Diagnosis:
                 lines.append(f"Shift of {name}: times {factor:.3f} (+-{error:.3f})")
         return "\n".join(lines + self.remarks)
 
+    def plot_overview(self) -> "Figure":
+        """Where the cause shows most: measured, simulated, and by the extended food; what is left;
+        evidence and size of each cause."""
+        return overview_figure(self)
+
     def plot(self) -> "Figure":
         """Measured and simulated force of each condition, and what is left."""
         return records_figure(self.problem, self.verdict)
@@ -144,60 +163,49 @@ class Diagnosis:
         """Gain of each cause against chance, and the angles between causes."""
         return evidence_figure(self.verdict.screening)
 
-    def _lines(self, finding: Finding, named: bool) -> list[str]:
+    def _lines(self, finding: Finding) -> list[str]:
         e, cause = finding.evidence, self.causes[finding.evidence.name]
         values = self.values(finding)
         parts = []
         for c, error in zip(e.columns, e.errors, strict=True):
             spread = f" +- {abs(error * c.size):.2g}" if np.isfinite(error) else ""
             parts.append(f"{c.parameter} = {values[c.parameter]:.3g}{spread} {c.unit}".rstrip())
-        head = "Supported" if named else "Nearest"
+        word = "Nearest" if self.verdict.kind == "unknown" else "Supported"
         lines = [
-            f"  {head}: {e.name} ({cause.family}), {', '.join(parts)}; "
-            f"{finding.size:.2f} of the noise, explains {100 * min(finding.share, 1.0):.0f} %"
+            f"  {word}: {e.name} ({cause.family}), {', '.join(parts)}; "
+            f"{finding.size:.2f} of noise and own error where it acts, explains "
+            f"{100 * finding.share:.0f} % there"
         ]
         if finding.others:
+            split = sorted({self.causes[n].experiment for n in finding.names if n != LAW})
             lines.append(
                 f"    These records cannot tell it from: {', '.join(finding.others)}. To split "
-                f"them: {', '.join(sorted({self.causes[n].experiment for n in finding.names}))}"
+                f"them: {', '.join(split)}"
             )
             if self.next_experiment is None:
                 lines.append("    --next-experiment FILE finds the motion that does, and writes it")
         return lines
 
     def extended(self) -> CalibratedFood:
-        """The food with the named causes and the shifts of the base parameters in it.
+        """The food with the named causes and the shifts of the base parameters in it and its bench.
 
-        Causes of sensor and robot do not belong to the food; the note names them.
+        The note names the causes that it cannot hold.
         """
-        food = copy.deepcopy(self.setup.food)
-        model = make_food_model(food, self.setup.knife, self.setup.numerics)
         # What is not understood, or may be the slices, is no reason to change a food.
         sure = self.verdict.kind in ("cause", "causes", "nothing")
-        values = {
-            name: float(get_parameter(model, name)) * factor
-            for name, (factor, _) in self.shifts.items()
-            if sure
-        }
-        model = with_parameters(model, values)
-        left = []
-        named = self.verdict.findings if self.verdict.kind in ("cause", "causes") else []
-        for finding in named:
-            cause = self.causes[finding.evidence.name]
-            changed = cause.extension(model, self.values(finding))
-            if changed is model:
-                left.append(f"{cause.name} ({cause.family})")
-            model = changed
-        food.material, food.effects = model.material, model.effects
-        note = f"Not in the food: {', '.join(left)}." if left else ""
-        return CalibratedFood(
-            food=food,
-            knife=self.setup.knife,
-            flank_stiffness=model.numerics.flank_stiffness,
-            records=[r.name for r in self.problem.found.records],
-            date=datetime.date.today().isoformat(),
-            note=note,
-        )
+        food, left = self._extension(self.verdict.findings) if sure else self._extension([], False)
+        food.records = [r.name for r in self.problem.found.records]
+        food.date = datetime.date.today().isoformat()
+        food.note = f"Not in this file: {', '.join(left)}." if left else ""
+        return food
+
+    def _extension(
+        self, findings: list[Finding], shifted: bool = True
+    ) -> tuple[CalibratedFood, list[str]]:
+        """See `extended_food`."""
+        factors = {name: factor for name, (factor, _) in self.shifts.items() if shifted}
+        causes = [(self.causes[f.evidence.name], self.values(f)) for f in findings]
+        return extended_food(self.setup, factors, causes)
 
     def facts(self) -> dict[str, Any]:
         """The result as plain values."""
@@ -216,9 +224,16 @@ class Diagnosis:
                 }
                 for f in v.findings
             ],
+            "own_error": v.own_error,
+            "own_error_mostly": [
+                {"channel": c, "phase": f, "part": p, "share": s} for c, f, p, s in v.mostly
+            ],
+            "causes": [
+                {"cause": c.name, "verdict": c.kind, "why": c.why, "limits": c.limits}
+                for c in v.causes
+            ],
             "misfit_over_noise": v.misfit,
             "p_value": v.screening.p_value,
-            "misfit_p_value": v.screening.misfit_p_value,
             "simulated_share_of_gain": None
             if self.confirmation is None
             else self.confirmation.gained / max(self.confirmation.promised, 1e-9),
@@ -239,7 +254,10 @@ class Diagnosis:
                     "expected": e.expected,
                     "limit": e.limit,
                     "scan": e.scan,
-                    "held_out_share": held_out_share(self.problem, [e.cause]),
+                    "size": e.size,
+                    "held_out_share": held_out_share(self.problem, [e.cause])
+                    if e.score > 0.0
+                    else None,
                 }
                 for e in v.screening.causes
             ],
@@ -268,5 +286,5 @@ class Diagnosis:
         (directory / "diagnosis.json").write_text(text, encoding="utf-8")
         dump_yaml(self.extended(), directory / "extended.yaml")
         if report:
-            page = report_html(self.table(), self.problem, self.verdict, self.gain)
+            page = report_html(self)
             (directory / "report.html").write_text(page, encoding="utf-8")

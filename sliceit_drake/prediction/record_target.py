@@ -11,11 +11,13 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.board import Board, board_wrenches
+from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import GRAVITY, CuttingModel, Numerics
-from sliceit_drake.cutting.parameters import with_parameters
+from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.prediction.clock import Clock, Stretches
+from sliceit_drake.prediction.noise import without_spikes
 from sliceit_drake.prediction.placement import food_of, is_bare, knife_of, poses_in_food
 from sliceit_drake.prediction.series import ForceSeries, SliceFacts
 from sliceit_drake.prediction.simulator import JobResult
@@ -91,7 +93,8 @@ class RecordTarget:
         channels: Names of the compared channels: `CHANNELS`, the first three without a torque, or
             "force_norm".
         time: Of the rows [m], s.
-        measured: Channels at the rows [m, c].
+        measured: Channels at the rows [m, c], without spikes.
+        doubt: Standard deviation by which each of them is doubted, see `without_spikes` [m, c].
         depth: Of the edge below the top of the food at the rows [m], metres.
         phase: Label at the rows [m]; "" for none.
         grid: Even times of the coupling steps [N + 1], s; row 0 is the first row of the record.
@@ -162,13 +165,14 @@ class RecordTarget:
         )
         if record.force is None:
             self.channels: tuple[str, ...] = NORM
-            measured = record.force_magnitude[:, None]
+            groups = [record.force_magnitude[:, None]]
         else:
-            self.channels, measured = CHANNELS[:3], R_FW.apply(record.force)
+            self.channels, groups = CHANNELS[:3], [R_FW.apply(record.force)]
             if record.torque is not None:
                 self.channels = CHANNELS
-                measured = np.column_stack([measured, R_FW.apply(record.torque)[:, 1]])
-        self.measured = measured[rows]
+                groups.append(R_FW.apply(record.torque)[:, 1:2])
+        cleaned = zip(*map(without_spikes, groups), strict=True)
+        self.measured, self.doubt = (np.column_stack(parts)[rows] for parts in cleaned)
 
     @property
     def model(self) -> CuttingModel:
@@ -215,19 +219,31 @@ class RecordTarget:
         return self.clock.stretches(way, max(int(low[0]) - 1, 0), last)
 
     def as_cut(self, model: CuttingModel) -> CuttingModel:
-        """A cut of the record's food, without its skin where it was peeled."""
-        if self.facts.peeled and model.effects.skin.toughness > 0.0:
-            return with_parameters(model, {"effects.skin.toughness": 0.0})
-        return model
+        """A cut of the record's food, without its skin where it was peeled, by a knife that has cut
+        as many slices."""
+        effects, changes = model.effects, {}
+        if self.facts.peeled:
+            skins = ("effects.skin.toughness", "effects.outside.toughness")
+            changes = {name: 0.0 for name in skins if get_parameter(model, name)}
+        if effects.entry.dulling and effects.entry.slices != self.facts.knife_slices:
+            changes["effects.entry.slices"] = self.facts.knife_slices
+        return with_parameters(model, changes) if changes else model
 
     def moved(self, lower: float, faster: float) -> np.ndarray:
         """Positions of Ko at the grid [N + 1, 3], metres, of a knife that stood lower, metres, and
         moved faster by a factor."""
         return self.home + faster * (self.p - self.home) - np.array([0.0, 0.0, lower])
 
-    def series(self, result: JobResult | None, board_wrench: np.ndarray) -> ForceSeries:
-        """The predicted slice on the even grid, from the result of the food, None where the knife
-        never comes near any, and the wrench of the board, from `board` [N, 6]."""
+    def series(
+        self, result: JobResult | None, board_wrench: np.ndarray, effects: Effects
+    ) -> ForceSeries:
+        """The predicted slice on the even grid.
+
+        Args:
+            result: Of the food; None where the knife never comes near any.
+            board_wrench: From `board` [N, 6].
+            effects: Of the food; those that change the force of the cut are not in the result.
+        """
         T, n = self.clock.period, len(self.grid) - 1
         parts = {name: np.zeros((n, 6)) for name in ("edge", "normal", "friction")}
         if result is not None:
@@ -238,9 +254,12 @@ class RecordTarget:
             known = result.parts.reshape(len(result.parts), 18)
             inside = (wanted > ends[0]) & (wanted < ends[-1])
             values = interpolated(wanted, middle, known)
-            values = np.where(inside[:, None], values, 0.0)
+            values = np.where(inside[:, None], values, 0.0).reshape(n, 3, 6)
+            if effects.changes_force:
+                speed = np.linalg.norm(np.diff(self.p, axis=0), axis=1) / T
+                values, _ = effects.changed(values, self.R[1:, :, 0], speed, T)
             for k, name in enumerate(parts):
-                parts[name] = values[:, 6 * k : 6 * k + 6]
+                parts[name] = values[:, k]
         parts["board"] = board_wrench
         parts["weight"] = self._weight()
         turn = self.R[1:] @ self.R[:-1].transpose(0, 2, 1)

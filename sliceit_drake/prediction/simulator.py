@@ -32,6 +32,9 @@ class Job:
         stretches: Which coupling steps these are.
         name: For messages.
         precision: That the result is kept in, float32 or float64.
+        substeps: Numbers of sub-steps of the coupling steps that are taken [E]: those of a job from
+            which this one differs a little. None, or those of one that broke down, for those by
+            need.
     """
 
     model: CuttingModel
@@ -40,6 +43,7 @@ class Job:
     stretches: Stretches
     name: str = ""
     precision: str = "float32"
+    substeps: np.ndarray | None = None
 
     @property
     def duration(self) -> float:
@@ -60,11 +64,13 @@ class JobResult:
             force, in F [E, 3, 6]; none of them is finite where the slice broke down.
         rise: By which an arm that gives stood higher than its command, at the ends [E], metres.
         cut: Fraction of the section that is cut [E]; NaN from where the slice broke down.
+        substeps: Of each coupling step [E]; 0 from where the slice broke down.
     """
 
     parts: np.ndarray
     rise: np.ndarray
     cut: np.ndarray
+    substeps: np.ndarray
 
 
 Executor = Callable[[Sequence[Job], float, Board], Iterable[tuple[int, JobResult]]]
@@ -83,19 +89,21 @@ def run_job(driver: Driver, job: Job, board: Board) -> JobResult:
     together, multiples = BLOCK if path.rigid else 1, job.stretches.multiples.tolist()
     launches = [Launch(k, together, multiples[k // BLOCK]) for k in range(0, count, together)]
     wrenches, cut = np.zeros((count, 3, 6)), np.full(count, np.nan)
-    rise = np.zeros(count)
-    for launch, (step,) in driver.run([path], launches, board):
+    rise, substeps = np.zeros(count), np.zeros(count, int)
+    given = None if job.substeps is None or not job.substeps.all() else [job.substeps]
+    for launch, (step,) in driver.run([path], launches, board, given):
         at = slice(launch.first, launch.first + launch.coupling_steps)
         # The last launch may go on beyond the job, with a knife that rests.
         wrenches[at] = step.wrenches[: count - launch.first]
         if step.finite:
-            cut[at] = step.cut[: count - launch.first]
+            cut[at], substeps[at] = step.cut[: count - launch.first], step.substeps
         else:
             wrenches[:] = np.nan
     if np.isfinite(wrenches).all():
         rise = path.p_FK[1:, 2] - job.p[1:, 2]
     parts = (wrenches.reshape(-1, 3, 2, 3) @ job.model.X_FC_rotation.T).reshape(-1, 3, 6)
-    return JobResult(*(series.astype(job.precision) for series in (parts, rise, cut)))
+    parts, rise, cut = (series.astype(job.precision) for series in (parts, rise, cut))
+    return JobResult(parts, rise, cut, substeps)
 
 
 class Simulator:
@@ -164,10 +172,10 @@ class Simulator:
         if known is None or known[0] is not model.split:
             known = self._geometry[id(model.split)] = (model.split, _geometry_key(model))
         settings = (model.effects, model.knife, model.numerics, self._clock, self._board)
-        motion = (job.R, job.p, job.stretches.ends, job.stretches.multiples, job.precision)
+        stretches = job.stretches.ends, job.stretches.multiples
         return content_key(
             *(self._code, known[1], parameter_row(model), model.inertia.matrix.data),
-            *(settings, model.outline, *motion),
+            *(settings, job.R, job.p, *stretches, job.precision, job.substeps),
         )
 
 

@@ -15,6 +15,10 @@ MIN_ROWS = 10
 KINDS = {
     "missing column": ("error", "Add it."),
     "gap": ("error", "Remove these rows, or cut the record off before them."),
+    "no reading": (
+        "warning",
+        "Leave them if nothing happened then; else cut the record off before.",
+    ),
     "short": ("error", f"Give at least {MIN_ROWS} rows."),
     "time": ("error", "Remove repeated rows; split the record where the clock was set back."),
     "quaternion": ("error", "Write a unit quaternion, w first."),
@@ -94,11 +98,12 @@ class Findings:
     """Collects findings about one table.
 
     Attributes:
+        table: The table whose rows `add` counts.
         found: The findings so far.
     """
 
     def __init__(self, table: SliceTable) -> None:
-        self._table = table
+        self.table = table
         self.found: list[RecordFinding] = []
 
     def add(
@@ -112,17 +117,17 @@ class Findings:
     ) -> None:
         """Reports something about the table; `rows` are first and last index."""
         severity, usual = KINDS[kind]
-        lines = self._table.lines
+        lines = self.table.lines
         place = None if rows is None else (int(lines[rows[0]]), int(lines[rows[1]]))
         self.found.append(
             RecordFinding(
-                severity, kind, file or self._table.file, column, place, problem, fix or usual
+                severity, kind, file or self.table.file, column, place, problem, fix or usual
             )
         )
 
     def fact(self, kind: str, field: str, problem: str, fix: str | None = None) -> None:
         """Reports something about a field of the YAML file."""
-        file = str(Path(self._table.file).with_suffix(".yaml"))
+        file = str(Path(self.table.file).with_suffix(".yaml"))
         self.add(kind, field, problem, fix=fix, file=file)
 
     def has(self, *kinds: str) -> bool:

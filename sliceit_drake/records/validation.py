@@ -39,6 +39,8 @@ KEY_FACTS = (
     "sensor.rate",
 )
 """Facts that the simulation of a slice needs: given, or listed as unknown."""
+MOST_LOST = 0.1
+"""Fraction of the rows that may lack a finite number of the wrench: they are left out."""
 
 
 def load_record(file: str | Path) -> SliceRecord:
@@ -56,7 +58,7 @@ def load_record(file: str | Path) -> SliceRecord:
             raise ConfigurationError(
                 finding.problem, source=finding.place, field=finding.column, fix=finding.fix
             )
-    return fmt.record_from_table(table)
+    return fmt.record_from_table(_with_readings(table))
 
 
 def load_records(folder: str | Path) -> list[SliceRecord]:
@@ -129,8 +131,14 @@ def check_table(table: SliceTable) -> list[RecordFinding]:
     If the columns cannot be read as series, only the errors that say so.
     """
     findings = Findings(table)
+    whole, table = table, _with_readings(table)
+    if lost := len(whole.lines) - len(table.lines):
+        rows = np.flatnonzero(~np.isin(whole.lines, table.lines))
+        text = f"{lost} of {len(whole.lines)} rows have no finite wrench and are left out"
+        findings.add("no reading", "", text, (rows[0], rows[-1]))
+        findings.table = table
     _check_structure(table, findings)
-    if findings.found:
+    if any(finding.severity == "error" for finding in findings.found):
         return findings.found
     try:
         record = fmt.record_from_table(table)
@@ -143,6 +151,17 @@ def check_table(table: SliceTable) -> list[RecordFinding]:
     if not findings.has("millimetres", "milliseconds"):
         check_force(table, record, findings)
     return findings.found
+
+
+def _with_readings(table: SliceTable) -> SliceTable:
+    """The table without the rows in which the sensor has no finite number, where these are few."""
+    names = (*fmt.FORCE, *fmt.TORQUE, fmt.FORCE_NORM)
+    series = [table.columns[name] for name in names if name in table.columns]
+    kept = np.isfinite(series).all(0) if series else np.ones(len(table.lines), bool)
+    if kept.all() or kept.mean() < 1.0 - MOST_LOST:
+        return table
+    columns = {name: values[kept] for name, values in table.columns.items()}
+    return dc.replace(table, columns=columns, lines=table.lines[kept])
 
 
 def _check_structure(table: SliceTable, findings: Findings) -> None:
@@ -163,7 +182,7 @@ def _check_structure(table: SliceTable, findings: Findings) -> None:
         for first, last in runs(~np.isfinite(values)):
             text = f"{last - first + 1} of {len(values)} rows have no finite number"
             findings.add("gap", name, text, (first, last))
-    if findings.found:
+    if findings.has("missing column", "gap"):
         return
     time = table.columns[fmt.TIME]
     if len(time) < MIN_ROWS:

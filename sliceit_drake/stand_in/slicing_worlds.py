@@ -198,9 +198,7 @@ class StandInWorld(SlicingWorld):
     def _cut(
         self, scenario: Scenario, calibrated: CalibratedFood, rng: np.random.Generator
     ) -> None:
-        scenario.numerics = Numerics(
-            flank_stiffness=calibrated.flank_stiffness, time_step=self.time_step
-        )
+        scenario.numerics = Numerics(time_step=self.time_step)
         scenario.food = food = calibrated.apply_to(copy.deepcopy(calibrated.food))
         shape, material, effects = food.shape, food.material, food.effects
         assert isinstance(shape, Cylinder)

@@ -19,7 +19,7 @@ from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
 from sliceit_drake.cutting.foods.effects import Effects
 from sliceit_drake.diagnosis.cause import EXPERIMENTS
-from sliceit_drake.diagnosis.evidence.verdict import MIN_REPLICATES
+from sliceit_drake.diagnosis.evidence.verdict import DecisionRule
 from sliceit_drake.diagnosis.experiments.identifiability import ANGLE, short
 from sliceit_drake.diagnosis.input_checks import check_records
 from sliceit_drake.diagnosis.one_slice.diagnose_slice import diagnose_slice, setup_of_slice
@@ -184,7 +184,7 @@ def page_values(items: Sequence[MeasuredSlice], replicates: int, command: str) -
             [text, *(_cell(item.results["plain"], expected, pairs) for item in items)]
             for text, expected, pairs in CLAIMS
         ],
-        slices=MIN_REPLICATES,
+        slices=DecisionRule.replicates,
         experiments={
             item.food: ", then ".join(
                 f"{EXPERIMENTS[e]} (`{e}`)" for e in item.results["plain"].experiments()[:5]

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.diagnosis.evidence.verdict import LAW, LOCKED_TO_DEPTH
 from studies.hidden_effects.cases import Case
 from studies.hidden_effects.runner import TIMING, is_done
 from studies.hidden_effects.study import CLASSES, NEAR, load_cases, read_facts
@@ -128,6 +129,9 @@ def judge(
         # One that looks for itself in the records has nothing to be near to here.
         least = own + AS_WELL if own < NOT_ITSELF else 0.0
         allowed |= {n for n, angle in angles.items() if angle <= max(CLASS_ANGLE, least)}
+    # What is locked to depth no records tell from the law, and so not from one another.
+    if allowed & set(LOCKED_TO_DEPTH) and any(LAW in c for c in named):
+        allowed |= {*LOCKED_TO_DEPTH, LAW}
     wrong = sorted({n for c in named for n in c} - allowed)
     gain = facts.get("gain")
     shares = {e["cause"]: e.get("held_out_share") for e in facts["evidence"]}

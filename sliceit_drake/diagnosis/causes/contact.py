@@ -2,21 +2,12 @@
 
 import dataclasses as dc
 
-import numpy as np
-
-from sliceit_drake.cutting.foods.effects import Bluntness
 from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.cutting.parameters import with_parameters
 from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan, Values
-from sliceit_drake.diagnosis.causes.material import tougher
 from sliceit_drake.prediction.series import SliceFacts
 
 __all__ = ["BluntEdge", "Dulling", "FlankAdhesion", "StaticFriction"]
-
-DULLED = 10.0
-"""Slices after which a dulling edge has its `growth`."""
-DULLED_DEPTH = 2e-3
-"""Over which its excess falls to 1/e, metres."""
 
 
 class StaticFriction(Cause):
@@ -70,19 +61,15 @@ class BluntEdge(Cause):
 
     name = "bluntness"
     family = "knife and contact"
-    parameters = (CauseParameter("initiation", "J/m2", 250.0, low=0.0, high=1e4),)
-    scan = Scan("depth", "m", (1e-3, 2e-3, 4e-3))
+    parameters = (
+        CauseParameter(
+            "initiation", "J/m2", 250.0, low=0.0, high=1e4, adds_to="effects.entry.initiation"
+        ),
+    )
+    scan = Scan("depth", "m", (1e-3, 2e-3, 4e-3), "effects.entry.depth")
     absorbed_by = ("effects.bluntness.initiation",)
     signature = "raises the first peak, the plateau hardly; with skin or without, less in a draw"
     experiment = "skinned"
-
-    def model(self, model: CuttingModel, values: Values, facts: SliceFacts) -> CuttingModel:
-        """Tougher points near the surface."""
-        return _harder_to_begin(model, values["initiation"], values["depth"])
-
-    def extension(self, model: CuttingModel, values: Values) -> CuttingModel:
-        """More to begin with; the depth over which it falls takes the place of the model's."""
-        return _blunter(model, values["initiation"], values["depth"])
 
 
 class Dulling(Cause):
@@ -91,34 +78,10 @@ class Dulling(Cause):
     name = "dulling"
     family = "knife and contact"
     by_slice = True
-    parameters = (CauseParameter("growth", "J/m2", 250.0, low=0.0, high=1e4),)
-    scan = Scan("exponent", "", (0.5, 1.0))
+    parameters = (
+        CauseParameter("growth", "J/m2", 250.0, low=0.0, high=1e4, adds_to="effects.entry.dulling"),
+    )
+    scan = Scan("exponent", "", (0.5, 1.0), "effects.entry.dulling_exponent")
     absorbed_by = ("effects.bluntness.dulling",)
     signature = "the first peak grows from slice to slice, and is back when the knife is sharpened"
     experiment = "repeats"
-
-    def model(self, model: CuttingModel, values: Values, facts: SliceFacts) -> CuttingModel:
-        """Tougher points near the surface, by the number of slices."""
-        grown = values["growth"] * (facts.knife_slices / DULLED) ** values["exponent"]
-        return _harder_to_begin(model, grown, DULLED_DEPTH)
-
-    def extension(self, model: CuttingModel, values: Values) -> CuttingModel:
-        """An edge after `DULLED` slices."""
-        return _blunter(model, values["growth"], DULLED_DEPTH)
-
-
-def _harder_to_begin(model: CuttingModel, initiation: float, depth: float) -> CuttingModel:
-    """Tougher points near the top, where the edge begins: all that parts there is harder, and not
-    what the edge alone does below each place of the outside, as in `effects.bluntness`."""
-    tables = model.tables
-    grid = np.linspace(-tables.reach, tables.reach, tables.width.shape[1])
-    depths = model.top - model.split.points[:, 2]
-    below = np.maximum(depths[:, None] + grid, 0.0)
-    work = float((np.exp(-below / depth) * tables.width).sum()) * tables.spacing
-    shape = np.exp(-np.maximum(depths, 0.0) / depth)
-    return tougher(model, shape, initiation * work)
-
-
-def _blunter(model: CuttingModel, excess: float, depth: float) -> CuttingModel:
-    blunt = Bluntness(model.effects.bluntness.grown + excess, depth)
-    return model.derive(effects=dc.replace(model.effects, bluntness=blunt))

@@ -1,4 +1,4 @@
-"""Causes in what the robot carries and how it moves. They act on predicted wrenches alone."""
+"""Causes in what the robot carries and how it moves."""
 
 import copy
 import dataclasses as dc
@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sliceit_drake.cutting.model import GRAVITY
 from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan, Values
 from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
 from sliceit_drake.diagnosis.evidence.searches import strongest_frequencies
@@ -24,32 +23,11 @@ class ToolWeight(Cause):
     name = "tool_weight"
     family = "robot"
     parameters = (
-        CauseParameter("mass", "kg", 0.15, low=-5.0, high=5.0),
-        CauseParameter("moment", "kg m", 0.01, low=-1.0, high=1.0),
+        CauseParameter("mass", "kg", 0.15, low=-5.0, high=5.0, adds_to="bench.tool.mass"),
+        CauseParameter("moment", "kg m", 0.01, low=-1.0, high=1.0, adds_to="bench.tool.moment"),
     )
     signature = "there in the air; goes with acceleration and the tool's orientation"
     experiment = "air"
-
-    def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:
-        """With what a mass on Kz adds, `moment` its mass times its place there from Ko.
-
-        A sensor that was zeroed at the start does not show what was there then.
-        """
-        acceleration = np.gradient(series.v, series.period, axis=0)
-        acceleration[:, 2] += GRAVITY
-        down = series.in_food(np.array([0.0, 0.0, 1.0]))
-        added = np.concatenate(
-            [
-                -values["moment"] * np.cross(down, acceleration),
-                -values["mass"] * acceleration,
-            ],
-            axis=1,
-        )
-        if facts.tared:
-            for part in (slice(0, 3), slice(3, 6)):
-                first = series.in_knife(added[:, part])[0]
-                added[:, part] -= series.in_food(first)
-        return series.wrench + added
 
 
 class Vibration(Cause):

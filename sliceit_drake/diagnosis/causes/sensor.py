@@ -1,10 +1,6 @@
-"""Causes in the wrench sensor and its mounting. They act on predicted wrenches alone."""
+"""Causes in the wrench sensor and its mounting, as `cutting.bench_errors.SensorErrors` has them."""
 
-import numpy as np
-from scipy.signal import lfilter
-
-from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan, Values
-from sliceit_drake.prediction.series import ForceSeries, SliceFacts
+from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan
 
 __all__ = ["SensorDelay", "SensorGain", "SensorTilt", "SensorZero"]
 
@@ -14,20 +10,16 @@ class SensorZero(Cause):
 
     name = "sensor_zero"
     family = "sensor"
-    parameters = (
-        *(CauseParameter(f"bias_{a}", "N", 0.3) for a in "xyz"),
-        *(CauseParameter(f"drift_{a}", "N/s", 0.03) for a in "xyz"),
+    parameters = tuple(
+        CauseParameter(f"{kind}_{axis}", unit, size, adds_to=f"bench.sensor.force_{field}.{k}")
+        for kind, unit, size, field in (
+            ("bias", "N", 0.3, "bias"),
+            ("drift", "N/s", 0.03, "drift_rate"),
+        )
+        for k, axis in enumerate("xyz")
     )
     signature = "there without contact; independent of depth and speed"
     experiment = "air"
-
-    def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:
-        """With the zero added."""
-        bias, drift = (np.array([values[f"{k}_{a}"] for a in "xyz"]) for k in ("bias", "drift"))
-        out = series.wrench.copy()
-        since = (series.time - series.time[0])[:, None]
-        out[:, 3:] += series.in_food(bias + since * drift)
-        return out
 
 
 class SensorGain(Cause):
@@ -35,13 +27,11 @@ class SensorGain(Cause):
 
     name = "sensor_gain"
     family = "sensor"
-    parameters = (CauseParameter("gain", "", 0.08, low=-0.9, high=5.0),)
+    parameters = (
+        CauseParameter("gain", "", 0.08, low=-0.9, high=5.0, adds_to="bench.sensor.gain"),
+    )
     signature = "scales everything, a known weight too"
     experiment = "weight"
-
-    def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:
-        """Scaled."""
-        return series.wrench * (1.0 + values["gain"])
 
 
 class SensorTilt(Cause):
@@ -49,26 +39,14 @@ class SensorTilt(Cause):
 
     name = "sensor_tilt"
     family = "sensor"
-    parameters = (
-        CauseParameter("about_x", "rad", 0.06, low=-0.5, high=0.5),
-        CauseParameter("about_y", "rad", 0.06, low=-0.5, high=0.5),
+    parameters = tuple(
+        CauseParameter(
+            f"about_{axis}", "rad", 0.06, low=-0.5, high=0.5, adds_to=f"bench.sensor.tilt.{k}"
+        )
+        for k, axis in enumerate("xy")
     )
     signature = "sideways forces in proportion to the press; turns with the tool"
     experiment = "weight"
-
-    def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:
-        """Turned."""
-        turn = series.in_food(np.array([values["about_x"], values["about_y"], 0.0]))
-        angle = float(np.hypot(values["about_x"], values["about_y"]))
-        if angle == 0.0:
-            return series.wrench
-        out = series.wrench.copy()
-        axis = turn / angle
-        for part in (slice(0, 3), slice(3, 6)):
-            v = series.wrench[:, part]
-            along = axis * (axis * v).sum(1, keepdims=True)
-            out[:, part] = along + np.cos(angle) * (v - along) + np.sin(angle) * np.cross(axis, v)
-        return out
 
 
 class SensorDelay(Cause):
@@ -76,17 +54,9 @@ class SensorDelay(Cause):
 
     name = "sensor_delay"
     family = "sensor"
-    parameters = (CauseParameter("delay", "s", 0.01, low=0.0, high=0.2),)
-    scan = Scan("stages", "", (1.0, 4.0))
+    parameters = (
+        CauseParameter("delay", "s", 0.01, low=0.0, high=0.2, adds_to="bench.sensor.delay"),
+    )
+    scan = Scan("stages", "", (1.0, 4.0), "bench.sensor.delay_stages")
     signature = "minus the delay times the rate of the force; in depth it goes with the speed"
     experiment = "retract"
-
-    def wrench(self, series: ForceSeries, values: Values, facts: SliceFacts) -> np.ndarray:
-        """Delayed; a filter y += (x - y) / (n + 1) is n rows late."""
-        stages = round(values["stages"])
-        rows = values["delay"] / stages / series.period
-        keep = rows / (1.0 + rows)
-        out = series.wrench
-        for _ in range(stages if values["delay"] > 0.0 else 0):
-            out, _ = lfilter([1.0 - keep], [1.0, -keep], out, axis=0, zi=keep * out[:1])
-        return np.asarray(out)

@@ -36,6 +36,7 @@ class Column:
         one_sided: Whether its coefficient cannot be negative.
         per_record: Whether each record has a coefficient of its own.
         searched: `Cause.searched`.
+        low, high: Range of the parameter's distance from its null.
     """
 
     kind: str
@@ -47,6 +48,8 @@ class Column:
     one_sided: bool = False
     per_record: bool = False
     searched: float = 0.0
+    low: float = -np.inf
+    high: float = np.inf
 
     @property
     def label(self) -> str:
@@ -73,8 +76,10 @@ class RecordSensitivity:
         measured, predicted: [m, c], N and Nm.
         columns: Changes of the prediction [m, c, K].
         even: Even parts of the changes [m, c, K]; 0 where there is none.
+        doubt: Standard deviation by which each measurement is doubted [m, c]; None for none.
         bent: Part of the prediction that is beyond the first order of what is the record's own
             (`own_values`) [m, c]; None where that was not looked at.
+        height: Depth at which the board is, metres; infinite where none is in reach.
     """
 
     name: str
@@ -89,7 +94,9 @@ class RecordSensitivity:
     predicted: np.ndarray
     columns: np.ndarray
     even: np.ndarray
+    doubt: np.ndarray | None = None
     bent: np.ndarray | None = None
+    height: float = np.inf
 
     @property
     def residual(self) -> np.ndarray:

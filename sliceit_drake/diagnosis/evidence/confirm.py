@@ -15,6 +15,7 @@ from sliceit_drake.cutting.parameters import get_parameter
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
+from sliceit_drake.prediction.discrepancy import Sizes
 
 __all__ = ["Confirmation", "confirm"]
 
@@ -67,8 +68,9 @@ def confirm(
     shared = found.of_causes(
         [(c.name, None if c.scan is None else values.get(c.scan.name)) for c, values in causes]
     )
-    _, start = _fit(problem, problem.base, shared)
-    theta, end = _fit(problem, [*problem.base, *shared], shared)
+    sizes = problem.fitted_sizes(shared, problem.sizes)[0]
+    _, start = _fit(problem, problem.base, shared, sizes)
+    theta, end = _fit(problem, [*problem.base, *shared], shared, sizes)
     promised = start - end
     at = {cause.name: dict(values) for cause, values in causes}
     logs = {k: float(x) * found.columns[k].size for k, x in zip(problem.base, theta, strict=False)}
@@ -80,7 +82,7 @@ def confirm(
         base = {found.columns[k].name: calibrated[k] * float(np.exp(x)) for k, x in logs.items()}
         active = tuple(ActiveCause(cause, at[cause.name]) for cause, _ in causes)
         moved = _at_point(problem, predictor, Point(values=base, causes=active), progress)
-        step, chi_square = _fit(moved, [*moved.base, *shared], shared)
+        step, chi_square = _fit(moved, [*moved.base, *shared], shared, sizes)
         rounds.append((chi_square, moved, {n: dict(v) for n, v in at.items()}, dict(logs)))
         for k, change in zip([*moved.base, *shared], step, strict=True):
             column = found.columns[k]
@@ -101,16 +103,15 @@ def confirm(
 
 
 def _fit(
-    problem: LinearProblem, columns: list[int], not_usual: list[int]
+    problem: LinearProblem, columns: list[int], causes: list[int], sizes: Sizes
 ) -> tuple[np.ndarray, float]:
     """Coefficients of columns [n], and twice the negative log-likelihood but for a constant."""
-    own, variance = problem.own_prior(without=not_usual)
-    total = problem.reduced(own, variance).sum(0)
-    usual = [k for k in problem.usual if k not in not_usual]
-    chosen = [*problem.numerical, *problem.spline, *usual, *columns]
-    theta, _ = problem.fit_shared(total, chosen, columns)
-    y = problem.size
-    return np.asarray(theta[-len(columns) :]), float(total[y, y] - total[chosen, y] @ theta)
+    model = problem.with_causes([k for k in columns if k in causes])
+    total = problem.weighted(model, sizes).total
+    theta, _ = problem.fit_shared(total, model.shared, model.prior)
+    at = [model.shared.index(k) for k in columns]
+    left = float(total[-1, -1] - total[model.shared, -1] @ theta)
+    return np.asarray(theta[at]), left
 
 
 def _at_point(

@@ -7,14 +7,13 @@ import numpy as np
 
 from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
+from sliceit_drake.prediction.discrepancy import Sizes
 
 __all__ = ["HeldOutGain", "fitted_changes", "held_out_gain", "held_out_share", "own_coefficients"]
 
 BOOTSTRAP = 1000
 MIN_REDUCIBLE = 0.02
 """Least of the mean square that is called reducible, against the noise."""
-FLAT = 1e4
-"""Variance of a coefficient of which nothing is known, in the column's size."""
 
 
 @dc.dataclass
@@ -31,6 +30,8 @@ class HeldOutGain:
         by_record: Error of each record before and after [R, 2], N.
         share: Of what is above the floor in the mean square, that the causes remove.
         interval: 90 % interval of the share, from records drawn anew.
+        counted: Fraction of the causes' doing, squared, at the rows that this error counts: that of
+            a delay is where the force jumps, and is not counted.
     """
 
     before: float
@@ -39,6 +40,7 @@ class HeldOutGain:
     by_record: np.ndarray
     share: float
     interval: tuple[float, float]
+    counted: float = 1.0
 
 
 def held_out_gain(
@@ -46,6 +48,8 @@ def held_out_gain(
     causes: Sequence[CauseAtScan],
     seed: int = 0,
     simulated: LinearProblem | None = None,
+    beside: Sequence[CauseAtScan] = (),
+    sizes: Sizes | None = None,
 ) -> HeldOutGain:
     """Leaves out each record in turn, with and without causes.
 
@@ -53,10 +57,16 @@ def held_out_gain(
         problem: The records' moments.
         causes: Names and values of the scan.
         seed: For the interval.
-        simulated: The moments with the causes in the simulation (`confirm`), from which they are
-            fitted; by default from where they are absent.
+        simulated: The moments as the extended food predicts them, at values that were fitted to all
+            records; by default causes are fitted from where they are absent.
+        beside: Those of the causes that are in the model before as well.
+        sizes: Of the discrepancy beside which causes are fitted. By default there is none: a file
+            holds none either.
     """
-    squares = _both(problem, causes, simulated)
+    named = problem.found.of_causes(causes)
+    without = _errors(problem, beside, named, None if sizes is None else problem.sizes)
+    fitted = simulated is not None
+    squares = np.array([without, _errors(simulated or problem, causes, named, sizes, fitted)])
     counts = problem.moments.force_rows
     rng = np.random.default_rng(seed)
     touched = np.flatnonzero(counts > 0)
@@ -74,24 +84,30 @@ def held_out_gain(
         by_record=np.sqrt(squares / np.maximum(counts, 1)).T,
         share=_share(mean, noise),
         interval=(low, high),
+        counted=_counted(problem, [c for c in causes if c not in beside]),
     )
 
 
 def held_out_share(problem: LinearProblem, causes: Sequence[CauseAtScan]) -> float:
     """Fraction of the held-out mean square above the noise floor that causes remove."""
     total = max(int(problem.moments.force_rows.sum()), 1)
-    return _share(_both(problem, causes).sum(1) / total, _noise(problem))
-
-
-def _both(
-    problem: LinearProblem,
-    causes: Sequence[CauseAtScan],
-    simulated: LinearProblem | None = None,
-) -> np.ndarray:
-    """Squared errors of the records without and with causes [2, R], N^2."""
     named = problem.found.of_causes(causes)
-    without = _errors(problem, (), named)
-    return np.array([without, _errors(simulated or problem, causes, named)])
+    squares = np.array([_errors(problem, (), named), _errors(problem, causes, named)])
+    return _share(squares.sum(1) / total, _noise(problem))
+
+
+def _counted(problem: LinearProblem, causes: Sequence[CauseAtScan]) -> float:
+    columns = problem.found.of_causes(causes)
+    shared = [k for k in columns if not problem.found.columns[k].per_record]
+    linear = _Linear(problem, causes)
+    theta = linear.shared()[len(linear.columns) - len(shared) :] if shared else np.zeros(0)
+    inside = counted = 0.0
+    for record in problem.found.records:
+        change = record.columns[:, problem.forces][:, :, shared] @ theta
+        squares = (change**2).sum(1)
+        inside += float(squares[record.in_contact].sum())
+        counted += float(squares[problem.calm(record)].sum())
+    return counted / max(inside, 1e-12)
 
 
 def _noise(problem: LinearProblem) -> float:
@@ -106,7 +122,7 @@ def _share(mean: np.ndarray, noise: float) -> float:
 def fitted_changes(problem: LinearProblem, causes: Sequence[CauseAtScan]) -> list[np.ndarray]:
     """Change of each record's prediction by causes and all that is refitted with them [m, c]."""
     linear = _Linear(problem, causes)
-    theta = linear.shared(linear.reduced.sum(0))
+    theta = linear.shared()
     out = []
     for r, record in enumerate(problem.found.records):
         shared = record.columns[:, :, linear.columns] @ theta
@@ -118,21 +134,35 @@ def own_coefficients(problem: LinearProblem) -> np.ndarray:
     """Coefficients of what is each record's own (`LinearProblem.own`), where no cause is at work
     [R, n], in the columns' sizes."""
     linear = _Linear(problem, ())
-    theta = linear.shared(linear.reduced.sum(0))
+    theta = linear.shared()
     records = range(len(problem.found.records))
     return np.array([linear.of_own(r, theta)[: len(problem.own)] for r in records])
 
 
 def _errors(
-    problem: LinearProblem, causes: Sequence[CauseAtScan], not_usual: Sequence[int]
+    problem: LinearProblem,
+    causes: Sequence[CauseAtScan],
+    not_usual: Sequence[int],
+    sizes: Sizes | None = None,
+    fitted: bool = False,
 ) -> np.ndarray:
-    """Sum of squared force errors in contact of each record when it is left out [R], N^2; of the
-    columns `not_usual` nothing is taken for usual."""
-    linear = _Linear(problem, causes, not_usual)
-    total = linear.reduced.sum(0)
-    out = np.zeros(len(linear.reduced))
+    """Sum of squared force errors in contact of each record when it is left out [R], N^2.
+
+    Args:
+        problem: The records' moments.
+        causes: That are fitted with the base parameters.
+        not_usual: Columns of which nothing is taken for usual: a file foretells none of it.
+        sizes: Of the discrepancy.
+        fitted: Whether the prediction has the values of all records: then only what these values
+            owe to the record is taken out of it.
+    """
+    linear = _Linear(problem, causes, not_usual, sizes)
+    whole = linear.shared()
+    inside = [*problem.base, *problem.found.of_causes(causes)]
+    whole[~np.isin(linear.columns, inside)] = 0.0
+    out = np.zeros(len(problem.found.records))
     for r, H in enumerate(problem.moments.force_gram):
-        theta = linear.shared(total - linear.reduced[r])
+        theta = linear.shared(r) - fitted * whole
         left = np.zeros(len(H))
         left[-1] = 1.0
         left[linear.columns] -= theta
@@ -149,25 +179,24 @@ class _Linear:
         problem: LinearProblem,
         causes: Sequence[CauseAtScan],
         not_usual: Sequence[int] = (),
+        sizes: Sizes | None = None,
     ) -> None:
-        found = problem.found
-        columns = found.of_causes(causes)
-        shared = [k for k in columns if not found.columns[k].per_record]
-        self.problem, self.flat = problem, shared
-        mine = {*columns, *not_usual}
-        usual = [k for k in problem.usual if k not in mine]
-        self.columns = [*problem.base, *problem.numerical, *usual, *shared]
-        free = {k: FLAT for k in columns if k not in shared}
-        self.own, self.variance = problem.own_prior(tuple(mine), free)
-        self.reduced = problem.reduced(self.own, self.variance)
+        self.problem, self.sizes = problem, sizes
+        self.model = problem.with_causes(problem.found.of_causes(causes), not_usual)
+        self.columns, self.own = self.model.shared, self.model.own
 
-    def shared(self, total: np.ndarray) -> np.ndarray:
-        """Coefficients of the shared columns from a sum of reduced Gram matrices."""
-        return self.problem.fit_shared(total, self.columns, self.flat)[0]
+    def shared(self, without: int | None = None) -> np.ndarray:
+        """Coefficients of the shared columns from all records, or all but one."""
+        if self.sizes is None:
+            reduced = self.problem.reduced(self.model.own, self.model.variance)
+            total = reduced.sum(0) - (0.0 if without is None else reduced[without])
+        else:
+            total = self.problem.weighted(self.model, self.sizes, without).total
+        return self.problem.fit_shared(total, self.columns, self.model.prior)[0]
 
     def of_own(self, r: int, theta: np.ndarray) -> np.ndarray:
         """Coefficients of what is a record's own, from itself."""
         G, own = self.problem.moments.gram[r], self.own
-        inner = G[np.ix_(own, own)] + np.diag(1.0 / np.maximum(self.variance, 1e-12))
+        inner = G[np.ix_(own, own)] + np.diag(1.0 / np.maximum(self.model.variance, 1e-12))
         rest = G[own, self.problem.size] - G[np.ix_(own, self.columns)] @ theta
         return np.asarray(np.linalg.solve(inner, rest))

@@ -10,10 +10,10 @@ Gram matrix weighted with the inverse of the noise's covariance.
 
 import copy
 import dataclasses as dc
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
-from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
@@ -24,13 +24,25 @@ from sliceit_drake.diagnosis.evidence.columns import (
     replicates,
 )
 from sliceit_drake.diagnosis.evidence.noise_levels import ChannelNoise, differences, estimate_noise
+from sliceit_drake.prediction.discrepancy import (
+    USUAL_SHARE,
+    Covariates,
+    Discrepancy,
+    Sizes,
+    Weighted,
+    motion_shapes,
+)
 
-__all__ = ["USUAL", "LinearProblem", "Moments", "integrate_out", "scaled_inverse"]
+__all__ = [
+    "PLAUSIBLE",
+    "USUAL",
+    "LinearProblem",
+    "Model",
+    "Moments",
+    "integrate_out",
+    "scaled_inverse",
+]
 
-KNOT = 4e-3
-"""Spacing of the splines of depth in which the discretisation's error is taken to vary, metres."""
-PHASE_KNOTS = 20
-"""Splines over the time of each condition's record, for the nonparametric correction."""
 USUAL = {
     ("sensor_delay", "delay"): (1.5e-3, False),
     **{("sensor_zero", f"bias_{a}"): (0.1, True) for a in "xyz"},
@@ -39,24 +51,22 @@ USUAL = {
 """What every sensor has, by cause and parameter: usual standard deviation in its unit, and whether
 that differs from record to record. Only more than that is a finding, or what should differ and is
 the same in all records."""
-DISCRETISATION = 0.5
-"""Standard deviation of the discretisation's error as a function of depth, in that of the mesh
-column."""
 FINE_MESH = 0.3
-"""The same of each row by itself."""
+"""Standard deviation of the discretisation's error of each row, in that of the mesh column."""
 SECOND_ORDER = 0.5
 """The same of a row by what is beyond the first order of a record's own values, in that."""
-RIDGE = 1e-8
+PLAUSIBLE = 2.0
+"""Standard deviation of a cause's number before the data, in its size."""
 KEPT = 4
 """Sets of reduced Gram matrices that are kept."""
 
 
 @dc.dataclass
 class Moments:
-    """Gram matrices of all records, each over [columns, splines of depth, correction, y].
+    """Gram matrices of all records, each over [columns, shapes of the discrepancy, y].
 
     Attributes:
-        gram: [R, K + 1, K + 1], y last. The correction's columns are of the record's condition.
+        gram: [R, K + 1, K + 1], y last.
         force_gram: Of the force's components without weights, where the knife touches and the force
             does not jump [R, K + 1, K + 1], N^2.
         force_rows: Number of such rows of each record [R].
@@ -67,6 +77,23 @@ class Moments:
     force_rows: np.ndarray
 
 
+@dc.dataclass(frozen=True)
+class Model:
+    """What is fitted to records beside the discrepancy.
+
+    Attributes:
+        own: Numbers of the columns that are each record's own.
+        variance: Of their coefficients.
+        shared: Numbers of the columns that all records share.
+        prior: Precisions of the coefficients of all columns [K].
+    """
+
+    own: list[int]
+    variance: np.ndarray
+    shared: list[int]
+    prior: np.ndarray
+
+
 class LinearProblem:
     """Moments of records, and the levels of noise and variation, which are estimated by default.
 
@@ -75,13 +102,15 @@ class LinearProblem:
         noise: Of each channel.
         repeated: Whether the noise is from replicates.
         conditions: Numbers of the records of each condition.
+        condition_of: Number of the condition of each record [R].
         base, own, numerical: Numbers of columns.
         mesh: Number of the column of the mesh; None without one.
         usual: Numbers of columns of `USUAL` that all records share, and their standard deviations.
         usual_own: The same of those that are each record's own.
-        spline: Numbers of the columns appended for the discretisation's error.
-        discretisation: Standard deviations of their coefficients [len(spline)], N and Nm.
-        correction: Numbers of the columns of each condition's nonparametric correction.
+        shapes: Numbers of the columns appended for the discrepancy (`prediction.discrepancy`).
+        shape_values: Values of the shapes in each record [m, n], the same for all channels.
+        discrepancy: The model of it.
+        sizes: Its sizes, causes left out.
         size: Number of all columns; y stands there.
         moments: Of the records.
         forces: Numbers of the channels that are forces.
@@ -102,6 +131,8 @@ class LinearProblem:
         self.numerical = found.index("numerical")
         self.mesh = next(iter(found.index("numerical", MESH.name)), None)
         self.conditions = replicates(found.records)
+        of = {r: k for k, members in enumerate(self.conditions.values()) for r in members}
+        self.condition_of = [of[r] for r in range(len(found.records))]
         if noise is None:
             self.noise, self.repeated = estimate_noise(found.records, self.own)
         else:
@@ -123,40 +154,73 @@ class LinearProblem:
 
     def _make_moments(self) -> None:
         found = self.found
-        K = len(found.columns)
-        channels = found.records[0].channels
+        K, channels = len(found.columns), len(found.records[0].channels)
         reach = max(float(r.depth.max()) for r in found.records)
-        count = max(2, int(np.ceil(max(reach, KNOT) / KNOT)) + 1)
-        S = count * len(channels)
-        N = PHASE_KNOTS * len(channels)
-        self.spline = list(range(K, K + S))
-        self.correction = list(range(K + S, K + S + N))
-        self.size = K + S + N
-        self.discretisation = np.repeat(self._mesh_scale(len(channels)), count)
-        gram = np.zeros((len(found.records), self.size + 1, self.size + 1))
-        force_gram, force_rows = np.zeros_like(gram), np.zeros(len(found.records), int)
+        self.shape_values = []
+        for r in found.records:
+            values, phase = motion_shapes(r.time, r.depth, r.path, r.in_contact, reach, r.height)
+            self.shape_values.append(values)
+        count = len(phase)
+        self.shapes = list(range(K, K + channels * count))
+        self.size = K + channels * count
         self.forces = found.records[0].forces
-        for r, record in enumerate(found.records):
-            X = self._table(record)
-            gram[r] = self._weighted(record.time, X, self.model_error(record))
-            calm = self.calm(record)
-            inside = X[calm][:, self.forces].reshape(-1, self.size + 1)
-            force_gram[r] = inside.T @ inside
-            force_rows[r] = int(calm.sum())
-        self.moments = Moments(gram, force_gram, force_rows)
-
-    def _table(self, record: RecordSensitivity) -> np.ndarray:
-        """All columns and what is left of a record [m, c, K + 1]."""
-        channels = len(record.channels)
-        return np.concatenate(
+        grams, squares = [], np.zeros(channels + 1)
+        for record, shapes in zip(found.records, self.shape_values, strict=True):
+            grams.append(self._moments_of(record, shapes))
+            inside = record.predicted[record.in_contact]
+            squares += np.append((inside**2).sum(0), len(inside))
+        self.moments = Moments(*map(np.array, zip(*grams, strict=True)))
+        mean = np.sqrt(squares[:-1] / max(squares[-1], 1.0))
+        force = np.linalg.norm(mean[self.forces])
+        usual = np.where(np.isin(np.arange(channels), self.forces), force, mean)
+        self.discrepancy = Discrepancy(
+            self.shapes,
+            np.repeat(np.arange(channels), count),
+            np.tile(phase, channels),
+            [k for k in range(self.size + 1) if k not in set(self.shapes)],
             [
-                record.columns,
-                _depth_splines(record, len(self.spline) // channels, channels),
-                _time_splines(record, channels),
-                record.residual[:, :, None],
+                Covariates.of(r.time, r.depth, r.path)
+                for r in (found.records[m[0]] for m in self.conditions.values())
             ],
-            axis=2,
+            USUAL_SHARE * np.maximum(usual, 1e-3),
         )
+
+    def _parts(
+        self, record: RecordSensitivity, shapes: np.ndarray
+    ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+        """Of each channel its number, the numbers of the columns that it has and these [m, k], the
+        residual last: a shape belongs to one channel."""
+        K, n = len(self.found.columns), shapes.shape[1]
+        for c in range(len(record.channels)):
+            at = np.array([*range(K), *range(K + c * n, K + (c + 1) * n), self.size])
+            X = np.column_stack([record.columns[:, c], shapes, record.residual[:, c]])
+            yield c, at, X.astype(float)
+
+    def _moments_of(
+        self, record: RecordSensitivity, shapes: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, int]:
+        """Gram matrices of a record with weights and of its force without, and its rows."""
+        gram = np.zeros((self.size + 1, self.size + 1))
+        force_gram = np.zeros_like(gram)
+        error, calm = self.model_error(record), self.calm(record)
+        for c, at, X in self._parts(record, shapes):
+            G = X.T @ self.noise[c].solve(record.time, X, error[:, c])
+            gram[np.ix_(at, at)] += 0.5 * (G + G.T)
+            if c in self.forces:
+                force_gram[np.ix_(at, at)] += X[calm].T @ X[calm]
+        return gram, force_gram, int(calm.sum())
+
+    def _products_of(
+        self, record: RecordSensitivity, moved: RecordSensitivity, shapes: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The last columns of `_moments_of` with another prediction, weights as of the record."""
+        products, of_force = np.zeros(self.size + 1), np.zeros(self.size + 1)
+        error, calm = self.model_error(record), self.calm(record)
+        for c, at, X in self._parts(moved, shapes):
+            products[at] += X.T @ self.noise[c].solve(record.time, X[:, -1:], error[:, c])[:, 0]
+            if c in self.forces:
+                of_force[at] += X[calm].T @ X[calm, -1]
+        return products, of_force
 
     def calm(self, record: RecordSensitivity) -> np.ndarray:
         """Rows in contact at which the force does not jump [m]."""
@@ -167,6 +231,7 @@ class LinearProblem:
         """The same problem, weights included, about another prediction of each record [m, c]."""
         out = copy.copy(self)
         out._reduced = {}
+        vars(out).pop("sizes", None)
         gram, force_gram = self.moments.gram.copy(), self.moments.force_gram.copy()
         records = []
         for r, (record, values) in enumerate(zip(self.found.records, predicted, strict=True)):
@@ -174,13 +239,9 @@ class LinearProblem:
                 record, predicted=values if record.bent is None else values + record.bent
             )
             records.append(moved)
-            X, error, calm = self._table(moved), self.model_error(record), self.calm(record)
-            b, inside = np.zeros(self.size + 1), X[calm][:, self.forces]
-            for c, noise in enumerate(self.noise):
-                b += X[:, c].T @ noise.solve(record.time, X[:, c, -1:], error[:, c])[:, 0]
+            b, of_force = self._products_of(record, moved, self.shape_values[r])
             gram[r, -1], gram[r, :, -1] = b, b
-            b = np.einsum("mck,mc->k", inside, inside[:, :, -1])
-            force_gram[r, -1], force_gram[r, :, -1] = b, b
+            force_gram[r, -1], force_gram[r, :, -1] = of_force, of_force
         out.found = dc.replace(self.found, records=records)
         out.moments = Moments(gram, force_gram, self.moments.force_rows)
         return out
@@ -196,21 +257,67 @@ class LinearProblem:
             self._reduced[key] = np.array([integrate_out(G, list(own), variance) for G in gram])
         return self._reduced[key]
 
-    def _mesh_scale(self, channels: int) -> np.ndarray:
-        """Standard deviation of the discretisation's error by channel [c]."""
-        if self.mesh is None:
-            return np.full(channels, RIDGE)
-        squares, count = np.zeros(channels), 0
-        for record in self.found.records:
-            inside = record.in_contact
-            squares += (record.columns[inside][:, :, self.mesh] ** 2).sum(0)
-            count += int(inside.sum())
-        return DISCRETISATION * np.sqrt(squares / max(count, 1)) + RIDGE
+    def by_condition(
+        self, own: Sequence[int], variance: np.ndarray, without: int | None = None
+    ) -> list[np.ndarray]:
+        """Sums of `reduced` over the records of each condition; one record may be left out."""
+        reduced = self.reduced(own, variance)
+        return [
+            np.sum([reduced[r] for r in members if r != without], axis=0)
+            if any(r != without for r in members)
+            else np.zeros_like(reduced[0])
+            for members in self.conditions.values()
+        ]
+
+    @functools.cached_property
+    def sizes(self) -> Sizes:
+        """Of the discrepancy where no cause is at work."""
+        return self.fitted_sizes()[0]
+
+    def fitted_sizes(
+        self, causes: Sequence[int] = (), start: Sizes | None = None
+    ) -> tuple[Sizes, float]:
+        """Sizes of the discrepancy with columns of causes in the model, and the logarithm of the
+        restricted likelihood with the prior."""
+        model = self.with_causes(causes)
+        grams = self.by_condition(model.own, model.variance)
+        prior = model.prior[model.shared]
+        sizes, value = self.discrepancy.fit(grams, model.shared, prior, start)
+        return sizes, value - 0.5 * self.own_log_det(model)
+
+    def with_causes(self, causes: Sequence[int] = (), unusual: Sequence[int] = ()) -> Model:
+        """The model with columns of causes, their coefficients normal with a standard deviation of
+        `PLAUSIBLE` sizes, whatever is usual of them; of columns `unusual` nothing is usual."""
+        kinds = self.found.columns
+        own, variance = self.own_prior(
+            unusual, {k: PLAUSIBLE**2 for k in causes if kinds[k].per_record}
+        )
+        added = [k for k in causes if not kinds[k].per_record]
+        prior = self.prior()
+        prior[added] = 1.0 / PLAUSIBLE**2
+        kept = [k for k in self.baseline if k not in (*added, *unusual)]
+        shared = [*kept, *added]
+        return Model(own, variance, shared, prior)
+
+    def own_log_det(self, model: Model) -> float:
+        """Logarithm of the determinant by which what is each record's own widens their spread."""
+        root = np.sqrt(model.variance)
+        at = np.ix_(range(len(self.moments.gram)), model.own, model.own)
+        inner = np.eye(len(root)) + root[:, None] * self.moments.gram[at] * root
+        return float(np.linalg.slogdet(inner)[1].sum())
+
+    def weighted(
+        self, model: Model, sizes: Sizes | None = None, without: int | None = None
+    ) -> Weighted:
+        """Moments with what is each record's own and the discrepancy integrated out; one record may
+        be left out."""
+        grams = self.by_condition(model.own, model.variance, without)
+        return self.discrepancy.weighted(grams, self.sizes if sizes is None else sizes)
 
     @property
     def baseline(self) -> list[int]:
         """Numbers of the columns that all records share and that are fitted in any case."""
-        return [*self.base, *self.numerical, *self.spline, *self.usual]
+        return [*self.base, *self.numerical, *self.usual]
 
     def own_prior(
         self, without: Sequence[int] = (), free: Mapping[int, float] | None = None
@@ -228,26 +335,25 @@ class LinearProblem:
         return [*self.own, *usual, *free], np.concatenate([deviations**2, list(free.values())])
 
     def fit_shared(
-        self, total: np.ndarray, columns: list[int], flat: Sequence[int] = ()
+        self, total: np.ndarray, columns: list[int], prior: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Coefficients of columns that all records share, and their covariance.
 
         Args:
-            total: Sum of Gram matrices from which what is each record's own is integrated out.
+            total: Gram matrix of all columns, y last, from which what is each record's own and the
+                discrepancy are integrated out.
             columns: Numbers [n].
-            flat: Those of them of which nothing is taken for usual.
+            prior: Precisions of the coefficients of all columns [K]; `prior()` by default.
         """
-        prior = self.prior()
-        prior[list(flat)] = 0.0
+        prior = self.prior() if prior is None else prior
         A = total[np.ix_(columns, columns)] + np.diag(prior[columns])
         covariance = scaled_inverse(A)
-        return covariance @ total[columns, self.size], covariance
+        return covariance @ total[columns, -1], covariance
 
     def prior(self) -> np.ndarray:
         """Precision of the columns' coefficients before the data [K]: 0 where nothing is known."""
-        out = np.zeros(self.size)
+        out = np.zeros(len(self.found.columns))
         out[self.numerical] = 1.0
-        out[self.spline] = 1.0 / self.discretisation**2
         for k, deviation in self.usual.items():
             out[k] = 1.0 / deviation**2
         return out
@@ -284,8 +390,10 @@ class LinearProblem:
 
     def model_error(self, record: RecordSensitivity) -> np.ndarray:
         """Standard deviation of what the model is unsure of at each row by itself [m, c]: when a
-        force jumps, and what a finer mesh still may change."""
+        force jumps, what a finer mesh still may change, and a spike of the sensor."""
         out = record.kinks()
+        if record.doubt is not None:
+            out = np.hypot(out, record.doubt)
         if self.mesh is not None:
             out = np.hypot(out, FINE_MESH * record.columns[:, :, self.mesh])
         if record.bent is not None:
@@ -314,29 +422,3 @@ def integrate_out(G: np.ndarray, own: list[int], variance: np.ndarray) -> np.nda
     inner = G[np.ix_(own, own)] + np.diag(1.0 / np.maximum(variance, 1e-12))
     factor = cho_factor(inner, check_finite=False)
     return np.asarray(G - G[:, own] @ cho_solve(factor, G[own], check_finite=False))
-
-
-def _depth_splines(record: RecordSensitivity, count: int, channels: int) -> np.ndarray:
-    """Hat functions of depth for each channel while the edge is in the food [m, c, c * count]."""
-    knots = KNOT * np.arange(count)
-    hats = np.maximum(1.0 - np.abs(record.depth[:, None] - knots) / KNOT, 0.0)
-    hats[~record.in_contact | (record.depth <= 0.0)] = 0.0
-    return _by_channel(hats, channels)
-
-
-def _time_splines(record: RecordSensitivity, channels: int) -> np.ndarray:
-    """Cubic splines over the time of a record for each channel [m, c, c * PHASE_KNOTS]."""
-    inside = record.in_contact
-    time = record.time
-    low, high = (time[inside][[0, -1]] if inside.sum() > 10 else time[[0, -1]]).tolist()
-    inner = np.linspace(low, high, PHASE_KNOTS - 2)
-    knots = np.concatenate([[inner[0]] * 3, inner, [inner[-1]] * 3])
-    basis = BSpline.design_matrix(np.clip(time, low, high), knots, 3).toarray()
-    basis = basis[:, :PHASE_KNOTS]
-    basis[(time < low) | (time > high)] = 0.0
-    return _by_channel(basis, channels)
-
-
-def _by_channel(shapes: np.ndarray, channels: int) -> np.ndarray:
-    """Columns [m, k] for each channel by itself [m, c, c * k]."""
-    return np.einsum("mk,cd->mcdk", shapes, np.eye(channels)).reshape(len(shapes), channels, -1)

@@ -27,7 +27,7 @@ from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.content_store import ContentStore, content_key, source_key
 from sliceit_drake.cutting.parameters import get_parameter
 from sliceit_drake.cutting.solver import CuttingError
-from sliceit_drake.diagnosis.cause import Cause, Values
+from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.evidence.columns import MESH, Column, RecordSensitivity, Sensitivities
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.prediction.record_target import Meshing, RecordTarget
@@ -64,14 +64,13 @@ class _Change:
         column: The column.
         ends: Points at plus its size and, where that may be, at minus.
         factor: On the change.
-        cause, values: Of a cause that needs no simulation, and so no points: its values there.
+        simulates: Whether slices must be simulated for it.
     """
 
     column: Column
-    ends: tuple[Point, ...] = ()
+    ends: tuple[Point, ...]
     factor: float = 1.0
-    cause: Cause | None = None
-    values: tuple[Values, ...] = ()
+    simulates: bool = True
 
 
 def _model_changes(predictor: SlicePredictor, point: Point) -> list[_Change]:
@@ -116,14 +115,12 @@ def _cause_changes(cause: Cause, point: Point) -> list[_Change]:
             steps = (p.step,) if p.one_sided else (p.step, -p.step)
             values = tuple(cause.nulls(value) | {p.name: p.null + step} for step in steps)
             traits = p.step, p.unit, p.one_sided, cause.per_record, cause.searched
-            column = Column("cause", cause.name, p.name, value, *traits)
-            if cause.simulates:
-                ends = tuple(
-                    dc.replace(point, causes=(*point.causes, ActiveCause(cause, v))) for v in values
-                )
-                out.append(_Change(column, ends))
-            else:
-                out.append(_Change(column, cause=cause, values=values))
+            within = p.low - p.null, p.high - p.null
+            column = Column("cause", cause.name, p.name, value, *traits, *within)
+            ends = tuple(
+                dc.replace(point, causes=(*point.causes, ActiveCause(cause, v))) for v in values
+            )
+            out.append(_Change(column, ends, simulates=cause.simulates))
     return out
 
 
@@ -168,7 +165,8 @@ def sensitivities(
         common = None
         if cache is not None and not any(cause.adapts for cause in some):
             common = _common_key(setup, some, point, not changes, finer)
-        by_slice = any(c.by_slice for c in (*some, *(a.cause for a in point.causes)))
+        by_slice = setup.food.effects.entry.dulling > 0.0
+        by_slice |= any(c.by_slice for c in (*some, *(a.cause for a in point.causes)))
         changes = changes + [change for cause in some for change in _cause_changes(cause, point)]
         return _Computation(predictor, point, changes, store, common, by_slice).result(show)
 
@@ -212,7 +210,8 @@ class _Computation:
         known = [self._load(target) for target in targets]
         missing = tuple(k for k, found in enumerate(known) if found is None)
         if missing:
-            points = [self.point, *(p for change in self.changes for p in change.ends)]
+            changed = (change.ends for change in self.changes if change.simulates)
+            points = [self.point, *(p for ends in changed for p in ends)]
             points = [dc.replace(p, only=missing) for p in points]
             # First, because causes may ask for its force.
             self.predictor.simulate(points[:1])
@@ -235,11 +234,10 @@ class _Computation:
         base = self.predictor.series(self.point, number)
         wrenches, places = [base.wrench], []
         for change in self.changes:
-            if change.cause is None:
+            if change.simulates:
                 moved = [self.predictor.series(p, number).wrench for p in change.ends]
             else:
-                facts = change.cause.visible(target.facts)
-                moved = [change.cause.wrench(base, v, facts) for v in change.values]
+                moved = [self.predictor.shown(base, target, p) for p in change.ends]
             places.append(slice(len(wrenches), len(wrenches) + len(moved)))
             wrenches += moved
         # All at once: the filters of the record are made anew in each call.
@@ -302,9 +300,11 @@ class _Computation:
             path=np.interp(target.time, target.grid, way),
             in_contact=in_contact,
             measured=target.measured,
+            doubt=target.doubt,
             predicted=predicted,
             columns=nothing,
             even=np.zeros_like(nothing),
+            height=target.facts.height,
         )
 
 

@@ -25,7 +25,7 @@ from sliceit_drake.diagnosis.evidence.columns import CauseAtScan, RecordSensitiv
 from sliceit_drake.diagnosis.evidence.linear import USUAL, LinearProblem, scaled_inverse
 from sliceit_drake.diagnosis.evidence.screen import CauseEvidence, Screening
 from sliceit_drake.diagnosis.evidence.sensitivity import Progress, sensitivities
-from sliceit_drake.diagnosis.evidence.verdict import CLASS_ANGLE, MIN_REPLICATES
+from sliceit_drake.diagnosis.evidence.verdict import CLASS_ANGLE, LAW, DecisionRule
 from sliceit_drake.diagnosis.experiments.designs import menu
 from sliceit_drake.diagnosis.experiments.planned_record import (
     experiment_of_record,
@@ -56,8 +56,9 @@ EXPLORING = ("tour", "draw_3", "draw_1", "air")
 """Motions for what no cause explains: what differs most from one another."""
 
 
-_CauseClass = tuple[list[CauseEvidence], Screening]
-"""Evidence for causes to be told apart, and the screening that it is from."""
+_CauseClass = tuple[list[CauseEvidence], Screening, bool]
+"""Evidence for causes to be told apart, the screening that it is from, and whether they are to be
+told from the simulation's own law as well."""
 
 
 @dc.dataclass
@@ -99,15 +100,33 @@ class _Search:
         planned = [planned_record(step.plan, setup, template, first) for step in steps]
         found = diagnosis.problem.found
         # What every record has a little of is fitted beside.
-        names = {e.name for evidence, _ in classes for e in evidence} | {name for name, _ in USUAL}
-        names |= {name for _, screening in classes for name, _ in screening.assumed}
+        names = {e.name for evidence, _, _ in classes for e in evidence} | {
+            name for name, _ in USUAL
+        }
+        names |= {name for _, screening, _ in classes for name, _ in screening.assumed}
         causes = [diagnosis.causes[n] for n in found.causes if n in names]
         new = sensitivities(setup, planned, causes, cache=cache, workers=workers, progress=progress)
         self.problem = _joined(diagnosis.problem, new, names)
-        reduced = self.problem.reduced(*self.problem.own_prior())
-        count = len(found.records)
-        self.old, self.new = np.sum(reduced[:count], axis=0), reduced[count:]
-        self._before = self._angles(self.old)
+        # As large as without any cause: what was found may be the simulation's own law. Of a force
+        # that the records did not have, as of one along the edge, it is as wrong as of those.
+        sizes, forces = diagnosis.problem.sizes, diagnosis.problem.forces
+        channel = sizes.channel.copy()
+        channel[forces] = channel[forces].max()
+        self.sizes = dc.replace(sizes, channel=channel)
+        self.count = len(found.records)
+        self._before = self._angles(*self._totals({}))
+
+    def _totals(self, counts: Mapping[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        """Gram matrices of all columns with the discrepancy integrated out and without one, of the
+        records at hand and slices of experiments, by the number of the experiment."""
+        problem = self.problem
+        reduced = problem.reduced(*problem.own_prior())
+        weights = [1] * self.count + [counts.get(k, 0) for k in range(len(self.menu))]
+        grams = [
+            np.sum([weights[r] * reduced[r] for r in members], axis=0)
+            for members in problem.conditions.values()
+        ]
+        return problem.discrepancy.weighted(grams, self.sizes).total, np.sum(grams, axis=0)
 
     def _projected(self, total: np.ndarray, assumed: Sequence[CauseAtScan]) -> np.ndarray:
         """What is left of a summed Gram matrix beside what is fitted in any case."""
@@ -118,10 +137,11 @@ class _Search:
         )
         return np.asarray(total - total[:, baseline] @ inverse @ total[baseline])
 
-    def _angles(self, total: np.ndarray) -> list[tuple[str, str, float, float]]:
-        """Angle, degrees, and expected gain of each ordered pair of causes."""
+    def _angles(self, total: np.ndarray, plain: np.ndarray) -> list[tuple[str, str, float, float]]:
+        """Angle, degrees, and expected gain of each ordered pair of causes, from Gram matrices of
+        all columns with the discrepancy integrated out and without one."""
         out = []
-        for evidence, before in self.classes:
+        for evidence, before, with_law in self.classes:
             screening = dc.replace(before, projected=self._projected(total, before.assumed))
             for a, b in itertools.permutations(evidence, 2):
                 own = self.problem.found.of_causes([a.cause])
@@ -130,15 +150,23 @@ class _Search:
                 angle = screening.angle_to(self.problem, a, b.name) if square > 0.0 else 0.0
                 gain = square * float(np.sin(np.radians(angle))) ** 2
                 out.append((a.name, b.name, angle, gain))
+            for a in evidence if with_law else ():
+                # What an error of the law, which is alike in all cuts, leaves of the cause.
+                own = self.problem.found.of_causes([a.cause])
+                e, at = np.array(a.coefficients), np.ix_(own, own)
+                left = max(float(e @ screening.projected[at] @ e), 0.0)
+                whole = max(float(e @ self._projected(plain, before.assumed)[at] @ e), 1e-12)
+                angle = float(np.degrees(np.arcsin(np.sqrt(min(left / whole, 1.0)))))
+                out.append((a.name, LAW, angle, left))
         return out
 
     def pairs(self, counts: Mapping[int, int]) -> list[Pair]:
         """What slices of experiments do, by the number of the experiment."""
-        total = self.old + np.sum([n * self.new[k] for k, n in counts.items()], axis=0)
+        totals = self._totals(counts)
         return [
             Pair(a, b, was, angle, gain, (gain - start) / max(sum(counts.values()), 1))
             for (a, b, was, start), (_, _, angle, gain) in zip(
-                self._before, self._angles(total), strict=True
+                self._before, self._angles(*totals), strict=True
             )
         ]
 
@@ -149,7 +177,7 @@ class _Search:
             if number in choice.counts:
                 continue
             by_hand = choice.by_hand + bool(step.experiment.by_hand)
-            for slices in range(MIN_REPLICATES, MOST_SLICES + 1):
+            for slices in range(DecisionRule.replicates, MOST_SLICES + 1):
                 counts = {**choice.counts, number: slices}
                 choices.append(_Choice(counts, self.pairs(counts), by_hand))
         return min(choices, key=lambda c: c.key)
@@ -164,7 +192,9 @@ class _Search:
             choice = further
         counts, pairs = choice.counts, choice.pairs
         steps = [dc.replace(self.menu[k], slices=n) for k, n in counts.items()]
-        classes = "; ".join("{" + ", ".join(e.name for e in own) + "}" for own, _ in self.classes)
+        classes = "; ".join(
+            "{" + ", ".join(e.name for e in own) + "}" for own, _, _ in self.classes
+        )
         if all(p.parts for p in pairs) and not steps:
             reason = f"nothing to split: the records at hand part {classes}"
             return NextExperiment("none", reason, [], pairs)
@@ -227,7 +257,7 @@ def next_experiment(
     verdict = diagnosis.verdict
     if verdict.kind == "too_few_replicates":
         return _repeat(diagnosis, records)
-    if verdict.kind == "unknown":
+    if verdict.kind == "unknown" and not verdict.findings:
         reason = (
             "no cause of the list explains what is wrong; what it depends on shows where speed, "
             "draw and pose differ most"
@@ -250,7 +280,7 @@ def _repeat(diagnosis: Diagnosis, records: Sequence[SliceRecord]) -> NextExperim
     template, knife = template_of(records), next_knife_slice(records)
     steps = []
     for members in conditions.values():
-        missing = MIN_REPLICATES - len(members)
+        missing = DecisionRule.replicates - len(members)
         if missing > 0:
             own = template if is_bare(members[0]) else members[0]
             experiment = experiment_of_record(members[0], diagnosis.setup)
@@ -307,11 +337,10 @@ def _classes(diagnosis: Diagnosis) -> list[_CauseClass]:
     that are nearly so, or would be taken for it if they were the ones that act."""
     verdict, problem = diagnosis.verdict, diagnosis.problem
     out = []
-    for finding, screening in zip(
-        verdict.findings, (verdict.screening, verdict.second), strict=False
-    ):
+    for finding in verdict.findings:
         best = finding.evidence
-        if screening is not None and not best.per_record:
+        screening = next(s for s in verdict.screenings if any(e is best for e in s.causes))
+        if not best.per_record:
             alike = [
                 e.name
                 for e in screening.causes
@@ -324,10 +353,10 @@ def _classes(diagnosis: Diagnosis) -> list[_CauseClass]:
                 )
                 < CLASS_ANGLE + MARGIN
             ]
-            names = [*finding.names, *alike]
+            names = [n for n in (*finding.names, *alike) if n != LAW]
             if len(names) > 1:
                 evidence = [_within_range(diagnosis, screening.evidence(n)) for n in names]
-                out.append((evidence, screening))
+                out.append((evidence, screening, LAW in finding.names))
     return out
 
 

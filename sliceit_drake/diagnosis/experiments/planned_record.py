@@ -80,7 +80,6 @@ def planned_slice(
         height=_section(food, setup)[1],
         knife=knife_of(setup.knife, template),
         board=setup.board,
-        flank_stiffness=setup.numerics.flank_stiffness,
         position=facts.position,
         yaw=facts.yaw or 0.0,
         clearance=experiment.clearance,

@@ -9,14 +9,14 @@ from scipy.stats import norm
 
 from sliceit_drake.configuration import dump_yaml
 from sliceit_drake.cutting.planned_slice import PlannedSlice
-from sliceit_drake.diagnosis.evidence.verdict import ALARM, CLASS_ANGLE, MIN_REPLICATES
+from sliceit_drake.diagnosis.evidence.verdict import CLASS_ANGLE, DecisionRule
 from sliceit_drake.diagnosis.experiments.designs import Experiment
 
 __all__ = ["MARGIN", "NEEDED", "NextExperiment", "Pair", "Step"]
 
 POWER = 0.9
 """Probability with which slices shall tell two causes apart."""
-NEEDED = float((norm.ppf(1.0 - ALARM) + norm.ppf(POWER)) ** 2)
+NEEDED = float((norm.ppf(1.0 - DecisionRule.alarm) + norm.ppf(POWER)) ** 2)
 """Expected gain that a test at the verdict's level finds with `POWER`."""
 MARGIN = 5.0
 """By which the angle shall exceed that of a class, degrees: sizes were estimated."""
@@ -68,7 +68,7 @@ class Step:
 
     experiment: Experiment
     plan: PlannedSlice
-    slices: int = MIN_REPLICATES
+    slices: int = DecisionRule.replicates
     file: Path | None = None
 
 

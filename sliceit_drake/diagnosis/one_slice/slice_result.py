@@ -11,7 +11,7 @@ import numpy as np
 
 from sliceit_drake.diagnosis.cause import EXPERIMENTS, Cause
 from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
-from sliceit_drake.diagnosis.evidence.verdict import MIN_REPLICATES
+from sliceit_drake.diagnosis.evidence.verdict import DecisionRule
 from sliceit_drake.diagnosis.experiments.identifiability import (
     SHOWS,
     Identifiability,
@@ -194,8 +194,8 @@ class OneSlice:
     def needed(self) -> list[str]:
         """What would make a diagnosis of it."""
         lines = [
-            f"Needed for a diagnosis: at least {MIN_REPLICATES} slices of each condition (one"
-            " slice says nothing of how slices vary)."
+            f"Needed for a diagnosis: at least {DecisionRule.replicates} slices of each condition"
+            " (one slice says nothing of how slices vary)."
         ]
         for name in self.experiments()[:3]:
             lines.append(f"  Next: {EXPERIMENTS[name]} ({name})")
@@ -228,7 +228,7 @@ class OneSlice:
             "cannot_show": self.hidden,
             "not_above_what_is_left": self.drowned,
             "experiments": self.experiments(),
-            "slices_needed_of_each_condition": MIN_REPLICATES,
+            "slices_needed_of_each_condition": DecisionRule.replicates,
             "remarks": self.remarks,
         }
 

@@ -1,0 +1,123 @@
+"""How large an effect is, over the noise and over what the simulation gets wrong by itself."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sliceit_drake.diagnosis.evidence.linear import LinearProblem, Model, scaled_inverse
+from sliceit_drake.prediction.discrepancy import PARTS, PHASES, Sizes
+
+__all__ = ["OwnError", "standardised_size"]
+
+ACTS, GREAT = 0.1, 99.0
+"""An effect acts in a row and channel from this share of this percentile of its changes on: a few
+rows in which the force jumps are not all of it."""
+
+
+class OwnError:
+    """The discrepancy as it was found: its mean after the data.
+
+    Args:
+        problem: The records.
+        model: What is fitted beside it.
+        sizes: Of the discrepancy.
+
+    Attributes:
+        coefficients: Of the shapes in each record, by part and channel [R, 4, c, n].
+        values: At the rows of each record [m, c], N and Nm.
+    """
+
+    def __init__(self, problem: LinearProblem, model: Model, sizes: Sizes) -> None:
+        self.problem, self.sizes = problem, sizes
+        weighted = problem.weighted(model, sizes)
+        theta, _ = problem.fit_shared(weighted.total, model.shared, model.prior)
+        left = np.zeros(len(weighted.total))
+        left[-1], left[model.shared] = 1.0, -theta
+        shape = len(PARTS), len(problem.noise), -1
+        found = [parts.reshape(shape) for parts in weighted.found(left)]
+        self.coefficients = [found[k] for k in problem.condition_of]
+        self.values = [
+            values @ parts.sum(0).T
+            for values, parts in zip(problem.shape_values, self.coefficients, strict=True)
+        ]
+
+    def scales(self, found: bool = False) -> list[np.ndarray]:
+        """Root mean square at the rows of each record in its channel and phase of the motion, over
+        all records, where the knife touches; 0 elsewhere [m, c], N and Nm.
+
+        Of what was found or of what the sizes let it be, whichever is more: a part of it may have
+        been taken for a cause. With `found` of what was found alone.
+        """
+        records, model = self.problem.found.records, self.problem.discrepancy
+        deviations = self.sizes.deviations(model.channel, model.phase)
+        usual = []
+        for r, values in enumerate(self.problem.shape_values):
+            factors = np.append(model.factors[self.problem.condition_of[r]], 1.0)
+            by_shape = ((factors[:, None] * deviations) ** 2).sum(0)
+            usual.append((not found) * values**2 @ by_shape.reshape(len(self.problem.noise), -1).T)
+        labels = np.concatenate([r.phase.astype(str) for r in records])
+        touching = np.concatenate([r.in_contact for r in records])
+        squares = np.concatenate(self.values) ** 2, np.concatenate(usual)
+        out = np.zeros_like(squares[0])
+        for label in np.unique(labels[touching]):
+            rows = touching & (labels == label)
+            out[rows] = np.sqrt(np.maximum(*(of[rows].mean(0) for of in squares)))
+        return np.split(out, np.cumsum([len(v) for v in usual])[:-1])
+
+    def by_part(self) -> dict[tuple[str, str, str], float]:
+        """Mean square in contact over the noise's, by channel, phase and part."""
+        problem, names = self.problem, self.problem.found.records[0].channels
+        of_phase = problem.discrepancy.phase[: problem.shape_values[0].shape[1]]
+        out = {(c, f, p): 0.0 for c in names for f in PHASES for p in PARTS}
+        rows = 0
+        for record, shapes, coefficients in zip(
+            problem.found.records, problem.shape_values, self.coefficients, strict=True
+        ):
+            inside = shapes[record.in_contact]
+            rows += len(inside)
+            for f, phase in enumerate(PHASES):
+                chosen = of_phase == f
+                values = np.einsum("mn,pcn->pcm", inside[:, chosen], coefficients[:, :, chosen])
+                for part, of_part in zip(PARTS, (values**2).sum(2), strict=True):
+                    for name, square in zip(names, of_part, strict=True):
+                        out[name, phase, part] += float(square)
+        noise = {c: n.deviation**2 for c, n in zip(names, problem.noise, strict=True)}
+        return {key: value / noise[key[0]] / max(rows, 1) for key, value in out.items()}
+
+
+def standardised_size(
+    problem: LinearProblem,
+    columns: Sequence[int],
+    coefficients: np.ndarray,
+    wrong: OwnError | None = None,
+    found: bool = False,
+) -> float:
+    """Root mean square of an effect over sqrt(noise^2 + discrepancy^2), in the rows and channels in
+    which it acts, once the base parameters are refitted to it. The noise is with what the model is
+    unsure of at each row (`LinearProblem.model_error`), as when exactly a force jumps.
+
+    Args:
+        problem: The records.
+        columns: Numbers of the effect's columns [n].
+        coefficients: Of the columns [n], or of each record [R, n].
+        wrong: The discrepancy beside the effect; None for an effect that differs from record to
+            record, as no discrepancy does.
+        found: Whether only what was found of it counts, not what it may be.
+    """
+    records, base = problem.found.records, problem.base
+    coefficients = np.broadcast_to(coefficients, (len(records), len(columns)))
+    noise = np.array([n.deviation for n in problem.noise])
+    scales = wrong.scales(found) if wrong is not None else [np.zeros(1)] * len(records)
+    effects, free = [], []
+    for record, own, g in zip(records, scales, coefficients, strict=True):
+        scale = np.hypot(np.hypot(own, noise), problem.model_error(record))
+        effects.append((record.columns[:, :, list(columns)] @ g / scale).ravel())
+        free.append((record.columns[:, :, base] / scale[:, :, None]).reshape(-1, len(base)))
+    effect, X = np.concatenate(effects), np.concatenate(free)
+    left = effect - X @ (scaled_inverse(X.T @ X) @ (X.T @ effect)) if base else effect
+    whole = np.abs(effect)
+    changed = whole[whole > 1e-3 * whole.max(initial=1e-12)]
+    if not changed.size:
+        return 0.0
+    acts = whole > ACTS * np.percentile(changed, GREAT)
+    return float(np.sqrt(np.mean(left[acts] ** 2)))

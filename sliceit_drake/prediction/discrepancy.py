@@ -1,0 +1,432 @@
+"""What a simulation gets wrong by itself: a random function of depth, phase, speed and draw.
+
+Measured less predicted force of channel c in condition k is, beside parameters and noise,
+
+    delta_kc = sum_j phi_j (u_jc + s_k v_jc + d_k w_jc + g_jkc)
+
+with shapes phi_j of depth within a phase of the motion (into the food, at rest, out of it, again),
+s_k the decimal logarithm of the condition's speed over the mean, d_k the share of the draw in its
+way. The coefficients are independent and normal: u is shared by all conditions, v goes with the
+speed, w with the draw, g is each condition's own. This is a Gaussian process of low rank (Kennedy
+and O'Hagan 2001; sines as in Solin and Saerkkae 2020). The standard deviation of each is
+
+    size = of the channel * of the part * of the phase
+
+and these few numbers are found by restricted maximum likelihood (Patterson and Thompson 1971) with
+priors that say what is known before any data: see `Discrepancy`. All is computed from moments, by
+Woodbury's identity: with Gram matrices G = [X Z]' N^-1 [X Z] of columns X and shapes Z, random
+coefficients of variance D leave G - G[:, Z] (G[Z, Z] + D^-1)^-1 G[Z, :].
+"""
+
+import dataclasses as dc
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import minimize
+
+__all__ = [
+    "PARTS",
+    "PHASES",
+    "USUAL_SHARE",
+    "Covariates",
+    "Discrepancy",
+    "Sizes",
+    "Weighted",
+    "motion_shapes",
+]
+
+PHASES = ("in", "rest", "out", "again", "board", "any")
+"""Of the motion: deeper than ever before, at rest, up, down through the open cut, in the board, and
+anywhere, in the air as well: a cable, a hose or a joint pulls with where the arm is, and unlike a
+sensor that drifts no more where the arm is back."""
+PARTS = ("shared", "speed", "draw", "condition")
+SHAPES = {"in": 10, "out": 5, "again": 5}
+"""Number of shapes of a phase."""
+ENTRY = 3e-3
+"""Depth over which shapes are finest, metres."""
+BOARD = 2e-4
+"""Way into the board of which its shapes are powers, metres."""
+SMOOTH = 2.0
+"""Number of the shape from which on their standard deviations fall, as 1 / (1 + (j / SMOOTH)^2)."""
+RESTING = 3e-4
+"""Speed below which the knife rests, m/s."""
+FIRST_REST, LAST_REST = 0.03, 3.0
+"""Times within which a force at rest changes, s."""
+USUAL_SHARE = 0.02
+"""Median before any data of a channel's size, relative to the root mean square force."""
+PRIOR = {"channel": 1.5, "part": 1.0, "phase": 1.0}
+"""Standard deviations of the logarithms of the sizes before any data."""
+JITTER = 1e-8
+"""Added to the diagonal of what is inverted, relative to it."""
+LESS = 0.5
+"""Median before any data of the sizes of the other parts and phases, relative to the shared part
+on the way in."""
+
+
+@dc.dataclass(frozen=True)
+class Covariates:
+    """Of a condition, or a record.
+
+    Attributes:
+        speed: Decimal logarithm of the knife's speed on the way in, m/s; nan without food.
+        draw: Share of the draw in that way, 0 to 1.
+    """
+
+    speed: float
+    draw: float
+
+    @staticmethod
+    def of(time: np.ndarray, depth: np.ndarray, path: np.ndarray) -> "Covariates":
+        """Of a record: times [m], depths [m] and the way of the knife [m], s and metres."""
+        going, _ = _phases(time, depth, path)
+        first = going == PHASES.index("in")
+        if first.sum() < 5:
+            return Covariates(np.nan, 0.0)
+        speed = np.gradient(path, time)[first]
+        down = np.gradient(depth, time)[first]
+        share = np.sqrt(np.clip(1.0 - (down / np.maximum(speed, 1e-9)) ** 2, 0.0, 1.0))
+        draw = float(np.median(share))
+        return Covariates(float(np.log10(np.median(speed))), draw if draw > 0.1 else 0.0)
+
+
+def _phases(time: np.ndarray, depth: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Number of the phase at each row, -1 outside of the food [m], and time at rest so far [m]."""
+    step = np.diff(time, prepend=time[0] - (time[1] - time[0]))
+    speed, rate = np.gradient(path, time), np.gradient(depth, time)
+    deepest = np.maximum.accumulate(depth)
+    resting = speed < RESTING
+    out = np.full(len(time), PHASES.index("in"))
+    out[depth < deepest - 1e-4] = PHASES.index("again")
+    out[(rate < -0.2 * speed) & ~resting] = PHASES.index("out")
+    out[resting] = PHASES.index("rest")
+    out[depth <= 0.0] = -1
+    rested = np.cumsum(np.where(resting, step, 0.0))
+    begun = np.maximum.accumulate(np.where(resting, 0.0, rested))
+    return out, np.where(resting, rested - begun, 0.0)
+
+
+def motion_shapes(
+    time: np.ndarray,
+    depth: np.ndarray,
+    path: np.ndarray,
+    touching: np.ndarray,
+    reach: float,
+    height: float = np.inf,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Shapes of a record.
+
+    Along depth sines (j + 1/2) pi u that vanish at the top of the food, where they are finest:
+    u = ln(1 + depth / ENTRY) over its value at `reach`. Those of the way in go on at rest, where
+    sines of the logarithm of the time at rest are added, with the depth and without. In the board
+    the first two powers of the way into it.
+
+    Args:
+        time, depth, path: Of the rows [m], s and metres.
+        touching: Whether the knife touches [m].
+        reach: Greatest depth of all records, metres.
+        height: Of the food, metres: the board is at this depth.
+
+    Returns:
+        Values [m, n], and the number of the phase of each shape [n].
+    """
+    going, rested = _phases(time, depth, path)
+    going = np.where(touching, going, -1)
+    at = np.log1p(np.clip(depth, 0.0, reach) / ENTRY) / np.log1p(max(reach, 1e-9) / ENTRY)
+    if height <= 0.0:
+        going = np.full(len(time), -1)
+    into = np.where(touching, np.maximum(depth - height, 0.0), 0.0) / BOARD
+    down = (depth - depth[0]) / max(reach, 1e-9)
+    across = np.sqrt(np.maximum(np.diff(path) ** 2 - np.diff(depth) ** 2, 0.0))
+    along = np.append(0.0, np.cumsum(across)) / max(reach, 1e-9)
+    out, of = [], []
+    for number, name in enumerate(PHASES):
+        if name == "rest":
+            span = np.log1p(LAST_REST / FIRST_REST)
+            late = np.clip(np.log1p(rested / FIRST_REST) / span, 0.0, 1.2)
+            times = [np.sin((j + 0.5) * np.pi * late) / (1.0 + j * j) for j in range(2)]
+            shapes = [t * level for level in (np.ones(len(at)), 2.0 * at - 1.0) for t in times]
+            where = going == number
+        elif name == "board":
+            shapes, where = [into, into**2], into > 0.0
+        elif name == "any":
+            shapes, where = [down, along], np.full(len(time), True)
+        else:
+            shapes = [
+                np.sin((j + 0.5) * np.pi * at) / (1.0 + (j / SMOOTH) ** 2)
+                for j in range(SHAPES[name])
+            ]
+            where = going == number
+            if name == "in":
+                where |= going == PHASES.index("rest")
+        out += [np.where(where, s, 0.0) for s in shapes]
+        of += [number] * len(shapes)
+    return np.column_stack(out), np.array(of)
+
+
+@dc.dataclass(frozen=True)
+class Sizes:
+    """Standard deviations of the discrepancy's coefficients.
+
+    Attributes:
+        channel: Logarithms of the shared part's on the way in [c], N and Nm.
+        part: Logarithms of the others' relative to it, in the order of `PARTS` but the first [3].
+        phase: The same of the phases but the first [4].
+    """
+
+    channel: np.ndarray
+    part: np.ndarray
+    phase: np.ndarray
+
+    @property
+    def flat(self) -> np.ndarray:
+        """All in a row."""
+        return np.concatenate([self.channel, self.part, self.phase])
+
+    @staticmethod
+    def of(flat: np.ndarray) -> "Sizes":
+        """From a row."""
+        phases = len(PHASES) - 1
+        return Sizes(flat[: -3 - phases], flat[-3 - phases : -phases], flat[-phases:])
+
+    def deviations(self, channel: np.ndarray, phase: np.ndarray) -> np.ndarray:
+        """Of shapes of these channels and phases [n] in each part [4, n]."""
+        logs = self.channel[channel] + np.append(0.0, self.phase)[phase]
+        return np.asarray(np.exp(np.append(0.0, self.part)[:, None] + logs))
+
+
+class Weighted:
+    """Moments in which a discrepancy of certain sizes is integrated out.
+
+    Attributes:
+        total: Gram matrix of the columns, all conditions together, without what the discrepancy may
+            be [n, n].
+        log_det: Logarithm of the determinant of what was integrated out.
+    """
+
+    def __init__(self, problem: "Discrepancy", grams: Sequence[np.ndarray], sizes: Sizes) -> None:
+        self.problem, self.sizes = problem, sizes
+        Z, X = problem.shapes, problem.others
+        deviations = sizes.deviations(problem.channel, problem.phase)
+        self.log_det, n, z = 0.0, len(X), len(Z)
+        D = deviations[3]
+        self.of_condition: list[np.ndarray] = []
+        self.weights: list[np.ndarray] = []
+        shared = np.zeros((3 * z + n, 3 * z + n))
+        for G, covariates in zip(grams, problem.factors, strict=True):
+            inner = np.eye(z) + D[:, None] * G[np.ix_(Z, Z)] * D
+            factor = cho_factor(inner, lower=True, check_finite=False)
+            self.log_det += 2.0 * float(np.log(np.diag(factor[0])).sum())
+            GZ = D[:, None] * G[Z]
+            weights = D[:, None] * cho_solve(factor, GZ, check_finite=False)
+            A = G - G[:, Z] @ weights
+            self.of_condition.append(A)
+            self.weights.append(weights)
+            ZZ, ZX = A[np.ix_(Z, Z)], A[np.ix_(Z, X)]
+            scale = covariates[:, None] * deviations[:3]
+            flat = scale.reshape(-1)
+            shared[: 3 * z, : 3 * z] += flat[:, None] * np.tile(ZZ, (3, 3)) * flat
+            shared[: 3 * z, 3 * z :] += flat[:, None] * np.tile(ZX, (3, 1))
+            shared[3 * z :, 3 * z :] += A[np.ix_(X, X)]
+        shared[3 * z :, : 3 * z] = shared[: 3 * z, 3 * z :].T
+        self.shared, self.size = shared, 3 * z
+        inner = np.eye(3 * z) + shared[: 3 * z, : 3 * z]
+        inner[np.diag_indices(3 * z)] *= 1.0 + JITTER
+        self.factor = cho_factor(inner, lower=True, check_finite=False)
+        self.log_det += 2.0 * float(np.log(np.diag(self.factor[0])).sum())
+        right = shared[: 3 * z, 3 * z :]
+        self.total = shared[3 * z :, 3 * z :] - right.T @ cho_solve(self.factor, right)
+
+    def products(self, columns: np.ndarray) -> list[np.ndarray]:
+        """Products of each coefficient of the discrepancy, over its standard deviation, with
+        combinations of the columns [n, k]: of the shared ones, of speed and draw [3 z, k], and of
+        each condition [z, k], in a list."""
+        problem = self.problem
+        Z, X, s = problem.shapes, problem.others, self.size
+        deviations = self.sizes.deviations(problem.channel, problem.phase)
+        right = self.shared[:s, s:] @ columns
+        fitted = cho_solve(self.factor, right, check_finite=False)
+        out = [right - self.shared[:s, :s] @ fitted]
+        for A, covariates in zip(self.of_condition, problem.factors, strict=True):
+            back = (covariates[:, None] * deviations[:3]).reshape(3, len(Z), 1) * fitted.reshape(
+                3, len(Z), -1
+            )
+            left = A[np.ix_(Z, X)] @ columns - A[np.ix_(Z, Z)] @ back.sum(0)
+            out.append(deviations[3][:, None] * left)
+        return out
+
+    def found(self, columns: np.ndarray) -> list[np.ndarray]:
+        """Mean, after the data, of the coefficients of each condition's shapes, by part [4, z].
+
+        Args:
+            columns: Combination of the columns that is left of the measurement [n].
+        """
+        z = len(self.problem.shapes)
+        deviations = self.sizes.deviations(self.problem.channel, self.problem.phase)
+        first, *own = (p[:, 0] for p in self.products(columns[:, None]))
+        shared = deviations[:3] * first.reshape(3, z)
+        return [
+            np.vstack([covariates[:, None] * shared, deviations[3] * g])
+            for covariates, g in zip(self.problem.factors, own, strict=True)
+        ]
+
+    def products_of_record(
+        self, rows: np.ndarray, condition: int, columns: np.ndarray
+    ) -> np.ndarray:
+        """Products of columns that one record alone has with combinations of the columns [n, k].
+
+        Args:
+            rows: Products of the record's columns with all columns, own ones left out [e, all].
+            condition: Of the record.
+            columns: The combinations.
+
+        Returns:
+            [e, k].
+        """
+        problem, s = self.problem, self.size
+        Z, X = problem.shapes, problem.others
+        deviations = self.sizes.deviations(problem.channel, problem.phase)
+        left = rows - rows[:, Z] @ self.weights[condition]
+        scale = (problem.factors[condition][:, None] * deviations[:3]).reshape(-1)
+        fitted = cho_solve(self.factor, self.shared[:s, s:] @ columns, check_finite=False)
+        return np.asarray(left[:, X] @ columns - (np.tile(left[:, Z], 3) * scale) @ fitted)
+
+    def traces(self) -> list[np.ndarray]:
+        """z' V^-1 z of each coefficient z of the discrepancy, over its standard deviation, as
+        `products` but with nothing else projected out."""
+        problem, s = self.problem, self.size
+        Z = problem.shapes
+        deviations = self.sizes.deviations(problem.channel, problem.phase)
+        B = self.shared[:s, :s]
+        out = [np.diag(B) - np.einsum("ij,ji->i", B, cho_solve(self.factor, B))]
+        for A, covariates in zip(self.of_condition, problem.factors, strict=True):
+            ZZ = A[np.ix_(Z, Z)] * deviations[3]
+            scale = (covariates[:, None] * deviations[:3]).reshape(-1)
+            right = scale[:, None] * np.tile(ZZ, (3, 1))
+            inner = np.einsum("ij,ij->j", right, cho_solve(self.factor, right))
+            out.append(deviations[3] * np.diag(ZZ) - inner)
+        return out
+
+
+class Discrepancy:
+    """The sizes of a discrepancy, from moments.
+
+    Args:
+        shapes: Numbers of the shapes' columns in Gram matrices [z].
+        channel, phase: Number of the channel and of the phase of each [z].
+        others: Numbers of the other columns [n], the residual last.
+        covariates: Of each condition.
+        usual: Median of the size of each channel before any data [c], N and Nm.
+    """
+
+    def __init__(
+        self,
+        shapes: Sequence[int],
+        channel: np.ndarray,
+        phase: np.ndarray,
+        others: Sequence[int],
+        covariates: Sequence[Covariates],
+        usual: np.ndarray,
+    ) -> None:
+        self.shapes, self.channel, self.phase = list(shapes), channel, phase
+        self.others = list(others)
+        speeds = np.array([c.speed for c in covariates])
+        known = np.isfinite(speeds)
+        middle = speeds[known].mean() if known.any() else 0.0
+        away = np.where(known, speeds - middle, 0.0)
+        self.factors = [np.array([1.0, s, c.draw]) for s, c in zip(away, covariates, strict=True)]
+        phases = len(PHASES) - 1
+        less = np.log(np.full(3 + phases, LESS))
+        self.prior = Sizes(np.log(usual), less[:3], less[3:])
+        self.spread = np.concatenate(
+            [np.full(len(usual), PRIOR["channel"]), [PRIOR["part"]] * 3, [PRIOR["phase"]] * phases]
+        )
+
+    def weighted(self, grams: Sequence[np.ndarray], sizes: Sizes) -> Weighted:
+        """Moments of each condition without a discrepancy of these sizes."""
+        return Weighted(self, grams, sizes)
+
+    def likelihood(
+        self, grams: Sequence[np.ndarray], sizes: Sizes, fitted: Sequence[int], prior: np.ndarray
+    ) -> tuple[float, np.ndarray]:
+        """Logarithm of the restricted likelihood and of the prior, and its gradient by the sizes.
+
+        Args:
+            grams: Moments of each condition.
+            sizes: Of the discrepancy.
+            fitted: Columns that are fitted, as numbers in `others` [k].
+            prior: Precisions of their coefficients; 0 where nothing is known [k].
+        """
+        W = Weighted(self, grams, sizes)
+        T, y, k = W.total, len(self.others) - 1, list(fitted)
+        inner = T[np.ix_(k, k)] + np.diag(prior)
+        scale = np.sqrt(np.maximum(np.diag(inner), 1e-30))
+        values, vectors = np.linalg.eigh(inner / np.outer(scale, scale))
+        kept = values > 1e-9
+        root = vectors[:, kept] / np.sqrt(values[kept]) / scale[:, None]
+        seen = root.T @ T[k, y]
+        proper = prior > 0.0
+        log_det = W.log_det + float(np.log(values[kept]).sum())
+        log_det += 2.0 * float(np.log(scale[proper]).sum()) - float(np.log(prior[proper]).sum())
+        # Flat columns have no scale of their own: their determinant is as in the first model.
+        log_det += 2.0 * float(np.log(scale[~proper]).sum())
+        value = -0.5 * (log_det + T[y, y] - float(seen @ seen))
+        columns = np.zeros((len(self.others), len(root.T) + 1))
+        columns[k, :-1] = root
+        columns[y, -1], columns[k, -1] = 1.0, -root @ seen
+        shares = []
+        for product, trace in zip(W.products(columns), W.traces(), strict=True):
+            shares.append(product[:, -1] ** 2 - trace + (product[:, :-1] ** 2).sum(1))
+        by_shape = np.array([*shares[0].reshape(3, -1), np.sum(shares[1:], axis=0)])
+        gradient = self._by_size(by_shape)
+        away = (sizes.flat - self.prior.flat) / self.spread
+        return value - 0.5 * float(away @ away), gradient - away / self.spread
+
+    def _by_size(self, by_shape: np.ndarray) -> np.ndarray:
+        """Sums of what belongs to shapes [4, z] by the size that it belongs to."""
+        channels = len(self.prior.channel)
+        of_channel = np.bincount(self.channel, by_shape.sum(0), channels)
+        of_phase = np.bincount(self.phase, by_shape.sum(0), len(PHASES))[1:]
+        return np.concatenate([of_channel, by_shape.sum(1)[1:], of_phase])
+
+    def uncertain(
+        self, grams: Sequence[np.ndarray], sizes: Sizes, fitted: Sequence[int], prior: np.ndarray
+    ) -> np.ndarray:
+        """Covariance of the logarithms of sizes that `fit` found, by Laplace's approximation."""
+        step, flat = 0.05, sizes.flat
+        rows = []
+        for e in step * np.eye(len(flat)):
+            ends = [self.likelihood(grams, Sizes.of(flat + d), fitted, prior)[1] for d in (e, -e)]
+            rows.append((ends[1] - ends[0]) / (2.0 * step))
+        values, vectors = np.linalg.eigh(0.5 * (np.array(rows) + np.array(rows).T))
+        # Nothing is less certain than before any data.
+        values = np.maximum(values, 1.0 / self.spread.max() ** 2)
+        return np.asarray((vectors / values) @ vectors.T)
+
+    def fit(
+        self,
+        grams: Sequence[np.ndarray],
+        fitted: Sequence[int],
+        prior: np.ndarray,
+        start: Sizes | None = None,
+        tolerance: float = 1e-2,
+    ) -> tuple[Sizes, float]:
+        """Sizes of largest likelihood and prior, and its logarithm; see `likelihood`."""
+
+        def objective(flat: np.ndarray) -> tuple[float, np.ndarray]:
+            value, gradient = self.likelihood(grams, Sizes.of(flat), fitted, prior)
+            return -value, -gradient
+
+        first = (start or self.prior).flat
+        near = [
+            (m - 5.0 * s, m + 3.0 * s) for m, s in zip(self.prior.flat, self.spread, strict=True)
+        ]
+        found = minimize(
+            objective,
+            first,
+            jac=True,
+            method="L-BFGS-B",
+            bounds=near,
+            options={"ftol": 1e-12, "gtol": tolerance, "maxiter": 60},
+        )
+        return Sizes.of(found.x), -float(found.fun)

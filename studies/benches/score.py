@@ -1,0 +1,205 @@
+"""Judges the answers of `python -m studies benches`, law by law.
+
+Right is a finding that holds a cause that is right, in a group of at most four that holds nothing
+an oracle knowing the law could tell from it, with no other bench or sensor cause named. Rows for
+naming nothing, for naming the first of the list, and for the oracle stand beside the diagnosis; the
+oracle names all that nobody could tell apart wherever the effect's standardised size is 1 or more.
+Intervals are bootstrap intervals of 90 % over draws.
+
+  python -m studies bench_score output/benches --output docs/results/benches_table.md
+"""
+
+import argparse
+import dataclasses as dc
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sliceit_drake.configuration import ConfigurationError
+from studies.benches.draw import LAWS
+from studies.benches.effects import BENCH_CAUSES, DEPTH_CAUSES, HIDDEN
+from studies.benches.runs import CALIBRATED_TO
+from studies.hidden_effects.score import NAMING
+from studies.pages import percent, publish, table
+
+__all__ = ["Judged", "add_arguments", "answers_of", "judge", "named_by", "rates", "run"]
+
+WHO = ("diagnosis", "always nothing", "always the top", "oracle")
+LARGE = 1.8
+"""Standardised size from which on targets hold, with what a size may be off by."""
+SEEN = 1.0
+"""Standardised size from which on the oracle sees an effect."""
+GROUP = 4
+"""Most causes of a finding."""
+RESAMPLES = 2000
+
+Groups = list[list[str]]
+
+
+@dc.dataclass(frozen=True)
+class Judged:
+    """How a run was answered.
+
+    Attributes:
+        kind: "listed", "depth", "nothing" or "unlisted".
+        size: Standardised size of what was hidden.
+        right: Whether a finding is right; of "nothing" and "unlisted" whether nothing was named
+            that must not be.
+        wrong: Whether something was named and nothing right.
+        beside: Whether a material cause is named beside.
+        failed: Whether there is no answer.
+    """
+
+    kind: str
+    size: float
+    right: bool
+    wrong: bool
+    beside: bool
+    failed: bool = False
+
+
+def answers_of(folder: Path) -> list[dict[str, Any]]:
+    """All runs that are done, with an effect that could be hidden.
+
+    Raises:
+        ConfigurationError: There are none.
+    """
+    files = sorted((folder / "runs").glob("*.json"))
+    out = [json.loads(file.read_text(encoding="utf-8")) for file in files]
+    if not out:
+        raise ConfigurationError(
+            "holds no runs",
+            source=str(folder),
+            fix="Give the --output of `python -m studies benches`.",
+        )
+    return [facts for facts in out if facts["hidden"] is not None]
+
+
+def named_by(who: str, facts: Mapping[str, Any], to: str) -> Groups | None:
+    """Findings of one of `WHO` in a run, best first; None where the diagnosis broke down."""
+    said, hidden = facts[to], facts["hidden"]
+    if who == "oracle":
+        return [hidden["group"]] if hidden["group"] and hidden["standardised"] >= SEEN else []
+    if who == "always nothing":
+        return []
+    if "failure" in said:
+        return None
+    if who == "always the top":
+        return [[said["evidence"][0]["cause"]]] if said["evidence"] else []
+    return list(said["classes"]) if said["verdict"] in NAMING else []
+
+
+def judge(named: Groups | None, hidden: Mapping[str, Any], to: str) -> Judged:
+    """Judges the findings of a run.
+
+    Args:
+        named: Findings, each a group of causes; None where there is no answer.
+        hidden: Effect, standardised size and the oracle's group.
+        to: What the food is calibrated to, one of `CALIBRATED_TO`.
+    """
+    effect, size = hidden["effect"], float(hidden["standardised"])
+    kind = "nothing"
+    if effect:
+        group = HIDDEN[effect].group
+        kind = {"bench": "listed", "material": "listed"}.get(group, group)
+    if named is None:
+        return Judged(kind, size, False, False, False, True)
+    causes = [set(finding) for finding in named]
+    if kind in ("nothing", "unlisted"):
+        bad = any(c & BENCH_CAUSES for c in causes) if kind == "nothing" else bool(causes)
+        return Judged(kind, size, not bad, bad, any(not c & BENCH_CAUSES for c in causes))
+    allowed = HIDDEN[effect].right | set(hidden["group"])
+    if kind == "depth":
+        allowed |= DEPTH_CAUSES
+    hits = [c for c in causes if c & allowed and c <= allowed and len(c) <= GROUP]
+    if kind == "listed":
+        hits = [c for c in hits if c & HIDDEN[effect].right]
+    others = [c for c in causes if c not in hits[:1]]
+    bench = any(c & BENCH_CAUSES - allowed for c in others)
+    right = bool(hits) and not bench
+    # What cannot be seen in affected records need not be named there.
+    if to == "affected" and not causes and size < SEEN:
+        right = True
+    return Judged(
+        kind, size, right, bool(causes) and not right, any(not c & BENCH_CAUSES for c in others)
+    )
+
+
+Columns = dict[str, Callable[[Judged], bool | None]]
+"""By title: whether a run counts as a hit; None where it does not belong to the column."""
+
+
+def _of(kind: str, hit: Callable[[Judged], bool], low: float = 0.0, high: float = np.inf):  # type: ignore[no-untyped-def]
+    return lambda j: hit(j) if j.kind == kind and low <= j.size < high else None
+
+
+COLUMNS: Columns = {
+    "named rightly": _of("listed", lambda j: j.right, LARGE),
+    "wrongly": _of("listed", lambda j: j.wrong, LARGE),
+    "material beside": _of("listed", lambda j: j.beside, LARGE),
+    "locked to depth": _of("depth", lambda j: j.right, LARGE),
+    "alarm, nothing hidden": _of("nothing", lambda j: j.wrong),
+    "unlisted: no name": _of("unlisted", lambda j: j.right),
+    "at 0.5": _of("listed", lambda j: j.right, 0.0, 0.75),
+    "at 1": _of("listed", lambda j: j.right, 0.75, 1.5),
+    "at 2": _of("listed", lambda j: j.right, 1.5, 3.0),
+    "at 4": _of("listed", lambda j: j.right, 3.0),
+    "no answer": lambda j: j.failed,
+}
+
+
+def rates(
+    judged: Mapping[int, Sequence[Judged]], rng: np.random.Generator
+) -> dict[str, tuple[float, float, float, int]]:
+    """By column the share of hits, its bootstrap interval over draws, and the number of runs.
+
+    Args:
+        judged: By draw.
+        rng: For the bootstrap.
+    """
+    out = {}
+    for title, hit in COLUMNS.items():
+        marks = [[hit(j) for j in runs] for runs in judged.values()]
+        counts = np.array(
+            [[sum(m is True for m in d), sum(m is not None for m in d)] for d in marks]
+        )
+        hits, runs = counts.sum(0)
+        if not runs:
+            continue
+        drawn = counts[rng.integers(0, len(counts), (RESAMPLES, len(counts)))].sum(1)
+        shares = drawn[drawn[:, 1] > 0]
+        low, high = np.percentile(shares[:, 0] / shares[:, 1], [5.0, 95.0])
+        out[title] = float(hits / runs), float(low), float(high), int(runs)
+    return out
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments of the study."""
+    parser.add_argument("folder", metavar="FOLDER", type=Path, help="--output of `benches`")
+    parser.add_argument("--output", metavar="FILE", type=Path, help="also write the table there")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
+    answers, rng, rows = answers_of(options.folder), np.random.default_rng(0), []
+    for law in LAWS:
+        of_law = [facts for facts in answers if facts["case"]["law"] == law]
+        for to in CALIBRATED_TO if of_law else ():
+            for who in WHO:
+                judged: dict[int, list[Judged]] = {}
+                for facts in of_law:
+                    verdict = judge(named_by(who, facts, to), facts["hidden"], to)
+                    judged.setdefault(facts["case"]["draw"], []).append(verdict)
+                found = rates(judged, rng)
+                cells = ["" if title not in found else _cell(*found[title]) for title in COLUMNS]
+                rows.append((law, to, who, len(judged), *cells))
+    head = " | ".join(["law", "food calibrated to", "who", "draws", *COLUMNS])
+    publish(table(head, rows), options.output)
+    return 0
+
+
+def _cell(share: float, low: float, high: float, runs: int) -> str:
+    return f"{percent(share)} ({100 * low:.0f} to {100 * high:.0f}) of {runs}"
