@@ -3,6 +3,8 @@
 import dataclasses as dc
 import json
 import math
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 
@@ -181,6 +183,21 @@ def test_an_evaluation_goes_on_over_batches_of_processes_and_runs(tmp_path, monk
     assert sorted(row["slice"] for row in found) == [0, 1, 2]
     assert all(row["completed"] and row["simulator"] == "cutting" for row in found)
     assert "3 of 3" in capsys.readouterr().out
+
+
+def test_policies_are_evaluated_without_what_trained_them():
+    code = """if True:
+        from importlib.machinery import PathFinder
+        find, absent = PathFinder.find_spec, ("torch", "gymnasium", "stable_baselines3", "torchrl")
+        PathFinder.find_spec = lambda name, *rest: None if name in absent else find(name, *rest)
+        from pathlib import Path
+        from sliceit_drake.cli import evaluate
+        from sliceit_drake.learning.unseen_worlds import cases_of, cut
+        policies = [Path("models/policies/cutting_0")]
+        (case,) = cases_of(policies, ["curves"], ["cucumber"], [3e4], 0, 1)
+        assert cut(case)["completed"]
+    """
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 
 def test_the_page_is_that_of_the_slices(tmp_path, capsys):

@@ -1,6 +1,8 @@
 """The station as a Gymnasium environment: what repeats, how an episode ends, what is rewarded."""
 
+import copy
 import dataclasses as dc
+import pickle
 
 import numpy as np
 import pytest
@@ -9,9 +11,9 @@ gymnasium = pytest.importorskip("gymnasium")
 
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
-import sliceit_drake.learning  # noqa: E402, F401  (registers the environment)
 from sliceit_drake.configuration import ConfigurationError, validate  # noqa: E402
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver  # noqa: E402
+from sliceit_drake.diagrams.outputs import animation  # noqa: E402
 from sliceit_drake.diagrams.scenario import Start  # noqa: E402
 from sliceit_drake.learning.environment import SlicingEnv  # noqa: E402
 from sliceit_drake.learning.reward import (  # noqa: E402
@@ -62,11 +64,61 @@ def test_it_is_an_environment_as_gymnasium_has_them():
     check_env(SlicingEnv(task_of()), skip_render_check=True)
 
 
+NAME = "sliceit_drake.learning:sliceit_drake/Slicing-v0"
+
+
 def test_it_is_registered():
-    env = gymnasium.make("sliceit_drake/Slicing-v0", task=task_of())
+    env = gymnasium.make(NAME, task=task_of())
     assert isinstance(env.unwrapped, SlicingEnv)
     observation, info = env.reset(seed=0)
     assert observation.shape == (28,) and info == {"food": "cucumber"}
+
+
+@pytest.mark.parametrize("food", ["apple", "carrot", "cucumber", "potato", "tomato"])
+def test_each_calibrated_food_has_a_name_of_its_own(food):
+    name = NAME.replace("Slicing-", f"Slicing{food.title()}-")
+    assert gymnasium.make(name, simulator="spring").unwrapped.task == TaskConfig("spring", [food])
+
+
+def test_the_station_of_a_name_is_drawn_and_a_guest_of_vector_environments():
+    vector = gymnasium.make_vec(NAME, 2, vectorization_mode="sync", task=task_of())
+    first, _ = vector.reset(seed=3)
+    alone = [gymnasium.make(NAME, task=task_of()).reset(seed=seed)[0] for seed in (3, 4)]
+    np.testing.assert_array_equal(first, alone)
+    if not animation.can_draw():
+        with pytest.raises(ConfigurationError, match="EGL"):
+            gymnasium.make(NAME, task=task_of(), render_mode="rgb_array")
+        return
+    env = gymnasium.make(NAME, task=task_of(), render_mode="rgb_array")
+    check_env(env.unwrapped)
+    env.reset(seed=0)
+    before = env.render()
+    for _ in range(8):
+        env.step(PRESS)
+    after = env.render()
+    assert before.shape == after.shape == (480, 640, 3)
+    # The knife has moved, and nothing else; it is not most of the picture.
+    changed = (before != after).any(axis=2).mean()
+    assert 0.005 < changed < 0.5
+
+
+def test_a_wrong_simulator_is_refused():
+    with pytest.raises(ConfigurationError, match=r"task\.simulator"):
+        SlicingEnv(simulator="springs")
+
+
+@pytest.mark.parametrize("copied", [lambda env: pickle.loads(pickle.dumps(env)), copy.deepcopy])
+def test_a_copy_goes_on_from_the_same_moment(copied):
+    env = SlicingEnv(task_of())
+    rollout(env, 3, seed=5)
+    other = copied(env)
+    assert other.task == env.task
+    for _ in range(2):
+        (found, *rest), (expected, *others) = other.step(PRESS), env.step(PRESS)
+        np.testing.assert_array_equal(found, expected)
+        assert rest == others
+    np.testing.assert_array_equal(env.reset()[0], other.reset()[0])
+    copied(SlicingEnv(task_of()))  # Without an episode there is nothing to repeat.
 
 
 @pytest.mark.parametrize("simulator", ["spring", "cutting"])
@@ -195,9 +247,17 @@ def test_an_action_that_is_none_is_refused(spring, action):
         spring.step(np.array(action))
 
 
-def test_a_step_before_a_reset_is_refused():
-    with pytest.raises(RuntimeError, match="call reset"):
-        SlicingEnv(task_of()).step(np.zeros(6))
+def test_a_step_without_an_episode_is_refused():
+    env = SlicingEnv(task_of(decisions=1))
+    with pytest.raises(RuntimeError, match=r"before reset.*call reset"):
+        env.step(np.zeros(6))
+    with pytest.raises(RuntimeError, match=r"before reset.*call reset"):
+        env.render()
+    env.reset(seed=0)
+    env.step(np.zeros(6))
+    # The goal is not paid twice.
+    with pytest.raises(RuntimeError, match=r"has ended.*call reset"):
+        env.step(np.zeros(6))
 
 
 def test_starts_are_within_their_ranges_and_fill_them():

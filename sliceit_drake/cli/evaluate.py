@@ -14,7 +14,6 @@ import argparse
 import math
 
 from sliceit_drake.cli.arguments import SEEDS, WORKERS, check_numbers, output_path
-from sliceit_drake.cli.extras import needs_extra
 from sliceit_drake.cli.progress import StageBars
 from sliceit_drake.resources import here_or_shipped
 
@@ -60,8 +59,7 @@ def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     check_numbers(options, slices=(1, math.inf), seed=SEEDS, workers=WORKERS)
     check_numbers(options, board_stiffness=(1e2, 1e8))
-    with needs_extra("learn"):
-        from sliceit_drake.learning.unseen_worlds import cases_of, evaluate, results_table
+    from sliceit_drake.learning.unseen_worlds import cases_of, evaluate, results_table
 
     cases = cases_of(
         options.policies,

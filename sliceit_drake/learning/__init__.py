@@ -1,8 +1,12 @@
-"""Learning to slice; importing it registers the environment `sliceit_drake/Slicing-v0`."""
+"""Learning to slice.
 
+Where Gymnasium is installed, importing this package registers the environment
+`sliceit_drake/Slicing-v0` and one for each calibrated food, such as
+`sliceit_drake/SlicingCucumber-v0`; `gymnasium.make("sliceit_drake.learning:ID")` imports it.
+"""
+
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
-
-import gymnasium
 
 from sliceit_drake.lazy_names import lazy_names
 
@@ -15,6 +19,13 @@ if TYPE_CHECKING:
 else:
     __getattr__, __dir__ = lazy_names(__name__)
 
-gymnasium.register(
-    id="sliceit_drake/Slicing-v0", entry_point="sliceit_drake.learning.environment:SlicingEnv"
-)
+# Policies are run and evaluated without it.
+if find_spec("gymnasium") is not None:
+    import gymnasium
+
+    for _food in ("", "apple", "carrot", "cucumber", "potato", "tomato"):
+        gymnasium.register(
+            f"sliceit_drake/Slicing{_food.title()}-v0",
+            "sliceit_drake.learning.environment:SlicingEnv",
+            kwargs={"food": _food} if _food else {},
+        )

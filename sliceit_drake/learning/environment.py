@@ -6,6 +6,8 @@ other errors end the process (1.51).
 """
 
 import copy
+import dataclasses as dc
+from collections.abc import Iterator
 from typing import Any
 
 import gymnasium
@@ -13,8 +15,11 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.analysis import Simulator
 
+from sliceit_drake.configuration import ConfigurationError, validate
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.agent_station import AgentStation
+from sliceit_drake.diagrams.live_view import make_meshcat, viewing_instructions
+from sliceit_drake.diagrams.outputs.animation import NEEDED, Film, can_draw
 from sliceit_drake.learning.reward import TERMS, reward_potential, reward_terms, reward_weights
 from sliceit_drake.learning.task import TaskConfig, make_agent_station
 
@@ -38,17 +43,43 @@ class SlicingEnv(gymnasium.Env):
     A seed given to `reset` fixes all that follows. The variants of the foods come from a seed of
     their own, the same in every environment of a task.
 
+    A copy, or what comes out of a pickle, is at the same moment of the same episode: it has
+    repeated the actions. The mode "human" shows the station in Meshcat, in real time at most, and
+    says on the terminal where; "rgb_array" draws it without a display.
+
     Args:
         task: What to cut, and how.
+        simulator: In place of the task's, see `TaskConfig`.
+        food: The only food, in place of the task's; name or file of a calibrated one.
+        render_mode: "human", "rgb_array", or None to draw nothing.
 
     Attributes:
         progress: Fraction of the training that is done, for the reward's schedule.
+
+    Raises:
+        ConfigurationError: `simulator` is none, or this machine cannot draw.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"], "render_fps": 20}
 
-    def __init__(self, task: TaskConfig | None = None) -> None:
+    def __init__(
+        self,
+        task: TaskConfig | None = None,
+        *,
+        simulator: str | None = None,
+        food: str | None = None,
+        render_mode: str | None = None,
+    ) -> None:
         self.task = task or TaskConfig()
+        if simulator is not None:
+            self.task = dc.replace(self.task, simulator=simulator)
+        if food is not None:
+            self.task = dc.replace(self.task, foods=[food])
+        validate(self.task, "task")
+        if render_mode == "rgb_array" and not can_draw():
+            raise ConfigurationError(NEEDED, field="render_mode")
+        self.render_mode = render_mode
+        self.metadata = self.metadata | {"render_fps": 1.0 / self.task.agent.period}
         self.progress = 0.0
         size = self.task.agent.observation_size()
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
@@ -58,6 +89,40 @@ class SlicingEnv(gymnasium.Env):
         self._decisions = 0
         self._potential = 0.0
         self._moment: dict[str, Any] = {}
+        self._ended = False
+        self._pictures: dict[str, Iterator[np.ndarray]] = {}
+        self._meshcat = make_meshcat() if render_mode == "human" else None
+        if self._meshcat is not None:
+            print(viewing_instructions(self._meshcat.port()), flush=True)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # What Drake and Warp hold cannot be copied; it is built and run again.
+        names = ("task", "progress", "render_mode", "spec", "_moment")
+        return {name: getattr(self, name) for name in names}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(state["task"], render_mode=state["render_mode"])  # type: ignore[misc]
+        self.progress, self.spec = state["progress"], state["spec"]
+        if state["_moment"]:
+            self.return_to(state["_moment"])
+
+    def render(self) -> np.ndarray | None:
+        """In the mode "rgb_array" a picture [480, 640, 3] of arm, knife and food, 0 to 255.
+
+        Raises:
+            RuntimeError: The environment was not reset.
+        """
+        if self._current is None:
+            raise RuntimeError("render() before reset(): call reset() first.")
+        if self.render_mode != "rgb_array":
+            return None
+        station, simulator = self._current
+        food = self._moment["food"]
+        if food not in self._pictures:
+            film, context = Film(station.station, 1.0), simulator.get_context()
+            film.frame(context)
+            self._pictures[food] = film.draw(iter(lambda: film.frame(context), None))
+        return next(self._pictures[food])
 
     def moment(self) -> dict[str, Any]:
         """Where the episode is, for `return_to`, as plain data: how it began, the actions since.
@@ -96,6 +161,7 @@ class SlicingEnv(gymnasium.Env):
         rng = self.np_random
         state = copy.deepcopy(rng.bit_generator.state)
         self._moment = {"random": state, "options": options, "actions": []}
+        self._ended = False
         foods, randomization = self.task.foods, self.task.randomization
         food = foods[int(rng.integers(len(foods)))]
         low, high = randomization.height
@@ -105,6 +171,7 @@ class SlicingEnv(gymnasium.Env):
         food = (options or {}).get("food", food)
         if food not in foods:
             raise ValueError(f"the task has no food {food!r}; it has {', '.join(foods)}.")
+        self._moment["food"] = food
         self._current = station, simulator = self._station(food)
         shift = RigidTransform(RotationMatrix.MakeYRotation(turn), [along, 0.0, -up])
         station.begin(simulator, rng, shift)
@@ -117,10 +184,11 @@ class SlicingEnv(gymnasium.Env):
 
         Raises:
             ValueError: The action is not six finite numbers.
-            RuntimeError: The environment was not reset.
+            RuntimeError: The environment was not reset, or the slice has ended.
         """
-        if self._current is None:
-            raise RuntimeError("step() before reset(): call reset() first.")
+        if self._current is None or self._ended:
+            when = "after the slice has ended" if self._ended else "before reset()"
+            raise RuntimeError(f"step() {when}: call reset() first.")
         action = np.asarray(action, float)
         if action.shape != (6,) or not np.isfinite(action).all():
             raise ValueError(f"an action is six finite numbers within [-1, 1]; this is {action}.")
@@ -157,6 +225,7 @@ class SlicingEnv(gymnasium.Env):
         if guard:
             info["guard_error"], info["guard_message"] = guard, message
         truncated = not end and self._decisions >= self.task.decisions
+        self._ended = bool(end) or truncated
         if end or truncated:
             info["end"] = end or "time"
             info["is_success"] = end == "goal"
@@ -165,8 +234,11 @@ class SlicingEnv(gymnasium.Env):
     def _station(self, food: str) -> tuple[AgentStation, Simulator]:
         if food not in self._built:
             rng = np.random.default_rng([VARIANT_SEED, self.task.foods.index(food)])
-            station = make_agent_station(self.task, food, rng)
-            self._built[food] = station, Simulator(station)
+            station = make_agent_station(self.task, food, rng, self._meshcat)
+            simulator = Simulator(station)
+            if self.render_mode == "human":
+                simulator.set_target_realtime_rate(1.0)
+            self._built[food] = station, simulator
         return self._built[food]
 
     def _output(self, port: str) -> Any:

@@ -1,6 +1,6 @@
 """The networks of the agent: a temporal convolution over the readings, beside all the rest.
 
-`export_policy` writes an actor as a network that runs without the library that trained it.
+`export_network` writes a policy as a network that runs without the library that trained it.
 """
 
 from pathlib import Path
@@ -15,7 +15,7 @@ from torch import nn
 from sliceit_drake.systems.agent import AgentConfig
 from sliceit_drake.systems.exported_network import LAYOUT, layout_of
 
-__all__ = ["HistoryExtractor", "TemporalConvolution", "export_policy"]
+__all__ = ["HistoryExtractor", "TemporalConvolution", "export_network", "export_policy"]
 
 READING = 3
 
@@ -94,13 +94,23 @@ class HistoryExtractor(BaseFeaturesExtractor):
 
 
 def export_policy(actor: Actor, config: AgentConfig, file: Path) -> None:
-    """Writes the actor's decisions, without its randomness, as ONNX with the layout it needs."""
+    """Writes the actor's decisions, without its randomness; see `export_network`."""
     # The middle of the distribution.
     parts = (actor.features_extractor, actor.latent_pi, actor.mu, nn.Tanh())
-    network = nn.Sequential(*parts).eval()
+    export_network(nn.Sequential(*parts), config, file)
+
+
+def export_network(network: nn.Module, config: AgentConfig, file: Path) -> None:
+    """Writes a policy of any algorithm as ONNX, for `AgentConfig.network`.
+
+    Args:
+        network: From observations [batch, n] to actions [batch, 6], which are cut off at -1 and 1.
+        config: The agent's settings in training; the file keeps the layout of its observations.
+        file: To write.
+    """
     example = torch.zeros(1, config.observation_size())
     torch.onnx.export(
-        network,
+        network.eval(),
         (example,),
         str(file),
         input_names=["observation"],

@@ -5,6 +5,7 @@ import dataclasses as dc
 from collections.abc import Sequence
 
 import numpy as np
+from pydrake.geometry import Meshcat
 
 from sliceit_drake.configuration import ConfigurationError, choice, quantity
 from sliceit_drake.cutting.board import Board
@@ -155,7 +156,7 @@ def station_scenario(task: TaskConfig, calibrated: CalibratedFood, food: str) ->
         board=copy.deepcopy(task.board),
         sensor=copy.deepcopy(task.sensor),
         start=copy.deepcopy(task.start),
-        numerics=Numerics(flank_stiffness=calibrated.flank_stiffness, time_step=task.time_step),
+        numerics=Numerics(time_step=task.time_step),
     )
     if task.simulator == "cutting":
         food_model = calibrated.apply_to(calibrated.food)
@@ -173,8 +174,12 @@ def station_scenario(task: TaskConfig, calibrated: CalibratedFood, food: str) ->
     return scenario
 
 
-def make_agent_station(task: TaskConfig, food: str, rng: np.random.Generator) -> AgentStation:
+def make_agent_station(
+    task: TaskConfig, food: str, rng: np.random.Generator, meshcat: Meshcat | None = None
+) -> AgentStation:
     """The station of one of a task's foods with all its variants, drawn by `rng`, and the agent.
+
+    It is shown in `meshcat`, if there is one.
 
     Raises:
         ConfigurationError: The food cannot be loaded or cut.
@@ -187,7 +192,7 @@ def make_agent_station(task: TaskConfig, food: str, rng: np.random.Generator) ->
         solvers = [CuttingSolver(model, scenario.exchange_period) for model in models]
         cutting = CuttingSystem(solvers, scenario.X_WF())
 
-    station = MakeStation(scenario, cutting=cutting)
+    station = MakeStation(scenario, meshcat, cutting=cutting)
     return AgentStation(station, dc.replace(task.agent, descent=station.descent()))
 
 
