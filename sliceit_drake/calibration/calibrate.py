@@ -160,8 +160,7 @@ def calibrate(
 
 def values_of(food: CalibratedFood) -> dict[str, float]:
     """The values of a calibrated food's parameters, for `CalibrationOptions.start`."""
-    numerics = Numerics(flank_stiffness=food.flank_stiffness)
-    model = make_food_model(food.food, food.knife, numerics)
+    model = make_food_model(food.food, food.knife, Numerics())
     return {name: float(get_parameter(model, name)) for name in food.distribution.names}
 
 

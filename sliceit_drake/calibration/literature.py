@@ -91,7 +91,6 @@ def food_from_literature(
     return CalibratedFood(
         food=dc.replace(setup.food, material=central.material, effects=central.effects),
         knife=setup.knife,
-        flank_stiffness=central.numerics.flank_stiffness,
         distribution=distribution,
         spring=calibrate_spring(peaks[kept].mean()[None], float(model.top - model.bottom)),
         records=[literature.source],

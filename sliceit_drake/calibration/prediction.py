@@ -11,6 +11,7 @@ from scipy.linalg import block_diag
 from sliceit_drake.calibration.oscillation import Oscillation, fit_oscillation
 from sliceit_drake.calibration.setup import CalibrationSetup
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.bench_errors import BenchErrors
 from sliceit_drake.cutting.foods.distribution import from_unit, to_unit
 from sliceit_drake.cutting.gradient import SliceAdjoint
 from sliceit_drake.cutting.knife_path import KnifePath
@@ -129,6 +130,13 @@ class Predictor:
     ) -> None:
         if not records:
             raise ConfigurationError("no record is given", field="RECORD", fix="Name one.")
+        if setup.bench != BenchErrors() or setup.food.effects.changes_force:
+            raise ConfigurationError(
+                "a calibration fits the force of the cut itself",
+                field="bench" if setup.bench != BenchErrors() else "food.effects",
+                fix="Leave out bench, effects.resting and effects.slice_push.pull: simulations and"
+                " a diagnosis take them.",
+            )
         self.setup = setup
         step = time_step or setup.numerics.time_step
         meshing = Meshing(1.0, step, precision, setup.numerics.device)
@@ -235,14 +243,34 @@ class Predictor:
         return Job(model, R, p, target.stretches, target.record.name, "float64")
 
     def predict(
-        self, units: Sequence[np.ndarray], step: float | None = None
+        self,
+        units: Sequence[np.ndarray],
+        step: float | None = None,
+        near: np.ndarray | None = None,
     ) -> list[list[Prediction]]:
         """Forces at several places in the ranges, each [d]: for each, one prediction a record.
 
         Args:
             units: The places.
             step: Sub-step, s; the predictor's by default.
+            near: Place whose sub-steps are taken, for differences from it; None for those that each
+                place asks for.
         """
+        jobs, failures = self._jobs(units, step)
+        if near is not None:
+            here = self._simulator.run(self._jobs([near], step)[0])
+            for job, result in zip(jobs, itertools.cycle(here), strict=False):
+                job.substeps = result.substeps
+        results = self._simulator.run(jobs)
+        parts = zip(itertools.cycle(self.targets), jobs, results, failures, strict=False)
+        predictions = [self._prediction(*part) for part in parts]
+        n = len(self.targets)
+        return [predictions[k : k + n] for k in range(0, len(predictions), n)]
+
+    def _jobs(
+        self, units: Sequence[np.ndarray], step: float | None
+    ) -> tuple[list[Job], list[str | None]]:
+        """What `predict` simulates, and why it cannot, by place and record."""
         jobs, failures = [], []
         for unit in units:
             values = self.values(unit)
@@ -255,11 +283,7 @@ class Predictor:
                     failure = str(error)
                 jobs.append(self._job(target, model, values))
                 failures.append(failure)
-        results = self._simulator.run(jobs)
-        parts = zip(itertools.cycle(self.targets), jobs, results, failures, strict=False)
-        predictions = [self._prediction(*part) for part in parts]
-        n = len(self.targets)
-        return [predictions[k : k + n] for k in range(0, len(predictions), n)]
+        return jobs, failures
 
     def _prediction(
         self, target: RecordTarget, job: Job, result: JobResult, failure: str | None
@@ -410,7 +434,7 @@ class Predictor:
         """Derivative of the mean square by the k-th unit value, by differences."""
         ends = np.tile(unit, (2, 1))
         ends[:, k] = np.clip(unit[k] + STEP * np.array([1.0, -1.0]), 0.0, 1.0)
-        squares = [self.error(row) ** 2 for row in self.predict(list(ends))]
+        squares = [self.error(row) ** 2 for row in self.predict(list(ends), near=unit)]
         return (squares[0] - squares[1]) / float(ends[0, k] - ends[1, k])
 
     def jacobian(self, unit: np.ndarray, step: float = 2e-3) -> tuple[np.ndarray, np.ndarray]:
@@ -423,15 +447,14 @@ class Predictor:
         """
         high, low = np.minimum(unit + step, 1.0), np.maximum(unit - step, 0.0)
         moved = self._moved_together()
-        sets = [unit]
+        sets = []
         for members in moved:
             for end in (high, low):
                 sets.append(np.where(np.isin(np.arange(len(unit)), members), end, unit))
-        rows = self.predict(sets)
-        for row in rows:
-            for p in row:
-                if p.failure is not None:
-                    raise CuttingError(f"a slice near the calibrated values: {p.failure}")
+        rows = self.predict([unit]) + self.predict(sets, near=unit)
+        for p in itertools.chain(*rows):
+            if p.failure is not None:
+                raise CuttingError(f"a slice near the calibrated values: {p.failure}")
         factors = [
             p.oscillation.factor(t.time)[:, None]
             for p, t in zip(rows[0], self.targets, strict=True)

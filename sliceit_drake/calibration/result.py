@@ -104,7 +104,6 @@ class Calibration:
         return CalibratedFood(
             food=food,
             knife=model.knife,
-            flank_stiffness=model.numerics.flank_stiffness,
             distribution=self.posterior.shared(),
             spring=spring,
             rms_error=self.rms,

@@ -10,6 +10,7 @@ from sliceit_drake.configuration import (
     load_yaml,
     quantity,
 )
+from sliceit_drake.cutting.bench_errors import BenchErrors
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.foods.food import Food, make_food_model
 from sliceit_drake.cutting.knife import Knife
@@ -81,6 +82,8 @@ class CalibrationSetup:
     food: Food = dc.field(default_factory=Food)
     knife: Knife = dc.field(default_factory=Knife)
     board: Board = dc.field(default_factory=Board)
+    bench: BenchErrors = dc.field(default_factory=BenchErrors)
+    """What sensor, tool, board, arm and mounting do otherwise; a diagnosis takes it."""
     numerics: Numerics = dc.field(default_factory=Numerics)
     parameters: list[ParameterRange] = dc.field(default_factory=list)
     height_offset: list[float] = quantity([-2e-3, 2e-3], "m", low=-0.02, high=0.02, size=2)
