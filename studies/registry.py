@@ -43,7 +43,10 @@ TOPICS: dict[str, tuple[Study, ...]] = {
         ),
         Study("disect", "disect.page", "side by side with DiSECt", "5 min"),
         Study(
-            "random", "physics.random_slices", "random foods, planes, knives and motions", "7 min"
+            "random",
+            "physics.random_slices",
+            "random foods, planes, knives and motions",
+            "15 min",
         ),
         Study(
             "stepping",
@@ -58,6 +61,12 @@ TOPICS: dict[str, tuple[Study, ...]] = {
             "2 min",
         ),
         Study(
+            "soft_foods",
+            "physics.soft_foods",
+            "foods that are soft for their mesh, and what helps",
+            "4 min",
+        ),
+        Study(
             "split_step_limit",
             "physics.split_step_limit",
             "stable step of cuts by random planes",
@@ -67,12 +76,6 @@ TOPICS: dict[str, tuple[Study, ...]] = {
         Study("foods_page", "physics.foods_page", "tables of foods and knives", "1 s"),
         Study("cutting_speed", "physics.cutting_speed", "cost of a cut without a robot", "5 min"),
         Study("batch_speed", "physics.batch_speed", "cuts a second, on CPU and GPU", "2 min"),
-        Study(
-            "condensed_scheme",
-            "physics.condensed_scheme",
-            "quasi-static schemes against the explicit solver",
-            "10 min",
-        ),
     ),
     "robot and station": (
         Study(
@@ -146,6 +149,20 @@ TOPICS: dict[str, tuple[Study, ...]] = {
             "hidden_effects.sizes",
             "sizes of effects by their strength against the noise",
             "1 h",
+        ),
+        Study(
+            "benches",
+            "benches.runs",
+            "hides effects on benches of other laws and has them diagnosed",
+            "hours",
+        ),
+        Study("bench_score", "benches.score", "judges the diagnoses of `benches`", "5 s"),
+        Study("bench_figures", "benches.figure", "draws a record of each law", "30 s"),
+        Study(
+            "bench_misfit",
+            "benches.calibrated",
+            "how wrong the simulation is by itself on benches of other laws",
+            "1 min a draw",
         ),
         Study("diagnosis_speed", "diagnosis.diagnosis_speed", "time of a diagnosis", "3 min"),
         Study(

@@ -76,7 +76,7 @@ TESTED = {
         " --output records/a",
         "sliceit record --output records/a --seed 1",
         "sliceit record --effect brine.py:2.0 --output records/b",
-        "sliceit record --seed 1 --effect bulk_relaxation:0.0399",
+        "sliceit record --seed 1 --effect bulk_relaxation:0.0399 --output RECORDS",
     ],
     "tests/test_cluster.py::test_records_of_a_cluster_are_those_of_one_process": [
         "sliceit record --output records/b --seed 1 --backend dask --scheduler tcp://10.0.0.5:8786",
@@ -114,6 +114,9 @@ TESTED = {
     "tests/test_next_experiment.py::test_station_and_stand_in_run_what_was_written": [
         "sliceit simulate next.yaml",
         "sliceit record next.yaml --replicates 3 --output records/tuesday",
+    ],
+    "tests/test_benches.py::test_the_table_has_rows_for_naming_nothing_the_top_and_the_oracle": [
+        "python -m studies bench_score output/benches --output output/benches.md",
     ],
     "tests/test_hidden_effects_page.py::test_the_page_is_made_from_the_runs_and_says_how_they_"
     "were": [
@@ -247,9 +250,12 @@ READ_ONLY = {
         python -m studies control --output FOLDER
         python -m studies coverage --replicates 12 --output docs/results
         python -m studies disect --output docs/results
+        python -m studies bench_misfit --draws 2 --output output/misfit.md
+        python -m studies benches --output output/benches --commit HEAD --laws slice_push bonds
         python -m studies hidden --output output/hidden --seed 1 --replicates 100
         python -m studies identifiability --output docs/results/identifiability.md --figure docs/results/figures/identifiability.png
         python -m studies random --count 200 --seed 1 --output docs/results
+        python -m studies random --count 50 --seed 1 --output docs/results
         python -m studies real --output docs/results
         python -m studies stepping --output FOLDER
         python -m studies verification --fit
@@ -257,7 +263,6 @@ READ_ONLY = {
         """,  # noqa: E501
     "measures times or draws figures, whose results stand in docs": """
         python -m studies batch_speed --output docs/results/speed.md
-        python -m studies condensed_scheme
         python -m studies contact --output docs/results/contact.md
         python -m studies cutting_speed --json docs/results/benchmarks/cutting_speed.json
         python -m studies cutting_speed --repeats 3 --output docs/results/figures/cutting_speed.png
@@ -275,8 +280,10 @@ READ_ONLY = {
         python -m studies scaling --output docs/results/scaling.md
         python -m studies scaling --trials 24 --slices 4 --tasks 500 --seconds 2 --output docs/results/scaling.md
         python -m studies slicing_ablations --folder output/ablations --output docs/results/learning.md
+        python -m studies soft_foods --output docs/results/soft_foods.md
         python -m studies split_step_limit
         python -m studies stand_in_figure
+        python -m studies bench_figures
         python -m studies station_speed --repeat 6 --before docs/results/data/before/station_speed.json --json docs/results/benchmarks/station_speed.json --output docs/results/speed.md
         python -m studies station_speed --json docs/results/benchmarks/station_speed.json
         python -m studies unfinished_slices docs/results/slicing_evaluation.jsonl --output docs/results/learning.md

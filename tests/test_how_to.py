@@ -72,4 +72,5 @@ def test_a_scenario_of_the_how_to_list_loads(tmp_path):
 def test_the_first_slice_is_softer_in_python(tmp_path, monkeypatch, capsys):
     page = (DOCS / "tutorials/first_slice.md").read_text(encoding="utf-8")
     run_program(blocks("python", page)["The same in Python"], tmp_path, monkeypatch)
-    assert 12.0 < float(capsys.readouterr().out.split()[-1]) < 14.5
+    # With its own toughness, 360 J/m2, 15.9 N.
+    assert 13.5 < float(capsys.readouterr().out.split()[-1]) < 15.5

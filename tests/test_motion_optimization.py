@@ -56,7 +56,8 @@ def test_a_faster_draw_lowers_the_force_as_atkins_says():
     xi = draw.amplitude * 2.0 * np.pi * draw.frequency / draw.press_speed * np.cos(phase)
     expected = float(np.mean(1.0 / np.sqrt(1.0 + xi**2)))
     ratio = mean_force(adjoint, draw)[0] / mean_force(adjoint, press)[0]
-    assert ratio == pytest.approx(expected, rel=0.1)
+    # The wedge's own part, 12 % of the press, does not fall with the draw as the edge's does.
+    assert expected < ratio < 0.88 * expected + 0.12
 
 
 def test_the_optimum_keeps_its_limits_and_no_neighbour_within_them_is_better():

@@ -32,7 +32,6 @@ def scenario_of_slice(plan: PlannedSlice) -> Scenario:
     scenario.controller.mode = "motion"
     scenario.controller.error_scale = 1.0
     scenario.controller.p_gains = [GAINS] * 6
-    scenario.numerics.flank_stiffness = plan.flank_stiffness
     if plan.food is None:
         # Of no toughness, it is a height to start from and no force.
         scenario.food = no_food(plan.height)

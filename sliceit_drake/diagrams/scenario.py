@@ -7,6 +7,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
 from sliceit_drake.configuration import ConfigurationError, choice, quantity
+from sliceit_drake.cutting.bench_errors import BenchErrors
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
 from sliceit_drake.cutting.foods.effects import Effects
@@ -104,6 +105,8 @@ class Scenario:
     knife_name: str | None = None
     """A knife by name (calibration/knives) or file; it takes the place of `knife`."""
     board: Board = dc.field(default_factory=Board)
+    bench: BenchErrors = dc.field(default_factory=BenchErrors)
+    """What the bench does otherwise than the rest says; a food of a diagnosis has it."""
     food: Food | AnalyticFood | SpringFood = dc.field(default_factory=Food)
     calibration: str | None = None
     """A calibrated food, by name (calibration/foods) or file: its material, effects and flank
@@ -132,6 +135,14 @@ class Scenario:
                         field=f"{where}.food.effects.{name}",
                         fix="Leave it out.",
                     )
+        tool = self.bench.tool
+        if tool.mass < 0.0 or (tool.mass == 0.0 and tool.moment != 0.0):
+            raise ConfigurationError(
+                f"{tool.mass:.4g} kg with a moment of {tool.moment:.4g} kg m is no part that an arm"
+                " can carry",
+                field=f"{where}.bench.tool",
+                fix="Give a mass above 0, or leave it out and take less off the readings.",
+            )
         if self.policy is not None:
             for name, default in (("motion", MotionPlan()), ("sequence", None)):
                 if getattr(self, name) != default:
@@ -156,6 +167,25 @@ class Scenario:
                     field=f"{where}.{name}",
                     fix=f"Leave out one of {name} and sequence.",
                 )
+
+    def as_it_is(self) -> "Scenario":
+        """The same with the board, and the food on it, as the bench has them; the knife starts
+        where it did, and the board gives as it does together with the arm."""
+        errors, board = self.bench.board, self.board
+        stiffness = board.stiffness * (1.0 + errors.stiffness)
+        stiffness /= 1.0 + self.bench.arm.compliance * stiffness
+        board = dc.replace(board, height=board.height + errors.height, stiffness=stiffness)
+        start = dc.replace(self.start, clearance=self.start.clearance - errors.height)
+        return dc.replace(self, board=board, start=start)
+
+    def not_simulated(self) -> list[str]:
+        """What of the bench a station does not follow, in words."""
+        if self.bench.board.exponent == 0.0:
+            return []
+        return [
+            "bench.board.exponent is not in this station, whose board is linear; a diagnosis with"
+            " --model takes it"
+        ]
 
     def X_WF(self) -> RigidTransform:
         """Pose of the food frame: on the board's top surface."""
@@ -233,7 +263,8 @@ def _put_in_named(scenario: Scenario, given: Scenario, source: str) -> None:
             )
         calibrated = load_calibrated_food(scenario.calibration)
         scenario.food = calibrated.apply_to(scenario.food)
-        scenario.numerics.flank_stiffness = calibrated.flank_stiffness
+        if calibrated.bench != BenchErrors():
+            scenario.bench = calibrated.bench
     if scenario.preparation is not None and scenario.preparation.peeled:
         if isinstance(scenario.food, Food):
             scenario.food.effects.skin.toughness = 0.0

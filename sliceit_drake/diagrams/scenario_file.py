@@ -14,7 +14,7 @@ OTHERS = (".csv", ".gif", ".html", ".jpg", ".json", ".md", ".npz", ".onnx", ".pd
 """Files that are no YAML, which scenarios are."""
 KINDS = (
     (
-        {"distribution", "flank_stiffness", "spring", "rms_error"},
+        {"distribution", "spring", "rms_error"},
         "is a calibrated food, and not a scenario",
         "Use it in one: sliceit simulate --set calibration={}",
     ),

@@ -10,6 +10,7 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer
 
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.cutting.bench_errors import ArmErrors, BenchErrors, MountingErrors
 from sliceit_drake.diagrams.plant.knife_body import check_plant_step, effective_mass
 from sliceit_drake.diagrams.plant.robot_plant import (
     ArmController,
@@ -34,6 +35,7 @@ from sliceit_drake.systems.cut_report import FrameRecorder
 from sliceit_drake.systems.cutting_system import CuttingSystem
 from sliceit_drake.systems.food_visualizer import FoodVisualizer
 from sliceit_drake.systems.frame_visualizer import FrameVisualizer
+from sliceit_drake.systems.giving_mount import GivingMount
 from sliceit_drake.systems.knife_force import AppliedForce, KnifeForceSystem
 from sliceit_drake.systems.knife_kinematics import BoardContact, KnifeKinematics
 from sliceit_drake.systems.loose_slices import LooseSlices
@@ -106,10 +108,17 @@ class SimulatedStation(Station):
         self.meshcat = meshcat
         food = food_to_cut(scenario, cutting)
         self.motion_plan, self.start_pose = food.motion_plan, food.start_pose
+        bench = scenario.bench
+        if bench != BenchErrors():
+            # The motion is meant for the bench as it was assumed.
+            scenario = scenario.as_it_is()
+            food = food_to_cut(scenario, cutting)
         self.estimate_error = food.estimate_error
         builder = DiagramBuilder()
         self.plant, self.scene_graph = add_plant(builder, scenario.robot)
-        self.robot: Robot = add_robot(self.plant, scenario.robot, scenario.knife, scenario.board)
+        self.robot: Robot = add_robot(
+            self.plant, scenario.robot, scenario.knife, scenario.board, bench.tool
+        )
         add_table(self.plant, (0.1 if scenario.holder == "clamp" else -0.15, -0.3))
         add_board(self.plant, scenario.board, scenario.X_WF())
         if food.held is not None:
@@ -130,7 +139,12 @@ class SimulatedStation(Station):
         )
         self.controller = make_controller(scenario, controller)
         self.sensor = sensor = WrenchSensor(
-            self.plant, self.robot.sensor_weld, scenario.exchange_period, scenario.sensor
+            self.plant,
+            self.robot.sensor_weld,
+            scenario.exchange_period,
+            scenario.sensor,
+            bench.sensor,
+            scenario.robot.X_TK(),
         )
         kinematics = KnifeKinematics(self.plant, self.robot.knife)
         board_contact = BoardContact(
@@ -149,6 +163,14 @@ class SimulatedStation(Station):
         }
         for name, system in named.items():
             builder.AddNamedSystem(name, system)
+        met_pose = kinematics.GetOutputPort("knife_pose")
+        if (bench.arm, bench.mounting) != (ArmErrors(), MountingErrors()):
+            mount = builder.AddNamedSystem(
+                "giving_mount", GivingMount(bench, scenario.exchange_period)
+            )
+            connect(builder, met_pose, mount)
+            connect(builder, self.cutting.GetOutputPort("food_wrench_vector"), mount)
+            met_pose = mount.GetOutputPort("met_pose")
         self.slices: LooseSlices | None = None
         if food.make_slices is not None and isinstance(self.cutting, CuttingSystem):
             self.slices = builder.AddNamedSystem("slices", food.make_slices(self.cutting))
@@ -171,13 +193,14 @@ class SimulatedStation(Station):
             (plant.get_geometry_pose_output_port(), kinematics),
             (plant.get_contact_results_output_port(), board_contact),
             (plant.get_reaction_forces_output_port(), sensor),
-            (kinematics.GetOutputPort("knife_pose"), self.cutting, board_contact),
+            (kinematics.GetOutputPort("knife_pose"), board_contact),
             (kinematics.GetOutputPort("knife_velocity"), self.cutting),
             (sensor.GetOutputPort("sensor_wrench"), self.controller),
             (sensor.GetOutputPort("sensor_wrench_vector"), monitor),
             (self.controller.GetOutputPort("joint_positions_command"), self._arm),
         ):
             connect(builder, source, *systems)
+        builder.Connect(met_pose, self.cutting.GetInputPort("knife_pose"))
         joints = builder.AddNamedSystem("joints", Demultiplexer([JOINTS, JOINTS]))
         builder.Connect(plant.get_state_output_port(self.robot.arm), joints.get_input_port())
         builder.Connect(joints.get_output_port(0), self.controller.GetInputPort("joint_positions"))

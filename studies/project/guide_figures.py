@@ -1,11 +1,13 @@
 """Draws pictures of the guides: foods, shapes, frames, the station's loop, the servo, a record.
 
-Writes foods.png, shapes.png, frames.png, station.png, servo.png and record.png to docs/figures.
+Writes foods.png, shapes.png, frames.png, station.png, servo.png, record.png and environment.png to
+docs/figures.
 """
 
 import argparse
 import itertools
 
+import gymnasium
 import numpy as np
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
@@ -30,6 +32,7 @@ from studies.figures import (
 
 __all__ = [
     "add_arguments",
+    "environment_figure",
     "foods_figure",
     "frames_figure",
     "record_figure",
@@ -78,6 +81,7 @@ def run(options: argparse.Namespace) -> int:
             "foods": foods_figure,
             "shapes": shapes_figure,
             "frames": frames_figure,
+            "environment": environment_figure,
             "station": station_figure,
             "servo": servo_figure,
             "record": record_figure,
@@ -157,6 +161,29 @@ def frames_figure() -> Figure:
     axes.plot([0.0, 0.0], [0.0, 0.0], [spine, 165.0], color="0.3", lw=4.0)
     axes.set(xlim=(-90, 90), ylim=(-90, 90), zlim=(0, 170))
     axes.set_box_aspect((180, 180, 170), zoom=1.25)
+    return figure
+
+
+def environment_figure() -> Figure:
+    """What the environment renders in an episode of draws and presses."""
+    env = gymnasium.make(
+        "sliceit_drake.learning:sliceit_drake/SlicingCucumber-v0", render_mode="rgb_array"
+    )
+    env.reset(seed=0)
+    pictures: list = []
+    done = False
+    while not done:
+        k = len(pictures)
+        draw = 1.0 if k // 12 % 2 else -1.0
+        *_, terminated, truncated, _ = env.step(np.array([0.0, 0.0, 0.5, 0.0, draw, 0.5]))
+        done = terminated or truncated
+        pictures.append(env.render())
+    figure = new_figure(9.0, 2.4)
+    for column, k in enumerate(np.linspace(0, len(pictures) - 1, 4).astype(int)):
+        axes = figure.add_subplot(1, 4, column + 1)
+        axes.imshow(pictures[k])
+        axes.set_axis_off()
+        axes.set_title(f"decision {k + 1}", fontsize=9)
     return figure
 
 

@@ -9,7 +9,7 @@ import json
 import math
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -140,7 +140,7 @@ class Film:
         """Of the frames, s."""
         return np.array([frame.time for frame in self.frames])
 
-    def draw(self, frames: Sequence[Frame]) -> Iterator[np.ndarray]:
+    def draw(self, frames: Iterable[Frame]) -> Iterator[np.ndarray]:
         """Draws frames of its own one by one: [H, W, 3], red, green, blue, 0 to 255.
 
         Call it only where `can_draw`.

@@ -107,6 +107,7 @@ def run_summary(run: FinishedRun, record: Record, comparison: Comparison | None)
         summary["slices"] = [dc.asdict(report) for report in slice_reports(record, areas)]
     warnings = [*summary.get("warnings", ()), *run.warnings]
     warnings += [each for each in (_not_cut_through(run, record), _clamped(run)) if each]
+    warnings += run.scenario.not_simulated()
     if warnings:
         summary["warnings"] = warnings
     if station.estimate_error is not None:

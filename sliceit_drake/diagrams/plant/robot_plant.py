@@ -8,12 +8,20 @@ from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import ModelInstanceIndex, RevoluteJoint, RigidBody, WeldJoint
+from pydrake.multibody.tree import (
+    ModelInstanceIndex,
+    RevoluteJoint,
+    RigidBody,
+    SpatialInertia,
+    UnitInertia,
+    WeldJoint,
+)
 from pydrake.systems.controllers import InverseDynamics
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import LinearSystem, Multiplexer
 
 from sliceit_drake.configuration import ConfigurationError, quantity
+from sliceit_drake.cutting.bench_errors import ToolErrors
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.diagrams.plant.knife_body import add_knife
@@ -121,11 +129,17 @@ def add_plant(builder: DiagramBuilder, config: RobotConfig) -> tuple[MultibodyPl
     )
 
 
-def add_robot(plant: MultibodyPlant, config: RobotConfig, knife: Knife, board: Board) -> Robot:
+def add_robot(
+    plant: MultibodyPlant,
+    config: RobotConfig,
+    knife: Knife,
+    board: Board,
+    tool: ToolErrors | None = None,
+) -> Robot:
     """Adds the arm, the gripper and the knife, at their initial positions.
 
     The plant is not finalized, and registered with a scene graph; `board` is what the knife may
-    touch.
+    touch, and `tool` a part on Kz that it carries beside, of a mass above zero.
     """
     arm, gripper = add_arm_and_gripper(plant)
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", arm), config.X_WB())
@@ -135,6 +149,11 @@ def add_robot(plant: MultibodyPlant, config: RobotConfig, knife: Knife, board: B
         WeldJoint("sensor_weld", tool0, gripper_frame, RigidTransform.Identity())
     )
     knife_body = add_knife(plant, knife, board, gripper_frame, config.X_TK())
+    if tool is not None and tool.mass > 0.0:
+        point = SpatialInertia(tool.mass, np.zeros(3), UnitInertia(0.0, 0.0, 0.0))
+        part = plant.AddRigidBody("uncompensated", plant.AddModelInstance("uncompensated"), point)
+        place = RigidTransform([0.0, 0.0, tool.moment / tool.mass])
+        plant.WeldFrames(knife_body.body_frame(), part.body_frame(), place)
     joints = map(plant.get_joint, plant.GetJointIndices(arm))
     turning = (joint for joint in joints if isinstance(joint, RevoluteJoint))
     for joint, position in zip(turning, config.joint_positions, strict=True):
