@@ -187,7 +187,7 @@ def package_page(package: str) -> str:
 
 
 def constants(module: str) -> Iterator[tuple[str, str]]:
-    """Public constants and kernels that automodule passes over, and what is said of them.
+    """Public constants, kernels and their functions that automodule passes over, and what is said of them.
 
     Those are the ones with a comment before them, or nothing, in place of a docstring after them.
     """
@@ -199,7 +199,9 @@ def constants(module: str) -> Iterator[tuple[str, str]]:
     public = {name for name in found.__all__ if not inspect.isclass(getattr(found, name))}
     for node, following in itertools.pairwise([*body, ast.Pass()]):
         if isinstance(node, ast.FunctionDef):
-            kernel = any(ast.unparse(d).startswith("wp.kernel") for d in node.decorator_list)
+            kernel = any(
+                ast.unparse(d).startswith(("wp.kernel", "wp.func")) for d in node.decorator_list
+            )
             names = [node.name] if kernel else []
             words = (ast.get_docstring(node) or "").partition("\n\n")[0].replace("\n", " ")
         elif isinstance(node, ast.Assign | ast.AnnAssign):

@@ -214,7 +214,11 @@ def test_names_that_code_of_the_docs_imports_exist():
     for file in pages_of(ROOT / "docs"):
         for block in re.findall(r"^```(?:python)?\n(.*?)^```", file.read_text(), re.M | re.S):
             for line in re.findall(r"^from sliceit_drake.*$", block, re.M):
-                exec(line, {})
+                try:
+                    exec(line, {})
+                except ModuleNotFoundError as missing:
+                    # Of the extra "learn", which only the second tier has.
+                    assert missing.name in ("gymnasium", "onnx", "stable_baselines3", "torch"), line
 
 
 def test_pages_of_the_api_have_every_folder_of_modules():
