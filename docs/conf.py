@@ -187,7 +187,7 @@ def package_page(package: str) -> str:
 
 
 def constants(module: str) -> Iterator[tuple[str, str]]:
-    """Public constants, kernels and their functions that automodule passes over, and what is said of them.
+    """Public constants and kernels that automodule passes over, and what is said of them.
 
     Those are the ones with a comment before them, or nothing, in place of a docstring after them.
     """

@@ -119,6 +119,18 @@ def test_what_no_cause_explains_is_unknown():
     assert reach_verdict(problem(40, unknown=1.5), 60).kind == "unknown"
 
 
+def test_what_goes_with_the_number_of_the_slice_alone_is_unknown():
+    for trend, kind in ((0.0, "nothing"), (0.1, "unknown")):
+        found = problem(45, replicates=5).found
+        for k, r in enumerate(found.records):
+            lean = trend * (k % 5 - 2) * np.sin(r.depth / 3e-3) * r.in_contact
+            moved = r.measured + lean[:, None]
+            found.records[k] = dc.replace(r, measured=moved, slice_index=k)
+        verdict = reach_verdict(LinearProblem(found), 60)
+        assert verdict.kind == kind
+        assert (verdict.trend is not None) == (trend > 0.0)
+
+
 def test_without_three_slices_of_a_cut_it_asks_for_more():
     verdict = reach_verdict(problem(50, replicates=2, rate=3.0), 60)
     assert verdict.kind == "too_few_replicates"

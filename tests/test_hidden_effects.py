@@ -166,6 +166,9 @@ NEAR = {
 def said(kind: str, effects: tuple[str, ...], verdict: str, *named: list[str]) -> Judgement:
     case = Case("x", kind, "rich", tuple(Hidden(e, 1.0, 2.5) for e in effects), 1)
     facts = {"verdict": verdict, "classes": list(named), "evidence": [], "shifts": {}}
+    if verdict == "unknown":
+        found = [{"cause": group[0], "others": group[1:]} for group in named]
+        facts |= {"classes": [], "findings": found}
     return judge(case, facts, NEAR)
 
 
@@ -180,6 +183,10 @@ def said(kind: str, effects: tuple[str, ...], verdict: str, *named: list[str]) -
         (said("single", ("skin",), "cause", ["skin", "dulling"]), False),
         (said("single", ("skin",), "causes", ["skin"], ["dulling"]), False),
         (said("single", ("skin",), "unknown"), False),
+        # What is locked to depth may be the law: then it has to be said that it may.
+        (said("single", ("skin",), "unknown", ["core", "skin", "law"]), True),
+        (said("single", ("skin",), "unknown", ["core", "law"]), False),
+        (said("single", ("sensor_delay",), "unknown", ["core", "skin", "law"]), False),
         (said("nothing", (), "nothing"), True),
         (said("nothing", (), "unknown"), False),
         (said("unknown", ("warm_wrist",), "unknown"), True),

@@ -317,6 +317,9 @@ def sentence(result: Result) -> str:
             "The simulation is as close to these records as noise and slices that differ allow to"
             " tell."
         )
+    if verdict.trend is not None and not names:
+        channel = CHANNELS[verdict.trend.channel]
+        return f"The {channel} goes with the number of the slice, and no known cause explains it."
     if not names:
         return (
             f"The simulation is wrong, most in {where}, and none of the known causes explains it."

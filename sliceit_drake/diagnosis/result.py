@@ -121,6 +121,11 @@ class Diagnosis:
             f"The simulation by itself: wrong by {100 * v.own_error:.1f} % of the force, "
             f"{v.misfit:.2f} of the noise, in contact"
         )
+        if v.trend is not None:
+            lines.append(
+                f"With the number of the slice: {v.trend.channel}, by {v.trend.size:.1f} of the "
+                f"noise (chance {v.trend.p_value:.3f})"
+            )
         if self.gain is not None:
             g = self.gain
             lines.append(
@@ -233,6 +238,7 @@ class Diagnosis:
                 for c in v.causes
             ],
             "misfit_over_noise": v.misfit,
+            "trend": None if v.trend is None else dc.asdict(v.trend),
             "p_value": v.screening.p_value,
             "simulated_share_of_gain": None
             if self.confirmation is None

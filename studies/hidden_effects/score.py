@@ -136,11 +136,12 @@ def judge(
     gain = facts.get("gain")
     shares = {e["cause"]: e.get("held_out_share") for e in facts["evidence"]}
     oracle = shares.get(truth[0]) if len(truth) == 1 else None
+    near_by = [[f["cause"], *f["others"]] for f in facts.get("findings", [])]
     return Judgement(
         case=case,
         verdict=verdict,
         classes=named,
-        right=_is_right(case.kind, verdict, named, truth, wrong),
+        right=_is_right(case.kind, verdict, named, truth, wrong, near_by),
         wrong=wrong,
         gain=None if gain is None else float(gain["share_removed"]),
         oracle=None if oracle is None else float(oracle),
@@ -151,7 +152,12 @@ def judge(
 
 
 def _is_right(
-    kind: str, verdict: str, named: list[list[str]], truth: list[str], wrong: list[str]
+    kind: str,
+    verdict: str,
+    named: list[list[str]],
+    truth: list[str],
+    wrong: list[str],
+    near_by: list[list[str]],
 ) -> bool:
     if kind in ("nothing", "base"):
         return bool(verdict == "nothing")
@@ -162,6 +168,9 @@ def _is_right(
             return False
         (a, b), (first, second) = truth, named
         return (a in first and b in second) or (a in second and b in first)
+    if verdict == "unknown" and truth[0] in LOCKED_TO_DEPTH:
+        # "Which may be its law as well as shape, core or skin": no records tell these apart.
+        return len(near_by) == 1 and {truth[0], LAW} <= set(near_by[0])
     # One cause: no other may stand beside it, and nothing outside its class.
     return verdict == "cause" and len(named) == 1 and truth[0] in named[0] and not wrong
 

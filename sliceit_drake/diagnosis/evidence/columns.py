@@ -80,6 +80,7 @@ class RecordSensitivity:
         bent: Part of the prediction that is beyond the first order of what is the record's own
             (`own_values`) [m, c]; None where that was not looked at.
         height: Depth at which the board is, metres; infinite where none is in reach.
+        slice_index: Order of the slice in its session.
     """
 
     name: str
@@ -97,6 +98,7 @@ class RecordSensitivity:
     doubt: np.ndarray | None = None
     bent: np.ndarray | None = None
     height: float = np.inf
+    slice_index: int = 0
 
     @property
     def residual(self) -> np.ndarray:

@@ -31,15 +31,24 @@ class OwnError:
         self.problem, self.sizes = problem, sizes
         weighted = problem.weighted(model, sizes)
         theta, _ = problem.fit_shared(weighted.total, model.shared, model.prior)
-        left = np.zeros(len(weighted.total))
-        left[-1], left[model.shared] = 1.0, -theta
+        self._fitted = np.zeros(len(weighted.total))
+        self._fitted[-1], self._fitted[model.shared] = 1.0, -theta
         shape = len(PARTS), len(problem.noise), -1
-        found = [parts.reshape(shape) for parts in weighted.found(left)]
+        found = [parts.reshape(shape) for parts in weighted.found(self._fitted)]
         self.coefficients = [found[k] for k in problem.condition_of]
         self.values = [
             values @ parts.sum(0).T
             for values, parts in zip(problem.shape_values, self.coefficients, strict=True)
         ]
+
+    def left(self, number: int) -> np.ndarray:
+        """The combination of all columns, the residual last, that is left of a record beside what
+        all share and the discrepancy [K + 1]."""
+        problem = self.problem
+        out = np.zeros(problem.size + 1)
+        out[problem.discrepancy.others] = self._fitted
+        out[problem.shapes] = -self.coefficients[number].sum(0).ravel()
+        return out
 
     def scales(self, found: bool = False) -> list[np.ndarray]:
         """Root mean square at the rows of each record in its channel and phase of the motion, over

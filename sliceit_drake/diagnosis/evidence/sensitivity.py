@@ -305,6 +305,7 @@ class _Computation:
             columns=nothing,
             even=np.zeros_like(nothing),
             height=target.facts.height,
+            slice_index=target.facts.slice_index,
         )
 
 

@@ -9,8 +9,9 @@ from scipy.stats import norm
 from sliceit_drake.diagnosis.evidence.columns import CauseAtScan, Column
 from sliceit_drake.diagnosis.evidence.effect_size import OwnError, standardised_size
 from sliceit_drake.diagnosis.evidence.held_out import held_out_gain
-from sliceit_drake.diagnosis.evidence.linear import LinearProblem, scaled_inverse
+from sliceit_drake.diagnosis.evidence.linear import PLAUSIBLE, LinearProblem, scaled_inverse
 from sliceit_drake.diagnosis.evidence.screen import CauseEvidence, Screening, screen
+from sliceit_drake.diagnosis.evidence.trends import Trend, trend_of_slices
 
 __all__ = [
     "CLASS_ANGLE",
@@ -27,6 +28,11 @@ CLASS_ANGLE = 15.0
 """Causes that can do what was found to within this, degrees, are one group."""
 LOCKED_TO_DEPTH = ("section_shape", "core", "skin")
 """Causes that are locked to depth alone, as the simulation's own law is."""
+OF_THE_BOARD = ("board_height", "board_stiffness")
+"""Causes of which one is named: a board that lies higher is pressed to where its law was not
+measured, and then seems to be of another stiffness as well."""
+HALF = 0.5
+"""Least share of the simulation's own error that a cause can do which is said to be near."""
 LAW = "law"
 """Name of the simulation's own law in a group."""
 
@@ -38,6 +44,8 @@ class DecisionRule:
     Attributes:
         alarm: Greatest chance that a simulation as wrong as this one, with nothing else wrong,
             gives a gain as large as the largest.
+        gain: Least gain, twice in log-likelihood: where the simulation is wrong in a form that the
+            prior does not have, causes gain up to this.
         size: Least size of an effect, over the noise and what the simulation gets wrong by itself,
             where it acts. Sensors and foods that do not follow the simulation's law look like
             causes of up to this size.
@@ -46,15 +54,18 @@ class DecisionRule:
         presence: Share of the records in which a cause shows that has numbers of its own in each.
         unknown: Size of the simulation's own error over the noise in contact from which on records
             that no cause explains are called unknown.
+        trend: The same of what goes with the number of the slice.
         most: Greatest number of findings.
     """
 
     alarm: float = 0.02
+    gain: float = 50.0
     size: float = 0.9
     limit: float = 0.1
     replicates: int = 3
     presence: float = 0.4
     unknown: float = 1.0
+    trend: float = 0.4
     most: int = 3
 
 
@@ -115,6 +126,7 @@ class Verdict:
             mean square, the largest first.
         reason: In a sentence.
         slices_needed: Replicates of each condition that are missing.
+        trend: What goes with the number of the slice beside the findings; None for nothing.
     """
 
     kind: str
@@ -126,6 +138,7 @@ class Verdict:
     mostly: list[tuple[str, str, str, float]]
     reason: str
     slices_needed: int = 0
+    trend: Trend | None = None
 
     @property
     def screening(self) -> Screening:
@@ -166,7 +179,7 @@ def reach_verdict(
             break
         best = None
         for e in sorted(screening.causes, key=lambda e: -e.gain):
-            why = _refusal(problem, screening, e, rule)
+            why = _refusal(problem, screening, e, rule) or _beside(e, assumed)
             if not why:
                 best = e
                 break
@@ -182,6 +195,9 @@ def reach_verdict(
     shown = f"the simulation is wrong by {100 * wrong:.1f} % of the force by itself"
     if not named and misfit >= rule.unknown and mostly[0][1:3] == ("in", "shared"):
         findings = _nearest(problem, screenings[0])
+    trend = trend_of_slices(problem, [f.evidence.cause for f in findings if named], seed=seed)
+    if trend is not None and (trend.p_value > rule.alarm or trend.size < rule.trend):
+        trend = None
     few = f"no condition has {rule.replicates} slices, so that"
     if not named and not (needed and findings):
         if misfit >= rule.unknown and needed:
@@ -192,6 +208,9 @@ def reach_verdict(
                 reason += "which may be its law as well as shape, core or skin"
             else:
                 reason += "and no cause of the list explains it"
+        elif trend is not None:
+            kind = "unknown"
+            reason = f"{trend.channel} goes with the number of the slice, in no form of the list"
         else:
             kind = "nothing"
             reason = "nothing beyond the noise and what the simulation is unsure of"
@@ -202,7 +221,7 @@ def reach_verdict(
         kind = "cause" if len(findings) == 1 else "causes"
         reason = f"{_named(findings)}; beside that {shown}, mostly {_words(mostly)}"
     return Verdict(
-        kind, findings, screenings, causes, wrong, misfit, mostly, reason, max(needed, 0)
+        kind, findings, screenings, causes, wrong, misfit, mostly, reason, max(needed, 0), trend
     )
 
 
@@ -249,6 +268,8 @@ def _refusal(
         size = standardised_size(problem, _columns(problem, e), np.array(e.coefficients))
         if size >= rule.size and e.gain >= max(other.gain for other in screening.causes):
             return _at_bound(e)
+    if e.gain < rule.gain:
+        return f"gains {e.gain:.0f}, as a law that is wrong may give"
     if e.size < rule.size:
         return f"its effect is {e.size:.2f} of the noise and the simulation's own error"
     if e.presence < rule.presence:
@@ -260,6 +281,14 @@ def _refusal(
         gain = held_out_gain(problem, [*before, e.cause], beside=before, sizes=e.sizes)
         if gain.counted >= 0.5 and gain.interval[1] <= 0.0:
             return "does not foretell records that were left out"
+    return ""
+
+
+def _beside(e: CauseEvidence, named: Sequence[CauseAtScan]) -> str:
+    """Why a cause is not named beside others; "" for one that may be."""
+    other = next((n for n, _ in named if n in OF_THE_BOARD), None)
+    if other is not None and e.name in OF_THE_BOARD:
+        return f"may be of {other}: press the bare board"
     return ""
 
 
@@ -319,13 +348,33 @@ def _angle_to_law(problem: LinearProblem, effect: CauseEvidence) -> float:
 
 def _nearest(problem: LinearProblem, screening: Screening) -> list[Finding]:
     """Where the simulation is wrong along depth, alike in all cuts, the cause locked to depth that
-    gains most, with the others and the law: which it is an experiment tells."""
-    locked = [e for e in screening.causes if e.name in LOCKED_TO_DEPTH and e.score > 0.0]
-    if not locked:
+    can do most of it, with the others and the law: which it is an experiment tells. None where none
+    can do half of it."""
+    model = problem.with_causes()
+    wrong = OwnError(problem, model, problem.sizes)
+    reduced = problem.reduced(model.own, model.variance)
+    F, Z = model.shared, problem.shapes
+    K = [values.sum(0).ravel() for values in wrong.coefficients]
+    G = reduced.sum(0)
+    b = np.sum([A[:, Z] @ k for A, k in zip(reduced, K, strict=True)], axis=0)
+    square = sum(float(k @ A[np.ix_(Z, Z)] @ k) for A, k in zip(reduced, K, strict=True))
+    inverse = scaled_inverse(G[np.ix_(F, F)] + np.diag(model.prior[F]))
+    square -= float(b[F] @ inverse @ b[F])
+    b = b - G[:, F] @ inverse @ b[F]
+    G = G - G[:, F] @ inverse @ G[F]
+    best, share = None, HALF
+    for name in (n for n in LOCKED_TO_DEPTH if n in screening.names):
+        for scan in problem.found.scans(name):
+            own = problem.found.index("cause", name, scan)
+            inner = G[np.ix_(own, own)] + np.eye(len(own)) / PLAUSIBLE**2
+            found = float(b[own] @ np.linalg.solve(inner, b[own])) / max(square, 1e-12)
+            if found > share:
+                best, share = name, found
+    if best is None:
         return []
-    best = max(locked, key=lambda e: e.gain)
-    others = [n for n in LOCKED_TO_DEPTH if n != best.name and n in screening.names]
-    return [Finding(best, best.size, best.share, [*others, LAW])]
+    others = [n for n in LOCKED_TO_DEPTH if n != best and n in screening.names]
+    e = screening.evidence(best)
+    return [Finding(e, e.size, e.share, [*others, LAW])]
 
 
 def _lasting(
