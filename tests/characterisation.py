@@ -311,10 +311,8 @@ if __name__ == "__main__":
 
     wanted = sys.argv[1:] or list(PARTS)
     stored = json.loads(FILE.read_text(encoding="utf-8")) if FILE.exists() else {"parts": {}}
-    if stored.get("machine") != machine():
-        stored = {"machine": machine(), "parts": {}}
     for part in wanted:
         begin = time.perf_counter()
-        stored["parts"][part] = dc.asdict(PARTS[part]())
+        stored["parts"][part] = {"machine": machine(), **dc.asdict(PARTS[part]())}
         print(f"{part}: {time.perf_counter() - begin:.1f} s", flush=True)
         FILE.write_text(json.dumps(stored, indent=1) + "\n", encoding="utf-8")
