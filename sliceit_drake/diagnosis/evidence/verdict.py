@@ -46,6 +46,7 @@ class DecisionRule:
             gives a gain as large as the largest.
         gain: Least gain, twice in log-likelihood: where the simulation is wrong in a form that the
             prior does not have, causes gain up to this.
+        beside: The same of a cause beside others that are named: these too may be of another form.
         size: Least size of an effect, over the noise and what the simulation gets wrong by itself,
             where it acts. Sensors and foods that do not follow the simulation's law look like
             causes of up to this size.
@@ -59,7 +60,8 @@ class DecisionRule:
     """
 
     alarm: float = 0.02
-    gain: float = 50.0
+    gain: float = 25.0
+    beside: float = 60.0
     size: float = 0.9
     limit: float = 0.1
     replicates: int = 3
@@ -268,7 +270,7 @@ def _refusal(
         size = standardised_size(problem, _columns(problem, e), np.array(e.coefficients))
         if size >= rule.size and e.gain >= max(other.gain for other in screening.causes):
             return _at_bound(e)
-    if e.gain < rule.gain:
+    if e.gain < (rule.beside if screening.assumed else rule.gain):
         return f"gains {e.gain:.0f}, as a law that is wrong may give"
     if e.size < rule.size:
         return f"its effect is {e.size:.2f} of the noise and the simulation's own error"
