@@ -44,7 +44,8 @@ class DecisionRule:
     Attributes:
         alarm: Greatest chance that a simulation as wrong as this one, with nothing else wrong,
             gives a gain as large as the largest.
-        gain: Least gain, twice in log-likelihood: where the simulation is wrong in a form that the
+        gain: Least gain, twice in log-likelihood, for each record and each multiple of the noise
+            that the simulation is wrong by without the cause: where it is wrong in a form that the
             prior does not have, causes gain up to this.
         beside: The same of a cause beside others that are named: these too may be of another form.
         size: Least size of an effect, over the noise and what the simulation gets wrong by itself,
@@ -60,8 +61,8 @@ class DecisionRule:
     """
 
     alarm: float = 0.02
-    gain: float = 25.0
-    beside: float = 60.0
+    gain: float = 0.7
+    beside: float = 2.5
     size: float = 0.9
     limit: float = 0.1
     replicates: int = 3
@@ -179,9 +180,11 @@ def reach_verdict(
         screenings.append(screening)
         if screening.p_value > rule.alarm or len(findings) == rule.most:
             break
+        wrong_by = max(_own_error(problem, assumed)[1], 1.0)
+        least = (rule.beside if assumed else rule.gain) * len(problem.found.records) * wrong_by
         best = None
         for e in sorted(screening.causes, key=lambda e: -e.gain):
-            why = _refusal(problem, screening, e, rule) or _beside(e, assumed)
+            why = _refusal(problem, screening, e, rule, least) or _beside(e, assumed)
             if not why:
                 best = e
                 break
@@ -259,9 +262,9 @@ def _words(mostly: Sequence[tuple[str, str, str, float]]) -> str:
 
 
 def _refusal(
-    problem: LinearProblem, screening: Screening, e: CauseEvidence, rule: DecisionRule
+    problem: LinearProblem, screening: Screening, e: CauseEvidence, rule: DecisionRule, least: float
 ) -> str:
-    """Why a cause is not named; "" for one that may be."""
+    """Why a cause is not named, which has to gain so much at least; "" for one that may be."""
     by_chance = (1.0 + (screening.largest >= e.deviations).sum()) / (len(screening.largest) + 1.0)
     if e.score <= 0.0 or by_chance > rule.alarm:
         return "gains no more than chance gives"
@@ -270,8 +273,8 @@ def _refusal(
         size = standardised_size(problem, _columns(problem, e), np.array(e.coefficients))
         if size >= rule.size and e.gain >= max(other.gain for other in screening.causes):
             return _at_bound(e)
-    if e.gain < (rule.beside if screening.assumed else rule.gain):
-        return f"gains {e.gain:.0f}, as a law that is wrong may give"
+    if e.gain < least:
+        return f"gains {e.gain:.0f}, where a law as wrong as this may give {least:.0f}"
     if e.size < rule.size:
         return f"its effect is {e.size:.2f} of the noise and the simulation's own error"
     if e.presence < rule.presence:
