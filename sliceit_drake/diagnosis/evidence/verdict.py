@@ -45,7 +45,7 @@ class DecisionRule:
         alarm: Greatest chance that a simulation as wrong as this one, with nothing else wrong,
             gives a gain as large as the largest.
         gain: Least gain, twice in log-likelihood, for each record and each multiple of the noise
-            that the simulation is wrong by without the cause: where it is wrong in a form that the
+            that the simulation is wrong by beside the cause: where it is wrong in a form that the
             prior does not have, causes gain up to this.
         beside: The same of a cause beside others that are named: these too may be of another form.
         size: Least size of an effect, over the noise and what the simulation gets wrong by itself,
@@ -61,8 +61,8 @@ class DecisionRule:
     """
 
     alarm: float = 0.02
-    gain: float = 0.7
-    beside: float = 2.5
+    gain: float = 1.1
+    beside: float = 3.0
     size: float = 0.9
     limit: float = 0.1
     replicates: int = 3
@@ -180,11 +180,9 @@ def reach_verdict(
         screenings.append(screening)
         if screening.p_value > rule.alarm or len(findings) == rule.most:
             break
-        wrong_by = max(_own_error(problem, assumed)[1], 1.0)
-        least = (rule.beside if assumed else rule.gain) * len(problem.found.records) * wrong_by
         best = None
         for e in sorted(screening.causes, key=lambda e: -e.gain):
-            why = _refusal(problem, screening, e, rule, least) or _beside(e, assumed)
+            why = _refusal(problem, screening, e, rule) or _beside(e, assumed)
             if not why:
                 best = e
                 break
@@ -262,9 +260,9 @@ def _words(mostly: Sequence[tuple[str, str, str, float]]) -> str:
 
 
 def _refusal(
-    problem: LinearProblem, screening: Screening, e: CauseEvidence, rule: DecisionRule, least: float
+    problem: LinearProblem, screening: Screening, e: CauseEvidence, rule: DecisionRule
 ) -> str:
-    """Why a cause is not named, which has to gain so much at least; "" for one that may be."""
+    """Why a cause is not named; "" for one that may be."""
     by_chance = (1.0 + (screening.largest >= e.deviations).sum()) / (len(screening.largest) + 1.0)
     if e.score <= 0.0 or by_chance > rule.alarm:
         return "gains no more than chance gives"
@@ -273,16 +271,18 @@ def _refusal(
         size = standardised_size(problem, _columns(problem, e), np.array(e.coefficients))
         if size >= rule.size and e.gain >= max(other.gain for other in screening.causes):
             return _at_bound(e)
-    if e.gain < least:
-        return f"gains {e.gain:.0f}, where a law as wrong as this may give {least:.0f}"
     if e.size < rule.size:
         return f"its effect is {e.size:.2f} of the noise and the simulation's own error"
     if e.presence < rule.presence:
         return f"shows in {100 * e.presence:.0f} % of the records that could show it"
     if _at_bound(e):
         return _at_bound(e)
+    before = [*screening.assumed]
+    wrong_by = max(_own_error(problem, [*before, e.cause])[1], 1.0)
+    least = (rule.beside if before else rule.gain) * len(problem.found.records) * wrong_by
+    if e.gain < least:
+        return f"gains {e.gain:.0f}, where a law as wrong as this may give {least:.0f}"
     if not e.per_record:
-        before = [*screening.assumed]
         gain = held_out_gain(problem, [*before, e.cause], beside=before, sizes=e.sizes)
         if gain.counted >= 0.5 and gain.interval[1] <= 0.0:
             return "does not foretell records that were left out"
