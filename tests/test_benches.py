@@ -445,7 +445,7 @@ def test_a_diagnosis_that_breaks_down_is_kept_as_a_failure(tmp_path):
     assert list(said) == ["failure"] and "record" in said["failure"]
 
 
-def test_a_study_keeps_each_answer_and_goes_on_with_what_is_left(tmp_path, monkeypatch):
+def test_a_study_keeps_each_answer_and_goes_on_with_what_is_left(tmp_path, monkeypatch, capsys):
     def small(law: str, seed: int) -> Draw:
         bench = Draw(law, seed)
         bench.protocol.conditions = bench.protocol.conditions[2:4]
@@ -483,3 +483,12 @@ def test_a_study_keeps_each_answer_and_goes_on_with_what_is_left(tmp_path, monke
     assert found[0]["hidden"]["standardised"] == pytest.approx(2.0, rel=0.05)
     assert json.loads((tmp_path / "draws" / "slice_push_00.json").read_text())["misfit"]
     assert run_benches(parser.parse_args(typed)) == 0 and len(asked) == 4
+    # From the file of all runs it goes on in the same way, and is judged the same.
+    file, score = tmp_path / "runs.jsonl", argparse.ArgumentParser()
+    add_score_arguments(score)
+    assert run_score(score.parse_args([str(tmp_path), "--keep", str(file)])) == 0
+    table = capsys.readouterr().out.splitlines()[-10:]
+    assert run_score(score.parse_args([str(file)])) == 0
+    assert capsys.readouterr().out.splitlines()[-10:] == table
+    elsewhere = ["--output", str(tmp_path / "other"), *typed[2:], "--kept", str(file)]
+    assert run_benches(parser.parse_args(elsewhere)) == 0 and len(asked) == 4

@@ -234,6 +234,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frozen", metavar="COMMIT", help="in which the rule is frozen")
     parser.add_argument("--replicates", type=int, default=100, help="of each bootstrap")
     parser.add_argument("--minutes", type=float, metavar="M", help="begin no run after these")
+    parser.add_argument(
+        "--kept",
+        metavar="FILE",
+        type=Path,
+        help="what `bench_score --keep` wrote: its runs are done",
+    )
     parser.add_argument("--worker", metavar="K/N", default="1/1", help="every Nth draw from K on")
     parser.set_defaults(resumes=True)
 
@@ -297,6 +303,7 @@ def _left(
 ) -> Iterator[tuple[str, int, int, list[Case]]]:
     """Draws that are not done, law by law in turn, and their runs that are left."""
     first, of = (int(word) for word in options.worker.split("/"))
+    done = set(_kept(options.kept)) if options.kept else set()
     draws = [(law, number) for number in range(options.draws) for law in laws]
     for law, number in draws[first - 1 :: of]:
         seed = seed_of(commit, options.part, law, number)
@@ -304,9 +311,17 @@ def _left(
             case
             for case in cases_of(law, number, seed, options.runs)
             if not (options.output / "runs" / f"{case.name}.json").exists()
+            and (commit, options.part, case.name) not in done
         ]
         if cases:
             yield law, number, seed, cases
+
+
+def _kept(file: Path) -> Iterator[tuple[str, str, str]]:
+    """Commit, part and name of the runs in a file."""
+    for line in file.read_text(encoding="utf-8").splitlines():
+        facts = json.loads(line)
+        yield facts["commit"], facts["part"], Case(**facts["case"]).name
 
 
 def _keep(file: Path, facts: dict[str, Any]) -> None:

@@ -6,6 +6,9 @@ naming nothing, for naming the first of the list, and for the oracle stand besid
 oracle names all that nobody could tell apart wherever the effect's standardised size is 1 or more.
 Intervals are bootstrap intervals of 90 % over draws.
 
+--keep writes what a judgement needs of each run as a line of JSON. This file is judged like the
+folder, and `benches --kept FILE` goes on from it.
+
   python -m studies bench_score output/benches --output docs/results/benches_table.md
 """
 
@@ -25,7 +28,7 @@ from studies.benches.runs import CALIBRATED_TO
 from studies.hidden_effects.score import NAMING
 from studies.pages import percent, publish, table
 
-__all__ = ["Judged", "add_arguments", "answers_of", "judge", "named_by", "rates", "run"]
+__all__ = ["Judged", "add_arguments", "answers_of", "judge", "kept", "named_by", "rates", "run"]
 
 WHO = ("diagnosis", "always nothing", "always the top", "oracle")
 LARGE = 1.8
@@ -35,6 +38,8 @@ SEEN = 1.0
 GROUP = 4
 """Most causes of a finding."""
 RESAMPLES = 2000
+SAID = ("verdict", "classes", "findings", "own_error", "misfit_over_noise", "gain", "failure")
+"""What is kept of an answer, beside the cause with most evidence."""
 
 Groups = list[list[str]]
 
@@ -61,21 +66,37 @@ class Judged:
     failed: bool = False
 
 
-def answers_of(folder: Path) -> list[dict[str, Any]]:
-    """All runs that are done, with an effect that could be hidden.
+def answers_of(source: Path) -> list[dict[str, Any]]:
+    """All runs that are done.
+
+    Args:
+        source: Folder of the study, or the file that --keep wrote.
 
     Raises:
         ConfigurationError: There are none.
     """
-    files = sorted((folder / "runs").glob("*.json"))
-    out = [json.loads(file.read_text(encoding="utf-8")) for file in files]
-    if not out:
+    if source.is_file():
+        texts = source.read_text(encoding="utf-8").splitlines()
+    else:
+        files = sorted((source / "runs").glob("*.json"))
+        texts = [file.read_text(encoding="utf-8") for file in files]
+    if not texts:
         raise ConfigurationError(
             "holds no runs",
-            source=str(folder),
-            fix="Give the --output of `python -m studies benches`.",
+            source=str(source),
+            fix="Give the --output of `python -m studies benches`, or what --keep wrote.",
         )
-    return [facts for facts in out if facts["hidden"] is not None]
+    return [json.loads(text) for text in texts]
+
+
+def kept(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """What a judgement needs of a run."""
+    out = {name: value for name, value in facts.items() if name not in CALIBRATED_TO}
+    for to in (to for to in CALIBRATED_TO if to in facts):
+        said = facts[to]
+        out[to] = {name: said[name] for name in SAID if name in said}
+        out[to]["evidence"] = said.get("evidence", [])[:1]
+    return out
 
 
 def named_by(who: str, facts: Mapping[str, Any], to: str) -> Groups | None:
@@ -178,15 +199,27 @@ def rates(
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of the study."""
-    parser.add_argument("folder", metavar="FOLDER", type=Path, help="--output of `benches`")
+    parser.add_argument(
+        "runs",
+        metavar="RUNS",
+        nargs="+",
+        type=Path,
+        help="--output of `benches`, or what --keep wrote",
+    )
+    parser.add_argument("--keep", metavar="FILE", type=Path, help="write all runs, a line for each")
     parser.add_argument("--output", metavar="FILE", type=Path, help="also write the table there")
 
 
 def run(options: argparse.Namespace) -> int:
     """Runs the study."""
-    answers, rng, rows = answers_of(options.folder), np.random.default_rng(0), []
+    answers = [facts for source in options.runs for facts in answers_of(source)]
+    if options.keep:
+        lines = (json.dumps(kept(facts), sort_keys=True) + "\n" for facts in answers)
+        options.keep.write_text("".join(lines), encoding="utf-8")
+    rng, rows = np.random.default_rng(0), []
     for law in LAWS:
-        of_law = [facts for facts in answers if facts["case"]["law"] == law]
+        # Without an effect that could be hidden there was no run.
+        of_law = [f for f in answers if f["case"]["law"] == law and f["hidden"] is not None]
         for to in CALIBRATED_TO if of_law else ():
             for who in WHO:
                 judged: dict[int, list[Judged]] = {}
