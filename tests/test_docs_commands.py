@@ -265,7 +265,7 @@ READ_ONLY = {
         python -m studies batch_speed --output docs/results/speed.md
         python -m studies contact --output docs/results/contact.md
         python -m studies cutting_speed --json docs/results/benchmarks/cutting_speed.json
-        python -m studies cutting_speed --repeats 3 --output docs/results/figures/cutting_speed.png
+        python -m studies cutting_speed --repeats 3 --output docs/results/figures/cutting_speed.png --json docs/results/benchmarks/cutting_speed.json
         python -m studies diagnosis_speed --json docs/results/benchmarks/diagnosis_speed.json
         python -m studies effects_figure
         python -m studies emulator_figure
@@ -284,7 +284,7 @@ READ_ONLY = {
         python -m studies split_step_limit
         python -m studies stand_in_figure
         python -m studies bench_figures
-        python -m studies station_speed --repeat 6 --before docs/results/data/before/station_speed.json --json docs/results/benchmarks/station_speed.json --output docs/results/speed.md
+        python -m studies station_speed --repeat 20 --before docs/results/data/before/station_speed.json --json docs/results/benchmarks/station_speed.json --output docs/results/speed.md
         python -m studies station_speed --json docs/results/benchmarks/station_speed.json
         python -m studies unfinished_slices docs/results/slicing_evaluation.jsonl --output docs/results/learning.md
         """,  # noqa: E501
