@@ -96,6 +96,13 @@ TOPICS: dict[str, tuple[Study, ...]] = {
             "safety_layer", "robot.safety_layer", "time of a decision of the safety layer", "5 s"
         ),
         Study(
+            "faults",
+            "robot.faults",
+            "what stops the emulated robot when something fails",
+            "40 min",
+            "hardware",
+        ),
+        Study(
             "hardware_pace",
             "robot.hardware_pace",
             "how a run keeps up with the controller's clock",

@@ -196,7 +196,9 @@ class OperatedRobot:
         with catch_signals(), Supervisor(self.host) as supervisor:
             print(f"Connecting to {self.host}", flush=True)
             config = self.config
-            client = UrClient(self.host, config.lookahead_time, config.gain, pace=self.pace)
+            client = UrClient(
+                self.host, config.lookahead_time, config.gain, config.limits, pace=self.pace
+            )
             try:
                 supervisor.begin()
                 yield client
