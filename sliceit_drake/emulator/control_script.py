@@ -1,8 +1,8 @@
 """The control scripts of ur_rtde and of `hardware.control_script`, as far as a slice needs them.
 
-A client uploads a program in URScript that polls a register for commands. That program is not
-interpreted here: its side of the register protocol is written out again. Read from its text are
-its first register, the commands that it has, and how far a target of servoJ may jump. Input integer register
+A client uploads a program in URScript that polls a register for commands. It is not interpreted
+here: its side of the register protocol is written out again. Read from its text are its first
+register, the commands that it has, and how far a target of servoJ may jump. Input integer register
 0 has the number of a command, output integer register 0 answers 1 (ready) or 2 (done), and doubles
 carry the arguments. What is not emulated stops the program with a message that says so.
 """

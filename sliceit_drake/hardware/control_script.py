@@ -46,7 +46,13 @@ def rtde_control():
   end
 
   def six():
-    return [read_input_float_register(0), read_input_float_register(1), read_input_float_register(2), read_input_float_register(3), read_input_float_register(4), read_input_float_register(5)]
+    q = [0, 0, 0, 0, 0, 0]
+    k = 0
+    while k < 6:
+      q[k] = read_input_float_register(k)
+      k = k + 1
+    end
+    return q
   end
 
   def stop_threads():

@@ -40,7 +40,7 @@ class UrClient:
         host: Name or address.
         lookahead_time: Argument of servoj, s, 0.03 to 0.2.
         gain: Argument of servoj, 100 to 2000.
-        limits: Limits of steps and speed that the program on the robot keeps; None for the defaults.
+        limits: Of which the program on the robot keeps step and speed; None for the defaults.
         pace: Controller seconds in a second; 1 for all robots.
 
     Raises:
@@ -67,7 +67,7 @@ class UrClient:
         self._host, self._lookahead, self._gain = host, lookahead_time, gain
         self._is_moving = self._is_stopped = self._was_lost = False
         self._stop_time, self._attempt = (t / max(pace, SLOWEST) for t in (STOP_TIME, ATTEMPT))
-        step = "the dashboard server (port 29999)"
+        step = "the dashboard server (port 29999), which PolyScope X does not have,"
         try:
             self._dashboard = dashboard_client.DashboardClient(host)
             self._dashboard.connect(2000)
@@ -132,7 +132,7 @@ class UrClient:
         while not self._control.isProgramRunning():
             if time.monotonic() > deadline:
                 raise RuntimeError(
-                    f"its program does not start within {patience:g} s; the pendant's log may say why"
+                    f"its program does not start in {patience:g} s; the pendant's log may say why"
                 )
             time.sleep(0.01)
 

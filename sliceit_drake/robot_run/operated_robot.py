@@ -16,6 +16,7 @@ from sliceit_drake.hardware.checks import Check
 from sliceit_drake.hardware.client import RobotClient, is_loopback
 from sliceit_drake.hardware.guarded_touch import TouchError
 from sliceit_drake.hardware.hardware_config import HardwareConfig, differing
+from sliceit_drake.hardware.real_time import RealTime
 from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.hardware.supervisor import Supervisor
 from sliceit_drake.interruption import catch_signals, handle_signals
@@ -26,12 +27,14 @@ from sliceit_drake.robot_run.hardware_run import (
     write_hardware_outputs,
 )
 from sliceit_drake.robot_run.move_to_start import MoveToStart
+from sliceit_drake.robot_run.retreat import SPEED, Retreat
 
 __all__ = ["OperatedRobot", "ask", "plan_text"]
 
 WORD = "slice"
 MOVE_WORD = "move"
 TOUCH_WORD = "touch"
+RETREAT_WORD = "retreat"
 WATCHED = 1.0
 """Longest time that a dry run follows the robot's data, s."""
 
@@ -84,7 +87,34 @@ class OperatedRobot:
         with self._connected() as client:
             meshcat = make_meshcat() if draws and not self.dry_run else None
             hardware = prepare_hardware_run(scenario, self.config, client, self.pace, meshcat)
-            return self.checked_run(hardware, directory, duration)
+            made = self.checked_run(hardware, directory, duration)
+        if Retreat.is_offered_after(hardware):
+            self.retreat(hardware)
+        return made
+
+    def retreat(self, hardware: HardwareRun) -> bool:
+        """Connects anew and goes back on the last way after the operator's word.
+
+        Returns:
+            False if the robot was not ready or stopped, or the operator did not confirm.
+        """
+        with self._connected() as client:
+            hardware.client = client
+            retreat = Retreat(hardware)
+            if not _report("Retreat", [*hardware.check_facts(), *retreat.checks()]):
+                return False
+            print(
+                f"\nRETREAT: the knife goes back on its last way, {1e3 * retreat.distance:.1f} mm "
+                f"at {1e3 * SPEED:g} mm/s. It stops at {retreat.limits.force:.0f} N; it feels "
+                f"{retreat.force:.0f} N now. Look first what it pressed on.\n"
+            )
+            if not self._asks(RETREAT_WORD):
+                return False
+            problem = retreat.execute()
+            print(
+                f"STOPPED: {problem}" if problem else "The knife is back. Its program is stopped."
+            )
+            return problem is None
 
     def move_to_start(self, scenario: Scenario) -> bool:
         """Connects, checks the robot, and moves it to the start after the operator's word.
@@ -193,8 +223,14 @@ class OperatedRobot:
         """
         from sliceit_drake.hardware.ur_client import UrClient
 
-        with catch_signals(), Supervisor(self.host) as supervisor:
+        # The supervisor begins before, and keeps the usual priority.
+        with (
+            catch_signals(),
+            Supervisor(self.host) as supervisor,
+            RealTime(asks=not is_loopback(self.host)) as real_time,
+        ):
             print(f"Connecting to {self.host}", flush=True)
+            _report("This computer", real_time.checks)
             config = self.config
             client = UrClient(
                 self.host, config.lookahead_time, config.gain, config.limits, pace=self.pace

@@ -3,8 +3,8 @@
   python -m studies faults --output docs/results
 
 Each row is a slice of a spring-backed food by `sliceit emulate` and `sliceit hardware`, each in a
-process of its own, in lockstep and with every limit at its default, with one fault in the middle. It is
-compared with the same slice without a fault, by the true joints and the true force that the
+process of its own, in lockstep and with every limit at its default, with one fault in the middle.
+It is compared with the same slice without a fault, by the true joints and the true force that the
 emulator keeps:
   after   controller time from the fault to the arm's rest
   way     how far the farther end of the edge moved meanwhile
@@ -238,9 +238,8 @@ FOODS = {
 def free_runs(count: int) -> Iterator[tuple[str, str, bool]]:
     """Name, overrides and whether other work goes on, of slices without a fault."""
     kinds = itertools.product(FOODS.items(), ("", NOISE), (False, True))
-    for k, ((food, fields), noise, is_busy) in zip(
-        range(count), itertools.cycle(kinds), strict=False
-    ):
+    for k, kind in zip(range(count), itertools.cycle(kinds), strict=False):
+        (food, fields), noise, is_busy = kind
         words = [food, "noise" if noise else "", "beside other work" if is_busy else ""]
         # Another height of the start each time: no two slices are the same.
         parts = [MOTION, fields, noise, f"start: {{clearance: {0.01 + 2e-5 * k:.6g}}}"]
