@@ -80,8 +80,8 @@ def add_robot_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--move-to-start",
         action="store_true",
-        help='first move the joints straight to the start, after you typed "move"; nothing looks '
-        "for obstacles on the way",
+        help='first move the joints straight to the start, after you typed "move"; of '
+        "obstacles on the way only board, table and holder are looked for",
     )
 
 

@@ -81,6 +81,9 @@ class SafetyLimits:
     """How much faster than joint_speed and knife_speed the arm may be measured."""
     singular_margin: float = quantity(0.1, "", low=0.0, high=0.5)
     """Least distance of the arm from a singularity: sines of elbow and wrist, shoulder in m."""
+    clearance: float = quantity(2e-3, "m", low=0.0, high=0.1)
+    """Least distance of gripper, knife, wrists and forearm from board, table and holder, and of
+    gripper and knife from the arm, at a target and where the arm could stop after it."""
     force_age: float = quantity(0.02, "s", low=0.002, high=1.0)
     """Longest time in which the force readings are the same to the last digit."""
     force_rate: float = quantity(5000.0, "N/s", low=100.0, high=1e5)

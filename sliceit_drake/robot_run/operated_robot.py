@@ -132,8 +132,8 @@ class OperatedRobot:
             print(
                 "\nMOVE: the joints turn straight to "
                 f"{hardware.twin.start_joints.round(4).tolist()}; the knife moves at up to "
-                f"{1e3 * move.knife_speed:.0f} mm/s, and nothing looks for obstacles but the "
-                "board. Stand back.\n"
+                f"{1e3 * move.knife_speed:.0f} mm/s, and nothing looks for obstacles but board, "
+                "table and holder. Stand back.\n"
             )
             if not self._asks(MOVE_WORD):
                 return False

@@ -1,4 +1,4 @@
-"""Back on the last way after a breach of force, slowly: offered to the operator, never by itself."""
+"""Back on the last way after a breach of force, slowly: only at the operator's word."""
 
 import dataclasses as dc
 import math
