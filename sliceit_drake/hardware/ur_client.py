@@ -204,25 +204,32 @@ class UrClient:
             if self._ends(end_program, before) and not errors:
                 return
         # The dashboard has a connection of its own, and needs no program that listens.
-        if not self._ends(self._dashboard.stop, before):
+        if not self._ends(self._stop_by_dashboard, before):
             reason = f" ({errors[0]})" if errors else ""
             raise RuntimeError(f"the robot's program still plays, or no data come{reason}")
+
+    def _stop_by_dashboard(self) -> bool:
+        self._dashboard.stop()
+        return not self._dashboard.running()
 
     def _ends(self, ask: Callable[[], object], before: float) -> bool:
         """Whether the program ends in time that is asked to, by data newer than `before`, s.
 
-        What asks may block for ever.
+        What asks may block for ever; where it returns True it knows that the program has ended.
         """
+        known: list[bool] = []
 
         def quietly() -> None:
             with contextlib.suppress(RuntimeError):
-                ask()
+                known.append(ask() is True)
 
         asking = threading.Thread(target=quietly, daemon=True)
         asking.start()
         deadline = time.monotonic() + self._attempt
         receive = self._receive
         while receive.getRuntimeState() == PLAYING or receive.getTimestamp() == before:
+            if known == [True]:
+                return True
             if time.monotonic() > deadline:
                 return False
             time.sleep(0.01)
