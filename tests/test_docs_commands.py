@@ -175,6 +175,9 @@ TESTED = {
         " --robot hardware/emulated.yaml --move-to-start --emulator-pendant 30099",
         "sliceit collect PROTOCOL --host ADDRESS --robot my.yaml --move-to-start --touch",
     ],
+    "tests/test_commissioning.py::test_the_walk_ends_with_the_first_cut": [
+        "sliceit hardware SCENARIO --host ADDRESS --robot my.yaml --commission",
+    ],
     "tests/test_hardware_interrupted.py::test_a_program_that_runs_on_the_robot_is_not_replaced": [
         "sliceit hardware SCENARIO --host ADDRESS --robot my.yaml --dry-run",
     ],
@@ -270,6 +273,7 @@ READ_ONLY = {
         python -m studies effects_figure
         python -m studies emulator_figure
         python -m studies endurance --minutes 60 --output docs/results/endurance.md
+        python -m studies faults --output docs/results
         python -m studies faster_draws docs/results/slicing_evaluation.jsonl docs/results/faster_draws.jsonl --output docs/results/learning.md
         python -m studies first_run --json docs/results/benchmarks/first_run.json
         python -m studies foods_page --cut --output docs/reference/foods.md

@@ -120,7 +120,7 @@ _CASES = (
     ("program paused on the pendant", "program_paused"),
     ("local control", "remote_control_off"),
     ("a second client takes free registers", "second_client", "it gets none that are in use"),
-    ("arm stuck", "arm_stuck"),
+    ("arm stuck", "arm_stuck", "targets begin where the arm is measured, and wait there with it"),
 )
 _IN_AIR = {"force frozen", "force all zero", "force flipped", "raw force frozen", "joints frozen"}
 _IN_AIR |= {"silence 0.5 s", "a target jumps by 0.1 rad", "RTDE closed", "arm stuck"}

@@ -57,6 +57,7 @@ ATTEMPTS = 4
 """How often a slice is made that had stopped before its fault came."""
 BEYOND, FORCE_BEYOND = 1e-3, 5.0
 """What a fault may add to the edge's way, m, and to the true force, N."""
+FIGURE = "robot_faults.png"
 REST = 1e-3
 """A joint slower than this is at rest, rad/s."""
 CYCLE = 0.002
@@ -99,7 +100,14 @@ def slice_with(case: Case, address: str, overrides: str, set_robot: str = "") ->
         for fault, at in ((MARK, 0.0), *((fault, case.at) for fault in case.faults)):
             pendant.inject(fault, after=at)
         command = [sys.executable, "-m", "sliceit_drake.cli.main", "hardware", SCENARIO, *options]
-        command += ["--host", address, "--pace", str(CLIENT_PACE), "--robot", "hardware/emulated.yaml"]
+        command += [
+            "--host",
+            address,
+            "--pace",
+            str(CLIENT_PACE),
+            "--robot",
+            "hardware/emulated.yaml",
+        ]
         command += ["--set-robot", f"{{{set_robot}}}"] if set_robot else []
         command += ["--no-replay", "--output", f"{folder}/out"]
         process = subprocess.Popen(
@@ -229,7 +237,6 @@ def measure(case: Case, base: Slice, kinematics: EdgeKinematics, address: str) -
         "attempts": attempt,
         "by": stopped_by(made),
         "said": said_by(made),
-        "unseen": case.unseen,
     }
     if result["injected"]:
         result |= compare(made, base, kinematics)
@@ -277,7 +284,9 @@ def busy(is_busy: bool) -> Iterator[None]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of the study."""
-    parser.add_argument("--output", metavar="DIR", type=Path, required=True)
+    parser.add_argument(
+        "--output", metavar="DIR", type=Path, required=True, help="of results, page and figure"
+    )
     parser.add_argument("--first", type=int, metavar="N", help="make N results at most, then end")
     parser.add_argument(
         "--free", type=int, default=0, metavar="N", help="slices without a fault (default 0)"
@@ -313,6 +322,7 @@ def run(options: argparse.Namespace) -> int:
         by = stopped_by(made)
         keep({"key": name, "free": True, "by": by, "said": said_by(made)})
     rows = list(done.values())
+    draw(rows, options.output / "figures" / FIGURE)
     publish(page(rows), options.output / "robot_faults.md")
     return 0 if all(is_held(row) for row in rows if "free" not in row) else 1
 
@@ -328,15 +338,18 @@ def page(rows: list[dict]) -> str:
     """The page of stored results."""
     made = [row for row in rows if "free" not in row]
     order = {case.key: k for k, case in enumerate(cases())}
+    reasons = {case.key: case.unseen for case in cases()}
     made.sort(key=lambda row: order.get(row["key"], len(order)))
     held = [row for row in made if is_held(row)]
     stopped = [row for row in made if row["by"]]
     free = [row for row in rows if "free" in row]
     return render(
         "robot_faults",
+        figure=FIGURE,
+        planned=len(order),
         stopped=[_cells(row) for row in stopped],
         going=[
-            [row["fault"], row["where"], *_excess(row), row["unseen"] or "**not explained**"]
+            [row["fault"], row["where"], *_excess(row), reasons[row["key"]] or "**not explained**"]
             for row in made
             if not row["by"]
         ],
@@ -350,6 +363,28 @@ def page(rows: list[dict]) -> str:
         busy=sum("beside other work" in row["key"] for row in free),
         noisy=sum("noise" in row["key"] for row in free),
     )
+
+
+def draw(rows: list[dict], file: Path) -> None:
+    """Draws how far the edge moved from each fault that stopped the robot to the arm's rest."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 3.6), layout="constrained")
+    axes = figure.add_subplot()
+    stopped = [row for row in rows if row.get("by") and row.get("injected")]
+    for where, marker, colour in (("food", "o", "#0072b2"), ("air", "^", "#d55e00")):
+        found = [row for row in stopped if row["where"] == where]
+        after = [1e3 * row["after"] for row in found]
+        way = [1e3 * row["way"] for row in found]
+        label = f"fault in the {where}, {len(found)}"
+        axes.plot(after, way, marker, color=colour, alpha=0.6, label=label)
+    axes.set(
+        xlabel="time from the fault to rest (ms)", ylabel="way of the edge (mm)", xscale="log",
+        title="From a fault to rest, at 40 mm/s",
+    )  # fmt: skip
+    axes.legend()
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file, dpi=150)
 
 
 def _excess(row: dict) -> list[str]:
