@@ -176,7 +176,6 @@ class Commissioning:
         config = self._robot.config
         criterion = f"the board within {1e3 * config.touch.tolerance:g} mm of where it should be"
         scenario = copy.deepcopy(self._scenario)
-        self._robot.found = None
         try:
             passed = self._robot.move_to_start(scenario) and self._robot.find_board(scenario)
         except ConfigurationError as error:  # The board is somewhere else.

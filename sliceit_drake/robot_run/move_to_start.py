@@ -79,10 +79,10 @@ class MoveToStart:
         turn = self._turn
         clearance, near = make_clearance(hardware.twin), None
         # Where it is nearer already, as on a board that lies lower, it may go away.
-        begin = clearance.nearest(q, limits.clearance)
+        begin = clearance.nearest(q.tolist(), limits.clearance)
         least = limits.clearance if begin is None else begin[0] - 1e-4
         for share in np.linspace(0.0, 1.0, SAMPLES):
-            near = near or clearance.nearest(q + share * turn, least)
+            near = near or clearance.nearest((q + share * turn).tolist(), least)
         return [
             Check(
                 "clearance on the way",

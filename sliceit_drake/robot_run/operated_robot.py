@@ -158,7 +158,7 @@ class OperatedRobot:
         Raises:
             ConfigurationError: The board is not where it is expected.
         """
-        config = self.config
+        config, self.found = self.config, None
         field = "scenario.board.height" if config.board_height is None else "board_height"
         if config.board_height is None:
             config.board_height = scenario.board.height

@@ -225,16 +225,15 @@ def said_by(made: Slice) -> str:
 
 def measure(case: Case, base: Slice, kinematics: EdgeKinematics, address: str) -> dict:
     """The result of a fault."""
-    for attempt in range(1, ATTEMPTS + 1):
-        made = slice_with(case, address, MOTION)
-        if _moves_at_fault(made):
-            break
+    made, attempts = slice_with(case, address, MOTION), 1
+    while not _moves_at_fault(made) and attempts < ATTEMPTS:
+        made, attempts = slice_with(case, address, MOTION), attempts + 1
     result: dict = {
         "key": case.key,
         "fault": case.name,
         "where": case.key.rpartition(", ")[2],
         "injected": _moves_at_fault(made),
-        "attempts": attempt,
+        "attempts": attempts,
         "by": stopped_by(made),
         "said": said_by(made),
     }
@@ -379,7 +378,7 @@ def draw(rows: list[dict], file: Path) -> None:
         label = f"fault in the {where}, {len(found)}"
         axes.plot(after, way, marker, color=colour, alpha=0.6, label=label)
     axes.set(
-        xlabel="time from the fault to rest (ms)", ylabel="way of the edge (mm)", xscale="log",
+        xlabel="time from the fault to rest (ms)", ylabel="way of the edge (mm)",
         title="From a fault to rest, at 40 mm/s",
     )  # fmt: skip
     axes.legend()
