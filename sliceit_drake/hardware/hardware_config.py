@@ -94,7 +94,7 @@ class SafetyLimits:
     """Change of the force that the knife must have felt at blind_depth in a food."""
     blind_depth: float = quantity(5e-3, "m", low=0.0, high=0.05)
     """Depth of the edge in a food at which felt_force must have been felt."""
-    read_back: float = quantity(2e-3, "rad", low=1e-4, high=0.1)
+    read_back: float = quantity(5e-4, "rad", low=1e-4, high=0.1)
     """How far the robot's own joint targets may be from all that was sent a moment before."""
     kinematics: float = quantity(5e-3, "m", low=1e-4, high=0.05)
     """How far the robot's own flange may be from where the nominal kinematics have it."""
