@@ -379,10 +379,17 @@ def test_a_calibration_recovers_what_made_the_records_within_its_intervals(tmp_p
         assert low < value < high
         assert result.posterior.determined()[name]
     assert result.rms == pytest.approx(0.1, rel=0.2)
-    assert result.rms <= result.refined_rms + 1e-6
+    assert result.polished_rms <= result.refined_rms + 1e-6
     assert result.held_out_records["slice_001"] == pytest.approx(0.1, rel=0.3)
     assert result.held_out_rms == pytest.approx(0.1, rel=0.5)
-    assert f"polished {result.rms:.3f} N" in result.table()
+    assert f"polished {result.polished_rms:.3f}, with these values {result.rms:.3f} N" in (
+        result.table()
+    )
+    # One estimate, one covariance: what is printed is what the food has, inside its interval.
+    values = result.predictor.values(result.unit)
+    assert result.posterior.values() == values
+    for name, (low, high) in result.posterior.intervals(0.9).items():
+        assert low <= values[name] <= high, name
     assert f"Held-out record slice_001: {result.held_out_records['slice_001']:.3f} N" in (
         result.table()
     )

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from sliceit_drake.calibration.gauss_newton import gauss_newton
-from sliceit_drake.calibration.prediction import Prediction, Predictor
+from sliceit_drake.calibration.prediction import Predictor
 from sliceit_drake.calibration.refine import Refinement, refine
 from sliceit_drake.calibration.result import Calibration
 from sliceit_drake.calibration.search import SearchResult, error_of, open_study, search
@@ -123,19 +123,22 @@ def calibrate(
         if not np.isfinite(found.errors).any():
             raise CuttingError("no trial of the search could be cut; widen the setup's ranges")
         refinements = _refine(setup, records, directory, options, found, problem, show)
-    best: tuple[float, np.ndarray, list[Prediction]] = (np.inf, refinements[0].unit, [])
+    best = (np.inf, refinements[0].unit)
     for k, refinement in enumerate(sorted(refinements, key=lambda r: r.error)):
         show("polish", k, len(refinements), best[0])
         unit = gauss_newton(predictor, refinement.unit).unit
         (row,) = predictor.predict([unit])
         error = predictor.error(row)
         if error < best[0]:
-            best = (error, unit, row)
+            best = (error, unit)
     show("polish", len(refinements), len(refinements), best[0])
-    rms, unit, predictions = best
-    if not np.isfinite(rms):
+    polished_rms, unit = best
+    if not np.isfinite(polished_rms):
         raise CuttingError("what the search found breaks down at the setup's sub-step")
-    posterior = estimate(predictor, unit).posterior
+    estimated = estimate(predictor, unit)
+    unit, posterior = estimated.unit, estimated.posterior
+    (predictions,) = predictor.predict([unit])
+    rms = predictor.error(predictions)
     blocks: list[float] = []
     held_out_rms = None
     if options.blocks:
@@ -150,6 +153,7 @@ def calibrate(
         rms,
         float(found.errors.min()),
         min(r.error for r in refinements),
+        polished_rms,
         posterior,
         blocks,
         held_out_rms,

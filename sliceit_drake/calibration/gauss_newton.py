@@ -8,7 +8,7 @@ from scipy.optimize import lsq_linear
 
 from sliceit_drake.calibration.prediction import Predictor
 from sliceit_drake.cutting.solver import CuttingError
-from sliceit_drake.prediction.noise import NoiseModel
+from sliceit_drake.prediction.noise import EvenNoise, NoiseModel
 
 __all__ = [
     "PRIOR_CENTER",
@@ -100,7 +100,7 @@ def gauss_newton(
     model: Predictor,
     start: np.ndarray,
     *,
-    noise: NoiseModel | None = None,
+    noise: NoiseModel | EvenNoise | None = None,
     free: np.ndarray | None = None,
     steps: int = 10,
     tolerance: float = 1e-4,
@@ -161,7 +161,7 @@ def gauss_newton(
     return Fit(at.unit, cost, taken, False, at)
 
 
-def _cost(residuals: np.ndarray, unit: np.ndarray, noise: NoiseModel | None) -> float:
+def _cost(residuals: np.ndarray, unit: np.ndarray, noise: NoiseModel | EvenNoise | None) -> float:
     """Sum of squares; infinite where a slice broke down."""
     if not np.isfinite(residuals).all():
         return float("inf")
@@ -171,7 +171,9 @@ def _cost(residuals: np.ndarray, unit: np.ndarray, noise: NoiseModel | None) -> 
     return float(residuals @ noise.solve(residuals[:, None])[:, 0]) + prior
 
 
-def _normal_equations(at: Linearisation, noise: NoiseModel | None) -> tuple[np.ndarray, np.ndarray]:
+def _normal_equations(
+    at: Linearisation, noise: NoiseModel | EvenNoise | None
+) -> tuple[np.ndarray, np.ndarray]:
     """Half the second derivatives [d, d] and half the gradient [d] of the cost.
 
     Nuisance numbers are eliminated.

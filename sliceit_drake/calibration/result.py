@@ -36,6 +36,8 @@ class Calibration:
         rms: On the records, N.
         search_rms: Best of the search alone, N; of the start where there was no search.
         refined_rms: Best after Adam, N; the same.
+        polished_rms: Least of all, N; where the values are that the noise makes more probable,
+            `rms` is a little greater.
         posterior: Of the parameters.
         blocks: RMS error on each block of depth when it was held out, N.
         held_out_rms: On all of them, N; None if none was held out.
@@ -49,6 +51,7 @@ class Calibration:
     rms: float
     search_rms: float
     refined_rms: float
+    polished_rms: float
     posterior: Posterior
     blocks: list[float]
     held_out_rms: float | None
@@ -65,10 +68,10 @@ class Calibration:
     def table(self) -> str:
         """Parameters with 90 % intervals, which of them are not determined, errors, warnings."""
         lines = [
-            self.posterior.table(self.predictor.values(self.unit)),
+            self.posterior.table(),
             *self.posterior.remarks(),
             f"RMS error: search {self.search_rms:.3f}, Adam {self.refined_rms:.3f}, "
-            f"polished {self.rms:.3f} N",
+            f"polished {self.polished_rms:.3f}, with these values {self.rms:.3f} N",
         ]
         if self.held_out_rms is not None:
             blocks = ", ".join(f"{b:.2f}" for b in self.blocks)
@@ -129,6 +132,7 @@ class Calibration:
             "rms_N": self.rms,
             "search_rms_N": self.search_rms,
             "adam_rms_N": self.refined_rms,
+            "polished_rms_N": self.polished_rms,
             "held_out_rms_N": self.held_out_rms,
             "held_out_blocks_N": self.blocks,
             "held_out_records_N": self.held_out_records,
@@ -142,7 +146,8 @@ class Calibration:
 
 
 def _plot_record(target: RecordTarget, predicted: np.ndarray, upper: "Axes", lower: "Axes") -> None:
-    channels = ("force",) if len(target.channels) == 1 else CHANNELS
+    what = "vertical force" if target.channels == ("force_z",) else "force"
+    channels = (what,) if len(target.channels) == 1 else CHANNELS
     for c, name in enumerate(channels):
         # The press, which is nearly all of the force, stands out.
         style = (":", "--", "-")[c] if len(channels) > 1 else "-"
@@ -151,7 +156,7 @@ def _plot_record(target: RecordTarget, predicted: np.ndarray, upper: "Axes", low
         rest = target.measured[:, c] - predicted[:, c]
         lower.plot(target.time, rest, style, color="#475569", lw=1.0, label=name)
     rms = target.rms_error(predicted)
-    upper.set(title=f"{target.record.name}: RMS {rms:.2f} N", ylabel="force on the knife [N]")
+    upper.set(title=f"{target.record.name}: RMS {rms:.2f} N", ylabel=f"{what} on the knife [N]")
     upper.plot([], [], color=MEASURED, label="measured")
     upper.plot([], [], color=PREDICTED, label="calibrated")
     lower.set(xlabel="time [s]", ylabel="rest [N]")
