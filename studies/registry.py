@@ -118,6 +118,12 @@ TOPICS: dict[str, tuple[Study, ...]] = {
             "1 h",
         ),
         Study(
+            "half_depth",
+            "calibration.half_depth",
+            "measured curves: is the lower half in the band of a fit to the upper",
+            "5 min",
+        ),
+        Study(
             "coverage",
             "calibration.coverage",
             "how often intervals of calibrations hold the truth",

@@ -28,6 +28,7 @@ from sliceit_drake.cutting.foods.calibrated_food import (
     load_calibrated_food,
 )
 from sliceit_drake.cutting.foods.distribution import ParameterDistribution
+from sliceit_drake.cutting.foods.effects import Effects, Skin
 from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.foods.shapes import Cylinder
@@ -61,7 +62,9 @@ def coarse_setup(**changes) -> CalibrationSetup:
     )
 
 
-def bench_records(count: int = 1, noise: float = 0.1, time_step: float = 1e-3) -> list[SliceRecord]:
+def bench_records(
+    count: int = 1, noise: float = 0.1, time_step: float = 1e-3, skin: float = 0.0
+) -> list[SliceRecord]:
     """Press cuts to 18 mm with a withdrawal, in a world without hidden effects."""
     material = Material(
         youngs_modulus=TRUTH["material.youngs_modulus"],
@@ -82,7 +85,7 @@ def bench_records(count: int = 1, noise: float = 0.1, time_step: float = 1e-3) -
         ]
     )
     protocol = Protocol(
-        food=Food(shape=SHAPE, material=material),
+        food=Food(shape=SHAPE, material=material, effects=Effects(skin=Skin(toughness=skin))),
         sensor=SensorModel(
             force_noise=noise,
             correlated_share=0.0,

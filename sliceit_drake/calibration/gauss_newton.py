@@ -16,6 +16,7 @@ __all__ = [
     "Fit",
     "Linearisation",
     "gauss_newton",
+    "linear_step",
     "linearise",
     "residuals_at",
 ]
@@ -132,13 +133,13 @@ def gauss_newton(
     damping, taken = FIRST_DAMPING, 0
     while taken < steps:
         H, g = _normal_equations(at, noise)
-        move = _step(H, g, at.unit, 0.0, free)
+        move = linear_step(H, g, at.unit, 0.0, free)
         promised = float(-2.0 * g @ move - move @ H @ move)
         if promised <= tolerance * cost:
             return Fit(at.unit, cost, taken, True, at)
         accepted = None
         while accepted is None and damping <= WORST_DAMPING:
-            moves = [_step(H, g, at.unit, factor * damping, free) for factor in DAMPINGS]
+            moves = [linear_step(H, g, at.unit, factor * damping, free) for factor in DAMPINGS]
             places = [np.clip(at.unit + move, 0.0, 1.0) for move in moves]
             tried = residuals_at(model, places)
             costs = [_cost(r, u, noise) for r, u in zip(tried, places, strict=True)]
@@ -193,7 +194,7 @@ def _normal_equations(
     return H, g
 
 
-def _step(
+def linear_step(
     H: np.ndarray, g: np.ndarray, unit: np.ndarray, damping: float, free: np.ndarray
 ) -> np.ndarray:
     """The move [d] that minimises the damped quadratic within the box."""

@@ -58,6 +58,14 @@ and prints what `sliceit records check` finds in them.
 """
 
 
+AGAIN = {
+    "flipped sign": "--sign by_knife",
+    "kilonewtons": "--units s kN",
+    "force unit": "--units s mN",
+}
+"""What mends an import of a force in which something was found."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the command's arguments."""
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
@@ -208,11 +216,15 @@ def _import(options: argparse.Namespace) -> int:
     findings = check_record(record)
     for finding in findings:
         print(finding)
+        if options.format == "force" and finding.kind in AGAIN:
+            print(f"If so, import it again with {AGAIN[finding.kind]}.")
     return 1 if any(finding.severity == "error" for finding in findings) else 0
 
 
 def _say_what_was_taken(record: "SliceRecord") -> None:
     """What the command found by itself, so that a user sees where it erred."""
+    from sliceit_drake.prediction.noise import without_spikes
+
     facts = record.metadata
     begins = [phase.start for phase in facts.motion.phases if phase.label == "slice"]
     if record.phase("air").any():
@@ -223,6 +235,19 @@ def _say_what_was_taken(record: "SliceRecord") -> None:
         print(
             f"The speed is not known: {facts.motion.speed:.3g} m/s would bring the knife to the "
             "board with the last row. A calibration fits it."
+        )
+    if facts.motion.speed is not None and facts.food.size is not None:
+        way = facts.motion.speed * (record.time[-1] - begins[0])
+        print(
+            f"By the last row the knife is {1e3 * way:.0f} mm deep in a food that is "
+            f"{1e3 * facts.food.size[2]:.0f} mm high."
+        )
+    if "no unit" in facts.processing[0].note:
+        print("The table names no unit: s and N are taken. Give --units if they are others.")
+    if spikes := int((without_spikes(record.measured_force)[1] > 0.0).any(1).sum()):
+        print(
+            f"{spikes} rows stand out from those before and after, as of a faulty cable: they "
+            "count for little."
         )
     if any(step.name == "tare" for step in facts.processing):
         print("The mean force before that is taken off.")

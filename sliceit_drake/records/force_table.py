@@ -251,9 +251,9 @@ def _picked(file: str | Path, names: list[str], columns: Sequence[str]) -> list[
 
 
 def _unit_of(header: list[list[str]], column: int) -> str | None:
-    """A unit in brackets behind the name, or a row of units below it."""
+    """A unit in brackets or after an underscore behind the name, or a row of units below it."""
     for cells in header:
-        found = re.search(r"[\[(]\s*([A-Za-z]+)\s*[\])]", cells[column])
+        found = re.search(r"[\[(_]\s*([A-Za-z]+)\s*[\])]?$", cells[column])
         text = found[1] if found else cells[column]
         if text.lower() in UNITS and (found or cells is not header[0]):
             return text

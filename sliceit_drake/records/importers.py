@@ -223,6 +223,8 @@ def import_force(
     if facts.sensor.rate is None and "sensor.rate" not in facts.unknown:
         facts.sensor.rate = float(f"{1.0 / np.median(np.diff(time)):.4g}")
     step = ProcessingStep("import_force", {}, "the motion is nominal")
+    if None in table.units:
+        step.note += "; the table names no unit of time or of force: s and N are taken"
     if component == "norm":
         return _nominal_record(file, facts, step, time, {"force_norm": force[:, 0]}, contact)
     if component == "vertical":
