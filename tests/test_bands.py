@@ -85,6 +85,36 @@ def test_depth_that_was_not_measured_has_a_wider_band_that_holds_what_is_there()
     assert np.mean(widths) > 1.5
 
 
+class BentModel(PressModel):
+    """Its lower half grows with the exponential of a place that the upper half hardly tells."""
+
+    def force(self, unit):
+        x = np.clip(self.depth, 0.0, None) / HEIGHT
+        return self.columns[:, 0] * unit[0] + x**6 * np.exp(8.0 * (unit[1] - 0.5))
+
+    def predict(self, units):
+        return [[SimpleNamespace(predicted=self.force(u))] for u in units]
+
+    def jacobian(self, unit):
+        ends = [self.force(unit + s * e) for e in 1e-5 * np.eye(2) for s in (1.0, -1.0)]
+        columns = [(ends[0] - ends[1]) / 2e-5, (ends[2] - ends[3]) / 2e-5]
+        return self.force(unit) - self.measured, np.column_stack(columns)
+
+
+def test_slices_are_drawn_where_the_force_is_not_linear_in_what_is_not_known():
+    model = BentModel()
+    model.measured = model.force(np.array([0.5, 0.9]))
+    model.measured = model.measured + 0.1 * np.random.default_rng(3).normal(size=ROWS)
+    model.used = model.depth < 0.4 * HEIGHT
+    unit = np.array([0.5, 0.5])
+    shares = []
+    for draws in (0, 200):
+        low, high = force_band(model, unit, draws).interval()
+        inside = (low <= model.measured) & (model.measured <= high)
+        shares.append(inside[~model.used].mean())
+    assert shares[1] > 0.9 > shares[0]
+
+
 def test_a_speed_that_was_not_measured_has_a_wider_band():
     model = PressModel(speeds=(0.01, 0.02, 0.1))
     rng = np.random.default_rng(2)

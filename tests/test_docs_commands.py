@@ -68,6 +68,12 @@ TESTED = {
     "tests/test_paraview.py::test_a_run_is_exported_again_as_it_was": [
         "sliceit export output/cucumber",
     ],
+    "tests/test_record_importers.py::test_the_page_makes_a_record_of_a_table_with_other_columns": [
+        "sliceit records import force calibration/measured/sliceit_real_potato_force.csv"
+        " --columns time_s F_ground_truth_N --name potato_1 --component norm --food potato"
+        " --shape cylinder --size 0.04 0.08 0.04 --output records/potato",
+        "sliceit records check records/potato",
+    ],
     "tests/test_record_importers.py::test_the_program_imports_a_recording_and_says_what_is_wrong": [
         "sliceit records check FOLDER",
     ],
@@ -220,6 +226,7 @@ READ_ONLY = {
         sliceit diagram --output station.svg
         sliceit doctor
         sliceit simulate --meshcat
+        sliceit records import force slice.csv --output records
         sliceit records import force scale.csv --metadata facts.yaml --contact 0.4 --output records
         sliceit records import rosbag run_07.mcap --topics /wrench /tcp_pose --between 4.0 9.5 --metadata session.yaml --output records
         sliceit simulate --set food.material.toughness=300 --output output/softer
@@ -238,6 +245,8 @@ READ_ONLY = {
         sliceit record radish.yaml --replicates 2 --seed 1 --output records/radish
         sliceit calibrate records/radish --food radish_setup.yaml --output output/radish_food
         sliceit simulate radish.yaml --set calibration=output/radish_food/food.yaml
+        sliceit calibrate records/potato --output output/potato_food
+        sliceit simulate --set calibration=output/potato_food/food.yaml
         sliceit calibrate RECORD... --food cucumber --output DIR
         sliceit calibrate RECORD... --food NAME --output DIR
         sliceit calibrate calibration/records/NAME.csv --food NAME --start NAME --output FOLDER --blocks 0 --per-point 60
@@ -252,6 +261,7 @@ READ_ONLY = {
         python -m studies disect --output docs/results
         python -m studies bench_misfit --draws 2 --output output/misfit.md
         python -m studies benches --output output/benches --commit HEAD --laws slice_push bonds
+        python -m studies half_depth
         python -m studies hidden --output output/hidden --seed 1 --replicates 100
         python -m studies identifiability --output docs/results/identifiability.md --figure docs/results/figures/identifiability.png
         python -m studies random --count 200 --seed 1 --output docs/results
@@ -293,6 +303,7 @@ READ_ONLY = {
 # Files that a reader has, by the pages that say so.
 READERS = {
     "scale.csv": "docs/how_to/tasks.md: the reader's measurement",
+    "slice.csv": "docs/how_to/tasks.md: the reader's measurement",
     "facts.yaml": "docs/how_to/tasks.md: the reader's measurement",
     "session.yaml": "docs/how_to/tasks.md: the reader's measurement",
     "run_07.mcap": "docs/how_to/tasks.md: the reader's measurement",

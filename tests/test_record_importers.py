@@ -381,6 +381,20 @@ def test_a_script_says_by_options_what_the_table_does_not(tmp_path, capsys):
     assert {"food.support", "food.slice_thickness", "provenance"} <= set(metadata.unknown)
 
 
+def test_the_page_makes_a_record_of_a_table_with_other_columns(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    file = "calibration/measured/sliceit_real_potato_force.csv"
+    command = ["records", "import", "force", file, "--columns", "time_s", "F_ground_truth_N"]
+    command += ["--name", "potato_1", "--component", "norm", "--food", "potato"]
+    command += ["--shape", "cylinder", "--size", "0.04", "0.08", "0.04"]
+    assert main([*command, "--output", "records/potato"]) == 0
+    said = capsys.readouterr().out
+    assert "The force begins at 0.16 s" in said and "0.0217 m/s would bring the knife to" in said
+    assert "names no unit" not in said
+    assert main(["records", "check", "records/potato"]) == 0
+    assert "potato_1.csv: nothing found" in capsys.readouterr().out
+
+
 def test_at_a_terminal_one_question_comes_after_the_other(tmp_path, capsys, monkeypatch):
     np.savetxt(tmp_path / "a.csv", slice_in_air_and_food(), delimiter=",")
     answers = iter(

@@ -1,9 +1,9 @@
 """Bands of predicted force: what parameters, noise and the simulation's own error leave open.
 
 A record's force is the simulated one, plus what the parameters may change of it, plus what the
-simulation gets wrong by itself (`prediction.discrepancy`), plus noise. The first is linear about
-the fit, all are normal, and their sizes are those of the records that were fitted. Where nothing
-was fitted, deeper or at another speed, parameters and discrepancy are what they were before.
+simulation gets wrong by itself (`prediction.discrepancy`), plus noise. All are normal, and their
+sizes are those of the records that were fitted. Where nothing was fitted, deeper or at another
+speed, parameters and discrepancy are what they were before.
 """
 
 import dataclasses as dc
@@ -21,10 +21,13 @@ from sliceit_drake.prediction.discrepancy import (
     Sizes,
     motion_shapes,
 )
+from sliceit_drake.prediction.noise import EvenNoise
 from sliceit_drake.prediction.record_target import RecordTarget
 
-__all__ = ["ForceBand", "force_band"]
+__all__ = ["ForceBand", "force_band", "independent"]
 
+WIDER = 1.5
+"""Spread of the drawn places over that of the linear problem."""
 ROUNDS = 3
 """Alternations of the noise and the sizes of the discrepancy."""
 LEAST = 1e-3
@@ -49,12 +52,21 @@ class ForceBand:
         return self.mean - reach, self.mean + reach
 
 
-def force_band(model: Predictor, unit: np.ndarray) -> ForceBand:
+def independent(model: Predictor, residuals: np.ndarray) -> EvenNoise:
+    """Independent noise that tells as little as residuals [M], N, whose neighbours are alike."""
+    variance = float(np.mean(residuals[model.used] ** 2))
+    return EvenNoise(variance * _shared(residuals, model.used, model.record_of))
+
+
+def force_band(model: Predictor, unit: np.ndarray, draws: int = 0) -> ForceBand:
     """The band of all entries, from those that `model` uses.
 
     Args:
         model: Of the records; entries that it does not use are predicted from the others.
         unit: The fit to those that it uses [d].
+        draws: Slices at places that the parameters may have, as far as the entries tell, weighed by
+            how probable these make them; 0 to take the force for linear about the fit, which it is
+            where there are entries.
 
     Raises:
         CuttingError: A slice breaks down near the fit.
@@ -75,18 +87,70 @@ def force_band(model: Predictor, unit: np.ndarray) -> ForceBand:
     rest = r
     for _ in range(ROUNDS):
         # Neighbours share their error: they tell as much as fewer rows would.
-        weight = 1.0 / (variance * _shared(rest, used, model.record_of))
+        weight = 1.0 / independent(model, rest).variance
         grams = [weight * columns[rows & used].T @ columns[rows & used] for _, rows in conditions]
         sizes, _ = problem.fit(grams, range(d), prior)
         coefficients = _Coefficients(problem, sizes, conditions, Z, J)
         mean, _ = coefficients.posterior(r, used, weight, unit)
         rest = r - coefficients.columns @ mean
         variance = max(float(np.mean(rest[used] ** 2)), (LEAST * level) ** 2)
-    weight = 1.0 / (variance * _shared(rest, used, model.record_of))
+    weight = 1.0 / independent(model, rest).variance
     mean, covariance = coefficients.posterior(r, used, weight, unit)
+    if draws:
+        normal = mean[:d], covariance[:d, :d]
+        forces, spread = _drawn(model, unit, draws, normal, coefficients.columns[:, d:], weight)
+        return ForceBand(forces, np.sqrt(spread + variance))
     A = coefficients.columns
     spread = np.einsum("ij,jk,ik->i", A, covariance, A)
     return ForceBand(model.measured - r + A @ mean, np.sqrt(np.maximum(spread, 0.0) + variance))
+
+
+def _drawn(
+    model: Predictor,
+    unit: np.ndarray,
+    draws: int,
+    normal: tuple[np.ndarray, np.ndarray],
+    C: np.ndarray,
+    weight: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and variance of the entries [M] without noise, from slices at drawn places.
+
+    Args:
+        normal: Mean and covariance of the places from `unit`, as the linear problem has them.
+        C: By which the discrepancy's coefficients change the entries [M, n].
+        weight: One over the variance of the entries that are used.
+    """
+    rng, used = np.random.default_rng(0), model.used
+    values, vectors = np.linalg.eigh(WIDER**2 * normal[1])
+    steps = rng.normal(size=(draws, len(unit)))
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    places = np.clip(unit + normal[0] + steps @ root.T, 0.0, 1.0)
+    rows = model.predict(list(places))
+    forces = np.array([np.concatenate([p.predicted.ravel() for p in row]) for row in rows])
+    cut = np.isfinite(forces).all(1)
+    forces, places, steps = forces[cut], places[cut], steps[cut]
+    rest = model.measured - forces
+    inner = np.linalg.inv(np.eye(C.shape[1]) + weight * C[used].T @ C[used])
+    found = weight * rest[:, used] @ C[used] @ inner
+    fit = weight * ((rest[:, used] ** 2).sum(1) - ((rest[:, used] @ C[used]) * found).sum(1))
+    prior = ((places - PRIOR_CENTER) ** 2).sum(1) / PRIOR_VARIANCE
+    logs = -0.5 * (fit + prior - (steps**2).sum(1))
+    shares = _shares(logs)
+    means = forces + found @ C.T
+    mean = shares @ means
+    within = np.einsum("ij,jk,ik->i", C, inner, C)
+    return mean, shares @ (means - mean) ** 2 + within
+
+
+def _shares(logs: np.ndarray) -> np.ndarray:
+    """Weights from logarithms, flattened until they are worth a quarter of the draws: few draws
+    would take the best of them for certain."""
+    for power in np.geomspace(1.0, 1e-3, 40):
+        shares = np.exp(power * (logs - logs.max()))
+        shares = shares / shares.sum()
+        if 1.0 / (shares**2).sum() >= 0.25 * len(logs):
+            break
+    return np.asarray(shares)
 
 
 class _Coefficients:

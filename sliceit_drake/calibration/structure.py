@@ -180,7 +180,7 @@ def choice_in(
 
 
 def find_puncture(target: RecordTarget) -> Puncture | None:
-    """The greatest sudden fall of a record's force in the upper part of the food, if any."""
+    """The first sudden fall of a record's force in the upper part of the food, if any."""
     force = np.linalg.norm(target.measured[:, :3], axis=1)
     depth, height = target.depth, target.facts.height
     inside = np.flatnonzero((depth > 0.0) & np.append(np.diff(depth) > 0.0, False))
@@ -189,6 +189,8 @@ def find_puncture(target: RecordTarget) -> Puncture | None:
         after = (depth > depth[k]) & (depth <= depth[k] + WITHIN) & (np.arange(len(depth)) > k)
         if depth[k] > DEEPEST * height or not after.any():
             continue
+        if found is not None and depth[k] > found.depth + WITHIN:
+            break
         lowest = int(np.flatnonzero(after)[force[after].argmin()])
         drop = float(force[k] - force[lowest])
         goes_on = depth[-1] > depth[k] + 2.0 * WITHIN

@@ -92,7 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     make.add_argument(
         "format", choices=("ur_rtde", "force", "profile", "rosbag"), help="what FILE is"
     )
-    make.add_argument("file", metavar="FILE", type=Path, help="what to read")
+    make.add_argument("file", metavar="FILE", type=here_or_shipped, help="what to read")
     add_output_folder(make, "folder of records", required=True)
     make.add_argument("--metadata", metavar="YAML", type=Path, help="what FILE does not say")
     make.add_argument("--name", help="name of the record; default: that in YAML, or FILE's")

@@ -1,8 +1,8 @@
 """Fits the upper half of each measured curve, and asks whether the lower half lies in the band.
 
-Each of calibration/records is fitted down to half of the food's height, with the shipped setup on a
-coarse mesh and from three starts. The band of the lower half (calibration/bands.py) is then compared
-with what was measured there. Prints a table; with --output it also draws the curves (a PNG).
+Each of calibration/records is fitted down to half of the food's height, with the shipped setup on
+a coarse mesh and from three starts. The band of the lower half (calibration/bands.py) is then
+compared with what was measured there. Prints a table; with --output it also draws the curves.
 """
 
 import argparse
@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sliceit_drake.calibration.bands import ForceBand, force_band
-from sliceit_drake.calibration.gauss_newton import gauss_newton
+from sliceit_drake.calibration.bands import ForceBand, force_band, independent
+from sliceit_drake.calibration.gauss_newton import gauss_newton, residuals_at
 from sliceit_drake.calibration.prediction import Predictor
 from sliceit_drake.calibration.setup import load_setup
 from sliceit_drake.calibration.structure import coarse_predictor, first_starts
@@ -26,6 +26,8 @@ __all__ = ["HalfDepth", "add_arguments", "half_depth", "run"]
 FOODS = ("cucumber", "tomato", "potato")
 STEPS = 6
 """Of each fit."""
+DRAWS = 32
+"""Slices of each band."""
 
 
 @dc.dataclass
@@ -67,9 +69,12 @@ def half_depth(predictor: Predictor) -> HalfDepth:
         unit = np.array([p.unit(start[p.name]) for p in predictor.parameters])
         fits.append(gauss_newton(upper, unit, steps=STEPS))
     best = min(fits, key=lambda fit: fit.cost)
-    (row,) = predictor.predict([best.unit])
+    # Half a record hardly tells some parameters: these stay near the middle of their ranges.
+    noise = independent(upper, *residuals_at(upper, [best.unit]))
+    unit = gauss_newton(upper, best.unit, noise=noise, steps=STEPS).unit
+    (row,) = predictor.predict([unit])
     fitted = np.concatenate([p.predicted.ravel() for p in row])
-    band = force_band(upper, best.unit)
+    band = force_band(upper, unit, DRAWS)
     return HalfDepth(predictor.depth, predictor.measured, lower, fitted, band)
 
 
