@@ -96,6 +96,13 @@ TOPICS: dict[str, tuple[Study, ...]] = {
             "safety_layer", "robot.safety_layer", "time of a decision of the safety layer", "5 s"
         ),
         Study(
+            "faults",
+            "robot.faults",
+            "what stops the emulated robot when something fails",
+            "40 min",
+            "hardware",
+        ),
+        Study(
             "hardware_pace",
             "robot.hardware_pace",
             "how a run keeps up with the controller's clock",
@@ -116,6 +123,12 @@ TOPICS: dict[str, tuple[Study, ...]] = {
             "calibration.comparison",
             "the paper's measured curves, calibrated and compared",
             "1 h",
+        ),
+        Study(
+            "half_depth",
+            "calibration.half_depth",
+            "measured curves: is the lower half in the band of a fit to the upper",
+            "5 min",
         ),
         Study(
             "coverage",

@@ -24,6 +24,7 @@ class FakeRobot:
         self.payload = (1.2, 0.0, 0.0, 0.06)
         self.call_time = 0.0
         self.frozen = False
+        self.raw = None
         self.time = 100.0
         # Targets, each with the time of the state read before it: under load the clock has gone on.
         self.sent = []
@@ -76,8 +77,9 @@ class FakeRobot:
         self._noise = -self._noise
         wrench = [x + self._noise * self._read_time for x in self.wrench]
         return RobotState(
-            self._read_time, self.q, self.qd, wrench, self.runtime, self.bits, self.payload
-        )
+            self._read_time, self.q, self.qd, wrench, self.runtime, self.bits, self.payload,
+            raw_wrench=self.raw,
+        )  # fmt: skip
 
     def is_connected(self):
         return self.connected

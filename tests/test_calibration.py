@@ -28,6 +28,7 @@ from sliceit_drake.cutting.foods.calibrated_food import (
     load_calibrated_food,
 )
 from sliceit_drake.cutting.foods.distribution import ParameterDistribution
+from sliceit_drake.cutting.foods.effects import Effects, Skin
 from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.foods.shapes import Cylinder
@@ -61,7 +62,9 @@ def coarse_setup(**changes) -> CalibrationSetup:
     )
 
 
-def bench_records(count: int = 1, noise: float = 0.1, time_step: float = 1e-3) -> list[SliceRecord]:
+def bench_records(
+    count: int = 1, noise: float = 0.1, time_step: float = 1e-3, skin: float = 0.0
+) -> list[SliceRecord]:
     """Press cuts to 18 mm with a withdrawal, in a world without hidden effects."""
     material = Material(
         youngs_modulus=TRUTH["material.youngs_modulus"],
@@ -82,7 +85,7 @@ def bench_records(count: int = 1, noise: float = 0.1, time_step: float = 1e-3) -
         ]
     )
     protocol = Protocol(
-        food=Food(shape=SHAPE, material=material),
+        food=Food(shape=SHAPE, material=material, effects=Effects(skin=Skin(toughness=skin))),
         sensor=SensorModel(
             force_noise=noise,
             correlated_share=0.0,
@@ -379,10 +382,17 @@ def test_a_calibration_recovers_what_made_the_records_within_its_intervals(tmp_p
         assert low < value < high
         assert result.posterior.determined()[name]
     assert result.rms == pytest.approx(0.1, rel=0.2)
-    assert result.rms <= result.refined_rms + 1e-6
+    assert result.polished_rms <= result.refined_rms + 1e-6
     assert result.held_out_records["slice_001"] == pytest.approx(0.1, rel=0.3)
     assert result.held_out_rms == pytest.approx(0.1, rel=0.5)
-    assert f"polished {result.rms:.3f} N" in result.table()
+    assert f"polished {result.polished_rms:.3f}, with these values {result.rms:.3f} N" in (
+        result.table()
+    )
+    # One estimate, one covariance: what is printed is what the food has, inside its interval.
+    values = result.predictor.values(result.unit)
+    assert result.posterior.values() == values
+    for name, (low, high) in result.posterior.intervals(0.9).items():
+        assert low <= values[name] <= high, name
     assert f"Held-out record slice_001: {result.held_out_records['slice_001']:.3f} N" in (
         result.table()
     )

@@ -8,8 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from sliceit_drake.calibration import uncertainty
 from sliceit_drake.calibration.calibrate import blocked_error
-from sliceit_drake.calibration.gauss_newton import gauss_newton, residuals_at
+from sliceit_drake.calibration.gauss_newton import gauss_newton, linearise, residuals_at
 from sliceit_drake.calibration.prediction import Parameter
 from sliceit_drake.calibration.uncertainty import Posterior, estimate
 from sliceit_drake.configuration import ConfigurationError, dump_yaml, load_yaml
@@ -161,6 +162,57 @@ def test_a_single_record_is_said_to_tell_nothing_of_how_slices_differ():
     posterior = estimate(model, truth).posterior
     assert posterior.record_variation is None
     assert any("no cut was repeated" in line for line in posterior.remarks())
+
+
+def test_least_squares_stand_where_the_noise_gives_up_the_force_of_a_model_that_lacks_something():
+    """A force that grows and at its end drops: its changes say that it hardly grows."""
+    x = np.linspace(0.0, 1.0, 150)
+    model, _ = small_model(10.0 * x[:, None], noise=0.0)
+    model.measured = 5.0 * x - 3.0 * (x > 0.97)
+    model.measured += 0.01 * np.random.default_rng(1).normal(size=150)
+    fit = gauss_newton(model, np.array([0.5]))
+    found = estimate(model, fit.unit)
+    assert found.unit == pytest.approx(fit.unit, abs=0.02)
+    assert "the model lacks something that noise does not explain" in found.posterior.notes[-1]
+    # Their covariance allows for what goes on along the cut.
+    _, naive = white_noise_interval(model, fit.unit)
+    assert (1.645 * found.posterior.deviation > 1.5 * naive)[0]
+
+
+def test_the_covariance_of_least_squares_is_that_of_many_repetitions():
+    rng = np.random.default_rng(3)
+    fits, stated = [], []
+    for k in range(150):
+        model = linear_model()
+        truth = np.full(3, 0.5)
+        force = model.function(truth)
+        noise = noise_of(model, 0.2, 0.1, 0.1, 0.2, force)
+        model.measured = force - noise.sample(rng, len(force))
+        fits.append(gauss_newton(model, truth).unit)
+        if k < 30:
+            problem = uncertainty._noise_problem(model, linearise(model, fits[-1]))
+            found = problem.fit()
+            stated.append(problem.covariance_of_least_squares(found.evened.variance))
+    assert np.sqrt(np.diag(np.mean(stated, axis=0))) == pytest.approx(np.std(fits, axis=0), rel=0.3)
+
+
+def test_a_parameter_at_the_end_of_its_range_is_said_with_what_to_do():
+    posterior = Posterior(
+        names=["material.friction", "material.toughness", "height_offset:a"],
+        low=[0.02, 1.0, -2e-3],
+        high=[1.0, 9.0, 2e-3],
+        log=[True, False, False],
+        mean=[0.0, 0.5, 1.0],
+        covariance=(1e-4 * np.eye(3)).tolist(),
+    )
+    first, second = posterior.remarks()
+    assert first == (
+        "material.friction is at the low end of its range, 0.02: the force asks for less. If the "
+        "food can have less, move the setup's low of material.friction under parameters; if not, "
+        "the model lacks something else, and this parameter stands in for it"
+    )
+    assert second.startswith("height_offset:a is at the high end of its range, 0.002: the force")
+    assert "move the setup's height_offset" in second
 
 
 def test_a_record_that_breaks_down_with_small_sub_steps_is_noted():

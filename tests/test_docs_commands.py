@@ -68,6 +68,12 @@ TESTED = {
     "tests/test_paraview.py::test_a_run_is_exported_again_as_it_was": [
         "sliceit export output/cucumber",
     ],
+    "tests/test_record_importers.py::test_the_page_makes_a_record_of_a_table_with_other_columns": [
+        "sliceit records import force calibration/measured/sliceit_real_potato_force.csv"
+        " --columns time_s F_ground_truth_N --name potato_1 --component norm --food potato"
+        " --shape cylinder --size 0.04 0.08 0.04 --output records/potato",
+        "sliceit records check records/potato",
+    ],
     "tests/test_record_importers.py::test_the_program_imports_a_recording_and_says_what_is_wrong": [
         "sliceit records check FOLDER",
     ],
@@ -175,6 +181,9 @@ TESTED = {
         " --robot hardware/emulated.yaml --move-to-start --emulator-pendant 30099",
         "sliceit collect PROTOCOL --host ADDRESS --robot my.yaml --move-to-start --touch",
     ],
+    "tests/test_commissioning.py::test_the_walk_ends_with_the_first_cut": [
+        "sliceit hardware SCENARIO --host ADDRESS --robot my.yaml --commission",
+    ],
     "tests/test_hardware_interrupted.py::test_a_program_that_runs_on_the_robot_is_not_replaced": [
         "sliceit hardware SCENARIO --host ADDRESS --robot my.yaml --dry-run",
     ],
@@ -220,6 +229,7 @@ READ_ONLY = {
         sliceit diagram --output station.svg
         sliceit doctor
         sliceit simulate --meshcat
+        sliceit records import force slice.csv --output records
         sliceit records import force scale.csv --metadata facts.yaml --contact 0.4 --output records
         sliceit records import rosbag run_07.mcap --topics /wrench /tcp_pose --between 4.0 9.5 --metadata session.yaml --output records
         sliceit simulate --set food.material.toughness=300 --output output/softer
@@ -238,6 +248,8 @@ READ_ONLY = {
         sliceit record radish.yaml --replicates 2 --seed 1 --output records/radish
         sliceit calibrate records/radish --food radish_setup.yaml --output output/radish_food
         sliceit simulate radish.yaml --set calibration=output/radish_food/food.yaml
+        sliceit calibrate records/potato --output output/potato_food
+        sliceit simulate --set calibration=output/potato_food/food.yaml
         sliceit calibrate RECORD... --food cucumber --output DIR
         sliceit calibrate RECORD... --food NAME --output DIR
         sliceit calibrate calibration/records/NAME.csv --food NAME --start NAME --output FOLDER --blocks 0 --per-point 60
@@ -252,6 +264,7 @@ READ_ONLY = {
         python -m studies disect --output docs/results
         python -m studies bench_misfit --draws 2 --output output/misfit.md
         python -m studies benches --output output/benches --commit HEAD --laws slice_push bonds
+        python -m studies half_depth
         python -m studies hidden --output output/hidden --seed 1 --replicates 100
         python -m studies identifiability --output docs/results/identifiability.md --figure docs/results/figures/identifiability.png
         python -m studies random --count 200 --seed 1 --output docs/results
@@ -265,11 +278,12 @@ READ_ONLY = {
         python -m studies batch_speed --output docs/results/speed.md
         python -m studies contact --output docs/results/contact.md
         python -m studies cutting_speed --json docs/results/benchmarks/cutting_speed.json
-        python -m studies cutting_speed --repeats 3 --output docs/results/figures/cutting_speed.png
+        python -m studies cutting_speed --repeats 3 --output docs/results/figures/cutting_speed.png --json docs/results/benchmarks/cutting_speed.json
         python -m studies diagnosis_speed --json docs/results/benchmarks/diagnosis_speed.json
         python -m studies effects_figure
         python -m studies emulator_figure
         python -m studies endurance --minutes 60 --output docs/results/endurance.md
+        python -m studies faults --output docs/results
         python -m studies faster_draws docs/results/slicing_evaluation.jsonl docs/results/faster_draws.jsonl --output docs/results/learning.md
         python -m studies first_run --json docs/results/benchmarks/first_run.json
         python -m studies foods_page --cut --output docs/reference/foods.md
@@ -284,7 +298,7 @@ READ_ONLY = {
         python -m studies split_step_limit
         python -m studies stand_in_figure
         python -m studies bench_figures
-        python -m studies station_speed --repeat 6 --before docs/results/data/before/station_speed.json --json docs/results/benchmarks/station_speed.json --output docs/results/speed.md
+        python -m studies station_speed --repeat 20 --before docs/results/data/before/station_speed.json --json docs/results/benchmarks/station_speed.json --output docs/results/speed.md
         python -m studies station_speed --json docs/results/benchmarks/station_speed.json
         python -m studies unfinished_slices docs/results/slicing_evaluation.jsonl --output docs/results/learning.md
         """,  # noqa: E501
@@ -293,6 +307,7 @@ READ_ONLY = {
 # Files that a reader has, by the pages that say so.
 READERS = {
     "scale.csv": "docs/how_to/tasks.md: the reader's measurement",
+    "slice.csv": "docs/how_to/tasks.md: the reader's measurement",
     "facts.yaml": "docs/how_to/tasks.md: the reader's measurement",
     "session.yaml": "docs/how_to/tasks.md: the reader's measurement",
     "run_07.mcap": "docs/how_to/tasks.md: the reader's measurement",

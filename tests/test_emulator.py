@@ -535,7 +535,7 @@ def test_another_program_than_the_control_script_is_refused_aloud():
         script.socket.sendall(b"end\n")
         bench.serve()
         bench.cycles(2)
-        assert "only ur_rtde's control script is" in client.texts()[0]
+        assert "only a control script is" in client.texts()[0]
 
 
 # Faults.
@@ -667,6 +667,8 @@ def test_the_remaining_faults_do_what_they_say():
         "shows:robot_mode:-1",
         "shows:safety_mode:flipped",
         "frame_size:65536",
+        "lose_inputs:2",
+        "jump_inputs:nan",
     ],
 )
 def test_a_fault_that_makes_no_sense_is_refused(fault):
@@ -689,6 +691,7 @@ def test_a_time_that_never_comes_is_refused_and_blocks_no_later_fault(at):
     [
         ("actual_q", "flipped", -np.array(START)), ("actual_q", "+0.5", np.array(START) + 0.5),
         ("actual_qd", "3", np.full(6, 3.0)), ("robot_mode", "5", 5), ("actual_q", "true", START),
+        ("actual_q", "*2", 2.0 * np.array(START)), ("actual_q", "+-1", np.array(START) - 1.0),
     ],
 )  # fmt: skip
 def test_a_variable_is_shown_otherwise_than_it_is_and_the_arm_stays(variable, how, shown):
@@ -757,6 +760,7 @@ def test_every_fault_of_the_table_can_be_injected():
     arguments = {
         "silence": ":1", "drop_packets": ":0.1", "late_packets": ":0.1", "close": ":rtde",
         "late_inputs": ":0.1", "frame_size": ":2", "shows": ":actual_q:frozen",
+        "jump_inputs": ":0.1", "shift_inputs": ":0.1", "lose_inputs": ":0.1",
         "refuse": ":1", "wrong_payload": ":1", "sensor_bias": ":1", "model": ":UR3",
     }  # fmt: skip
     with Bench() as bench:

@@ -24,6 +24,7 @@ from sliceit_drake.systems.policy import PressByForce
 
 pytestmark = [pytest.mark.second_tier, pytest.mark.usefixtures("no_test_hangs")]
 
+SPRING = resource_path("scenarios/cucumber_spring.yaml")
 CUCUMBER_POLICY = resource_path("scenarios/cucumber_policy.yaml")
 POLICY = """{
   food: {shape: !Cylinder
@@ -185,3 +186,21 @@ def test_a_touch_that_fails_stops_the_robot_and_says_why(
     assert code == 1 and re.search(said, printed), printed
     assert status["runtime_state"] == "STOPPED" and status["safety_mode"] == "NORMAL"
     assert not (tmp_path / "record.csv").exists()
+
+
+@pytest.mark.parametrize("typed", [["slice", "retreat"], ["slice", "no"]], ids=["word", "no word"])
+def test_after_a_breach_of_force_the_knife_goes_back_if_the_operator_says_so(
+    typed, tmp_path, monkeypatch, capsys
+):
+    with emulated(SPRING, "measurement: null") as emulator:
+        code = run_hardware(
+            emulator, tmp_path, monkeypatch, typed, "--set-robot", "limits.force=6",
+            scenario=SPRING, overrides="measurement: null",
+        )  # fmt: skip
+        status, trace = emulator.pendant.status(), np.array(emulator.pendant.trace())
+    printed = capsys.readouterr().out
+    assert code == 1 and re.search("STOPPED: force .*RETREAT: the knife", printed, re.S), printed
+    force = np.linalg.norm(trace[:, 7:], axis=1)
+    assert 6.0 < force.max() < 7.0
+    assert (force[-1] < 0.1) == ("retreat" in typed), force[-1]
+    assert status["runtime_state"] == "STOPPED" and status["safety_mode"] == "NORMAL"

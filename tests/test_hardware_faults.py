@@ -59,6 +59,7 @@ def test_it_stops_the_robot_for_good(fault, said, tmp_path, monkeypatch, capsys)
         thread.join()
         printed = capsys.readouterr().out
         assert code == 1 and re.search(said, printed), printed
+        assert "RETREAT" not in printed, "only after a breach of force"
         log = emulator.pendant.status()["log"]
         at = next(when for when, text in log if text.startswith("injected"))
         # When the network is there again nothing moves; after 4 s it did not either, in a minute.

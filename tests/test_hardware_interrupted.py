@@ -116,7 +116,7 @@ def test_a_program_that_runs_on_the_robot_is_not_replaced(emulator):
         wait_for(emulator, lambda status: np.abs(status["velocities"]).max() > 0.01)
 
 
-@pytest.mark.parametrize("how", ["SIGKILL", "a frame of a wrong size"])
+@pytest.mark.parametrize("how", ["SIGKILL", "frame_size:2", "close:rtde"])
 def test_a_crash_at_the_question_stops_the_robots_program_and_says_so(how, emulator):
     # No watchdog is set yet: nobody but the supervisor stops the program.
     with hardware(emulator, "--move-to-start") as process:
@@ -124,7 +124,7 @@ def test_a_crash_at_the_question_stops_the_robots_program_and_says_so(how, emula
         if how == "SIGKILL":
             process.kill()
         else:
-            emulator.pendant.inject("frame_size:2")
+            emulator.pendant.inject(how)
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(5.0)
             with contextlib.suppress(BrokenPipeError):
@@ -132,6 +132,8 @@ def test_a_crash_at_the_question_stops_the_robots_program_and_says_so(how, emula
         status = wait_for(emulator, lambda status: status["runtime_state"] == "STOPPED")
         printed = process.stdout.read()
     assert is_still(status)
+    # ur_rtde connects again, and would upload its program anew, and anew.
+    assert sum(text.startswith("program started") for _, text in status["log"]) == 1
     if process.returncode < 0:
         assert "HAS CRASHED. The robot's program was stopped through its dashboard" in printed
         assert any("stopped by the dashboard" in text for _, text in status["log"])

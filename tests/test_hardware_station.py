@@ -104,6 +104,9 @@ def test_a_scenario_runs_and_leaves_the_outputs_of_simulate(robot, tmp_path):
     assert abs(record["q_2"][-1] - record["q_2"][0]) > 0.003
     log = np.genfromtxt(tmp_path / "robot.csv", delimiter=",", names=True)
     assert np.isfinite(log["sent_1"]).sum() == summary["robot"]["targets_sent"] > 50
+    late = summary["robot"]["lateness_histogram"]
+    assert sum(late.values()) == len(log) == summary["robot"]["cycles"]
+    assert late["below 0.1 ms"] == (log["lateness"] < 1e-4).sum()
     made = slice_record_of(run, "a test")
     assert made.force.shape == (len(record["time"]), 3)
 
@@ -144,6 +147,8 @@ def test_it_begins_nothing_where_the_robot_is_not_ready(twin, robot):
     for change, name in (
         ({"model": "UR10"}, "model"),
         ({"software": "3.15.8"}, "software"),
+        ({"software": "10.7.0"}, "software"),
+        ({"software": ""}, "software"),
         ({"robot_mode": "IDLE"}, "robot mode"),
         ({"safety_mode": "PROTECTIVE_STOP"}, "safety mode"),
         ({"remote_control": False}, "remote control"),
@@ -289,6 +294,29 @@ def test_a_contact_after_zeroing_is_found_before_it_moves(robot, monkeypatch, ca
     made = checked_run(robot, tmp_path)
     assert "force after zeroing: " in made.stopped
     assert robot.sent == [] and robot.watchdog is None
+
+
+def test_a_contact_that_begins_while_it_is_zeroed_is_found_after_the_word(
+    robot, monkeypatch, capsys, tmp_path
+):
+    # The sensor shows the payload's weight alone, along the flange's axis: the tool points down.
+    weight = 1.2 * 9.81
+    robot.raw = [0.0, 0.0, weight, 0.0, 0.0, 0.0]
+
+    def press():
+        robot.raw = [0.0, 0.0, weight - 40.0, 0.0, 0.0, 0.0]
+
+    robot.zero_sensor = press
+    monkeypatch.setattr("sys.stdin", io.StringIO("slice\n"))
+    made = checked_run(robot, tmp_path)
+    assert "force before zeroing: " in made.stopped
+    assert robot.sent == [] and robot.watchdog is None
+
+
+def test_other_software_is_refused_by_its_name(robot):
+    facts = dc.replace(robot.facts(), software="10.7.0")
+    (check,) = [c for c in check_facts(facts, HardwareConfig(**CONFIG)) if not c.passed]
+    assert "PolyScope X (10.7.0)" in check.found
 
 
 def test_a_contact_is_not_zeroed_away(robot):

@@ -7,6 +7,7 @@ from sliceit_drake.calibration.setup import load_setup
 from sliceit_drake.cli.main import main
 from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
 from sliceit_drake.cutting.knife import Knife, load_knife
+from sliceit_drake.diagrams import run as run_module
 from sliceit_drake.diagrams.run import prepare_run
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.resources import resource_path, shipped_names
@@ -28,6 +29,7 @@ def test_the_foods_that_ship_each_have_a_setup_to_calibrate_them():
 def test_a_food_without_a_record_says_so_and_calls_nothing_determined(name):
     food = load_calibrated_food(name)
     assert food.records and food.command and food.date
+    assert food.is_measured == (name not in ("apple", "carrot"))
     if food.rms_error is None:
         assert "not from a record" in food.note.lower()
         assert not any(food.distribution.determined().values())
@@ -59,6 +61,8 @@ def test_the_apple_is_cut_by_a_knife_that_is_higher_and_the_arm_reaches_its_star
     assert scenario.food.material == load_calibrated_food("apple").food.material
     assert scenario.knife == load_knife("cleaver").knife
     run = prepare_run(scenario)
+    # Every picture of the run has this title.
+    assert run_module._title(run) == "A UR5e slices apple at 20 mm/s, not calibrated"
     model = run.station.cutting.solvers[0].model
     assert Knife().height < model.top < scenario.knife.height
     assert model.section_area == pytest.approx(0.25 * np.pi * 0.063**2, rel=1e-9)

@@ -104,6 +104,8 @@ def changed(**changes):
         ("kinematics", changed(tcp_pose=lambda p: [*p[:2], p[2] + 0.01, *p[3:]]), 1),
         ("kinematics", changed(tcp_pose=lambda p: [*p[:3], p[3] + 0.05, *p[4:]]), 1),
         ("read_back", changed(target_q=lambda q: [q[0], q[1] + 0.01, *q[2:]]), 1),
+        ("read_back", changed(target_q=lambda q: [q[0] + 0.001, *q[1:]]), 1),
+        ("read_back", changed(target_q=lambda q: [math.nan] * 6), 1),
     ],
 )
 def test_a_reading_that_cannot_be_true_stops_the_robot(limit, fault, within):

@@ -8,6 +8,8 @@ import pytest
 from example_slices import HEIGHT, example_metadata, example_slice, wrist_motion
 from scipy.spatial.transform import Rotation
 
+from sliceit_drake.calibration.prediction import Predictor
+from sliceit_drake.calibration.setup import load_setup
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.records.force_profile import load_force_profile
@@ -19,7 +21,7 @@ from sliceit_drake.records.importers import (
 )
 from sliceit_drake.records.metadata import SliceMetadata, WrenchFacts
 from sliceit_drake.records.phases import phases_from_motion
-from sliceit_drake.records.slice_record import SliceRecord
+from sliceit_drake.records.slice_record import SliceRecord, write_record
 from sliceit_drake.records.validation import check_record, load_record, load_records
 from sliceit_drake.resources import resource_path
 
@@ -165,6 +167,15 @@ def test_the_shipped_records_are_what_the_program_makes(tmp_path):
             assert made.read_text() == (folder / made.name).read_text(), made.name
 
 
+def table_of(force) -> str:
+    """A table at 100 Hz of a force that is a function of time."""
+    times = np.arange(181) / 100.0
+    return "".join(f"{t:.2f},{force(t):.5f}\n" for t in times)
+
+
+CURVE = table_of(lambda t: 8.0 * np.interp(t, [0.0, 0.5, 0.7, 1.8], [0.0, 0.0, 1.0, 1.3]))
+
+
 def facts() -> SliceMetadata:
     metadata = example_metadata()
     metadata.motion.phases = []
@@ -195,30 +206,211 @@ def test_a_vertical_force_keeps_its_sign(tmp_path, sign):
     np.savetxt(tmp_path / "scale.csv", np.column_stack([truth.time, up]), delimiter=",")
     metadata = dc.replace(facts(), wrench=WrenchFacts(sign=sign, tared="yes"))
     record = import_force(tmp_path / "scale.csv", metadata, component="vertical", contact=0.5)
-    np.testing.assert_allclose(record.force[:, 2], truth.force[:, 2])
-    assert not record.force[:, :2].any()
+    np.testing.assert_allclose(record.force_vertical, truth.force[:, 2])
+    assert [str(finding) for finding in check_record(record)] == []
+
+
+def test_a_vertical_force_is_compared_in_one_channel_and_none_is_invented(tmp_path):
+    truth = example_slice().between(0.0, 1.8)
+    rows = np.column_stack([truth.time, -truth.force[:, 2]])
+    np.savetxt(tmp_path / "scale.csv", rows, delimiter=",")
+    metadata = dc.replace(facts(), wrench=WrenchFacts(sign="by_knife", tared="yes"))
+    made = import_force(tmp_path / "scale.csv", metadata, component="vertical", contact=0.5)
+    assert made.force is None
+    record = load_record(write_record(made, tmp_path / "made"))
+    np.testing.assert_allclose(record.force_vertical, truth.force[:, 2])
+    setup = load_setup("cucumber")
+    (target,) = Predictor(setup, [record], workers=1).targets
+    assert target.channels == ("force_z",) and target.measured.shape[1] == 1
+    wrench = np.arange(6.0 * (len(target.grid) - 1)).reshape(-1, 6)
+    seen = target.compare(wrench)
+    assert seen.shape == target.measured.shape
+    # The adjoint is that of the comparison.
+    force = wrench[target.coupling_steps[1:] - 1, 3:]
+    weights = np.random.default_rng(0).normal(size=target.measured.shape)
+    back = target.adjoint(force, weights)
+    assert (weights * target.compare_forces(force)).sum() == pytest.approx((back * force).sum())
+    assert not back[:, :2].any()
+
+
+def test_an_upside_down_vertical_force_is_found(tmp_path):
+    truth = example_slice().between(0.0, 1.8)
+    rows = np.column_stack([truth.time, -truth.force[:, 2]])
+    np.savetxt(tmp_path / "scale.csv", rows, delimiter=",")
+    metadata = dc.replace(facts(), wrench=WrenchFacts(tared="yes"))
+    made = import_force(tmp_path / "scale.csv", metadata, component="vertical", contact=0.5)
+    (finding,) = check_record(made)
+    assert "force_vertical: the force on the knife drives it" in str(finding)
+    assert "Write wrench.sign: by_knife" in str(finding)
+
+
+def test_a_vertical_force_is_tared_by_the_mean_in_the_air(tmp_path):
+    truth = example_slice().between(0.0, 1.8)
+    rows = np.column_stack([truth.time, truth.force[:, 2] + 3.0])
+    np.savetxt(tmp_path / "scale.csv", rows, delimiter=",")
+    said = dc.replace(facts(), wrench=WrenchFacts(tared="yes"))
+    made = import_force(tmp_path / "scale.csv", said, component="vertical", contact=0.5)
+    assert [finding.kind for finding in check_record(made)] == ["no tare"]
+    unsaid = dc.replace(facts(), wrench=WrenchFacts())
+    record = import_force(tmp_path / "scale.csv", unsaid, component="vertical", contact=0.5)
+    assert abs(record.force_vertical[record.phase("air")].mean()) < 1e-9
+    assert record.metadata.processing[-1].numbers == {"force_vertical": pytest.approx(3.0, abs=0.1)}
     assert [str(finding) for finding in check_record(record)] == []
 
 
 @pytest.mark.parametrize(
     ("text", "change", "message"),
     [
-        ("0,1,2\n", {}, "scale.csv, line 1: the first row has 3 cells. Give two columns"),
-        ("0,1\n1,x\n", {}, "scale.csv: the table holds something else than numbers"),
+        ("0,1,2\n", {}, "scale.csv: --columns: has 3 columns, 1, 2, 3. Name two, of time and"),
+        ("0,1\n1,x\n", {}, "scale.csv, line 2: 2: is 'x', which is not a finite number"),
         ("t,f\n1,x\n", {}, "scale.csv, line 2: f: is 'x', which is not a finite number"),
-        ("t,f\n1,1\n0,1\n", {}, "scale.csv: time: row 2 has 0 after 1. Sort the rows"),
-        ("t,f\n0,1\n1,1\n", {"speed": None}, "motion.speed: is not given, but the motion of"),
-        ("t,f\n0,1\n1,1\n", {"contact": 3.0}, "contact: 3 s is not within the record, 0 to 1 s"),
-        ("t,f\n0,1\n1,1\n", {"component": "sideways"}, "component: 'sideways' is no component"),
+        ("t,f\n1,1\n0,1\n", {}, "scale.csv: t: row 2 has 0 after 1. Sort the rows"),
+        ("t,f\n0,1\n5,1\n", {}, "t: its rows are 5 s apart.* Is it in ms. Give --units ms N"),
+        ("t (ms),f [stone]\n0,1\n", {"units": ["ms", "stone"]}, "'stone' is no unit of force"),
+        (CURVE, {"size": None}, "food.size: is not given, but the motion of"),
+        (CURVE, {"contact": 3.0}, "contact: 3 s is not within the record, 0 to 1.8 s"),
+        (CURVE, {"component": "sideways"}, "component: 'sideways' is no component"),
+        (CURVE, {"component": "components"}, "components goes with 3 columns of force"),
+        (CURVE, {"between": [1.0, 1.01]}, "1 to 1.01 s holds 2 rows of the table, which has 0 to"),
+        (CURVE, {"speed": 0.05}, "0.05 m/s brings the knife 64 mm down in the 1.29 s from the"),
+        (table_of(lambda t: 0.05 * np.cos(900.0 * t)), {}, "force: never rises: it stays within"),
+        (
+            table_of(lambda t: 9.0 * np.interp(t % 0.9, [0.3, 0.31, 0.5, 0.51], [0, 1, 1, 0])),
+            {},
+            "holds 2 slices, 0.31 to 0.5 s, 1.21 to 1.4 s. Import each by itself",
+        ),
     ],
 )
 def test_a_force_that_makes_no_record_is_refused(tmp_path, text, change, message):
     (tmp_path / "scale.csv").write_text(text, encoding="utf-8")
-    metadata = facts()
-    metadata.motion.speed = change.get("speed", 0.02)
-    options = {name: change[name] for name in ("contact", "component") if name in change}
+    metadata, options = facts(), dict(change)
+    metadata.motion.speed = options.pop("speed", 0.02)
+    metadata.food.size = options.pop("size", metadata.food.size)
     with pytest.raises(ConfigurationError, match=message):
         import_force(tmp_path / "scale.csv", metadata, **options)
+
+
+def slice_in_air_and_food(rate: float = 500.0, offset: float = 0.0) -> np.ndarray:
+    """Time and vertical force of a slice of 27 mm at 20 mm/s, with noise, at a rate [n, 2]."""
+    t = np.arange(0.0, 1.8, 1.0 / rate)
+    up = 8.0 * np.interp(t, [0.5, 0.7, 1.8], [0.0, 1.0, 1.3])
+    return np.column_stack([t, up + offset + 0.02 * np.random.default_rng(0).normal(size=len(t))])
+
+
+@pytest.mark.parametrize("rate", [60.0, 1000.0])
+def test_the_contact_is_found_at_any_rate_and_the_rate_is_noted(tmp_path, rate):
+    np.savetxt(tmp_path / "a.csv", slice_in_air_and_food(rate, -3.0), delimiter=",", fmt="%.7f")
+    metadata = facts()
+    metadata.sensor.rate, metadata.wrench = None, WrenchFacts()
+    record = import_force(tmp_path / "a.csv", metadata, component="vertical")
+    air, cut = record.metadata.motion.phases
+    assert air.end == pytest.approx(0.5, abs=0.03) and cut.label == "slice"
+    assert record.metadata.sensor.rate == pytest.approx(rate, rel=0.01)
+    assert abs(record.force_vertical[record.phase("air")].mean()) < 1e-6
+    (target,) = Predictor(load_setup("cucumber"), [record], workers=1).targets
+    assert np.isfinite(target.measured).all() and abs(target.depth[-1] - 0.026) < 1.5e-3
+
+
+@pytest.mark.parametrize(
+    ("header", "separator", "decimal"),
+    [("Zeit (ms);Kraft (kN)\n", ";", ","), ("time\tforce\n(ms)\t(kN)\n", "\t", ".")],
+)
+def test_units_and_separators_of_other_labs_are_read(tmp_path, header, separator, decimal):
+    known = slice_in_air_and_food()
+    rows = [
+        separator.join(f"{x:.9f}".replace(".", decimal) for x in (1e3 * t, 1e-3 * f))
+        for t, f in known
+    ]
+    (tmp_path / "a.csv").write_text(header + "\n".join(rows), encoding="utf-8")
+    record = import_force(tmp_path / "a.csv", facts(), component="vertical")
+    np.testing.assert_allclose(record.time, known[:, 0], atol=1e-9)
+    assert record.force_vertical[-1] == pytest.approx(known[-1, 1], abs=0.02)
+
+
+def test_components_in_the_knifes_axes_become_those_of_the_world(tmp_path):
+    known = slice_in_air_and_food()
+    table = np.column_stack([known[:, 0], 0.1 * known[:, 1], 0.0 * known[:, 1], -known[:, 1]])
+    np.savetxt(tmp_path / "a.csv", table, delimiter=",", header="t,Fx,Fy,Fz,", comments="")
+    metadata = dc.replace(facts(), wrench=WrenchFacts(frame="K", tared="yes"))
+    record = import_force(tmp_path / "a.csv", metadata, component="components")
+    np.testing.assert_allclose(record.force[:, 2], known[:, 1], atol=1e-9)
+
+
+def test_a_record_that_begins_in_the_food_is_predicted_from_above_it(tmp_path):
+    whole = slice_in_air_and_food()
+    np.savetxt(tmp_path / "whole.csv", whole, delimiter=",")
+    np.savetxt(tmp_path / "cropped.csv", whole[280:], delimiter=",")
+    setup = load_setup("cucumber")
+    ends = []
+    for name in ("whole", "cropped"):
+        record = import_force(tmp_path / f"{name}.csv", facts(), component="vertical")
+        (target,) = Predictor(setup, [record], workers=1).targets
+        assert target.p[0, 2] >= target.home[2] + 2e-3
+        ends.append(target.depth[-1])
+    # It began 1.2 mm below the top, which follows from how its force rises.
+    assert record.metadata.motion.phases[0].label == "slice"
+    assert target.grid[0] < record.time[0] - 0.1
+    assert ends[1] == pytest.approx(ends[0], abs=3e-4)
+
+
+def test_a_speed_that_is_not_known_follows_from_the_height_and_is_fitted(tmp_path):
+    np.savetxt(tmp_path / "a.csv", slice_in_air_and_food(), delimiter=",")
+    metadata = facts()
+    metadata.motion.speed, metadata.food.size = None, [0.027, 0.12, 0.026]
+    record = import_force(tmp_path / "a.csv", metadata, component="vertical")
+    assert record.metadata.motion.speed == pytest.approx(0.02, rel=0.03)
+    assert "motion.speed" in record.metadata.unknown
+
+
+def test_a_script_says_by_options_what_the_table_does_not(tmp_path, capsys):
+    np.savetxt(tmp_path / "a.csv", slice_in_air_and_food(), delimiter=",")
+    command = ["records", "import", "force", str(tmp_path / "a.csv"), "--output", str(tmp_path)]
+    command += ["--component", "vertical", "--name", "radish_1"]
+    assert main(command) == 2
+    said = capsys.readouterr().err
+    assert "--shape and --size: is not given: its shape: cylinder" in said
+    command += ["--shape", "cylinder", "--food", "radish", "--speed", "0.02"]
+    assert main([*command, "--size", "27", "120", "27"]) == 2
+    assert "Is it in mm? Write 0.027" in capsys.readouterr().err
+    assert main([*command, "--size", "0.027", "0.12", "0.027"]) == 0
+    said = capsys.readouterr().out
+    assert "The force begins at 0.5" in said and "The mean force before that is taken off" in said
+    assert said.count("warning") == 0
+    metadata = load_record(tmp_path / "radish_1.csv").metadata
+    assert metadata.food.name == "radish" and metadata.food.size == [0.027, 0.12, 0.027]
+    assert {"food.support", "food.slice_thickness", "provenance"} <= set(metadata.unknown)
+
+
+def test_the_page_makes_a_record_of_a_table_with_other_columns(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    file = "calibration/measured/sliceit_real_potato_force.csv"
+    command = ["records", "import", "force", file, "--columns", "time_s", "F_ground_truth_N"]
+    command += ["--name", "potato_1", "--component", "norm", "--food", "potato"]
+    command += ["--shape", "cylinder", "--size", "0.04", "0.08", "0.04"]
+    assert main([*command, "--output", "records/potato"]) == 0
+    said = capsys.readouterr().out
+    assert "The force begins at 0.16 s" in said and "0.0217 m/s would bring the knife to" in said
+    assert "names no unit" not in said
+    assert main(["records", "check", "records/potato"]) == 0
+    assert "potato_1.csv: nothing found" in capsys.readouterr().out
+
+
+def test_at_a_terminal_one_question_comes_after_the_other(tmp_path, capsys, monkeypatch):
+    np.savetxt(tmp_path / "a.csv", slice_in_air_and_food(), delimiter=",")
+    answers = iter(
+        ["vertical", "radish", "round", "cylinder", "", "0.027 0.12 0.027", "20", "0.02"]
+        + ["", "", "", "my kitchen"]
+    )
+    asked = []
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    monkeypatch.setattr("builtins.input", lambda text: asked.append(text) or next(answers))
+    command = ["records", "import", "force", str(tmp_path / "a.csv"), "--output", str(tmp_path)]
+    assert main([*command, "--name", "b"]) == 0
+    assert len(asked) == 12 and asked[-1].startswith("Where the curve is from")
+    said = capsys.readouterr().out
+    assert "'round' is not one of" in said and "20 m/s is not within" in said
+    metadata = load_record(tmp_path / "b.csv").metadata
+    assert metadata.provenance == "my kitchen" and metadata.motion.speed == 0.02
 
 
 class Column:

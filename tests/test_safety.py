@@ -353,3 +353,27 @@ def test_a_payload_that_is_not_known_any_more_stops_the_robot(now):
     assert layer.arm(known) is None
     decision = layer.step(known._replace(time=0.002, payload=now), START, 0.002)
     assert decision.stop.limit == "payload"
+
+
+def test_bodies_that_would_come_near_each_other_stop_it_while_the_arm_can_still_stop():
+    def nearest(q, within):
+        distance = 0.02 - 0.8 * (q[0] - START[0])
+        return (distance, "knife and holder") if distance < within else None
+
+    limits = SafetyLimits()
+    kinematics = EdgeKinematics(X_WB, X_TK, LENGTH)
+    layer = SafetyLayer(limits, kinematics, BOARD, START, PERIOD, nearest=nearest)
+    time, q, v = 1.0, np.array(START), 0.0
+    layer.arm(state(time, q))
+    stop = None
+    while stop is None:
+        v, time = min(0.15, v + 9.0 * PERIOD), time + PERIOD
+        q = q + [v * PERIOD, 0, 0, 0, 0, 0]
+        stop = layer.step(state(time, q), q, time).stop
+    assert stop.limit == "clearance" and "knife and holder" in stop.detail
+    sent = q
+    while not layer.is_still:
+        time += PERIOD
+        sent = layer.step(state(time, sent), None, time).q
+    assert nearest(sent, 1.0)[0] >= limits.clearance
+    assert nearest(sent, 1.0)[0] < limits.clearance + 2e-3, "it goes as far as it may"

@@ -56,6 +56,17 @@ def test_scaled_masses_give_the_force_of_the_true_ones():
     assert relative_rms(scaled, true) < 0.02
 
 
+@pytest.mark.parametrize("damping_time", [0.0, 4e-6, 2e-4])
+@pytest.mark.parametrize("held_sides", ["both", "plus"])
+def test_shorter_steps_have_the_same_masses_on_the_way_and_from_the_start(held_sides, damping_time):
+    material = dc.replace(SMALL.material, damping_time=damping_time)
+    food = dc.replace(SMALL, material=material, held_sides=held_sides)
+    coarse = make_food_model(food, Knife(), Numerics())
+    for step in (5e-4, 1.25e-4, 3.125e-5):
+        direct = coarse.derive(numerics=Numerics(time_step=step)).inertia.matrix
+        assert (coarse.with_step(step).inertia.matrix != direct).nnz == 0
+
+
 @pytest.mark.parametrize(("precision", "tolerance"), [("float32", 5e-6), ("float64", 1e-13)])
 @pytest.mark.parametrize("refinement", [0.5, 1.5])
 def test_accelerations_solve_the_mass_matrix(precision, tolerance, refinement):

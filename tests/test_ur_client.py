@@ -56,5 +56,17 @@ def test_the_dashboard_stops_a_robot_whose_control_link_does_not(fails):
             client.close()
 
 
+def test_where_no_data_come_the_dashboard_can_confirm_that_the_program_has_stopped():
+    with EmulatorProcess(address=free_address(), pace=1.0) as emulator:
+        client = UrClient(emulator.address, 0.03, 2000.0)
+        try:
+            emulator.pendant.inject("shows:timestamp:frozen")
+            time.sleep(0.1)
+            client.stop()
+        finally:
+            client.close()
+        assert emulator.pendant.status()["runtime_state"] == "STOPPED"
+
+
 def test_both_ways_to_stop_are_tried_before_the_operator_is_told_that_none_did():
     assert 2.0 * ATTEMPT < HALT_TIME

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from sliceit_drake.calibration.bands import force_band
 from sliceit_drake.calibration.gauss_newton import gauss_newton
-from sliceit_drake.calibration.prediction import Prediction, Predictor
+from sliceit_drake.calibration.prediction import Predictor
 from sliceit_drake.calibration.refine import Refinement, refine
 from sliceit_drake.calibration.result import Calibration
 from sliceit_drake.calibration.search import SearchResult, error_of, open_study, search
@@ -33,6 +34,8 @@ __all__ = [
     "Progress",
     "blocked_error",
     "calibrate",
+    "depth_blocks",
+    "fingerprint",
     "values_of",
 ]
 
@@ -111,7 +114,7 @@ def calibrate(
         found = _given(predictor, options.start)
         refinements = [Refinement(found.units[0], float(found.errors[0]), [])]
     else:
-        problem = _fingerprint(setup, records)
+        problem = fingerprint(setup, records)
         storage = options.storage or directory / "trials.log"
         found = search(
             Predictor(setup, records, setup.search_time_step, workers=options.workers),
@@ -123,19 +126,23 @@ def calibrate(
         if not np.isfinite(found.errors).any():
             raise CuttingError("no trial of the search could be cut; widen the setup's ranges")
         refinements = _refine(setup, records, directory, options, found, problem, show)
-    best: tuple[float, np.ndarray, list[Prediction]] = (np.inf, refinements[0].unit, [])
+    best = (np.inf, refinements[0].unit)
     for k, refinement in enumerate(sorted(refinements, key=lambda r: r.error)):
         show("polish", k, len(refinements), best[0])
         unit = gauss_newton(predictor, refinement.unit).unit
         (row,) = predictor.predict([unit])
         error = predictor.error(row)
         if error < best[0]:
-            best = (error, unit, row)
+            best = (error, unit)
     show("polish", len(refinements), len(refinements), best[0])
-    rms, unit, predictions = best
-    if not np.isfinite(rms):
+    polished_rms, unit = best
+    if not np.isfinite(polished_rms):
         raise CuttingError("what the search found breaks down at the setup's sub-step")
-    posterior = estimate(predictor, unit).posterior
+    estimated = estimate(predictor, unit)
+    unit, posterior = estimated.unit, estimated.posterior
+    (predictions,) = predictor.predict([unit])
+    rms = predictor.error(predictions)
+    band = force_band(predictor, unit)
     blocks: list[float] = []
     held_out_rms = None
     if options.blocks:
@@ -150,7 +157,9 @@ def calibrate(
         rms,
         float(found.errors.min()),
         min(r.error for r in refinements),
+        polished_rms,
         posterior,
+        band,
         blocks,
         held_out_rms,
         {} if others is None else _held_out(others, predictor, unit),
@@ -178,7 +187,7 @@ def _given(predictor: Predictor, start: Mapping[str, float]) -> SearchResult:
     return SearchResult(unit[None], np.array([error]), 0)
 
 
-def _fingerprint(setup: CalibrationSetup, records: Sequence[SliceRecord]) -> str:
+def fingerprint(setup: CalibrationSetup, records: Sequence[SliceRecord]) -> str:
     """What tells a calibration's checkpoints from another's: setup and data."""
     digest = hashlib.sha256(repr(setup).encode())
     for record in records:
@@ -247,6 +256,14 @@ def _note(shared: Any, k: int, done: int, error: float) -> None:
     shared[k] = (done, error)
 
 
+def depth_blocks(model: Predictor, blocks: int) -> np.ndarray:
+    """Number of the block of equal depth of each entry of the measurement [M]; what lies above the
+    food belongs to the first."""
+    edges = np.linspace(0.0, float(model.depth[model.used].max()), blocks + 1)
+    numbers = np.searchsorted(edges, model.depth, side="right") - 1
+    return np.asarray(np.clip(numbers, 0, blocks - 1))
+
+
 @dc.dataclass
 class HeldOutError:
     """Errors on blocks of the data, each from a fit without it.
@@ -266,9 +283,8 @@ def blocked_error(model: Predictor, unit: np.ndarray, blocks: int = 5) -> HeldOu
     """Holds out contiguous blocks of depth in turn, in all records at once.
 
     Neighbouring samples share their error, so that samples held out one by one would be predicted
-    by their neighbours; a block must be predicted by the physics. What lies above the food belongs
-    to the first block. What is a record's own (its height, its speed) stays as fitted: where the
-    knife was is not what is predicted.
+    by their neighbours; a block must be predicted by the physics. What is a record's own (its
+    height, its speed) stays as fitted: where the knife was is not what is predicted.
 
     Args:
         unit: The fit to all data [d]; each refit starts there.
@@ -277,9 +293,7 @@ def blocked_error(model: Predictor, unit: np.ndarray, blocks: int = 5) -> HeldOu
     Raises:
         CuttingError: A slice breaks down near `unit`.
     """
-    depth = model.depth
-    edges = np.linspace(0.0, float(depth[model.used].max()), blocks + 1)
-    block = np.clip(np.searchsorted(edges, depth, side="right") - 1, 0, blocks - 1)
+    block = depth_blocks(model, blocks)
     shared = np.array([p.shared for p in model.parameters])
     errors, counts, squares = [], [], 0.0
     for k in range(blocks):

@@ -8,7 +8,7 @@ from scipy.optimize import lsq_linear
 
 from sliceit_drake.calibration.prediction import Predictor
 from sliceit_drake.cutting.solver import CuttingError
-from sliceit_drake.prediction.noise import NoiseModel
+from sliceit_drake.prediction.noise import EvenNoise, NoiseModel
 
 __all__ = [
     "PRIOR_CENTER",
@@ -16,6 +16,7 @@ __all__ = [
     "Fit",
     "Linearisation",
     "gauss_newton",
+    "linear_step",
     "linearise",
     "residuals_at",
 ]
@@ -100,7 +101,7 @@ def gauss_newton(
     model: Predictor,
     start: np.ndarray,
     *,
-    noise: NoiseModel | None = None,
+    noise: NoiseModel | EvenNoise | None = None,
     free: np.ndarray | None = None,
     steps: int = 10,
     tolerance: float = 1e-4,
@@ -132,13 +133,13 @@ def gauss_newton(
     damping, taken = FIRST_DAMPING, 0
     while taken < steps:
         H, g = _normal_equations(at, noise)
-        move = _step(H, g, at.unit, 0.0, free)
+        move = linear_step(H, g, at.unit, 0.0, free)
         promised = float(-2.0 * g @ move - move @ H @ move)
         if promised <= tolerance * cost:
             return Fit(at.unit, cost, taken, True, at)
         accepted = None
         while accepted is None and damping <= WORST_DAMPING:
-            moves = [_step(H, g, at.unit, factor * damping, free) for factor in DAMPINGS]
+            moves = [linear_step(H, g, at.unit, factor * damping, free) for factor in DAMPINGS]
             places = [np.clip(at.unit + move, 0.0, 1.0) for move in moves]
             tried = residuals_at(model, places)
             costs = [_cost(r, u, noise) for r, u in zip(tried, places, strict=True)]
@@ -161,7 +162,7 @@ def gauss_newton(
     return Fit(at.unit, cost, taken, False, at)
 
 
-def _cost(residuals: np.ndarray, unit: np.ndarray, noise: NoiseModel | None) -> float:
+def _cost(residuals: np.ndarray, unit: np.ndarray, noise: NoiseModel | EvenNoise | None) -> float:
     """Sum of squares; infinite where a slice broke down."""
     if not np.isfinite(residuals).all():
         return float("inf")
@@ -171,7 +172,9 @@ def _cost(residuals: np.ndarray, unit: np.ndarray, noise: NoiseModel | None) -> 
     return float(residuals @ noise.solve(residuals[:, None])[:, 0]) + prior
 
 
-def _normal_equations(at: Linearisation, noise: NoiseModel | None) -> tuple[np.ndarray, np.ndarray]:
+def _normal_equations(
+    at: Linearisation, noise: NoiseModel | EvenNoise | None
+) -> tuple[np.ndarray, np.ndarray]:
     """Half the second derivatives [d, d] and half the gradient [d] of the cost.
 
     Nuisance numbers are eliminated.
@@ -191,7 +194,7 @@ def _normal_equations(at: Linearisation, noise: NoiseModel | None) -> tuple[np.n
     return H, g
 
 
-def _step(
+def linear_step(
     H: np.ndarray, g: np.ndarray, unit: np.ndarray, damping: float, free: np.ndarray
 ) -> np.ndarray:
     """The move [d] that minimises the damped quadratic within the box."""

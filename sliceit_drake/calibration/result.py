@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sliceit_drake.calibration.bands import ForceBand
 from sliceit_drake.calibration.prediction import Prediction, Predictor
 from sliceit_drake.calibration.uncertainty import Posterior
 from sliceit_drake.configuration import dump_yaml
@@ -36,7 +37,10 @@ class Calibration:
         rms: On the records, N.
         search_rms: Best of the search alone, N; of the start where there was no search.
         refined_rms: Best after Adam, N; the same.
+        polished_rms: Least of all, N; where the values are that the noise makes more probable,
+            `rms` is a little greater.
         posterior: Of the parameters.
+        band: Within what another measurement is expected.
         blocks: RMS error on each block of depth when it was held out, N.
         held_out_rms: On all of them, N; None if none was held out.
         held_out_records: RMS error by name on records that were not fitted, N.
@@ -49,7 +53,9 @@ class Calibration:
     rms: float
     search_rms: float
     refined_rms: float
+    polished_rms: float
     posterior: Posterior
+    band: ForceBand
     blocks: list[float]
     held_out_rms: float | None
     held_out_records: dict[str, float]
@@ -65,14 +71,20 @@ class Calibration:
     def table(self) -> str:
         """Parameters with 90 % intervals, which of them are not determined, errors, warnings."""
         lines = [
-            self.posterior.table(self.predictor.values(self.unit)),
+            self.posterior.table(),
             *self.posterior.remarks(),
             f"RMS error: search {self.search_rms:.3f}, Adam {self.refined_rms:.3f}, "
-            f"polished {self.rms:.3f} N",
+            f"polished {self.polished_rms:.3f}, with these values {self.rms:.3f} N",
         ]
         if self.held_out_rms is not None:
             blocks = ", ".join(f"{b:.2f}" for b in self.blocks)
             lines.append(f"Held-out blocks of depth: {self.held_out_rms:.3f} N ({blocks})")
+        low, high = self.band.interval()
+        inside = np.mean((low <= self.predictor.measured) & (self.predictor.measured <= high))
+        lines.append(
+            f"90 % band of the force: {np.mean(high - low):.3g} N wide in the mean, and "
+            f"{100.0 * inside:.0f} % of the rows are in it"
+        )
         for name, error in self.held_out_records.items():
             lines.append(f"Held-out record {name}: {error:.3f} N")
         lines += [f"Warning: {text}" for text in self.warnings]
@@ -87,10 +99,11 @@ class Calibration:
         axes = sheet.subplots(
             2, len(shown), squeeze=False, sharex="col", gridspec_kw={"height_ratios": (3, 1)}
         )
-        for target, prediction, (upper, lower) in zip(
-            shown, self.predictions, axes.T, strict=False
+        ends = zip(*map(self.predictor.split, self.band.interval()), strict=True)
+        for target, prediction, band, (upper, lower) in zip(
+            shown, self.predictions, ends, axes.T, strict=False
         ):
-            _plot_record(target, prediction.predicted, upper, lower)
+            _plot_record(target, prediction.predicted, band, upper, lower)
         return sheet
 
     def calibrated_food(self, date: str = "", command: str = "") -> CalibratedFood:
@@ -129,6 +142,7 @@ class Calibration:
             "rms_N": self.rms,
             "search_rms_N": self.search_rms,
             "adam_rms_N": self.refined_rms,
+            "polished_rms_N": self.polished_rms,
             "held_out_rms_N": self.held_out_rms,
             "held_out_blocks_N": self.blocks,
             "held_out_records_N": self.held_out_records,
@@ -141,19 +155,29 @@ class Calibration:
         (directory / "calibration.json").write_text(text, encoding="utf-8")
 
 
-def _plot_record(target: RecordTarget, predicted: np.ndarray, upper: "Axes", lower: "Axes") -> None:
-    channels = ("force",) if len(target.channels) == 1 else CHANNELS
+def _plot_record(
+    target: RecordTarget,
+    predicted: np.ndarray,
+    band: tuple[np.ndarray, np.ndarray],
+    upper: "Axes",
+    lower: "Axes",
+) -> None:
+    what = "vertical force" if target.channels == ("force_z",) else "force"
+    channels = (what,) if len(target.channels) == 1 else CHANNELS
     for c, name in enumerate(channels):
         # The press, which is nearly all of the force, stands out.
         style = (":", "--", "-")[c] if len(channels) > 1 else "-"
         upper.plot(target.time, target.measured[:, c], style, color=MEASURED, lw=1.2)
         upper.plot(target.time, predicted[:, c], style, color=PREDICTED, lw=1.2)
+        low, high = (end[:, c] for end in band)
+        upper.fill_between(target.time, low, high, color=PREDICTED, alpha=0.15, lw=0)
         rest = target.measured[:, c] - predicted[:, c]
         lower.plot(target.time, rest, style, color="#475569", lw=1.0, label=name)
     rms = target.rms_error(predicted)
-    upper.set(title=f"{target.record.name}: RMS {rms:.2f} N", ylabel="force on the knife [N]")
+    upper.set(title=f"{target.record.name}: RMS {rms:.2f} N", ylabel=f"{what} on the knife [N]")
     upper.plot([], [], color=MEASURED, label="measured")
     upper.plot([], [], color=PREDICTED, label="calibrated")
+    upper.fill_between([], [], [], color=PREDICTED, alpha=0.15, lw=0, label="90 % band")
     lower.set(xlabel="time [s]", ylabel="rest [N]")
     for axis in (upper, lower):
         axis.grid(alpha=0.25)

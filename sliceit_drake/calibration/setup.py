@@ -13,13 +13,16 @@ from sliceit_drake.configuration import (
 from sliceit_drake.cutting.bench_errors import BenchErrors
 from sliceit_drake.cutting.board import Board
 from sliceit_drake.cutting.foods.food import Food, make_food_model
+from sliceit_drake.cutting.foods.material import Material
+from sliceit_drake.cutting.foods.shapes import Box, Cylinder, Ellipsoid, HalfCylinder
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError
 from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.parameters import POINT_PARAMETERS, parameter_names
+from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.resources import named_yaml, shipped_names
 
-__all__ = ["CalibrationSetup", "Literature", "ParameterRange", "load_setup"]
+__all__ = ["CalibrationSetup", "Literature", "ParameterRange", "load_setup", "setup_of_record"]
 
 FOLDER = "calibration/setups"
 
@@ -118,6 +121,54 @@ class CalibrationSetup:
                     field=f"{where}.{name}",
                     fix="Give low < high.",
                 )
+
+
+SHAPES = {s.__name__.lower(): s for s in (Cylinder, HalfCylinder, Box, Ellipsoid)}
+"""Of a food that only a record describes."""
+
+
+def setup_of_record(record: SliceRecord) -> CalibrationSetup:
+    """A setup for a food that none ships for: its shape and name as the record has them, a material
+    of vegetables, and wide ranges.
+
+    Raises:
+        ConfigurationError: The record does not say shape or size.
+    """
+    facts = record.metadata.food
+    if facts.shape not in SHAPES or facts.size is None:
+        missing = "food.size" if facts.shape in SHAPES else "food.shape"
+        raise ConfigurationError(
+            "is not given, and without --food there is no other",
+            source=record.file or record.name,
+            field=missing,
+            fix="Give it in the record's YAML file, or a setup by --food.",
+        )
+    material = Material(
+        youngs_modulus=1e6,
+        poisson_ratio=0.4,
+        density=1000.0,
+        toughness=300.0,
+        strength=3e5,
+        damping_time=5e-4,
+        friction=0.2,
+    )
+    food = Food(
+        name=facts.name,
+        shape=SHAPES[facts.shape]().resized(facts.size),
+        material=material,
+        hold_distance=min(0.0119, 0.35 * facts.size[1]),
+    )
+    wide = "from soft gels to hard roots"
+    return CalibrationSetup(
+        food=food,
+        numerics=Numerics(time_step=5e-4),
+        parameters=[
+            ParameterRange("material.toughness", 10.0, 4000.0, why=wide),
+            ParameterRange("material.youngs_modulus", 5e4, 1e7, why=wide),
+            ParameterRange("material.friction", 0.005, 1.0, why=wide),
+        ],
+        speed_factor=[0.7, 1.4],
+    )
 
 
 def load_setup(name: str | Path) -> CalibrationSetup:

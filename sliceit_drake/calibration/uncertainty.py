@@ -28,8 +28,10 @@ ROUNDS = 3
 STEPS = 3
 SETTLED = 0.1
 """Largest move, in standard deviations, with which the alternation of noise and fit ends."""
-ODDS = 3.0
-"""Standard deviations between two estimates that noise does not explain."""
+WORSE = 1.1
+"""Error of the weighted fit over that of least squares from which on the noise is refuted."""
+AT_END = 5e-3
+"""Part of a range within which a value is at its end."""
 CORRELATED = 0.9
 SHARE = 0.3
 """Least part of a parameter in a direction for it to be named."""
@@ -111,12 +113,27 @@ class Posterior(ParameterDistribution):
             if len(direction) > 1 and frozenset(direction) not in named:
                 parts = ", ".join(f"{name} {part:+.2f}" for name, part in direction.items())
                 lines.append(f"not determined together, in parts of their ranges: {parts}")
-        return lines + self.notes
+        return lines + self.at_ends() + self.notes
+
+    def at_ends(self) -> list[str]:
+        """Which parameters are at an end of their range, and what to do, as sentences."""
+        lines = []
+        for name, place, low, high in zip(self.names, self.mean, self.low, self.high, strict=True):
+            if AT_END < place < 1.0 - AT_END:
+                continue
+            end, value, word = ("low", low, "less") if place < 0.5 else ("high", high, "more")
+            own = name.split(":")[0] if ":" in name else f"{end} of {name} under parameters"
+            lines.append(
+                f"{name} is at the {end} end of its range, {value:.4g}: the force asks for {word}. "
+                f"If the food can have {word}, move the setup's {own}; if not, the model lacks "
+                "something else, and this parameter stands in for it"
+            )
+        return lines
 
 
 @dc.dataclass
 class Estimate:
-    """The weighted fit of all parameters.
+    """The estimate of all parameters.
 
     Attributes:
         unit: Places in the ranges [d], those of the posterior's mean.
@@ -137,9 +154,11 @@ def estimate(model: Predictor, unit: np.ndarray, rounds: int = ROUNDS) -> Estima
 
     The parameters minimise the residuals weighted with the noise's covariance (generalised least
     squares) plus the prior of a uniform range, which has variance 1/12 about its middle: what the
-    data do not determine stays as wide as its range. Where samples are autocorrelated and slices
-    differ, this is not the fit of least squares; the posterior notes where the two are further
-    apart than noise explains. What the sub-step does wrong at `unit` is taken off the predictions.
+    data do not determine stays as wide as its range. A model that lacks something leaves residuals
+    that are no noise, and such weights then give up the force for its changes. Where that costs
+    much of the force, which the posterior notes, the estimate is that of least squares, with the
+    covariance that it has under these residuals. What the sub-step does wrong at `unit` is taken
+    off the predictions.
 
     Args:
         unit: A good fit, such as that of least squares [d].
@@ -150,7 +169,7 @@ def estimate(model: Predictor, unit: np.ndarray, rounds: int = ROUNDS) -> Estima
     """
     start = np.clip(unit, 0.0, 1.0)
     model = model.without_step_error(start)
-    at = linearise(model, start)
+    at = first = linearise(model, start)
     problem = _noise_problem(model, at)
     noise = problem.fit()
     for _ in range(rounds):
@@ -163,8 +182,24 @@ def estimate(model: Predictor, unit: np.ndarray, rounds: int = ROUNDS) -> Estima
         noise = problem.fit(noise)
         if moved.max() < SETTLED:
             break
-    posterior = _posterior(model, at.unit, problem.averaged_covariance(), noise, unit)
-    return Estimate(at.unit, posterior, noise, problem.covariance())
+    errors = [float(np.sqrt(np.mean(x.residuals[model.used] ** 2))) for x in (first, at)]
+    if errors[1] <= WORSE * errors[0]:
+        posterior = _posterior(model, at.unit, problem.averaged_covariance(), noise)
+        return Estimate(at.unit, posterior, noise, problem.covariance())
+    even = noise.evened
+    fit = gauss_newton(model, start, noise=even, steps=STEPS, tolerance=1e-5, linearisation=first)
+    at = _at_end(model, fit)
+    problem = _noise_problem(model, at)
+    noise = problem.fit(noise)
+    covariance = problem.covariance_of_least_squares(even.variance)
+    posterior = _posterior(model, at.unit, covariance, noise)
+    posterior.notes.append(
+        f"the fit weighted with the noise misses the force by {errors[1]:.3g} N, least squares by "
+        f"{errors[0]:.3g} N: the model lacks something that noise does not explain. The values are "
+        "those of least squares, and the intervals count what is left as an error that goes on "
+        "along the cut"
+    )
+    return Estimate(at.unit, posterior, noise, covariance)
 
 
 def _at_end(model: Predictor, fit: Fit) -> Linearisation:
@@ -204,7 +239,6 @@ def _posterior(
     unit: np.ndarray,
     covariance: np.ndarray,
     noise: NoiseModel,
-    least_squares: np.ndarray,
 ) -> Posterior:
     parameters = model.parameters
     notes = []
@@ -218,15 +252,6 @@ def _posterior(
             f"{', '.join(model.step_unknown)}: breaks down with small sub-steps, so that the error "
             "of the usual ones is not known and not in the intervals"
         )
-    sd = np.sqrt(np.diag(covariance))
-    for k, parameter in enumerate(parameters):
-        if abs(least_squares[k] - unit[k]) > ODDS * sd[k]:
-            notes.append(
-                f"{parameter.name}: least squares gives "
-                f"{parameter.value(float(least_squares[k])):.3g}, the fit weighted with the noise "
-                f"{parameter.value(float(unit[k])):.3g}: the model lacks something that noise "
-                "does not explain"
-            )
     return Posterior(
         names=[p.name for p in parameters],
         low=[float(p.low) for p in parameters],

@@ -1,12 +1,16 @@
 """Calibrate a food from slice records (NAME.csv and NAME.yaml, see docs/reference/records.md).
 
-Searches with Optuna's TPE, refines the best places with Adam on the exact gradient, polishes with
-Gauss-Newton, and says how sure it is. Writes to DIR:
+Compares structures of the food (skin, puncture, blunt edge, core, compliance, support) on depth
+that is left out, says why it takes or leaves each, polishes what it took with Gauss-Newton, and
+says how sure it is. With --structure setup it keeps the setup's, searches with Optuna's TPE and
+refines the best places with Adam on the exact gradient. Without --food the record says name, shape
+and size. Writes to DIR:
   food.yaml         the calibrated food: scenarios load it with `calibration: DIR/food.yaml`
   calibration.json  errors by stage, held-out errors, parameters
   fit.png           measured and predicted force
+  structure.json    what was compared, and setup.yaml, the setup with what was taken
   points.csv        with --per-point: factors of the cut points' toughness
-  trials.log        all trials; a run that was killed goes on from here, and so do others
+  trials.log        all trials of a search; a run that was killed goes on, and so do others
   adam-*.npz        checkpoints of Adam
 
 Several machines: give all the same --storage and different --seed, as
@@ -37,13 +41,20 @@ if TYPE_CHECKING:
 
 __all__ = ["add_arguments", "run"]
 
+TRIALS = 500
+"""Of a search."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the command's arguments."""
     parser.add_argument(
         "records", metavar="RECORD", nargs="*", type=here_or_shipped, help="NAME.csv or folder"
     )
-    parser.add_argument("--food", metavar="NAME", help="a setup by name, or a YAML file of one")
+    parser.add_argument(
+        "--food",
+        metavar="NAME",
+        help="a setup by name, or a YAML file of one (default: what the first record says)",
+    )
     add_output_folder(parser, "where the results go")
     parser.add_argument("--show", metavar="NAME", help="print a calibrated food and stop")
     parser.add_argument(
@@ -56,7 +67,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="polish a calibrated food, by name or YAML file, in place of a search",
     )
-    parser.add_argument("--trials", type=int, default=500, help="of the search (default 500)")
+    parser.add_argument(
+        "--structure",
+        choices=("choose", "setup"),
+        help="choose it from the curves, or keep that of the setup (default: choose; with "
+        "--trials, --storage or --start: setup)",
+    )
+    parser.add_argument("--trials", type=int, help=f"of the search (default {TRIALS})")
     parser.add_argument("--steps", type=int, default=100, help="of Adam (default 100)")
     parser.add_argument("--starts", type=int, default=2, help="places refined (default 2)")
     parser.add_argument("--seed", type=int, default=0, help="of the search (default 0)")
@@ -92,10 +109,14 @@ def run(options: argparse.Namespace) -> int:
     if options.show:
         return _show(options.show)
     for name in ("food", "output"):
-        if getattr(options, name) is None:
+        if getattr(options, name) is None and (name != "food" or options.literature):
             raise ConfigurationError(
                 "is not given", field=f"--{name}", fix=f"Give --{name}; see --help."
             )
+    if options.structure is None:
+        beside = (options.trials, options.storage, options.start)
+        options.structure = "choose" if beside == (None, None, None) else "setup"
+    options.trials = TRIALS if options.trials is None else options.trials
     any_number, some = (0, math.inf), (1, math.inf)
     check_numbers(options, trials=some, starts=some, workers=WORKERS, seed=(0, 2**32 - 1))
     check_numbers(options, steps=any_number, blocks=any_number, per_point=any_number)
@@ -150,13 +171,18 @@ def _calibrate(options: argparse.Namespace) -> int:
     import sys
 
     from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate, values_of
-    from sliceit_drake.calibration.setup import load_setup
+    from sliceit_drake.calibration.setup import load_setup, setup_of_record
     from sliceit_drake.calibration.storage import without_password
+    from sliceit_drake.calibration.structure import choice_in
     from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
     from sliceit_drake.records.validation import check_record, load_record, record_files
 
-    setup = load_setup(options.food)
+    setup = None if options.food is None else load_setup(options.food)
     records = [load_record(file) for path in options.records for file in record_files(path)]
+    if setup is None:
+        if not records:
+            raise ConfigurationError("no record is given", field="RECORD", fix="Name one.")
+        setup = setup_of_record(records[0])
     for record in records:
         for finding in check_record(record):
             print(finding)
@@ -168,10 +194,24 @@ def _calibrate(options: argparse.Namespace) -> int:
                 field="--hold-out",
                 fix="Give the names of records that are given.",
             )
+    fitted = [r for r in records if r.name not in options.hold_out]
+    start = values_of(load_calibrated_food(options.start)) if options.start else None
+    warnings: list[str] = []
+    if options.structure == "choose":
+        with StageBars() as bars:
+            choice = choice_in(
+                options.output,
+                setup,
+                fitted,
+                options.workers,
+                lambda done, all, error: bars.show_error("structures", done, all, error),
+            )
+        print("\n".join(choice.lines))
+        setup, start, warnings = choice.setup, choice.values, choice.warnings
     with StageBars() as bars:
         result = calibrate(
             setup,
-            [r for r in records if r.name not in options.hold_out],
+            fitted,
             options.output,
             CalibrationOptions(
                 trials=options.trials,
@@ -181,7 +221,7 @@ def _calibrate(options: argparse.Namespace) -> int:
                 workers=options.workers,
                 storage=options.storage,
                 blocks=options.blocks,
-                start=values_of(load_calibrated_food(options.start)) if options.start else None,
+                start=start,
             ),
             [r for r in records if r.name in options.hold_out],
             bars.show_error,
@@ -189,7 +229,7 @@ def _calibrate(options: argparse.Namespace) -> int:
     # The command is kept with the food, for others to read.
     command = shlex.join(["sliceit", *(without_password(a) for a in sys.argv[1:])])
     result.save(options.output, command)
-    print(result.table())
+    print("\n".join([result.table(), *(f"Warning: {text}" for text in warnings)]))
     if options.per_point:
         _fit_points(options, result)
     print(f"Results in {options.output}/")

@@ -51,6 +51,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--touch", action="store_true", help="first find the board's height with the knife"
     )
+    parser.add_argument(
+        "--commission",
+        action="store_true",
+        help="walk through the first steps with a robot, from a push by hand to the first cut",
+    )
 
 
 def add_robot_arguments(parser: argparse.ArgumentParser) -> None:
@@ -80,16 +85,21 @@ def add_robot_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--move-to-start",
         action="store_true",
-        help='first move the joints straight to the start, after you typed "move"; nothing looks '
-        "for obstacles on the way",
+        help='first move the joints straight to the start, after you typed "move"; of '
+        "obstacles on the way only board, table and holder are looked for",
     )
 
 
 def run(options: argparse.Namespace) -> int:
     """Runs the command."""
     scenario = scenario_of(options)
-    directory = output_of(options, scenario.name, "_robot")
+    suffix = "_commissioning" if options.commission else "_robot"
+    directory = output_of(options, scenario.name, suffix)
     robot = robot_of(options)
+    if options.commission:
+        from sliceit_drake.robot_run.commissioning import Commissioning
+
+        return 0 if Commissioning(robot, scenario, directory).walk() else 1
 
     from sliceit_drake.diagrams.outputs.slice_record_of_run import slice_record_of
     from sliceit_drake.records.slice_record import write_record

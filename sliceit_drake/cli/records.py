@@ -3,11 +3,13 @@ docs/reference/records.md describes the format; calibration/records holds three 
 """
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sliceit_drake.cli.arguments import add_output_folder
 from sliceit_drake.cli.extras import needs_extra
+from sliceit_drake.cli.record_questions import add_question_options, complete_facts
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.resources import here_or_shipped
 
@@ -35,8 +37,12 @@ Make a slice record from another format.
             variables timestamp, actual_TCP_pose, actual_TCP_speed, actual_TCP_force (and actual_q):
               sliceit records import ur_rtde run_07.csv --metadata session.yaml \\
                 --tcp-to-knife 0 0 0.12 3.1416 0 0 --output records
-  force     two columns, time in s and force in N; the motion is nominal, straight down at
-            motion.speed:
+  force     time and force of any lab, with a comma, semicolon, tab or spaces between; the motion
+            is nominal, straight down at motion.speed. At a terminal the command asks for what the
+            table does not say; in a script options or a YAML file say it:
+              sliceit records import force slice.csv --output records
+              sliceit records import force slice.csv --component vertical --food radish \\
+                --shape cylinder --size 0.027 0.12 0.027 --speed 0.02 --output records
               sliceit records import force scale.csv --metadata facts.yaml --contact 0.4 \\
                 --output records
   profile   a force profile digitised from a figure, as those in calibration/measured
@@ -50,6 +56,14 @@ Make a slice record from another format.
 provenance, and what is unknown (docs/reference/records.md). Writes DIR/NAME.csv and DIR/NAME.yaml,
 and prints what `sliceit records check` finds in them.
 """
+
+
+AGAIN = {
+    "flipped sign": "--sign by_knife",
+    "kilonewtons": "--units s kN",
+    "force unit": "--units s mN",
+}
+"""What mends an import of a force in which something was found."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -78,7 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     make.add_argument(
         "format", choices=("ur_rtde", "force", "profile", "rosbag"), help="what FILE is"
     )
-    make.add_argument("file", metavar="FILE", type=Path, help="what to read")
+    make.add_argument("file", metavar="FILE", type=here_or_shipped, help="what to read")
     add_output_folder(make, "folder of records", required=True)
     make.add_argument("--metadata", metavar="YAML", type=Path, help="what FILE does not say")
     make.add_argument("--name", help="name of the record; default: that in YAML, or FILE's")
@@ -102,15 +116,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     make.add_argument(
         "--component",
-        choices=("norm", "vertical"),
-        default="norm",
-        help="force: what of the force FILE has (default: norm)",
+        choices=("norm", "vertical", "components"),
+        help="force: what of the force FILE has (without a terminal: norm)",
+    )
+    make.add_argument(
+        "--columns",
+        metavar="COLUMN",
+        nargs="+",
+        default=(),
+        help="force: names, or numbers from 1, of time and force, or of time and x, y, z",
+    )
+    make.add_argument(
+        "--units",
+        metavar=("TIME", "FORCE"),
+        nargs=2,
+        default=(),
+        help="force: units in FILE, as ms kN, where its header does not say them (default: s N)",
+    )
+    make.add_argument(
+        "--sign",
+        choices=("on_knife", "by_knife"),
+        help="force: whether a vertical force upwards is positive in a press (on_knife)",
     )
     make.add_argument(
         "--contact",
         metavar="S",
         type=float,
-        help="force, profile: time at which the force rises, which ends the air phase",
+        help="force, profile: time at which the force rises, which ends the air phase (force: "
+        "found by default)",
     )
     make.add_argument(
         "--topics", metavar=("WRENCH", "MOTION"), nargs=2, help="rosbag: of force and of motion"
@@ -123,7 +156,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=("S", "S"),
         nargs=2,
         type=float,
-        help="rosbag: begin and end of the slice, s after the first wrench; default: all",
+        help="force, rosbag: begin and end of the slice, s, in the time of FILE or after the "
+        "first wrench; default: all",
     )
     make.add_argument(
         "--clock",
@@ -131,6 +165,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="header",
         help="rosbag: stamps of the messages (the default), or when they were recorded",
     )
+    add_question_options(make)
     make.set_defaults(action=_import)
 
 
@@ -168,14 +203,69 @@ def _import(options: argparse.Namespace) -> int:
 
     metadata = load_yaml(SliceMetadata, options.metadata)
     metadata.name = options.name or metadata.name
+    if options.format == "force":
+        metadata.wrench.sign = options.sign or metadata.wrench.sign
+        options.component = options.component or _component(options)
+        metadata = complete_facts(metadata, options)
     record = _imported(options, metadata)
     file = write_record(record, options.output / record.name)
     print(f"{file} and .yaml: {len(record)} rows, {record.time[-1] - record.time[0]:.4g} s")
+    if options.format == "force":
+        _say_what_was_taken(record)
     record.file = str(file)
     findings = check_record(record)
     for finding in findings:
         print(finding)
+        if options.format == "force" and finding.kind in AGAIN:
+            print(f"If so, import it again with {AGAIN[finding.kind]}.")
     return 1 if any(finding.severity == "error" for finding in findings) else 0
+
+
+def _say_what_was_taken(record: "SliceRecord") -> None:
+    """What the command found by itself, so that a user sees where it erred."""
+    from sliceit_drake.prediction.noise import without_spikes
+
+    facts = record.metadata
+    begins = [phase.start for phase in facts.motion.phases if phase.label == "slice"]
+    if record.phase("air").any():
+        print(f"The force begins at {begins[0]:.4g} s: give --contact if it does not.")
+    else:
+        print("The record begins in the food: a calibration lets the knife come from above it.")
+    if "motion.speed" in facts.unknown:
+        print(
+            f"The speed is not known: {facts.motion.speed:.3g} m/s would bring the knife to the "
+            "board with the last row. A calibration fits it."
+        )
+    if facts.motion.speed is not None and facts.food.size is not None:
+        way = facts.motion.speed * (record.time[-1] - begins[0])
+        print(
+            f"By the last row the knife is {1e3 * way:.0f} mm deep in a food that is "
+            f"{1e3 * facts.food.size[2]:.0f} mm high."
+        )
+    if "no unit" in facts.processing[0].note:
+        print("The table names no unit: s and N are taken. Give --units if they are others.")
+    if spikes := int((without_spikes(record.measured_force)[1] > 0.0).any(1).sum()):
+        print(
+            f"{spikes} rows stand out from those before and after, as of a faulty cable: they "
+            "count for little."
+        )
+    if any(step.name == "tare" for step in facts.processing):
+        print("The mean force before that is taken off.")
+    if facts.unknown:
+        print(f"Listed as unknown: {', '.join(facts.unknown)}.")
+
+
+def _component(options: argparse.Namespace) -> str:
+    """What of the force the file has, asked at a terminal."""
+    if len(options.columns) == 4:
+        return "components"
+    if not sys.stdin.isatty() or options.metadata is not None:
+        return "norm"
+    while True:
+        words = "norm, vertical or components"
+        answer = input(f"What of the force the file has, {words} (Enter: norm): ").strip()
+        if not answer or answer in words.replace(" or", ",").split(", "):
+            return answer or "norm"
 
 
 def _imported(options: argparse.Namespace, metadata: "SliceMetadata") -> "SliceRecord":
@@ -185,7 +275,13 @@ def _imported(options: argparse.Namespace, metadata: "SliceMetadata") -> "SliceR
         return importers.import_profile(options.file, metadata, contact=options.contact)
     if options.format == "force":
         return importers.import_force(
-            options.file, metadata, component=options.component, contact=options.contact
+            options.file,
+            metadata,
+            component=options.component,
+            contact=options.contact,
+            columns=options.columns,
+            units=options.units,
+            between=options.between,
         )
     if options.format == "rosbag" and options.topics is None:
         raise ConfigurationError(

@@ -159,6 +159,6 @@ def run_coupling_steps(
     ws.advance(states, R, p)
     new, rows = ws.read(ws.states[-1]).copy(), ws.read(ws.result_rows).copy()
     return [
-        CouplingSteps(state, ws.substeps, model.section_area, row, ws.result_layout)
-        for model, state, row in zip(ws.models, new, rows, strict=True)
+        CouplingSteps(new[c], ws.substeps, model.section_area, rows[c], ws.result_layout)
+        for c, model in enumerate(ws.models)
     ]

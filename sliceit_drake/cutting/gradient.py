@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from sliceit_drake.cutting.coupling_steps import run_coupling_steps
 from sliceit_drake.cutting.driver import Driver
-from sliceit_drake.cutting.kernels.layouts import BLADE_SUMS, POINT_SUMS
+from sliceit_drake.cutting.kernels.layouts import BladeSum, PointSum
 from sliceit_drake.cutting.kernels.types import LANES, PARAMETERS
 from sliceit_drake.cutting.knife_path import Mounting
 from sliceit_drake.cutting.model import CuttingModel
@@ -148,22 +149,21 @@ class SliceAdjoint:
                 ws = self._driver.workspace([model], substeps=number)
                 rise, shift = mounting.given.tolist()
                 run.p[e + 1] = p[e + 1] + [-shift, 0.0, rise]
-                ws.advance(before[None], run.R[None, e : e + 2], run.p[None, e : e + 2])
-                wrenches = ws.results()["wrenches"][0, 0]
-                if not np.isfinite(wrenches).all():
+                poses = run.R[None, e : e + 2], run.p[None, e : e + 2]
+                (step,) = run_coupling_steps(ws, before[None], *poses)
+                if not step.finite:
                     raise CuttingError(f"at {(e + 1) * self.exchange_period:.4g} s {NOT_FINITE}")
-                run.wrenches[e] = wrenches.sum(0)
+                run.wrenches[e] = step.wrenches[0].sum(0)
                 draw, _, rise = (-run.wrenches[e, 3:]).tolist()
                 balanced = mounting.rigid or mounting.balanced(-rise, draw, 0.0, None)
                 if balanced and substeps is None:
-                    added = ws.results()["added_force"][0].tolist()
-                    wanted = rule.again(number, added, after)
+                    wanted = rule.again(number, step.added_force.tolist(), after)
                     if wanted != number:
                         number, balanced = wanted, False
                         mounting.undo()
             run.substeps.append(number)
-            run.states.append(ws.read(ws.states[-1])[0].copy())
-            run.states[-1][stepping] = after
+            run.states.append(step.state)
+            step.state[stepping] = after
         return run
 
     def gradient(self, run: SliceRun, weights: np.ndarray) -> SliceGradient:
@@ -219,8 +219,6 @@ class SliceAdjoint:
         adj_sums, adj_R[1, :, 1] = self._adjoint_of_sums(ws, weights, run.R[e + 1])
         if n not in self._backward:
             self._backward[n] = ws.captured(lambda: self._launch_backward(ws))
-        for array in (ws.parameter_rows.grad, self._adj_mu, self._adj_lam):
-            array.zero_()
         ws.write(ws.states[-1].grad, adj_state[None])
         ws.write(ws.sum_rows.grad, adj_sums[None])
         wp.capture_launch(self._backward[n])
@@ -236,7 +234,7 @@ class SliceAdjoint:
         row = ws.read(ws.parameter_rows.grad)[0].astype(np.float64)
         scalars = ws.parameter_layout["P"].start
         for name, adjoint in (("mu", self._adj_mu), ("lam", self._adj_lam)):
-            row[scalars + PARAMETERS.index(name)] += adjoint.numpy().astype(np.float64).sum()
+            row[scalars + PARAMETERS.index(name)] += ws.read(adjoint).astype(np.float64).sum()
         return _Back(ws.read(ws.states[0].grad)[0].astype(np.float64), adj_p, adj_R, row)
 
     def _adjoint_of_sums(
@@ -245,29 +243,32 @@ class SliceAdjoint:
         """Adjoint of `knife_wrenches`: of the sums as the workspace holds them, and of Ky."""
         n = ws.substeps
         of_moment, of_force = weights[:3], weights[3:]
-        (result,) = ws.results()
-        blade, sums = result["blade"][0], result["point_sums"][0]
-        push, area = blade["on_knife"] - blade["on_blade"], sums["buried_area"]
+        result, at = ws.read(ws.result_rows)[0], ws.result_layout
+        sums, (_, on_knife, on_blade) = result[at["point_sums"]], result[at["blade"]].tolist()
+        push, area = on_knife - on_blade, float(sums[PointSum.BURIED_AREA])
         lateral = push / n * R[:, 1]
-        middle = sums["buried_moment"] / area if area > 0.0 else np.zeros(3)
+        buried = slice(PointSum.BURIED_MOMENT, PointSum.BURIED_MOMENT + 3)
+        middle = sums[buried] / area if area > 0.0 else np.zeros(3)
         of_lateral = of_force + _cross(of_moment, middle)
         of_middle = _cross(lateral, of_moment)
-        adjoint = np.zeros(ws.sum_rows.shape[1])
-        total, bending = np.zeros(1, POINT_SUMS), np.zeros(1, BLADE_SUMS)
-        total["forces"], total["moments"] = of_force / n, of_moment / n
+        total = np.zeros(len(sums))
+        total[PointSum.FORCES : PointSum.FORCES + 9].reshape(3, 3)[:] = of_force / n
+        total[PointSum.MOMENTS : PointSum.MOMENTS + 9].reshape(3, 3)[:] = of_moment / n
         if area > 0.0:
-            total["buried_moment"] = of_middle / area
-            total["buried_area"] = -(of_middle @ middle) / area
-        of_block = np.repeat(total.view(float), LANES)
-        adjoint[ws.sum_layout["points"]] = np.tile(of_block, ws.point_blocks)
+            total[buried] = of_middle / area
+            total[PointSum.BURIED_AREA] = -(of_middle @ middle) / area
+        adjoint = np.zeros(ws.sum_rows.shape[1])
+        adjoint[ws.sum_layout["points"]].reshape(ws.point_blocks, -1, LANES)[:] = total[:, None]
         along = float(of_lateral @ R[:, 1]) / n
-        bending["on_knife"], bending["on_blade"] = along, -along
-        adjoint[ws.sum_layout["blade"]] = bending.view(float)
+        blade = ws.sum_layout["blade"].start
+        adjoint[blade + BladeSum.ON_KNIFE], adjoint[blade + BladeSum.ON_BLADE] = along, -along
         return adjoint, of_lateral * push / n
 
     def _launch_backward(self, ws: Workspace) -> None:
         for array in (*ws.states[:-1], *(slot.ahead for slot in ws.slots), ws.motion_rows):
             array.grad.zero_()
+        for array in (ws.parameter_rows.grad, self._adj_mu, self._adj_lam):
+            array.zero_()
         for k in reversed(range(ws.steps)):
             self._launch_substep_adjoint(ws, k)
         ws.launch_look_ahead(adjoint=True)

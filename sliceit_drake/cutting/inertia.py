@@ -96,14 +96,19 @@ class Inertia:
         blade = self.matrix[:-1, [-1]]
         return csc_array(self.matrix[:-1, :-1] - blade @ blade.T / self.matrix[-1, -1])
 
+    @functools.cached_property
+    def _of_blade(self) -> tuple[csc_array, float]:
+        """The blade's row without its own entry [1, K], and that entry, kg."""
+        return self.matrix[[-1], :-1], self.matrix[-1, -1]
+
     def kinetic_energy(self, velocities: np.ndarray, blade: float | None = None) -> float:
         """Of velocities of the moving nodes in the matrix's order [K, 3] and of the blade along y,
         m/s; in J. Without the blade's, it follows the nodes."""
         v = np.asarray(velocities, np.float64)
         energy = 0.5 * (v * (self.of_nodes @ v)).sum()
         if blade is not None:
-            heavy = self.matrix[-1, -1]
-            ahead = blade + float((self.matrix[[-1], :-1] @ v[:, 1])[0]) / heavy
+            to_blade, heavy = self._of_blade
+            ahead = blade + float((to_blade @ v[:, 1])[0]) / heavy
             energy += 0.5 * heavy * ahead**2
         return float(energy)
 

@@ -146,6 +146,7 @@ class CuttingModel(CutGeometry):
     point_scales: PointScales
     true_mass: np.ndarray = dc.field(init=False)
     _inertia_of: "CuttingModel | None" = dc.field(init=False, default=None)
+    _longer: "CuttingModel | None" = dc.field(init=False, default=None)
     weight: np.ndarray = dc.field(init=False)
     toughness: np.ndarray = dc.field(init=False)
     toughness_by_scale: np.ndarray = dc.field(init=False)
@@ -297,13 +298,10 @@ class CuttingModel(CutGeometry):
         if self._inertia_of is not None:
             return self._inertia_of.with_step(numerics.time_step).inertia
         if numerics.mass_scaling:
-            x = numerics.time_step / numerics.stability_margin
-            matrix = self._scaled_masses(x)
-            share = self._bulk_share(matrix)
-            if share > BULK_SHARE:
-                # By more than in proportion: what else is in the matrix stays.
-                matrix = self._scaled_masses(x, (share / BULK_SHARE) ** 1.5)
-            return Inertia(matrix)
+            share = self._bulk_share
+            # By more than in proportion: what else is in the matrix stays.
+            factor = max(1.0, share / BULK_SHARE) ** 1.5
+            return Inertia(self._scaled_masses(factor) if factor > 1.0 else self._unraised_masses)
         stiff, viscous = self._stiffness_bounds()
         x = self.critical_time_step / numerics.stability_margin
         needed = np.where(self._slivers, (stiff * x + viscous) * x, 0.0)
@@ -327,14 +325,19 @@ class CuttingModel(CutGeometry):
         """Whether a node is one [N]."""
         return np.asarray(self.node_volume < SLIVER * self.vertex_volume)
 
-    def _scaled_masses(self, x: float, bulk_factor: float = 1.0) -> csc_array:
-        """True masses and what keeps a step of `x` over the stability margin, s, stable, kg.
+    @functools.cached_property
+    def _unraised_masses(self) -> csc_array:
+        return self._scaled_masses()
+
+    def _scaled_masses(self, bulk_factor: float = 1.0) -> csc_array:
+        """True masses and what keeps a step, x with the stability margin, stable, kg.
 
         With f = -K u - C v a step is stable if S >= (x / 2)^2 K + (x / 2) C. Every stiffness that
         can become active is there from the start.
         """
         material, numerics, parameters = self.material, self.numerics, self.parameters
         mu, lam = material.lame()
+        x = numerics.time_step / numerics.stability_margin
         square, half = 0.25 * x**2, 0.5 * x
         _, products = self._gradient_products
         damped = square * (1.0 + 2.0 * numerics.numerical_damping)
@@ -371,12 +374,19 @@ class CuttingModel(CutGeometry):
         entry = self.knife.lateral_mass() + self._bending(x)
         return self._with_blade(parts, self.true_mass + board, entry)
 
-    def _bulk_share(self, mass: csc_array) -> float:
+    @functools.cached_property
+    def _bulk_share(self) -> float:
         """Share of the mass matrix that the stiffness and damping of the bulk need, at most.
 
         (lam + 2 mu) grad u : grad u bounds the bulk's energy where the surface is held; a part that
-        is free may dilate, by up to 3 lam + 2 mu.
+        is free may dilate, by up to 3 lam + 2 mu. A shorter step has no larger share, but for
+        what `damping_time` needs beside the stiffness.
         """
+        longer = self._longer
+        if longer is not None and longer.numerics.time_step > self.numerics.time_step:
+            most = longer._bulk_share * self._bulk_needs / longer._bulk_needs
+            if most <= BULK_SHARE:
+                return most
         mu, lam = self.material.lame()
         half = 0.5 * self.numerics.time_step
         modulus = (half**2 + half * self.parameters["damping_time"]) * self.element_volume
@@ -394,7 +404,12 @@ class CuttingModel(CutGeometry):
             of_nodes = back @ (modulus[:, None, None] * stress).reshape(-1, 3)
             return np.vstack([of_nodes, np.zeros(3)])
 
-        return largest_share(forces, mass)
+        return largest_share(forces, self._unraised_masses)
+
+    @property
+    def _bulk_needs(self) -> float:
+        """Stiffness and damping of the bulk over its stiffness, in half a step."""
+        return 1.0 + 2.0 * self.parameters["damping_time"] / self.numerics.time_step
 
     def _stiffness_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Gershgorin's bounds of a quarter of the stiffness, N/m, and of half the damping, Ns/m, of
@@ -545,7 +560,7 @@ class CuttingModel(CutGeometry):
 
     def __getstate__(self) -> dict[str, Any]:
         # A copy, also in another process, may get other values, and then has other inertia.
-        own = ("inertia", "critical_time_step")
+        own = ("inertia", "critical_time_step", "_unraised_masses", "_bulk_share", "_longer")
         return {k: v for k, v in vars(self).items() if k not in own} | {"_by_step": {}}
 
     def with_step(self, step: float) -> Self:
@@ -556,6 +571,7 @@ class CuttingModel(CutGeometry):
         if name not in self._by_step:
             other = self._by_step[name] = copy.copy(self)
             other.numerics = dc.replace(self.numerics, time_step=step)
+            other._longer = self
             other._set_step()
         return self._by_step[name]
 

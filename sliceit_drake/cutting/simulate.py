@@ -114,8 +114,8 @@ def check_in_plane(model: CuttingModel, X_CK: Pose, time: float) -> None:
     px, y, pz = X_CK.p.tolist()
     if pz > model.top or pz < model.bottom - model.knife.height:
         return
-    turn, _, lean = map(abs, X_CK.R[1].tolist())
-    offset = abs(y)
+    (ax, _, _), (turn, _, lean), (az, _, _) = X_CK.R.tolist()
+    offset, turn, lean = abs(y), abs(turn), abs(lean)
     if offset > LATERAL_LIMIT or lean > TILT_LIMIT or turn > TILT_LIMIT:
         raise CuttingError(
             f"at {time:.4g} s the blade is {1e3 * offset:.3g} mm off the cut plane, leans "
@@ -125,7 +125,6 @@ def check_in_plane(model: CuttingModel, X_CK: Pose, time: float) -> None:
         )
     # The model cuts with the edge, not with an end of it.
     low, high = model.span
-    ax, _, az = X_CK.R[:, 0].tolist()
     for end in (-0.5 * model.knife.length, 0.5 * model.knife.length):
         x, z = px + end * ax, pz + end * az
         if low < x < high and z < model.top:

@@ -104,8 +104,8 @@ class CuttingSolver:
         `coupling_step` does so at its first call; call this before to keep it out of a measured
         time."""
         with self._lock:
-            # Those that a knife asks for that meets the food or turns round, too.
-            for finer in (1, 2, 4):
+            # Those that a knife asks for that meets the food or the board or turns round, too.
+            for finer in (1, 2, 4, 8, 16):
                 self._stepped(finer * self._workspace.substeps).capture()
 
     def _stepped(self, number: int) -> Workspace:

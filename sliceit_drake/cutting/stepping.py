@@ -52,7 +52,14 @@ CALM = 5
 """Coupling steps in which a sub-step could be twice as long before it is."""
 
 
-_ROOMS = threading.local()
+class _Rooms(threading.local):
+    """Rooms of a thread, by number of coupling steps and scalar of the kernels."""
+
+    def __init__(self) -> None:
+        self.by_size: dict[tuple[int, Any], PlanRoom] = {}
+
+
+_ROOMS = _Rooms()
 
 
 class Frame(NamedTuple):
@@ -76,6 +83,7 @@ class PlanRoom:
 
     Attributes:
         rule: Input: numbers of `Stepping`, and the duration of a coupling step, s [5].
+        held: The `Stepping` whose numbers they are.
         frame: Input: that of the poses.
         X_AK: Input: poses at the steps' ends [E + 1, 3, 4], m.
         stepping: Input: see `PLANNED`, before them.
@@ -89,6 +97,7 @@ class PlanRoom:
         limits = TRAVEL, CHANGE, SETTLING_WAY, SETTLING_TIME, FINEST, SLACK, CALM
         self._limits = np.array(limits, float)
         self.rule, self.stepping = np.zeros(5), np.zeros(STEPPING)
+        self.held: Stepping | None = None
         self.frame, self.X_AK = IN_CUT, np.zeros((ends, 3, 4))
         self._X_CA = IN_CUT.X_CA.copy()
         self.R, self.p = np.zeros((1, ends, 3, 3)), np.zeros((1, ends, 3))
@@ -183,11 +192,13 @@ class Stepping(NamedTuple):
 
     def room(self, coupling_steps: int, stepping: np.ndarray, period: float) -> PlanRoom:
         """This thread's room for a plan of so many steps, all but the poses put in; see `plan`."""
-        rooms, key = vars(_ROOMS), f"{coupling_steps} {self.real.__name__}"
-        if key not in rooms:
-            rooms[key] = PlanRoom(coupling_steps, self.real)
-        room: PlanRoom = rooms[key]
-        room.rule[:] = self.half_span, self.top, self.coarsest, self.by_need, period
+        key = coupling_steps, self.real
+        room = _ROOMS.by_size.get(key)
+        if room is None:
+            room = _ROOMS.by_size[key] = PlanRoom(coupling_steps, self.real)
+        if room.held is not self or room.rule[-1] != period:
+            room.held = self
+            room.rule[:] = self.half_span, self.top, self.coarsest, self.by_need, period
         room.stepping[:] = stepping
         return room
 
@@ -210,5 +221,6 @@ class Stepping(NamedTuple):
         more = number
         while more < min(need, FINEST):
             more *= 2
-        stepping[Planned.SUB_STEP] *= number / more
+        if more > number:
+            stepping[Planned.SUB_STEP] *= number / more
         return more

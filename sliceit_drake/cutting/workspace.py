@@ -262,9 +262,8 @@ class Workspace:
             "internal_work": (N,),
         }
         self.sum_rows, self.sum_layout = self._rows(self.sums, sums)
-        self._result_type = layouts.results(E)
-        names = self._result_type.names or ()
-        shapes = {name: layouts.field_shape(self._result_type, name) for name in names}
+        results = layouts.results(E)
+        shapes = {name: layouts.field_shape(results, name) for name in results.names or ()}
         self.result_rows, self.result_layout = self._rows(self._results, shapes, wp.float64)
         by_element = (B, STRIP, LANES)
         self._allocate(self._energies, elastic=by_element, volume_ratio=by_element)
@@ -299,11 +298,6 @@ class Workspace:
     def initial_state(self) -> np.ndarray:
         """The food at rest, to be cut downwards [state_size]."""
         return self._initial_state.copy()
-
-    def results(self) -> np.ndarray:
-        """A copy of what the last launch gave, by name [C]; see `layouts.results`."""
-        rows = self.read(self.result_rows).copy()
-        return np.ndarray(len(rows), self._result_type, rows)
 
     def write(self, array: wp.array, values: np.ndarray) -> None:
         """Sets an array from host memory."""
@@ -455,7 +449,7 @@ class Workspace:
     def advance(self, states: np.ndarray, R: np.ndarray, p: np.ndarray) -> None:
         """Advances all cuts by the workspace's coupling steps.
 
-        The new states are in `states[-1]`, the rest in `result`.
+        The new states are in `states[-1]`, the rest in `result_rows`.
 
         Args:
             states: [C, state_size].

@@ -108,7 +108,7 @@ def _check_same_slice(records: Sequence[SliceRecord]) -> None:
     seen: dict[bytes, SliceRecord] = {}
     names: dict[str, SliceRecord] = {}
     for record in records:
-        force = record.force if record.force is not None else record.force_magnitude
+        force = record.measured_force
         content = (record.time - record.time[0]).round(9).tobytes() + force.tobytes()
         if content in seen:
             raise ConfigurationError(
@@ -171,16 +171,18 @@ def _check_foods(records: Sequence[SliceRecord], food: Food, other_food: bool) -
 
 
 def _check_channels(records: Sequence[SliceRecord]) -> None:
-    norms = [r for r in records if r.force is None]
-    if norms and len(norms) < len(records):
-        few = norms if 2 * len(norms) <= len(records) else [r for r in records if r not in norms]
-        what = "the norm of the force alone" if few is norms else "the components of the force"
+    kinds: dict[str, list[SliceRecord]] = {}
+    for record in records:
+        kinds.setdefault(record.force_columns[0], []).append(record)
+    if len(kinds) > 1:
+        column, few = min(kinds.items(), key=lambda kind: len(kind[1]))
         raise ConfigurationError(
-            f"has {what}, unlike {len(records) - len(few)} of the {len(records)} records",
+            f"has {few[0].known_force}, unlike {len(records) - len(few)} of the {len(records)} "
+            "records",
             source=_file(few[0]),
-            field="force_norm" if few is norms else "force_x",
-            fix="Give all records the same columns: force_x, force_y, force_z, or force_norm alone;"
-            " or diagnose the two kinds apart.",
+            field=column,
+            fix="Give all records the same columns: force_x, force_y, force_z, or force_norm alone,"
+            " or force_vertical alone; or diagnose the kinds apart.",
         )
 
 
@@ -224,7 +226,7 @@ def _check_board(record: SliceRecord, records: Sequence[SliceRecord]) -> None:
 def _spikes(records: Sequence[SliceRecord]) -> list[str]:
     found = []
     for record in records:
-        force = record.force_magnitude[:, None] if record.force is None else record.force
+        force = record.measured_force
         count = int((without_spikes(force)[1] > 0.0).any(1).sum())
         if count:
             found.append(f"{record.name} {count} of {len(record)}")
@@ -254,12 +256,12 @@ def _check_contact(record: SliceRecord, food: Food) -> None:
     if not record.phase("slice").any():
         return
     force = without_spikes(record.force_magnitude[:, None])[0][:, 0]
-    if record.force is not None:
-        clean, _ = without_spikes(record.force)
+    if record.force_norm is None:
+        clean, _ = without_spikes(record.measured_force)
         force = np.linalg.norm(clean - clean[:3].mean(axis=0), axis=1)
     peak = float(force.max())
     facts = record.metadata
-    if record.force is None and force[:3].mean() > BEGUN * peak:
+    if record.force_norm is not None and force[:3].mean() > BEGUN * peak:
         raise ConfigurationError(
             f"begins with {force[:3].mean():.3g} N, {100 * force[:3].mean() / peak:.0f} % of its"
             " greatest force: the knife is in the food already, or the sensor was not tared",

@@ -13,6 +13,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues
 from pydrake.systems.primitives import ConstantVectorSource
 
 from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.diagrams.plant.clearance import Clearance
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.diagrams.simulated_station import SimulatedStation
 from sliceit_drake.diagrams.station_interface import (
@@ -39,6 +40,7 @@ __all__ = [
     "HardwareStation",
     "KnifeEstimate",
     "RobotConnection",
+    "make_clearance",
     "make_edge_kinematics",
     "make_safety_layer",
 ]
@@ -248,6 +250,11 @@ def make_edge_kinematics(twin: Station) -> EdgeKinematics:
     )
 
 
+def make_clearance(twin: SimulatedStation) -> Clearance:
+    """Distances of the bodies of a scenario's robot."""
+    return Clearance(twin.scenario, twin.plant, twin.scene_graph)
+
+
 def make_safety_layer(
     twin: SimulatedStation, limits: SafetyLimits, board_height: float | None = None
 ) -> SafetyLayer:
@@ -263,4 +270,5 @@ def make_safety_layer(
     # A touch, whose board may be lower, is made without food.
     has_food = board_height is None and not is_no_food(twin.scenario.food)
     top = twin.food_top() if has_food else None
-    return SafetyLayer(limits, make_edge_kinematics(twin), height, start, PERIOD, top)
+    nearest = make_clearance(twin).nearest
+    return SafetyLayer(limits, make_edge_kinematics(twin), height, start, PERIOD, top, nearest)

@@ -15,6 +15,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator, SimulatorStatus
 
 from sliceit_drake.configuration import ConfigurationError, dump_yaml, validate
+from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
 from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.kernels.precision import kernels
 from sliceit_drake.cutting.motion import Motion, MotionPlan
@@ -416,6 +417,8 @@ def _title(run: Run) -> str:
     speeds = [getattr(s, "speed", None) for s in segments]
     speed = next((s for s in speeds if s), None)
     at = f" at {1e3 * speed:.3g} mm/s" if speed and run.diagram.policy is None else ""
+    if scenario.calibration and not load_calibrated_food(scenario.calibration).is_measured:
+        at += ", not calibrated"
     name = scenario.food.name if isinstance(scenario.food, Food) else scenario.name
     if scenario.sequence is not None:
         count, thickness = scenario.sequence.count, 1e3 * scenario.sequence.thickness

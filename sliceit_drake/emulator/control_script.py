@@ -1,11 +1,14 @@
-"""The control script of ur_rtde, as far as a slicing robot needs it.
+"""The control scripts of ur_rtde and of `hardware.control_script`, as far as a slice needs them.
 
-The real client uploads a program in URScript that polls a register for commands. That program is
-not interpreted here: its side of the register protocol is written out again. Input integer register
+A client uploads a program in URScript that polls a register for commands. It is not interpreted
+here: its side of the register protocol is written out again. Read from its text are its first
+register, the commands that it has, and how far a target of servoJ may jump. Input integer register
 0 has the number of a command, output integer register 0 answers 1 (ready) or 2 (done), and doubles
 carry the arguments. What is not emulated stops the program with a message that says so.
 """
 
+import dataclasses as dc
+import math
 import re
 from collections.abc import Callable, Iterator
 
@@ -19,7 +22,7 @@ from sliceit_drake.emulator.motions import ScriptError, joint_motion, line_motio
 from sliceit_drake.emulator.robot_model import CYCLE
 from sliceit_drake.systems.servo import ServoConfig
 
-__all__ = ["COMMAND_NAMES", "SERVO_COMMAND", "ControlScript", "register_offset"]
+__all__ = ["COMMAND_NAMES", "SERVO_COMMAND", "ControlScript", "ScriptText", "read_script"]
 
 _MAIN_LOOP = "RTDE Control script - Main loop"
 _READY, _DONE = 1, 2
@@ -57,12 +60,42 @@ _RADIANS_PER_METRE = 5.0
 _TOLERANCE = 1e-6
 
 
-def register_offset(text: str) -> int | None:
-    """First register that an uploaded program uses: 0 or 24; None if it is no control script."""
+@dc.dataclass(frozen=True)
+class ScriptText:
+    """What the text of a control script says.
+
+    Attributes:
+        offset: First register that it uses: 0 or 24.
+        commands: Numbers of the commands that it has; None for all.
+        most_in_a_step: Most that a target of servoJ may change at once, rad.
+        most_in_a_cycle: The same for each cycle since the target before, and two more, rad.
+    """
+
+    offset: int = 0
+    commands: frozenset[int] | None = None
+    most_in_a_step: float = math.inf
+    most_in_a_cycle: float = math.inf
+
+
+def read_script(text: str) -> ScriptText | None:
+    """Reads an uploaded program; None if it is no control script that is known."""
     if _MAIN_LOOP not in text:
         return None
     match = re.search(r"# float register offset\s*\n\D*(\d+)", text)
-    return 0 if match is None else {"0": 0, "24": 24}.get(match.group(1))
+    offset = 0 if match is None else {"0": 0, "24": 24}.get(match.group(1))
+    if offset is None:
+        return None
+    commands = frozenset(map(int, re.findall(r"\bcmd == (\d+)\b", text)))
+    step, cycle = (_number(text, f"most_in_a_{unit}") for unit in ("step", "cycle"))
+    return ScriptText(offset, commands, step, cycle)
+
+
+def _number(text: str, name: str) -> float:
+    match = re.search(rf"global {name} = ([\d.e+-]+)\s", text)
+    # Named but not checked, it is no limit.
+    if match is None or "check_step(q)\n" not in text:
+        return math.inf
+    return float(match.group(1))
 
 
 class ControlScript:
@@ -70,12 +103,14 @@ class ControlScript:
 
     Args:
         controller: The controller whose registers and arm it uses.
-        offset: First register.
+        text: What its text says.
     """
 
-    def __init__(self, controller: Controller, offset: int = 0) -> None:
+    def __init__(self, controller: Controller, text: ScriptText | None = None) -> None:
         self._controller = controller
-        self._offset = offset
+        self._text = text or ScriptText()
+        self._offset = self._text.offset
+        self._passes = 0
         self._main = self._main_loop()
         self._motion: Iterator[np.ndarray] | None = None
         self._servo: tuple[np.ndarray, ServoConfig] | None = None
@@ -122,6 +157,8 @@ class ControlScript:
 
     def _run(self, command: int) -> Iterator[None]:
         """Runs a command to its end; each `yield` is the end of a cycle."""
+        if self._text.commands is not None and command not in self._text.commands:
+            raise ScriptError(f"the program has no command {command}")
         if command in _DOUBLES:
             self._controller.write_doubles(self._offset, _DOUBLES[command](self))
         elif command in _QUESTIONS:
@@ -200,7 +237,20 @@ class ControlScript:
         if not (lookahead_time > 0.0 and gain > 0.0):
             raise ScriptError(f"servoj: lookahead {lookahead_time} s, gain {gain} not positive")
         servo = ServoConfig(lookahead_time=lookahead_time, gain=gain)
-        self._servo = (np.array(self._doubles(0)), servo)
+        target = np.array(self._doubles(0))
+        self._check_step(target)
+        self._servo = (target, servo)
+
+    def _check_step(self, target: np.ndarray) -> None:
+        if self._servo is None:
+            self._passes = 0
+        last = self._controller.target if self._servo is None else self._servo[0]
+        step = float(np.abs(target - last).max())
+        text = self._text
+        room = min(text.most_in_a_step, text.most_in_a_cycle * (self._passes + 2))
+        if not step <= room:
+            raise ScriptError(f"a target jumps by {step:.3g} rad, allowed {room:.3g}")
+        self._passes = 0 if step > 0.0 else self._passes + 1
 
     def _stop_servo(self) -> Iterator[np.ndarray]:
         self._servo = None

@@ -27,6 +27,7 @@ from sliceit_drake.systems.servo import ServoConfig
 __all__ = ["Controller", "ControllerConfig", "Program"]
 
 _LOG_LENGTH = 1000
+_TRACE_LENGTH = 30_000
 # Of the forces that are shown, N: no two readings of a sensor are the same.
 _NOISE = 1e-13
 # Joint speed below which the arm counts as standing still, rad/s.
@@ -85,12 +86,15 @@ class Controller:
         is_remote: Whether the pendant is set to remote control.
         payload: Mass that is set, kg.
         payload_cog: Its centre in the flange [3], m.
+        stuck_at: Joint positions [6], rad, at which the arm stays (a fault), or None.
         payload_is_locked: Whether clients' changes of the payload are ignored (a fault).
         sensor_bias: Added to what the sensor feels [6], a fault.
         shown: What is made of the values of output variables before clients see them, by name (a
             fault).
         messages: Level and text of messages for the clients, taken from the left.
         log: Controller time and words of what happened.
+        trace: Controller time, true joint positions [6], rad, and true force [3], N, of the last
+            minute's cycles.
     """
 
     def __init__(self, robot: RobotModel, config: ControllerConfig | None = None) -> None:
@@ -108,12 +112,14 @@ class Controller:
         self.payload = self.config.payload
         self.payload_cog = np.array(self.config.payload_cog, float)
         self.payload_is_locked = False
+        self.stuck_at: np.ndarray | None = None
         self.sensor_bias = np.zeros(6)
         self.shown: dict[str, Callable[[object], object]] = {}
         self._random = np.random.default_rng(0)
         self.tcp = np.zeros(6)
         self.messages: collections.deque[tuple[int, str]] = collections.deque(maxlen=100)
         self.log: collections.deque[tuple[float, str]] = collections.deque(maxlen=_LOG_LENGTH)
+        self.trace: collections.deque[list[float]] = collections.deque(maxlen=_TRACE_LENGTH)
         self._program: Program | None = None
         self._watchdog: tuple[str, float] | None = None
         self._stopped_at = -np.inf
@@ -286,6 +292,8 @@ class Controller:
         self._move()
         while self.robot.warnings:
             self.tell(MessageLevel.WARNING, self.robot.warnings.pop(0))
+        state = self.robot.state
+        self.trace.append([self.time, *state.positions.tolist(), *state.wrench[:3].tolist()])
         self._show()
         self._supervise()
 
@@ -293,7 +301,8 @@ class Controller:
         if self._simulation_has_stopped:
             return
         try:
-            self.robot.step(self.target, self._servo)
+            target = self.target if self.stuck_at is None else self.stuck_at
+            self.robot.step(target, self._servo)
         except SimulationStopped as error:
             # A robot has no such state; a fault is the nearest that clients understand.
             self._simulation_has_stopped = True

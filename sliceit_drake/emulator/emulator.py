@@ -101,7 +101,7 @@ class Emulator:
         dashboard, script = Dashboard(controller), ScriptServer(controller)
         services = {"rtde": self.rtde, "dashboard": dashboard, "script": script}
         self.faults = FaultInjector(controller, self._hub, self.rtde, services)
-        pendant = Pendant(self.faults, self.status, self.stop, self.put_fresh_food)
+        pendant = Pendant(self.faults, self.status, self.trace, self.stop, self.put_fresh_food)
         try:
             self._hub.listen(_RTDE_PORT, self.rtde)
             self._hub.listen(_DASHBOARD_PORT, dashboard)
@@ -172,6 +172,10 @@ class Emulator:
             "rtde": self.rtde.statistics(),
             "log": list(controller.log)[-_STATUS_LOG:],
         }
+
+    def trace(self, since: float) -> list[list[float]]:
+        """The controller's trace from a controller time on, s."""
+        return [row for row in self.controller.trace if row[0] >= since]
 
     def put_fresh_food(self, scenario: str | None = None) -> None:
         """Puts an uncut food under the knife, as a person does between two cuts.

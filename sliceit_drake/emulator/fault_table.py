@@ -23,8 +23,13 @@ _MEANINGS = {
         "the connections of a service are closed; clients may connect again"
     ),
     "late_inputs:SECONDS": "what clients send comes late",
+    "jump_inputs:RADIANS": "is added to joint 1 of the next target of servoJ, and to no other",
+    "shift_inputs:RADIANS": "is added to joint 1 of all that follow",
+    "swap_inputs": "the next two targets come the other way round",
+    "lose_inputs:SHARE": "a fraction of the targets gets lost",
+    "arm_stuck": "the arm stays where it is, whatever the program does",
     "frame_size:BYTES": "the header of the next data package claims a size that is not its own",
-    "shows:VARIABLE:frozen|flipped|true|NUMBER|+NUMBER": (
+    "shows:VARIABLE:frozen|flipped|true|NUMBER|+NUMBER|*NUMBER": (
         "an output variable of RTDE is shown otherwise than it is, each of its elements"
     ),
     "refuse:SECONDS": "new connections are turned away for a time",

@@ -11,11 +11,12 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.emulator.connections import Service, SocketHub
+from sliceit_drake.emulator.control_script import SERVO_COMMAND
 from sliceit_drake.emulator.controller import Controller
 from sliceit_drake.emulator.fault_table import FAULTS
 from sliceit_drake.emulator.modes import RobotMode, SafetyMode
 from sliceit_drake.emulator.robot_model import CYCLE
-from sliceit_drake.emulator.rtde_server import RtdeServer
+from sliceit_drake.emulator.rtde_server import InputValues, RtdeServer
 from sliceit_drake.emulator.variables import INPUTS
 
 __all__ = ["FaultInjector"]
@@ -41,6 +42,10 @@ class FaultInjector:
         services: Mapping[str, Service],
     ) -> None:
         self._controller, self._hub, self._services = controller, hub, services
+        self._rtde = rtde
+        # Faults that wait for a client to servo: delay, what to do, and words.
+        self._at_servoing: list[tuple[float, Callable[[], object], str]] = []
+        self._targets_before = 0
         self._number = itertools.count()
         self._waiting: list[tuple[float, int, Callable[[], object], str]] = []
         # How the argument of each is read when it is injected, and what is then done with it.
@@ -77,6 +82,11 @@ class FaultInjector:
             ),
             "late_packets": (_value(float, _is_amount), partial(setattr, rtde, "delay")),
             "late_inputs": (_value(float, _is_amount), partial(setattr, rtde, "input_delay")),
+            "jump_inputs": (_value(float, math.isfinite), partial(self._shift_inputs, once=True)),
+            "shift_inputs": (_value(float, math.isfinite), self._shift_inputs),
+            "swap_inputs": (_nothing, self._swap_inputs),
+            "lose_inputs": (_value(float, lambda share: 0.0 <= share <= 1.0), self._lose_inputs),
+            "arm_stuck": (_nothing, self._hold_arm),
             "frame_size": (
                 _value(int, lambda size: 0 <= size <= 0xFFFF),
                 partial(setattr, rtde, "next_size"),
@@ -90,12 +100,13 @@ class FaultInjector:
             "second_client": (_nothing, self._claim_inputs),
         }
 
-    def inject(self, fault: str, at: float | None = None) -> None:
+    def inject(self, fault: str, at: float | None = None, *, after: float | None = None) -> None:
         """Injects a fault.
 
         Args:
             fault: The fault, as ``"silence:0.1"``, see `FAULTS`.
             at: Controller time, s; None for the next cycle.
+            after: In place of `at`, controller time since the first target of servoJ that comes, s.
 
         Raises:
             ConfigurationError: There is no such fault, or its argument or time is wrong.
@@ -112,13 +123,21 @@ class FaultInjector:
             raise ConfigurationError(
                 f"{fault!r} is not understood", field="inject", fix=f"Write {FAULTS[name]}."
             ) from None
-        if at is not None and not math.isfinite(at):
-            raise ConfigurationError(f"{at} is no time", field="at", fix="Give seconds.")
-        self._at(self._controller.time if at is None else at, action, fault)
+        if not all(x is None or math.isfinite(x) for x in (at, after)):
+            raise ConfigurationError(f"{at or after} is no time", field="at", fix="Give seconds.")
+        if after is not None:
+            self._targets_before = self._rtde.command_counts[SERVO_COMMAND]
+            self._at_servoing.append((after, action, fault))
+        else:
+            self._at(self._controller.time if at is None else at, action, fault)
 
     def apply(self) -> None:
         """Does what is due in the cycle that comes; before each cycle."""
         now = self._controller.time
+        if self._at_servoing and self._rtde.command_counts[SERVO_COMMAND] > self._targets_before:
+            for delay, action, what in self._at_servoing:
+                self._at(now + delay, action, what)
+            self._at_servoing.clear()
         while self._waiting and self._waiting[0][0] <= now + 0.5 * CYCLE:
             _, _, action, what = heapq.heappop(self._waiting)
             if what:
@@ -154,7 +173,7 @@ class FaultInjector:
     def _what_is_shown(self, argument: str) -> tuple[str, str, float]:
         name, _, how = argument.partition(":")
         value = self._controller.outputs[name]
-        number = 0.0 if how in ("frozen", "flipped", "true") else float(how)
+        number = 0.0 if how in ("frozen", "flipped", "true") else float(how.lstrip("+*"))
         first = value[0] if isinstance(value, list | tuple) else value
         # What is an integer has to stay one that the wire holds.
         is_whole = number.is_integer() and 0.0 <= number < 1 << 30 and how != "flipped"
@@ -178,9 +197,37 @@ class FaultInjector:
             "frozen": lambda value: held,
             "flipped": partial(each, lambda x: -x),
         }
-        add = partial(each, lambda x: x + number)
-        other = add if how.startswith("+") else partial(each, lambda x: number)
+        by_sign = {"+": lambda x: x + number, "*": lambda x: x * number}
+        other = partial(each, by_sign.get(how[:1], lambda x: number))
         self._controller.shown[name] = changes.get(how, other)
+
+    def _shift_inputs(self, angle: float, once: bool = False) -> None:
+        def shifted(values: InputValues) -> list[InputValues]:
+            if once:
+                self._rtde.change_targets = None
+            first = "input_double_register_0"
+            return [values | {first: float(values[first]) + angle}]  # type: ignore[arg-type]
+
+        self._rtde.change_targets = shifted
+
+    def _swap_inputs(self) -> None:
+        held: list[InputValues] = []
+
+        def swapped(values: InputValues) -> list[InputValues]:
+            if not held:
+                held.append(values)
+                return []
+            self._rtde.change_targets = None
+            return [values, *held]
+
+        self._rtde.change_targets = swapped
+
+    def _lose_inputs(self, share: float) -> None:
+        random = np.random.default_rng(0)
+        self._rtde.change_targets = lambda values: [] if random.random() < share else [values]
+
+    def _hold_arm(self) -> None:
+        self._controller.stuck_at = self._controller.robot.state.positions.copy()
 
     def _lock_payload(self, mass: float) -> None:
         self._controller.payload_is_locked = False

@@ -1,6 +1,7 @@
 """The emulator's own port, 30099, in place of a person at the pendant: a line of JSON in, one out.
 
-Requests: ``{"inject": FAULT, "at": TIME}`` (`at` may be left out), ``{"status": true}``,
+Requests: ``{"inject": FAULT, "at": TIME}`` (`at` may be left out, or be `after`: since the first
+target that comes), ``{"status": true}``, ``{"trace": TIME}`` for `Controller.trace` since then,
 ``{"fresh_food": true}`` for the same food uncut, ``{"fresh_food": SCENARIO}`` for that of a
 scenario, as YAML text, ``{"stop": true}``. Answers have ``"ok"``, and ``"error"`` where it is
 false.
@@ -26,10 +27,11 @@ class Pendant(Service):
         self,
         faults: FaultInjector,
         status: Callable[[], dict[str, object]],
+        trace: Callable[[float], list[list[float]]],
         stop: Callable[[], None],
         put_fresh_food: Callable[[str | None], None],
     ) -> None:
-        self._faults, self._status, self._stop = faults, status, stop
+        self._faults, self._status, self._trace, self._stop = faults, status, trace, stop
         self._put_fresh_food = put_fresh_food
 
     def received(self, connection: Connection) -> None:
@@ -44,8 +46,11 @@ class Pendant(Service):
             if not isinstance(request, dict):
                 raise ValueError("a request is an object")
             if "inject" in request:
-                at = request.get("at")
-                self._faults.inject(str(request["inject"]), None if at is None else float(at))
+                times = (request.get(name) for name in ("at", "after"))
+                at, after = (None if time is None else float(time) for time in times)
+                self._faults.inject(str(request["inject"]), at, after=after)
+            elif "trace" in request:
+                return {"ok": True, "trace": self._trace(float(request["trace"]))}
             elif "status" in request:
                 return {"ok": True, **self._status()}
             elif "stop" in request:
@@ -56,7 +61,7 @@ class Pendant(Service):
                     raise ValueError("fresh_food is true or a scenario as text")
                 self._put_fresh_food(None if food is True else food)
             else:
-                raise ValueError("a request has one of inject, status, fresh_food, stop")
+                raise ValueError("a request has one of inject, status, trace, fresh_food, stop")
             return {"ok": True}
         except (ValueError, TypeError, OverflowError, RecursionError, ConfigurationError) as error:
             return {"ok": False, "error": str(error)}

@@ -52,9 +52,13 @@ class PendantClient:
             raise EmulatorError(answer["error"])
         return answer
 
-    def inject(self, fault: str, at: float | None = None) -> None:
-        """Injects a fault of `faults.FAULTS`, at a controller time, s, or now."""
-        self.request(inject=fault, at=at)
+    def inject(self, fault: str, at: float | None = None, *, after: float | None = None) -> None:
+        """Injects a fault of `faults.FAULTS`, see `FaultInjector.inject`."""
+        self.request(inject=fault, at=at, after=after)
+
+    def trace(self, since: float = 0.0) -> list[list[float]]:
+        """The true arm and force in each cycle since a controller time, s: `Controller.trace`."""
+        return self.request(trace=since)["trace"]
 
     def status(self) -> dict:
         """Answer of `emulator.Emulator.status`."""

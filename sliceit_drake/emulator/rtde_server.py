@@ -4,8 +4,10 @@ import collections
 import dataclasses as dc
 import random
 import struct
+from collections.abc import Callable
 
 from sliceit_drake.emulator.connections import Connection, Service
+from sliceit_drake.emulator.control_script import SERVO_COMMAND
 from sliceit_drake.emulator.controller import Controller
 from sliceit_drake.emulator.frames import (
     LONGEST_PAYLOAD,
@@ -21,16 +23,17 @@ from sliceit_drake.emulator.modes import MessageLevel
 from sliceit_drake.emulator.robot_model import CYCLE
 from sliceit_drake.emulator.variables import IN_USE, NOT_FOUND, output_type
 
-__all__ = ["RATE", "RtdeServer"]
+__all__ = ["RATE", "InputValues", "RtdeServer"]
 
 RATE = 1.0 / CYCLE
 """Highest frequency of data packages, Hz."""
 
 _PROTOCOL = 2
+_COMMANDS = ("input_int_register_0", "input_int_register_24")
 # Above this backlog a client gets no further packages: only whole ones are ever dropped.
 _FULL = 65536
 
-_Values = dict[str, int | float | bool | tuple]
+InputValues = dict[str, int | float | bool | tuple]
 
 
 @dc.dataclass
@@ -54,6 +57,7 @@ class RtdeServer(Service):
         drop_share: Fraction of the data packages, in and out, that gets lost (a fault).
         delay: Controller time by which data packages come late, in and out, s (a fault).
         input_delay: The same of those that come in alone, s (a fault).
+        change_targets: What arrives in place of a target of servoJ (a fault), or None.
         next_size: Size that the header of the next data package claims, bytes (a fault), or None.
         packages_in: Data packages that have arrived and fit their recipe, lost and late ones too.
         command_counts: Number of them by the value that they had for the command register.
@@ -65,6 +69,7 @@ class RtdeServer(Service):
         self.frequency_limit = RATE
         self.drop_share = self.delay = self.input_delay = 0.0
         self.next_size: int | None = None
+        self.change_targets: Callable[[InputValues], list[InputValues]] | None = None
         self.packages_in = 0
         self.command_counts: collections.Counter[int] = collections.Counter()
         self.last_command = 0
@@ -72,7 +77,7 @@ class RtdeServer(Service):
         self._controller = controller
         self._random = random.Random(0)
         self._sessions: dict[Connection, _Session] = {}
-        self._late_inputs: collections.deque[tuple[float, _Values]] = collections.deque()
+        self._late_inputs: collections.deque[tuple[float, InputValues]] = collections.deque()
 
     # Service.
 
@@ -202,13 +207,20 @@ class RtdeServer(Service):
             connection.send(encode_text(f"input package ignored: {error}", MessageLevel.ERROR))
             return
         self.packages_in += 1
-        for name in ("input_int_register_0", "input_int_register_24"):
+        for name in _COMMANDS:
             if name in values:
                 command = int(values[name])  # type: ignore[arg-type]
                 self.command_counts[command] += 1
                 self.last_command = command or self.last_command
         if self._is_lost():
             return
+        if self.change_targets is None or SERVO_COMMAND not in map(values.get, _COMMANDS):
+            self._write(values)
+        else:
+            for changed in self.change_targets(values):
+                self._write(changed)
+
+    def _write(self, values: InputValues) -> None:
         delay = max(self.delay, self.input_delay)
         if delay > 0.0 or self._late_inputs:
             self._late_inputs.append((self._controller.time + delay, values))

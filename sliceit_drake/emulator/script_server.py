@@ -3,7 +3,7 @@
 import weakref
 
 from sliceit_drake.emulator.connections import Connection, Service, take_until
-from sliceit_drake.emulator.control_script import ControlScript, register_offset
+from sliceit_drake.emulator.control_script import ControlScript, read_script
 from sliceit_drake.emulator.controller import Controller
 from sliceit_drake.emulator.modes import MessageLevel
 
@@ -14,7 +14,7 @@ _END = b"\nend\n"
 
 
 class ScriptServer(Service):
-    """Starts ur_rtde's control script when a client uploads it; refuses other programs aloud.
+    """Starts a control script when a client uploads it; refuses other programs aloud.
 
     On a real controller these ports also stream the robot's state, which ur_rtde does not read;
     here they are silent. A connection that was opened in local control stays read-only, as on a
@@ -47,14 +47,14 @@ class ScriptServer(Service):
         if is_read_only or not controller.is_remote:
             controller.note("program ignored: not in remote control")
             return
-        offset = register_offset(text)
-        if offset is None:
+        found = read_script(text)
+        if found is None:
             first = text.strip().splitlines()[0][:60]
             controller.tell(
                 MessageLevel.ERROR,
-                f"program not emulated, only ur_rtde's control script is; it begins with {first!r}",
+                f"program not emulated, only a control script is; it begins with {first!r}",
             )
             controller.stop_program("a program that is not emulated was sent")
             return
-        program = ControlScript(controller, offset)
+        program = ControlScript(controller, found)
         controller.start_program(program.step, f"control script, {len(text)} characters")

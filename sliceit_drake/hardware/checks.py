@@ -20,6 +20,10 @@ __all__ = [
 ]
 
 
+POLYSCOPE = 5
+"""Generation of the robot's software that is known: of e-Series robots."""
+
+
 @dc.dataclass(frozen=True)
 class Check:
     """One check.
@@ -58,9 +62,10 @@ def check_facts(facts: RobotFacts, config: HardwareConfig) -> list[Check]:
         ),
         Check(
             "software",
-            _version(facts.software) >= _version(config.software),
-            f"{facts.software or 'unknown'}, wanted {config.software} or later",
-            "Update PolyScope.",
+            _version(config.software) <= _version(facts.software) < [POLYSCOPE + 1],
+            f"{_polyscope(facts.software)}, wanted PolyScope {POLYSCOPE}, {config.software} or "
+            "later",
+            "Other software answers otherwise, and nothing here was written for it.",
         ),
         Check(
             "robot mode",
@@ -217,6 +222,12 @@ def check_start(state: RobotState, start: Sequence[float], config: HardwareConfi
         ),
         Check("at rest", fastest < 0.01, f"fastest joint {fastest:.4f} rad/s", "Wait."),
     ]
+
+
+def _polyscope(version: str) -> str:
+    major = (_version(version) or [0])[0]
+    names = {0: "unknown", 3: "PolyScope 3 of a CB3", POLYSCOPE: "PolyScope 5", 10: "PolyScope X"}
+    return f"{names.get(major, 'a PolyScope of no known name')} ({version or 'no version'})"
 
 
 def _version(text: str) -> list[int]:

@@ -2,7 +2,8 @@
 
 Closed forward kinematics of a UR, in plain floats: numpy's calls on six numbers cost more than the
 arithmetic. The lengths are Universal Robots' nominal ones for the UR5e; a real arm differs from
-them by its factory calibration, up to some millimetres in position. The board's height must
+them by its factory calibration, up to centimetres in position, and is refused where its own pose
+says that it differs by much (`readings.pose_difference`). The board's height must
 therefore be found with the same nominal kinematics (docs/how_to/hardware.md).
 
 Apart on purpose from the model of the controller (`systems.ur5e_kinematics`, against which a test

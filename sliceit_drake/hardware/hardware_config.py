@@ -81,6 +81,9 @@ class SafetyLimits:
     """How much faster than joint_speed and knife_speed the arm may be measured."""
     singular_margin: float = quantity(0.1, "", low=0.0, high=0.5)
     """Least distance of the arm from a singularity: sines of elbow and wrist, shoulder in m."""
+    clearance: float = quantity(2e-3, "m", low=0.0, high=0.1)
+    """Least distance of gripper, knife, wrists and forearm from board, table and holder, and of
+    gripper and knife from the arm, at a target and where the arm could stop after it."""
     force_age: float = quantity(0.02, "s", low=0.002, high=1.0)
     """Longest time in which the force readings are the same to the last digit."""
     force_rate: float = quantity(5000.0, "N/s", low=100.0, high=1e5)
@@ -91,7 +94,7 @@ class SafetyLimits:
     """Change of the force that the knife must have felt at blind_depth in a food."""
     blind_depth: float = quantity(5e-3, "m", low=0.0, high=0.05)
     """Depth of the edge in a food at which felt_force must have been felt."""
-    read_back: float = quantity(2e-3, "rad", low=1e-4, high=0.1)
+    read_back: float = quantity(5e-4, "rad", low=1e-4, high=0.1)
     """How far the robot's own joint targets may be from all that was sent a moment before."""
     kinematics: float = quantity(5e-3, "m", low=1e-4, high=0.05)
     """How far the robot's own flange may be from where the nominal kinematics have it."""

@@ -180,7 +180,8 @@ class ReadingCheck:
         for j in range(6):
             angles = [q[j] for _, q in line]
             off = max(min(angles) - target[j], target[j] - max(angles))
-            if off > limits.read_back:
+            # Written so that a NaN fails.
+            if not off <= limits.read_back:
                 detail = (
                     f"the robot's own target of joint {j + 1} is {off:.3g} rad from all that was "
                     f"sent in the last {state.time - line[0][0]:.3g} s: commands come late or "

@@ -26,6 +26,8 @@ STOP_TIME = 2.0
 """How long a stop at the end may take, s."""
 HALT_TIME = 3.0
 """How long the robot may take to end its program, s."""
+LATENESS = (1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2)
+"""Bounds of the histogram of lateness, s."""
 SLOWEST = 0.2
 """Pace below which no more wall time is given for that."""
 
@@ -203,6 +205,11 @@ class RobotLink:
                 self.stop_error = f"it did not answer for {patience:g} s"
         return self._safety.stop or stop
 
+    def way(self) -> list[list[float]]:
+        """Measured joints [n, 6], rad, from the first target on; after `finish`."""
+        first = next((k for k, (_, _, q) in enumerate(self._log) if q), len(self._log))
+        return [state.q for state, _, _ in self._log[first:]]
+
     def timing(self) -> dict[str, float]:
         """How the cycles came: counts, and percentiles of lateness, s; after `finish`."""
         lateness = sorted(late for _, late, _ in self._log) or [0.0]
@@ -220,6 +227,16 @@ class RobotLink:
             "lateness_99_s": percentile(0.99),
             "lateness_max_s": percentile(1.0),
         }
+
+    def lateness_histogram(self) -> dict[str, int]:
+        """How many cycles came how late, by wall time; after `finish`."""
+        counts = dict.fromkeys([f"below {1e3 * most:g} ms" for most in LATENESS], 0)
+        rest = f"{1e3 * LATENESS[-1]:g} ms and more"
+        counts[rest] = 0
+        for _, late, _ in self._log:
+            name = next((f"below {1e3 * most:g} ms" for most in LATENESS if late < most), rest)
+            counts[name] += 1
+        return counts
 
     def write_log(self, file: Path) -> None:
         """Writes what came and went out in every cycle as CSV; after `finish`."""

@@ -5,7 +5,7 @@ sense of ISO 13849 or ISO 10218: the robot's own safety system is (docs/how_to/h
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from sliceit_drake.configuration import ConfigurationError, validate
@@ -29,6 +29,9 @@ _REACH = 1.6  # Of the tool's farthest point from the first joint's axis, m, gen
 # What a payload, kg, and its centre, m, may differ by and still be the same.
 _SAME_PAYLOAD = 1e-3
 _REST_SPEED = 0.02  # A joint slower than this counts as at rest, rad/s.
+
+
+Nearest = Callable[[Sequence[float], float], tuple[float, str] | None]
 
 
 class Stop(NamedTuple):
@@ -90,6 +93,8 @@ class SafetyLayer:
         start: Joint positions around which `SafetyLimits.joint_window` lies [6], rad.
         period: Period of the controller, s.
         food_top: Height of the food's top in the world, m; None where there is no food.
+        nearest: Least distance of bodies that must not touch, m, and their names, at joint
+            positions [6], rad; None where it is more than its second argument, m.
 
     Raises:
         ConfigurationError: A limit is out of its range, or a number is none.
@@ -103,6 +108,7 @@ class SafetyLayer:
         start: Sequence[float],
         period: float = 0.002,
         food_top: float | None = None,
+        nearest: Nearest | None = None,
     ) -> None:
         # A NaN would be a limit that nothing breaks, wherever it came from.
         validate(limits, "limits")
@@ -113,7 +119,7 @@ class SafetyLayer:
             )
         self.limits, self.period, self._food_top = limits, period, food_top
         self._readings: ReadingCheck | None = None
-        self._kinematics = kinematics
+        self._kinematics, self._nearest = kinematics, nearest
         window = limits.joint_window
         self._lower = [max(a, s - window) for a, s in zip(limits.joint_lower, start, strict=True)]
         self._upper = [min(b, s + window) for b, s in zip(limits.joint_upper, start, strict=True)]
@@ -395,7 +401,7 @@ class SafetyLayer:
             return self._breach(
                 "knife_speed", "the knife would move", fastest, limits.knife_speed, "m/s", time
             )
-        stop = self._position_fault(q, edge, "the command", time)
+        stop, rest = self._position_fault(q, edge, "the command", time), q
         if stop is None and brake_time > 0.0:
             # In steps the way is less than v T / 2, by half a step. On it a point leaves the
             # straight line by at most reach / 8 times the square of the angles turned.
@@ -409,9 +415,21 @@ class SafetyLayer:
                 time,
                 _REACH / 8.0 * turned * turned,
             )
+        stop = stop or self._clearance_fault(rest, time)
         if stop is None:
             self._q, self._v, self._edge, self._sent_time = q, v, edge, time
         return stop
+
+    def _clearance_fault(self, q: Sequence[float], time: float) -> Stop | None:
+        if self._nearest is None:
+            return None
+        found = self._nearest(q, self.limits.clearance)
+        if found is None or found[0] >= self.limits.clearance:
+            return None
+        return self._breach(
+            "clearance", f"{found[1]} would come near each other", found[0],
+            self.limits.clearance, "m", time,
+        )  # fmt: skip
 
     def _carried_on(self, q: list[float], command_time: float, time: float) -> list[float]:
         """Where commands that go on as fast as the last two will be at the time of sending."""

@@ -2,23 +2,28 @@
 
 ur_rtde 1.6.5 keeps silent about much (docs/how_to/hardware.md): its getters return the last values
 for ever when the link is gone, servoJ returns True on a dead link, and a lost control link is taken
-up again, with the program uploaded anew. So freshness comes from the controller's timestamp alone,
-and `RobotLink` latches on what a program that restarts leaves as traces.
+up again. So freshness comes from the controller's timestamp alone. The program on the robot is
+ours (`control_script`), which ur_rtde does not upload anew.
 """
 
 import contextlib
 import re
+import tempfile
 import threading
 import time
 from collections.abc import Callable
 
 from sliceit_drake.hardware.client import PLAYING, RobotFacts, RobotState, RobotUnavailableError
+from sliceit_drake.hardware.control_script import NOTHING, control_script, upload
+from sliceit_drake.hardware.hardware_config import SafetyLimits
 
 __all__ = ["UrClient"]
 
 RATE = 500.0
 DECELERATION = 2.0
 """Deceleration of the fastest joint when a planned motion is stopped, rad/s2."""
+START_TIME = 2.0
+"""Time in which a program begins to play, s."""
 STOP_TIME = 2.0
 """Time in which a program ends that is asked to, s; longer means that the link is dead."""
 ATTEMPT = 1.4
@@ -35,13 +40,22 @@ class UrClient:
         host: Name or address.
         lookahead_time: Argument of servoj, s, 0.03 to 0.2.
         gain: Argument of servoj, 100 to 2000.
+        limits: Of which the program on the robot keeps step and speed; None for the defaults.
         pace: Controller seconds in a second; 1 for all robots.
 
     Raises:
         RobotUnavailableError: Nothing answers there, or it refuses, or ur_rtde is not installed.
     """
 
-    def __init__(self, host: str, lookahead_time: float, gain: float, *, pace: float = 1.0) -> None:
+    def __init__(
+        self,
+        host: str,
+        lookahead_time: float,
+        gain: float,
+        limits: SafetyLimits | None = None,
+        *,
+        pace: float = 1.0,
+    ) -> None:
         try:
             import dashboard_client
             import rtde_control
@@ -51,9 +65,9 @@ class UrClient:
                 f"ur_rtde is not installed ({error}). Install sliceit_drake[hardware]."
             ) from None
         self._host, self._lookahead, self._gain = host, lookahead_time, gain
-        self._is_moving = self._is_stopped = False
+        self._is_moving = self._is_stopped = self._was_lost = False
         self._stop_time, self._attempt = (t / max(pace, SLOWEST) for t in (STOP_TIME, ATTEMPT))
-        step = "the dashboard server (port 29999)"
+        step = "the dashboard server (port 29999), which PolyScope X does not have,"
         try:
             self._dashboard = dashboard_client.DashboardClient(host)
             self._dashboard.connect(2000)
@@ -65,8 +79,15 @@ class UrClient:
             self._refuse_running_program()
             self._has_raw_wrench = self._shows_raw_wrench()
             step = "taking control (ports 30003 and 30004)"
-            self._control = rtde_control.RTDEControlInterface(host, RATE)
-        except RuntimeError as error:
+            kind = rtde_control.RTDEControlInterface
+            flags = kind.FLAG_CUSTOM_SCRIPT | kind.FLAG_NO_WAIT
+            self._control = kind(host, RATE, flags)
+            self._never_upload_again()
+            limits = limits or SafetyLimits()
+            script = control_script(limits.joint_step, max(limits.joint_speed))
+            self._script = upload(host, script)
+            self._await_program(START_TIME / max(pace, SLOWEST))
+        except (RuntimeError, OSError) as error:
             if isinstance(error, RobotUnavailableError):
                 raise
             raise RobotUnavailableError(
@@ -98,6 +119,22 @@ class UrClient:
                     "pendant, and start again."
                 )
             time.sleep(0.05)
+
+    def _never_upload_again(self) -> None:
+        # ur_rtde keeps the name alone, and reads the file when it has reconnected.
+        self._nothing = tempfile.NamedTemporaryFile("w", suffix=".script", encoding="ascii")
+        self._nothing.write(NOTHING)
+        self._nothing.flush()
+        self._control.setCustomScriptFile(self._nothing.name)
+
+    def _await_program(self, patience: float) -> None:
+        deadline = time.monotonic() + patience
+        while not self._control.isProgramRunning():
+            if time.monotonic() > deadline:
+                raise RuntimeError(
+                    f"its program does not start in {patience:g} s; the pendant's log may say why"
+                )
+            time.sleep(0.01)
 
     def _shows_raw_wrench(self) -> bool:
         # Before PolyScope 5.9 a robot does not have it, and the getter of ur_rtde raises.
@@ -135,7 +172,9 @@ class UrClient:
         return state
 
     def is_connected(self) -> bool:
-        return self._receive.isConnected() and self._control.isConnected()
+        is_there = self._receive.isConnected() and self._control.isConnected()
+        self._was_lost |= not is_there
+        return is_there
 
     def servo(self, q: list[float]) -> bool:
         return self._control.servoJ(q, 0.0, 0.0, 1.0 / RATE, self._lookahead, self._gain)
@@ -160,28 +199,37 @@ class UrClient:
                 errors.append(error)
             self._control.stopScript()
 
-        if self._ends(end_program, before) and not errors:
-            return
+        # While ur_rtde reconnects, a call can end the process.
+        if self.is_connected() and not self._was_lost:
+            if self._ends(end_program, before) and not errors:
+                return
         # The dashboard has a connection of its own, and needs no program that listens.
-        if not self._ends(self._dashboard.stop, before):
+        if not self._ends(self._stop_by_dashboard, before):
             reason = f" ({errors[0]})" if errors else ""
             raise RuntimeError(f"the robot's program still plays, or no data come{reason}")
+
+    def _stop_by_dashboard(self) -> bool:
+        self._dashboard.stop()
+        return not self._dashboard.running()
 
     def _ends(self, ask: Callable[[], object], before: float) -> bool:
         """Whether the program ends in time that is asked to, by data newer than `before`, s.
 
-        What asks may block for ever.
+        What asks may block for ever; where it returns True it knows that the program has ended.
         """
+        known: list[bool] = []
 
         def quietly() -> None:
             with contextlib.suppress(RuntimeError):
-                ask()
+                known.append(ask() is True)
 
         asking = threading.Thread(target=quietly, daemon=True)
         asking.start()
         deadline = time.monotonic() + self._attempt
         receive = self._receive
         while receive.getRuntimeState() == PLAYING or receive.getTimestamp() == before:
+            if known == [True]:
+                return True
             if time.monotonic() > deadline:
                 return False
             time.sleep(0.01)
@@ -229,3 +277,5 @@ class UrClient:
             # A link that is gone already cannot be closed better.
             with contextlib.suppress(RuntimeError):
                 part.disconnect()
+        self._script.close()
+        self._nothing.close()

@@ -19,6 +19,7 @@ from scipy.ndimage import median_filter
 from scipy.optimize import minimize
 
 __all__ = [
+    "EvenNoise",
     "MarkovCovariance",
     "NoiseModel",
     "NoiseProblem",
@@ -86,6 +87,17 @@ class SeriesGroup:
     gap: np.ndarray
 
 
+@dc.dataclass(frozen=True)
+class EvenNoise:
+    """Noise that is independent from entry to entry, with one variance, N^2: least squares."""
+
+    variance: float
+
+    def solve(self, columns: np.ndarray) -> np.ndarray:
+        """The inverse covariance times columns [M, k]."""
+        return columns / self.variance
+
+
 @dc.dataclass
 class NoiseModel:
     """Covariance of the residuals.
@@ -138,6 +150,12 @@ class NoiseModel:
             total += V.variance * float(V.solve(np.ones((len(group.rows), 1))).sum())
         return total
 
+    @property
+    def evened(self) -> EvenNoise:
+        """Independent noise that would leave a constant as uncertain."""
+        variance = (self.ar**2 + self.white**2) @ [len(g.rows) for g in self.groups]
+        return EvenNoise(float(variance) / self.effective_samples)
+
     def sample(self, rng: np.random.Generator, size: int) -> np.ndarray:
         """A sample of the noise [size]; entries that are not used are zero."""
         out = np.zeros(size)
@@ -186,6 +204,11 @@ class MarkovCovariance:
         out[:-1] += off * columns[1:]
         out[1:] += off * columns[:-1]
         return np.asarray(solveh_banded(self._shifted, white * out, check_finite=False) / white)
+
+    def product(self, columns: np.ndarray) -> np.ndarray:
+        """V times columns [n, k]."""
+        first = solveh_banded(self._band, columns, check_finite=False)
+        return np.asarray(first + self._white[:, None] ** 2 * columns)
 
     def log_det(self) -> float:
         """log det V."""
@@ -369,6 +392,40 @@ class NoiseProblem:
 
         The average is over samples of a normal approximation in the logarithms of its numbers.
         """
+        sets = self._draws()
+        pairs = [self._estimate(s) for s in sets]
+        shifts = np.array([shift for _, shift in pairs])
+        within = np.mean([covariance for covariance, _ in pairs], axis=0)
+        center = self._estimate(self._numbers)[1]
+        return np.asarray(within + (shifts - center).T @ (shifts - center) / DRAWS)
+
+    def covariance_of_least_squares(self, variance: float) -> np.ndarray:
+        """Covariance [d, d] of the fit that takes all entries for independent, of one variance.
+
+        Its weights are not those of the noise, so that its covariance is A^-1 B A^-1, where B is
+        what the noise does to the gradient (the sandwich of Huber 1967 and White 1980), averaged
+        over the uncertainty of what was fitted. Where the entries say nothing the prior is left.
+        """
+        d, q = self._d, self._q
+        columns = np.concatenate(self._columns)
+        J, N, F = np.split(columns[:, 1:], [d, d + q], axis=1)
+        if q:
+            J = J - N @ np.linalg.lstsq(N, J, rcond=None)[0]
+        ends = np.cumsum([len(c) for c in self._columns])[:-1]
+        scaled = F.T @ J
+        prior = self._prior_precision * np.eye(d)
+        inverse = np.linalg.inv(J.T @ J / variance + prior)
+        B = np.zeros((d, d))
+        for x in self._draws():
+            numbers = np.exp(x[: 3 * len(self._groups)].reshape(-1, 3))
+            for group, part, own in zip(self._groups, np.split(J, ends), numbers, strict=True):
+                B += part.T @ MarkovCovariance(group.gap, *own).product(part)
+            if self._replicated:
+                B += np.exp(2.0 * x[-1]) * scaled.T @ scaled
+        return np.asarray(inverse @ (B / DRAWS / variance**2 + prior) @ inverse)
+
+    def _draws(self) -> np.ndarray:
+        """Draws of what was fitted [DRAWS, numbers], with its uncertainty."""
         x = self._numbers
         blocks = [list(range(3 * g, 3 * g + 3)) for g in range(len(self._groups))]
         if self._replicated:
@@ -377,12 +434,7 @@ class NoiseProblem:
         sets = np.tile(x, (DRAWS, 1))
         for block in blocks:
             sets[:, block] += self._scatter(x, block, rng)
-        sets = np.clip(sets, self._bounds[:, 0], self._bounds[:, 1])
-        pairs = [self._estimate(s) for s in sets]
-        shifts = np.array([shift for _, shift in pairs])
-        within = np.mean([covariance for covariance, _ in pairs], axis=0)
-        center = self._estimate(x)[1]
-        return np.asarray(within + (shifts - center).T @ (shifts - center) / DRAWS)
+        return np.asarray(np.clip(sets, self._bounds[:, 0], self._bounds[:, 1]))
 
     def _scatter(self, x: np.ndarray, block: list[int], rng: np.random.Generator) -> np.ndarray:
         """Draws of some numbers about their best [DRAWS, block], by the objective's curvature."""

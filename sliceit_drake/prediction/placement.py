@@ -20,6 +20,12 @@ ONSET = 0.02
 known."""
 
 
+CROPPED = 0.05
+"""Fraction of a record's greatest force above which it begins in the food, its height unknown."""
+DEEPEST = 5e-3
+"""Depth in the food at which such a record may begin, metres."""
+
+
 def poses_in_food(
     record: SliceRecord, model: CuttingModel
 ) -> tuple[Rotation, Rotation, np.ndarray]:
@@ -44,11 +50,24 @@ def poses_in_food(
         p = R_FW.apply(p - np.array(facts.position))
     if facts.position is None or "p_WK_z" in unknown or "food.position" in unknown:
         # Height is measured from where the force begins.
-        force = record.force_magnitude
-        quiet = force[: max(3, len(force) // 50)].max()
-        onset = int(np.argmax(force > quiet + ONSET * force.max()))
-        p[:, 2] += home.p[2] - p[onset, 2]
+        p[:, 2] += home.p[2] - _contact_height(record.force_magnitude, p[:, 2])
     return R_FW, rotation, p
+
+
+def _contact_height(force: np.ndarray, height: np.ndarray) -> float:
+    """Height of the edge [n], metres, where its force [n], N, begins.
+
+    A record that begins in the food is taken back in a straight line to where there was none.
+    """
+    first = max(3, len(force) // 50)
+    quiet = float(force[:first].max())
+    early = slice(3 * first)
+    way = height[0] - height[early].min()
+    if force[0] > CROPPED * force.max() and way > 0.0:
+        slope, level = np.polyfit(height[early], force[early], 1)
+        if -slope * way > ONSET * force.max():
+            return float(np.clip(-level / slope, height[0], height[0] + DEEPEST))
+    return float(height[np.argmax(force > quiet + ONSET * force.max())])
 
 
 def food_of(food: Food, record: SliceRecord) -> Food:

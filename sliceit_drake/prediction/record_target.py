@@ -31,11 +31,14 @@ CHANNELS = ("force_x", "force_y", "force_z", "torque_y")
 """Compared components, in F: along the edge, normal to the blade, vertical, N; moment about Ko and
 Fy, which a draw and a turned sensor change, Nm."""
 WRENCH_ROWS = (3, 4, 5, 1)
-NORM = ("force_norm",)
+NORM, VERTICAL = ("force_norm",), ("force_z",)
 
 CLEARANCE = 5e-4
 """Height of the edge over the food from which on the food is computed, beside the range of the
 record's own height, metres."""
+START, SLOWEST = 0.02, 1e-3
+"""Time at a record's start over which its speed is taken, s, and the least that brings the knife
+from above the food, m/s."""
 CLEAR = 6e-4
 """Height of the edge over the food above which nothing moves fast, metres."""
 
@@ -69,8 +72,9 @@ class Meshing:
 class RecordTarget:
     """One record: its motion relative to the food and what of it is compared.
 
-    The force is compared by component in F where the record has them, else by its norm. Prediction
-    and measurement went through the same filters: `records.preprocessing.as_measured`.
+    The force is compared by component in F where the record has them, else by its norm or by the
+    vertical one. Prediction and measurement went through the same filters:
+    `records.preprocessing.as_measured`.
 
     Args:
         bench: Of which the knife is taken, but for what the record says of it, and the range of the
@@ -90,14 +94,15 @@ class RecordTarget:
         facts: What causes see of it.
         knife: The knife.
         home: Ko where the edge first touches the food, in F [3], metres; 0 without food.
-        channels: Names of the compared channels: `CHANNELS`, the first three without a torque, or
-            "force_norm".
+        channels: Names of the compared channels: `CHANNELS`, the first three without a torque,
+            "force_z" alone, or "force_norm".
         time: Of the rows [m], s.
         measured: Channels at the rows [m, c], without spikes.
         doubt: Standard deviation by which each of them is doubted, see `without_spikes` [m, c].
         depth: Of the edge below the top of the food at the rows [m], metres.
         phase: Label at the rows [m]; "" for none.
-        grid: Even times of the coupling steps [N + 1], s; row 0 is the first row of the record.
+        grid: Even times of the coupling steps [N + 1], s; they begin with the record, or before it
+            where that may begin in the food.
         R, p: Pose X_FK at `grid`.
         stretches: Coupling steps that are simulated; None without food in reach.
         height_unknown: Whether the height of the whole record is only known from its force.
@@ -137,9 +142,11 @@ class RecordTarget:
         # never had.
         first, last = record.time[0], record.time[-1]
         count = max(2, int((last - first) / clock.period + 1e-6))
-        self.grid = first + clock.period * np.arange(count + 1)
-        at = np.minimum(self.grid, record.time[-1])
+        before = self._run_in(height[0], p) if models and self.height_unknown else 0
+        self.grid = first + clock.period * np.arange(-before, count + 1)
+        at = np.clip(self.grid, first, last)
         self.p = interpolated(at, record.time, p)
+        self.p += np.minimum(self.grid - first, 0.0)[:, None] * self._first_velocity(p)
         self.R = Slerp(record.time, rotation)(at).as_matrix()
         phase = np.array([""] * len(record), dtype="<U16")
         for label in metadata.motion.phases:
@@ -164,8 +171,8 @@ class RecordTarget:
             tared=metadata.wrench.tared != "no",
         )
         if record.force is None:
-            self.channels: tuple[str, ...] = NORM
-            groups = [record.force_magnitude[:, None]]
+            self.channels: tuple[str, ...] = NORM if record.force_vertical is None else VERTICAL
+            groups = [record.measured_force]
         else:
             self.channels, groups = CHANNELS[:3], [R_FW.apply(record.force)]
             if record.torque is not None:
@@ -190,6 +197,21 @@ class RecordTarget:
                 fix="Correct food.position or the heights; both are in the world frame, in metres.",
             )
         return slice(max(int(low[0]) - 1, 0), int(low[-1]) + 2)
+
+    def _first_velocity(self, p: np.ndarray) -> np.ndarray:
+        """Mean velocity of Ko over the first `START` of the record [3], m/s, of its positions."""
+        time = self.record.time
+        row = max(1, int(np.searchsorted(time, time[0] + START)))
+        row = min(row, len(time) - 1)
+        return np.asarray((p[row] - p[0]) / (time[row] - time[0]))
+
+    def _run_in(self, height: float, p: np.ndarray) -> int:
+        """Coupling steps before the record, in which a knife whose first height is only known from
+        its force comes from above the food as fast as it is then."""
+        speed = -float(self._first_velocity(p)[2])
+        if height >= self._margin or speed < SLOWEST:
+            return 0
+        return int(np.ceil((self._margin - height) / (speed * self.clock.period)))
 
     def _stretches(self) -> Stretches | None:
         height = self.p[:, 2] - self._top
@@ -318,7 +340,8 @@ class RecordTarget:
         if self.channels == NORM:
             picked = wrench[:, 3:]
         else:
-            picked = wrench[:, list(WRENCH_ROWS[: len(self.channels)])]
+            rows = dict(zip(CHANNELS, WRENCH_ROWS, strict=True))
+            picked = wrench[:, [rows[name] for name in self.channels]]
         seen = self._seen(picked.reshape(len(picked), -1))
         seen = seen.reshape(len(self.time), -1, *rest)
         if self.channels == NORM:
@@ -367,7 +390,9 @@ class RecordTarget:
         """Channels at the rows [m, c] from forces of the simulated coupling steps [E, 3], N, in
         F."""
         seen = self.operator @ force + self._weight_seen
-        return np.linalg.norm(seen, axis=1)[:, None] if self.channels == NORM else seen
+        if self.channels == NORM:
+            return np.linalg.norm(seen, axis=1)[:, None]
+        return seen[:, 2:] if self.channels == VERTICAL else seen
 
     def adjoint(self, force: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Adjoint of `compare_forces` at `force`: of the channels [m, c] to forces [E, 3]."""
@@ -375,6 +400,8 @@ class RecordTarget:
             seen = self.operator @ force + self._weight_seen
             norm = np.maximum(np.linalg.norm(seen, axis=1), 1e-9)[:, None]
             weights = weights * seen / norm
+        elif self.channels == VERTICAL:
+            weights = weights * np.array([0.0, 0.0, 1.0])
         return np.asarray(self.operator.T @ weights)
 
     def at_rows(self, mask: np.ndarray) -> np.ndarray:

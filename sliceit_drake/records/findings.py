@@ -42,6 +42,10 @@ KINDS = {
         "Label the time before contact as air; record half a second of it.",
     ),
     "no tare": ("warning", "Apply the step tare, which subtracts that mean."),
+    "drift": (
+        "warning",
+        "Let the sensor warm up, record air before and after the slice, and repeat it.",
+    ),
     "force unit": (
         "error",
         "Is it in mN, or in counts of the sensor? Convert it to newtons.",

@@ -37,6 +37,9 @@ FLAT, FLAT_FAR = 5.0, 50.0
 """Rows at exactly the greatest value from which on a sensor is taken for saturated, near its range
 and far from it."""
 
+DRIFT = 0.05
+"""Fraction of the greatest force by which a sensor's zero may drift over the record."""
+
 ALONG = 0.2
 """Fraction of |F| |v| that the power must have at least for its sign to mean something."""
 
@@ -44,7 +47,7 @@ ALONG = 0.2
 def check_force(table: SliceTable, record: SliceRecord, findings: Findings) -> None:
     """Adds to the findings what is wrong with the force, of a table and its record in W."""
     magnitude = record.force_magnitude
-    name = fmt.FORCE[0] if record.force is not None else fmt.FORCE_NORM
+    name = record.force_columns[0]
     if np.ptp(magnitude) == 0.0:
         findings.add("constant", name, f"is {magnitude[0]:.6g} N in every row")
         return
@@ -68,16 +71,17 @@ def check_force(table: SliceTable, record: SliceRecord, findings: Findings) -> N
 
 
 def _known_offset(record: SliceRecord, air: np.ndarray) -> np.ndarray | None:
-    """Force to subtract so that what is left is that of food and board alone [3].
+    """What to subtract so that food and board alone are left, of the measured columns.
 
     None if an offset may be there that cannot be told.
     """
-    if record.force is None:
-        return np.zeros(3)
+    nothing = np.zeros(len(record.force_columns))
+    if record.force_norm is not None:
+        return nothing
     if air.sum() >= MIN_AIR_ROWS:
-        return record.force[air].mean(axis=0)
+        return record.measured_force[air].mean(axis=0)
     facts = record.metadata.wrench
-    return np.zeros(3) if facts.tared == "yes" and "gravity" not in facts.includes else None
+    return nothing if facts.tared == "yes" and "gravity" not in facts.includes else None
 
 
 def _check_tare(record: SliceRecord, air: np.ndarray, findings: Findings) -> None:
@@ -88,30 +92,49 @@ def _check_tare(record: SliceRecord, air: np.ndarray, findings: Findings) -> Non
         return
     if record.phase("air").all():
         return  # Such a record is there to show zero and drift; no force makes them large or small.
-    force = record.force if record.force is not None else record.force_magnitude[:, None]
+    force = record.measured_force
     mean, scatter = force[air].mean(axis=0), force[air].std(axis=0)
     peak = float(record.force_magnitude.max())
     # A norm of noise is not zero in the mean; ten rows of a filtered sensor are one reading.
-    allowed = 3.0 * scatter if record.force is None else 5.0 * scatter / np.sqrt(air.sum() / 10.0)
+    is_norm = record.force_norm is not None
+    allowed = 3.0 * scatter if is_norm else 5.0 * scatter / np.sqrt(air.sum() / 10.0)
     allowed = np.maximum(allowed, OFFSET * peak)
     axis = int((np.abs(mean) - allowed).argmax())
     weighs_tool = "gravity" in facts.includes and facts.tared != "yes"
     if abs(mean[axis]) > allowed[axis] and not weighs_tool:
-        name = fmt.FORCE[axis] if record.force is not None else fmt.FORCE_NORM
+        name = record.force_columns[axis]
         text = f"the force in the air is {mean[axis]:.3g} N in the mean, with a scatter of"
         text += f" {scatter[axis]:.2g} N; wrench.tared is {facts.tared}"
-        findings.add("no tare", name, text, _ends(air))
+        fix = "Give its components, or the vertical one: no zero can be taken off a norm."
+        findings.add("no tare", name, text, _ends(air), fix if is_norm else None)
+    _check_drift(record, air, findings)
+
+
+def _check_drift(record: SliceRecord, air: np.ndarray, findings: Findings) -> None:
+    """A zero that moves in the air goes on moving in the food."""
+    time, force = record.time[air], record.measured_force[air]
+    moved = time - time.mean()
+    slope = moved @ force / (moved @ moved)
+    left = force - force.mean(axis=0) - np.outer(moved, slope)
+    # Of a filtered sensor ten rows are one reading.
+    spread = left.std(axis=0) * np.sqrt(10.0 / (moved @ moved))
+    lasting = float(record.time[-1] - time.mean())
+    shift = np.abs(slope) * lasting
+    axis = int(shift.argmax())
+    peak = float(record.force_magnitude.max())
+    if shift[axis] > DRIFT * peak and abs(slope[axis]) > 5.0 * spread[axis]:
+        text = f"the force in the air changes by {slope[axis]:.2g} N/s: {shift[axis]:.2g} N by the"
+        text += " last row, if it goes on"
+        findings.add("drift", record.force_columns[axis], text, _ends(air))
 
 
 def _check_units(
     record: SliceRecord, air: np.ndarray, cut: np.ndarray, name: str, findings: Findings
 ) -> None:
     offset = _known_offset(record, air)
-    magnitude = record.force_magnitude
     if offset is None:
         return
-    if record.force is not None:
-        magnitude = np.linalg.norm(record.force - offset, axis=1)
+    magnitude = np.linalg.norm(record.measured_force - offset, axis=1)
     peak = float(np.percentile(magnitude[cut], 95.0))
     problem = ""
     if peak < MIN_FORCE:
@@ -139,7 +162,7 @@ def _ends(mask: np.ndarray) -> tuple[int, int]:
 
 def _noise(record: SliceRecord, air: np.ndarray) -> float:
     """Standard deviation in the air of the noisiest component, N, after drift; 0 if not known."""
-    force = record.force if record.force is not None else record.force_magnitude[:, None]
+    force = record.measured_force
     if air.sum() < MIN_AIR_ROWS:
         return 0.0
     return float(np.diff(force[air], axis=0).std(axis=0).max() / np.sqrt(2.0))
@@ -158,10 +181,12 @@ def _check_sign(
 ) -> None:
     """Food and board take work from the knife, so that the power of their force is negative."""
     offset = _known_offset(record, air)
-    if record.force is None or offset is None:
+    if record.force_norm is not None or offset is None:
         return
-    force = record.force - offset
+    force = record.measured_force - offset
     v, _ = fmt.velocities(record.time, record.position, record.rotation)
+    if record.force is None:
+        v = v[:, 2:]
     power = np.einsum("ij,ij->i", force, v)
     most = np.linalg.norm(force, axis=1) * np.linalg.norm(v, axis=1)
     work = trapezoid(np.where(cut, power, 0.0), record.time)
@@ -175,18 +200,24 @@ def _check_sign(
         other = "on_knife" if facts.sign == "by_knife" else "by_knife"
         text = f"the force on the knife drives it: work of {work:+.3g} J while slicing, expected"
         fix = f'Write wrench.sign: {other}, or correct wrench.frame ("{facts.frame}").'
-        findings.add("flipped sign", fmt.FORCE[axis], f"{text} negative", _ends(cut), fix)
+        findings.add(
+            "flipped sign", record.force_columns[axis], f"{text} negative", _ends(cut), fix
+        )
     elif work > -ALONG * scale:
         text = f"the force is across the knife's motion: its work while slicing is {work:+.3g} J of"
         text += f" {scale:.3g} J, were it along it"
         fix = f'Check wrench.frame ("{facts.frame}"), and the placement of the knife on the tool.'
-        findings.add("frame", fmt.FORCE[axis], text, _ends(cut), fix)
+        findings.add("frame", record.force_columns[axis], text, _ends(cut), fix)
 
 
 def _check_saturation(table: SliceTable, record: SliceRecord, findings: Findings) -> None:
     """Values at the sensor's range, or exactly the same greatest value for several rows."""
     sensor = record.metadata.sensor
-    for names, limit in ((fmt.FORCE, sensor.force_range), (fmt.TORQUE, sensor.torque_range)):
+    for names, limit in (
+        (fmt.FORCE, sensor.force_range),
+        ((fmt.FORCE_VERTICAL,), sensor.force_range),
+        (fmt.TORQUE, sensor.torque_range),
+    ):
         if not table.has(names):
             continue
         for name, values in _in_sensor_axes(table, record, names):
@@ -236,7 +267,7 @@ def _report_clipping(findings: Findings, name: str, text: str, at: np.ndarray) -
 
 
 def _check_frozen(table: SliceTable, cut: np.ndarray, findings: Findings) -> None:
-    names = fmt.FORCE if table.has(fmt.FORCE) else (fmt.FORCE_NORM,)
+    names = next(n for n in (fmt.FORCE, ("force_norm",), ("force_vertical",)) if table.has(n))
     same = (np.diff(table.stack(names), axis=0) == 0.0).all(axis=1) & cut[1:] & cut[:-1]
     time = table.columns[fmt.TIME]
     for first, last in runs(same):

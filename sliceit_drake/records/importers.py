@@ -6,7 +6,7 @@ record whose `processing` says what was done. None of them checks the result:
 """
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.records import slice_record as fmt
+from sliceit_drake.records.findings import MIN_ROWS
 from sliceit_drake.records.force_profile import load_force_profile
+from sliceit_drake.records.force_table import find_contact, one_slice, read_force_table
 from sliceit_drake.records.metadata import Phase, ProcessingStep, SliceMetadata
 from sliceit_drake.records.phases import phases_from_motion
+from sliceit_drake.records.preprocessing import MIN_AIR_ROWS, tare
 from sliceit_drake.records.slice_record import (
     SliceRecord,
     SliceTable,
@@ -35,8 +38,10 @@ __all__ = [
     "pose_matrix",
 ]
 
-COMPONENTS = ("norm", "vertical")
+COMPONENTS = ("norm", "vertical", "components")
 
+THROUGH = 5e-3
+"""Way below the board's surface that a knife of a nominal motion may seem to go, m."""
 CLEARANCE = 1e-3
 """Height of the edge above the food at the start of a nominal motion, m."""
 
@@ -151,23 +156,31 @@ def import_force(
     *,
     component: str = "norm",
     contact: float | None = None,
+    columns: Sequence[str] = (),
+    units: Sequence[str] = (),
+    between: Sequence[float] | None = None,
 ) -> SliceRecord:
-    """Reads a CSV file with two columns, time in s and force in N, under any names or none.
+    """Reads time and force from a table of any lab (`records.force_table`).
 
     The motion is nominal: straight down at `motion.speed` (with `motion.draw_ratio` along Fx) from
     1 mm above the food, `food.position` and `food.yaw` taken as 0 where not given. The height is
-    thereby known up to a constant, and listed under `unknown`.
+    thereby known up to a constant, and listed under `unknown`. Without a speed, the knife is taken
+    to cross the food from the contact to the last row, and the speed is listed there too. What the
+    sensor shows in the air is taken off, but from a norm.
 
     Args:
-        metadata: Facts, `motion.speed` and `food.size` among them.
+        metadata: Facts, `food.size` among them.
         component: "norm" if the force is the norm of the force; "vertical" if it is the vertical
-            component, positive upwards for `wrench.sign` on_knife.
+            component, positive upwards for `wrench.sign` on_knife; "components" for all three, in
+            `wrench.frame`.
         contact: Time at which the force rises, s, which ends the air phase; None to take the
-            phases of `metadata`.
+            phases of `metadata`, or without these to find it.
+        columns, units: See `read_force_table`.
+        between: First and last time of the slice in the file, s.
 
     Raises:
-        ConfigurationError: If the file is not such a table, the component none, or a fact is
-            missing.
+        ConfigurationError: If the file is not such a table, the component none, a fact is
+            missing, or there is no slice or there are several.
     """
     if component not in COMPONENTS:
         raise ConfigurationError(
@@ -175,14 +188,56 @@ def import_force(
             field="component",
             fix=f"Give one of {', '.join(COMPONENTS)}.",
         )
-    time, force = _two_columns(file)
+    table = read_force_table(file, columns, units)
+    wanted = 3 if component == "components" else 1
+    if table.force.shape[1] != wanted:
+        raise ConfigurationError(
+            f"= {component} goes with {wanted} columns of force, and there are "
+            f"{table.force.shape[1]}",
+            source=str(file),
+            field="--component",
+            fix="Give --component components and four --columns, or another component and two.",
+        )
+    first, last = between or (table.time[0], table.time[-1])
+    rows = (table.time >= first) & (table.time <= last)
+    time, force = table.time[rows], table.force[rows]
+    if rows.sum() < MIN_ROWS:
+        raise ConfigurationError(
+            f"{first:g} to {last:g} s holds {rows.sum()} rows of the table, which has "
+            f"{table.time[0]:g} to {table.time[-1]:g} s",
+            source=str(file),
+            field="--between",
+            fix="Give first and last time of the slice, in seconds of the table.",
+        )
+    # The component that changes most, with its sign.
+    most = force[:, np.ptp(force, axis=0).argmax()]
+    one_slice(time, most, str(file))
+    facts = copy.deepcopy(metadata)
+    if contact is None and not facts.motion.phases:
+        contact = find_contact(time, most, str(file))
+    if facts.motion.speed is None and facts.food.size is not None:
+        begins = time[0] if contact is None else contact
+        facts.motion.speed = facts.food.size[2] / float(time[-1] - begins)
+        facts.unknown = [*(n for n in facts.unknown if n != "motion.speed"), "motion.speed"]
+    _check_way(facts, float(time[-1] - (time[0] if contact is None else contact)), str(file))
+    if facts.sensor.rate is None and "sensor.rate" not in facts.unknown:
+        facts.sensor.rate = float(f"{1.0 / np.median(np.diff(time)):.4g}")
     step = ProcessingStep("import_force", {}, "the motion is nominal")
+    if None in table.units:
+        step.note += "; the table names no unit of time or of force: s and N are taken"
     if component == "norm":
-        return _nominal_record(file, metadata, step, time, {"force_norm": force}, contact)
-    sign = -1.0 if metadata.wrench.sign == "by_knife" else 1.0
-    vertical = np.outer(sign * force, [0.0, 0.0, 1.0])
-    step.note += "; the horizontal force is not measured"
-    return _nominal_record(file, metadata, step, time, {"force": vertical}, contact)
+        return _nominal_record(file, facts, step, time, {"force_norm": force[:, 0]}, contact)
+    if component == "vertical":
+        sign = -1.0 if facts.wrench.sign == "by_knife" else 1.0
+        known = {"force_vertical": sign * force[:, 0]}
+        record = _nominal_record(file, facts, step, time, known, contact)
+    else:
+        as_given = _nominal_record(file, facts, step, time, {"force": force}, contact).table()
+        as_given.metadata.wrench.sign = facts.wrench.sign
+        as_given.metadata.wrench.frame = facts.wrench.frame
+        record = record_from_table(as_given)
+    in_air = record.first_phase("air").sum() >= MIN_AIR_ROWS
+    return tare(record) if in_air and facts.wrench.tared != "yes" else record
 
 
 def import_frame(
@@ -223,7 +278,7 @@ def import_frame(
             raise ConfigurationError(
                 f"holds no numbers ({error})", source=table, field=other, fix=fix
             ) from error
-    has_force = set(fmt.FORCE) <= set(values) or fmt.FORCE_NORM in values
+    has_force = set(fmt.FORCE) <= set(values) or {fmt.FORCE_NORM, fmt.FORCE_VERTICAL} & set(values)
     for name in (fmt.TIME, *fmt.POSITION, *fmt.QUATERNION, *(() if has_force else fmt.FORCE)):
         if name not in values:
             fix = f'Name it in columns, as {{"{name}": "..."}}. There are: {", ".join(there)}.'
@@ -245,28 +300,21 @@ def _header(file: str | Path) -> list[str]:
     return rows[0][1] if rows else []
 
 
-def _two_columns(file: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    header = _header(file)
-    if len(header) != 2:
+def _check_way(facts: SliceMetadata, duration: float, file: str) -> None:
+    """Refuses a nominal knife that goes through the board."""
+    if facts.motion.speed is None or facts.food.size is None:
+        return
+    way, height = facts.motion.speed * duration, facts.food.size[2]
+    if way > height + THROUGH:
         raise ConfigurationError(
-            f"the first row has {len(header)} cells",
-            source=f"{file}, line 1",
-            fix="Give two columns, time in s and force in N, separated by a comma.",
+            f"{facts.motion.speed:.3g} m/s brings the knife {1e3 * way:.0f} mm down in the "
+            f"{duration:.3g} s from the contact to the last row, and the food is "
+            f"{1e3 * height:.0f} mm high",
+            source=file,
+            field="motion.speed",
+            fix="Correct speed or size; if the knife stops or goes back, end the record there by "
+            "--between START END.",
         )
-    try:
-        float(header[0])
-    except ValueError:
-        columns = read_columns(file, header)
-        return columns[header[0]], columns[header[1]]
-    try:
-        table = np.loadtxt(file, delimiter=",", ndmin=2, encoding="utf-8")
-    except ValueError as error:
-        raise ConfigurationError(
-            f"the table holds something else than numbers ({error})",
-            source=str(file),
-            fix="Give two columns, time in s and force in N, separated by a comma.",
-        ) from error
-    return table[:, 0], table[:, 1]
 
 
 def _nominal_record(
@@ -289,6 +337,9 @@ def _nominal_record(
         )
     require_increasing(time, file, "time")
     facts.processing = [step]
+    if food.position is None:
+        # The world is the food's: nothing else is placed in it.
+        food.position, food.yaw, facts.board_height = [0.0, 0.0, 0.0], 0.0, 0.0
     if "p_WK_z" not in facts.unknown:
         facts.unknown.append("p_WK_z")
     R_WF = Rotation.from_euler("z", food.yaw or 0.0).as_matrix()
@@ -308,6 +359,8 @@ def _nominal_record(
             Phase("air", float(time[0]), contact),
             Phase("slice", contact, float(time[-1])),
         ]
+    elif not motion.phases:
+        motion.phases = [Phase("slice", float(time[0]), float(time[-1]))]
     facts.wrench.sign, facts.wrench.frame, facts.wrench.point = "on_knife", "W", "Ko"
     v, w = velocities(time, position, rotation)
     return SliceRecord(
@@ -317,7 +370,6 @@ def _nominal_record(
         rotation=rotation,
         velocity=v,
         angular_velocity=w,
-        force=force.get("force"),
-        force_norm=force.get("force_norm"),
         file=str(file),
+        **force,
     )

@@ -50,14 +50,20 @@ def tare(record: SliceRecord) -> SliceRecord:
             known, from which an offset cannot be subtracted.
     """
     air = record.first_phase("air")
-    if record.force is None or air.sum() < MIN_AIR_ROWS:
+    if record.force_norm is not None or air.sum() < MIN_AIR_ROWS:
         raise ConfigurationError(
-            "has the norm of the force alone"
-            if record.force is None
+            f"has {record.known_force}"
+            if record.force_norm is not None
             else f"has {air.sum()} rows in its first phase labelled air, expected {MIN_AIR_ROWS}",
             source=record.file or record.name,
             fix="Leave the step tare out, or give components and an air phase.",
         )
+    if record.force_vertical is not None:
+        zero = float(record.force_vertical[air].mean())
+        result = _with_step(record, "tare", {"force_vertical": zero})
+        result.force_vertical = record.force_vertical - zero
+        result.metadata.wrench.tared = "yes"
+        return result
     result = _with_step(record, "tare", {}, "subtracted in K, about Ko")
     for name in ("force", "torque"):
         values = getattr(record, name)
@@ -86,13 +92,13 @@ def compensate_tool(record: SliceRecord, *, cutoff: float | None = 20.0) -> Slic
             differentiated; None for no filter.
 
     Raises:
-        ConfigurationError: If mass or centre of mass are not given, or only the norm of the force
-            is known.
+        ConfigurationError: If mass or centre of mass are not given, or not all components of the
+            force.
     """
     tool, facts = record.metadata.tool, record.metadata.wrench
     if record.force is None or tool.mass is None or tool.center_of_mass is None:
         raise ConfigurationError(
-            "has the norm of the force alone"
+            f"has {record.known_force}"
             if record.force is None
             else "tool.mass or tool.center_of_mass is not given",
             source=record.file or record.name,
@@ -264,8 +270,8 @@ def _with_step(
 
 
 def _map_wrench(record: SliceRecord, change: Callable[[np.ndarray], np.ndarray]) -> SliceRecord:
-    """Changes force, torque and norm in place, those that are there."""
-    for name in ("force", "torque", "force_norm"):
+    """Changes force and torque in place, whatever of them is there."""
+    for name in ("force", "torque", "force_norm", "force_vertical"):
         values = getattr(record, name)
         if values is not None:
             setattr(record, name, change(values))

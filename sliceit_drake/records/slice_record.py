@@ -38,6 +38,7 @@ ANGULAR_VELOCITY = ("w_WK_x", "w_WK_y", "w_WK_z")
 FORCE = ("force_x", "force_y", "force_z")
 TORQUE = ("torque_x", "torque_y", "torque_z")
 FORCE_NORM = "force_norm"
+FORCE_VERTICAL = "force_vertical"
 JOINTS = ("q_1", "q_2", "q_3", "q_4", "q_5", "q_6")
 
 COLUMNS = (
@@ -49,6 +50,7 @@ COLUMNS = (
     *FORCE,
     *TORQUE,
     FORCE_NORM,
+    FORCE_VERTICAL,
     *JOINTS,
 )
 """Columns of the CSV file, in the order in which they are written. Others are refused."""
@@ -91,9 +93,10 @@ class SliceRecord:
         rotation: R_WK [n, 3, 3].
         velocity: v_WK of Ko [n, 3], m/s.
         angular_velocity: w_WK [n, 3], rad/s.
-        force: Force on the knife [n, 3], N; None if only its norm is known.
+        force: Force on the knife [n, 3], N; None if not all of its components are known.
         torque: Torque on the knife about Ko [n, 3], Nm; None if not known.
-        force_norm: Norm of the force [n], N, where the components are not known; None otherwise.
+        force_norm: Norm of the force [n], N, where that is all that is known; None otherwise.
+        force_vertical: The same of its component along Wz.
         joints: Joint angles [n, 6], rad; None if not known.
         file: The CSV file that it was read from, or a name for errors.
     """
@@ -107,6 +110,7 @@ class SliceRecord:
     force: np.ndarray | None = None
     torque: np.ndarray | None = None
     force_norm: np.ndarray | None = None
+    force_vertical: np.ndarray | None = None
     joints: np.ndarray | None = None
     file: str = ""
 
@@ -120,11 +124,33 @@ class SliceRecord:
 
     @property
     def force_magnitude(self) -> np.ndarray:
-        """Norm of the force [n], N, from the components where they are known."""
+        """Norm of what is known of the force [n], N, from the components where they are known."""
+        if self.force_norm is not None:
+            return self.force_norm
+        return np.linalg.norm(self.measured_force, axis=1)
+
+    @property
+    def force_columns(self) -> tuple[str, ...]:
+        """What is known of the force: its components, its norm or the vertical one."""
         if self.force is not None:
-            return np.linalg.norm(self.force, axis=1)
-        assert self.force_norm is not None, "a record has force or force_norm"
-        return self.force_norm
+            return FORCE
+        return (FORCE_NORM,) if self.force_norm is not None else (FORCE_VERTICAL,)
+
+    @property
+    def known_force(self) -> str:
+        """The same in words."""
+        if self.force is not None:
+            return "the components of the force"
+        return f"the {'norm of the' if self.force_norm is not None else 'vertical'} force alone"
+
+    @property
+    def measured_force(self) -> np.ndarray:
+        """Values of `force_columns` [n, 3] or [n, 1], N."""
+        if self.force is not None:
+            return self.force
+        known = self.force_vertical if self.force_norm is None else self.force_norm
+        assert known is not None, "a record has force, force_norm or force_vertical"
+        return known[:, None]
 
     def phase(self, *labels: str) -> np.ndarray:
         """Bool mask [n] of the rows in phases with any of these labels."""
@@ -168,8 +194,8 @@ class SliceRecord:
                 JOINTS: self.joints,
             }
         )
-        if self.force_norm is not None:
-            columns[FORCE_NORM] = self.force_norm
+        if self.force is None:
+            columns[self.force_columns[0]] = self.measured_force[:, 0]
         lines = np.arange(2, len(self) + 2)
         return SliceTable(self.metadata, columns, self.file or self.name, lines)
 
@@ -280,6 +306,12 @@ def record_from_table(table: SliceTable) -> SliceRecord:
         w = table.stack(ANGULAR_VELOCITY)
     force = table.stack(FORCE) if table.has(FORCE) else None
     torque = table.stack(TORQUE) if force is not None and table.has(TORQUE) else None
+    vertical = None
+    if force is None and FORCE_NORM not in table.columns:
+        vertical = (-1.0 if metadata.wrench.sign == "by_knife" else 1.0) * table.columns[
+            FORCE_VERTICAL
+        ]
+        metadata.wrench.sign = "on_knife"
     if force is not None:
         force, torque = _wrench_on_knife(table, rotation, force, torque)
         facts, was = metadata.wrench, copy.deepcopy(metadata.wrench)
@@ -297,6 +329,7 @@ def record_from_table(table: SliceTable) -> SliceRecord:
         force=force,
         torque=torque,
         force_norm=table.columns.get(FORCE_NORM) if force is None else None,
+        force_vertical=vertical,
         joints=table.stack(JOINTS) if table.has(JOINTS) else None,
         file=table.file,
     )

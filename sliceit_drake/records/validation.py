@@ -155,7 +155,7 @@ def check_table(table: SliceTable) -> list[RecordFinding]:
 
 def _with_readings(table: SliceTable) -> SliceTable:
     """The table without the rows in which the sensor has no finite number, where these are few."""
-    names = (*fmt.FORCE, *fmt.TORQUE, fmt.FORCE_NORM)
+    names = (*fmt.FORCE, *fmt.TORQUE, fmt.FORCE_NORM, fmt.FORCE_VERTICAL)
     series = [table.columns[name] for name in names if name in table.columns]
     kept = np.isfinite(series).all(0) if series else np.ones(len(table.lines), bool)
     if kept.all() or kept.mean() < 1.0 - MOST_LOST:
@@ -169,8 +169,8 @@ def _check_structure(table: SliceTable, findings: Findings) -> None:
     for name in (fmt.TIME, *fmt.POSITION, *fmt.QUATERNION):
         if name not in table.columns:
             findings.add("missing column", name, "the column is missing")
-    if not (table.has(fmt.FORCE) or fmt.FORCE_NORM in table.columns):
-        fix = f"Add {', '.join(fmt.FORCE)}, or force_norm if only the norm is known."
+    if not (table.has(fmt.FORCE) or {fmt.FORCE_NORM, fmt.FORCE_VERTICAL} & set(table.columns)):
+        fix = f"Add {', '.join(fmt.FORCE)}, or force_norm or force_vertical if no more is known."
         findings.add("missing column", fmt.FORCE[0], "there is no force", fix=fix)
     for group in (fmt.FORCE, fmt.TORQUE, fmt.VELOCITY, fmt.ANGULAR_VELOCITY, fmt.JOINTS):
         absent = [name for name in group if name not in table.columns]

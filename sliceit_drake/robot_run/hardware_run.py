@@ -37,6 +37,7 @@ from sliceit_drake.hardware.checks import (
 from sliceit_drake.hardware.client import RobotClient, RobotState
 from sliceit_drake.hardware.hardware_config import HardwareConfig
 from sliceit_drake.hardware.rtde_link import RobotLink
+from sliceit_drake.hardware.safety import Stop
 from sliceit_drake.interruption import raise_if_interrupted
 from sliceit_drake.output_folder import remove_results
 from sliceit_drake.robot_run.plan_check import JointPlan, check_plan, plan_joints
@@ -66,6 +67,7 @@ class HardwareRun:
         pace: Controller seconds in a second.
         run: Diagram and results, once it ran.
         link: Link to the robot, once it ran.
+        stop: Why the robot stopped, once it ran.
     """
 
     scenario: Scenario
@@ -76,6 +78,7 @@ class HardwareRun:
     pace: float = 1.0
     run: Run | None = None
     link: RobotLink | None = None
+    stop: Stop | None = None
 
     @property
     def motion(self) -> Motion:
@@ -127,6 +130,7 @@ class HardwareRun:
             *check_payload(state.payload, self.config),
             check_kinematics(state, self.config),
             *check_sensor(states, self.config, SENSOR_SAMPLES),
+            check_unzeroed(states, make_edge_kinematics(self.twin), self.config, SENSOR_SAMPLES),
         ]
         return next((str(check) for check in checks if not check.passed), None)
 
@@ -163,7 +167,7 @@ class HardwareRun:
                 raise
             self.run.stopped = reason
         finally:
-            stop = link.finish(reason)
+            stop = self.stop = link.finish(reason)
         if stop.limit != "end":
             self.run.stopped = str(stop)
         return self.run
@@ -291,7 +295,8 @@ def write_hardware_outputs(hardware: HardwareRun, directory: Path) -> dict:
     meshcat = hardware.twin.meshcat
     if meshcat is not None:
         _draw(hardware, meshcat)
-    return run.save(directory, extra={"robot": link.timing()})
+    timing = {**link.timing(), "lateness_histogram": link.lateness_histogram()}
+    return run.save(directory, extra={"robot": timing})
 
 
 def _draw(hardware: HardwareRun, meshcat: Meshcat) -> None:

@@ -4,7 +4,7 @@ import time as clock
 
 import numpy as np
 
-from sliceit_drake.diagrams.hardware_station import make_edge_kinematics
+from sliceit_drake.diagrams.hardware_station import make_clearance, make_edge_kinematics
 from sliceit_drake.hardware.checks import Check
 from sliceit_drake.hardware.client import RobotUnavailableError
 from sliceit_drake.hardware.safety import robot_fault
@@ -32,8 +32,9 @@ ARRIVED = 1e-3
 class MoveToStart:
     """The way from where the arm is to the start of a run: a line in joint space.
 
-    Nothing looks for obstacles, but for the board: the edge may not go below it, nor lower than it
-    is at the beginning, if that is below it already.
+    Looked for are board, table and holder as the scenario has them, and the arm itself: nothing
+    else. The edge may not go below the board, nor lower than it is at the beginning, if that is
+    below it already.
 
     Args:
         hardware: Whose robot, start and limits are used.
@@ -76,7 +77,21 @@ class MoveToStart:
             for x in (q, end)
         )
         turn = self._turn
+        clearance, near = make_clearance(hardware.twin), None
+        # Where it is nearer already, as on a board that lies lower, it may go away.
+        begin = clearance.nearest(q.tolist(), limits.clearance)
+        least = limits.clearance if begin is None else begin[0] - 1e-4
+        for share in np.linspace(0.0, 1.0, SAMPLES):
+            near = near or clearance.nearest((q + share * turn).tolist(), least)
         return [
+            Check(
+                "clearance on the way",
+                near is None,
+                f"at least {1e3 * least:g} mm"
+                if near is None
+                else f"{near[1]} {1e3 * near[0]:.1f} mm apart, wanted {1e3 * least:g}",
+                "Move the arm to the start, or over it, by hand.",
+            ),
             Check(
                 "way to the start",
                 self.lowest >= self.floor,

@@ -14,8 +14,9 @@ from sliceit_drake.diagrams.run import Run
 from sliceit_drake.diagrams.scenario import Scenario
 from sliceit_drake.hardware.checks import Check
 from sliceit_drake.hardware.client import RobotClient, is_loopback
-from sliceit_drake.hardware.guarded_touch import TouchError
+from sliceit_drake.hardware.guarded_touch import Touch, TouchError
 from sliceit_drake.hardware.hardware_config import HardwareConfig, differing
+from sliceit_drake.hardware.real_time import RealTime
 from sliceit_drake.hardware.rtde_link import RobotLink
 from sliceit_drake.hardware.supervisor import Supervisor
 from sliceit_drake.interruption import catch_signals, handle_signals
@@ -26,12 +27,14 @@ from sliceit_drake.robot_run.hardware_run import (
     write_hardware_outputs,
 )
 from sliceit_drake.robot_run.move_to_start import MoveToStart
+from sliceit_drake.robot_run.retreat import SPEED, Retreat
 
 __all__ = ["OperatedRobot", "ask", "plan_text"]
 
 WORD = "slice"
 MOVE_WORD = "move"
 TOUCH_WORD = "touch"
+RETREAT_WORD = "retreat"
 WATCHED = 1.0
 """Longest time that a dry run follows the robot's data, s."""
 
@@ -45,12 +48,14 @@ class OperatedRobot:
         config: The robot's file; a touch writes the board's height into it.
         pace: Controller seconds in a second; 1 for all robots.
         dry_run: Whether to do all but move.
+        found: What the last touch of the board has found.
     """
 
     host: str
     config: HardwareConfig
     pace: float = 1.0
     dry_run: bool = False
+    found: Touch | None = None
 
     def run(
         self,
@@ -81,10 +86,37 @@ class OperatedRobot:
         if touch and not self.dry_run:
             if not self.find_board(scenario):
                 return None
-        with self._connected() as client:
+        with self.connected() as client:
             meshcat = make_meshcat() if draws and not self.dry_run else None
             hardware = prepare_hardware_run(scenario, self.config, client, self.pace, meshcat)
-            return self.checked_run(hardware, directory, duration)
+            made = self.checked_run(hardware, directory, duration)
+        if Retreat.is_offered_after(hardware):
+            self.retreat(hardware)
+        return made
+
+    def retreat(self, hardware: HardwareRun) -> bool:
+        """Connects anew and goes back on the last way after the operator's word.
+
+        Returns:
+            False if the robot was not ready or stopped, or the operator did not confirm.
+        """
+        with self.connected() as client:
+            hardware.client = client
+            retreat = Retreat(hardware)
+            if not _report("Retreat", [*hardware.check_facts(), *retreat.checks()]):
+                return False
+            print(
+                f"\nRETREAT: the knife goes back on its last way, {1e3 * retreat.distance:.1f} mm "
+                f"at {1e3 * SPEED:g} mm/s. It stops at {retreat.limits.force:.0f} N; it feels "
+                f"{retreat.force:.0f} N now. Look first what it pressed on.\n"
+            )
+            if not self.asks(RETREAT_WORD):
+                return False
+            problem = retreat.execute()
+            print(
+                f"STOPPED: {problem}" if problem else "The knife is back. Its program is stopped."
+            )
+            return problem is None
 
     def move_to_start(self, scenario: Scenario) -> bool:
         """Connects, checks the robot, and moves it to the start after the operator's word.
@@ -92,7 +124,7 @@ class OperatedRobot:
         Returns:
             False if the robot was not ready or did not move, or the operator did not confirm.
         """
-        with self._connected() as client:
+        with self.connected() as client:
             hardware = prepare_hardware_run(scenario, self.config, client, self.pace)
             if not _report("Robot", hardware.check_facts()):
                 return False
@@ -102,10 +134,10 @@ class OperatedRobot:
             print(
                 "\nMOVE: the joints turn straight to "
                 f"{hardware.twin.start_joints.round(4).tolist()}; the knife moves at up to "
-                f"{1e3 * move.knife_speed:.0f} mm/s, and nothing looks for obstacles but the "
-                "board. Stand back.\n"
+                f"{1e3 * move.knife_speed:.0f} mm/s, and nothing looks for obstacles but board, "
+                "table and holder. Stand back.\n"
             )
-            if not self._asks(MOVE_WORD):
+            if not self.asks(MOVE_WORD):
                 return False
             problem = move.execute()
             if problem is not None:
@@ -114,7 +146,7 @@ class OperatedRobot:
 
     def find_board(self, scenario: Scenario) -> bool:
         """Connects and finds the board, see `touch_board`; the program on the robot is stopped."""
-        with self._connected() as client:
+        with self.connected() as client:
             return self.touch_board(scenario, client)
 
     def touch_board(self, scenario: Scenario, client: RobotClient) -> bool:
@@ -126,7 +158,7 @@ class OperatedRobot:
         Raises:
             ConfigurationError: The board is not where it is expected.
         """
-        config = self.config
+        config, self.found = self.config, None
         field = "scenario.board.height" if config.board_height is None else "board_height"
         if config.board_height is None:
             config.board_height = scenario.board.height
@@ -143,10 +175,10 @@ class OperatedRobot:
             f"{touch.expected - config.touch.below:.4f} m. Take the food away: the knife would "
             "take it for the board.\n"
         )
-        if not self._asks(TOUCH_WORD):
+        if not self.asks(TOUCH_WORD):
             return False
         try:
-            found = touch.execute()
+            found = self.found = touch.execute()
         except TouchError as error:
             print(f"STOPPED: {error}")
             print(_stopped_text(touch.link))
@@ -177,13 +209,19 @@ class OperatedRobot:
             timing = ", ".join(f"{k} {v:.4g}" for k, v in hardware.link.timing().items())
             print(f"Dry run: nothing was sent to the joints. {timing}")
             return made
-        return _slice(hardware, duration, directory) if self._asks(WORD) else None
+        return _slice(hardware, duration, directory) if self.asks(WORD) else None
 
-    def _asks(self, word: str) -> bool:
+    @staticmethod
+    def report(title: str, checks: Sequence[Check]) -> bool:
+        """Prints checks; whether all passed."""
+        return _report(title, checks)
+
+    def asks(self, word: str) -> bool:
+        """Whether the operator types the word, see `ask`."""
         return ask(word, is_loopback(self.host))
 
     @contextmanager
-    def _connected(self) -> Iterator[RobotClient]:
+    def connected(self) -> Iterator[RobotClient]:
         """A client in control of the robot; at its end, however it ends, the program is stopped.
 
         SIGTERM and SIGHUP, which a terminal that is closed sends, end it as Ctrl-C does.
@@ -193,10 +231,18 @@ class OperatedRobot:
         """
         from sliceit_drake.hardware.ur_client import UrClient
 
-        with catch_signals(), Supervisor(self.host) as supervisor:
+        # The supervisor begins before, and keeps the usual priority.
+        with (
+            catch_signals(),
+            Supervisor(self.host) as supervisor,
+            RealTime(asks=not is_loopback(self.host)) as real_time,
+        ):
             print(f"Connecting to {self.host}", flush=True)
+            _report("This computer", real_time.checks)
             config = self.config
-            client = UrClient(self.host, config.lookahead_time, config.gain, pace=self.pace)
+            client = UrClient(
+                self.host, config.lookahead_time, config.gain, config.limits, pace=self.pace
+            )
             try:
                 supervisor.begin()
                 yield client

@@ -8,7 +8,8 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from scipy.spatial.transform import Rotation
 
 from sliceit_drake.cutting.motion import Motion
-from sliceit_drake.diagrams.hardware_station import make_edge_kinematics
+from sliceit_drake.diagrams.hardware_station import make_clearance, make_edge_kinematics
+from sliceit_drake.diagrams.simulated_station import SimulatedStation
 from sliceit_drake.diagrams.station_interface import Station
 from sliceit_drake.hardware.checks import Check
 from sliceit_drake.hardware.client import RobotClient
@@ -21,6 +22,8 @@ SAMPLE = 0.01
 ITERATIONS = 20
 POSITION_MISS = 1e-4
 ASKED_OF_ROBOT = 12
+SEEN = 0.05
+"""Distance of bodies up to which it is said how near they come, m."""
 
 
 @dc.dataclass
@@ -99,7 +102,7 @@ def plan_joints(
 
 
 def check_plan(
-    plan: JointPlan, station: Station, config: HardwareConfig, client: RobotClient | None
+    plan: JointPlan, station: SimulatedStation, config: HardwareConfig, client: RobotClient | None
 ) -> list[Check]:
     """Compares a station's plan with the limits of the robot's file.
 
@@ -164,6 +167,18 @@ def check_plan(
             change,
         ),
     ]
+    clearance = make_clearance(station)
+    near = [found for q in plan.q if (found := clearance.nearest(q, SEEN)) is not None]
+    least, bodies = min(near, default=(SEEN, "all bodies"))
+    checks.append(
+        Check(
+            "clearance",
+            least >= limits.clearance,
+            f"{bodies} {1e3 * least:.1f} mm apart" + ("" if near else " or more")
+            + f", wanted {1e3 * limits.clearance:g}",
+            "Hold the food farther from the cut, or cut it elsewhere.",
+        )
+    )  # fmt: skip
     if client is not None:
         chosen = np.unique(np.linspace(0, len(plan.q) - 1, ASKED_OF_ROBOT).astype(int))
         refused = [k for k in chosen if not client.allows_joints(plan.q[k].tolist())]

@@ -265,7 +265,8 @@ class WrenchSensor(PlainSystem):
         reading = discrete_state.get_mutable_value(self._reading)
         x[_READINGS] += 1.0
         is_first = x[_READINGS] == 1.0
-        for late in x[self._late].reshape(-1, 6):
+        for start in range(self._late.start, self._late.stop, 6):
+            late = x[start : start + 6]
             late += (1.0 if is_first else self._late_share) * (wrench - late)
             wrench = late
         if is_first:

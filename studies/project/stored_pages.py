@@ -23,6 +23,7 @@ from studies.pages import RESULTS, render
 from studies.physics import foods_page
 from studies.physics.verification_page import verification_page
 from studies.project import aims
+from studies.robot import faults
 
 __all__ = ["add_arguments", "run", "stored_pages"]
 
@@ -58,6 +59,7 @@ def _whole_pages(docs: Path) -> Iterator[tuple[str, str]]:
     # All replicates are there: none is computed.
     measured = coverage.coverage_study(problem, count, replicates)
     yield "results/coverage.md", coverage.coverage_page(problem, measured, command)
+    yield "results/robot_faults.md", faults.page(faults.read(results / "robot_faults.jsonl"))
     with tempfile.TemporaryDirectory() as folder:
         study = Path(folder)
         unpack(results / "hidden_effects.jsonl", study)

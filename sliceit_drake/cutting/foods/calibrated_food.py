@@ -47,6 +47,11 @@ class CalibratedFood:
     command: str = ""
     note: str = ""
 
+    @property
+    def is_measured(self) -> bool:
+        """Whether records of cuts stand behind it; else its values are published or chosen."""
+        return self.rms_error is not None
+
     def apply_to(self, food: Food) -> Food:
         """A food of the given shape with the calibrated material and effects.
 

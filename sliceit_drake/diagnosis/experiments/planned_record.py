@@ -124,7 +124,8 @@ def planned_record(
         angular_velocity=w,
         force=None if template.force is None else nothing,
         torque=None if template.torque is None else nothing.copy(),
-        force_norm=np.zeros(len(p)) if template.force is None else None,
+        force_norm=None if template.force_norm is None else np.zeros(len(p)),
+        force_vertical=None if template.force_vertical is None else np.zeros(len(p)),
         file=metadata.name,
     )
 

@@ -1,0 +1,498 @@
+"""Which effects a food's curve asks for: nested comparison on depth that was left out.
+
+It begins with a food that has none of them and takes, one after the other, the element that
+predicts left-out depth best, as long as that gains `GAIN`. Fits stop in the minimum that is next,
+and an element may belong to another one: all minima that were found go on to the next comparison.
+Which elements are worth a fit from which minimum is told by a slice with each switched on, added to
+the linear problem there. All is computed on a coarse mesh: it is to choose, not to calibrate.
+"""
+
+import dataclasses as dc
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sliceit_drake.calibration.calibrate import depth_blocks, fingerprint
+from sliceit_drake.calibration.gauss_newton import (
+    PRIOR_CENTER,
+    PRIOR_VARIANCE,
+    Linearisation,
+    gauss_newton,
+    linear_step,
+    linearise,
+    residuals_at,
+)
+from sliceit_drake.calibration.prediction import Predictor
+from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
+from sliceit_drake.configuration import dump_yaml, load_yaml
+from sliceit_drake.cutting.batch import simulate_batch
+from sliceit_drake.cutting.foods.food import start_pose
+from sliceit_drake.cutting.motion import Motion, MotionPlan, PressAndDraw
+from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.prediction.clock import EXCHANGE_PERIOD
+from sliceit_drake.prediction.record_target import RecordTarget
+from sliceit_drake.records.slice_record import SliceRecord
+
+__all__ = [
+    "Puncture",
+    "StructureChoice",
+    "choice_in",
+    "choose_structure",
+    "coarse_predictor",
+    "find_puncture",
+    "first_starts",
+]
+
+COARSE = 0.5
+"""Elements along an edge, relative to those of the setup."""
+STEPS = 5
+"""Most steps of each fit."""
+BLOCKS = 5
+"""Of depth that are left out in turn."""
+FITTED, OF_ONE = 5, 2
+"""Most fits before an element is taken, and most of one element: those that promise most."""
+FAR = 3.0
+"""Error over that of the best minimum above which another one is given up."""
+GAIN = 0.05
+"""Part of the error on left-out depth by which an element must lower it."""
+ALIKE = 0.1
+"""Part of the error within which two structures fit alike."""
+APART = 0.1
+"""Part of the greatest force by which two predictions differ."""
+DROP, WITHIN = 0.12, 2e-3
+"""Part of a force, and depth in metres over which it falls, of a puncture."""
+DEEPEST = 0.6
+"""Part of the food's height above which a skin is punctured, or a wall."""
+
+OFF = {
+    "effects.skin.toughness": 0.0,
+    "effects.bluntness.initiation": 0.0,
+    "effects.core.toughness_ratio": 1.0,
+    "effects.compliance.arm": 0.0,
+}
+"""Values that switch elements off."""
+
+
+@dc.dataclass(frozen=True)
+class Puncture:
+    """A sudden fall of the force where the edge breaks through.
+
+    Attributes:
+        depth: Of the edge when it begins, metres.
+        force: Before it, N.
+        drop: By which it falls, N.
+    """
+
+    depth: float
+    force: float
+    drop: float
+
+
+@dc.dataclass(frozen=True)
+class Element:
+    """A part of a food's structure.
+
+    Attributes:
+        name: In words.
+        ranges: Its parameters.
+        starts: Values of these from which fits begin.
+        needs: Element without which it is nothing.
+        held_sides: In place of the setup's; "" for these.
+    """
+
+    name: str
+    ranges: tuple[ParameterRange, ...]
+    starts: tuple[tuple[float, ...], ...]
+    needs: str = ""
+    held_sides: str = ""
+
+
+@dc.dataclass
+class _Fitted:
+    """A structure, fitted.
+
+    Attributes:
+        setup: With its parameters, as fine as the user's.
+        values: Of its parameters, those of records included.
+        rms: On the records, N.
+        left_out: On depth that was left out, N.
+        predictor: Coarse.
+        at: The fit's linear problem.
+    """
+
+    setup: CalibrationSetup
+    values: dict[str, float]
+    rms: float
+    left_out: float
+    predictor: Predictor
+    at: Linearisation
+
+
+@dc.dataclass
+class StructureChoice:
+    """What a curve asks for.
+
+    Attributes:
+        setup: With the elements that were taken.
+        values: Of its parameters, a start for the calibration.
+        taken: Names of the elements.
+        lines: What was compared, and why each element was taken or left.
+        warnings: Where structures fit alike and predict differently.
+    """
+
+    setup: CalibrationSetup
+    values: dict[str, float]
+    taken: list[str]
+    lines: list[str]
+    warnings: list[str]
+
+
+Progress = Callable[[int, int, float], None]
+"""Called with structures that are fitted, those in all, and the best error on the records, N."""
+
+
+def choice_in(
+    directory: Path,
+    setup: CalibrationSetup,
+    records: Sequence[SliceRecord],
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> StructureChoice:
+    """The choice that a folder holds of the same setup and records, else a new one, written there
+    as `structure.json` and `setup.yaml`.
+
+    Args and Raises: as `choose_structure`.
+    """
+    notes, problem = directory / "structure.json", fingerprint(setup, records)
+    if notes.exists():
+        known = json.loads(notes.read_text(encoding="utf-8"))
+        if known.pop("problem") == problem:
+            return StructureChoice(load_yaml(CalibrationSetup, directory / "setup.yaml"), **known)
+    choice = choose_structure(setup, records, workers, progress)
+    directory.mkdir(parents=True, exist_ok=True)
+    dump_yaml(choice.setup, directory / "setup.yaml")
+    content = {n: getattr(choice, n) for n in ("values", "taken", "lines", "warnings")}
+    text = json.dumps({"problem": problem} | content, indent=2) + "\n"
+    notes.write_text(text, encoding="utf-8")
+    return choice
+
+
+def find_puncture(target: RecordTarget) -> Puncture | None:
+    """The first sudden fall of a record's force in the upper part of the food, if any."""
+    force = np.linalg.norm(target.measured[:, :3], axis=1)
+    depth, height = target.depth, target.facts.height
+    inside = np.flatnonzero((depth > 0.0) & np.append(np.diff(depth) > 0.0, False))
+    found = None
+    for k in inside[force[inside] > 0.2 * force.max()]:
+        after = (depth > depth[k]) & (depth <= depth[k] + WITHIN) & (np.arange(len(depth)) > k)
+        if depth[k] > DEEPEST * height or not after.any():
+            continue
+        if found is not None and depth[k] > found.depth + WITHIN:
+            break
+        lowest = int(np.flatnonzero(after)[force[after].argmin()])
+        drop = float(force[k] - force[lowest])
+        goes_on = depth[-1] > depth[k] + 2.0 * WITHIN
+        if drop > DROP * force[k] and goes_on and (found is None or drop > found.drop):
+            found = Puncture(float(depth[k]), float(force[k]), drop)
+    return found
+
+
+def choose_structure(
+    setup: CalibrationSetup,
+    records: Sequence[SliceRecord],
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> StructureChoice:
+    """Compares structures on the records, from the plainest to the one that is asked for.
+
+    Args:
+        setup: Food and ranges; ranges of elements that it lacks are usual ones.
+        records: Of one food.
+        workers: Threads.
+
+    Raises:
+        ConfigurationError: A record cannot be predicted.
+        CuttingError: Nothing that was tried can be cut.
+    """
+    plain = _without_elements(setup)
+    first = coarse_predictor(plain, records, workers)
+    height = max(t.facts.height for t in first.targets)
+    punctures = [p for p in map(find_puncture, first.targets) if p is not None]
+    free = all(r.metadata.food.support == "unknown" for r in records)
+    elements = _elements(setup, height, free)
+    lines, warnings = [], []
+    for p in punctures[:1]:
+        lines.append(
+            f"The force falls by {p.drop:.3g} of {p.force:.3g} N at a depth of "
+            f"{1e3 * p.depth:.3g} mm, as where a skin is punctured"
+        )
+        if not any(r.name == "effects.skin.toughness" for r in setup.parameters):
+            lines[-1] += "; the setup has no skin"
+    done, tried = 0, 1 + FITTED
+
+    def show(best: float) -> None:
+        if progress is not None:
+            progress(done, max(tried, done), best)
+
+    minima = _best_first([_fit(first, plain, start) for start in first_starts(first)])
+    if not minima:
+        raise CuttingError("no start of the plainest structure could be cut; widen the ranges")
+    current = minima[0]
+    done = 1
+    show(current.rms)
+    lines.append(
+        f"Plain food: {current.rms:.3f} N on the records, {current.left_out:.3f} N on left-out "
+        "depth"
+    )
+    taken: list[str] = []
+    rest = list(elements)
+    last: dict[str, _Fitted] = {}
+    promised: dict[str, float] = {}
+    while rest:
+        able = [e for e in rest if not e.needs or e.needs in taken]
+        trials: list[_Trial] = []
+        for element in able:
+            wider = _with_element(current.setup, element)
+            predictor = coarse_predictor(wider, records, workers)
+            own = _trials(element, wider, predictor, minima)
+            promised[element.name] = max([t.promise for t in own], default=0.0)
+            trials += own[:OF_ONE]
+        trials.sort(key=lambda t: -t.promise)
+        fits: dict[str, list[_Fitted | None]] = {}
+        for trial in [t for t in trials[:FITTED] if t.promise > 0.5 * GAIN]:
+            fits.setdefault(trial.element.name, []).append(
+                _fit(trial.predictor, trial.setup, trial.start)
+            )
+            done += 1
+            show(min([current.rms, *(f.rms for own in fits.values() for f in own if f)]))
+        by_name = {name: _best_first(own) for name, own in fits.items()}
+        found = last = {name: own[0] for name, own in by_name.items() if own}
+        gains = {n: 1.0 - f.left_out / current.left_out for n, f in found.items()}
+        best = max(gains, key=lambda n: gains[n], default=None)
+        if best is None or gains[best] < GAIN:
+            break
+        others = [n for n in gains if n != best]
+        for other in others:
+            if found[other].left_out < (1.0 + ALIKE) * found[best].left_out:
+                warnings += _alike(best, found[best], other, found[other])
+        lines.append(f"{best}: taken. {_change(current, found[best])}")
+        current, minima = found[best], by_name[best]
+        taken.append(best)
+        rest = [e for e in rest if e.name != best]
+        tried = done + FITTED
+    for element in elements:
+        if element.name in taken:
+            continue
+        if element.name in last:
+            lines.append(f"{element.name}: left. {_change(current, last[element.name])}")
+        elif element.needs and element.needs not in taken:
+            lines.append(f"{element.name}: left, without {element.needs} it is nothing")
+        else:
+            lines.append(
+                f"{element.name}: left. A slice with it promises "
+                f"{100.0 * max(promised[element.name], 0.0):.0f} % on left-out depth"
+            )
+    return StructureChoice(current.setup, current.values, taken, lines, warnings)
+
+
+def _change(before: _Fitted, after: _Fitted) -> str:
+    return (
+        f"Left-out depth {before.left_out:.3f} to {after.left_out:.3f} N, on the records "
+        f"{before.rms:.3f} to {after.rms:.3f} N"
+    )
+
+
+def _elements(setup: CalibrationSetup, height: float, free: bool) -> list[Element]:
+    """What may be taken; ranges are the setup's where it has them."""
+    known = {r.name: r for r in setup.parameters}
+
+    def ranged(name: str, low: float, high: float, scale: str = "log") -> ParameterRange:
+        return known.get(name) or ParameterRange(name, low, high, scale, "usual")
+
+    out = [
+        Element("skin", (ranged("effects.skin.toughness", 1e-2, 10.0),), ((0.05,), (0.5,), (3.0,))),
+        Element(
+            "puncture",
+            (ranged("effects.skin.thickness", 1e-4, 3e-3),),
+            ((2e-4,), (2e-3,)),
+            needs="skin",
+        ),
+        Element(
+            "blunt edge", (ranged("effects.bluntness.initiation", 10.0, 1e4),), ((100.0,), (1e3,))
+        ),
+        Element(
+            "core",
+            (
+                ranged("effects.core.toughness_ratio", 0.05, 5.0),
+                ranged("effects.core.rind", 0.05 * height, 0.45 * height, "linear"),
+            ),
+            ((0.6, 0.2 * height), (1.6, 0.3 * height)),
+        ),
+        Element("compliance", (ranged("effects.compliance.arm", 1e-6, 1e-3),), ((1e-5,), (2e-4,))),
+    ]
+    if free and setup.food.held_sides == "both":
+        out.append(Element("support on one side", (), ((),), held_sides="plus"))
+    return out
+
+
+def _without_elements(setup: CalibrationSetup) -> CalibrationSetup:
+    """A setup whose food has none of the elements; ranges of the rest stay."""
+    effects = setup.food.effects
+    for name, value in OFF.items():
+        _, group, field = name.split(".")
+        effects = dc.replace(
+            effects, **{group: dc.replace(getattr(effects, group), **{field: value})}
+        )
+    names = {r.name for e in _elements(setup, 1.0, False) for r in e.ranges}
+    names |= {"effects.core.transition"}
+    return dc.replace(
+        setup,
+        food=dc.replace(setup.food, effects=effects),
+        parameters=[r for r in setup.parameters if r.name not in names],
+    )
+
+
+def _with_element(setup: CalibrationSetup, element: Element) -> CalibrationSetup:
+    food = setup.food
+    if element.held_sides:
+        food = dc.replace(food, held_sides=element.held_sides)
+    return dc.replace(setup, food=food, parameters=[*setup.parameters, *element.ranges])
+
+
+def _named(element: Element, values: tuple[float, ...]) -> dict[str, float]:
+    return {r.name: v for r, v in zip(element.ranges, values, strict=True)}
+
+
+def coarse_predictor(
+    setup: CalibrationSetup, records: Sequence[SliceRecord], workers: int | None
+) -> Predictor:
+    """Of records on a coarse mesh, with the sub-step of the search."""
+    coarse = dc.replace(setup, refinement=COARSE * setup.refinement)
+    return Predictor(coarse, records, setup.search_time_step, workers=workers)
+
+
+def first_starts(predictor: Predictor) -> list[dict[str, float]]:
+    """Values of the plain food from which fits begin: the setup's, with a toughness that the work
+    of the curve is spent on, and places a quarter and three quarters into the ranges."""
+    usual = {p.name: p.start for p in predictor.parameters}
+    target = predictor.targets[0]
+    way = np.clip(np.diff(target.depth, prepend=target.depth[0]), 0.0, None)
+    work = float((np.linalg.norm(target.measured[:, :3], axis=1) * way).sum())
+    area = max(target.facts.width * target.facts.height, 1e-9)
+    starts = [usual | {"material.toughness": 0.7 * work / area}]
+    for friction, modulus in ((0.25, 0.25), (0.5, 0.75)):
+        at = {"material.friction": friction, "material.youngs_modulus": modulus}
+        values = {p.name: p.value(at[p.name]) for p in predictor.parameters if p.name in at}
+        starts.append(starts[0] | values)
+    return starts
+
+
+def _fit(
+    predictor: Predictor, setup: CalibrationSetup, start: Mapping[str, float]
+) -> _Fitted | None:
+    """The fit from a start, by name; None where slices break down."""
+    unit = np.array([p.unit(start.get(p.name, p.start)) for p in predictor.parameters])
+    try:
+        fit = gauss_newton(predictor, unit, steps=STEPS, tolerance=1e-3)
+        at = fit.linearisation
+        if not np.array_equal(at.unit, fit.unit):
+            at = linearise(predictor, fit.unit)
+    except CuttingError:
+        return None
+    rms = float(np.sqrt(np.mean(at.residuals[predictor.used] ** 2)))
+    values = predictor.values(at.unit)
+    return _Fitted(setup, values, rms, _left_out(predictor, at), predictor, at)
+
+
+def _best_first(fits: Sequence[_Fitted | None]) -> list[_Fitted]:
+    """Those that could be cut and are not far behind the best."""
+    known = sorted([f for f in fits if f is not None], key=lambda f: f.rms)
+    return [f for f in known if f.rms < FAR * known[0].rms]
+
+
+@dc.dataclass
+class _Trial:
+    """A fit that may be worth while.
+
+    Attributes:
+        element: That is added.
+        setup, predictor: With it.
+        start: Values by name.
+        promise: Part of the best error on left-out depth that it takes off in the linear problem.
+    """
+
+    element: Element
+    setup: CalibrationSetup
+    predictor: Predictor
+    start: dict[str, float]
+    promise: float
+
+
+def _trials(
+    element: Element, setup: CalibrationSetup, predictor: Predictor, minima: Sequence[_Fitted]
+) -> list[_Trial]:
+    """What an element promises from each minimum and start, best first: a slice in which it is
+    switched on gives its derivative."""
+    pairs = [(m, m.values | _named(element, s)) for m in minima for s in element.starts]
+    units = [np.array([p.unit(s[p.name]) for p in predictor.parameters]) for _, s in pairs]
+    out = []
+    for (minimum, start), residuals in zip(pairs, residuals_at(predictor, units), strict=True):
+        if np.isfinite(residuals).all():
+            at = minimum.at
+            wider = dc.replace(
+                at,
+                unit=np.append(at.unit, 0.0),
+                jacobian=np.column_stack([at.jacobian, residuals - at.residuals]),
+            )
+            error = _left_out(minimum.predictor, wider)
+            out.append(_Trial(element, setup, predictor, start, 1.0 - error / minima[0].left_out))
+    return sorted(out, key=lambda t: -t.promise)
+
+
+def _left_out(model: Predictor, at: Linearisation) -> float:
+    """Root mean square error on blocks of depth, each predicted by a fit without it, N.
+
+    The fits are those of the linear problem at the fit to all; what is a record's own stays.
+    """
+    block, free = depth_blocks(model, BLOCKS), np.array([p.shared for p in model.parameters])
+    free = np.append(free, np.full(len(at.unit) - len(free), True))
+    variance = float(np.mean(at.residuals[model.used] ** 2))
+    total = 0.0
+    for k in range(BLOCKS):
+        rest = (block != k) & model.used
+        J, r = at.jacobian[rest], at.residuals[rest]
+        H = J.T @ J + variance / PRIOR_VARIANCE * np.eye(len(at.unit))
+        g = J.T @ r + variance / PRIOR_VARIANCE * (at.unit - PRIOR_CENTER)
+        move = linear_step(H, g, at.unit, 0.0, free)
+        held = (block == k) & model.used
+        total += float(((at.residuals[held] + at.jacobian[held] @ move) ** 2).sum())
+    return float(np.sqrt(total / model.used.sum()))
+
+
+def _alike(name: str, one: _Fitted, other_name: str, other: _Fitted) -> list[str]:
+    """A warning where two structures that fit alike predict another cut differently."""
+    forces = [f for f in map(_other_cut, (one, other)) if f is not None]
+    if len(forces) < 2:
+        return []
+    n = min(len(f) for f in forces)
+    apart = float(np.sqrt(np.mean((forces[0][:n] - forces[1][:n]) ** 2)))
+    greatest = float(max(f.max() for f in forces))
+    if apart < APART * greatest:
+        return []
+    return [
+        f"{name} and {other_name} fit alike ({one.left_out:.3f} and {other.left_out:.3f} N on "
+        f"left-out depth), but a cut with as much draw as press they predict {apart:.2g} N apart, "
+        f"of {greatest:.3g} N: record such a cut"
+    ]
+
+
+def _other_cut(fitted: _Fitted) -> np.ndarray | None:
+    """Vertical force of a cut that draws as much as it presses [N], N; None if it breaks down."""
+    target = fitted.predictor.targets[0]
+    model = fitted.predictor.model(target, fitted.values)
+    way = 0.95 * float(model.top - model.bottom)
+    plan = MotionPlan([PressAndDraw(distance=way, draw_ratio=1.0)])
+    (cut,) = simulate_batch([model], [Motion(plan, start_pose(model, 0.0))], EXCHANGE_PERIOD)
+    return None if cut.failure else np.asarray(cut.food_wrench[:, 5])

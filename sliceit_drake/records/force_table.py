@@ -1,0 +1,260 @@
+"""Force curves of any lab: time and force from a CSV file, and where in it a slice is."""
+
+import dataclasses as dc
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.tables import require_increasing
+
+__all__ = ["UNITS", "ForceTable", "find_contact", "one_slice", "read_force_table"]
+
+SECONDS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
+NEWTONS = {"n": 1.0, "kn": 1e3, "mn": 1e-3, "g": 9.80665e-3, "gf": 9.80665e-3}
+NEWTONS |= {"kg": 9.80665, "kgf": 9.80665, "lbf": 4.4482216}
+UNITS = SECONDS | NEWTONS
+"""Units of time and force by name, in small letters: s and N."""
+
+SLOWEST = 0.25
+"""Rows further apart than this, s, are in another unit: a slice lasts a second or a few."""
+EARLY = 10
+"""Rows at least that tell whether a record begins in the air, where the force is level."""
+ONSET = 0.02
+"""Fraction of the greatest force at which contact begins, where the noise is smaller."""
+NOISES = 5.0
+"""Standard deviations above the force in the air at which contact begins."""
+LASTING = 5
+"""Rows for which the force must stay above that."""
+APART = 0.3
+"""Time without force between two slices, s."""
+TOUCHED, FREE = 0.25, 0.08
+"""Fractions of the greatest force above which there is a slice, and below which there is none."""
+LEAST = 8.0
+"""Greatest force over the scatter of the first rows without which there was no contact."""
+
+
+@dc.dataclass
+class ForceTable:
+    """A force over time, as a file has it, in SI units.
+
+    Attributes:
+        time: [n], s.
+        force: [n, 1], or [n, 3] of three components, N.
+        units: Of time and force in the file, where the file or the caller says them.
+    """
+
+    time: np.ndarray
+    force: np.ndarray
+    units: tuple[str | None, str | None]
+
+
+def read_force_table(
+    file: str | Path, columns: Sequence[str] = (), units: Sequence[str] = ()
+) -> ForceTable:
+    """Reads time and force from a table with a comma, semicolon, tab or spaces between its cells.
+
+    Rows before the first of numbers are a header. A decimal comma is understood beside any other
+    separator. Units in brackets in the header, or in a row of units, are converted.
+
+    Args:
+        columns: Names or numbers (from 1) of the time and of one or three columns of the force; by
+            default the only two, or four, that there are.
+        units: Of time and force, in place of the header's.
+
+    Raises:
+        ConfigurationError: Naming file, line and column.
+    """
+    rows, separator = _rows(file)
+    first = next((k for k, (_, cells) in enumerate(rows) if _is_data(cells)), len(rows))
+    if first == len(rows) or len(rows[first][1]) < 2:
+        raise ConfigurationError(
+            "there are no two columns of numbers",
+            source=str(file),
+            fix="Give a table of time and force with a comma, semicolon, tab or spaces between.",
+        )
+    width = len(rows[first][1])
+    header = [cells for _, cells in rows[:first] if len(cells) == width]
+    names = header[0] if header else [str(k + 1) for k in range(width)]
+    picked = _picked(file, names, columns)
+    known = [_unit_of(header, k) for k in (picked[0], picked[1])]
+    known = [given or found for given, found in zip(units or (None, None), known, strict=True)]
+    for unit, table in zip(known, (SECONDS, NEWTONS), strict=True):
+        if unit is not None and unit.lower() not in table:
+            raise ConfigurationError(
+                f"{unit!r} is no unit of {'time' if table is SECONDS else 'force'}",
+                field="--units",
+                fix=f"There are {', '.join(table)}.",
+            )
+    values = np.array([_numbers(file, row, names, picked, separator) for row in rows[first:]])
+    time = values[:, 0] * SECONDS[(known[0] or "s").lower()]
+    require_increasing(time, file, names[picked[0]])
+    period = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    if known[0] is None and period > SLOWEST:
+        raise ConfigurationError(
+            f"its rows are {period:.3g} s apart, which no slice can be read from",
+            source=str(file),
+            field=names[picked[0]],
+            fix="Is it in ms? Give --units ms N; give --units s N if it is in seconds.",
+        )
+    return ForceTable(
+        time, values[:, 1:] * NEWTONS[(known[1] or "N").lower()], (known[0], known[1])
+    )
+
+
+def find_contact(time: np.ndarray, force: np.ndarray, file: str = "") -> float | None:
+    """Time at which the force begins, s; None where the record begins in the food.
+
+    Args:
+        time: [n], s.
+        force: Its norm or one component, whose sign does not matter [n], N.
+
+    Raises:
+        ConfigurationError: There is no contact.
+    """
+    early = force[: max(EARLY, len(force) // 50)]
+    third = len(early) // 3
+    scatter = float(np.median(np.abs(np.diff(early))))
+    away = np.abs(force - np.median(early))
+    peak = float(away.max())
+    if peak <= LEAST * scatter:
+        raise ConfigurationError(
+            f"never rises: it stays within {peak:.2g} N of {np.median(force):.3g} N, and scatters "
+            f"by {scatter:.2g} N from row to row",
+            source=file,
+            field="force",
+            fix="Was there food under the knife? Give another file, or --between START END.",
+        )
+    least = max(ONSET * peak, NOISES * scatter)
+    if abs(np.median(early[-third:]) - np.median(early[:third])) > least:
+        return None
+    lasting = np.convolve(away > least, np.ones(LASTING), "valid") == LASTING
+    return float(time[np.argmax(lasting)]) if lasting.any() else None
+
+
+def one_slice(time: np.ndarray, force: np.ndarray, file: str = "") -> None:
+    """Refuses a file with several slices.
+
+    Args:
+        time: [n], s.
+        force: Its norm or one component [n], N.
+
+    Raises:
+        ConfigurationError: With the times of the slices.
+    """
+    away = np.abs(force - np.median(force[: max(10, len(force) // 50)]))
+    away = away / max(float(np.quantile(away, 0.99)), 1e-12)
+    touched = np.flatnonzero(away > TOUCHED)
+    slices: list[list[float]] = []
+    for k in touched:
+        if slices:
+            between = (time > slices[-1][1]) & (time < time[k])
+            quiet = between & (away < FREE)
+            if quiet.any() and np.ptp(time[quiet]) > APART:
+                slices.append([float(time[k])] * 2)
+            slices[-1][1] = float(time[k])
+        else:
+            slices.append([float(time[k])] * 2)
+    if len(slices) > 1:
+        spans = ", ".join(f"{a:.3g} to {b:.3g} s" for a, b in slices)
+        begin = max(float(time[0]), slices[0][0] - 1.0)
+        end = 0.5 * (slices[0][1] + slices[1][0])
+        raise ConfigurationError(
+            f"holds {len(slices)} slices, {spans}",
+            source=file,
+            fix=f"Import each by itself, the first with --between {begin:.3g} {end:.3g}.",
+        )
+
+
+def _rows(file: str | Path) -> tuple[list[tuple[int, list[str]]], str]:
+    """Cells of all lines that hold something, with their numbers, and the separator."""
+    try:
+        text = Path(file).read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigurationError(
+            f"the table cannot be read ({error})", source=str(file), fix="Check the path."
+        ) from error
+    lines = [
+        (number, line.strip())
+        for number, line in enumerate(text.splitlines(), start=1)
+        if line.strip() and not line.startswith("#")
+    ]
+    body = [line for _, line in lines[len(lines) // 4 :]]
+    separator = next((s for s in ";\t," if body and all(s in line for line in body)), " ")
+    split = (
+        (lambda line: line.split()) if separator == " " else (lambda line: line.split(separator))
+    )
+    return [(n, [c.strip().strip('"') for c in split(line)]) for n, line in lines], separator
+
+
+def _number(cell: str) -> float:
+    return float(cell.replace(",", "."))
+
+
+def _is_data(cells: list[str]) -> bool:
+    """Whether a row begins the table: its first cell is a number."""
+    try:
+        _number(cells[0])
+    except ValueError:
+        return False
+    return True
+
+
+def _numbers(
+    file: str | Path,
+    row: tuple[int, list[str]],
+    names: list[str],
+    picked: list[int],
+    separator: str,
+) -> list[float]:
+    number, cells = row
+    values = []
+    for k in picked:
+        text = cells[k] if k < len(cells) else ""
+        try:
+            value = _number(text)
+        except ValueError:
+            value = np.nan
+        if not np.isfinite(value):
+            raise ConfigurationError(
+                f"is {text!r}, which is not a finite number",
+                source=f"{file}, line {number}",
+                field=names[k],
+                fix="Correct the cell or remove the row.",
+            )
+        values.append(value)
+    return values
+
+
+def _picked(file: str | Path, names: list[str], columns: Sequence[str]) -> list[int]:
+    """Numbers of the columns of time and force."""
+    if not columns and len(names) in (2, 4):
+        return list(range(len(names)))
+    out = []
+    for column in columns:
+        if column in names:
+            out.append(names.index(column))
+        elif column.isdigit() and 0 < int(column) <= len(names):
+            out.append(int(column) - 1)
+    if len(out) not in (2, 4) or len(out) != len(columns):
+        raise ConfigurationError(
+            f"has {len(names)} columns, {', '.join(names)}"
+            + (f"; --columns {' '.join(columns)} are not among them" if columns else ""),
+            source=str(file),
+            field="--columns",
+            fix="Name two, of time and force, or four, of time and the force along x, y and z "
+            "(or their numbers, from 1).",
+        )
+    return out
+
+
+def _unit_of(header: list[list[str]], column: int) -> str | None:
+    """A unit in brackets or after an underscore behind the name, or a row of units below it."""
+    for cells in header:
+        found = re.search(r"[\[(_]\s*([A-Za-z]+)\s*[\])]?$", cells[column])
+        text = found[1] if found else cells[column]
+        if text.lower() in UNITS and (found or cells is not header[0]):
+            return text
+    return None

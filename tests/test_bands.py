@@ -1,0 +1,137 @@
+"""Bands of predicted force hold what they say, and widen where nothing was measured."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sliceit_drake.calibration.bands import force_band
+from sliceit_drake.calibration.gauss_newton import gauss_newton
+
+ROWS = 200
+HEIGHT = 0.03
+
+
+class PressModel:
+    """Presses at given speeds, whose force is linear in two places; as `Predictor` has them."""
+
+    def __init__(self, speeds=(0.02,)):
+        self.targets, depths, columns = [], [], []
+        for speed in speeds:
+            time = np.linspace(0.0, HEIGHT / speed, ROWS)
+            depth = speed * time - 1e-3
+            p = np.column_stack([0.0 * depth, 0.0 * depth, -depth])
+            self.targets.append(
+                SimpleNamespace(
+                    time=time,
+                    grid=time,
+                    depth=depth,
+                    p=p,
+                    facts=SimpleNamespace(height=HEIGHT),
+                    measured=np.zeros((ROWS, 1)),
+                )
+            )
+            depths.append(depth)
+            x = np.clip(depth, 0.0, None) / HEIGHT
+            columns.append(np.column_stack([20.0 * np.sqrt(x), 20.0 * x**2]))
+        self.depth, self.columns = np.concatenate(depths), np.concatenate(columns)
+        self.record_of = np.repeat(np.arange(len(speeds)), ROWS)
+        self.conditions = [f"at {speed}" for speed in speeds]
+        self.used = np.ones(len(self.depth), bool)
+        self.measured = self.columns @ [0.5, 0.5]
+
+    def predict(self, units):
+        return [[SimpleNamespace(predicted=self.columns @ u)] for u in units]
+
+    def jacobian(self, unit):
+        return self.columns @ unit - self.measured, self.columns
+
+    def nuisance_jacobian(self, unit):
+        return np.zeros((len(self.depth), 0))
+
+
+def band_of(model):
+    return force_band(model, gauss_newton(model, np.full(2, 0.4)).unit)
+
+
+def bump(depth, at, wide=3e-3):
+    return np.exp(-(((depth - at) / wide) ** 2)) * (depth > 0.0)
+
+
+def test_nine_of_ten_measurements_are_in_a_band_of_90_percent():
+    rng, shares = np.random.default_rng(0), []
+    for _ in range(20):
+        model = PressModel()
+        law = sum(rng.normal(0.0, 0.8) * bump(model.depth, at) for at in (4e-3, 11e-3, 19e-3))
+        model.measured = model.measured + law + 0.1 * rng.normal(size=ROWS)
+        low, high = band_of(model).interval()
+        shares.append(np.mean((low <= model.measured) & (model.measured <= high)))
+    assert 0.85 < np.mean(shares) < 0.97
+
+
+def test_depth_that_was_not_measured_has_a_wider_band_that_holds_what_is_there():
+    rng, shares, widths = np.random.default_rng(1), [], []
+    for _ in range(20):
+        model = PressModel()
+        law = sum(rng.normal(0.0, 0.8) * bump(model.depth, at) for at in (4e-3, 11e-3, 19e-3))
+        model.measured = model.measured + law + 0.1 * rng.normal(size=ROWS)
+        model.used = model.depth < 0.5 * HEIGHT
+        band = band_of(model)
+        low, high = band.interval()
+        inside = (low <= model.measured) & (model.measured <= high)
+        shares.append(inside[~model.used].mean())
+        widths.append(band.deviation[~model.used].mean() / band.deviation[model.used].mean())
+    assert np.mean(shares) > 0.8
+    assert np.mean(widths) > 1.5
+
+
+class BentModel(PressModel):
+    """Its lower half grows with the exponential of a place that the upper half hardly tells."""
+
+    def force(self, unit):
+        x = np.clip(self.depth, 0.0, None) / HEIGHT
+        return self.columns[:, 0] * unit[0] + x**6 * np.exp(8.0 * (unit[1] - 0.5))
+
+    def predict(self, units):
+        return [[SimpleNamespace(predicted=self.force(u))] for u in units]
+
+    def jacobian(self, unit):
+        ends = [self.force(unit + s * e) for e in 1e-5 * np.eye(2) for s in (1.0, -1.0)]
+        columns = [(ends[0] - ends[1]) / 2e-5, (ends[2] - ends[3]) / 2e-5]
+        return self.force(unit) - self.measured, np.column_stack(columns)
+
+
+def test_slices_are_drawn_where_the_force_is_not_linear_in_what_is_not_known():
+    model = BentModel()
+    model.measured = model.force(np.array([0.5, 0.9]))
+    model.measured = model.measured + 0.1 * np.random.default_rng(3).normal(size=ROWS)
+    model.used = model.depth < 0.4 * HEIGHT
+    unit = np.array([0.5, 0.5])
+    shares = []
+    for draws in (0, 200):
+        low, high = force_band(model, unit, draws).interval()
+        inside = (low <= model.measured) & (model.measured <= high)
+        shares.append(inside[~model.used].mean())
+    assert shares[1] > 0.9 > shares[0]
+
+
+def test_a_speed_that_was_not_measured_has_a_wider_band():
+    model = PressModel(speeds=(0.01, 0.02, 0.1))
+    rng = np.random.default_rng(2)
+    speed = np.repeat([-1.0, -0.5, 0.9], ROWS)
+    model.measured = model.measured + bump(model.depth, 8e-3) * (1.0 + speed)
+    model.measured = model.measured + 0.05 * rng.normal(size=len(model.measured))
+    model.used = model.record_of < 2
+    band = band_of(model)
+    means = [band.deviation[model.record_of == k].mean() for k in range(3)]
+    assert means[2] > 1.5 * max(means[:2])
+
+
+def test_more_rows_of_the_same_error_do_not_narrow_a_band():
+    widths = []
+    for every in (1, 4):
+        model = PressModel()
+        model.measured = model.measured + 0.5 * np.sin(model.depth / 6e-4)
+        model.used = (np.arange(ROWS) % every == 0) & (model.depth < 0.5 * HEIGHT)
+        widths.append(band_of(model).deviation[~model.used & (model.depth > 0.02)].mean())
+    assert widths[0] == pytest.approx(widths[1], rel=0.3)

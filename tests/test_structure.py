@@ -1,0 +1,143 @@
+"""Calibration takes the structure that a curve asks for, and says why."""
+
+import copy
+import dataclasses as dc
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_calibration import TRUTH, bench_records, coarse_setup
+from test_calibration_uncertainty import shapes, small_model
+
+from sliceit_drake.calibration import structure
+from sliceit_drake.calibration.calibrate import blocked_error
+from sliceit_drake.calibration.gauss_newton import gauss_newton, linearise
+from sliceit_drake.calibration.setup import load_setup, setup_of_record
+from sliceit_drake.calibration.structure import (
+    StructureChoice,
+    choice_in,
+    choose_structure,
+    find_puncture,
+)
+from sliceit_drake.cli.main import main
+from sliceit_drake.configuration import ConfigurationError
+from sliceit_drake.records.slice_record import SliceRecord
+from sliceit_drake.records.validation import load_record
+from sliceit_drake.resources import resource_path
+
+
+def curve(depth: np.ndarray, force: np.ndarray) -> SimpleNamespace:
+    """A record as `find_puncture` reads it."""
+    return SimpleNamespace(
+        depth=depth, measured=force[:, None], facts=SimpleNamespace(height=0.03, width=0.03)
+    )
+
+
+def test_a_sudden_fall_of_the_force_is_a_puncture_and_a_smooth_one_is_none():
+    depth = np.linspace(-2e-3, 28e-3, 600)
+    smooth = 20.0 * np.sin(np.pi * np.clip(depth, 0.0, None) / 0.03)
+    assert find_puncture(curve(depth, smooth)) is None
+    found = find_puncture(curve(depth, np.where(depth > 6e-3, 0.7, 1.0) * smooth))
+    assert found.depth == pytest.approx(6e-3, abs=2e-4)
+    assert found.drop == pytest.approx(0.3 * found.force, rel=0.15)
+    # Of what falls near the board the food's end may be the cause.
+    assert find_puncture(curve(depth, np.where(depth > 24e-3, 0.2, 1.0) * smooth)) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "depth"), [("tomato", 13e-3), ("cucumber", None), ("potato", None)]
+)
+def test_of_the_measured_curves_the_tomato_punctures(name, depth):
+    record = load_record(resource_path(f"calibration/records/{name}.csv"))
+    (target,) = structure.coarse_predictor(load_setup(name), [record], 1).targets
+    found = find_puncture(target)
+    assert (found and found.depth) == (depth and pytest.approx(depth, abs=2e-3))
+
+
+def test_left_out_depth_shows_an_overfit_as_blocks_that_are_held_out_do():
+    x = np.linspace(0.0, 1.0, 150)
+    wave = 0.3 * np.cumsum(np.random.default_rng(2).normal(size=150)) / 5.0
+    for columns in (4.0 * x[:, None], np.column_stack([4.0 * x, 0.2 * shapes(150, 6)[:, 1:]])):
+        model, truth = small_model(columns, noise=0.0)
+        model.measured = 2.0 * x + wave + 0.1 * shapes(150, 6)[:, 1:].sum(1)
+        fit = gauss_newton(model, truth)
+        left_out = structure._left_out(model, linearise(model, fit.unit))
+        assert left_out == pytest.approx(blocked_error(model, fit.unit).rms, rel=0.2)
+
+
+@pytest.fixture
+def few_elements(monkeypatch):
+    """Only skin and core, on the mesh that is coarse already."""
+    usual = structure._elements
+
+    def some(*given):
+        return [e for e in usual(*given) if e.name in ("skin", "core")]
+
+    monkeypatch.setattr(structure, "_elements", some)
+    monkeypatch.setattr(structure, "COARSE", 1.0)
+
+
+@pytest.mark.second_tier
+def test_a_skin_is_taken_where_there_is_one_and_nothing_where_there_is_none(few_elements):
+    (plain,) = bench_records(1)
+    found = choose_structure(coarse_setup(), [plain], 1)
+    assert found.taken == []
+    assert found.lines[0].startswith("Plain food: 0.1")
+    assert [line.split(".")[0] for line in found.lines[1:]] == ["skin: left", "core: left"]
+    (tough,) = bench_records(1, skin=0.6)
+    found = choose_structure(coarse_setup(), [tough], 1)
+    assert found.taken[0] == "skin"
+    assert found.values["effects.skin.toughness"] == pytest.approx(0.6, rel=0.3)
+    assert found.values["material.toughness"] == pytest.approx(
+        TRUTH["material.toughness"], rel=0.15
+    )
+    assert any(line.startswith("skin: taken. Left-out depth ") for line in found.lines)
+    assert "effects.skin.toughness" in [p.name for p in found.setup.parameters]
+
+
+def test_a_choice_is_read_back_and_made_anew_for_other_records(tmp_path, monkeypatch):
+    (record,) = bench_records(1)
+    setup = coarse_setup()
+    made = []
+
+    def choose(setup, records, *_):
+        made.append(records)
+        return StructureChoice(setup, {"material.toughness": 300.0}, ["skin"], ["why"], ["alike"])
+
+    monkeypatch.setattr(structure, "choose_structure", choose)
+    first = choice_in(tmp_path, setup, [record])
+    assert choice_in(tmp_path, setup, [record]) == first and len(made) == 1
+    other = dc.replace(record, metadata=copy.deepcopy(record.metadata))
+    other.metadata.food.peeled = True
+    choice_in(tmp_path, setup, [other])
+    assert len(made) == 2
+
+
+def test_a_food_that_no_setup_ships_for_is_what_its_record_says():
+    record = load_record(resource_path("calibration/records/cucumber.csv"))
+    record.metadata.food.name = "radish"
+    setup = setup_of_record(record)
+    assert setup.food.name == "radish" and setup.food.shape.diameter == pytest.approx(0.027)
+    assert [p.name for p in setup.parameters][0] == "material.toughness"
+    record.metadata.food.shape = "unknown"
+    with pytest.raises(ConfigurationError, match="food.shape: is not given, and without --food"):
+        setup_of_record(record)
+
+
+def test_the_command_says_what_it_compared_and_calibrates_what_it_took(
+    tmp_path, monkeypatch, capsys
+):
+    record: SliceRecord = bench_records(1)[0]
+    monkeypatch.setattr("sliceit_drake.records.validation.load_record", lambda _: record)
+    monkeypatch.setattr("sliceit_drake.calibration.setup.load_setup", lambda _: coarse_setup())
+
+    def choose(setup, *_):
+        return StructureChoice(setup, TRUTH, [], ["skin: left."], ["skin and core fit alike"])
+
+    monkeypatch.setattr(structure, "choose_structure", choose)
+    command = ["calibrate", "x.csv", "--food", "x", "--output", str(tmp_path / "out")]
+    assert main([*command, "--blocks", "0", "--workers", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "skin: left." in said and "Warning: skin and core fit alike" in said
+    assert "warning: warning:" not in said.lower()
+    assert (tmp_path / "out" / "structure.json").exists()
