@@ -55,6 +55,8 @@ class CalibrationOptions:
         storage: Journal file or URL of the search, shared by many machines; None for a file in the
             output folder.
         blocks: Blocks of depth that are held out in turn; 0 for none.
+        block_length: Depth of interleaved blocks, metres, see `blocked_error`; None for blocks that
+            each are one piece.
         start: Values of shared parameters to polish in place of a search, as those of a food that
             was calibrated before; None to search.
     """
@@ -66,6 +68,7 @@ class CalibrationOptions:
     workers: int = 2
     storage: str | None = None
     blocks: int = 5
+    block_length: float | None = None
     start: Mapping[str, float] | None = None
 
 
@@ -140,7 +143,7 @@ def calibrate(
     held_out_rms = None
     if options.blocks:
         show("held-out blocks", 0, options.blocks, rms)
-        result = blocked_error(predictor, unit, options.blocks)
+        result = blocked_error(predictor, unit, options.blocks, options.block_length)
         blocks, held_out_rms = result.blocks, result.rms
         show("held-out blocks", options.blocks, options.blocks, rms)
     return Calibration(
@@ -262,24 +265,32 @@ class HeldOutError:
     rms: float
 
 
-def blocked_error(model: Predictor, unit: np.ndarray, blocks: int = 5) -> HeldOutError:
-    """Holds out contiguous blocks of depth in turn, in all records at once.
+def blocked_error(
+    model: Predictor, unit: np.ndarray, blocks: int = 5, length: float | None = None
+) -> HeldOutError:
+    """Holds out blocks of depth in turn, in all records at once.
 
     Neighbouring samples share their error, so that samples held out one by one would be predicted
     by their neighbours; a block must be predicted by the physics. What lies above the food belongs
-    to the first block. What is a record's own (its height, its speed) stays as fitted: where the
+    to the first block. Interleaved blocks ask how well the fit fills gaps of a length; blocks in one
+    piece, how well it predicts a part of the food that no data have seen. What is a record's own (its height, its speed) stays as fitted: where the
     knife was is not what is predicted.
 
     Args:
         unit: The fit to all data [d]; each refit starts there.
         blocks: Number of blocks of equal depth.
+        length: Each block is every `blocks`-th piece of depth of this length, metres; None for one
+            piece of depth each.
 
     Raises:
         CuttingError: A slice breaks down near `unit`.
     """
     depth = model.depth
-    edges = np.linspace(0.0, float(depth[model.used].max()), blocks + 1)
-    block = np.clip(np.searchsorted(edges, depth, side="right") - 1, 0, blocks - 1)
+    if length is None:
+        edges = np.linspace(0.0, float(depth[model.used].max()), blocks + 1)
+        block = np.clip(np.searchsorted(edges, depth, side="right") - 1, 0, blocks - 1)
+    else:
+        block = np.maximum(np.floor(depth / length), 0).astype(int) % blocks
     shared = np.array([p.shared for p in model.parameters])
     errors, counts, squares = [], [], 0.0
     for k in range(blocks):
