@@ -38,6 +38,8 @@ __all__ = [
 
 HELD_OUT_STEPS = 4
 """Most steps of a refit without a block of depth."""
+PLACE_STEPS = 6
+"""Most steps of a fit of the records' own heights and speeds."""
 
 Progress = Callable[[str, int, int, float], None]
 """Called with what is done, steps done, steps in all, best error so far in N."""
@@ -122,6 +124,7 @@ def calibrate(
             options.trials,
             options.seed,
             lambda done, error: show("search", done, options.trials, error),
+            _placed,
         )
         if not np.isfinite(found.errors).any():
             raise CuttingError("no trial of the search could be cut; widen the setup's ranges")
@@ -174,11 +177,25 @@ def _given(predictor: Predictor, start: Mapping[str, float]) -> SearchResult:
         CuttingError: It cannot be cut.
     """
     unit = np.array([p.unit(start.get(p.name, p.start)) for p in predictor.parameters])
+    unit = _placed(predictor, unit)
     (row,) = predictor.predict([unit])
     error, broken = error_of(predictor, row)
     if broken:
         raise CuttingError("the food that was given breaks down on these records")
     return SearchResult(unit[None], np.array([error]), 0)
+
+
+def _placed(predictor: Predictor, unit: np.ndarray) -> np.ndarray:
+    """The same values of the food [d], with the heights and speeds of the records that suit them,
+    where a record does not know its speed: what is known of a food from elsewhere says nothing of
+    where such a knife was."""
+    own = np.array([not p.shared for p in predictor.parameters])
+    if not any(target.speed_unknown for target in predictor.targets):
+        return unit
+    try:
+        return gauss_newton(predictor, unit, free=own, steps=PLACE_STEPS).unit
+    except CuttingError:
+        return unit
 
 
 def _fingerprint(setup: CalibrationSetup, records: Sequence[SliceRecord]) -> str:
