@@ -288,10 +288,10 @@ def blocked_error(
     """Holds out blocks of depth in turn, in all records at once.
 
     Neighbouring samples share their error, so that samples held out one by one would be predicted
-    by their neighbours; a block must be predicted by the physics. What lies above the food belongs
-    to the first block. Interleaved blocks ask how well the fit fills gaps of a length; blocks in one
-    piece, how well it predicts a part of the food that no data have seen. What is a record's own (its height, its speed) stays as fitted: where the
-    knife was is not what is predicted.
+    by their neighbours; a block must be predicted by the physics. Interleaved blocks ask how well
+    the fit fills gaps of a length; blocks in one piece, how well it predicts a part of the food
+    that no data have seen. What lies above the food belongs to the first block. What is a record's
+    own (its height, its speed) stays as fitted: where the knife was is not what is predicted.
 
     Args:
         unit: The fit to all data [d]; each refit starts there.

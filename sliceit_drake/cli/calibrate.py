@@ -88,7 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--block-length",
         metavar="METRES",
         type=float,
-        help="hold out every --blocks-th piece of this depth together (default: blocks in one piece)",
+        help="hold out every --blocks-th piece of this depth together (default: whole blocks)",
     )
     parser.set_defaults(resumes=True)
 
