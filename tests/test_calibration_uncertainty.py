@@ -50,7 +50,7 @@ class MapModel:
         self.tried += [u.copy() for u in units]
         return [[SimpleNamespace(predicted=p) for p in self.split(self.function(u))] for u in units]
 
-    def jacobian(self, unit):
+    def jacobian(self, unit, free=None):
         columns = []
         for k in range(len(unit)):
             step = np.zeros(len(unit))
@@ -314,7 +314,7 @@ def test_a_profile_says_where_slices_break_down():
     found = estimate(model, truth)
     edge = found.unit[0] + 1e-3
 
-    def jacobian(unit):
+    def jacobian(unit, free=None):
         if unit[0] > edge:
             raise CuttingError("a slice breaks down")
         return columns @ unit - model.measured, columns
@@ -378,6 +378,19 @@ def test_held_out_blocks_of_depth_show_an_overfit_and_fitted_error_does_not():
         errors.append((np.sqrt(np.mean(fitted**2)), held.rms))
     assert errors[1][0] < 0.5 * errors[0][0]
     assert errors[1][1] > 2.0 * errors[1][0]
+
+
+def test_interleaved_blocks_are_predicted_from_their_neighbours_and_long_ones_are_not():
+    x = np.linspace(0.0, 1.0, 100)
+    columns = np.column_stack([np.exp(-(((x - c) / 0.1) ** 2)) for c in np.linspace(0.0, 1.0, 6)])
+    model, truth = small_model(columns, noise=0.0)
+    model.measured = 0.5 * columns.sum(1) + 0.1 * np.sin(40.0 * x)
+    fit = gauss_newton(model, truth)
+    length = 0.02 * float(model.depth.max())
+    short, long = (blocked_error(model, fit.unit, 2, each) for each in (length, None))
+    assert len(short.blocks) == 2 and sum(short.counts) == 100
+    (fitted,) = residuals_at(model, [fit.unit])
+    assert short.rms < 1.3 * np.sqrt(np.mean(fitted**2)) < 0.7 * long.rms
 
 
 def test_parameters_of_simulated_cuts_are_found_within_their_intervals():

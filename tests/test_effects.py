@@ -24,6 +24,7 @@ from sliceit_drake.cutting.foods.effects import (
     SlicePush,
     Slip,
     ToughnessRate,
+    Underside,
 )
 from sliceit_drake.cutting.foods.food import Food, make_food_model, start_pose
 from sliceit_drake.cutting.foods.material import Material
@@ -89,6 +90,7 @@ NULLS = {
     "skin": Effects(skin=Skin(0.0, 2e-3)),
     "core": Effects(core=Core(2e-3, 5e-4, offset=[1e-3, -1e-3])),
     "centre": Effects(centre=Centre(2e-3, 5e-4, offset=[0.0, 1e-3])),
+    "underside": Effects(underside=Underside(5e-3, 5e-4)),
     "bluntness": Effects(bluntness=Bluntness(0.0, 7e-3, 0.0, 2.0, 100)),
     "a sharpened knife": Effects(bluntness=Bluntness(dulling=200.0, dulling_exponent=0.5)),
     "adhesion": Effects(adhesion=Adhesion(0.0, 0.0)),
@@ -254,6 +256,18 @@ def test_a_core_off_the_middle_is_tough_and_stiff_where_it_lies():
     assert set(stiffer[known]) == {1.0, ratio}
     found = model.element_volume / model.stiff_volume
     np.testing.assert_allclose(found[known], stiffer[known], rtol=1e-3)
+
+
+def test_an_underside_changes_the_force_where_the_edge_is_in_it_and_nowhere_above():
+    height, ratio = 5e-3, 0.4
+    bottom = Effects(underside=Underside(height, 1e-4, ratio))
+    base, other = (simulate(bar(), e, press(HEIGHT - 1e-3)) for e in (Effects(), bottom))
+    depth = depth_of(base)
+    below = (depth > HEIGHT - height + 1.5e-3) & (depth < HEIGHT - 1.5e-3)
+    above = (depth > 2e-3) & (depth < HEIGHT - height - 2e-3)
+    for rows, expected in ((below, ratio), (above, 1.0)):
+        found = other.edge[rows, 2].mean() / base.edge[rows, 2].mean()
+        assert found == pytest.approx(expected, rel=0.05)
 
 
 def test_what_lies_outside_of_the_section_is_no_core():
@@ -474,6 +488,7 @@ ALL = Effects(
     skin=Skin(0.1),
     core=Core(4e-3, 1e-3, 0.7, 0.8),
     centre=Centre(5e-3, 1e-3, 1.3),
+    underside=Underside(5e-3, 1e-3, 0.6),
     bluntness=Bluntness(100.0, 2e-3, 10.0, 1.0, 5),
     adhesion=Adhesion(500.0, 1e4),
     slice_push=SlicePush(0.8),

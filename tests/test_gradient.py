@@ -20,6 +20,7 @@ from sliceit_drake.cutting.foods.effects import (
     SlicePush,
     Slip,
     ToughnessRate,
+    Underside,
 )
 from sliceit_drake.cutting.foods.food import Food, make_food_model
 from sliceit_drake.cutting.foods.material import Material
@@ -64,6 +65,7 @@ EFFECTS = Effects(
     skin=Skin(0.5),
     core=Core(4e-3, 1e-3, 0.7, 0.8),
     centre=Centre(8e-3, 2e-3, 1.5),
+    underside=Underside(8e-3, 4e-3, 0.7),
     bluntness=Bluntness(50.0, 2e-3),
     adhesion=Adhesion(300.0, 3000.0, 0.6),
     slice_push=SlicePush(0.8),

@@ -41,6 +41,8 @@ __all__ = [
 
 HELD_OUT_STEPS = 4
 """Most steps of a refit without a block of depth."""
+PLACE_STEPS = 6
+"""Most steps of a fit of the records' own heights and speeds."""
 
 Progress = Callable[[str, int, int, float], None]
 """Called with what is done, steps done, steps in all, best error so far in N."""
@@ -58,6 +60,8 @@ class CalibrationOptions:
         storage: Journal file or URL of the search, shared by many machines; None for a file in the
             output folder.
         blocks: Blocks of depth that are held out in turn; 0 for none.
+        block_length: Depth of interleaved blocks, metres, see `blocked_error`; None for blocks that
+            each are one piece.
         start: Values of shared parameters to polish in place of a search, as those of a food that
             was calibrated before; None to search.
     """
@@ -69,6 +73,7 @@ class CalibrationOptions:
     workers: int = 2
     storage: str | None = None
     blocks: int = 5
+    block_length: float | None = None
     start: Mapping[str, float] | None = None
 
 
@@ -122,6 +127,7 @@ def calibrate(
             options.trials,
             options.seed,
             lambda done, error: show("search", done, options.trials, error),
+            _placed,
         )
         if not np.isfinite(found.errors).any():
             raise CuttingError("no trial of the search could be cut; widen the setup's ranges")
@@ -147,7 +153,7 @@ def calibrate(
     held_out_rms = None
     if options.blocks:
         show("held-out blocks", 0, options.blocks, rms)
-        result = blocked_error(predictor, unit, options.blocks)
+        result = blocked_error(predictor, unit, options.blocks, options.block_length)
         blocks, held_out_rms = result.blocks, result.rms
         show("held-out blocks", options.blocks, options.blocks, rms)
     return Calibration(
@@ -180,11 +186,25 @@ def _given(predictor: Predictor, start: Mapping[str, float]) -> SearchResult:
         CuttingError: It cannot be cut.
     """
     unit = np.array([p.unit(start.get(p.name, p.start)) for p in predictor.parameters])
+    unit = _placed(predictor, unit)
     (row,) = predictor.predict([unit])
     error, broken = error_of(predictor, row)
     if broken:
         raise CuttingError("the food that was given breaks down on these records")
     return SearchResult(unit[None], np.array([error]), 0)
+
+
+def _placed(predictor: Predictor, unit: np.ndarray) -> np.ndarray:
+    """The same values of the food [d], with the heights and speeds of the records that suit them,
+    where a record does not know its speed: what is known of a food from elsewhere says nothing of
+    where such a knife was."""
+    own = np.array([not p.shared for p in predictor.parameters])
+    if not any(target.speed_unknown for target in predictor.targets):
+        return unit
+    try:
+        return gauss_newton(predictor, unit, free=own, steps=PLACE_STEPS).unit
+    except CuttingError:
+        return unit
 
 
 def fingerprint(setup: CalibrationSetup, records: Sequence[SliceRecord]) -> str:
@@ -256,9 +276,16 @@ def _note(shared: Any, k: int, done: int, error: float) -> None:
     shared[k] = (done, error)
 
 
-def depth_blocks(model: Predictor, blocks: int) -> np.ndarray:
-    """Number of the block of equal depth of each entry of the measurement [M]; what lies above the
-    food belongs to the first."""
+def depth_blocks(model: Predictor, blocks: int, length: float | None = None) -> np.ndarray:
+    """Number of the block of depth of each entry of the measurement [M].
+
+    Args:
+        blocks: How many; what lies above the food belongs to the first.
+        length: Of interleaved blocks, m, of which every `blocks`-th has the same number; without
+            it each number is one piece of equal depth.
+    """
+    if length is not None:
+        return np.maximum(np.floor(model.depth / length), 0).astype(int) % blocks
     edges = np.linspace(0.0, float(model.depth[model.used].max()), blocks + 1)
     numbers = np.searchsorted(edges, model.depth, side="right") - 1
     return np.asarray(np.clip(numbers, 0, blocks - 1))
@@ -279,21 +306,27 @@ class HeldOutError:
     rms: float
 
 
-def blocked_error(model: Predictor, unit: np.ndarray, blocks: int = 5) -> HeldOutError:
-    """Holds out contiguous blocks of depth in turn, in all records at once.
+def blocked_error(
+    model: Predictor, unit: np.ndarray, blocks: int = 5, length: float | None = None
+) -> HeldOutError:
+    """Holds out blocks of depth in turn, in all records at once.
 
     Neighbouring samples share their error, so that samples held out one by one would be predicted
-    by their neighbours; a block must be predicted by the physics. What is a record's own (its
-    height, its speed) stays as fitted: where the knife was is not what is predicted.
+    by their neighbours; a block must be predicted by the physics. Interleaved blocks ask how well
+    the fit fills gaps of a length; blocks in one piece, how well it predicts a part of the food
+    that no data have seen. What is a record's
+    own (its height, its speed) stays as fitted: where the knife was is not what is predicted.
 
     Args:
         unit: The fit to all data [d]; each refit starts there.
         blocks: Number of blocks of equal depth.
+        length: Each block is every `blocks`-th piece of depth of this length, metres; None for one
+            piece of depth each.
 
     Raises:
         CuttingError: A slice breaks down near `unit`.
     """
-    block = depth_blocks(model, blocks)
+    block = depth_blocks(model, blocks, length)
     shared = np.array([p.shared for p in model.parameters])
     errors, counts, squares = [], [], 0.0
     for k in range(blocks):

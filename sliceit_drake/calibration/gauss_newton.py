@@ -71,13 +71,13 @@ class Fit:
     linearisation: Linearisation
 
 
-def linearise(model: Predictor, unit: np.ndarray) -> Linearisation:
-    """Residuals and derivatives at a place.
+def linearise(model: Predictor, unit: np.ndarray, free: np.ndarray | None = None) -> Linearisation:
+    """Residuals and derivatives at a place; by values that are not `free`, mask [d], zero.
 
     Raises:
         CuttingError: A slice breaks down near it.
     """
-    residuals, jacobian = model.jacobian(unit)
+    residuals, jacobian = model.jacobian(unit, free=free)
     mask = model.used
     nuisance = model.nuisance_jacobian(unit)
     return Linearisation(
@@ -128,7 +128,7 @@ def gauss_newton(
         CuttingError: A slice breaks down at the start.
     """
     free = np.ones(len(start), bool) if free is None else free
-    at = linearisation or linearise(model, np.clip(start, 0.0, 1.0))
+    at = linearisation or linearise(model, np.clip(start, 0.0, 1.0), free)
     cost = _cost(at.residuals, at.unit, noise)
     damping, taken = FIRST_DAMPING, 0
     while taken < steps:
@@ -150,7 +150,7 @@ def gauss_newton(
             if taken + 1 == steps or cost - costs[k] <= tolerance * cost:
                 return Fit(places[k], costs[k], taken + 1, taken + 1 < steps, at)
             try:
-                accepted = linearise(model, places[k])
+                accepted = linearise(model, places[k], free)
             except CuttingError:
                 # So near to where slices break down there is no derivative.
                 damping *= RETREAT

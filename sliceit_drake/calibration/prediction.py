@@ -437,16 +437,21 @@ class Predictor:
         squares = [self.error(row) ** 2 for row in self.predict(list(ends), near=unit)]
         return (squares[0] - squares[1]) / float(ends[0, k] - ends[1, k])
 
-    def jacobian(self, unit: np.ndarray, step: float = 2e-3) -> tuple[np.ndarray, np.ndarray]:
+    def jacobian(
+        self, unit: np.ndarray, step: float = 2e-3, free: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Residuals [M] and their derivatives by the unit values [M, d], by central differences.
 
-        The oscillation is held. Steps that would leave a range are taken inwards.
+        The oscillation is held. Steps that would leave a range are taken inwards. Derivatives by
+        values that are not `free`, mask [d], are not computed, and zero.
 
         Raises:
             CuttingError: A slice breaks down there.
         """
         high, low = np.minimum(unit + step, 1.0), np.maximum(unit - step, 0.0)
         moved = self._moved_together()
+        if free is not None:
+            moved = [members for members in moved if free[members].any()]
         sets = []
         for members in moved:
             for end in (high, low):

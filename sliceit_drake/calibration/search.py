@@ -70,6 +70,7 @@ def search(
     trials: int,
     seed: int,
     progress: Callable[[int, float], None] | None = None,
+    place: Callable[[Predictor, np.ndarray], np.ndarray] | None = None,
 ) -> SearchResult:
     """Runs generations of trials until the study holds `trials` finished ones or a few more.
 
@@ -81,6 +82,8 @@ def search(
         study: From `open_study`.
         trials: Number of finished trials in the storage, those of all workers.
         progress: Called with the finished trials and the best error so far, N.
+        place: Gives the place [d] of the first trial, from that of the setup's values; as it is by
+            default.
 
     Raises:
         ConfigurationError: The study in the storage is of other parameters, or the storage failed.
@@ -100,11 +103,14 @@ def search(
         name: optuna.distributions.FloatDistribution(0.0, 1.0) for name in names
     }
     done = _finished(study)
+    start = predictor.start
+    if place is not None and len(done) < GENERATION:
+        start = place(predictor, start)
     while len(done) < trials:
         # A database need not keep the order of a trial's parameters.
         known_units = {tuple(t.params[name] for name in names) for t in done[-GENERATION:]}
         # A generation that was cut short is proposed once more, and what it lacks is computed.
-        proposed = _generation(space, predictor.start, seed, done)
+        proposed = _generation(space, start, seed, done)
         units = [u for u in proposed if tuple(u.tolist()) not in known_units]
         for unit, row in zip(units, predictor.predict(units), strict=True):
             error, broken = error_of(predictor, row)

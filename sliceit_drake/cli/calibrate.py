@@ -101,6 +101,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=5,
         help="blocks of depth held out in turn (default 5; 0: none)",
     )
+    parser.add_argument(
+        "--block-length",
+        metavar="METRES",
+        type=float,
+        help="hold out every --blocks-th piece of this depth together (default: whole blocks)",
+    )
     parser.set_defaults(resumes=True)
 
 
@@ -120,6 +126,7 @@ def run(options: argparse.Namespace) -> int:
     any_number, some = (0, math.inf), (1, math.inf)
     check_numbers(options, trials=some, starts=some, workers=WORKERS, seed=(0, 2**32 - 1))
     check_numbers(options, steps=any_number, blocks=any_number, per_point=any_number)
+    check_numbers(options, block_length=(1e-4, 1.0))
     return _from_literature(options) if options.literature else _calibrate(options)
 
 
@@ -221,6 +228,7 @@ def _calibrate(options: argparse.Namespace) -> int:
                 workers=options.workers,
                 storage=options.storage,
                 blocks=options.blocks,
+                block_length=options.block_length,
                 start=start,
             ),
             [r for r in records if r.name in options.hold_out],

@@ -167,16 +167,17 @@ class CuttingModel(CutGeometry):
             self.tables = edge_tables(section, split.triangles, numerics.edge_spread, groups)
         self.toughness_by_scale = np.full(len(self.point_depth), material.toughness)
         self.flank_scale = self.point_scales.flank_stiffness
+        up = self.split.points[:, 2] - self.bottom
         if effects.section != Section():
-            height = self.split.points[:, 2] - self.bottom
-            width = effects.section.width(2.0 * height / (self.top - self.bottom) - 1.0)
+            width = effects.section.width(2.0 * up / (self.top - self.bottom) - 1.0)
             self.toughness_by_scale = self.toughness_by_scale * width
             self.flank_scale = self.flank_scale * width
         excess = self._excess()
         points, elements = self.distances_inside(effects.core.offset)
         centred, _ = self.distances_inside(effects.centre.offset)
-        for part, distance in ((effects.core, points), (effects.centre, centred)):
-            factor = 1.0 + (part.toughness_ratio - 1.0) * part.share(distance)
+        parts = (effects.core, points), (effects.centre, centred), (effects.underside, up)
+        for part, place in parts:
+            factor = 1.0 + (part.toughness_ratio - 1.0) * part.share(place)
             self.toughness_by_scale, excess = self.toughness_by_scale * factor, excess * factor
         self.toughness = self.toughness_by_scale * self.point_scales.toughness + excess
         inside = effects.core.share(elements)
@@ -222,7 +223,8 @@ class CuttingModel(CutGeometry):
         material, effects, knife, numerics = self.material, self.effects, self.knife, self.numerics
         scale = material.youngs_modulus / self.element_size
         bond = numerics.bond_stiffness * scale
-        weakest = min(1.0, effects.core.toughness_ratio) * min(1.0, effects.centre.toughness_ratio)
+        places = effects.core, effects.centre, effects.underside
+        weakest = float(np.prod([min(1.0, part.toughness_ratio) for part in places]))
         weakest = max(material.toughness * weakest, 1e-12)
         mu, lam = material.stable_neo_hookean()
         step = numerics.time_step

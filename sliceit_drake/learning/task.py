@@ -159,7 +159,7 @@ def station_scenario(task: TaskConfig, calibrated: CalibratedFood, food: str) ->
         numerics=Numerics(time_step=task.time_step),
     )
     if task.simulator == "cutting":
-        food_model = calibrated.apply_to(calibrated.food)
+        food_model = calibrated.held()
         shape = food_model.shape
         if isinstance(shape, Cylinder):
             shape = dc.replace(shape, rings=max(2, round(shape.rings * task.refinement)))

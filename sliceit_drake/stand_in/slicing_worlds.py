@@ -199,7 +199,7 @@ class StandInWorld(SlicingWorld):
         self, scenario: Scenario, calibrated: CalibratedFood, rng: np.random.Generator
     ) -> None:
         scenario.numerics = Numerics(time_step=self.time_step)
-        scenario.food = food = calibrated.apply_to(copy.deepcopy(calibrated.food))
+        scenario.food = food = calibrated.held()
         shape, material, effects = food.shape, food.material, food.effects
         assert isinstance(shape, Cylinder)
         shape.rings = round(self.refinement * shape.rings)

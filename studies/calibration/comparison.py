@@ -16,11 +16,12 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate
+from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate, values_of
 from sliceit_drake.calibration.per_point import fit_points
 from sliceit_drake.calibration.result import Calibration
 from sliceit_drake.calibration.setup import load_setup
 from sliceit_drake.cli.progress import StageBars
+from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
 from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.records.validation import load_record
 from sliceit_drake.resources import resource_path
@@ -54,6 +55,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--trials", type=int, default=500, help="of the search (default 500)")
     parser.add_argument("--steps", type=int, default=100, help="of Adam (default 100)")
+    parser.add_argument("--starts", type=int, default=2, help="places refined (default 2)")
+    parser.add_argument(
+        "--polish",
+        nargs="+",
+        choices=FOODS,
+        default=[],
+        help="foods that are polished as they ship, in place of a search (default: none)",
+    )
+    parser.add_argument(
+        "--blocks", type=int, default=5, help="blocks of depth held out (default 5; 0: none)"
+    )
+    parser.add_argument(
+        "--block-length", type=float, metavar="METRES", help="as of sliceit calibrate"
+    )
     parser.add_argument(
         "--point-steps",
         type=int,
@@ -88,7 +103,13 @@ def run(options: argparse.Namespace) -> int:
         folder = options.output / food
         begin = time.monotonic()
         settings = CalibrationOptions(
-            trials=options.trials, steps=options.steps, workers=options.workers
+            trials=options.trials,
+            steps=options.steps,
+            starts=options.starts,
+            workers=options.workers,
+            blocks=options.blocks,
+            block_length=options.block_length,
+            start=values_of(load_calibrated_food(food)) if food in options.polish else None,
         )
         with StageBars(f"{food}: ") as bars:
             result = calibrate(
@@ -97,7 +118,7 @@ def run(options: argparse.Namespace) -> int:
         minutes = (time.monotonic() - begin) / 60.0
         command = (
             f"python -m studies calibration --foods {food} --trials {options.trials} --steps "
-            f"{options.steps}"
+            f"{options.steps} --starts {options.starts} --blocks {options.blocks}"
         )
         result.save(folder, command)
         comparison = compare(result, profile, minutes)

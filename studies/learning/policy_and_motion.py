@@ -41,9 +41,7 @@ def optimum(food: str, duration: float) -> PressAndDraw:
     """The best motion for a calibrated food in a time, s."""
     calibrated = load_calibrated_food(food)
     scenario = StandInWorld().scenario(food, 0)[0]
-    model = make_food_model(
-        calibrated.apply_to(copy.deepcopy(calibrated.food)), calibrated.knife, scenario.numerics
-    )
+    model = make_food_model(calibrated.held(), calibrated.knife, scenario.numerics)
     limits = MotionLimits(duration=duration)
     motion = optimize_motion(model, limits, period=scenario.exchange_period).motion
     return dc.replace(motion, acceleration=limits.draw_acceleration)

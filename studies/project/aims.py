@@ -309,7 +309,7 @@ def calibration_rows(docs: Docs) -> Iterator[Row]:
         )
         values = dict(zip(("ratio", "minutes"), found or (), strict=False))
         yield measured(
-            f"calibrating {food}: 500 trials, two starts of 100 steps of Adam, two cores",
+            f"calibrating {food}, by the command that its file names",
             "<= 10 min for one start",
             command,
             source,

@@ -60,6 +60,12 @@ class CalibratedFood:
         effects = dc.replace(copy.deepcopy(self.food.effects), compliance=Compliance())
         return dc.replace(food, material=copy.deepcopy(self.food.material), effects=effects)
 
+    def held(self) -> Food:
+        """A copy of the food for a robot that draws: held on both sides where it was cut unheld,
+        for a round food that nothing holds rolls under a draw."""
+        food = self.apply_to(copy.deepcopy(self.food))
+        return dc.replace(food, held_sides="both") if food.held_sides == "none" else food
+
 
 def load_calibrated_food(name: str | Path) -> CalibratedFood:
     """Reads a food that ships calibrated, or a YAML file.

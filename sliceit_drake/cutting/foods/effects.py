@@ -29,6 +29,7 @@ __all__ = [
     "SlicePush",
     "Slip",
     "ToughnessRate",
+    "Underside",
 ]
 
 
@@ -234,6 +235,23 @@ class Centre:
         return _inside(distance, self.distance, self.transition)
 
 
+@dc.dataclass
+class Underside:
+    """A bottom of another toughness, as of the last wall of a fruit, which parts by itself where it
+    is pressed on the board."""
+
+    height: float = quantity(8e-3, "m", low=0.0, high=0.1)
+    """From the food's lowest point to where the bottom ends."""
+    transition: float = quantity(1e-3, "m", low=1e-5, high=0.05)
+    """Width of the transition."""
+    toughness_ratio: float = quantity(1.0, "", low=0.01, high=10.0)
+    """Bottom over what is above it."""
+
+    def share(self, up: np.ndarray) -> np.ndarray:
+        """How much of the bottom is at a height above the food's lowest point: 1 below, 0 above."""
+        return _inside(self.height - np.asarray(up), 0.0, self.transition)
+
+
 def _check_offset(offset: list[float], around: float, name: str, where: str) -> None:
     """Refuses an inner part that is moved out of the food."""
     if np.linalg.norm(offset) > around:
@@ -360,6 +378,7 @@ class Effects:
     skin: Skin = dc.field(default_factory=Skin)
     core: Core = dc.field(default_factory=Core)
     centre: Centre = dc.field(default_factory=Centre)
+    underside: Underside = dc.field(default_factory=Underside)
     bluntness: Bluntness = dc.field(default_factory=Bluntness)
     adhesion: Adhesion = dc.field(default_factory=Adhesion)
     slice_push: SlicePush = dc.field(default_factory=SlicePush)
