@@ -8,13 +8,18 @@ import copy
 import dataclasses as dc
 import hashlib
 import json
+import os
 import platform
 import sys
 import tempfile
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import numpy as np
+import scipy.linalg
 
 from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate
 from sliceit_drake.calibration.setup import CalibrationSetup, ParameterRange
@@ -192,7 +197,7 @@ def diagnosis(name: str) -> Facts:
         )
     said = result.facts()
     numbers = {"misfit": said["misfit_over_noise"], "p_value": said["p_value"]}
-    numbers |= {f"gain:{e['cause']}": e["gain"] for e in said["evidence"][:5]}
+    numbers |= {f"gain:{e['cause']}": e["gain"] for e in said["evidence"][:5] if e["gain"]}
     return facts(numbers, json.dumps(said, sort_keys=True))
 
 
@@ -295,15 +300,28 @@ PARTS: dict[str, Callable[[], Facts]] = {
 
 
 def machine() -> str:
-    """What fixes the last bits of a computation: processor and versions."""
-    text = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    cpu = next((line for line in text if line.startswith("flags")), platform.processor())
-    versions = [platform.python_version()]
-    for name in ("drake", "numpy", "scipy", "warp-lang", "optuna", "onnxruntime"):
-        from importlib.metadata import version
-
-        versions.append(version(name))
-    return hashlib.sha256(repr((cpu, versions)).encode()).hexdigest()[:16]
+    """What the last bits of a computation depend on: versions, and how this processor's libraries
+    round. They choose their code by more than a processor's features (its caches, its cores), so
+    that it is measured: on products, decompositions, functions and a simulated press."""
+    names = ("drake", "numpy", "scipy", "warp-lang", "optuna", "onnxruntime")
+    versions = [platform.python_version(), *(version(name) for name in names)]
+    rng = np.random.default_rng(0)
+    a, b = rng.standard_normal((400, 300)), rng.standard_normal((400, 3))
+    model = make_food_model(effects_food(), Knife(), Numerics(time_step=5e-4))
+    plan = MotionPlan([ConstantSpeed(distance=4e-3, speed=0.1)])
+    press = simulate_slice(CuttingSolver(model, 2e-3), Motion(plan, start_pose(model, 1e-3)))
+    bits = (
+        a.T @ a,
+        a.astype(np.float32).T @ a.astype(np.float32),
+        scipy.linalg.lstsq(a, b)[0],
+        scipy.linalg.cho_solve(scipy.linalg.cho_factor(a.T @ a), a.T @ b),
+        np.linalg.eigh(a.T @ a)[0],
+        np.linalg.svd(a)[1],
+        np.exp(a) + np.log(np.abs(a)) + np.sin(a) + np.abs(a) ** 0.3,
+        a.sum(axis=0),
+        press.food_wrench,
+    )
+    return facts({}, repr(versions), *bits).hash
 
 
 if __name__ == "__main__":

@@ -1,8 +1,13 @@
 """Fixtures that several test modules use, and the two tiers of the tests."""
 
 import faulthandler
+import os
 
 import pytest
+
+# As the programs: before numpy is imported, and for what tests start. Sums of several threads
+# differ in their last bits from those of one.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 @pytest.fixture

@@ -43,7 +43,7 @@ class PressModel:
     def predict(self, units):
         return [[SimpleNamespace(predicted=self.columns @ u)] for u in units]
 
-    def jacobian(self, unit):
+    def jacobian(self, unit, free=None):
         return self.columns @ unit - self.measured, self.columns
 
     def nuisance_jacobian(self, unit):
@@ -95,7 +95,7 @@ class BentModel(PressModel):
     def predict(self, units):
         return [[SimpleNamespace(predicted=self.force(u))] for u in units]
 
-    def jacobian(self, unit):
+    def jacobian(self, unit, free=None):
         ends = [self.force(unit + s * e) for e in 1e-5 * np.eye(2) for s in (1.0, -1.0)]
         columns = [(ends[0] - ends[1]) / 2e-5, (ends[2] - ends[3]) / 2e-5]
         return self.force(unit) - self.measured, np.column_stack(columns)

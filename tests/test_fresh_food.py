@@ -146,7 +146,7 @@ def test_the_pendant_puts_food_there_only_while_nothing_can_move():
         for request, said in (
             ({"fresh_food": "{food: {shape: 3}}"}, "shape"),
             ({"fresh_food": 3}, "true or a scenario"),
-            ({"food": True}, "one of inject, status, fresh_food, stop"),
+            ({"food": True}, "one of inject, status, trace, fresh_food, stop"),
         ):
             refused = answer(request)
             assert not refused["ok"] and said in refused["error"]

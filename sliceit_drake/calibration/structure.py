@@ -91,7 +91,7 @@ class Puncture:
 
 
 @dc.dataclass(frozen=True)
-class Element:
+class _Element:
     """A part of a food's structure.
 
     Attributes:
@@ -304,7 +304,7 @@ def _change(before: _Fitted, after: _Fitted) -> str:
     )
 
 
-def _elements(setup: CalibrationSetup, height: float, free: bool) -> list[Element]:
+def _elements(setup: CalibrationSetup, height: float, free: bool) -> list[_Element]:
     """What may be taken; ranges are the setup's where it has them."""
     known = {r.name: r for r in setup.parameters}
 
@@ -312,17 +312,19 @@ def _elements(setup: CalibrationSetup, height: float, free: bool) -> list[Elemen
         return known.get(name) or ParameterRange(name, low, high, scale, "usual")
 
     out = [
-        Element("skin", (ranged("effects.skin.toughness", 1e-2, 10.0),), ((0.05,), (0.5,), (3.0,))),
-        Element(
+        _Element(
+            "skin", (ranged("effects.skin.toughness", 1e-2, 10.0),), ((0.05,), (0.5,), (3.0,))
+        ),
+        _Element(
             "puncture",
             (ranged("effects.skin.thickness", 1e-4, 3e-3),),
             ((2e-4,), (2e-3,)),
             needs="skin",
         ),
-        Element(
+        _Element(
             "blunt edge", (ranged("effects.bluntness.initiation", 10.0, 1e4),), ((100.0,), (1e3,))
         ),
-        Element(
+        _Element(
             "core",
             (
                 ranged("effects.core.toughness_ratio", 0.05, 5.0),
@@ -330,10 +332,10 @@ def _elements(setup: CalibrationSetup, height: float, free: bool) -> list[Elemen
             ),
             ((0.6, 0.2 * height), (1.6, 0.3 * height)),
         ),
-        Element("compliance", (ranged("effects.compliance.arm", 1e-6, 1e-3),), ((1e-5,), (2e-4,))),
+        _Element("compliance", (ranged("effects.compliance.arm", 1e-6, 1e-3),), ((1e-5,), (2e-4,))),
     ]
     if free and setup.food.held_sides == "both":
-        out.append(Element("support on one side", (), ((),), held_sides="plus"))
+        out.append(_Element("support on one side", (), ((),), held_sides="plus"))
     return out
 
 
@@ -354,14 +356,14 @@ def _without_elements(setup: CalibrationSetup) -> CalibrationSetup:
     )
 
 
-def _with_element(setup: CalibrationSetup, element: Element) -> CalibrationSetup:
+def _with_element(setup: CalibrationSetup, element: _Element) -> CalibrationSetup:
     food = setup.food
     if element.held_sides:
         food = dc.replace(food, held_sides=element.held_sides)
     return dc.replace(setup, food=food, parameters=[*setup.parameters, *element.ranges])
 
 
-def _named(element: Element, values: tuple[float, ...]) -> dict[str, float]:
+def _named(element: _Element, values: tuple[float, ...]) -> dict[str, float]:
     return {r.name: v for r, v in zip(element.ranges, values, strict=True)}
 
 
@@ -423,7 +425,7 @@ class _Trial:
         promise: Part of the best error on left-out depth that it takes off in the linear problem.
     """
 
-    element: Element
+    element: _Element
     setup: CalibrationSetup
     predictor: Predictor
     start: dict[str, float]
@@ -431,7 +433,7 @@ class _Trial:
 
 
 def _trials(
-    element: Element, setup: CalibrationSetup, predictor: Predictor, minima: Sequence[_Fitted]
+    element: _Element, setup: CalibrationSetup, predictor: Predictor, minima: Sequence[_Fitted]
 ) -> list[_Trial]:
     """What an element promises from each minimum and start, best first: a slice in which it is
     switched on gives its derivative."""

@@ -23,6 +23,7 @@ from sliceit_drake.cli.arguments import add_scenario_arguments, scenario_of
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.emulator.fault_table import faults_as_text
 from sliceit_drake.hardware.client import is_loopback
+from sliceit_drake.interruption import handle_signals
 
 if TYPE_CHECKING:
     from sliceit_drake.emulator.controller import ControllerConfig
@@ -102,15 +103,24 @@ def run(options: argparse.Namespace) -> int:
     except ValueError as error:
         emulator.close()
         raise ConfigurationError(str(error), field="--inject") from None
-    signal.signal(signal.SIGTERM, lambda *_: emulator.stop())
+    came: list[int] = []
+
+    def ask(number: int, _: object) -> None:
+        came.append(number)
+        emulator.stop()
+
     if options.end_with_stdin:
         threading.Thread(target=_stop_with_stdin, args=(emulator.stop,), daemon=True).start()
     how = "in lockstep with servoJ" if options.lockstep else f"at {options.pace:g} x real time"
     # Walking through all imported modules for garbage would make a cycle late.
     gc.collect()
     gc.freeze()
-    print(f"Emulated UR5e at {options.address}, {how}. Ctrl-C ends it.", flush=True)
-    emulator.run()
+    # Ctrl-C as an exception may come where Python drops it, in a destructor: it would go on.
+    with handle_signals((signal.SIGINT, signal.SIGTERM), ask):
+        print(f"Emulated UR5e at {options.address}, {how}. Ctrl-C ends it.", flush=True)
+        emulator.run()
+    if signal.SIGINT in came:
+        raise KeyboardInterrupt
     return 0
 
 

@@ -18,7 +18,7 @@ UNKNOWN = "unknown"
 
 
 @dc.dataclass(frozen=True)
-class Question:
+class _Question:
     """A fact that a file does not have.
 
     Attributes:
@@ -37,29 +37,29 @@ class Question:
 
 
 QUESTIONS = (
-    Question("food", "food.name", "what was cut, as cucumber"),
-    Question(
+    _Question("food", "food.name", "what was cut, as cucumber"),
+    _Question(
         "shape",
         "food.shape",
         "its shape: cylinder (lying), halfcylinder (on its flat side), box or ellipsoid",
         needed=True,
     ),
-    Question(
+    _Question(
         "size",
         "food.size",
         "its size in m along the edge, across the blade, and its height, as 0.027 0.12 0.027",
         3,
         needed=True,
     ),
-    Question("speed", "motion.speed", "speed of the knife in m/s, as 0.02", 1),
-    Question(
+    _Question("speed", "motion.speed", "speed of the knife in m/s, as 0.02", 1),
+    _Question(
         "support",
         "food.support",
         "clamped_slab if it was held on both sides of the cut, end_slice if the slice could part",
     ),
-    Question("slice-thickness", "food.slice_thickness", "thickness of the slice in m", 1),
-    Question("spine-thickness", "knife.spine_thickness", "thickness of the knife's spine in m", 1),
-    Question("provenance", "provenance", "where the curve is from, and who may use it"),
+    _Question("slice-thickness", "food.slice_thickness", "thickness of the slice in m", 1),
+    _Question("spine-thickness", "knife.spine_thickness", "thickness of the knife's spine in m", 1),
+    _Question("provenance", "provenance", "where the curve is from, and who may use it"),
 )
 
 
@@ -105,12 +105,12 @@ def complete_facts(metadata: "SliceMetadata", options: argparse.Namespace) -> "S
     return metadata
 
 
-def _is_open(metadata: "SliceMetadata", question: Question) -> bool:
+def _is_open(metadata: "SliceMetadata", question: _Question) -> bool:
     value = operator.attrgetter(question.field)(metadata)
     return value in (None, "", UNKNOWN) and question.field not in metadata.unknown
 
 
-def _ask(metadata: "SliceMetadata", question: Question) -> "SliceMetadata":
+def _ask(metadata: "SliceMetadata", question: _Question) -> "SliceMetadata":
     """Asks until the answer can be used; Enter alone says that it is not known."""
     while True:
         hint = "" if question.needed else " (Enter: not known)"
@@ -123,7 +123,7 @@ def _ask(metadata: "SliceMetadata", question: Question) -> "SliceMetadata":
             print(f"  {error}")
 
 
-def _answered(metadata: "SliceMetadata", question: Question, text: str) -> "SliceMetadata":
+def _answered(metadata: "SliceMetadata", question: _Question, text: str) -> "SliceMetadata":
     from sliceit_drake.configuration import load_yaml
     from sliceit_drake.records.metadata import SliceMetadata
 

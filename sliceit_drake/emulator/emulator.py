@@ -113,7 +113,7 @@ class Emulator:
             raise
 
     def run(self) -> None:
-        """Runs cycles until `stop`, then closes all sockets. Ctrl-C closes them too."""
+        """Runs cycles until `stop` or an exception, then closes all sockets."""
         period = CYCLE / self._clock.pace
         due = time.monotonic() + period
         try:

@@ -45,7 +45,13 @@ from sliceit_drake.systems.agent import AgentSystem
 from sliceit_drake.systems.motion_sources import placed_motion
 from sliceit_drake.systems.policy import PolicySystem
 
-__all__ = ["HardwareRun", "prepare_hardware_run", "steady_python", "write_hardware_outputs"]
+__all__ = [
+    "NO_DATA",
+    "HardwareRun",
+    "prepare_hardware_run",
+    "steady_python",
+    "write_hardware_outputs",
+]
 
 SENSOR_SAMPLES = 50
 WARM_UP = 0.05

@@ -116,7 +116,7 @@ def check_plan(
     inside = (plan.edge_low >= limits.workspace_lower).all() and (
         plan.edge_high <= limits.workspace_upper
     ).all()
-    miss = f"{1e3 * plan.miss:.3g} mm" if plan.miss < 0.1 else f"{plan.miss:.2f} m"
+    miss = f"{1e3 * plan.miss:.3f} mm" if plan.miss < 0.1 else f"{plan.miss:.2f} m"
     change = "Change the scenario, or name the limit in the robot's file"
     checks = [
         Check("reach", plan.miss <= POSITION_MISS, f"{miss} off the target"),
