@@ -28,7 +28,6 @@ from sliceit_drake.cutting.foods.calibrated_food import (
     load_calibrated_food,
 )
 from sliceit_drake.cutting.foods.distribution import ParameterDistribution
-from sliceit_drake.cutting.foods.effects import Effects, Skin
 from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.foods.material import Material
 from sliceit_drake.cutting.foods.shapes import Cylinder
@@ -38,6 +37,7 @@ from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.records.preprocessing import low_pass
 from sliceit_drake.records.slice_record import SliceRecord
 from sliceit_drake.resources import shipped_names
+from sliceit_drake.stand_in.effect_registry import make_effect
 from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
 from sliceit_drake.stand_in.protocol import Condition, Protocol, Variation
 from sliceit_drake.stand_in.sensor_model import SensorModel
@@ -63,9 +63,9 @@ def coarse_setup(**changes) -> CalibrationSetup:
 
 
 def bench_records(
-    count: int = 1, noise: float = 0.1, time_step: float = 1e-3, skin: float = 0.0
+    count: int = 1, noise: float = 0.1, time_step: float = 1e-3, hidden: tuple[str, ...] = ()
 ) -> list[SliceRecord]:
-    """Press cuts to 18 mm with a withdrawal, in a world without hidden effects."""
+    """Press cuts to 18 mm with a withdrawal, in a world with hidden effects."""
     material = Material(
         youngs_modulus=TRUTH["material.youngs_modulus"],
         toughness=TRUTH["material.toughness"],
@@ -85,7 +85,7 @@ def bench_records(
         ]
     )
     protocol = Protocol(
-        food=Food(shape=SHAPE, material=material, effects=Effects(skin=Skin(toughness=skin))),
+        food=Food(shape=SHAPE, material=material),
         sensor=SensorModel(
             force_noise=noise,
             correlated_share=0.0,
@@ -99,7 +99,7 @@ def bench_records(
         conditions=[Condition("press", plan, replicates=count)],
     )
     settings = FiniteElementSettings(refinement=1.0, time_step=time_step)
-    session = Session(protocol, seed=3, settings=settings)
+    session = Session(protocol, [make_effect(e) for e in hidden], seed=3, settings=settings)
     return [session.record(k) for k in range(count)]
 
 

@@ -70,7 +70,8 @@ def executed(
 def named(texts: dict[str, str], cells: tuple[str, ...]) -> dict[str, str]:
     """The texts, those of cells cut down to what a verdict names."""
     verdicts = {
-        cell: re.findall(r"^(?:Verdict|  Supported): [^;,]+", texts[cell], re.M) for cell in cells
+        cell: re.findall(r"^(?:hidden was|Verdict|  Supported): [^;,\n]+", texts[cell], re.M)
+        for cell in cells
     }
     assert all(verdicts.values())
     return texts | {cell: "\n".join(lines) for cell, lines in verdicts.items()}
@@ -264,7 +265,7 @@ def test_3_the_diagnosis_names_what_the_bench_hides(tmp_path):
     found = executed(
         notebook,
         tmp_path,
-        verdicts=("diagnose",),
+        verdicts=("diagnose", "envelope"),
         kind="result.verdict.kind",
         names="result.verdict.names",
         share="result.gain.share",

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses as dc
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -78,21 +79,23 @@ def few_elements(monkeypatch):
 
 
 @pytest.mark.second_tier
-def test_a_skin_is_taken_where_there_is_one_and_nothing_where_there_is_none(few_elements):
+def test_a_core_is_taken_where_there_is_one_and_nothing_where_there_is_none(few_elements):
     (plain,) = bench_records(1)
     found = choose_structure(coarse_setup(), [plain], 1)
     assert found.taken == []
     assert found.lines[0].startswith("Plain food: 0.1")
     assert [line.split(".")[0] for line in found.lines[1:]] == ["skin: left", "core: left"]
-    (tough,) = bench_records(1, skin=0.6)
-    found = choose_structure(coarse_setup(), [tough], 1)
-    assert found.taken[0] == "skin"
-    assert found.values["effects.skin.toughness"] == pytest.approx(0.6, rel=0.3)
+    (cored,) = bench_records(1, hidden=("core:0.5",))
+    found = choose_structure(coarse_setup(), [cored], 1)
+    assert found.taken == ["core"]
+    # From the outside to the middle the toughness falls to half, and the model's in one step.
+    assert found.values["effects.core.toughness_ratio"] == pytest.approx(0.6, abs=0.15)
     assert found.values["material.toughness"] == pytest.approx(
         TRUTH["material.toughness"], rel=0.15
     )
-    assert any(line.startswith("skin: taken. Left-out depth ") for line in found.lines)
-    assert "effects.skin.toughness" in [p.name for p in found.setup.parameters]
+    before, after = re.search(r"Left-out depth (.*) to (.*) N, on", " ".join(found.lines)).groups()
+    assert float(after) < 0.5 * float(before)
+    assert "effects.core.toughness_ratio" in [p.name for p in found.setup.parameters]
 
 
 def test_a_choice_is_read_back_and_made_anew_for_other_records(tmp_path, monkeypatch):

@@ -436,7 +436,9 @@ def _trials(
     element: _Element, setup: CalibrationSetup, predictor: Predictor, minima: Sequence[_Fitted]
 ) -> list[_Trial]:
     """What an element promises from each minimum and start, best first: a slice in which it is
-    switched on gives its derivative."""
+    switched on gives its derivative. A record's height and speed move with it: without the element
+    they are where they make up for it."""
+    before = min(_left_out(m.predictor, m.at, own=True) for m in minima)
     pairs = [(m, m.values | _named(element, s)) for m in minima for s in element.starts]
     units = [np.array([p.unit(s[p.name]) for p in predictor.parameters]) for _, s in pairs]
     out = []
@@ -448,17 +450,18 @@ def _trials(
                 unit=np.append(at.unit, 0.0),
                 jacobian=np.column_stack([at.jacobian, residuals - at.residuals]),
             )
-            error = _left_out(minimum.predictor, wider)
-            out.append(_Trial(element, setup, predictor, start, 1.0 - error / minima[0].left_out))
+            error = _left_out(minimum.predictor, wider, own=True)
+            out.append(_Trial(element, setup, predictor, start, 1.0 - error / before))
     return sorted(out, key=lambda t: -t.promise)
 
 
-def _left_out(model: Predictor, at: Linearisation) -> float:
+def _left_out(model: Predictor, at: Linearisation, own: bool = False) -> float:
     """Root mean square error on blocks of depth, each predicted by a fit without it, N.
 
-    The fits are those of the linear problem at the fit to all; what is a record's own stays.
+    The fits are those of the linear problem at the fit to all; what is a record's own stays, unless
+    `own` is fitted as well.
     """
-    block, free = depth_blocks(model, BLOCKS), np.array([p.shared for p in model.parameters])
+    block, free = depth_blocks(model, BLOCKS), np.array([own or p.shared for p in model.parameters])
     free = np.append(free, np.full(len(at.unit) - len(free), True))
     variance = float(np.mean(at.residuals[model.used] ** 2))
     total = 0.0

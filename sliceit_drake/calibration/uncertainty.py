@@ -157,8 +157,9 @@ def estimate(model: Predictor, unit: np.ndarray, rounds: int = ROUNDS) -> Estima
     data do not determine stays as wide as its range. A model that lacks something leaves residuals
     that are no noise, and such weights then give up the force for its changes. Where that costs
     much of the force, which the posterior notes, the estimate is that of least squares, with the
-    covariance that it has under these residuals. What the sub-step does wrong at `unit` is taken
-    off the predictions.
+    covariance that it has under these residuals. From the predictions of the weighted fit what the
+    sub-step does wrong at `unit` is taken off; beside what such a model lacks it is small, or, where
+    something snaps, so large that it is not the same near `unit`.
 
     Args:
         unit: A good fit, such as that of least squares [d].
@@ -168,7 +169,7 @@ def estimate(model: Predictor, unit: np.ndarray, rounds: int = ROUNDS) -> Estima
         CuttingError: A slice breaks down near `unit`.
     """
     start = np.clip(unit, 0.0, 1.0)
-    model = model.without_step_error(start)
+    usual, model = model, model.without_step_error(start)
     at = first = linearise(model, start)
     problem = _noise_problem(model, at)
     noise = problem.fit()
@@ -187,12 +188,12 @@ def estimate(model: Predictor, unit: np.ndarray, rounds: int = ROUNDS) -> Estima
         posterior = _posterior(model, at.unit, problem.averaged_covariance(), noise)
         return Estimate(at.unit, posterior, noise, problem.covariance())
     even = noise.evened
-    fit = gauss_newton(model, start, noise=even, steps=STEPS, tolerance=1e-5, linearisation=first)
-    at = _at_end(model, fit)
-    problem = _noise_problem(model, at)
+    fit = gauss_newton(usual, start, noise=even, steps=STEPS, tolerance=1e-5)
+    at = _at_end(usual, fit)
+    problem = _noise_problem(usual, at)
     noise = problem.fit(noise)
     covariance = problem.covariance_of_least_squares(even.variance)
-    posterior = _posterior(model, at.unit, covariance, noise)
+    posterior = _posterior(usual, at.unit, covariance, noise)
     posterior.notes.append(
         f"the fit weighted with the noise misses the force by {errors[1]:.3g} N, least squares by "
         f"{errors[0]:.3g} N: the model lacks something that noise does not explain. The values are "
