@@ -156,13 +156,13 @@ def estimate(model: Predictor, unit: np.ndarray, rounds: int = ROUNDS) -> Estima
     squares) plus the prior of a uniform range, which has variance 1/12 about its middle: what the
     data do not determine stays as wide as its range. A model that lacks something leaves residuals
     that are no noise, and such weights then give up the force for its changes. Where that costs
-    much of the force, which the posterior notes, the estimate is that of least squares, with the
-    covariance that it has under these residuals. From the predictions of the weighted fit what the
-    sub-step does wrong at `unit` is taken off; beside what such a model lacks it is small, or, where
+    much of the force, which the posterior notes, the estimate stays `unit`, with the covariance
+    that it has under these residuals. From the predictions of the weighted fit what the sub-step
+    does wrong at `unit` is taken off. Beside what such a model lacks that is small, or, where
     something snaps, so large that it is not the same near `unit`.
 
     Args:
-        unit: A good fit, such as that of least squares [d].
+        unit: The fit of least squares [d].
         rounds: Most alternations.
 
     Raises:
@@ -188,8 +188,8 @@ def estimate(model: Predictor, unit: np.ndarray, rounds: int = ROUNDS) -> Estima
         posterior = _posterior(model, at.unit, problem.averaged_covariance(), noise)
         return Estimate(at.unit, posterior, noise, problem.covariance())
     even = noise.evened
-    fit = gauss_newton(usual, start, noise=even, steps=STEPS, tolerance=1e-5)
-    at = _at_end(usual, fit)
+    # As they are: with so few independent rows a fit with the prior would go to where it draws.
+    at = linearise(usual, start)
     problem = _noise_problem(usual, at)
     noise = problem.fit(noise)
     covariance = problem.covariance_of_least_squares(even.variance)
