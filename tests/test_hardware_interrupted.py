@@ -4,6 +4,7 @@ import contextlib
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -121,16 +122,22 @@ def test_a_crash_at_the_question_stops_the_robots_program_and_says_so(how, emula
     # No watchdog is set yet: nobody but the supervisor stops the program.
     with hardware(emulator, "--move-to-start") as process:
         read_until(process, 'Type "move"')
+        said: list[str] = []
+        reader = threading.Thread(target=lambda: said.extend(process.stdout))
         if how == "SIGKILL":
             process.kill()
+            reader.start()
         else:
             emulator.pendant.inject(how)
+            # As a terminal would: ur_rtde says thousands of times that it connects again.
+            reader.start()
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(5.0)
             with contextlib.suppress(BrokenPipeError):
                 type_(process, "move")
         status = wait_for(emulator, lambda status: status["runtime_state"] == "STOPPED")
-        printed = process.stdout.read()
+        reader.join(30.0)
+        printed = "".join(said)
     assert is_still(status)
     # ur_rtde connects again, and would upload its program anew, and anew.
     assert sum(text.startswith("program started") for _, text in status["log"]) == 1
