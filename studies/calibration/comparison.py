@@ -119,6 +119,8 @@ def run(options: argparse.Namespace) -> int:
         command = (
             f"python -m studies calibration --foods {food} --trials {options.trials} --steps "
             f"{options.steps} --starts {options.starts} --blocks {options.blocks}"
+            + (f" --block-length {options.block_length:g}" if options.block_length else "")
+            + (f" --polish {food}" if food in options.polish else "")
         )
         result.save(folder, command)
         comparison = compare(result, profile, minutes)
