@@ -117,32 +117,60 @@ def test_a_program_that_runs_on_the_robot_is_not_replaced(emulator):
         wait_for(emulator, lambda status: np.abs(status["velocities"]).max() > 0.01)
 
 
+@pytest.mark.parametrize("is_read", [True, False], ids=["read", "paused terminal"])
 @pytest.mark.parametrize("how", ["SIGKILL", "frame_size:2", "close:rtde"])
-def test_a_crash_at_the_question_stops_the_robots_program_and_says_so(how, emulator):
-    # No watchdog is set yet: nobody but the supervisor stops the program.
+def test_a_lost_link_or_a_crash_at_the_question_stops_the_program_and_says_so(
+    how, is_read, emulator
+):
+    # No watchdog is set yet: nobody but the program and its supervisor stop the robot's.
     with hardware(emulator, "--move-to-start") as process:
         read_until(process, 'Type "move"')
         said: list[str] = []
         reader = threading.Thread(target=lambda: said.extend(process.stdout))
+        if is_read:
+            reader.start()
         if how == "SIGKILL":
             process.kill()
-            reader.start()
         else:
             emulator.pendant.inject(how)
-            # As a terminal would: ur_rtde says thousands of times that it connects again.
-            reader.start()
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(5.0)
-            with contextlib.suppress(BrokenPipeError):
-                type_(process, "move")
+        # Nobody types: after a lost link most calls of ur_rtde never return.
         status = wait_for(emulator, lambda status: status["runtime_state"] == "STOPPED")
+        if not is_read:
+            reader.start()
+        process.wait(30.0)
         reader.join(30.0)
+        assert not reader.is_alive()
         printed = "".join(said)
     assert is_still(status)
     # ur_rtde connects again, and would upload its program anew, and anew.
     assert sum(text.startswith("program started") for _, text in status["log"]) == 1
+    assert any("stopped by the dashboard" in text for _, text in status["log"])
+    has_crashed = "HAS CRASHED. The robot's program was stopped through its dashboard" in printed
     if process.returncode < 0:
-        assert "HAS CRASHED. The robot's program was stopped through its dashboard" in printed
-        assert any("stopped by the dashboard" in text for _, text in status["log"])
+        assert has_crashed, printed
     else:
-        assert "STOPPED" in printed or "Not confirmed" in printed
+        assert has_crashed or "STOPPED: the connection to the robot was lost" in printed, printed
+
+
+def test_a_call_that_never_returns_ends_the_program_and_stops_the_robots(emulator):
+    # As ur_rtde does after a lost link: it waits with Python's lock held.
+    script = f"""
+import ctypes, time
+from sliceit_drake.hardware import supervisor
+from sliceit_drake.hardware.ur_client import UrClient
+supervisor.CALL_TIME = 1.0
+with supervisor.Supervisor("{emulator.address}") as watched:
+    client = UrClient("{emulator.address}", 0.05, 500.0, pace={PACE}, limit=watched.limit)
+    watched.begin()
+    print("PLAYING", flush=True)
+    client._ask(ctypes.PyDLL(None).sleep, 60)
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        read_until(process, "PLAYING")
+        status = wait_for(emulator, lambda status: status["runtime_state"] == "STOPPED")
+        printed = process.stdout.read()
+    assert any("stopped by the dashboard" in text for _, text in status["log"])
+    assert process.returncode == 1
+    assert "HAS CRASHED. The robot's program was stopped through its dashboard" in printed

@@ -1,21 +1,27 @@
 """A process beside a run that stops the robot if the run's process dies, and says so.
 
 ur_rtde can end a process in the middle of a motion, by an abort or a segmentation fault; then no
-line of Python runs there any more. This process only reads a pipe from it. If the pipe ends
-without the word that all is done, it stops the robot's program through the dashboard server.
+line of Python runs there any more. It can also wait for ever, with Python's lock held: `limit` ends
+the run's process then. This process only reads a pipe from it. If the pipe ends without the word
+that all is done, it stops the robot's program through the dashboard server.
 """
 
 import contextlib
+import faulthandler
+import os
 import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 
 __all__ = ["Supervisor", "stop_by_dashboard"]
 
 DASHBOARD_PORT = 29999
 PATIENCE = 15.0
 """How long a controller is asked that does not answer, s."""
+CALL_TIME = 10.0
+"""How long a call of the robot's library may take, s."""
 _CONTROL, _DONE = b"control\n", b"done\n"
 
 
@@ -36,6 +42,20 @@ class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
     def begin(self) -> None:
         """Says that this process controls the robot now: its end stops the robot."""
         self._say(_CONTROL)
+
+    @contextlib.contextmanager
+    def limit(self) -> Iterator[None]:
+        """Ends this process at once if what is done inside takes longer than `CALL_TIME`.
+
+        One at a time in a process; for calls that nothing else watches.
+        """
+        # Its timer needs no lock of Python. A terminal that stands must not keep it from the end.
+        with open(os.devnull, "w") as nowhere:
+            faulthandler.dump_traceback_later(CALL_TIME, exit=True, file=nowhere)
+            try:
+                yield
+            finally:
+                faulthandler.cancel_dump_traceback_later()
 
     def _say(self, word: bytes) -> None:
         assert self._process.stdin is not None

@@ -12,6 +12,8 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import TypeVar
 
 from sliceit_drake.hardware.client import PLAYING, RobotFacts, RobotState, RobotUnavailableError
 from sliceit_drake.hardware.control_script import NOTHING, control_script, upload
@@ -33,6 +35,9 @@ SLOWEST = 0.2
 """Pace below which no more wall time is given for that."""
 
 
+_T = TypeVar("_T")
+
+
 class UrClient:
     """A connection to a UR e-Series robot; implements `RobotClient`.
 
@@ -42,6 +47,7 @@ class UrClient:
         gain: Argument of servoj, 100 to 2000.
         limits: Of which the program on the robot keeps step and speed; None for the defaults.
         pace: Controller seconds in a second; 1 for all robots.
+        limit: Makes a context for a call that can wait for ever, with Python's lock held.
 
     Raises:
         RobotUnavailableError: Nothing answers there, or it refuses, or ur_rtde is not installed.
@@ -55,7 +61,9 @@ class UrClient:
         limits: SafetyLimits | None = None,
         *,
         pace: float = 1.0,
+        limit: Callable[[], AbstractContextManager[object]] = contextlib.nullcontext,
     ) -> None:
+        self._limit = limit
         try:
             import dashboard_client
             import rtde_control
@@ -176,6 +184,17 @@ class UrClient:
         self._was_lost |= not is_there
         return is_there
 
+    def _ask(self, call: Callable[..., _T], *arguments: object) -> _T:
+        """What a call of ur_rtde's control returns; not one after a lost link: most never return.
+
+        Raises:
+            RobotUnavailableError: A connection was lost.
+        """
+        with self._limit():
+            if not self.is_connected() or self._was_lost:
+                raise RobotUnavailableError(f"{self._host}: a connection to the robot was lost")
+            return call(*arguments)
+
     def servo(self, q: list[float]) -> bool:
         return self._control.servoJ(q, 0.0, 0.0, 1.0 / RATE, self._lookahead, self._gain)
 
@@ -183,7 +202,7 @@ class UrClient:
         self._control.kickWatchdog()
 
     def set_watchdog(self, frequency: float) -> bool:
-        return self._control.setWatchdog(frequency)
+        return self._ask(self._control.setWatchdog, frequency)
 
     def stop(self) -> None:
         self._is_stopped = True
@@ -252,21 +271,21 @@ class UrClient:
             remote_control=remote,
             payload=receive.getPayload(),
             payload_cog=receive.getPayloadCog(),
-            tcp=self._control.getTCPOffset(),
+            tcp=self._ask(self._control.getTCPOffset),
             speed_scaling=receive.getSpeedScaling(),
         )
 
     def zero_sensor(self) -> None:
-        if not self._control.zeroFtSensor():
+        if not self._ask(self._control.zeroFtSensor):
             raise RobotUnavailableError(f"{self._host}: the force sensor cannot be zeroed")
         time.sleep(0.1)  # The next readings are of after it.
 
     def allows_joints(self, q: list[float]) -> bool:
-        return self._control.isJointsWithinSafetyLimits(q)
+        return self._ask(self._control.isJointsWithinSafetyLimits, q)
 
     def start_move(self, q: list[float], speed: float, acceleration: float) -> bool:
         self._is_moving = True
-        return self._control.moveJ(q, speed, acceleration, True)
+        return self._ask(self._control.moveJ, q, speed, acceleration, True)
 
     def close(self) -> None:
         if not self._is_stopped:
@@ -275,7 +294,7 @@ class UrClient:
                 self.stop()
         for part in (self._control, self._receive, self._dashboard):
             # A link that is gone already cannot be closed better.
-            with contextlib.suppress(RuntimeError):
+            with contextlib.suppress(RuntimeError), self._limit():
                 part.disconnect()
         self._script.close()
         self._nothing.close()

@@ -1,12 +1,16 @@
 """A robot whose motions an operator confirms: connect, check, show, ask for the word, move."""
 
 import dataclasses as dc
+import os
 import signal
 import sys
 import termios
+import threading
+import time as clock
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Self
 
 from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.live_view import make_meshcat
@@ -35,6 +39,10 @@ WORD = "slice"
 MOVE_WORD = "move"
 TOUCH_WORD = "touch"
 RETREAT_WORD = "retreat"
+LOOK = 2e-3
+"""Pause between two looks at the connection while the operator is asked, s."""
+SILENCE = 0.5
+"""How long the robot may send no data then, controller s."""
 WATCHED = 1.0
 """Longest time that a dry run follows the robot's data, s."""
 
@@ -56,6 +64,7 @@ class OperatedRobot:
     pace: float = 1.0
     dry_run: bool = False
     found: Touch | None = None
+    _connection: tuple[RobotClient, Supervisor] | None = None
 
     def run(
         self,
@@ -217,8 +226,21 @@ class OperatedRobot:
         return _report(title, checks)
 
     def asks(self, word: str) -> bool:
-        """Whether the operator types the word, see `ask`."""
-        return ask(word, is_loopback(self.host))
+        """Whether the operator types the word, see `ask`, and the robot was there all the time."""
+        if self._connection is None:
+            return ask(word, is_loopback(self.host))
+        watch = _Watch(*self._connection, self.pace)
+        is_confirmed = False
+        try:
+            with watch:
+                is_confirmed = ask(word, is_loopback(self.host))
+        except KeyboardInterrupt:
+            if watch.problem is None:
+                raise
+        if watch.problem is None:
+            return is_confirmed
+        print(f"\nSTOPPED: {watch.problem} Nothing was moved.", flush=True)
+        return False
 
     @contextmanager
     def connected(self) -> Iterator[RobotClient]:
@@ -241,13 +263,57 @@ class OperatedRobot:
             _report("This computer", real_time.checks)
             config = self.config
             client = UrClient(
-                self.host, config.lookahead_time, config.gain, config.limits, pace=self.pace
-            )
+                self.host, config.lookahead_time, config.gain, config.limits, pace=self.pace,
+                limit=supervisor.limit,
+            )  # fmt: skip
             try:
                 supervisor.begin()
+                self._connection = client, supervisor
                 yield client
             finally:
+                self._connection = None
                 client.close()
+
+
+class _Watch(threading.Thread):
+    """Ends a question with an interrupt when the robot's data stop or a connection is lost.
+
+    Attributes:
+        problem: What was lost, and whether the program on the robot is stopped; or None.
+    """
+
+    def __init__(self, client: RobotClient, supervisor: Supervisor, pace: float) -> None:
+        super().__init__(daemon=True)
+        self._client, self._supervisor = client, supervisor
+        self._silence = SILENCE / pace
+        self._is_over = threading.Event()
+        self.problem: str | None = None
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._is_over.set()
+        self.join()
+
+    def run(self) -> None:
+        newest, arrival = self._client.timestamp(), clock.monotonic()
+        while not self._is_over.wait(LOOK):
+            time, now = self._client.timestamp(), clock.monotonic()
+            if time != newest:
+                newest, arrival = time, now
+            if self._client.is_connected() and now - arrival < self._silence:
+                continue
+            problem = "the connection to the robot was lost."
+            with self._supervisor.limit():
+                try:
+                    self._client.stop()
+                except RuntimeError as error:
+                    problem += f" {_not_stopped_text(str(error))}"
+            self.problem = problem
+            os.kill(os.getpid(), signal.SIGINT)
+            return
 
 
 def _run_duration(hardware: HardwareRun, duration: float | None) -> float:
@@ -379,7 +445,11 @@ def _stopped_text(link: RobotLink | None) -> str:
     """What an operator must know about the robot after a stop."""
     if link is None or link.stop_error is None:
         return "The robot's program is stopped. Find the cause before you start again."
+    return _not_stopped_text(link.stop_error)
+
+
+def _not_stopped_text(error: str) -> str:
     return (
-        f"THE ROBOT DID NOT CONFIRM THAT ITS PROGRAM IS STOPPED ({link.stop_error}). Use the "
+        f"THE ROBOT DID NOT CONFIRM THAT ITS PROGRAM IS STOPPED ({error}). Use the "
         "emergency stop before you go near it."
     )
