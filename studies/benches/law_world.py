@@ -24,9 +24,6 @@ __all__ = ["Cut", "Heading", "Law", "LawWorld"]
 TRAVEL, LONGEST = 4e-5, 5
 """Most motion, metres, and most coupling steps that are computed as one."""
 
-BOARD_DEPTH = 2e-4
-"""Depth at which a board of Hertz's law is as stiff as the protocol's, metres."""
-
 
 class Heading:
     """The direction in which the food slides along the blade; it turns over `travel`, as bristles
@@ -152,9 +149,10 @@ class _LawRun(Run):
         return forces, self.section.above(self._deepest) / self.section.area
 
     def _board(self, height: float, press: float) -> float:
+        # As the user knows it: a bench on which nothing is hidden differs by its food alone.
         board = self.world.protocol.board
-        force = board.stiffness * max(-height, 0.0) ** 1.5 / BOARD_DEPTH**0.5
-        return float(force * max(0.0, 1.0 + 1.5 * board.dissipation * press))
+        factor = max(0.0, 1.0 + board.dissipation * press)
+        return board.stiffness * max(-height, 0.0) * factor
 
     def cut(self) -> Series:
         """Cuts the slice."""
