@@ -25,7 +25,7 @@ from studies.benches.noise import FAMILIES, Noise, unit_noise
 from studies.benches.runs import add_arguments, cases_of, commit_of, diagnosed
 from studies.benches.runs import run as run_benches
 from studies.benches.score import add_arguments as add_score_arguments
-from studies.benches.score import answers_of, judge, rates
+from studies.benches.score import answers_of, judge, kept, measured, rates
 from studies.benches.score import run as run_score
 from studies.benches.section import Section
 from studies.benches.sizes import Sizes
@@ -368,7 +368,7 @@ def test_a_signature_is_what_a_refit_leaves(monkeypatch):
 
 
 def hidden(effect: str, size: float, *group: str) -> dict:
-    return {"effect": effect, "standardised": size, "group": list(group)}
+    return {"effect": effect, "size": 0.1, "standardised": size, "group": list(group)}
 
 
 TILT = hidden("cross_talk", 2.0, "sensor_tilt")
@@ -408,6 +408,36 @@ def test_affected_records_need_not_show_what_a_refit_takes_up():
     assert judge([], small, "affected").right and not judge([], small, "earlier").right
 
 
+def test_values_and_gain_are_judged_where_the_right_cause_was_named():
+    truth = hidden("pure_delay", 2.0, "sensor_delay") | {"size": 0.02}
+    said = {
+        "verdict": "cause",
+        "classes": [["sensor_delay"]],
+        "findings": [{"cause": "sensor_delay", "values": {"delay": 0.025}}],
+        "causes": [
+            {"cause": "sensor_delay", "verdict": "supported", "limits": {"delay": [0.019, 0.03]}},
+            {"cause": "core", "verdict": "possible", "limits": {}},
+        ],
+        "evidence": [
+            {"cause": "core", "held_out_share": 0.9},
+            {"cause": "sensor_delay", "held_out_share": 0.5},
+        ],
+        "gain": {"share_removed": 0.4},
+    }
+    named = judge(said["classes"], truth, "earlier")
+    found = measured(named, said, truth)
+    assert (found.close, found.covered, found.gain) == (False, True, (0.4, 0.5))
+    assert rates({0: [found, found]}, np.random.default_rng(0))["of the right cause's gain"] == (
+        pytest.approx((0.8, 0.8, 0.8, 2))
+    )
+    # What is kept of an answer is judged the same.
+    short = kept({"case": {}, "hidden": truth, "earlier": said})["earlier"]
+    assert measured(named, short, truth) == found
+    silent = said | {"verdict": "nothing", "classes": [], "findings": []}
+    missed = measured(judge([], truth, "earlier"), silent, truth)
+    assert (missed.close, missed.covered, missed.gain) == (None, None, (0.0, 0.5))
+
+
 def test_rates_are_of_runs_and_their_intervals_of_draws():
     hit, miss = (judge(named, TILT, "earlier") for named in ([["sensor_tilt"]], [["sensor_gain"]]))
     rng = np.random.default_rng(0)
@@ -420,7 +450,8 @@ def test_rates_are_of_runs_and_their_intervals_of_draws():
 
 
 def test_the_table_has_rows_for_naming_nothing_the_top_and_the_oracle(tmp_path, capsys):
-    answer = {"verdict": "cause", "classes": [["sensor_gain"]], "evidence": [{"cause": "core"}]}
+    answer = {"verdict": "cause", "classes": [["sensor_gain"]], "gain": None}
+    answer["evidence"] = [{"cause": "core", "held_out_share": None}]
     for draw, effect in ((0, TILT), (1, hidden("", 0.0))):
         case = {"law": "bonds", "draw": draw}
         facts = {"case": case, "hidden": effect, "earlier": answer, "affected": {"failure": "x"}}
@@ -455,7 +486,7 @@ def test_a_study_keeps_each_answer_and_goes_on_with_what_is_left(tmp_path, monke
 
     def says(law, records, food, cache, replicates, frozen):
         asked.append((food.note, len(list(records.glob("*.csv")))))
-        return {"verdict": "nothing", "classes": [], "evidence": []}
+        return {"verdict": "nothing", "classes": [], "evidence": [], "gain": None}
 
     def fitted(food, records):
         return dc.replace(food, note=food.note + f" {len(records)}")

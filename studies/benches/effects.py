@@ -36,12 +36,14 @@ class HiddenEffect(Effect):
         trend: Whether slices may differ in the same way, by what goes with speed, draw, number or
             height.
         by_slice: Whether slices of one condition differ by it.
+        value: Parameter of a right cause that stands for `size`; "" where none does.
     """
 
     right: frozenset[str] = frozenset()
     group = "bench"
     trend = False
     by_slice = False
+    value = ""
 
 
 class StretchedRelaxation(HiddenEffect):
@@ -291,6 +293,7 @@ class PureDelay(HiddenEffect):
     """Readings that come late by size."""
 
     right = frozenset({"sensor_delay"})
+    value = "delay"
     unit, typical, least = "s", 0.02, 0.0
 
     def measure(self, series: Series, wrench: np.ndarray) -> np.ndarray:
@@ -301,6 +304,7 @@ class RingingFilter(HiddenEffect):
     """A filter of second order with a damping of 0.5, late by size on the mean."""
 
     right = frozenset({"sensor_delay"})
+    value = "delay"
     unit, typical, least = "s", 0.02, 0.0
 
     def measure(self, series: Series, wrench: np.ndarray) -> np.ndarray:
@@ -320,6 +324,7 @@ class SideMass(HiddenEffect):
     start."""
 
     right = frozenset({"tool_weight"})
+    value = "mass"
     unit, typical = "kg", 0.2
 
     def measure(self, series: Series, wrench: np.ndarray) -> np.ndarray:

@@ -6,6 +6,10 @@ naming nothing, for naming the first of the list, and for the oracle stand besid
 oracle names all that nobody could tell apart wherever the effect's standardised size is 1 or more.
 Intervals are bootstrap intervals of 90 % over draws.
 
+Values are judged where a cause was named rightly whose parameter the hidden effect has as well (a
+delay, a mass). The gain is the share of the removable error on left-out records that what
+was named removes, over the share that the right cause would, as this diagnosis fits it.
+
 --keep writes what a judgement needs of each run as a line of JSON. This file is judged like the
 folder, and `benches --kept FILE` goes on from it.
 
@@ -37,6 +41,10 @@ SEEN = 1.0
 """Standardised size from which on the oracle sees an effect."""
 GROUP = 4
 """Most causes of a finding."""
+CLOSE = 0.2
+"""Error of a value that counts as close."""
+LEAST_GAIN = 0.05
+"""Least gain of the right cause that others are compared with."""
 RESAMPLES = 2000
 SAID = ("verdict", "classes", "findings", "own_error", "misfit_over_noise", "gain", "failure")
 """What is kept of an answer, beside the cause with most evidence."""
@@ -56,6 +64,9 @@ class Judged:
         wrong: Whether something was named and nothing right.
         beside: Whether a material cause is named beside.
         failed: Whether there is no answer.
+        close, covered: Whether the value is within 20 %, and within its interval; None where there
+            is none to judge.
+        gain: Of what was named, and of the right cause; None where that has none.
     """
 
     kind: str
@@ -64,6 +75,9 @@ class Judged:
     wrong: bool
     beside: bool
     failed: bool = False
+    close: bool | None = None
+    covered: bool | None = None
+    gain: tuple[float, float] | None = None
 
 
 def answers_of(source: Path) -> list[dict[str, Any]]:
@@ -96,7 +110,45 @@ def kept(facts: Mapping[str, Any]) -> dict[str, Any]:
         said = facts[to]
         out[to] = {name: said[name] for name in SAID if name in said}
         out[to]["evidence"] = said.get("evidence", [])[:1]
+        out[to]["right_gain"] = _right_gain(said, facts["hidden"])
+        out[to]["causes"] = [c for c in said.get("causes", []) if c["verdict"] == "supported"]
     return out
+
+
+def _right_gain(said: Mapping[str, Any], hidden: Mapping[str, Any] | None) -> float:
+    """Share of the removable error that the best of the right causes removes."""
+    if not hidden or not hidden["effect"]:
+        return 0.0
+    if "right_gain" in said:
+        return float(said["right_gain"])
+    right = HIDDEN[hidden["effect"]].right
+    shares = [e["held_out_share"] for e in said.get("evidence", []) if e["cause"] in right]
+    return max((float(share) for share in shares if share is not None), default=0.0)
+
+
+def measured(judged: Judged, said: Mapping[str, Any], hidden: Mapping[str, Any]) -> Judged:
+    """With what the answer's values and its gain are worth.
+
+    Args:
+        judged: How the answer's names were judged.
+        said: The diagnosis.
+        hidden: Effect and size.
+    """
+    if not hidden["effect"] or "failure" in said:
+        return judged
+    kind, right_gain = HIDDEN[hidden["effect"]], _right_gain(said, hidden)
+    close = covered = None
+    if judged.right and kind.value:
+        size = float(hidden["size"])
+        limits = {c["cause"]: c["limits"] for c in said["causes"]}
+        for finding in said["findings"]:
+            if finding["cause"] in kind.right and kind.value in finding["values"]:
+                low, high = limits[finding["cause"]][kind.value]
+                close = abs(finding["values"][kind.value] - size) <= CLOSE * abs(size)
+                covered = low <= size <= high
+    gain = (said["gain"] or {}).get("share_removed", 0.0) if said["verdict"] in NAMING else 0.0
+    reached = (gain, right_gain) if right_gain >= LEAST_GAIN else None
+    return dc.replace(judged, close=close, covered=covered, gain=reached)
 
 
 def named_by(who: str, facts: Mapping[str, Any], to: str) -> Groups | None:
@@ -149,11 +201,13 @@ def judge(named: Groups | None, hidden: Mapping[str, Any], to: str) -> Judged:
     )
 
 
-Columns = dict[str, Callable[[Judged], bool | None]]
-"""By title: whether a run counts as a hit; None where it does not belong to the column."""
+Part = tuple[float, float] | bool | None
+Columns = dict[str, Callable[[Judged], Part]]
+"""By title: whether a run counts as a hit, or a part and the whole that it is of; None where it
+does not belong to the column."""
 
 
-def _of(kind: str, hit: Callable[[Judged], bool], low: float = 0.0, high: float = np.inf):  # type: ignore[no-untyped-def]
+def _of(kind: str, hit: Callable[[Judged], Part], low: float = 0.0, high: float = np.inf):  # type: ignore[no-untyped-def]
     return lambda j: hit(j) if j.kind == kind and low <= j.size < high else None
 
 
@@ -168,6 +222,9 @@ COLUMNS: Columns = {
     "at 1": _of("listed", lambda j: j.right, 0.75, 1.5),
     "at 2": _of("listed", lambda j: j.right, 1.5, 3.0),
     "at 4": _of("listed", lambda j: j.right, 3.0),
+    "value within 20 %": _of("listed", lambda j: j.close, LARGE),
+    "value in its interval": _of("listed", lambda j: j.covered, LARGE),
+    "of the right cause's gain": _of("listed", lambda j: j.gain, LARGE),
     "no answer": lambda j: j.failed,
 }
 
@@ -183,17 +240,16 @@ def rates(
     """
     out = {}
     for title, hit in COLUMNS.items():
-        marks = [[hit(j) for j in runs] for runs in judged.values()]
-        counts = np.array(
-            [[sum(m is True for m in d), sum(m is not None for m in d)] for d in marks]
-        )
-        hits, runs = counts.sum(0)
-        if not runs:
+        marks = [[m for j in runs if (m := hit(j)) is not None] for runs in judged.values()]
+        pairs = [[m if isinstance(m, tuple) else (float(m), 1.0) for m in d] for d in marks]
+        counts = np.array([np.sum([(0.0, 0.0), *d], axis=0) for d in pairs])
+        hits, whole = counts.sum(0)
+        if not whole:
             continue
         drawn = counts[rng.integers(0, len(counts), (RESAMPLES, len(counts)))].sum(1)
         shares = drawn[drawn[:, 1] > 0]
         low, high = np.percentile(shares[:, 0] / shares[:, 1], [5.0, 95.0])
-        out[title] = float(hits / runs), float(low), float(high), int(runs)
+        out[title] = float(hits / whole), float(low), float(high), sum(map(len, marks))
     return out
 
 
@@ -225,6 +281,8 @@ def run(options: argparse.Namespace) -> int:
                 judged: dict[int, list[Judged]] = {}
                 for facts in of_law:
                     verdict = judge(named_by(who, facts, to), facts["hidden"], to)
+                    if who == "diagnosis":
+                        verdict = measured(verdict, facts[to], facts["hidden"])
                     judged.setdefault(facts["case"]["draw"], []).append(verdict)
                 found = rates(judged, rng)
                 cells = ["" if title not in found else _cell(*found[title]) for title in COLUMNS]
