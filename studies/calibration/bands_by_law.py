@@ -1,0 +1,181 @@
+"""How often the bands of predicted force hold what is measured, on benches of other laws.
+
+Two press cuts of one speed are fitted. The band (calibration/bands.py) is then compared with a
+third cut of that speed, with cuts of two other speeds, and with two draws. Beside it stands a band
+of constant width, 1.645 standard deviations of what the fit leaves to both sides of the fit. The
+mean interval score (Gneiting and Raftery 2007), N, is the width and 20 times what lies outside; the
+lower the better.
+
+The benches are those of the training part (docs/results/benches.md). With --output each draw is
+kept there as a line of JSON, from which the study goes on if it was stopped.
+"""
+
+import argparse
+import dataclasses as dc
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from sliceit_drake.calibration.bands import force_band, independent
+from sliceit_drake.calibration.gauss_newton import gauss_newton, residuals_at
+from sliceit_drake.calibration.setup import setup_of_record
+from sliceit_drake.calibration.structure import coarse_predictor, first_starts
+from sliceit_drake.cutting.solver import CuttingError
+from sliceit_drake.records.slice_record import SliceRecord
+from studies.benches.draw import LAWS, RESERVED, Draw, seed_of
+from studies.pages import percent, publish, table
+
+__all__ = ["Row", "add_arguments", "interval_score", "run", "scored"]
+
+LEVEL = 0.9
+STEPS = 6
+"""Of each fit."""
+DRAWS = 32
+"""Slices of each band."""
+KINDS = ("same speed", "other speeds", "draws")
+COMMIT = "bands of predicted force"
+"""What seeds follow from, in the place of a commit."""
+
+
+@dc.dataclass(frozen=True)
+class Row:
+    """A record that was not fitted.
+
+    Attributes:
+        law, draw: Of its bench.
+        kind: One of `KINDS`.
+        inside: Share of it in the band.
+        whole: Whether all of it is.
+        width: Mean of the band's, over the root mean square force.
+        score, constant: Mean interval scores of the band and of the band of constant width, N.
+        constant_inside: Share of it in that one.
+    """
+
+    law: str
+    draw: int
+    kind: str
+    inside: float
+    whole: bool
+    width: float
+    score: float
+    constant: float
+    constant_inside: float
+
+
+def interval_score(low: np.ndarray, high: np.ndarray, measured: np.ndarray) -> float:
+    """Mean interval score at `LEVEL` of measurements [M]."""
+    outside = np.maximum(low - measured, 0.0) + np.maximum(measured - high, 0.0)
+    return float(np.mean(high - low + 2.0 / (1.0 - LEVEL) * outside))
+
+
+def scored(draw: Draw) -> list[tuple[str, list[float]]]:
+    """Of each record that is not fitted its kind, and what `Row` has behind it.
+
+    Raises:
+        CuttingError: No start leads to slices that can be cut.
+    """
+    fitted, left = _chosen(draw.records())
+    setup = setup_of_record(fitted[0])
+    few = coarse_predictor(setup, fitted, 1)
+    fits = []
+    for start in first_starts(few):
+        unit = np.array([p.unit(start[p.name]) for p in few.parameters])
+        try:
+            fits.append(gauss_newton(few, unit, steps=STEPS))
+        except CuttingError:
+            continue
+    if not fits:
+        raise CuttingError("no start leads to a fit")
+    best = min(fits, key=lambda fit: fit.cost).unit
+    noise = independent(few, *residuals_at(few, [best]))
+    found = few.values(gauss_newton(few, best, noise=noise, steps=STEPS).unit)
+    # What is each record's own is unknown of those that were not fitted.
+    predictor = coarse_predictor(setup, [*fitted, *(record for _, record in left)], 1)
+    model = predictor.holding_out(predictor.record_of >= len(fitted))
+    unit = np.array([p.unit(found.get(p.name, p.start)) for p in predictor.parameters])
+    low, high = force_band(model, unit, DRAWS).interval(LEVEL)
+    (residual,) = residuals_at(model, [unit])
+    measured, fit = model.measured, model.measured + residual
+    reach = 1.645 * float(np.std(residual[model.used]))
+    out = []
+    for k, (kind, _) in enumerate(left, len(fitted)):
+        rows = (predictor.record_of == k) & predictor.used
+        y, inside = measured[rows], (low <= measured)[rows] & (measured <= high)[rows]
+        force = float(np.sqrt(np.mean(y**2)))
+        near = np.abs(y - fit[rows]) <= reach
+        scores = [
+            interval_score(low[rows], high[rows], y),
+            interval_score(fit[rows] - reach, fit[rows] + reach, y),
+        ]
+        width = float(np.mean((high - low)[rows])) / force
+        out.append((kind, [inside.mean(), inside.all(), width, *scores, near.mean()]))
+    return out
+
+
+def _chosen(
+    records: Sequence[SliceRecord],
+) -> tuple[list[SliceRecord], list[tuple[str, SliceRecord]]]:
+    """Records to fit, and the others by kind."""
+    groups: dict[str, list[SliceRecord]] = {}
+    for record in records:
+        groups.setdefault(record.metadata.condition, []).append(record)
+    presses = [name for name in groups if name.startswith("press")]
+    middle = groups[presses[1]]
+    left = [(KINDS[0], middle[2]), *((KINDS[1], groups[p][0]) for p in presses[::2])]
+    left += [(KINDS[2], own[0]) for name, own in groups.items() if name.startswith("draw")]
+    return list(middle[:2]), left
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Adds the study's arguments."""
+    known = [law for law in LAWS if law != RESERVED]
+    parser.add_argument("--laws", nargs="+", choices=known, default=known, help="default: all")
+    parser.add_argument("--draws", type=int, default=6, help="of each law (default 6)")
+    parser.add_argument("--output", type=Path, metavar="FILE", help="of JSON lines, to go on from")
+    parser.set_defaults(resumes=True)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Runs the study."""
+    rows: list[Row] = []
+    if options.output is not None and options.output.exists():
+        lines = options.output.read_text(encoding="utf-8").splitlines()
+        rows = [Row(**json.loads(line)) for line in lines]
+    done = {(row.law, row.draw) for row in rows}
+    todo = [(law, k) for k in range(options.draws) for law in options.laws]
+    for law, k in tqdm([pair for pair in todo if pair not in done], desc="draws"):
+        try:
+            found = scored(Draw(law, seed_of(COMMIT, "training", law, k)))
+        except CuttingError as error:
+            print(f"{law} {k}: {error}")
+            continue
+        new = [Row(law, k, kind, *values) for kind, values in found]
+        rows += new
+        if options.output is not None:
+            with options.output.open("a", encoding="utf-8") as file:
+                file.writelines(json.dumps(dc.asdict(row)) + "\n" for row in new)
+    publish(_table(rows), None)
+    return 0
+
+
+def _table(rows: Sequence[Row]) -> str:
+    head = (
+        "law | record | records | in the band | whole in it | width / force | interval score [N] | "
+        "constant width: in it | its score [N]"
+    )
+    lines = []
+    for law in dict.fromkeys(row.law for row in rows):
+        for kind in KINDS:
+            of = [row for row in rows if (row.law, row.kind) == (law, kind)]
+            mean = {
+                name: float(np.mean([getattr(row, name) for row in of]))
+                for name in ("inside", "whole", "width", "score", "constant", "constant_inside")
+            }
+            shares = [percent(mean[name]) for name in ("inside", "whole")]
+            cells = [f"{mean['width']:.2f}", f"{mean['score']:.2f}"]
+            last = [percent(mean["constant_inside"]), f"{mean['constant']:.2f}"]
+            lines.append((law, kind, len(of), *shares, *cells, *last))
+    return table(head, lines)
