@@ -36,7 +36,9 @@ def robot_state(time, q, force, qd=0.0):
     )  # fmt: skip
 
 
-def slice_down(fault=lambda state, k: state, cycles=400, food_top=None, delay=0, stiffness=1.5e3):
+def slice_down(
+    fault=lambda state, k: state, cycles=400, food_top=None, delay=0, stiffness=1.5e3, noise=0.01
+):
     """Moves the edge down at 40 mm/s into a spring 5 mm below; the stop, and how many cycles."""
     rng = np.random.default_rng(0)
     layer = SafetyLayer(SafetyLimits(), KINEMATICS, BOARD - 0.02, START, PERIOD, food_top)
@@ -45,7 +47,7 @@ def slice_down(fault=lambda state, k: state, cycles=400, food_top=None, delay=0,
     path = [[START[0], START[1] + slope * (z - 0.05), *START[2:]] for z in heights]
     for k, q in enumerate(path):
         depth = max(0.0, 0.045 - heights[k])
-        force = np.array([0.0, 0.0, stiffness * depth]) + rng.normal(scale=0.01, size=3)
+        force = np.array([0.0, 0.0, stiffness * depth]) + rng.normal(scale=noise, size=3)
         now = robot_state(1.0 + PERIOD * k, q, force)
         now = fault(now._replace(target_q=path[max(0, k - delay)]), k)
         if k == 0:
@@ -90,6 +92,7 @@ def changed(**changes):
     ("limit", "fault", "within"),
     [
         ("force_age", frozen("wrench"), 12),
+        ("force_age", frozen("raw_wrench"), 12),
         ("force_age", changed(wrench=lambda w: [0.0] * 6), 1),
         ("force_rate", changed(wrench=lambda w: [-x for x in w]), 1),
         ("raw_force", changed(wrench=lambda w: [0.4 * x for x in w]), 40),
@@ -134,6 +137,38 @@ def test_a_food_that_is_not_felt_stops_the_knife_a_few_millimetres_in_it():
     assert stop is not None and stop.limit == "felt_force"
     assert "5." in stop.detail and "in the food" in stop.detail
     assert slice_down(food_top=None, stiffness=0.0) == (None, 400)
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.1, 0.3])
+def test_a_sensor_that_dies_in_the_food_but_for_its_noise_is_found(noise):
+    rng = np.random.default_rng(1)
+
+    def dies(state, k):
+        if k < FROM:
+            return state
+        force = rng.normal(scale=noise, size=3)
+        dead = robot_state(state.time, state.q, force)
+        return state._replace(wrench=dead.wrench, raw_wrench=dead.raw_wrench)
+
+    # The food is where its force begins.
+    food = {"food_top": BOARD + 0.045, "noise": noise, "cycles": 550}
+    stop, _ = slice_down(dies, stiffness=1e3, **food)
+    assert stop is not None and stop.limit == "felt_force", stop
+    never, _ = slice_down(stiffness=0.0, **food)
+    assert never is not None and never.limit == "felt_force", never
+    assert slice_down(stiffness=1e3, **food) == (None, 550)
+
+
+def test_a_breach_of_force_counts_as_one_only_where_the_sensor_can_be_believed():
+    """After `force` and `torque` a retreat is offered, which trusts the sensor."""
+    stop, _ = slice_down(stiffness=6e3)
+    assert stop is not None and stop.limit == "force"
+    jump, _ = slice_down(changed(wrench=lambda w: [*w[:2], w[2] + 60.0, *w[3:]]))
+    assert jump is not None and jump.limit == "force_rate" and "allowed 50" in jump.detail
+    # The torque of a wire that shows other numbers, at once; the raw force says otherwise.
+    other = changed(wrench=lambda w: [w[0], w[1], w[2] + 9.0, 11.0, *w[4:]])
+    torque, k = slice_down(other)
+    assert torque is not None and torque.limit == "raw_force" and k == FROM
 
 
 def level(height):

@@ -209,7 +209,7 @@ def test_one_target_goes_out_in_a_cycle_however_many_commands_come():
 @pytest.mark.parametrize(
     ("reason", "changes"),
     [
-        ("force", {"wrench": [0, 0, 51.0, 0, 0, 0]}),
+        ("force_rate", {"wrench": [0, 0, 51.0, 0, 0, 0]}),
         ("torque", {"wrench": [0, 0, 0, 0, 10.1, 0]}),
         ("measurement", {"wrench": [0, 0, math.nan, 0, 0, 0]}),
         ("measurement", {"q": [math.inf, *START[1:]]}),
@@ -233,7 +233,7 @@ def test_what_the_robot_reports_stops_in_the_same_cycle(reason, changes):
     assert decision.stop is not None and decision.stop.limit == reason
     # After a fault of the robot or the link nothing goes out any more.
     assert (decision.q is not None) == (
-        reason in ("force", "torque", "measurement", "tracking_error")
+        reason in ("force_rate", "torque", "measurement", "tracking_error")
     )
 
 

@@ -83,7 +83,8 @@ class SafetyLimits:
     """Least distance of the arm from a singularity: sines of elbow and wrist, shoulder in m."""
     clearance: float = quantity(2e-3, "m", low=0.0, high=0.1)
     """Least distance of gripper, knife, wrists and forearm from board, table and holder, and of
-    gripper and knife from the arm, at a target and where the arm could stop after it."""
+    gripper and knife from the arm, where the arm could stop after a target; the measured arm may
+    come nearer by measured_margin."""
     force_age: float = quantity(0.02, "s", low=0.002, high=1.0)
     """Longest time in which the force readings are the same to the last digit."""
     force_rate: float = quantity(5000.0, "N/s", low=100.0, high=1e5)
@@ -91,9 +92,10 @@ class SafetyLimits:
     raw_force: float = quantity(5.0, "N", low=0.5, high=250.0)
     """How far the raw force and the one that counts may come apart, for longer than force_age."""
     felt_force: float = quantity(0.1, "N", low=0.0, high=10.0)
-    """Change of the force that the knife must have felt at blind_depth in a food."""
+    """Change of the force, averaged over 0.1 s, that the knife must feel in a food; noise may ask
+    for more."""
     blind_depth: float = quantity(5e-3, "m", low=0.0, high=0.05)
-    """Depth of the edge in a food at which felt_force must have been felt."""
+    """Way down in a food on which felt_force must be felt, in each part of it."""
     read_back: float = quantity(5e-4, "rad", low=1e-4, high=0.1)
     """How far the robot's own joint targets may be from all that was sent a moment before."""
     kinematics: float = quantity(5e-3, "m", low=1e-4, high=0.05)

@@ -22,6 +22,10 @@ TURN = 0.02
 """Most that the robot's flange may be turned from where its joints have it, rad."""
 LAG = 0.03
 """Time by which a servo's own targets trail those that it is sent, s: least lookahead."""
+FELT_TIME = 0.1
+"""Time over which the force is averaged that a food must be felt by, s."""
+FELT_NOISE = 5.0
+"""Least of that force, in its standard deviations by noise."""
 STILL = 1e-3
 """Way of a joint's target on which its encoder shows something, rad."""
 
@@ -62,13 +66,16 @@ class ReadingCheck:
         state: RobotState,
     ) -> None:
         self._limits, self._kinematics = limits, kinematics
-        self._blind = -math.inf if food_top is None else food_top - limits.blind_depth
+        self._food_top = -math.inf if food_top is None else food_top
         self._first = self._last = state
-        self._force_since = self._joints_since = state.time
+        self._force_since = self._shown_since = self._joints_since = state.time
         self._joints_target = state.q
         self._raw_zero = self._raw_difference(state)
         self._raw_since = state.time
-        self._felt = 0.0
+        # Mean force over the food, of how many readings; change of the force since and mean square
+        # of what comes and goes in a cycle, both averaged; lowest height where a food was felt.
+        self._over, self._readings_over = list(state.wrench[:3]), 1
+        self._felt, self._noise, self._felt_down_to = [0.0] * 3, 0.0, self._food_top
         self._sent = collections.deque([(state.time, state.q)])
         if state.target_q is not None:
             self._sent.append((state.time, state.target_q))
@@ -92,6 +99,17 @@ class ReadingCheck:
         self._last = state
         return doubt
 
+    def disagreement(self, state: RobotState) -> Doubt | None:
+        """Whether the force that counts is not what the sensor shows, be it for a cycle."""
+        now, zero = self._raw_difference(state), self._raw_zero
+        if now is None or zero is None:
+            return None
+        off = math.dist(now, zero)
+        if off <= self._limits.raw_force:
+            return None
+        detail = f"the raw force and the force that counts have come {off:.3g} N apart"
+        return Doubt("raw_force", detail, off, self._limits.raw_force)
+
     def _missing(self, state: RobotState) -> Doubt | None:
         for name in ("target_q", "raw_wrench", "tcp_pose", "speed", "robot_mode"):
             if getattr(self._first, name) is not None and getattr(state, name) is None:
@@ -110,23 +128,49 @@ class ReadingCheck:
         if still > limits.force_age:
             detail = f"the force readings are the same to the last digit for {still:.3g} s"
             return Doubt("force_age", detail, still, limits.force_age)
+        # A sensor that stands: the force that counts goes on with the arm's posture.
+        if state.raw_wrench is None or state.raw_wrench != self._last.raw_wrench:
+            self._shown_since = state.time
+        stood = state.time - self._shown_since
+        if stood > limits.force_age:
+            detail = f"the sensor's raw readings are the same to the last digit for {stood:.3g} s"
+            return Doubt("force_age", detail, stood, limits.force_age)
         gap = max(PERIOD, state.time - self._last.time)
         step = math.dist(wrench[:3], self._last.wrench[:3])
         if step > limits.force_rate * gap:
             detail = f"the force jumps by {step:.3g} N in {1e3 * gap:.3g} ms"
             return Doubt("force_rate", detail, step / gap, limits.force_rate)
-        self._felt = max(self._felt, math.dist(wrench[:3], self._first.wrench[:3]))
-        if self._felt < limits.felt_force:
-            heel, tip, _ = self._kinematics.edge(state.q)
-            lowest = min(heel[2], tip[2])
-            if lowest < self._blind:
-                detail = (
-                    f"the edge is {1e3 * (self._blind + limits.blind_depth - lowest):.1f} mm in "
-                    f"the food and felt {self._felt:.3g} N at most, at least "
-                    f"{limits.felt_force:g} expected: is there a food, and does the sensor feel it?"
-                )
-                return Doubt("felt_force", detail, self._felt, limits.felt_force)
-        return None
+        return self._unfelt(state, gap)
+
+    def _unfelt(self, state: RobotState, gap: float) -> Doubt | None:
+        """Whether the edge has gone on in a food without any force; noise alone is none."""
+        wrench, last = state.wrench, self._last.wrench
+        heel, tip, _ = self._kinematics.edge(state.q)
+        lowest, share = min(heel[2], tip[2]), min(1.0, gap / FELT_TIME)
+        jump = sum((wrench[k] - last[k]) ** 2 for k in range(3)) / 6.0
+        self._noise += share * (jump - self._noise)
+        if lowest > self._food_top:
+            self._readings_over += 1
+            for k in range(3):
+                self._over[k] += (wrench[k] - self._over[k]) / self._readings_over
+            return None
+        for k in range(3):
+            self._felt[k] += share * (wrench[k] - self._over[k] - self._felt[k])
+        felt, now, least = math.hypot(*self._felt), math.dist(wrench[:3], self._over), []
+        for averaged in (0.5 * share, 1.0):
+            variance = self._noise * (averaged + 1.0 / self._readings_over)
+            least.append(max(self._limits.felt_force, FELT_NOISE * math.sqrt(variance)))
+        if felt >= least[0] or now >= least[1]:
+            self._felt_down_to = min(self._felt_down_to, lowest)
+        way = self._felt_down_to - lowest
+        if way <= self._limits.blind_depth:
+            return None
+        deep = 1e3 * (self._food_top - lowest)
+        detail = (
+            f"the edge is {deep:.1f} mm in the food and has felt {felt:.3g} N for {1e3 * way:.1f} "
+            f"mm, at least {least[0]:.3g} expected: is there a food, and does the sensor feel it?"
+        )
+        return Doubt("felt_force", detail, felt, least[0])
 
     def _raw_difference(self, state: RobotState) -> list[float] | None:
         """The flange's raw force less its weight and less the force that counts [3], N."""
@@ -142,16 +186,10 @@ class ReadingCheck:
         ]
 
     def _raw(self, state: RobotState) -> Doubt | None:
-        now, zero, limits = self._raw_difference(state), self._raw_zero, self._limits
-        if now is None or zero is None:
-            return None
-        off = math.dist(now, zero)
-        if off <= limits.raw_force:
+        doubt = self.disagreement(state)
+        if doubt is None:
             self._raw_since = state.time
-        elif state.time - self._raw_since > limits.force_age:
-            detail = f"the raw force and the force that counts have come {off:.3g} N apart"
-            return Doubt("raw_force", detail, off, limits.raw_force)
-        return None
+        return doubt if state.time - self._raw_since > self._limits.force_age else None
 
     def _joints(self, state: RobotState, target: Sequence[float] | None) -> Doubt | None:
         if target is None:

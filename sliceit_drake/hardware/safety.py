@@ -254,7 +254,7 @@ class SafetyLayer:
             before, self._last, self._time = self._last, state, time
             stop = self._measurement_fault(state)
             if stop is not None:
-                return stop
+                return self._doubted(stop, state)
             for j in range(6):
                 error = abs(self._q[j] - state.q[j])
                 if not error <= limits.tracking_error:
@@ -328,13 +328,26 @@ class SafetyLayer:
                     factor * limits.knife_speed, "m/s", time,
                 )  # fmt: skip
         margin = -limits.measured_margin
-        return self._edge_fault(edge, "the measured arm", time, margin, -limits.tracking_error)
+        return self._edge_fault(
+            edge, "the measured arm", time, margin, -limits.tracking_error
+        ) or self._clearance_fault(state.q, time, max(0.0, limits.clearance + margin))
 
     def _doubt(self, state: RobotState) -> Stop | None:
         """A reading that cannot be true; the arm then brakes by what was sent, and holds."""
         assert self._readings is not None
         doubt = self._readings.doubt(state, self._q)
         return None if doubt is None else Stop(*doubt, state.time, True)
+
+    def _doubted(self, stop: Stop, state: RobotState) -> Stop:
+        """A stop by the force, or the reason not to believe that force: it decides what is offered
+        to the operator then."""
+        if stop.limit not in ("force", "torque"):
+            return stop
+        assert self._readings is not None
+        doubt = self._readings.doubt(state, self._q) or self._readings.disagreement(state)
+        if doubt is None:
+            return stop
+        return Stop(doubt.limit, f"{doubt.detail}; {stop.detail}", *doubt[2:], state.time, True)
 
     def _payload_fault(self, state: RobotState) -> Stop | None:
         """The force readings jump with the payload that the controller subtracts."""
@@ -415,21 +428,20 @@ class SafetyLayer:
                 time,
                 _REACH / 8.0 * turned * turned,
             )
-        stop = stop or self._clearance_fault(rest, time)
+        stop = stop or self._clearance_fault(rest, time, limits.clearance)
         if stop is None:
             self._q, self._v, self._edge, self._sent_time = q, v, edge, time
         return stop
 
-    def _clearance_fault(self, q: Sequence[float], time: float) -> Stop | None:
+    def _clearance_fault(self, q: Sequence[float], time: float, least: float) -> Stop | None:
         if self._nearest is None:
             return None
-        found = self._nearest(q, self.limits.clearance)
-        if found is None or found[0] >= self.limits.clearance:
+        found = self._nearest(q, least)
+        if found is None or found[0] >= least:
             return None
         return self._breach(
-            "clearance", f"{found[1]} would come near each other", found[0],
-            self.limits.clearance, "m", time,
-        )  # fmt: skip
+            "clearance", f"{found[1]} would come near each other", found[0], least, "m", time
+        )
 
     def _carried_on(self, q: list[float], command_time: float, time: float) -> list[float]:
         """Where commands that go on as fast as the last two will be at the time of sending."""
