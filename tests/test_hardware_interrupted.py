@@ -152,6 +152,31 @@ def test_a_lost_link_or_a_crash_at_the_question_stops_the_program_and_says_so(
         assert has_crashed or "STOPPED: the connection to the robot was lost" in printed, printed
 
 
+def test_a_program_that_shows_no_life_is_stopped_and_the_operator_is_told(emulator):
+    script = f"""
+import time
+from sliceit_drake.hardware import supervisor
+from sliceit_drake.hardware.ur_client import UrClient
+with supervisor.Supervisor("{emulator.address}") as watched:
+    client = UrClient("{emulator.address}", 0.05, 500.0, pace={PACE}, supervisor=watched)
+    print("PLAYING", flush=True)
+    time.sleep(60.0)
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        try:
+            read_until(process, "PLAYING")
+            time.sleep(3.0)
+            assert emulator.pendant.status()["runtime_state"] == "PLAYING"
+            process.send_signal(signal.SIGSTOP)
+            status = wait_for(emulator, lambda status: status["runtime_state"] == "STOPPED", 40.0)
+            assert "HAS SHOWN NO LIFE" in read_until(process, "Find the cause first.")
+        finally:
+            process.kill()
+    assert any("stopped by the dashboard" in text for _, text in status["log"])
+
+
 def test_a_call_that_never_returns_ends_the_program_and_stops_the_robots(emulator):
     # As ur_rtde does after a lost link: it waits with Python's lock held.
     script = f"""
@@ -160,8 +185,7 @@ from sliceit_drake.hardware import supervisor
 from sliceit_drake.hardware.ur_client import UrClient
 supervisor.CALL_TIME = 1.0
 with supervisor.Supervisor("{emulator.address}") as watched:
-    client = UrClient("{emulator.address}", 0.05, 500.0, pace={PACE}, limit=watched.limit)
-    watched.begin()
+    client = UrClient("{emulator.address}", 0.05, 500.0, pace={PACE}, supervisor=watched)
     print("PLAYING", flush=True)
     client._ask(ctypes.PyDLL(None).sleep, 60)
 """

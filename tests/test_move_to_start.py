@@ -102,6 +102,9 @@ def test_a_way_through_the_board_or_of_half_a_turn_is_refused(robot, start):
         ({"connected": False}, "no data"),
         ({"wrench": [0.0, 0.0, 60.0, 0.0, 0.0, 0.0]}, "meets a force: 60 N, allowed 50"),
         ({"wrench": [np.nan] * 6}, "meets a force"),
+        ({"wrench": [0.0, 0.0, 0.0, 0.0, 11.0, 0.0]}, "meets a torque: 11 Nm, allowed 10"),
+        ({"wrench": [0.0, 0.0, 30.0, 0.0, 0.0, 0.0]}, "force_rate: the force jumps by 30 N"),
+        ({"_noise": 0.0}, "force_age: all force readings are exactly 0"),
     ],
     ids=lambda value: str(next(iter(value))) if isinstance(value, dict) else None,
 )

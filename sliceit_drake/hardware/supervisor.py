@@ -3,15 +3,18 @@
 ur_rtde can end a process in the middle of a motion, by an abort or a segmentation fault; then no
 line of Python runs there any more. It can also wait for ever, with Python's lock held: `limit` ends
 the run's process then. This process only reads a pipe from it. If the pipe ends without the word
-that all is done, it stops the robot's program through the dashboard server.
+that all is done, or nothing comes for a while, it stops the robot's program through the dashboard
+server.
 """
 
 import contextlib
 import faulthandler
 import os
+import select
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 
@@ -22,7 +25,11 @@ PATIENCE = 15.0
 """How long a controller is asked that does not answer, s."""
 CALL_TIME = 10.0
 """How long a call of the robot's library may take, s."""
-_CONTROL, _DONE = b"control\n", b"done\n"
+SILENCE = 1.5 * CALL_TIME
+"""How long a process that controls a robot may show no life, s."""
+BEAT = 0.5
+"""Time between two signs of its life, s."""
+_CONTROL, _ALIVE, _DONE = b"control\n", b".", b"done\n"
 
 
 class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
@@ -38,10 +45,17 @@ class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
             [sys.executable, "-m", "sliceit_drake.hardware.supervisor", host],
             stdin=subprocess.PIPE, start_new_session=True,
         )  # fmt: skip
+        self._is_over = threading.Event()
+        self._beats = threading.Thread(target=self._live, daemon=True)
 
     def begin(self) -> None:
-        """Says that this process controls the robot now: its end stops the robot."""
+        """Says that this process takes control of the robot: its end or silence stops the robot."""
         self._say(_CONTROL)
+        self._beats.start()
+
+    def _live(self) -> None:
+        while not self._is_over.wait(BEAT):
+            self._say(_ALIVE)
 
     @contextlib.contextmanager
     def limit(self) -> Iterator[None]:
@@ -65,6 +79,9 @@ class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
             self._process.stdin.flush()
 
     def __exit__(self, *_: object) -> None:
+        self._is_over.set()
+        if self._beats.ident is not None:
+            self._beats.join()
         self._say(_DONE)
         self._process.communicate()
 
@@ -94,12 +111,23 @@ def stop_by_dashboard(host: str) -> str | None:
 
 
 def _watch(host: str) -> None:
-    """Waits for the end of the process that has the other end of standard input."""
-    said = sys.stdin.buffer.read()
+    """Waits for the end, or the silence, of the process that has the other end of standard
+    input."""
+    said, what = b"", "HAS CRASHED"
+    pipe = sys.stdin.fileno()
+    while True:
+        patience = SILENCE if said.startswith(_CONTROL) else None
+        if not select.select([pipe], [], [], patience)[0]:
+            what = f"HAS SHOWN NO LIFE FOR {SILENCE:g} S"
+            break
+        new = os.read(pipe, 4096)
+        if not new:
+            break
+        said = (said + new).replace(_ALIVE, b"")
     if not said.startswith(_CONTROL) or said.endswith(_DONE):
         return
     problem = stop_by_dashboard(host)
-    text = "THE PROGRAM THAT DROVE THE ROBOT HAS CRASHED. "
+    text = f"THE PROGRAM THAT DROVE THE ROBOT {what}. "
     if problem is None:
         text += "The robot's program was stopped through its dashboard. Find the cause first."
     else:

@@ -12,12 +12,12 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from typing import TypeVar
 
 from sliceit_drake.hardware.client import PLAYING, RobotFacts, RobotState, RobotUnavailableError
 from sliceit_drake.hardware.control_script import NOTHING, control_script, upload
 from sliceit_drake.hardware.hardware_config import SafetyLimits
+from sliceit_drake.hardware.supervisor import Supervisor
 
 __all__ = ["UrClient"]
 
@@ -47,7 +47,8 @@ class UrClient:
         gain: Argument of servoj, 100 to 2000.
         limits: Of which the program on the robot keeps step and speed; None for the defaults.
         pace: Controller seconds in a second; 1 for all robots.
-        limit: Makes a context for a call that can wait for ever, with Python's lock held.
+        supervisor: Is told when this takes control, and limits calls that can wait for ever with
+            Python's lock held; None for nobody.
 
     Raises:
         RobotUnavailableError: Nothing answers there, or it refuses, or ur_rtde is not installed.
@@ -61,9 +62,9 @@ class UrClient:
         limits: SafetyLimits | None = None,
         *,
         pace: float = 1.0,
-        limit: Callable[[], AbstractContextManager[object]] = contextlib.nullcontext,
+        supervisor: Supervisor | None = None,
     ) -> None:
-        self._limit = limit
+        self._limit = contextlib.nullcontext if supervisor is None else supervisor.limit
         try:
             import dashboard_client
             import rtde_control
@@ -93,8 +94,14 @@ class UrClient:
             self._never_upload_again()
             limits = limits or SafetyLimits()
             script = control_script(limits.joint_step, max(limits.joint_speed))
+            if supervisor is not None:
+                supervisor.begin()
             self._script = upload(host, script)
-            self._await_program(START_TIME / max(pace, SLOWEST))
+            try:
+                self._await_program(START_TIME / max(pace, SLOWEST))
+            except RuntimeError:
+                self._dashboard.stop()  # It may begin yet.
+                raise
         except (RuntimeError, OSError) as error:
             if isinstance(error, RobotUnavailableError):
                 raise

@@ -7,6 +7,7 @@ import numpy as np
 from sliceit_drake.diagrams.hardware_station import make_clearance, make_edge_kinematics
 from sliceit_drake.hardware.checks import Check
 from sliceit_drake.hardware.client import RobotUnavailableError
+from sliceit_drake.hardware.readings import ReadingCheck
 from sliceit_drake.hardware.safety import robot_fault
 from sliceit_drake.interruption import raise_if_interrupted
 from sliceit_drake.robot_run.hardware_run import HardwareRun
@@ -147,12 +148,17 @@ class MoveToStart:
         duration = float(np.abs(self._turn).max()) / self.speed + self.speed / ACCELERATION
         deadline = clock.perf_counter() + (1.5 * duration + SETTLING) / pace
         state, arrival = client.read(), clock.perf_counter()
+        # The same readings are believed as in a run.
+        kinematics, floor = make_edge_kinematics(hardware.twin), self.floor - limits.measured_margin
+        readings = ReadingCheck(limits, kinematics, None, state)
         while True:
             raise_if_interrupted()
             client.kick()
             newer, now = client.read(), clock.perf_counter()
+            doubt = None
             if newer.time != state.time:
                 state, arrival = newer, now
+                doubt = readings.doubt(state)
             if now - arrival > NO_DATA / pace or not client.is_connected():
                 return "no data from the robot"
             fault = robot_fault(state)
@@ -161,6 +167,17 @@ class MoveToStart:
             force = float(np.linalg.norm(state.wrench[:3]))
             if not force <= limits.force:
                 return f"the tool meets a force: {force:.3g} N, allowed {limits.force:g}"
+            torque = float(np.linalg.norm(state.wrench[3:]))
+            if not torque <= limits.torque:
+                return f"the tool meets a torque: {torque:.3g} Nm, allowed {limits.torque:g}"
+            if doubt is not None:
+                return f"{doubt.limit}: {doubt.detail}"
+            fastest = max(map(abs, state.qd))
+            if fastest > limits.measured_speed * self.speed + AT_REST:
+                return f"a joint moves at {fastest:.3g} rad/s, wanted {self.speed:.3g} at most"
+            heel, tip, _ = kinematics.edge(state.q)
+            if min(heel[2], tip[2]) < floor:
+                return f"the edge is {1e3 * (floor - min(heel[2], tip[2])):.1f} mm too low"
             off = max(abs(a - b) for a, b in zip(state.q, start, strict=True))
             if off < ARRIVED and max(map(abs, state.qd)) < AT_REST:
                 return None

@@ -264,10 +264,9 @@ class OperatedRobot:
             config = self.config
             client = UrClient(
                 self.host, config.lookahead_time, config.gain, config.limits, pace=self.pace,
-                limit=supervisor.limit,
+                supervisor=supervisor,
             )  # fmt: skip
             try:
-                supervisor.begin()
                 self._connection = client, supervisor
                 yield client
             finally:
@@ -356,8 +355,10 @@ def _slice(hardware: HardwareRun, duration: float, directory: Path) -> Run:
     if made.stopped:
         print(f"STOPPED: {made.stopped}")
         print(_stopped_text(hardware.link), flush=True)
+    numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
     try:
-        summary = write_hardware_outputs(hardware, directory)
+        with handle_signals(numbers, lambda *_: print("Still writing the record.", flush=True)):
+            summary = write_hardware_outputs(hardware, directory)
     except OSError as error:
         print(f"NOT ALL IS WRITTEN: {directory}: {error.strerror}. Make room before the next run.")
         raise

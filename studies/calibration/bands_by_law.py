@@ -71,12 +71,13 @@ def interval_score(low: np.ndarray, high: np.ndarray, measured: np.ndarray) -> f
     return float(np.mean(high - low + 2.0 / (1.0 - LEVEL) * outside))
 
 
-def scored(draw: Draw) -> list[tuple[str, list[float]]]:
-    """Of each record that is not fitted its kind, and what `Row` has behind it.
+def scored(law: str, number: int) -> list[Row]:
+    """The records that are not fitted, of a draw.
 
     Raises:
         CuttingError: No start leads to slices that can be cut.
     """
+    draw = Draw(law, seed_of(COMMIT, "training", law, number))
     fitted, left = _chosen(draw.records())
     setup = setup_of_record(fitted[0])
     few = coarse_predictor(setup, fitted, 1)
@@ -106,12 +107,18 @@ def scored(draw: Draw) -> list[tuple[str, list[float]]]:
         y, inside = measured[rows], (low <= measured)[rows] & (measured <= high)[rows]
         force = float(np.sqrt(np.mean(y**2)))
         near = np.abs(y - fit[rows]) <= reach
-        scores = [
-            interval_score(low[rows], high[rows], y),
-            interval_score(fit[rows] - reach, fit[rows] + reach, y),
-        ]
-        width = float(np.mean((high - low)[rows])) / force
-        out.append((kind, [inside.mean(), inside.all(), width, *scores, near.mean()]))
+        row = Row(
+            law,
+            number,
+            kind,
+            inside=float(inside.mean()),
+            whole=bool(inside.all()),
+            width=float(np.mean((high - low)[rows])) / force,
+            score=interval_score(low[rows], high[rows], y),
+            constant=interval_score(fit[rows] - reach, fit[rows] + reach, y),
+            constant_inside=float(near.mean()),
+        )
+        out.append(row)
     return out
 
 
@@ -148,15 +155,14 @@ def run(options: argparse.Namespace) -> int:
     todo = [(law, k) for k in range(options.draws) for law in options.laws]
     for law, k in tqdm([pair for pair in todo if pair not in done], desc="draws"):
         try:
-            found = scored(Draw(law, seed_of(COMMIT, "training", law, k)))
+            found = scored(law, k)
         except CuttingError as error:
             print(f"{law} {k}: {error}")
             continue
-        new = [Row(law, k, kind, *values) for kind, values in found]
-        rows += new
+        rows += found
         if options.output is not None:
             with options.output.open("a", encoding="utf-8") as file:
-                file.writelines(json.dumps(dc.asdict(row)) + "\n" for row in new)
+                file.writelines(json.dumps(dc.asdict(row)) + "\n" for row in found)
     publish(_table(rows), None)
     return 0
 
