@@ -248,11 +248,12 @@ def is_held(row: dict) -> bool:
 
 
 NOISE = "sensor: {force_noise: 0.3, moment_noise: 0.02}"
-FOODS = {
-    "spring": "",
-    "cylinder without elements": "food: !AnalyticFood {diameter: 0.027, toughness: 300.0}",
-    "nothing on the board": "food: !AnalyticFood {diameter: 0.027, toughness: 0.0}",
+FOODS = {"spring": ""} | {
+    name: f"food: !Food {{name: {name}, shape: !Cylinder {{diameter: 0.027, rings: 3}}}}, "
+    f"calibration: {name}"
+    for name in ("apple", "carrot", "cucumber", "potato", "tomato")
 }
+"""The spring, and a stick of each calibrated food."""
 
 
 def free_runs(count: int) -> Iterator[tuple[str, str, bool]]:
