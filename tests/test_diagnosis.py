@@ -13,7 +13,7 @@ from sliceit_drake.diagnosis.evidence.columns import Sensitivities
 from sliceit_drake.diagnosis.evidence.held_out import fitted_changes, held_out_gain
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.noise_levels import ChannelNoise
-from sliceit_drake.diagnosis.evidence.verdict import reach_verdict
+from sliceit_drake.diagnosis.evidence.verdict import DecisionRule, reach_verdict
 from studies.hidden_effects.sizes import effect_in_noise
 
 
@@ -117,6 +117,22 @@ def test_two_hidden_causes_are_both_named():
 
 def test_what_no_cause_explains_is_unknown():
     assert reach_verdict(problem(40, unknown=1.5), 60).kind == "unknown"
+
+
+def test_a_cause_in_the_air_is_found_where_the_law_is_wrong():
+    """What the law gets wrong in contact asks for no more evidence of what acts in the air."""
+    found = problem(41, unknown=1.5).found
+    rate = [c.name for c in found.columns].index("rate")
+    for k, r in enumerate(found.records):
+        up = np.sin(np.pi * r.time / 0.3) * ~r.in_contact
+        columns = r.columns.copy()
+        columns[:, 0, rate] = up
+        measured = r.measured + 0.2 * up[:, None]
+        found.records[k] = dc.replace(r, columns=columns, measured=measured)
+    assert [f.evidence.name for f in reach_verdict(LinearProblem(found), 60).findings] == ["rate"]
+    strict = reach_verdict(LinearProblem(found), 60, rule=DecisionRule(air=30.0))
+    why = {c.name: c.why for c in strict.causes}
+    assert strict.kind == "unknown" and "a law as wrong as this" in why["rate"]
 
 
 def test_what_goes_with_the_number_of_the_slice_alone_is_unknown():

@@ -47,6 +47,7 @@ class DecisionRule:
         gain: Least gain, twice in log-likelihood, for each record and each multiple of the noise
             that the simulation is wrong by beside the cause: where it is wrong in a form that the
             prior does not have, causes gain up to this.
+        air: In place of that multiple where the knife touches nothing, and no law can be wrong.
         beside: The same of a cause beside others that are named: these too may be of another form.
         size: Least size of an effect, over the noise and what the simulation gets wrong by itself,
             where it acts. Sensors and foods that do not follow the simulation's law look like
@@ -62,6 +63,7 @@ class DecisionRule:
 
     alarm: float = 0.02
     gain: float = 1.1
+    air: float = 0.3
     beside: float = 3.0
     size: float = 0.9
     limit: float = 0.1
@@ -278,7 +280,10 @@ def _refusal(
     if _at_bound(e):
         return _at_bound(e)
     before = [*screening.assumed]
-    wrong_by = max(_own_error(problem, [*before, e.cause])[1], 1.0)
+    # A law cannot be wrong in the air, where there is only noise of another kind.
+    inside = 1.0 if e.per_record else _share_in_contact(problem, e)
+    wrong_by = inside * max(_own_error(problem, [*before, e.cause])[1], 1.0)
+    wrong_by += (1.0 - inside) * rule.air
     least = (rule.beside if before else rule.gain) * len(problem.found.records) * wrong_by
     if e.gain < least:
         return f"gains {e.gain:.0f}, where a law as wrong as this may give {least:.0f}"
@@ -287,6 +292,18 @@ def _refusal(
         if gain.counted >= 0.5 and gain.interval[1] <= 0.0:
             return "does not foretell records that were left out"
     return ""
+
+
+def _share_in_contact(problem: LinearProblem, e: CauseEvidence) -> float:
+    """Share of the mean square of a cause's doing, over the noise, where the knife touches."""
+    noise = np.array([n.deviation for n in problem.noise])
+    inside = whole = 0.0
+    for record in problem.found.records:
+        effect = record.columns[:, :, _columns(problem, e)] @ np.array(e.coefficients) / noise
+        squares = (effect**2).sum(1)
+        inside += float(squares[record.in_contact].sum())
+        whole += float(squares.sum())
+    return inside / max(whole, 1e-300)
 
 
 def _beside(e: CauseEvidence, named: Sequence[CauseAtScan]) -> str:
