@@ -17,7 +17,7 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.diagrams.plant.robot_plant import RobotConfig
 from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.diagrams.scenario_diagram import ScenarioDiagram
-from sliceit_drake.emulator.control_script import COMMAND_NAMES, ControlScript
+from sliceit_drake.emulator.control_script import COMMAND_NAMES, ControlScript, read_script
 from sliceit_drake.emulator.controller import ControllerConfig
 from sliceit_drake.emulator.emulator import ControllerClock, Emulator
 from sliceit_drake.emulator.fault_table import FAULTS
@@ -35,6 +35,7 @@ from sliceit_drake.emulator.process import PendantClient
 from sliceit_drake.emulator.robot_model import CYCLE, START, KinematicRobot, SimulationStopped
 from sliceit_drake.emulator.station_robot import JointTargets, StationRobot
 from sliceit_drake.emulator.variables import INPUTS, OUTPUTS, TYPES
+from sliceit_drake.hardware.control_script import control_script
 from sliceit_drake.hardware.hardware_config import load_hardware_config
 from sliceit_drake.resources import resource_path
 from sliceit_drake.systems.ur5e_kinematics import make_virtual_model, ur5e_chain
@@ -702,31 +703,51 @@ def test_a_variable_is_shown_otherwise_than_it_is_and_the_arm_stays(variable, ho
         assert bench.controller.robot.state.positions == pytest.approx(np.array(START))
 
 
+# Port, what is sent, and whether the connection ends by it.
 HOSTILE = {
     "a recipe too long for a frame": (
         30004, encode_frame(PackageType.SETUP_OUTPUTS, np.array([500.0], ">f8").tobytes()
-                            + b",".join([b"actual_q"] * 1500))),
-    "a frame without a size": (30004, b"\0\0\0\0"),
-    "a frame cut short": (30004, encode_frame(PackageType.SETUP_OUTPUTS, b"\1")),
-    "deep JSON": (30099, b"[" * 100_000 + b"\n"),
-    "a time that is none": (30099, b'{"inject": "normal", "at": NaN}\n'),
-    "a time too long": (30099, b'{"inject": "normal", "at": 1' + b"0" * 400 + b"}\n"),
-    "a line without an end": (30099, b"x" * ((1 << 20) + 1)),
-    "bytes that are no text": (29999, bytes(range(256)) * 40),
+                            + b",".join([b"actual_q"] * 1500)), True),
+    "a frame without a size": (30004, b"\0\0\0\0", True),
+    "a frame cut short": (30004, encode_frame(PackageType.SETUP_OUTPUTS, b"\1"), True),
+    "more recipes than have a number": (
+        30004, encode_frame(PackageType.SETUP_INPUTS, b"input_int_register_9") * 256, True),
+    "deep JSON": (30099, b"[" * 100_000 + b"\n", False),
+    "a time that is none": (30099, b'{"inject": "normal", "at": NaN}\n', False),
+    "a time too long": (30099, b'{"inject": "normal", "at": 1' + b"0" * 400 + b"}\n", False),
+    "a mode that the wire does not hold": (
+        30099, b'{"inject": "shows:robot_mode:*1000000000"}\n', False),
+    "a model that is no text": (30099, b'{"inject": "model:\\ud800"}\n', False),
+    "a line without an end": (30099, b"x" * ((1 << 20) + 1), True),
+    "bytes that are no text": (29999, bytes(range(256)) * 40, False),
     "a register far away": (
         30003, b"def x():\n# float register offset\n a = 99999999\n"
-        b"# RTDE Control script - Main loop\nend\n"),
+        b"# RTDE Control script - Main loop\nend\n", False),
+    "a limit that is no number": (
+        30003, control_script(0.01, 0.5).replace("step = 0.01", "step = 1.2.3").encode(), False),
 }  # fmt: skip
+
+
+def has_ended(connection: socket.socket) -> bool:
+    """Whether the other side of a connection has closed it; reads what came before."""
+    try:
+        while connection.recv(65536):
+            pass
+    except BlockingIOError:
+        return False
+    except ConnectionError:
+        pass
+    return True
 
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_hostile_input_is_refused_and_the_others_are_served(name):
-    port, data = HOSTILE[name]
+    port, data, ends = HOSTILE[name]
     with Bench() as bench:
         other = RawClient(bench)
-        recipe = other.read_from("timestamp", ["DOUBLE"])
+        recipe = other.read_from("timestamp,robot_mode", ["DOUBLE", "INT32"])
+        dashboard = RawClient(bench, 29999)
         attacker = socket.create_connection((bench.address, port))
-        attacker.settimeout(0.01)
         attacker.setblocking(False)
         for _ in range(200):
             with contextlib.suppress(BlockingIOError, ConnectionError):
@@ -734,11 +755,117 @@ def test_hostile_input_is_refused_and_the_others_are_served(name):
             bench.serve()
             if not data:
                 break
+        for _ in range(20):
+            bench.serve()
         bench.cycles(5)
+        dashboard.socket.sendall(b"get robot model\n")
+        bench.serve()
+        assert has_ended(attacker) == ends
+        assert dashboard.socket.recv(4096).endswith(b"UR5\n")
         attacker.close()
         bench.cycles(5)
         assert len(other.data(recipe)) == 10, "the emulator goes on for its other clients"
         assert bench.controller.runtime.name == "STOPPED"
+
+
+def far(first: float) -> list[float]:
+    return [first, *START[1:]]
+
+
+# Command, its doubles, and what the controller says of them.
+NO_NUMBERS = {
+    "a tool that is nowhere": (29, [math.nan] * 6, "argument 0 of the command is nan"),
+    "a tool turned without end": (29, [0.0, 0.0, 0.0, 1e308, 1e308, 0.0], "argument 3"),
+    "a pose that is none": (46, [math.nan] * 6, "argument 0 of the command is nan"),
+    "a pose at infinity": (60, [math.inf, 0.0, 0.0, 0.0, 0.0, 0.0], "argument 0"),
+    "joints that are none": (44, [math.nan] * 12, "argument 0 of the command is nan"),
+    "a move to infinity": (1, [*far(math.inf), 1.0, 1.0], "argument 0 of the command is inf"),
+    "a move too slow to divide by": (1, [*far(2.0), 5e-324, 1e6], "program error"),
+    "a speed without end": (9, [1e308] * 7, "argument 0 of the command is 1e+308"),
+    "a payload without end": (17, [1e308, 0.0, 0.0, 0.0], "argument 0"),
+    "a watchdog of no time": (35, [math.inf], "argument 0 of the command is inf"),
+    "servoj with a gain without end": (11, [*START, 0, 0, 0.002, 0.03, math.inf], "argument 10"),
+    "servoj with a gain of 1e308": (11, [*START, 0, 0, 0.002, 0.03, 1e308], "argument 10"),
+    "servoj with a gain of a million": (11, [*START, 0, 0, 0.002, 1e-9, 1e6], "lookahead_time"),
+    "servoj with a gain of nothing": (11, [*START, 0, 0, 0.002, 0.03, 0.0], "servoj.gain"),
+    "servoj to no number": (11, [*far(math.nan), 0, 0, 0.002, 0.03, 500.0], " nan"),
+}  # fmt: skip
+ALL_COMMANDS = "".join(f" if cmd == {number}:\n" for number in COMMAND_NAMES)
+SCRIPTS = {
+    "one like ur_rtde's": (
+        f"def x():\n# RTDE Control script - Main loop\n{ALL_COMMANDS}\nend\n".encode()
+    ),
+    "ours": control_script(0.01, 0.5).encode(),
+}
+
+
+@pytest.mark.parametrize("whose", SCRIPTS)
+@pytest.mark.parametrize("name", NO_NUMBERS)
+def test_a_command_with_no_numbers_ends_its_program_alone_and_moves_nothing(name, whose):
+    command, doubles, said = NO_NUMBERS[name]
+    with Bench() as bench:
+        other, attacker = RawClient(bench), RawClient(bench)
+        recipe = other.read_from("timestamp,actual_q", ["DOUBLE", "VECTOR6D"])
+        script = RawClient(bench, 30003)
+        script.socket.sendall(SCRIPTS[whose])
+        bench.cycles(5)
+        assert bench.controller.runtime == RuntimeState.PLAYING
+        names = "".join(f",input_double_register_{i}" for i in range(len(doubles)))
+        attacker.ask(PackageType.SETUP_INPUTS, b"input_int_register_0" + names.encode())
+        values = struct.pack(f">Bi{len(doubles)}d", 1, command, *doubles)
+        attacker.send(PackageType.DATA, values)
+        bench.cycles(5)
+        assert bench.controller.runtime == RuntimeState.STOPPED
+        texts = " ".join(attacker.texts())
+        if whose == "ours" and command not in read_script(SCRIPTS[whose].decode()).commands:
+            said = f"no command {command}"
+        assert said in texts
+        packages = other.data(recipe)
+        assert len(packages) == 10, "the emulator goes on for its other clients"
+        assert np.abs(np.array([p["actual_q"] for p in packages]) - START).max() < 1e-9
+        # Another program can be started.
+        script.socket.sendall(SCRIPTS[whose])
+        attacker.send(PackageType.DATA, struct.pack(f">Bi{len(doubles)}d", 1, 0, *doubles))
+        bench.cycles(5)
+        assert bench.controller.runtime == RuntimeState.PLAYING
+
+
+def test_a_speed_slider_that_is_no_number_holds_the_arm():
+    bench = ScriptBench()
+    slider = {"speed_slider_mask": 1, "speed_slider_fraction": math.nan}
+    bench.controller.registers.write(slider, bench.controller.time)
+    bench.write(1, [*(np.array(START) + 0.1), 1.0, 1.0])
+    bench.step(50)
+    assert bench.positions == pytest.approx(np.array(START), abs=1e-12)
+    assert bench.controller.outputs["target_speed_fraction"] == 0.0
+
+
+def test_a_whole_number_that_is_shown_greater_stops_where_its_type_ends():
+    with Bench() as bench:
+        client = RawClient(bench)
+        recipe = client.read_from("output_int_register_5,robot_mode", ["INT32", "INT32"])
+        bench.inject("shows:output_int_register_5:*1000000")
+        bench.controller.write_integer(5, 2**30)
+        bench.cycles(3)
+        assert client.data(recipe)[-1] == {"output_int_register_5": 2**31 - 1, "robot_mode": 7}
+        with pytest.raises(ConfigurationError, match="robot_mode"):
+            bench.inject("shows:robot_mode:*1000000000")
+
+
+@pytest.mark.parametrize("first", [0, 24])
+def test_a_target_is_shifted_wherever_the_script_has_its_registers(first):
+    with Bench() as bench:
+        client = RawClient(bench)
+        names = f"input_int_register_{first},input_double_register_{first}"
+        client.ask(PackageType.SETUP_INPUTS, names.encode())
+        client.ask(PackageType.SETUP_INPUTS, b"input_int_register_0")
+        bench.inject("shift_inputs:0.5")
+        bench.cycles(1)
+        client.send(PackageType.DATA, struct.pack(">Bid", 1, 11, 1.0))
+        assert bench.controller.registers.doubles(first, 1) == [1.5]
+        client.send(PackageType.DATA, struct.pack(">Bi", 2, 11))
+        bench.cycles(2)
+        assert not client.is_closed
 
 
 def test_a_frame_that_claims_another_size_goes_out_once():

@@ -6,6 +6,8 @@ import itertools
 import json
 import math
 import multiprocessing
+import os
+import pickle
 
 import numpy as np
 import pytest
@@ -20,7 +22,8 @@ from stable_baselines3 import SAC  # noqa: E402
 from stable_baselines3.common.logger import Logger  # noqa: E402
 from stable_baselines3.common.vec_env import DummyVecEnv  # noqa: E402
 
-from sliceit_drake.configuration import ConfigurationError  # noqa: E402
+from sliceit_drake.cli.main import main  # noqa: E402
+from sliceit_drake.configuration import ConfigurationError, dump_yaml  # noqa: E402
 from sliceit_drake.cutting.solver import CuttingError  # noqa: E402
 from sliceit_drake.diagrams.scenario import Start  # noqa: E402
 from sliceit_drake.learning import training  # noqa: E402
@@ -432,6 +435,62 @@ def test_a_checkpoint_of_another_training_is_refused(tmp_path, one_process):
         train(training_of(steps=60, learning_rate=2e-3), tmp_path)
     assert "another folder" in str(caught.value)
     assert (tmp_path / training.CONFIGURATION).read_text() == before
+
+
+class MakesFolder:
+    """An object whose pickle makes a folder when it is read."""
+
+    def __init__(self, folder):
+        self._folder = str(folder)
+
+    def __reduce__(self):
+        return os.mkdir, (self._folder,)
+
+
+def as_pickle(value):
+    return pickle.dumps(value)
+
+
+def as_checkpoint(value):
+    file = io.BytesIO()
+    torch.save(value, file)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("write", "content"),
+    [
+        (as_pickle, lambda trap: trap),
+        (as_pickle, lambda trap: {"config": trap}),
+        (as_checkpoint, lambda trap: trap),
+        (as_checkpoint, lambda trap: {"config": "{}", "model": trap}),
+        (as_checkpoint, lambda trap: {"model": {}}),
+        (as_checkpoint, lambda trap: [1, 2]),
+        (lambda _: b"", lambda trap: None),
+        (lambda _: b"no checkpoint", lambda trap: None),
+    ],
+    ids=["a pickle", "a pickle of a dict", "a saved object", "an object among others",
+         "no configuration", "a list", "an empty file", "a text"],
+)  # fmt: skip
+def test_a_checkpoint_that_would_run_code_is_refused_and_runs_none(
+    write, content, tmp_path, one_process, capsys
+):
+    config, folder, made = tmp_path / "training.yaml", tmp_path / "out", tmp_path / "made"
+    dump_yaml(training_of(), config)
+    folder.mkdir()
+    data = write(content(MakesFolder(made)))
+    (folder / training.CHECKPOINT).write_bytes(data)
+    if write is as_pickle:
+        pickle.loads(data)
+        assert made.is_dir(), "read carelessly it would run"
+        made.rmdir()
+    assert main(["train", str(config), "--output", str(folder)]) == 2
+    said = capsys.readouterr().err
+    assert "checkpoint.pt: output: is no checkpoint of this version" in said
+    assert "Give another folder, or delete it" in said
+    assert not made.exists()
+    assert [file.name for file in folder.iterdir()] == [training.CHECKPOINT]
+    assert (folder / training.CHECKPOINT).read_bytes() == data
 
 
 def test_a_training_whose_environment_dies_says_so_and_goes_on(tmp_path):

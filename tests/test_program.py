@@ -24,6 +24,7 @@ from sliceit_drake.hardware.hardware_config import load_hardware_config
 from sliceit_drake.learning.training_config import load_training
 from sliceit_drake.output_folder import remove_results, results_in
 from sliceit_drake.resources import resource_path
+from sliceit_drake.stand_in.protocol import load_protocol
 
 SMALL = "food.shape.rings=3,food.shape.layers=[0.0, 0.004, 0.012]"
 QUICK = ["--set", SMALL, "--no-replay", "--no-animation"]
@@ -206,15 +207,40 @@ def test_a_record_that_is_not_there_is_named_as_it_was_given(tmp_path, capsys, m
     assert "mine.csv: there is no such record" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", ["simulate", "record", "hardware"])
+NO_NAMES = ["..", ".", "", "a\0b", "a\nb", "../../mine", "/mine", "mine/"]
+
+
+@pytest.mark.parametrize("name", NO_NAMES)
+@pytest.mark.parametrize(
+    "command",
+    ["simulate", "record", "record PROTOCOL", "collect", "hardware", "hardware --commission"],
+)
 def test_a_name_that_leads_out_of_the_folder_of_outputs_is_refused(
-    command, tmp_path, capsys, monkeypatch
+    command, name, tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.chdir(tmp_path)
-    scenario = dump_yaml(load_scenario("cucumber_measured", "name=../../mine"))
-    (tmp_path / "a.yaml").write_text(scenario, encoding="utf-8")
-    assert main([command, "a.yaml"]) == 2
-    assert "'../../mine' is no name for the folder of the results" in capsys.readouterr().err
+    folder = tmp_path / "work" / "place"
+    folder.mkdir(parents=True)
+    monkeypatch.chdir(folder)
+    # What a run would take for its own earlier results, and replace.
+    mine = [place / "record.csv" for place in (folder, folder.parent, tmp_path)]
+    for file in mine:
+        file.write_text("mine", encoding="utf-8")
+    if command in ("collect", "record PROTOCOL"):
+        config = load_protocol(str(resource_path("calibration/protocols/poor.yaml")))
+    else:
+        config = load_scenario("cucumber_measured")
+    config.name = name
+    text = dump_yaml(config)
+    (folder / "a.yaml").write_text(text, encoding="utf-8")
+    there = sorted(tmp_path.rglob("*"))
+    verb, *options = command.replace(" PROTOCOL", "").split()
+    assert main([verb, "a.yaml", *options]) == 2
+    said = f"{name!r} is no name for the folder of the results"
+    # A scenario's name is that of its one condition too.
+    said = "Give the condition a name" if (command, name) == ("record", "") else said
+    assert said in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == there
+    assert {file.read_text(encoding="utf-8") for file in mine} == {"mine"}
 
 
 def test_a_protocol_and_a_scenario_go_by_their_names(tmp_path, capsys, monkeypatch):

@@ -381,6 +381,17 @@ def test_a_script_says_by_options_what_the_table_does_not(tmp_path, capsys):
     assert {"food.support", "food.slice_thickness", "provenance"} <= set(metadata.unknown)
 
 
+@pytest.mark.parametrize("name", ["..", "a/b", "../mine"])
+def test_a_record_is_not_imported_under_a_name_that_leads_elsewhere(name, tmp_path, capsys):
+    np.savetxt(tmp_path / "a.csv", slice_in_air_and_food(), delimiter=",")
+    command = ["records", "import", "force", str(tmp_path / "a.csv")]
+    command += ["--output", str(tmp_path / "records"), "--name", name, "--component", "vertical"]
+    command += ["--shape", "cylinder", "--food", "radish", "--speed", "0.02"]
+    assert main([*command, "--size", "0.027", "0.12", "0.027"]) == 2
+    assert f"{name!r} is no name for a record. Give --name NAME" in capsys.readouterr().err
+    assert [file.name for file in tmp_path.rglob("*.csv")] == ["a.csv"]
+
+
 def test_the_page_makes_a_record_of_a_table_with_other_columns(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     file = "calibration/measured/sliceit_real_potato_force.csv"

@@ -24,6 +24,7 @@ __all__ = [
     "add_overrides",
     "add_protocol_argument",
     "add_scenario_arguments",
+    "check_name",
     "check_numbers",
     "cluster_of",
     "find_file",
@@ -154,13 +155,27 @@ def output_of(options: argparse.Namespace, name: str, suffix: str = "") -> Path:
     """
     if options.output is not None:
         return options.output
-    if Path(name).name != name or not name:
-        raise ConfigurationError(
-            f"{name!r} is no name for the folder of the results",
-            field="name",
-            fix="Give --output, or a name without slashes.",
-        )
+    check_name(name, "the folder of the results", "Give --output, or a name")
     return Path("output") / f"{name}{suffix}"
+
+
+def check_name(name: str, what: str, fix: str) -> None:
+    """Refuses a name that leads to another folder, or that none can have.
+
+    Args:
+        name: As a file has it.
+        what: What it would be the name of.
+        fix: What to do; words about the name follow.
+
+    Raises:
+        ConfigurationError: It has a slash or what cannot be printed, is empty, or is dots alone.
+    """
+    if name in ("", ".", "..") or Path(name).name != name or not name.isprintable():
+        raise ConfigurationError(
+            f"{name!r} is no name for {what}",
+            field="name",
+            fix=f"{fix} of letters and digits, such as cucumber_2.",
+        )
 
 
 def add_cluster_arguments(parser: argparse.ArgumentParser, here: str, work: str) -> None:

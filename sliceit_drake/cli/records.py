@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sliceit_drake.cli.arguments import add_output_folder
+from sliceit_drake.cli.arguments import add_output_folder, check_name
 from sliceit_drake.cli.extras import needs_extra
 from sliceit_drake.cli.record_questions import add_question_options, complete_facts
 from sliceit_drake.configuration import ConfigurationError
@@ -208,6 +208,7 @@ def _import(options: argparse.Namespace) -> int:
         options.component = options.component or _component(options)
         metadata = complete_facts(metadata, options)
     record = _imported(options, metadata)
+    check_name(record.name, "a record", "Give --name NAME, one")
     file = write_record(record, options.output / record.name)
     print(f"{file} and .yaml: {len(record)} rows, {record.time[-1] - record.time[0]:.4g} s")
     if options.format == "force":

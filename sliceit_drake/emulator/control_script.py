@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sliceit_drake.configuration import ConfigurationError, validate
 from sliceit_drake.emulator.controller import Controller
 from sliceit_drake.emulator.kinematics import forward, inverse, matrix_of_pose, pose_of_matrix
 from sliceit_drake.emulator.modes import SafetyMode
@@ -58,6 +59,8 @@ COMMAND_NAMES = {
 # What stopL brakes a joint with, for want of its Cartesian meaning: a fifth of a metre of arm.
 _RADIANS_PER_METRE = 5.0
 _TOLERANCE = 1e-6
+# What no argument of a command exceeds, in any of their units; its squares are far from overflow.
+_GREATEST = 1e7
 
 
 @dc.dataclass(frozen=True)
@@ -85,8 +88,11 @@ def read_script(text: str) -> ScriptText | None:
     offset = 0 if match is None else {"0": 0, "24": 24}.get(match.group(1))
     if offset is None:
         return None
-    commands = frozenset(map(int, re.findall(r"\bcmd == (\d+)\b", text)))
-    step, cycle = (_number(text, f"most_in_a_{unit}") for unit in ("step", "cycle"))
+    try:
+        commands = frozenset(map(int, re.findall(r"\bcmd == (\d+)\b", text)))
+        step, cycle = (_number(text, f"most_in_a_{unit}") for unit in ("step", "cycle"))
+    except ValueError:
+        return None
     return ScriptText(offset, commands, step, cycle)
 
 
@@ -183,7 +189,12 @@ class ControlScript:
         return self._doubles(index, 1)[0]
 
     def _doubles(self, index: int, count: int = 6) -> list[float]:
-        return self._controller.registers.doubles(self._offset + index, count)
+        values = self._controller.registers.doubles(self._offset + index, count)
+        for k, value in enumerate(values):
+            # Written so that what is no number does not pass.
+            if not abs(value) <= _GREATEST:
+                raise ScriptError(f"argument {index + k} of the command is {value:.6g}")
+        return values
 
     def _pose(self, index: int = 0) -> np.ndarray:
         return matrix_of_pose(self._doubles(index))
@@ -233,13 +244,15 @@ class ControlScript:
         return slow_down(state.positions, state.velocities, factor * self._double(0))
 
     def _servo_joints(self) -> None:
+        # The program's own check comes before what the controller makes of the numbers.
+        self._check_step(np.array(self._controller.registers.doubles(self._offset, 6)))
         lookahead_time, gain = self._doubles(9, 2)
-        if not (lookahead_time > 0.0 and gain > 0.0):
-            raise ScriptError(f"servoj: lookahead {lookahead_time} s, gain {gain} not positive")
         servo = ServoConfig(lookahead_time=lookahead_time, gain=gain)
-        target = np.array(self._doubles(0))
-        self._check_step(target)
-        self._servo = (target, servo)
+        try:
+            validate(servo, "servoj")
+        except ConfigurationError as error:
+            raise ScriptError(str(error)) from None
+        self._servo = (np.array(self._doubles(0)), servo)
 
     def _check_step(self, target: np.ndarray) -> None:
         if self._servo is None:

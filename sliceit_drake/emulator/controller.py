@@ -150,7 +150,8 @@ class Controller:
         """Fraction of the planned speeds that the speed slider allows."""
         if self.registers.values["speed_slider_mask"]:
             fraction = float(self.registers.values["speed_slider_fraction"])  # type: ignore[arg-type]
-            return min(max(fraction, 0.0), 1.0)
+            # In this order a fraction that is no number holds the arm.
+            return min(max(0.0, fraction), 1.0)
         return 1.0
 
     @property
@@ -313,7 +314,8 @@ class Controller:
         try:
             if not program():
                 self.stop_program("it ended")
-        except ScriptError as error:
+        except (ScriptError, ArithmeticError, ValueError) as error:
+            # Numbers of a client may also have no result: too small to divide by, no rotation.
             self.messages.append((MessageLevel.ERROR, f"program error: {error}"))
             self.stop_program(f"error: {error}")
 

@@ -17,11 +17,13 @@ from sliceit_drake.emulator.fault_table import FAULTS
 from sliceit_drake.emulator.modes import RobotMode, SafetyMode
 from sliceit_drake.emulator.robot_model import CYCLE
 from sliceit_drake.emulator.rtde_server import InputValues, RtdeServer
-from sliceit_drake.emulator.variables import INPUTS
+from sliceit_drake.emulator.variables import INPUTS, OUTPUTS, TYPES, WHOLE_NUMBERS
 
 __all__ = ["FaultInjector"]
 
 _CB3_RATE = 125.0
+# Where a control script has the target of joint 1.
+_FIRST_TARGETS = ("input_double_register_0", "input_double_register_24")
 
 
 class FaultInjector:
@@ -96,7 +98,10 @@ class FaultInjector:
             "frequency_125": (_nothing, partial(setattr, rtde, "frequency_limit", _CB3_RATE)),
             "wrong_payload": (_value(float, _is_amount), self._lock_payload),
             "sensor_bias": (_value(float, math.isfinite), self._bias_sensor),
-            "model": (_value(str, bool), partial(setattr, controller.config, "model")),
+            "model": (
+                _value(str, lambda name: bool(name) and name.isprintable()),
+                partial(setattr, controller.config, "model"),
+            ),
             "second_client": (_nothing, self._claim_inputs),
         }
 
@@ -176,36 +181,44 @@ class FaultInjector:
         number = 0.0 if how in ("frozen", "flipped", "true") else float(how.lstrip("+*"))
         first = value[0] if isinstance(value, list | tuple) else value
         # What is an integer has to stay one that the wire holds.
-        is_whole = number.is_integer() and 0.0 <= number < 1 << 30 and how != "flipped"
+        is_whole = number.is_integer() and number >= 0.0 and how != "flipped"
         if not (is_whole or isinstance(first, float)):
             raise ValueError(argument)
+        if how not in ("frozen", "true"):
+            low, high = _range_of(name)
+            elements = value if isinstance(value, list | tuple) else [value]
+            shown = [_change(how, number)(x) for x in elements]
+            if not all(low <= x <= high for x in shown if not math.isnan(x)):
+                raise ValueError(argument)
         return name, how, number
 
     def _show(self, name: str, how: str, number: float) -> None:
         self._controller.shown.pop(name, None)
         if how == "true":
             return
-        held = self._controller.outputs[name]
+        if how == "frozen":
+            held = self._controller.outputs[name]
+            self._controller.shown[name] = lambda value: held
+            return
+        change, (low, high) = _change(how, number), _range_of(name)
 
-        def each(change: Callable[[Any], Any], value: Any) -> object:
-            kind = type(value[0] if isinstance(value, list | tuple) else value)
-            if isinstance(value, list | tuple):
-                return [kind(change(x)) for x in value]
-            return kind(change(value))
+        def one(value: Any) -> object:
+            shown = change(value)
+            # A value that grows stops where its type ends.
+            return type(value)(low if shown < low else high if shown > high else shown)
 
-        changes: dict[str, Callable[[Any], object]] = {
-            "frozen": lambda value: held,
-            "flipped": partial(each, lambda x: -x),
-        }
-        by_sign = {"+": lambda x: x + number, "*": lambda x: x * number}
-        other = partial(each, by_sign.get(how[:1], lambda x: number))
-        self._controller.shown[name] = changes.get(how, other)
+        def each(value: Any) -> object:
+            return [one(x) for x in value] if isinstance(value, list | tuple) else one(value)
+
+        self._controller.shown[name] = each
 
     def _shift_inputs(self, angle: float, once: bool = False) -> None:
         def shifted(values: InputValues) -> list[InputValues]:
             if once:
                 self._rtde.change_targets = None
-            first = "input_double_register_0"
+            first = next((name for name in _FIRST_TARGETS if name in values), None)
+            if first is None:
+                return [values]
             return [values | {first: float(values[first]) + angle}]  # type: ignore[arg-type]
 
         self._rtde.change_targets = shifted
@@ -242,6 +255,22 @@ class FaultInjector:
         self._controller.note(
             f"another client has taken {len(taken)} of {len(INPUTS)} input registers"
         )
+
+
+def _change(how: str, number: float) -> Callable[[Any], Any]:
+    """What is made of an element of a variable that is shown otherwise."""
+    if how == "flipped":
+        return lambda x: -x
+    by_sign: dict[str, Callable[[Any], Any]] = {
+        "+": lambda x: x + number,
+        "*": lambda x: x * number,
+    }
+    return by_sign.get(how[:1], lambda x: number)
+
+
+def _range_of(name: str) -> tuple[float, float]:
+    """Least and greatest value that the wire holds of an output variable."""
+    return WHOLE_NUMBERS.get(TYPES[OUTPUTS[name]][-1], (-math.inf, math.inf))
 
 
 # Readers of a fault's argument; they raise a ValueError where it has no meaning.

@@ -30,6 +30,8 @@ RATE = 1.0 / CYCLE
 
 _PROTOCOL = 2
 _COMMANDS = ("input_int_register_0", "input_int_register_24")
+# The number of a recipe is a byte; 0 says that there is none.
+_MOST_RECIPES = 255
 # Above this backlog a client gets no further packages: only whole ones are ever dropped.
 _FULL = 65536
 
@@ -193,6 +195,8 @@ class RtdeServer(Service):
         types = self._controller.registers.claim(connection, names)
         number = 0
         if not {NOT_FOUND, IN_USE} & set(types):
+            if len(session.inputs) == _MOST_RECIPES:
+                raise FrameError(f"a client has {_MOST_RECIPES} input recipes at most")
             session.inputs.append(Recipe(names, types))
             number = len(session.inputs)
         return bytes([number]) + ",".join(types).encode()

@@ -12,6 +12,7 @@ __all__ = [
     "NOT_FOUND",
     "OUTPUTS",
     "TYPES",
+    "WHOLE_NUMBERS",
     "InputRegisters",
     "output_type",
     "zero",
@@ -30,6 +31,14 @@ TYPES = {
     "VECTOR6UINT32": "6I",
 }
 """Type names of the protocol, and how `struct` writes them."""
+
+WHOLE_NUMBERS = {
+    "B": (0, 2**8 - 1),
+    "I": (0, 2**32 - 1),
+    "Q": (0, 2**64 - 1),
+    "i": (-(2**31), 2**31 - 1),
+}
+"""Least and greatest whole number of a type, by its letter in `struct`."""
 
 NOT_FOUND = "NOT_FOUND"
 """Word in place of the type of a variable that the controller does not have."""

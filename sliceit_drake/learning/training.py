@@ -197,12 +197,16 @@ def _load(file: Path, described: str) -> dict[str, Any] | None:
     if not file.exists():
         return None
     try:
+        # Tensors and plain values alone: a file from elsewhere must not run what it holds.
         saved = torch.load(file, weights_only=True)
+        if not isinstance(saved, dict) or "config" not in saved:
+            raise pickle.UnpicklingError("it has no settings")
         if saved["config"] == described:
             return saved
         problem = "is of a training with other settings"
-    except (pickle.UnpicklingError, RuntimeError) as error:
-        problem = f"is no checkpoint of this version ({str(error).splitlines()[0]})"
+    except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
+        reason = str(error).splitlines() or ["it ends too early"]
+        problem = f"is no checkpoint of this version ({reason[0]})"
     raise ConfigurationError(
         problem, field="output", source=str(file), fix="Give another folder, or delete it."
     )
