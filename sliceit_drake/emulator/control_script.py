@@ -71,13 +71,15 @@ class ScriptText:
         offset: First register that it uses: 0 or 24.
         commands: Numbers of the commands that it has; None for all.
         most_in_a_step: Most that a target of servoJ may change at once, rad.
-        most_in_a_cycle: The same for each cycle since the target before, and two more, rad.
+        most_in_a_cycle: By which what it may change grows in each cycle, rad.
+        most_move_speed: Greatest speed of a joint in moveJ, rad/s.
     """
 
     offset: int = 0
     commands: frozenset[int] | None = None
     most_in_a_step: float = math.inf
     most_in_a_cycle: float = math.inf
+    most_move_speed: float = math.inf
 
 
 def read_script(text: str) -> ScriptText | None:
@@ -91,9 +93,10 @@ def read_script(text: str) -> ScriptText | None:
     try:
         commands = frozenset(map(int, re.findall(r"\bcmd == (\d+)\b", text)))
         step, cycle = (_number(text, f"most_in_a_{unit}") for unit in ("step", "cycle"))
+        speed = _number(text, "most_move_speed")
     except ValueError:
         return None
-    return ScriptText(offset, commands, step, cycle)
+    return ScriptText(offset, commands, step, cycle, speed)
 
 
 def _number(text: str, name: str) -> float:
@@ -116,7 +119,7 @@ class ControlScript:
         self._controller = controller
         self._text = text or ScriptText()
         self._offset = self._text.offset
-        self._passes = 0
+        self._budget = 0.0
         self._main = self._main_loop()
         self._motion: Iterator[np.ndarray] | None = None
         self._servo: tuple[np.ndarray, ServoConfig] | None = None
@@ -230,6 +233,8 @@ class ControlScript:
 
     def _move_joints(self, end: ArrayLike) -> Iterator[np.ndarray] | None:
         speed, acceleration = self._doubles(6, 2)
+        if not speed <= self._text.most_move_speed:
+            raise ScriptError(f"a motion is too fast, {speed:.3g} rad/s")
         target = self._controller.target
         return self._move(joint_motion(target, end, speed, acceleration, self._scale))
 
@@ -255,15 +260,15 @@ class ControlScript:
         self._servo = (np.array(self._doubles(0)), servo)
 
     def _check_step(self, target: np.ndarray) -> None:
+        text = self._text
         if self._servo is None:
-            self._passes = 0
+            self._budget = text.most_in_a_cycle
         last = self._controller.target if self._servo is None else self._servo[0]
         step = float(np.abs(target - last).max())
-        text = self._text
-        room = min(text.most_in_a_step, text.most_in_a_cycle * (self._passes + 2))
-        if not step <= room:
-            raise ScriptError(f"a target jumps by {step:.3g} rad, allowed {room:.3g}")
-        self._passes = 0 if step > 0.0 else self._passes + 1
+        self._budget = min(text.most_in_a_step, self._budget + text.most_in_a_cycle)
+        if not step <= self._budget:
+            raise ScriptError(f"a target jumps by {step:.3g} rad, allowed {self._budget:.3g}")
+        self._budget -= step
 
     def _stop_servo(self) -> Iterator[np.ndarray]:
         self._servo = None

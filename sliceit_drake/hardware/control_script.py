@@ -11,6 +11,8 @@ __all__ = ["NOTHING", "control_script", "upload"]
 
 SCRIPT_PORT = 30003
 CYCLE = 0.002
+SLACK = 1.1
+"""How much faster than allowed targets may come: the robot's cycles are not the client's."""
 PATIENCE = 2.0
 """How long the robot may take to accept a connection, s."""
 
@@ -19,11 +21,12 @@ def rtde_control():
   # RTDE Control script - Main loop, by sliceit_drake.
   global most_in_a_step = {step:.9g}
   global most_in_a_cycle = {cycle:.9g}
+  global most_move_speed = {speed:.9g}
   global servoing = False
   global servo_q = [0, 0, 0, 0, 0, 0]
   global servo_lookahead = 0.1
   global servo_gain = 300
-  global passes = 0
+  global budget = 0
   global move_q = [0, 0, 0, 0, 0, 0]
   global move_v = 0
   global move_a = 0
@@ -71,30 +74,27 @@ def rtde_control():
 
   # A target farther from the last than the arm may go since then ends the program.
   def check_step(q):
-    room = most_in_a_cycle * (passes + 2)
-    if room > most_in_a_step:
-      room = most_in_a_step
+    budget = budget + most_in_a_cycle
+    if budget > most_in_a_step:
+      budget = most_in_a_step
     end
     k = 0
-    moved = False
+    largest = 0
     while k < 6:
       step = norm(q[k] - servo_q[k])
       # Written so that what is no number does not pass.
-      if not (step <= room):
+      if not (step <= budget):
         stop_threads()
         stopj(10.0)
         textmsg("sliceit_drake: a target jumps by ", step)
         halt
       end
-      if step > 0:
-        moved = True
+      if step > largest:
+        largest = step
       end
       k = k + 1
     end
-    passes = passes + 1
-    if moved:
-      passes = 0
-    end
+    budget = budget - largest
   end
 
   def process(cmd):
@@ -103,6 +103,11 @@ def rtde_control():
       move_q = six()
       move_v = read_input_float_register(6)
       move_a = read_input_float_register(7)
+      # Written so that what is no number does not pass.
+      if not (move_v <= most_move_speed):
+        textmsg("sliceit_drake: a motion is too fast, in rad/s: ", move_v)
+        halt
+      end
       move_thrd = run move_thread()
     elif cmd == 8:
       zero_ftsensor()
@@ -110,7 +115,7 @@ def rtde_control():
       q = six()
       if not servoing:
         servo_q = get_target_joint_positions()
-        passes = 0
+        budget = most_in_a_cycle
       end
       check_step(q)
       enter_critical
@@ -192,7 +197,8 @@ def control_script(joint_step: float, joint_speed: float) -> str:
         joint_step: Most that a joint's target may change at once, however long nothing came, rad.
         joint_speed: Greatest speed of a joint, rad/s.
     """
-    return _SCRIPT.format(step=joint_step, cycle=CYCLE * joint_speed)
+    cycle = SLACK * CYCLE * joint_speed
+    return _SCRIPT.format(step=joint_step, cycle=cycle, speed=joint_speed)
 
 
 def upload(host: str, text: str) -> socket.socket:
