@@ -28,11 +28,8 @@ __all__ = ["CurveCutter", "CurveFood", "food_curve"]
 
 BORROWED = {"carrot": ("potato", 0.5 * (47.9 + 67.6))}
 """Foods without a curve: whose shape they take, and the largest force, N."""
-
 STILL_SPEED = 1e-4
 """Below which a knife that a controller holds is at rest, m/s."""
-
-
 YIELDING = 4e-4
 """Travel over which the forces turn round with the motion, metres: that by which the food yields
 along the edge. Where a draw turns round, the force of the calibrated foods' finite elements is zero
@@ -93,8 +90,7 @@ class CurveCutter(KnifeForceSystem):
     Speed and draw are those of the knife's path between two coupling steps, with the edge's
     direction smoothed over `YIELDING`: a controlled knife shakes, and a food yields. The depth is
     that of the edge at the middle of the food, where the food pushes it; the flanks are pushed half
-    way up to the food's top. `cut_progress` is the fraction of the section that the edge has
-    passed.
+    way up to the food's top. `cut_progress` is the share of the section that it has passed.
 
     Further output port:
         force_components: Forces on the knife by edge, flank pressure, friction [9], N, in W.
