@@ -16,10 +16,7 @@ from sliceit_drake.records.slice_record import SliceRecord
 __all__ = ["food_of", "is_bare", "knife_of", "poses_in_food"]
 
 ONSET = 0.02
-"""Fraction of a record's greatest force at which contact is taken to begin, where its height is not
-known."""
-
-
+"""Fraction of a record's greatest force at which contact begins, its height unknown."""
 CROPPED = 0.05
 """Fraction of a record's greatest force above which it begins in the food, its height unknown."""
 DEEPEST = 5e-3
@@ -86,7 +83,7 @@ def food_of(food: Food, record: SliceRecord) -> Food:
     if kind != facts.shape or not isinstance(shape, PlainShape):
         raise ConfigurationError(
             f"is a {facts.shape}, the food of the setup is a {kind}",
-            source=record.file or record.name,
+            source=record.source,
             field="food.shape",
             fix="Calibrate it with a setup of that shape (--food FILE.yaml).",
         )
