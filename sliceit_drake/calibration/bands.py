@@ -192,8 +192,7 @@ class _Coefficients:
 
 
 def _shared(rest: np.ndarray, used: np.ndarray, record_of: np.ndarray) -> float:
-    """By how much neighbouring entries' errors are alike: the sum of their autocorrelation over all
-    distances, before its first zero."""
+    """How alike neighbours' errors are: the sum of their autocorrelation up to its first zero."""
     factors = []
     for record in np.unique(record_of[used]):
         x = rest[used & (record_of == record)]

@@ -61,8 +61,7 @@ class CalibrationOptions:
         blocks: Blocks of depth that are held out in turn; 0 for none.
         block_length: Depth of interleaved blocks, metres, see `blocked_error`; None for blocks that
             each are one piece.
-        start: Values of shared parameters to polish in place of a search, as those of a food that
-            was calibrated before; None to search.
+        start: Values of shared parameters to polish in place of a search; None to search.
     """
 
     trials: int = 500

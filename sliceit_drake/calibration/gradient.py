@@ -51,7 +51,8 @@ def slice_force(
 ) -> torch.Tensor:
     """Mean wrench of each coupling step on the knife, about Ko and in C [E, 6], Nm and N.
 
-    Differentiable by all tensors: parameters, and the path, from which its height or speed follow.
+    Differentiable by all tensors: parameters, and the path, from which a height, a speed or a time
+    shift follow by torch.
 
     Args:
         adjoint: The cut on its device.

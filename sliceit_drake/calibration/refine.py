@@ -78,8 +78,7 @@ def refine(
 
     The parameters of a cut trade against each other in narrow valleys, along whose walls Adam goes
     to and fro. So it runs in the principal axes of the sensitivity at the start, each scaled by its
-    curvature (the Gauss-Newton matrix, one Jacobian). Where a step leads to a slice that breaks
-    down, it is taken back and halved.
+    curvature (one Jacobian). A step to a slice that breaks down is taken back and halved.
 
     Args:
         start: Places in the ranges [d].

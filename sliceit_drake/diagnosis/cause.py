@@ -113,8 +113,7 @@ class Cause:
         parameters: Its numbers.
         scan: A number that exists only where the cause does, or None.
         per_record: Whether each record has values of its own, as the phase of a vibration.
-        searched: Twice the gain in log-likelihood that `adapted` finds in a record where there is
-            nothing, because it looked for it.
+        searched: Twice the gain in log-likelihood that `adapted` finds where there is nothing.
         by_slice: Whether it goes by which slice of the session or of the knife it is
             (`SliceFacts.slice_index`, `knife_slices`).
         uses_force: Whether its `motion` needs the force of the slice without it.

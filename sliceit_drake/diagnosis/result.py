@@ -154,8 +154,7 @@ class Diagnosis:
         return "\n".join(lines + self.remarks)
 
     def plot_overview(self) -> "Figure":
-        """Where the cause shows most: measured, simulated, and by the extended food; what is left;
-        evidence and size of each cause."""
+        """Where the cause shows most, what is left, and evidence and size of each cause."""
         return overview_figure(self)
 
     def plot(self) -> "Figure":

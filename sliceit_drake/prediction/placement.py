@@ -28,8 +28,7 @@ def poses_in_food(
 ) -> tuple[Rotation, Rotation, np.ndarray]:
     """Poses of the knife in a record of n rows, relative to the food that it cuts.
 
-    Where food or heights are not known, contact is taken to begin over the middle of the cut, as
-    high as its top, when the force does.
+    Where food or heights are unknown, contact begins at the top of the cut when the force does.
 
     Returns:
         R_FW, R_FK [n], p_FK [n, 3], metres.

@@ -379,7 +379,8 @@ class RecordTarget:
     def operator(self) -> np.ndarray:
         """From forces of `coupling_steps` to what would have been measured at the rows [m, E].
 
-        Filters are linear: their effect on each coupling step's force is all."""
+        Filters are linear, so that their effect on each coupling step's force is all there is to
+        know."""
         rows = self.coupling_steps[1:] - 1
         series = np.zeros((len(self.grid) - 1, len(rows)))
         series[rows, np.arange(len(rows))] = 1.0

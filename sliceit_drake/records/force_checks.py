@@ -18,8 +18,7 @@ weak force from a sensor that good is one in kN."""
 WEAK_FORCE = 1.0
 """Below this the noise is looked at, N."""
 MIN_WORK = 1.0
-"""Work of cutting over cut area below this, J/m2, is less than any food's toughness: soft gels
-have a few, vegetables some hundred."""
+"""Work over cut area below this, J/m2, is less than the toughness of any food, soft gels too."""
 GREATEST_FORCE = 5000.0
 """A force above this, N, breaks any arm that holds a kitchen knife."""
 FROZEN_TIME = 0.2

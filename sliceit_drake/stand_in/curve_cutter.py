@@ -90,7 +90,8 @@ class CurveCutter(KnifeForceSystem):
     Speed and draw are those of the knife's path between two coupling steps, with the edge's
     direction smoothed over `YIELDING`: a controlled knife shakes, and a food yields. The depth is
     that of the edge at the middle of the food, where the food pushes it; the flanks are pushed half
-    way up to the food's top. `cut_progress` is the share of the section that it has passed.
+    way up to the food's top. `cut_progress` is the fraction of the section that the edge has
+    passed.
 
     Further output port:
         force_components: Forces on the knife by edge, flank pressure, friction [9], N, in W.

@@ -3,7 +3,8 @@
 A world gives the slices of a food, one scenario each. Two stand for reality:
 
 - `StandInWorld`: finite elements, finer in mesh and step than a training's, with other parameters
-  than the calibrated ones, which also differ from slice to slice, and with effects of its own.
+  than the calibrated ones, which also differ from slice to slice, and with effects that no training
+  has.
 - `CurvesWorld`: measured curves of force over depth with laws of their own (`curve_cutter`). It
   shares no code with the finite elements or the spring; of a calibrated food it takes size and
   knife.

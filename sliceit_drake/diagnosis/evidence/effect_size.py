@@ -118,8 +118,7 @@ def standardised_size(
         problem: The records.
         columns: Numbers of the effect's columns [n].
         coefficients: Of the columns [n], or of each record [R, n].
-        wrong: The discrepancy beside the effect; None for an effect that differs from record to
-            record, as no discrepancy does.
+        wrong: The discrepancy beside the effect; None for an effect that differs by record.
         found: Whether only what was found of it counts, not what it may be.
     """
     records, base = problem.found.records, problem.base

@@ -130,8 +130,7 @@ def fitted_changes(problem: LinearProblem, causes: Sequence[CauseAtScan]) -> lis
 
 
 def own_coefficients(problem: LinearProblem) -> np.ndarray:
-    """Coefficients of what is each record's own (`LinearProblem.own`), where no cause is at work
-    [R, n], in the columns' sizes."""
+    """Coefficients of `LinearProblem.own` without causes [R, n], in the columns' sizes."""
     linear = _Linear(problem, ())
     theta = linear.shared()
     records = range(len(problem.found.records))

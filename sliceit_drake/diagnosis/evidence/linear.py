@@ -305,7 +305,8 @@ class LinearProblem:
     def weighted(
         self, model: Model, sizes: Sizes | None = None, without: int | None = None
     ) -> Weighted:
-        """Moments without the discrepancy and what is each record's own; one may be left out."""
+        """Moments with what is each record's own and the discrepancy integrated out; one record may
+        be left out."""
         grams = self.by_condition(model, without)
         return Weighted(self.discrepancy, grams, self.sizes if sizes is None else sizes)
 
@@ -393,8 +394,7 @@ def fit_shared(total: np.ndarray, model: Model) -> tuple[np.ndarray, np.ndarray]
 
 
 def fitted_covariance(G: np.ndarray, columns: list[int], prior: np.ndarray) -> np.ndarray:
-    """Covariance of the coefficients of columns that are fitted [n, n]; `prior` holds the
-    precisions of all columns [K]."""
+    """Covariance of fitted coefficients [n, n], with precisions `prior` of all columns [K]."""
     return scaled_inverse(G[np.ix_(columns, columns)] + np.diag(prior[columns]))
 
 
@@ -406,8 +406,7 @@ def beside(G: np.ndarray, columns: list[int], prior: np.ndarray) -> np.ndarray:
 def angle_to(
     G: np.ndarray, own: list[int], coefficients: np.ndarray, others: Iterable[list[int]]
 ) -> float:
-    """Between a combination of columns `own` and all that one of several sets of columns can do,
-    by their scalar products, degrees."""
+    """Between a combination of columns `own` and all that one of other sets can do, degrees."""
     best = 0.0
     for columns in others:
         b = G[np.ix_(columns, own)] @ coefficients

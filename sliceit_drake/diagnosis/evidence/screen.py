@@ -37,8 +37,7 @@ from sliceit_drake.prediction.discrepancy import Sizes
 __all__ = ["CauseEvidence", "Screening", "screen"]
 
 MIN_DEVIATION = 0.5
-"""Least standard deviation of a gain by chance: a cause that never gains by chance is not proved by
-a gain of next to nothing."""
+"""Least standard deviation of a gain by chance: a gain of next to nothing proves no cause."""
 PRESENT = 5.0
 """Gain for each number of a cause from which on it shows in a record."""
 JITTER = 1e-9

@@ -55,7 +55,8 @@ class DecisionRule:
             prior does not have, causes gain up to this.
         beside: The same of a cause beside others that are named: these too may be of another form.
         size: Least size of an effect, over the noise and what the simulation gets wrong by itself,
-            where it acts. What does not follow the simulation's law looks like causes up to it.
+            where it acts. Sensors and foods that do not follow the simulation's law look like
+            causes of up to this size.
         limit: Level of the intervals of the causes' numbers.
         replicates: Slices of a condition from which variation can be told from an effect.
         presence: Share of the records in which a cause shows that has numbers of its own in each.
@@ -170,8 +171,7 @@ def reach_verdict(
     progress: Callable[[int], None] | None = None,
     rule: DecisionRule | None = None,
 ) -> Verdict:
-    """Screens, names the cause with most evidence of those that may be named, and goes on with it
-    in the model; see `screen`."""
+    """Screens, names the cause with most evidence that may be named, and goes on beside it."""
     rule = rule or DecisionRule()
     counts = [len(m) for m in problem.conditions.values()]
     needed = rule.replicates - max(counts) if max(counts) < rule.replicates else 0

@@ -146,7 +146,8 @@ def fit_slice(
 ) -> SliceFit:
     """Fits a slice, and predicts each block of depth from a fit to the others.
 
-    What is the record's own stays as fitted to all of it: that is not what is predicted.
+    What is the record's own stays as fitted to all of it: where the knife was is not what is
+    predicted.
 
     Args:
         predictor: Of one record; the parameters of its setup are fitted.
