@@ -1,14 +1,14 @@
 """Tables of numbers: CSV files, with errors that name file, row and column, and interpolation."""
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError, closest
 
-__all__ = ["interpolated", "read_columns", "read_rows", "require_increasing"]
+__all__ = ["finite_number", "interpolated", "read_columns", "read_rows", "require_increasing"]
 
 
 def read_rows(file: str | Path) -> list[tuple[int, list[str]]]:
@@ -64,20 +64,35 @@ def read_columns(file: str | Path, columns: Sequence[str]) -> dict[str, np.ndarr
         values = []
         for number, row in rows[1:]:
             text = row[index] if index < len(row) else ""
-            try:
-                value = float(text)
-            except ValueError:
-                value = np.nan
-            if not np.isfinite(value):
-                raise ConfigurationError(
-                    f"is {text!r}, which is not a finite number",
-                    source=f"{file}, line {number}",
-                    field=name,
-                    fix="Correct the cell or remove the row.",
-                )
-            values.append(value)
+            values.append(finite_number(text, float, f"{file}, line {number}", name))
         result[name] = np.array(values)
     return result
+
+
+def finite_number(text: str, convert: Callable[[str], float], source: str, column: str) -> float:
+    """The number in a cell.
+
+    Args:
+        text: Of the cell.
+        convert: What turns it into a number, or raises ValueError.
+        source: File and line, for the error.
+        column: Name of the column, for the error.
+
+    Raises:
+        ConfigurationError: If it is none, or not finite.
+    """
+    try:
+        value = convert(text)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise ConfigurationError(
+            f"is {text!r}, which is not a finite number",
+            source=source,
+            field=column,
+            fix="Correct the cell or remove the row.",
+        )
+    return value
 
 
 def require_increasing(values: np.ndarray, file: str | Path, column: str) -> None:

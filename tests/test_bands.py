@@ -20,13 +20,11 @@ class PressModel:
         for speed in speeds:
             time = np.linspace(0.0, HEIGHT / speed, ROWS)
             depth = speed * time - 1e-3
-            p = np.column_stack([0.0 * depth, 0.0 * depth, -depth])
             self.targets.append(
                 SimpleNamespace(
                     time=time,
-                    grid=time,
                     depth=depth,
-                    p=p,
+                    path=depth - depth[0],
                     facts=SimpleNamespace(height=HEIGHT),
                     measured=np.zeros((ROWS, 1)),
                 )

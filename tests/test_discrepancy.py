@@ -144,7 +144,7 @@ def test_the_likelihood_is_that_of_the_model_written_out(
 
     def both(sizes: Sizes, causes: list[int]) -> tuple[float, float]:
         model = known.with_causes(causes)
-        grams = known.by_condition(model.own, model.variance)
+        grams = known.by_condition(model)
         value, _ = known.discrepancy.likelihood(
             grams, sizes, model.shared, model.prior[model.shared]
         )
@@ -161,7 +161,7 @@ def test_the_likelihood_is_that_of_the_model_written_out(
 
 def test_the_gradient_is_that_of_differences(known: LinearProblem) -> None:
     model = known.with_causes([2])
-    grams = known.by_condition(model.own, model.variance)
+    grams = known.by_condition(model)
     prior, sizes = model.prior[model.shared], some_sizes(2)
 
     def value(flat: np.ndarray) -> float:

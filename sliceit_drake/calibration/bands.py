@@ -22,7 +22,6 @@ from sliceit_drake.prediction.discrepancy import (
     motion_shapes,
 )
 from sliceit_drake.prediction.noise import EvenNoise
-from sliceit_drake.prediction.record_target import RecordTarget
 
 __all__ = ["ForceBand", "force_band", "independent"]
 
@@ -193,8 +192,7 @@ class _Coefficients:
 
 
 def _shared(rest: np.ndarray, used: np.ndarray, record_of: np.ndarray) -> float:
-    """By how much neighbouring entries' errors are alike: the sum of their autocorrelation over all
-    distances, before its first zero."""
+    """How alike neighbours' errors are: the sum of their autocorrelation up to its first zero."""
     factors = []
     for record in np.unique(record_of[used]):
         x = rest[used & (record_of == record)]
@@ -215,12 +213,6 @@ def _conditions(model: Predictor) -> list[tuple[int, np.ndarray]]:
     return [(own[0], np.isin(model.record_of, own)) for own in groups.values()]
 
 
-def _path(target: RecordTarget) -> np.ndarray:
-    """Way of the knife so far at the rows [m], metres."""
-    steps = np.linalg.norm(np.diff(target.p, axis=0), axis=1)
-    return np.interp(target.time, target.grid, np.append(0.0, np.cumsum(steps)))
-
-
 def _shapes(
     model: Predictor,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Covariates], np.ndarray]:
@@ -231,11 +223,9 @@ def _shapes(
     blocks, covariates = [], []
     phase = np.zeros(0, int)
     for target in model.targets:
-        path = _path(target)
-        values, phase = motion_shapes(
-            target.time, target.depth, path, target.depth > 0.0, reach, target.facts.height
-        )
-        covariates.append(Covariates.of(target.time, target.depth, path))
+        time, depth, path = target.time, target.depth, target.path
+        values, phase = motion_shapes(time, depth, path, depth > 0.0, reach, target.facts.height)
+        covariates.append(Covariates.of(time, depth, path))
         # Entries go by row, then by channel.
         blocks.append(np.einsum("mn,cd->mcdn", values, np.eye(channels)))
     n = len(phase)

@@ -43,7 +43,6 @@ HELD_OUT_STEPS = 4
 """Most steps of a refit without a block of depth."""
 PLACE_STEPS = 6
 """Most steps of a fit of the records' own heights and speeds."""
-
 Progress = Callable[[str, int, int, float], None]
 """Called with what is done, steps done, steps in all, best error so far in N."""
 
@@ -62,8 +61,7 @@ class CalibrationOptions:
         blocks: Blocks of depth that are held out in turn; 0 for none.
         block_length: Depth of interleaved blocks, metres, see `blocked_error`; None for blocks that
             each are one piece.
-        start: Values of shared parameters to polish in place of a search, as those of a food that
-            was calibrated before; None to search.
+        start: Values of shared parameters to polish in place of a search; None to search.
     """
 
     trials: int = 500
@@ -185,8 +183,7 @@ def _given(predictor: Predictor, start: Mapping[str, float]) -> SearchResult:
     Raises:
         CuttingError: It cannot be cut.
     """
-    unit = np.array([p.unit(start.get(p.name, p.start)) for p in predictor.parameters])
-    unit = _placed(predictor, unit)
+    unit = _placed(predictor, predictor.places(start))
     (row,) = predictor.predict([unit])
     error, broken = error_of(predictor, row)
     if broken:
@@ -314,14 +311,13 @@ def blocked_error(
     Neighbouring samples share their error, so that samples held out one by one would be predicted
     by their neighbours; a block must be predicted by the physics. Interleaved blocks ask how well
     the fit fills gaps of a length; blocks in one piece, how well it predicts a part of the food
-    that no data have seen. What is a record's
-    own (its height, its speed) stays as fitted: where the knife was is not what is predicted.
+    that no data have seen. What is a record's own (its height, its speed) stays as fitted: where
+    the knife was is not what is predicted.
 
     Args:
         unit: The fit to all data [d]; each refit starts there.
         blocks: Number of blocks of equal depth.
-        length: Each block is every `blocks`-th piece of depth of this length, metres; None for one
-            piece of depth each.
+        length: As of `depth_blocks`.
 
     Raises:
         CuttingError: A slice breaks down near `unit`.

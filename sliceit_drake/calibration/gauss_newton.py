@@ -23,7 +23,6 @@ __all__ = [
 
 PRIOR_CENTER, PRIOR_VARIANCE = 0.5, 1.0 / 12.0
 """Mean and variance of a place that is uniform in the unit range: what is known beforehand."""
-
 DAMPINGS = (0.0, 1e-2, 1.0, 1e2)
 """Tried side by side, times the present damping; in units of the diagonal."""
 FIRST_DAMPING, WORST_DAMPING = 1e-2, 1e6
@@ -60,8 +59,7 @@ class Fit:
         cost: Weighted sum of squares there, with the prior's where there is a noise model.
         steps: Steps that were taken.
         converged: Whether it ended because no step promised a further decrease.
-        linearisation: At the last place where one was taken: `unit`, or the place one last small
-            step before.
+        linearisation: The last that was taken, at `unit` or one small step before.
     """
 
     unit: np.ndarray

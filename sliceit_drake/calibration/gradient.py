@@ -47,13 +47,9 @@ class _SliceForce(torch.autograd.Function):
 
 
 def slice_force(
-    adjoint: SliceAdjoint,
-    R: torch.Tensor,
-    p: torch.Tensor,
-    values: dict[str, torch.Tensor],
+    adjoint: SliceAdjoint, R: torch.Tensor, p: torch.Tensor, values: dict[str, torch.Tensor]
 ) -> torch.Tensor:
-    """Mean wrench of each coupling step on the knife, moment about Ko and force in C [E, 6], Nm and
-    N.
+    """Mean wrench of each coupling step on the knife, about Ko and in C [E, 6], Nm and N.
 
     Differentiable by all tensors: parameters, and the path, from which a height, a speed or a time
     shift follow by torch.

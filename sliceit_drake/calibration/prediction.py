@@ -30,13 +30,10 @@ NO_ADJOINT = ("effects.skin.thickness",)
 """Parameters whose derivative is taken by differences."""
 STEP = 1e-3
 """Step of these differences, in the unit range."""
-
 REFERENCE_STEP = 2.5e-5
 """Sub-step, and its double, that show what the usual one does wrong, s."""
-
 KEPT = 300
 """Slices that are kept in memory: a step's Jacobian needs what its residuals have simulated."""
-
 HEIGHT, SPEED = "height_offset", "speed_factor"
 
 
@@ -144,7 +141,7 @@ class Predictor:
             if is_bare(record):
                 raise ConfigurationError(
                     "says that there is no food under the knife",
-                    source=record.file or record.name,
+                    source=record.source,
                     field="food.name",
                     fix="Leave the record out of the calibration.",
                 )
@@ -188,7 +185,11 @@ class Predictor:
     @property
     def start(self) -> np.ndarray:
         """The setup's values, as places in the ranges [d]."""
-        return np.array([p.unit(p.start) for p in self.parameters])
+        return self.places({})
+
+    def places(self, values: Mapping[str, float]) -> np.ndarray:
+        """Places in the ranges of values by name [d]; the setup's where there is none."""
+        return np.array([p.unit(values.get(p.name, p.start)) for p in self.parameters])
 
     @property
     def measured(self) -> np.ndarray:
@@ -243,18 +244,14 @@ class Predictor:
         return Job(model, R, p, target.stretches, target.record.name, "float64")
 
     def predict(
-        self,
-        units: Sequence[np.ndarray],
-        step: float | None = None,
-        near: np.ndarray | None = None,
+        self, units: Sequence[np.ndarray], step: float | None = None, near: np.ndarray | None = None
     ) -> list[list[Prediction]]:
         """Forces at several places in the ranges, each [d]: for each, one prediction a record.
 
         Args:
             units: The places.
             step: Sub-step, s; the predictor's by default.
-            near: Place whose sub-steps are taken, for differences from it; None for those that each
-                place asks for.
+            near: Place whose sub-steps are taken, for differences from it; None for those by need.
         """
         jobs, failures = self._jobs(units, step)
         if near is not None:
@@ -350,8 +347,7 @@ class Predictor:
     def mean_square_and_gradient(self, unit: np.ndarray) -> tuple[float, np.ndarray]:
         """Mean square of the used residuals [N^2] at places [d], and its gradient by them.
 
-        The gradient is exact (the solver's adjoint, for which the added inertia is a constant) but
-        for `NO_ADJOINT`.
+        The gradient is exact (the adjoint, with the added inertia constant) but for `NO_ADJOINT`.
 
         Raises:
             CuttingError: A slice broke down.

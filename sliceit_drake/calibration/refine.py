@@ -12,8 +12,7 @@ from sliceit_drake.cutting.solver import CuttingError
 __all__ = ["Adam", "Refinement", "refine"]
 
 RATE = 0.2
-"""First step of Adam, in lengths that change the prediction by its error; a tenth of it in the last
-quarter."""
+"""First step of Adam, in lengths that change the prediction by its error; in the end a tenth."""
 RIDGE = 1e-3
 """Least curvature that is told apart, relative to the greatest."""
 EPSILON = 1e-8
@@ -79,8 +78,7 @@ def refine(
 
     The parameters of a cut trade against each other in narrow valleys, along whose walls Adam goes
     to and fro. So it runs in the principal axes of the sensitivity at the start, each scaled by its
-    curvature (the Gauss-Newton matrix, one Jacobian). Where a step leads to a slice that breaks
-    down, it is taken back and halved.
+    curvature (one Jacobian). A step to a slice that breaks down is taken back and halved.
 
     Args:
         start: Places in the ranges [d].
@@ -89,7 +87,7 @@ def refine(
     """
     axes = _principal_axes(predictor, start, checkpoint)
     zero = np.zeros(len(start))
-    state = _State(unit=start, m=zero, v=zero, best=start, last=start)
+    state = _State(zero, zero, unit=start, best=start, last=start)
     if checkpoint is not None and checkpoint.exists():
         with np.load(checkpoint) as saved:
             state = _State(**(dict(saved) | {"errors": saved["errors"].tolist()}))
@@ -104,11 +102,9 @@ def refine(
             if error < state.error:
                 state.best, state.error = state.unit, error
             state.last = state.unit
-            adam = Adam(state.m, state.v)
             rate = state.factor * RATE * (0.1 if 4 * k >= 3 * steps else 1.0)
-            move = rate * axes @ adam.descent(axes.T @ gradient, k, EPSILON)
+            move = rate * axes @ state.descent(axes.T @ gradient, k, EPSILON)
             state.unit = np.clip(state.last + move, 0.0, 1.0)
-            state.m, state.v = adam.m, adam.v
         else:
             state.factor *= BACK_OFF
             state.unit = state.last + BACK_OFF * (state.unit - state.last)
@@ -123,13 +119,11 @@ def refine(
 
 
 @dc.dataclass
-class _State:
-    """Where a refinement stands, as a checkpoint holds it: the next place, Adam's means, the best
-    place, the last that did not break down, the best error, the factor on steps, their errors."""
+class _State(Adam):
+    """Where a refinement stands, as a checkpoint holds it: Adam's means, the next place, the best,
+    the last that did not break down, the best error, the factor on steps, their errors."""
 
     unit: np.ndarray
-    m: np.ndarray
-    v: np.ndarray
     best: np.ndarray
     last: np.ndarray
     error: float = np.inf

@@ -37,8 +37,7 @@ class Calibration:
         rms: On the records, N.
         search_rms: Best of the search alone, N; of the start where there was no search.
         refined_rms: Best after Adam, N; the same.
-        polished_rms: Least of all, N; where the values are that the noise makes more probable,
-            `rms` is a little greater.
+        polished_rms: Least of all, N; `rms` is that of the values that the noise makes probable.
         posterior: Of the parameters.
         band: Within what another measurement is expected.
         blocks: RMS error on each block of depth when it was held out, N.

@@ -27,8 +27,7 @@ class SearchResult:
 
     Attributes:
         units: Places in the ranges of all finished trials [n, d].
-        errors: Their root mean square errors [n], N; larger than any real one where a slice broke
-            down.
+        errors: Their root mean square errors [n], N; see `error_of` where a slice broke down.
         failures: Number of trials that broke down.
     """
 
@@ -82,8 +81,7 @@ def search(
         study: From `open_study`.
         trials: Number of finished trials in the storage, those of all workers.
         progress: Called with the finished trials and the best error so far, N.
-        place: Gives the place [d] of the first trial, from that of the setup's values; as it is by
-            default.
+        place: Gives the place [d] of the first trial, from that of the setup's values.
 
     Raises:
         ConfigurationError: The study in the storage is of other parameters, or the storage failed.

@@ -139,7 +139,7 @@ def setup_of_record(record: SliceRecord) -> CalibrationSetup:
         missing = "food.size" if facts.shape in SHAPES else "food.shape"
         raise ConfigurationError(
             "is not given, and without --food there is no other",
-            source=record.file or record.name,
+            source=record.source,
             field=missing,
             fix="Give it in the record's YAML file, or a setup by --food.",
         )

@@ -16,10 +16,8 @@ __all__ = ["keeps_answering", "open_storage", "without_password"]
 
 CONNECT = 10
 """Time to reach a database, s."""
-
 BEGINNERS = 20
 """Attempts to make the tables: workers that begin together on an empty database collide."""
-
 EXAMPLE = "postgresql://USER@HOST/DATABASE"
 
 

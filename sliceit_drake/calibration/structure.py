@@ -65,7 +65,6 @@ DROP, WITHIN = 0.12, 2e-3
 """Part of a force, and depth in metres over which it falls, of a puncture."""
 DEEPEST = 0.6
 """Part of the food's height above which a skin is punctured, or a wall."""
-
 OFF = {
     "effects.skin.toughness": 0.0,
     "effects.bluntness.initiation": 0.0,
@@ -92,15 +91,8 @@ class Puncture:
 
 @dc.dataclass(frozen=True)
 class _Element:
-    """A part of a food's structure.
-
-    Attributes:
-        name: In words.
-        ranges: Its parameters.
-        starts: Values of these from which fits begin.
-        needs: Element without which it is nothing.
-        held_sides: In place of the setup's; "" for these.
-    """
+    """A part of a food's structure: its parameters, values of these from which fits begin, the
+    element without which it is nothing, and the held sides in place of the setup's, if any."""
 
     name: str
     ranges: tuple[ParameterRange, ...]
@@ -111,16 +103,8 @@ class _Element:
 
 @dc.dataclass
 class _Fitted:
-    """A structure, fitted.
-
-    Attributes:
-        setup: With its parameters, as fine as the user's.
-        values: Of its parameters, those of records included.
-        rms: On the records, N.
-        left_out: On depth that was left out, N.
-        predictor: Coarse.
-        at: The fit's linear problem.
-    """
+    """A structure, fitted: its setup, as fine as the user's; values of all parameters; RMS error on
+    the records and on left-out depth, N; the coarse predictor, and the fit's linear problem."""
 
     setup: CalibrationSetup
     values: dict[str, float]
@@ -395,9 +379,8 @@ def _fit(
     predictor: Predictor, setup: CalibrationSetup, start: Mapping[str, float]
 ) -> _Fitted | None:
     """The fit from a start, by name; None where slices break down."""
-    unit = np.array([p.unit(start.get(p.name, p.start)) for p in predictor.parameters])
     try:
-        fit = gauss_newton(predictor, unit, steps=STEPS, tolerance=1e-3)
+        fit = gauss_newton(predictor, predictor.places(start), steps=STEPS, tolerance=1e-3)
         at = fit.linearisation
         if not np.array_equal(at.unit, fit.unit):
             at = linearise(predictor, fit.unit)
@@ -416,14 +399,9 @@ def _best_first(fits: Sequence[_Fitted | None]) -> list[_Fitted]:
 
 @dc.dataclass
 class _Trial:
-    """A fit that may be worth while.
-
-    Attributes:
-        element: That is added.
-        setup, predictor: With it.
-        start: Values by name.
-        promise: Part of the best error on left-out depth that it takes off in the linear problem.
-    """
+    """A fit that may be worth while: the element that is added, setup and predictor with it, values
+    to start from, and the part of the best error on left-out depth that it takes off in the linear
+    problem."""
 
     element: _Element
     setup: CalibrationSetup
@@ -440,7 +418,7 @@ def _trials(
     they are where they make up for it."""
     before = min(_left_out(m.predictor, m.at, own=True) for m in minima)
     pairs = [(m, m.values | _named(element, s)) for m in minima for s in element.starts]
-    units = [np.array([p.unit(s[p.name]) for p in predictor.parameters]) for _, s in pairs]
+    units = [predictor.places(s) for _, s in pairs]
     out = []
     for (minimum, start), residuals in zip(pairs, residuals_at(predictor, units), strict=True):
         if np.isfinite(residuals).all():
@@ -458,8 +436,7 @@ def _trials(
 def _left_out(model: Predictor, at: Linearisation, own: bool = False) -> float:
     """Root mean square error on blocks of depth, each predicted by a fit without it, N.
 
-    The fits are those of the linear problem at the fit to all; what is a record's own stays, unless
-    `own` is fitted as well.
+    The fits are linear, about the fit to all; what is a record's own stays unless `own` is set.
     """
     block, free = depth_blocks(model, BLOCKS), np.array([own or p.shared for p in model.parameters])
     free = np.append(free, np.full(len(at.unit) - len(free), True))

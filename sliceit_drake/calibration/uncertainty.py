@@ -236,10 +236,7 @@ def _noise_problem(model: Predictor, at: Linearisation) -> NoiseProblem:
 
 
 def _posterior(
-    model: Predictor,
-    unit: np.ndarray,
-    covariance: np.ndarray,
-    noise: NoiseModel,
+    model: Predictor, unit: np.ndarray, covariance: np.ndarray, noise: NoiseModel
 ) -> Posterior:
     parameters = model.parameters
     notes = []

@@ -15,15 +15,7 @@ from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity
 from sliceit_drake.prediction.series import ForceSeries, SharedFacts, SliceFacts
 
-__all__ = [
-    "EXPERIMENTS",
-    "FAMILIES",
-    "Cause",
-    "CauseParameter",
-    "Scan",
-    "Values",
-    "check_cause",
-]
+__all__ = ["EXPERIMENTS", "FAMILIES", "Cause", "CauseParameter", "Scan", "Values", "check_cause"]
 
 FAMILIES = (
     "material",
@@ -48,11 +40,9 @@ EXPERIMENTS = {
     "finer": "compute again with half the step and a finer mesh",
 }
 """What a cause may name as the experiment that reveals it."""
-
 BENCH = "bench."
 MOVING = ("bench.board.height", "bench.arm.", "bench.mounting.")
 """Parameters of the bench that change how the knife moves in the food."""
-
 Values = Mapping[str, float]
 """Parameters of a cause by name and, where there is a scan, its value by its name."""
 
@@ -123,8 +113,7 @@ class Cause:
         parameters: Its numbers.
         scan: A number that exists only where the cause does, or None.
         per_record: Whether each record has values of its own, as the phase of a vibration.
-        searched: Twice the gain in log-likelihood that `adapted` finds in a record where there is
-            nothing, because it looked for it.
+        searched: Twice the gain in log-likelihood that `adapted` finds where there is nothing.
         by_slice: Whether it goes by which slice of the session or of the knife it is
             (`SliceFacts.slice_index`, `knife_slices`).
         uses_force: Whether its `motion` needs the force of the slice without it.
@@ -172,8 +161,7 @@ class Cause:
     def adapted(self, records: Sequence[RecordSensitivity]) -> "Cause":
         """The same cause with its scan, or what else it needs, taken from the residuals.
 
-        A period or the time of an event cannot be tried at a few values. Only for causes that act
-        on wrenches alone.
+        A period or a moment cannot be tried at a few values. For causes that act on wrenches alone.
         """
         return self
 

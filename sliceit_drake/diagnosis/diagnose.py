@@ -10,7 +10,7 @@ from sliceit_drake.configuration import ConfigurationError
 from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
 from sliceit_drake.diagnosis.cause import Cause
 from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
-from sliceit_drake.diagnosis.evidence.linear import LinearProblem
+from sliceit_drake.diagnosis.evidence.linear import LinearProblem, fit_shared
 from sliceit_drake.diagnosis.evidence.own_values import at_own_values
 from sliceit_drake.diagnosis.evidence.sensitivity import sensitivities
 from sliceit_drake.diagnosis.evidence.verdict import DecisionRule, reach_verdict
@@ -25,14 +25,12 @@ __all__ = ["BASE", "Progress", "diagnose", "setup_of_food"]
 
 Progress = Callable[[str, int, int], None]
 """Called with what is done, steps done and steps in all."""
-
 BASE = (
     ParameterRange("material.toughness", 10.0, 5000.0),
     ParameterRange("material.youngs_modulus", 2e4, 2e7),
     ParameterRange("material.friction", 1e-3, 2.0),
 )
 """Base parameters of a calibrated food: a shift of theirs is reported as such."""
-
 MIN_RECORDS = 2
 
 
@@ -138,14 +136,11 @@ def _shifts(
     """Factors of the base parameters and their relative standard errors, causes in the model."""
     found = problem.found
     shared = [k for k in found.of_causes(causes) if not found.columns[k].per_record]
-    columns = [
-        *problem.base,
-        *(k for k in problem.with_causes(shared).shared if k not in problem.base),
-    ]
     model = problem.with_causes(shared)
-    theta, covariance = problem.fit_shared(problem.weighted(model).total, columns, model.prior)
+    theta, covariance = fit_shared(problem.weighted(model).total, model)
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     out = {}
+    # The base parameters come first.
     for i, k in enumerate(problem.base):
         size = found.columns[k].size
         out[found.columns[k].name] = (

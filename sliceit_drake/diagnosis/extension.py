@@ -11,6 +11,7 @@ from sliceit_drake.cutting.foods.calibrated_food import CalibratedFood
 from sliceit_drake.cutting.foods.food import make_food_model
 from sliceit_drake.cutting.parameters import get_parameter, with_parameters
 from sliceit_drake.diagnosis.cause import Cause, Values
+from sliceit_drake.diagnosis.evidence.confirm import predicted_at
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.prediction import Point, SlicePredictor
 from sliceit_drake.prediction.series import SliceFacts
@@ -48,14 +49,4 @@ def predicting_by(
 ) -> LinearProblem:
     """The problem with what simulations of a food and its bench predict, as its file gives them."""
     setup = dc.replace(predictor.setup, food=food.food, bench=food.bench)
-    of_food = predictor.of(setup)
-    (row,) = of_food.predict([Point()])
-    moved = []
-    for record, target, series in zip(problem.found.records, of_food.targets, row, strict=True):
-        assert series is not None
-        seen = target.compare(series.wrench)
-        if problem.mesh is not None:
-            # Of the finer mesh, as the prediction is; its difference is taken from the base model.
-            seen = seen - record.columns[:, :, problem.mesh]
-        moved.append(seen)
-    return problem.predicting(moved)
+    return predicted_at(Point(), problem, predictor.of(setup))

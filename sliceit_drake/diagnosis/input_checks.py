@@ -69,13 +69,13 @@ def check_records(
         _check_board(record, records)
     remarks = [
         *_conditions(records),
-        *_spikes(records),
-        *_dropped(records),
-        *_knives(records),
-        *_torques(records),
+        _spikes(records),
+        _dropped(records),
+        _knives(records),
+        _torques(records),
         *_warnings(records),
     ]
-    return list(dict.fromkeys(remarks))
+    return list(dict.fromkeys(remark for remark in remarks if remark))
 
 
 def without_lone_torques(records: Sequence[SliceRecord]) -> list[SliceRecord]:
@@ -85,22 +85,18 @@ def without_lone_torques(records: Sequence[SliceRecord]) -> list[SliceRecord]:
     return [dc.replace(r, torque=None) for r in records]
 
 
-def _torques(records: Sequence[SliceRecord]) -> list[str]:
+def _torques(records: Sequence[SliceRecord]) -> str:
     lack = [r.name for r in records if r.torque is None]
     if not 0 < len(lack) < len(records):
-        return []
-    return [
+        return ""
+    return (
         f"{_some(lack)}: no torque, so that the torques of the other records are not used either."
         " Give torque_x..z and wrench.point for all."
-    ]
-
-
-def _file(record: SliceRecord) -> str:
-    return record.file or record.name
+    )
 
 
 def _facts_file(record: SliceRecord) -> str:
-    return str(Path(_file(record)).with_suffix(".yaml"))
+    return str(Path(record.source).with_suffix(".yaml"))
 
 
 def _check_same_slice(records: Sequence[SliceRecord]) -> None:
@@ -112,8 +108,8 @@ def _check_same_slice(records: Sequence[SliceRecord]) -> None:
         content = (record.time - record.time[0]).round(9).tobytes() + force.tobytes()
         if content in seen:
             raise ConfigurationError(
-                f"holds the same measurement as {_file(seen[content])}",
-                source=_file(record),
+                f"holds the same measurement as {seen[content].source}",
+                source=record.source,
                 field="force",
                 fix="Remove one: a slice counted twice would look like two that agree.",
             )
@@ -133,7 +129,7 @@ def _check_foods(records: Sequence[SliceRecord], food: Food, other_food: bool) -
     if not cut:
         raise ConfigurationError(
             "in none of the records is there food",
-            source=_file(records[0]),
+            source=records[0].source,
             field="food.name",
             fix="Add records of slices; those of air, board and weight go with them.",
         )
@@ -158,9 +154,8 @@ def _check_foods(records: Sequence[SliceRecord], food: Food, other_food: bool) -
             " field if it is one food under two names.",
         )
     (name,) = foods
-    if UNNAMED[0] in (name, food.name) or UNNAMED[1] in (name, food.name) or other_food:
-        return
-    if name.lower() != food.name.lower():
+    named = not {name, food.name} & {*UNNAMED}
+    if named and name.lower() != food.name.lower() and not other_food:
         raise ConfigurationError(
             f"the records are of {name}, the model is of {food.name}",
             source=_facts_file(foods[name][0]),
@@ -179,7 +174,7 @@ def _check_channels(records: Sequence[SliceRecord]) -> None:
         raise ConfigurationError(
             f"has {few[0].known_force}, unlike {len(records) - len(few)} of the {len(records)} "
             "records",
-            source=_file(few[0]),
+            source=few[0].source,
             field=column,
             fix="Give all records the same columns: force_x, force_y, force_z, or force_norm alone,"
             " or force_vertical alone; or diagnose the kinds apart.",
@@ -190,22 +185,21 @@ def _check_force(record: SliceRecord) -> None:
     if len(record) < LEAST_ROWS:
         raise ConfigurationError(
             f"has {len(record)} rows, too few to tell a force from its noise",
-            source=_file(record),
+            source=record.source,
             field="time",
             fix=f"Give at least {LEAST_ROWS} rows, at the sensor's own rate.",
         )
     if float(np.ptp(record.force_magnitude)) < 1e-9:
         raise ConfigurationError(
             "has a constant force: there is nothing to compare",
-            source=_file(record),
+            source=record.source,
             field="force",
             fix="Check the sensor and its cable; record again.",
         )
 
 
 def _check_board(record: SliceRecord, records: Sequence[SliceRecord]) -> None:
-    """Refuses a board that is not where the food lies, its own or where it has none that of the
-    others."""
+    """Refuses a board that is not where the food lies, its own or else that of the others."""
     facts = record.metadata
     known = [r.metadata.food.position for r in (record, *records) if not is_bare(r)]
     heights = [position[2] for position in known if position is not None]
@@ -223,7 +217,7 @@ def _check_board(record: SliceRecord, records: Sequence[SliceRecord]) -> None:
         )
 
 
-def _spikes(records: Sequence[SliceRecord]) -> list[str]:
+def _spikes(records: Sequence[SliceRecord]) -> str:
     found = []
     for record in records:
         force = record.measured_force
@@ -231,14 +225,14 @@ def _spikes(records: Sequence[SliceRecord]) -> list[str]:
         if count:
             found.append(f"{record.name} {count} of {len(record)}")
     if not found:
-        return []
-    return [
+        return ""
+    return (
         f"{_some(found)}: rows in which the force stands out from those before and after, as a"
         " sensor's or a bus's fault does. They count for little; check the cable if there are many."
-    ]
+    )
 
 
-def _dropped(records: Sequence[SliceRecord]) -> list[str]:
+def _dropped(records: Sequence[SliceRecord]) -> str:
     found = []
     for record in records:
         steps = np.diff(record.time) / np.median(np.diff(record.time))
@@ -246,9 +240,8 @@ def _dropped(records: Sequence[SliceRecord]) -> list[str]:
         missing = int((np.rint(steps[steps < LONG_GAP]) - 1.0).clip(0.0).sum())
         if missing > DROPPED * len(record):
             found.append(f"{record.name} {missing} of {len(record) + missing}")
-    if not found:
-        return []
-    return [f"{_some(found)}: rows are missing; what is there is used at its own times."]
+    text = "rows are missing; what is there is used at its own times."
+    return f"{_some(found)}: {text}" if found else ""
 
 
 def _check_contact(record: SliceRecord, food: Food) -> None:
@@ -265,7 +258,7 @@ def _check_contact(record: SliceRecord, food: Food) -> None:
         raise ConfigurationError(
             f"begins with {force[:3].mean():.3g} N, {100 * force[:3].mean() / peak:.0f} % of its"
             " greatest force: the knife is in the food already, or the sensor was not tared",
-            source=_file(record),
+            source=record.source,
             field="force_norm",
             fix="Record from before the first contact, with the sensor tared.",
         )
@@ -278,7 +271,7 @@ def _check_contact(record: SliceRecord, food: Food) -> None:
     if above[cut].min() > 0.0:
         raise ConfigurationError(
             f"the knife stays {1e3 * above[cut].min():.3g} mm or more above the food",
-            source=_file(record),
+            source=record.source,
             field="p_WK_z",
             fix="Correct food.position or the heights; both are in the world frame, in metres.",
         )
@@ -291,7 +284,7 @@ def _check_contact(record: SliceRecord, food: Food) -> None:
         where = f"{1e3 * abs(above[begins]):.1f} mm {'above' if above[begins] > 0 else 'below'}"
         raise ConfigurationError(
             f"the force begins {where} the top of the food, which is {1e3 * height:.0f} mm high",
-            source=_file(record),
+            source=record.source,
             field="p_WK_z",
             fix="Correct food.position, food.size or the knife's pose on the tool; list p_WK_z"
             " under unknown if only changes of the height are known.",
@@ -337,18 +330,17 @@ def _conditions(records: Sequence[SliceRecord]) -> list[str]:
     return out
 
 
-def _knives(records: Sequence[SliceRecord]) -> list[str]:
+def _knives(records: Sequence[SliceRecord]) -> str:
     kinds: dict[str, list[str]] = {}
     for record in records:
         kinds.setdefault(repr(record.metadata.knife), []).append(record.name)
     if len(kinds) < 2:
-        return []
-    few = min(kinds.values(), key=len)
-    return [
-        f"{_some(few)}: another knife than in the other records. Each is simulated with its own"
-        " measures, but bluntness and dulling are taken for the same. Diagnose each knife apart if"
-        " these are in question."
-    ]
+        return ""
+    return (
+        f"{_some(min(kinds.values(), key=len))}: another knife than in the other records. Each is"
+        " simulated with its own measures, but bluntness and dulling are taken for the same."
+        " Diagnose each knife apart if these are in question."
+    )
 
 
 def _warnings(records: Sequence[SliceRecord]) -> list[str]:

@@ -46,7 +46,6 @@ RECORD_EFFECTS = (
 )
 """Logarithms of factors on toughness, modulus and friction of the slice; by how much its food is
 higher (where heights are only known from the force: by how much its knife is lower)."""
-
 SPEED = RecordEffect("speed", "", 0.05)
 """Logarithm of a factor on the speed, of a record whose speed is not known."""
 
@@ -84,8 +83,7 @@ class SlicePredictor:
     """Predicts records at points. Equal slices are simulated once.
 
     Args:
-        setup: Food at its calibrated values, knife, board, what the bench does otherwise, base
-            parameters.
+        setup: Food at its calibrated values, knife, board, bench, base parameters.
         records: What is predicted.
         meshings: How finely; the first is the default of a point.
         clock: How time is divided.
@@ -137,8 +135,7 @@ class SlicePredictor:
         """Predicts all records, or those that a point names, at points.
 
         Returns:
-            For each point a series a record; None for those that it does not name. One that broke
-            down is not finite.
+            For each point a series a record, not finite if it broke down; None if it is not named.
         """
         return [
             [
@@ -250,16 +247,11 @@ class SlicePredictor:
 
     def shown(self, series: ForceSeries, target: RecordTarget, point: Point) -> np.ndarray:
         """The wrench of a series of a record as it would be measured at a point [N, 6]."""
-        wrench, facts = series.wrench, target.facts
-        tared = facts.tared
-        series.wrench = self.bench(point).shown(
-            series.parts, series.R, series.v, series.time, tared
-        )
+        bench, facts, seen = self.bench(point), target.facts, copy.copy(series)
+        seen.wrench = bench.shown(seen.parts, seen.R, seen.v, seen.time, facts.tared)
         for active in point.causes:
-            out = active.cause.wrench(series, active.values, active.cause.visible(facts))
-            series.wrench = out
-        shown, series.wrench = series.wrench, wrench
-        return shown
+            seen.wrench = active.cause.wrench(seen, active.values, active.cause.visible(facts))
+        return seen.wrench
 
 
 @dc.dataclass

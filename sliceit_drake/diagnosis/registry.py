@@ -33,8 +33,7 @@ def all_causes() -> list[Cause]:
     """The causes that come with the package, and those of installed packages.
 
     Raises:
-        ConfigurationError: An installed cause cannot be loaded or is incomplete, or a name is there
-            twice.
+        ConfigurationError: An installed cause is broken or incomplete, or a name is there twice.
     """
     causes = [kind() for kind in BUILT_IN]
     for point in entry_points(group=ENTRY_POINTS):

@@ -46,13 +46,11 @@ class Diagnosis:
         causes: All that were tested, by name.
         shifts: Changes of the base parameters with the verdict's causes in the model, by name:
             factor (log scale) and its standard error.
-        gain: Error on records that were left out, by the extended food; None if nothing is named
-            that it can hold.
+        gain: Held-out error by the extended food; None if nothing is named that it can hold.
         remarks: What a reader must know.
         confirmation: What simulations with the named causes say; None before, or if none is named
             whose numbers all records share.
-        extension: The moments as the extended food predicts them; None if nothing is named that it
-            can hold.
+        extension: The moments as the extended food predicts them; None as `gain`.
         next_experiment: What to cut next, where that was asked for.
     """
 
@@ -156,8 +154,7 @@ class Diagnosis:
         return "\n".join(lines + self.remarks)
 
     def plot_overview(self) -> "Figure":
-        """Where the cause shows most: measured, simulated, and by the extended food; what is left;
-        evidence and size of each cause."""
+        """Where the cause shows most, what is left, and evidence and size of each cause."""
         return overview_figure(self)
 
     def plot(self) -> "Figure":
@@ -292,5 +289,4 @@ class Diagnosis:
         (directory / "diagnosis.json").write_text(text, encoding="utf-8")
         dump_yaml(self.extended(), directory / "extended.yaml")
         if report:
-            page = report_html(self)
-            (directory / "report.html").write_text(page, encoding="utf-8")
+            (directory / "report.html").write_text(report_html(self), encoding="utf-8")

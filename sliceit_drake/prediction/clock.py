@@ -13,7 +13,6 @@ __all__ = ["BLOCK", "EXCHANGE_PERIOD", "Clock", "Stretches"]
 
 EXCHANGE_PERIOD = 2e-3
 """Between two forces of the food, s."""
-
 BLOCK = 8
 """Coupling steps that are launched at once, all of one length."""
 

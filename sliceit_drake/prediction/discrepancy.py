@@ -60,8 +60,7 @@ PRIOR = {"channel": 1.5, "part": 1.0, "phase": 1.0}
 JITTER = 1e-8
 """Added to the diagonal of what is inverted, relative to it."""
 LESS = 0.5
-"""Median before any data of the sizes of the other parts and phases, relative to the shared part
-on the way in."""
+"""Median before any data of the other sizes, relative to the shared part on the way in."""
 
 
 @dc.dataclass(frozen=True)
@@ -199,21 +198,21 @@ class Weighted:
     """Moments in which a discrepancy of certain sizes is integrated out.
 
     Attributes:
-        total: Gram matrix of the columns, all conditions together, without what the discrepancy may
-            be [n, n].
+        total: Gram matrix of the columns without the discrepancy, all conditions together [n, n].
         log_det: Logarithm of the determinant of what was integrated out.
     """
 
     def __init__(self, problem: "Discrepancy", grams: Sequence[np.ndarray], sizes: Sizes) -> None:
-        self.problem, self.sizes = problem, sizes
+        self.problem = problem
         Z, X = problem.shapes, problem.others
-        deviations = sizes.deviations(problem.channel, problem.phase)
         self.log_det, n, z = 0.0, len(X), len(Z)
-        D = deviations[3]
+        self.deviations = sizes.deviations(problem.channel, problem.phase)
+        D = self.deviations[3]
+        self.scales = [of[:, None] * self.deviations[:3] for of in problem.factors]
         self.of_condition: list[np.ndarray] = []
         self.weights: list[np.ndarray] = []
         shared = np.zeros((3 * z + n, 3 * z + n))
-        for G, covariates in zip(grams, problem.factors, strict=True):
+        for G, scale in zip(grams, self.scales, strict=True):
             inner = np.eye(z) + D[:, None] * G[np.ix_(Z, Z)] * D
             factor = cho_factor(inner, lower=True, check_finite=False)
             self.log_det += 2.0 * float(np.log(np.diag(factor[0])).sum())
@@ -223,8 +222,7 @@ class Weighted:
             self.of_condition.append(A)
             self.weights.append(weights)
             ZZ, ZX = A[np.ix_(Z, Z)], A[np.ix_(Z, X)]
-            scale = covariates[:, None] * deviations[:3]
-            flat = scale.reshape(-1)
+            flat = scale.ravel()
             shared[: 3 * z, : 3 * z] += flat[:, None] * np.tile(ZZ, (3, 3)) * flat
             shared[: 3 * z, 3 * z :] += flat[:, None] * np.tile(ZX, (3, 1))
             shared[3 * z :, 3 * z :] += A[np.ix_(X, X)]
@@ -241,18 +239,14 @@ class Weighted:
         """Products of each coefficient of the discrepancy, over its standard deviation, with
         combinations of the columns [n, k]: of the shared ones, of speed and draw [3 z, k], and of
         each condition [z, k], in a list."""
-        problem = self.problem
-        Z, X, s = problem.shapes, problem.others, self.size
-        deviations = self.sizes.deviations(problem.channel, problem.phase)
+        Z, X, s = self.problem.shapes, self.problem.others, self.size
         right = self.shared[:s, s:] @ columns
         fitted = cho_solve(self.factor, right, check_finite=False)
         out = [right - self.shared[:s, :s] @ fitted]
-        for A, covariates in zip(self.of_condition, problem.factors, strict=True):
-            back = (covariates[:, None] * deviations[:3]).reshape(3, len(Z), 1) * fitted.reshape(
-                3, len(Z), -1
-            )
+        for A, scale in zip(self.of_condition, self.scales, strict=True):
+            back = scale[:, :, None] * fitted.reshape(3, len(Z), -1)
             left = A[np.ix_(Z, X)] @ columns - A[np.ix_(Z, Z)] @ back.sum(0)
-            out.append(deviations[3][:, None] * left)
+            out.append(self.deviations[3][:, None] * left)
         return out
 
     def found(self, columns: np.ndarray) -> list[np.ndarray]:
@@ -261,12 +255,10 @@ class Weighted:
         Args:
             columns: Combination of the columns that is left of the measurement [n].
         """
-        z = len(self.problem.shapes)
-        deviations = self.sizes.deviations(self.problem.channel, self.problem.phase)
         first, *own = (p[:, 0] for p in self.products(columns[:, None]))
-        shared = deviations[:3] * first.reshape(3, z)
+        shared = self.deviations[:3] * first.reshape(3, -1)
         return [
-            np.vstack([covariates[:, None] * shared, deviations[3] * g])
+            np.vstack([covariates[:, None] * shared, self.deviations[3] * g])
             for covariates, g in zip(self.problem.factors, own, strict=True)
         ]
 
@@ -283,28 +275,23 @@ class Weighted:
         Returns:
             [e, k].
         """
-        problem, s = self.problem, self.size
-        Z, X = problem.shapes, problem.others
-        deviations = self.sizes.deviations(problem.channel, problem.phase)
+        Z, X, s = self.problem.shapes, self.problem.others, self.size
         left = rows - rows[:, Z] @ self.weights[condition]
-        scale = (problem.factors[condition][:, None] * deviations[:3]).reshape(-1)
+        scaled = np.tile(left[:, Z], 3) * self.scales[condition].ravel()
         fitted = cho_solve(self.factor, self.shared[:s, s:] @ columns, check_finite=False)
-        return np.asarray(left[:, X] @ columns - (np.tile(left[:, Z], 3) * scale) @ fitted)
+        return np.asarray(left[:, X] @ columns - scaled @ fitted)
 
     def traces(self) -> list[np.ndarray]:
         """z' V^-1 z of each coefficient z of the discrepancy, over its standard deviation, as
         `products` but with nothing else projected out."""
-        problem, s = self.problem, self.size
-        Z = problem.shapes
-        deviations = self.sizes.deviations(problem.channel, problem.phase)
-        B = self.shared[:s, :s]
+        Z, D = self.problem.shapes, self.deviations[3]
+        B = self.shared[: self.size, : self.size]
         out = [np.diag(B) - np.einsum("ij,ji->i", B, cho_solve(self.factor, B))]
-        for A, covariates in zip(self.of_condition, problem.factors, strict=True):
-            ZZ = A[np.ix_(Z, Z)] * deviations[3]
-            scale = (covariates[:, None] * deviations[:3]).reshape(-1)
-            right = scale[:, None] * np.tile(ZZ, (3, 1))
+        for A, scale in zip(self.of_condition, self.scales, strict=True):
+            ZZ = A[np.ix_(Z, Z)] * D
+            right = scale.ravel()[:, None] * np.tile(ZZ, (3, 1))
             inner = np.einsum("ij,ij->j", right, cho_solve(self.factor, right))
-            out.append(deviations[3] * np.diag(ZZ) - inner)
+            out.append(D * np.diag(ZZ) - inner)
         return out
 
 
@@ -341,10 +328,6 @@ class Discrepancy:
         self.spread = np.concatenate(
             [np.full(len(usual), PRIOR["channel"]), [PRIOR["part"]] * 3, [PRIOR["phase"]] * phases]
         )
-
-    def weighted(self, grams: Sequence[np.ndarray], sizes: Sizes) -> Weighted:
-        """Moments of each condition without a discrepancy of these sizes."""
-        return Weighted(self, grams, sizes)
 
     def likelihood(
         self, grams: Sequence[np.ndarray], sizes: Sizes, fitted: Sequence[int], prior: np.ndarray

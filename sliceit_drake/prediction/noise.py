@@ -60,8 +60,7 @@ def without_spikes(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         values: Components of one quantity [n, c].
 
     Returns:
-        The series [n, c], and the standard deviation by which each row is doubted [n, c], 0 as a
-        rule.
+        The series [n, c], and the standard deviation by which it is doubted [n, c], mostly 0.
     """
     middle = median_filter(values, (5, 1), mode="nearest")
     away = np.abs(values - middle)

@@ -16,10 +16,7 @@ from sliceit_drake.records.slice_record import SliceRecord
 __all__ = ["food_of", "is_bare", "knife_of", "poses_in_food"]
 
 ONSET = 0.02
-"""Fraction of a record's greatest force at which contact is taken to begin, where its height is not
-known."""
-
-
+"""Fraction of a record's greatest force at which contact begins, its height unknown."""
 CROPPED = 0.05
 """Fraction of a record's greatest force above which it begins in the food, its height unknown."""
 DEEPEST = 5e-3
@@ -31,8 +28,7 @@ def poses_in_food(
 ) -> tuple[Rotation, Rotation, np.ndarray]:
     """Poses of the knife in a record of n rows, relative to the food that it cuts.
 
-    Where food or heights are not known, contact is taken to begin over the middle of the cut, as
-    high as its top, when the force does.
+    Where food or heights are unknown, contact begins at the top of the cut when the force does.
 
     Returns:
         R_FW, R_FK [n], p_FK [n, 3], metres.
@@ -86,7 +82,7 @@ def food_of(food: Food, record: SliceRecord) -> Food:
     if kind != facts.shape or not isinstance(shape, PlainShape):
         raise ConfigurationError(
             f"is a {facts.shape}, the food of the setup is a {kind}",
-            source=record.file or record.name,
+            source=record.source,
             field="food.shape",
             fix="Calibrate it with a setup of that shape (--food FILE.yaml).",
         )

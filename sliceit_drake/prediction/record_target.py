@@ -186,13 +186,19 @@ class RecordTarget:
         """The cut, in the first meshing; there is food."""
         return next(iter(self.models.values()))
 
+    @property
+    def path(self) -> np.ndarray:
+        """Way of the knife so far at the rows [m], metres."""
+        steps = np.linalg.norm(np.diff(self.p, axis=0), axis=1)
+        return np.interp(self.time, self.grid, np.append(0.0, np.cumsum(steps)))
+
     def _near(self, height: np.ndarray) -> slice:
         """Rows from before the first to after the last near the food, of heights over it [n]."""
         low = np.flatnonzero(height < self._margin)
         if low.size == 0:
             raise ConfigurationError(
                 f"the knife stays {1e3 * height.min():.3g} mm or more above the food",
-                source=self.record.file or self.record.name,
+                source=self.record.source,
                 field="p_WK_z",
                 fix="Correct food.position or the heights; both are in the world frame, in metres.",
             )
@@ -221,7 +227,7 @@ class RecordTarget:
         if low[0] == 0 and height[0] < 0.0:
             raise ConfigurationError(
                 f"the knife starts {-1e3 * height[0]:.3g} mm in the food",
-                source=self.record.file or self.record.name,
+                source=self.record.source,
                 field="p_WK_z",
                 fix="Record from before the first contact, or correct food.position.",
             )
@@ -229,7 +235,7 @@ class RecordTarget:
         if not upright.all():
             raise ConfigurationError(
                 f"the knife is upside down at the food, {self.grid[low[upright.argmin()]]:.4g} s",
-                source=self.record.file or self.record.name,
+                source=self.record.source,
                 field="quat_WK_w",
                 fix="z of K points from the spine to the edge, down in a cut: correct quat_WK.",
             )
@@ -241,8 +247,7 @@ class RecordTarget:
         return self.clock.stretches(way, max(int(low[0]) - 1, 0), last)
 
     def as_cut(self, model: CuttingModel) -> CuttingModel:
-        """A cut of the record's food, without its skin where it was peeled, by a knife that has cut
-        as many slices."""
+        """A cut of the record's food, peeled as it was, by a knife that has cut as many slices."""
         effects, changes = model.effects, {}
         if self.facts.peeled:
             skins = ("effects.skin.toughness", "effects.outside.toughness")
@@ -387,8 +392,7 @@ class RecordTarget:
         return self._seen(self._weight()[:, 3:])
 
     def compare_forces(self, force: np.ndarray) -> np.ndarray:
-        """Channels at the rows [m, c] from forces of the simulated coupling steps [E, 3], N, in
-        F."""
+        """Channels at the rows [m, c] from forces in F of simulated coupling steps [E, 3], N."""
         seen = self.operator @ force + self._weight_seen
         if self.channels == NORM:
             return np.linalg.norm(seen, axis=1)[:, None]

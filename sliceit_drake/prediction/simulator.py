@@ -76,7 +76,6 @@ class JobResult:
 Executor = Callable[[Sequence[Job], float, Board], Iterable[tuple[int, JobResult]]]
 """Runs jobs, given the period of the shortest coupling step, s, and the board under the knife;
 gives their numbers and results, in any order. Jobs of one mesh come in a row."""
-
 Workers = int | Executor | None
 """What simulates: so many threads, as many as there are processors, or an executor of jobs, as
 that of a cluster (`prediction.cluster`)."""

@@ -11,7 +11,6 @@ __all__ = ["KINDS", "MIN_ROWS", "Findings", "RecordFinding", "runs"]
 
 MIN_ROWS = 10
 """A table with fewer is no record of a slice."""
-
 KINDS = {
     "missing column": ("error", "Add it."),
     "gap": ("error", "Remove these rows, or cut the record off before them."),
@@ -46,10 +45,7 @@ KINDS = {
         "warning",
         "Let the sensor warm up, record air before and after the slice, and repeat it.",
     ),
-    "force unit": (
-        "error",
-        "Is it in mN, or in counts of the sensor? Convert it to newtons.",
-    ),
+    "force unit": ("error", "Is it in mN, or in counts of the sensor? Convert it to newtons."),
     "kilonewtons": (
         "error",
         "Is it in kN? Multiply the force and torque columns by 1000 to give N and Nm.",

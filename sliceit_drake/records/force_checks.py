@@ -12,34 +12,23 @@ __all__ = ["check_force"]
 
 MIN_FORCE = 0.1
 """A slice whose force stays below this, N, is too light even for soft tofu: it is in kN."""
-
 FINEST_NOISE = 1e-3
 """No sensor on a wrist is quieter, N: the finest have steps of 3 mN, a UR5e's scatters by 0.1 N. A
 weak force from a sensor that good is one in kN."""
-
 WEAK_FORCE = 1.0
 """Below this the noise is looked at, N."""
-
 MIN_WORK = 1.0
-"""Work of cutting over cut area below this, J/m2, is less than any food's toughness: soft gels
-have a few, vegetables some hundred."""
-
+"""Work over cut area below this, J/m2, is less than the toughness of any food, soft gels too."""
 GREATEST_FORCE = 5000.0
 """A force above this, N, breaks any arm that holds a kitchen knife."""
-
 FROZEN_TIME = 0.2
 """A sensor that shows exactly the same for this long while the knife cuts is stuck, s."""
-
 OFFSET = 0.02
 """Fraction of the greatest force that an offset in the air may have."""
-
 FLAT, FLAT_FAR = 5.0, 50.0
-"""Rows at exactly the greatest value from which on a sensor is taken for saturated, near its range
-and far from it."""
-
+"""Rows at exactly the greatest value that tell a saturated sensor, near its range and far."""
 DRIFT = 0.05
 """Fraction of the greatest force by which a sensor's zero may drift over the record."""
-
 ALONG = 0.2
 """Fraction of |F| |v| that the power must have at least for its sign to mean something."""
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError
-from sliceit_drake.tables import require_increasing
+from sliceit_drake.tables import finite_number, require_increasing
 
 __all__ = ["UNITS", "ForceTable", "find_contact", "one_slice", "read_force_table"]
 
@@ -17,7 +17,6 @@ NEWTONS = {"n": 1.0, "kn": 1e3, "mn": 1e-3, "g": 9.80665e-3, "gf": 9.80665e-3}
 NEWTONS |= {"kg": 9.80665, "kgf": 9.80665, "lbf": 4.4482216}
 UNITS = SECONDS | NEWTONS
 """Units of time and force by name, in small letters: s and N."""
-
 SLOWEST = 0.25
 """Rows further apart than this, s, are in another unit: a slice lasts a second or a few."""
 EARLY = 10
@@ -67,7 +66,7 @@ def read_force_table(
     Raises:
         ConfigurationError: Naming file, line and column.
     """
-    rows, separator = _rows(file)
+    rows = _rows(file)
     first = next((k for k, (_, cells) in enumerate(rows) if _is_data(cells)), len(rows))
     if first == len(rows) or len(rows[first][1]) < 2:
         raise ConfigurationError(
@@ -88,7 +87,7 @@ def read_force_table(
                 field="--units",
                 fix=f"There are {', '.join(table)}.",
             )
-    values = np.array([_numbers(file, row, names, picked, separator) for row in rows[first:]])
+    values = np.array([_numbers(file, row, names, picked) for row in rows[first:]])
     time = values[:, 0] * SECONDS[(known[0] or "s").lower()]
     require_increasing(time, file, names[picked[0]])
     period = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
@@ -168,8 +167,8 @@ def one_slice(time: np.ndarray, force: np.ndarray, file: str = "") -> None:
         )
 
 
-def _rows(file: str | Path) -> tuple[list[tuple[int, list[str]]], str]:
-    """Cells of all lines that hold something, with their numbers, and the separator."""
+def _rows(file: str | Path) -> list[tuple[int, list[str]]]:
+    """Cells of all lines that hold something, with their numbers."""
     try:
         text = Path(file).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -182,11 +181,8 @@ def _rows(file: str | Path) -> tuple[list[tuple[int, list[str]]], str]:
         if line.strip() and not line.startswith("#")
     ]
     body = [line for _, line in lines[len(lines) // 4 :]]
-    separator = next((s for s in ";\t," if body and all(s in line for line in body)), " ")
-    split = (
-        (lambda line: line.split()) if separator == " " else (lambda line: line.split(separator))
-    )
-    return [(n, [c.strip().strip('"') for c in split(line)]) for n, line in lines], separator
+    separator = next((s for s in ";\t," if body and all(s in line for line in body)), None)
+    return [(n, [c.strip().strip('"') for c in line.split(separator)]) for n, line in lines]
 
 
 def _number(cell: str) -> float:
@@ -203,29 +199,14 @@ def _is_data(cells: list[str]) -> bool:
 
 
 def _numbers(
-    file: str | Path,
-    row: tuple[int, list[str]],
-    names: list[str],
-    picked: list[int],
-    separator: str,
+    file: str | Path, row: tuple[int, list[str]], names: list[str], picked: list[int]
 ) -> list[float]:
     number, cells = row
-    values = []
-    for k in picked:
-        text = cells[k] if k < len(cells) else ""
-        try:
-            value = _number(text)
-        except ValueError:
-            value = np.nan
-        if not np.isfinite(value):
-            raise ConfigurationError(
-                f"is {text!r}, which is not a finite number",
-                source=f"{file}, line {number}",
-                field=names[k],
-                fix="Correct the cell or remove the row.",
-            )
-        values.append(value)
-    return values
+    texts = [cells[k] if k < len(cells) else "" for k in picked]
+    return [
+        finite_number(text, _number, f"{file}, line {number}", names[k])
+        for k, text in zip(picked, texts, strict=True)
+    ]
 
 
 def _picked(file: str | Path, names: list[str], columns: Sequence[str]) -> list[int]:

@@ -55,10 +55,7 @@ def pose_matrix(position: list[float], roll_pitch_yaw: list[float]) -> np.ndarra
 
 
 def import_ur_rtde(
-    file: str | Path,
-    metadata: SliceMetadata,
-    X_TK: np.ndarray,
-    X_WB: np.ndarray | None = None,
+    file: str | Path, metadata: SliceMetadata, X_TK: np.ndarray, X_WB: np.ndarray | None = None
 ) -> SliceRecord:
     """Reads what ur_rtde's `RTDEReceiveInterface.startFileRecording` wrote.
 
@@ -82,7 +79,7 @@ def import_ur_rtde(
         name: [f"actual_{name}_{i}" for i in range(6)]
         for name in ("TCP_pose", "TCP_speed", "TCP_force", "q")
     }
-    header = _header(file)
+    header = next((cells for _, cells in read_rows(file)), [])
     if any(name not in header for name in vectors["q"]):
         del vectors["q"]
     columns = read_columns(file, ["timestamp", *(name for v in vectors.values() for name in v)])
@@ -293,11 +290,6 @@ def imported_facts(metadata: SliceMetadata, file: str | Path) -> SliceMetadata:
     facts = copy.deepcopy(metadata)
     facts.name = facts.name or Path(file).stem
     return facts
-
-
-def _header(file: str | Path) -> list[str]:
-    rows = read_rows(file)
-    return rows[0][1] if rows else []
 
 
 def _check_way(facts: SliceMetadata, duration: float, file: str) -> None:

@@ -11,26 +11,20 @@ __all__ = ["check_motion"]
 
 REACH = 5.0
 """Positions beyond this are not those of an arm's knife, m."""
-
 FASTEST = 2.0
 """Above this speed between two rows the pose has jumped, m/s."""
-
 FASTEST_TURN = 20.0
 """Above this rate between two rows the orientation has jumped, rad/s."""
-
 JOINT_LIMIT = 7.0
 """Beyond this a joint angle is not in radians: joints turn by +-2 pi at most, rad."""
-
 THOUSAND = (250.0, 4000.0)
 """Ratios that a factor of 1000 in a unit explains, and a wrong nominal speed does not."""
-
 BELOW_BOARD = 0.02
 """An edge this far below the board's surface is not pressing into it, m."""
 
 
 def check_motion(table: SliceTable, record: SliceRecord, findings: Findings) -> None:
-    """Adds to the findings what is wrong with poses, velocities, joints and sampling, of a table
-    and its record in W."""
+    """Adds to the findings what is wrong with the motion, of a table and its record in W."""
     _check_units(record, findings)
     if record.joints is not None:
         _check_joints(record.joints, findings)

@@ -1,14 +1,13 @@
-"""Phases of one straight slice from the motion of the knife and the height of the food."""
+"""Phases of one straight slice, and its speed, from the motion of the knife."""
 
 import numpy as np
 
-from sliceit_drake.records.metadata import Phase, SliceMetadata
+from sliceit_drake.records.metadata import NominalMotion, Phase, SliceMetadata
 
-__all__ = ["phases_from_motion"]
+__all__ = ["nominal_motion", "phases_from_motion"]
 
 AT_REST = 0.05
 """Vertical speed below this fraction of its greatest is rest."""
-
 MIN_HOLD = 0.02
 """A rest shorter than this is a turning point, s."""
 
@@ -54,3 +53,22 @@ def phases_from_motion(
         for label, first, last in marks
         if time[last] > time[first]
     ]
+
+
+def nominal_motion(
+    phases: list[Phase], slicing: np.ndarray, press: np.ndarray, draw: np.ndarray
+) -> NominalMotion:
+    """The motion of a slice that was cut as planned.
+
+    Args:
+        phases: Of the motion.
+        slicing: Rows in phases of slicing [n]; those in which the knife presses count.
+        press, draw: Speeds into the food and along the edge [n], m/s.
+    """
+    motion = NominalMotion(phases=phases)
+    slicing = slicing & (press > 1e-5)
+    if slicing.any():
+        speed = float(np.median(press[slicing]))
+        motion.speed = round(speed, 6)
+        motion.draw_ratio = round(float(np.median(draw[slicing])) / speed, 4)
+    return motion

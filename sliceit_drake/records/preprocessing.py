@@ -33,7 +33,6 @@ GRAVITY = 9.81
 """Along -Wz, m/s2."""
 MIN_AIR_ROWS = 10
 """Fewest samples of the first air phase whose mean is a zero and whose scatter is the noise."""
-
 ANTI_ALIASING = 0.35
 """Cutoff of the filter before a resampling to fewer rows, of the new rate: at the new Nyquist
 frequency its two passes of order 4 leave 1/18."""
@@ -55,7 +54,7 @@ def tare(record: SliceRecord) -> SliceRecord:
             f"has {record.known_force}"
             if record.force_norm is not None
             else f"has {air.sum()} rows in its first phase labelled air, expected {MIN_AIR_ROWS}",
-            source=record.file or record.name,
+            source=record.source,
             fix="Leave the step tare out, or give components and an air phase.",
         )
     if record.force_vertical is not None:
@@ -92,8 +91,7 @@ def compensate_tool(record: SliceRecord, *, cutoff: float | None = 20.0) -> Slic
             differentiated; None for no filter.
 
     Raises:
-        ConfigurationError: If mass or centre of mass are not given, or not all components of the
-            force.
+        ConfigurationError: If mass, centre of mass or a component of the force is not given.
     """
     tool, facts = record.metadata.tool, record.metadata.wrench
     if record.force is None or tool.mass is None or tool.center_of_mass is None:
@@ -101,7 +99,7 @@ def compensate_tool(record: SliceRecord, *, cutoff: float | None = 20.0) -> Slic
             f"has {record.known_force}"
             if record.force is None
             else "tool.mass or tool.center_of_mass is not given",
-            source=record.file or record.name,
+            source=record.source,
             fix="Leave the step compensate_tool out, or give what is missing.",
         )
     numbers = {"gravity": GRAVITY} | ({} if cutoff is None else {"cutoff": cutoff})
@@ -198,7 +196,7 @@ def crop(record: SliceRecord, start: float, end: float) -> SliceRecord:
     if len(result) < 2:
         raise ConfigurationError(
             f"{len(result)} rows lie between {start:g} and {end:g} s",
-            source=record.file or record.name,
+            source=record.source,
             fix=f"The record has {record.time[0]:g} to {record.time[-1]:g} s.",
         )
     result.metadata.processing.append(ProcessingStep("crop", {"start": start, "end": end}))

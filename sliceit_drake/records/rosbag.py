@@ -6,7 +6,6 @@ or JointState. ROS is in SI units, as records are. No ROS is needed.
 
 import dataclasses as dc
 import functools
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -39,15 +38,12 @@ JOINT_NAMES = (
     "wrist_3_joint",
 )
 """Joints in Universal Robots' descriptions, from the base on; a prefix may stand before each."""
-
 FLANGE = "tool0"
 """The frame whose pose follows from the joints."""
-
 CLOCKS = ("header", "received")
 
 LARGEST_GAP = 0.1
 """Time without a message over which a motion or a force is not interpolated, s."""
-
 Forward = Callable[[Sequence[float]], Sequence[float]]
 
 Wrong = Callable[..., ConfigurationError]
@@ -82,8 +78,7 @@ def import_rosbag(
         metadata: Facts; `wrench.sign` among them. Phases, if given, count from the first row; if
             not, they are labelled from the motion where the food is placed.
         wrench, motion: Topics.
-        X_TK: Pose of the knife in the frame T that the motion is of [4, 4]; with joints that is
-            the flange, tool0.
+        X_TK: Pose of the knife in the frame T of the motion [4, 4]; with joints the flange, tool0.
         X_WB: Pose of the frame that poses are in, in W [4, 4]; with joints that is Universal
             Robots' "base", which is turned by pi about z against "base_link". None if it is W.
         forward: Pose of the flange in the base from six joint angles, rad: the columns of its
@@ -355,14 +350,14 @@ def _place_wrench(
     """The wrench [n, 6] in the axes and about the point that `facts.wrench` says afterwards."""
     tool, base = names
     force, torque = values[:, :3], values[:, 3:]
-    stated = re.sub("^/", "", frame)
-    if tool is not None and stated == re.sub("^/", "", tool):
+    stated = frame.removeprefix("/")
+    if tool is not None and stated == tool.removeprefix("/"):
         facts.wrench.frame, facts.wrench.point = "W", "Ko"
         force, torque = (np.einsum("nij,nj->ni", R_WT, v) for v in (force, torque))
         return np.hstack([force, torque - np.cross(p_TK_W, force)])
     if facts.wrench.frame != "W":
         return values
-    if base and stated == re.sub("^/", "", base):
+    if base and stated == base.removeprefix("/"):
         return np.hstack([force @ R_WB.T, torque @ R_WB.T])
     moving = repr(tool) if tool else "a frame without a name"
     raise wrong(

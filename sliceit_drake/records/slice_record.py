@@ -123,6 +123,11 @@ class SliceRecord:
         return self.metadata.name
 
     @property
+    def source(self) -> str:
+        """The file, or the name, for errors."""
+        return self.file or self.name
+
+    @property
     def force_magnitude(self) -> np.ndarray:
         """Norm of what is known of the force [n], N, from the components where they are known."""
         if self.force_norm is not None:
@@ -170,10 +175,9 @@ class SliceRecord:
     def rows(self, select: np.ndarray | slice) -> "SliceRecord":
         """The rows that a mask [n], indices or a slice selects; metadata are copied."""
         chosen = dc.replace(self, metadata=copy.deepcopy(self.metadata))
-        for field in dc.fields(self):
-            series = getattr(self, field.name)
+        for name, series in vars(self).items():
             if isinstance(series, np.ndarray):
-                setattr(chosen, field.name, series[select])
+                setattr(chosen, name, series[select])
         return chosen
 
     def between(self, start: float, end: float) -> "SliceRecord":
@@ -197,12 +201,11 @@ class SliceRecord:
         if self.force is None:
             columns[self.force_columns[0]] = self.measured_force[:, 0]
         lines = np.arange(2, len(self) + 2)
-        return SliceTable(self.metadata, columns, self.file or self.name, lines)
+        return SliceTable(self.metadata, columns, self.source, lines)
 
 
 def columns_of(series: Mapping[tuple[str, ...], np.ndarray | None]) -> dict[str, np.ndarray]:
-    """Columns [n] by name, from series [n, k] by the names of their columns; those of None are left
-    out."""
+    """Columns [n] by name, from series [n, k] by the names of their columns, but for None."""
     known = ((names, values.T) for names, values in series.items() if values is not None)
     return {name: column for pair in known for name, column in zip(*pair, strict=True)}
 
@@ -218,15 +221,12 @@ def read_table(file: str | Path) -> SliceTable:
     """Reads the two files of a record as they are, given NAME.csv, NAME.yaml or NAME.
 
     Raises:
-        ConfigurationError: If a file is missing or unreadable, a field or column is unknown, or a
-            cell holds text.
+        ConfigurationError: If a file cannot be read, a name is unknown, or a cell holds text.
     """
     table, facts = _files(file)
     if not table.is_file() and not facts.is_file():
         raise ConfigurationError(
-            "there is no such record",
-            source=str(table),
-            fix="Check the path.",
+            "there is no such record", source=str(table), fix="Check the path."
         )
     if not facts.is_file():
         raise ConfigurationError(

@@ -74,8 +74,7 @@ def load_records(folder: str | Path) -> list[SliceRecord]:
 def load_sessions(folders: Sequence[str | Path]) -> list[SliceRecord]:
     """Reads the records of folders, in the order of the sessions that they are, as one.
 
-    Slices are numbered through, and where there are several folders a record's name has its
-    folder's before it.
+    Slices are numbered through; of several folders a record's name has its folder's before it.
 
     Raises:
         ConfigurationError: As `load_records`, or a folder is there twice.

@@ -28,11 +28,8 @@ __all__ = ["CurveCutter", "CurveFood", "food_curve"]
 
 BORROWED = {"carrot": ("potato", 0.5 * (47.9 + 67.6))}
 """Foods without a curve: whose shape they take, and the largest force, N."""
-
 STILL_SPEED = 1e-4
 """Below which a knife that a controller holds is at rest, m/s."""
-
-
 YIELDING = 4e-4
 """Travel over which the forces turn round with the motion, metres: that by which the food yields
 along the edge. Where a draw turns round, the force of the calibrated foods' finite elements is zero

@@ -1,5 +1,4 @@
-"""Laws of the worlds of measured curves: force of the food on the knife, coupling step by coupling
-step.
+"""Laws of the worlds of measured curves: force of the food on the knife, step by step.
 
 The force over depth is a recorded one (calibration/measured), stretched over the height of the
 food. Around it stand laws of a few lines: a power of the speed (`RATE`), Atkins' draw
@@ -22,31 +21,22 @@ CURVES = {name: f"calibration/measured/sliceit_real_{name}_force.csv" for name i
           ("cucumber", "potato", "tomato")}  # fmt: skip
 CURVE_SPEED = 0.02
 """Speed at which the curves were recorded (calibration/measured/README.md), m/s."""
-
 CONTACT = 0.3
 """Force at which a curve begins, N."""
-
 RATE = 0.07
 """Exponent of the speed."""
-
 MIN_SPEED = 2e-3
 """Below which the force falls no further, m/s."""
-
 FLANK_SHARE, WEDGE_SHARE = 0.15, 0.03
 """Friction and pressure of the flanks, fully buried, over the curve's largest force."""
-
 HOLD_FADE, HOLD_ONSET = 0.06, 0.03
 """Share that a force loses in a hold with each tenfold of the time over the onset; the onset, s."""
-
 RELOAD = 4e-4
 """Travel after which a force that faded, or was let go, is there again, metres."""
-
 TURN = 1e-4
 """Travel over which friction turns round, metres."""
-
 STILL = 1e-9
 """Move in a coupling step below which the knife is held, on a prescribed path, metres."""
-
 LARGEST_RATIO = 1e3
 
 

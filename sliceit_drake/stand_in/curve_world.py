@@ -5,8 +5,7 @@ flanks. With them goes a board of Hunt and Crossley's law with Hertz's exponent.
 
 Of `cutting` it has the knife's motion and the configuration that a protocol is written in (size of
 the food, board), and no solver, model, mesh or kernel: `tests/test_stand_in.py` looks at what it
-imports. Effects act on it by the same hooks as on the finite elements; a factor on the modulus has
-nothing to act on.
+imports. Effects act on it as on the finite elements, but those on the modulus.
 """
 
 import dataclasses as dc
@@ -18,14 +17,13 @@ from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.stand_in.curve_laws import CutState, EllipticSection, food_forces, measured_curve
 from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceTruth, Tissue
 from sliceit_drake.stand_in.protocol import Protocol, Specimen, section_size
-from sliceit_drake.stand_in.world import Path, Run
+from sliceit_drake.stand_in.world import Path, Run, pushed
 from sliceit_drake.tables import interpolated
 
 __all__ = ["CurveWorld"]
 
 BOARD_DEPTH = 3e-4
 """Depth at which the board is as stiff as the protocol's, metres."""
-
 TRAVEL, LONGEST = 4e-5, 50
 
 
@@ -108,35 +106,20 @@ class _CurveRun(Run):
         """Cuts the slice."""
         path, section = self.path, self._section
         stretches, forces, depths, shifts = self.drive(TRAVEL, LONGEST, 0.0)
-        T, time = path.period, path.time[1:]
-        ends = T * stretches[:, 1]
+        time, ends = path.time[1:], path.period * stretches[:, 1]
         force = interpolated(time, ends, forces)
         knife, food = np.moveaxis(interpolated(time, ends, shifts), 1, 0)
         p_true = path.p[1:] + knife
         depth = interpolated(time, ends, depths)
         buried = np.array([section.above(d) for d in depth]) * self._has_food
-        # The edge is pushed where the food is, the flanks in the middle of what is buried.
-        arm = np.zeros((len(time), 3))
-        arm[:, 0] = self._protocol.food.cut_point[0] + food[:, 0] - p_true[:, 0]
-        raised = arm + np.array([0.0, 0.0, 0.5]) * np.maximum(depth, 0.0)[:, None]
-        edge, normal, friction = (
-            np.concatenate([np.cross(r, force[:, k]), force[:, k]], axis=1)
-            for k, r in enumerate((arm, raised, raised))
-        )
-        board = np.zeros((len(time), 6))
-        heights = np.concatenate([path.p[:1, 2] + knife[:1, 2], p_true[:, 2]])
-        sinking = -np.diff(heights) / T
-        board[:, 5] = [self._board(z, s) for z, s in zip(heights[1:], sinking, strict=True)]
+        along = self._protocol.food.cut_point[0] + food[:, 0] - p_true[:, 0]
         return self.series(
             p_true,
             depth=depth,
             flank=2.0 * section.area * buried,
-            flank_arm=raised,
             cut=np.maximum.accumulate(buried),
-            edge=edge,
-            normal=normal,
-            friction=friction,
-            board=board,
+            board=self.pressed(p_true, knife, self._board),
+            **pushed(force, along, depth),
         )
 
 

@@ -172,8 +172,7 @@ class Effect:
         unit: Unit of the size.
         typical: A size that matters and could be met in a kitchen.
         least: Least size that has a meaning.
-        every_coupling_step: Whether `drive` must see every coupling step, as where it feeds a force
-            back.
+        every_coupling_step: Whether `drive` must see each, as where it feeds a force back.
         size: How much of the effect there is.
     """
 

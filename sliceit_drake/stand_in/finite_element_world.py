@@ -34,10 +34,8 @@ __all__ = ["FiniteElementSettings", "FiniteElementWorld"]
 
 CLEAR = 1e-3
 """Height of the edge over the food above which nothing is computed, metres."""
-
 LONGEST = 50
 """Most coupling steps that are computed as one."""
-
 CHECK_TRAVEL = 1e-3
 
 SAMPLES = 5

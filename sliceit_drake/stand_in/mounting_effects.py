@@ -16,7 +16,6 @@ __all__ = [
 
 STIFFEST = 3e6
 """Greatest stiffness that arm and holder can meet, N/m."""
-
 FORGET = 0.8
 """Fraction of the last estimate of that below which the next does not fall."""
 

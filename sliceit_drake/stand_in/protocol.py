@@ -289,9 +289,7 @@ def scenario_of_cut(protocol: Protocol, specimen: Specimen, station: Scenario) -
         measurement=None,
         sequence=None,
         preparation=Preparation(
-            peeled=condition.peeled,
-            weight=condition.weight,
-            knife_slices=protocol.knife_slices,
+            peeled=condition.peeled, weight=condition.weight, knife_slices=protocol.knife_slices
         ),
     )
     scenario.sensor.seed = specimen.index

@@ -28,6 +28,7 @@ from sliceit_drake.records.metadata import (
     WrenchFacts,
     slice_name,
 )
+from sliceit_drake.records.phases import nominal_motion
 from sliceit_drake.records.slice_record import SliceRecord, write_record
 from sliceit_drake.stand_in.curve_world import CurveWorld
 from sliceit_drake.stand_in.effect import Effect, Series
@@ -46,7 +47,6 @@ WORLDS = ("finite_elements", "curves")
 
 ORDER, WORLD, SENSOR = range(3)
 """Independent streams of random numbers."""
-
 PROVENANCE = "Simulated bench, sliceit record. Not measured on a robot."
 
 
@@ -191,13 +191,8 @@ def _nominal_motion(series: Series) -> NominalMotion:
         Phase(labels[a], float(edges[a]), float(edges[b]))
         for a, b in zip(starts[:-1], starts[1:], strict=True)
     ]
-    motion = NominalMotion(phases=phases)
-    slicing = np.array([label == "slice" for label in labels]) & (series.press > 1e-5)
-    if slicing.any():
-        press = float(np.median(series.press[slicing]))
-        motion.speed = round(press, 6)
-        motion.draw_ratio = round(float(np.median(series.draw[slicing])) / press, 4)
-    return motion
+    slicing = np.array([label == "slice" for label in labels])
+    return nominal_motion(phases, slicing, series.press, series.draw)
 
 
 def record_session(
@@ -280,8 +275,7 @@ def is_recorded(specimen: Specimen, folder: FilePath) -> bool:
 def keep_record(files: Mapping[str, bytes], output: FilePath) -> None:
     """Writes the two files of a record.
 
-    They go to `output` at the end, the table before what describes it: a run that is killed must
-    not leave half a record.
+    They go to `output` at the end, the table first: a killed run must not leave half a record.
     """
     with tempfile.TemporaryDirectory(dir=output, prefix=".writing_") as folder:
         for name, content in files.items():

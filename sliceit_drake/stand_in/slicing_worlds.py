@@ -46,26 +46,20 @@ SLICING_FOODS = tuple(PAPER_SLICES)
 
 TOUGHNESS, MODULUS, FRICTION = 1.15, 1.1, 0.8
 """Means of the stand-in's parameters over the calibrated ones."""
-
 SPREAD = 0.1
 """Spread of the logarithms of toughness, modulus and friction from slice to slice."""
-
 SIZE_SPREAD = 0.02
 """Spread of the logarithm of the food's diameter."""
-
 PLACE_SPREAD = 1e-3
 """Spread of the food's place on the board, with the cut, and of the start along the edge and in
 height, metres. The cut stays on a layer of the mesh: off it, the tomato's thin elements invert in
 its tough middle, with or without hidden effects."""
-
 LARGEST = 2.5
 """Deviations go no further than this many spreads."""
-
 FORCE_NOISE, MOMENT_NOISE = 0.2, 0.02
 FORCE_BIAS, MOMENT_BIAS = 0.3, 0.02
 """The wrench sensor's, N and Nm: between an FT 300's resolution of 0.1 N and the 0.6 N by which
 its weighings spread (`WrenchSensorConfig`). Biases differ from slice to slice, by this spread."""
-
 DELAY = 4e-3
 """Delay of the wrench sensor, s: two coupling steps."""
 
@@ -173,8 +167,7 @@ class SlicingWorld(abc.ABC):
         return WorldSlice(scenario, self._cut(scenario, calibrated, rng))
 
     def rng(self, food: str, slice: int) -> np.random.Generator:
-        """Random numbers of a slice while it is cut, as of the sensor's noise: give them to
-        `AgentStation.begin`."""
+        """Random numbers of a slice while it is cut, for `AgentStation.begin`."""
         return self._random(food, slice, RUN)
 
     def _random(self, food: str, slice: int, stream: int) -> np.random.Generator:

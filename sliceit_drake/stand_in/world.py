@@ -3,7 +3,7 @@
 import abc
 import dataclasses as dc
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from sliceit_drake.cutting.motion import Motion, Pose
 from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceTruth
 from sliceit_drake.stand_in.protocol import Condition, Protocol, Specimen
 
-__all__ = ["GRAVITY", "Path", "Run", "World"]
+__all__ = ["GRAVITY", "Path", "Run", "World", "pushed"]
 
 GRAVITY = 9.81
 """m/s2."""
@@ -27,8 +27,7 @@ class World(typing.Protocol):
 
         Args:
             specimen: The slice.
-            effects: What is hidden; fresh copies, which the world begins, and which have not
-                responded yet.
+            effects: What is hidden; fresh copies, which the world begins.
             rng: Random numbers for what differs from slice to slice.
         """
         ...
@@ -109,6 +108,25 @@ class Path:
             a = b
 
 
+def pushed(forces: np.ndarray, along: np.ndarray, depth: np.ndarray) -> dict[str, np.ndarray]:
+    """Those fields of `Series` that say where the food pushes the knife, and how: the edge at its
+    place in the food, the flanks above that in the middle of what is buried.
+
+    Args:
+        forces: Of edge, flanks' pressure and friction, in F [N, 3, 3], N.
+        along: From Ko to the middle of the food, along Fx [N], metres.
+        depth: Of the edge below the top of the food [N], metres.
+    """
+    arm = np.zeros((len(along), 3))
+    arm[:, 0] = along
+    raised = arm + np.array([0.0, 0.0, 0.5]) * np.maximum(depth, 0.0)[:, None]
+    edge, normal, friction = (
+        np.concatenate([np.cross(r, forces[:, k]), forces[:, k]], axis=1)
+        for k, r in enumerate((arm, raised, raised))
+    )
+    return {"flank_arm": raised, "edge": edge, "normal": normal, "friction": friction}
+
+
 @dc.dataclass
 class Run(abc.ABC):
     """One slice while it is cut, stretch by stretch of the knife's path.
@@ -182,6 +200,22 @@ class Run(abc.ABC):
             parts.append(part)
             cuts.append(cut)
         return np.array(stretches), np.array(parts), np.array(cuts), np.array(shifts)
+
+    def pressed(
+        self, p_true: np.ndarray, shift: np.ndarray, law: Callable[[float, float], float]
+    ) -> np.ndarray:
+        """Wrench of a board that pushes Ko up [N, 6], Nm and N.
+
+        Args:
+            p_true: True positions of Ko after each coupling step [N, 3], metres.
+            shift: Knife off its commanded position there [N, 3], metres.
+            law: Its force, N, by the height of the edge, metres, and how fast it sinks, m/s.
+        """
+        heights = np.concatenate([self.path.p[:1, 2] + shift[:1, 2], p_true[:, 2]])
+        sinking = -np.diff(heights) / self.path.period
+        wrench = np.zeros((len(p_true), 6))
+        wrench[:, 5] = [law(z, s) for z, s in zip(heights[1:], sinking, strict=True)]
+        return wrench
 
     def series(self, p_true: np.ndarray, **own: np.ndarray) -> Series:
         """The slice.

@@ -15,7 +15,7 @@ import numpy as np
 from sliceit_drake.cutting.motion import Pose
 from sliceit_drake.stand_in.effect import Effect, Now, Series, SliceTruth
 from sliceit_drake.stand_in.protocol import Protocol, Specimen, section_size
-from sliceit_drake.stand_in.world import Path, Run
+from sliceit_drake.stand_in.world import Path, Run, pushed
 from sliceit_drake.tables import interpolated
 from studies.benches.section import Section
 
@@ -158,34 +158,18 @@ class _LawRun(Run):
         """Cuts the slice."""
         path, section = self.path, self.section
         stretches, parts, cut, shifts = self.drive(TRAVEL, LONGEST, 0.0)
-        T, time = path.period, path.time[1:]
-        ends = T * stretches[:, 1]
+        time, ends = path.time[1:], path.period * stretches[:, 1]
         force = interpolated(time, ends, parts)
         knife, food = np.moveaxis(interpolated(time, ends, shifts), 1, 0)
         p_true = path.p[1:] + knife
         height = (p_true - food)[:, 2]
         depth = section.top - height
-        # The edge is pushed where it meets the food, the flanks in the middle of what is buried.
-        arm = np.zeros((len(time), 3))
-        arm[:, 0] = force[:, 3, 0] - p_true[:, 0]
-        raised = arm + np.array([0.0, 0.0, 0.5]) * np.maximum(depth, 0.0)[:, None]
-        edge, normal, friction = (
-            np.concatenate([np.cross(r, force[:, k]), force[:, k]], axis=1)
-            for k, r in enumerate((arm, raised, raised))
-        )
-        board = np.zeros((len(time), 6))
-        heights = np.concatenate([path.p[:1, 2] + knife[:1, 2], p_true[:, 2]])
-        sinking = -np.diff(heights) / T
-        board[:, 5] = [self._board(z, s) for z, s in zip(heights[1:], sinking, strict=True)]
         buried = np.array([section.above(z) for z in height]) * self._has_food
         return self.series(
             p_true,
             depth=depth,
             flank=2.0 * buried,
-            flank_arm=raised,
             cut=interpolated(time, ends, cut),
-            edge=edge,
-            normal=normal,
-            friction=friction,
-            board=board,
+            board=self.pressed(p_true, knife, self._board),
+            **pushed(force, force[:, 3, 0] - p_true[:, 0], depth),
         )

@@ -9,13 +9,7 @@ from sliceit_drake.cutting.model import CuttingModel
 from sliceit_drake.diagnosis.cause import Cause, CauseParameter, Scan, Values
 from sliceit_drake.prediction.series import SliceFacts
 
-__all__ = [
-    "CoreRatio",
-    "SkinToughness",
-    "SlicePushLaw",
-    "ToughnessBySpeed",
-    "Viscoelasticity",
-]
+__all__ = ["CoreRatio", "SkinToughness", "SlicePushLaw", "ToughnessBySpeed", "Viscoelasticity"]
 
 
 BRANCHES = {"fast": 0.03, "medium": 0.3, "slow": 3.0}
@@ -48,9 +42,7 @@ class Viscoelasticity(Cause):
         if not (relaxing or fading):
             return model
         effects = dc.replace(
-            old,
-            relaxation=old.relaxation.joined(relaxing),
-            resting=old.resting.joined(fading),
+            old, relaxation=old.relaxation.joined(relaxing), resting=old.resting.joined(fading)
         )
         return model.derive(effects=effects)
 
@@ -72,8 +64,7 @@ class ToughnessBySpeed(Cause):
 class SkinToughness(Cause):
     """Food that is tougher towards the outside, by exp(-distance / thickness); where not peeled.
 
-    All that parts there is tougher, by the edge or ahead of it. The skin of `effects.skin` is cut
-    by the edge alone.
+    All that parts there is tougher; the skin of `effects.skin` is cut by the edge alone.
     """
 
     name = "skin"

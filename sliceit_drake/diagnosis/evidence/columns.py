@@ -6,18 +6,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-__all__ = [
-    "MESH",
-    "CauseAtScan",
-    "Column",
-    "RecordSensitivity",
-    "Sensitivities",
-    "replicates",
-]
+__all__ = ["MESH", "CauseAtScan", "Column", "RecordSensitivity", "Sensitivities", "replicates"]
 
 KINK_TIME = 0.02
 """By which the time of a jump of the force may be wrong, s."""
-
 CauseAtScan = tuple[str, float | None]
 """Name of a cause, and the value of its scan; None without one."""
 
@@ -134,8 +126,7 @@ class Sensitivities:
     Attributes:
         columns: What the columns are [K].
         records: One a record.
-        warnings: What a reader should know, as a cause whose slices broke down: its column is 0
-            for that record.
+        warnings: Such as causes whose slices broke down: their column is 0 for that record.
         elements: Most tetrahedra of a slice's food.
     """
 

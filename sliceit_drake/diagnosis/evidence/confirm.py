@@ -2,8 +2,7 @@
 
 The statistics rest on derivatives. Here slices are simulated once more with the causes and base
 parameters at the values that were found, these are corrected by a Gauss-Newton step from there, and
-simulated again. What the causes are worth is then what the simulator does with them, not what its
-derivatives promise.
+simulated again. What the causes are worth is then what the simulator does with them.
 """
 
 import dataclasses as dc
@@ -13,11 +12,11 @@ import numpy as np
 
 from sliceit_drake.cutting.parameters import get_parameter
 from sliceit_drake.diagnosis.cause import Cause
-from sliceit_drake.diagnosis.evidence.linear import LinearProblem
+from sliceit_drake.diagnosis.evidence.linear import LinearProblem, fit_shared
 from sliceit_drake.diagnosis.prediction import ActiveCause, Point, SlicePredictor
 from sliceit_drake.prediction.discrepancy import Sizes
 
-__all__ = ["Confirmation", "confirm"]
+__all__ = ["Confirmation", "confirm", "predicted_at"]
 
 ROUNDS = 2
 WORTH = 0.5
@@ -32,8 +31,7 @@ class Confirmation:
         problem: The moments with the predictions of those simulations.
         values: Of the causes' parameters, by cause and name.
         factors: Of the base parameters, by name.
-        promised, gained: Twice the gain in log-likelihood by causes, as the derivatives have it and
-            as simulated.
+        promised, gained: Twice the gain in log-likelihood, by derivatives and as simulated.
     """
 
     problem: LinearProblem
@@ -81,7 +79,7 @@ def confirm(
     for _ in range(ROUNDS):
         base = {found.columns[k].name: calibrated[k] * float(np.exp(x)) for k, x in logs.items()}
         active = tuple(ActiveCause(cause, at[cause.name]) for cause, _ in causes)
-        moved = _at_point(problem, predictor, Point(values=base, causes=active), progress)
+        moved = predicted_at(Point(values=base, causes=active), problem, predictor, progress)
         step, chi_square = _fit(moved, [*moved.base, *shared], shared, sizes)
         rounds.append((chi_square, moved, {n: dict(v) for n, v in at.items()}, dict(logs)))
         for k, change in zip([*moved.base, *shared], step, strict=True):
@@ -108,29 +106,26 @@ def _fit(
     """Coefficients of columns [n], and twice the negative log-likelihood but for a constant."""
     model = problem.with_causes([k for k in columns if k in causes])
     total = problem.weighted(model, sizes).total
-    theta, _ = problem.fit_shared(total, model.shared, model.prior)
+    theta, _ = fit_shared(total, model)
     at = [model.shared.index(k) for k in columns]
     left = float(total[-1, -1] - total[model.shared, -1] @ theta)
     return np.asarray(theta[at]), left
 
 
-def _at_point(
+def predicted_at(
+    point: Point,
     problem: LinearProblem,
     predictor: SlicePredictor,
-    point: Point,
-    progress: Callable[[int, int], None] | None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> LinearProblem:
-    """The problem with what slices simulated there predict."""
-    before, after = predictor.predict([Point(), point], progress)
+    """The problem with what slices simulated at a point predict."""
+    (row,) = predictor.predict([point], progress)
     moved = []
-    for record, target, first, second in zip(
-        problem.found.records, predictor.targets, before, after, strict=True
-    ):
-        assert first is not None and second is not None
-        seen = target.compare(np.stack([first.wrench, second.wrench], axis=2))
-        predicted = seen[:, :, 1]
+    for record, target, series in zip(problem.found.records, predictor.targets, row, strict=True):
+        assert series is not None
+        seen = target.compare(series.wrench)
         if problem.mesh is not None:
             # Of the finer mesh, as the prediction is; its difference is taken from the base model.
-            predicted = predicted - record.columns[:, :, problem.mesh]
-        moved.append(predicted)
+            seen = seen - record.columns[:, :, problem.mesh]
+        moved.append(seen)
     return problem.predicting(moved)

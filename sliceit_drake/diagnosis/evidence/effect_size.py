@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sliceit_drake.diagnosis.evidence.linear import LinearProblem, Model, scaled_inverse
+from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
+from sliceit_drake.diagnosis.evidence.linear import LinearProblem, Model, fit_shared, scaled_inverse
 from sliceit_drake.prediction.discrepancy import PARTS, PHASES, Sizes
 
 __all__ = ["OwnError", "standardised_size"]
@@ -23,14 +24,15 @@ class OwnError:
         sizes: Of the discrepancy.
 
     Attributes:
+        problem, model, sizes: As given.
         coefficients: Of the shapes in each record, by part and channel [R, 4, c, n].
         values: At the rows of each record [m, c], N and Nm.
     """
 
     def __init__(self, problem: LinearProblem, model: Model, sizes: Sizes) -> None:
-        self.problem, self.sizes = problem, sizes
+        self.problem, self.model, self.sizes = problem, model, sizes
         weighted = problem.weighted(model, sizes)
-        theta, _ = problem.fit_shared(weighted.total, model.shared, model.prior)
+        theta, _ = fit_shared(weighted.total, model)
         self._fitted = np.zeros(len(weighted.total))
         self._fitted[-1], self._fitted[model.shared] = 1.0, -theta
         shape = len(PARTS), len(problem.noise), -1
@@ -40,6 +42,13 @@ class OwnError:
             values @ parts.sum(0).T
             for values, parts in zip(problem.shape_values, self.coefficients, strict=True)
         ]
+
+    @classmethod
+    def beside(cls, problem: LinearProblem, causes: Sequence[CauseAtScan]) -> "OwnError":
+        """The discrepancy beside causes, its sizes estimated with them in the model."""
+        columns = problem.found.of_causes(causes)
+        sizes = problem.fitted_sizes(columns, problem.sizes)[0] if columns else problem.sizes
+        return cls(problem, problem.with_causes(columns), sizes)
 
     def left(self, number: int) -> np.ndarray:
         """The combination of all columns, the residual last, that is left of a record beside what
@@ -109,8 +118,7 @@ def standardised_size(
         problem: The records.
         columns: Numbers of the effect's columns [n].
         coefficients: Of the columns [n], or of each record [R, n].
-        wrong: The discrepancy beside the effect; None for an effect that differs from record to
-            record, as no discrepancy does.
+        wrong: The discrepancy beside the effect; None for an effect that differs by record.
         found: Whether only what was found of it counts, not what it may be.
     """
     records, base = problem.found.records, problem.base

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
-from sliceit_drake.diagnosis.evidence.linear import LinearProblem
+from sliceit_drake.diagnosis.evidence.linear import LinearProblem, fit_shared
 from sliceit_drake.prediction.discrepancy import Sizes
 
 __all__ = ["HeldOutGain", "fitted_changes", "held_out_gain", "held_out_share", "own_coefficients"]
@@ -60,8 +60,7 @@ def held_out_gain(
         simulated: The moments as the extended food predicts them, at values that were fitted to all
             records; by default causes are fitted from where they are absent.
         beside: Those of the causes that are in the model before as well.
-        sizes: Of the discrepancy beside which causes are fitted. By default there is none: a file
-            holds none either.
+        sizes: Of the discrepancy beside which causes are fitted; none by default, as in a file.
     """
     named = problem.found.of_causes(causes)
     without = _errors(problem, beside, named, None if sizes is None else problem.sizes)
@@ -131,8 +130,7 @@ def fitted_changes(problem: LinearProblem, causes: Sequence[CauseAtScan]) -> lis
 
 
 def own_coefficients(problem: LinearProblem) -> np.ndarray:
-    """Coefficients of what is each record's own (`LinearProblem.own`), where no cause is at work
-    [R, n], in the columns' sizes."""
+    """Coefficients of `LinearProblem.own` without causes [R, n], in the columns' sizes."""
     linear = _Linear(problem, ())
     theta = linear.shared()
     records = range(len(problem.found.records))
@@ -188,11 +186,11 @@ class _Linear:
     def shared(self, without: int | None = None) -> np.ndarray:
         """Coefficients of the shared columns from all records, or all but one."""
         if self.sizes is None:
-            reduced = self.problem.reduced(self.model.own, self.model.variance)
+            reduced = self.problem.reduced(self.model)
             total = reduced.sum(0) - (0.0 if without is None else reduced[without])
         else:
             total = self.problem.weighted(self.model, self.sizes, without).total
-        return self.problem.fit_shared(total, self.columns, self.model.prior)[0]
+        return fit_shared(total, self.model)[0]
 
     def of_own(self, r: int, theta: np.ndarray) -> np.ndarray:
         """Coefficients of what is a record's own, from itself."""

@@ -1,5 +1,4 @@
-"""The linear problem of a diagnosis, reduced to moments: records, what they share, what is their
-own.
+"""The linear problem of a diagnosis, reduced to moments: what records share, what is their own.
 
 A record r is y_r = F_r b + E_r a_r + D_r d + C_r g + noise: y_r measured less predicted, F_r the
 base parameters, E_r what differs from slice to slice (a_r normal, its variance estimated), D_r the
@@ -11,7 +10,7 @@ Gram matrix weighted with the inverse of the noise's covariance.
 import copy
 import dataclasses as dc
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -39,6 +38,10 @@ __all__ = [
     "LinearProblem",
     "Model",
     "Moments",
+    "angle_to",
+    "beside",
+    "fit_shared",
+    "fitted_covariance",
     "integrate_out",
     "scaled_inverse",
 ]
@@ -114,8 +117,7 @@ class LinearProblem:
         size: Number of all columns; y stands there.
         moments: Of the records.
         forces: Numbers of the channels that are forces.
-        variation: Standard deviations of what differs from slice to slice [len(own)], in the
-            columns' sizes.
+        variation: Standard deviations of `own` from slice to slice [len(own)], in their sizes.
         variation_samples: Number of independent differences that they were estimated from.
     """
 
@@ -246,28 +248,22 @@ class LinearProblem:
         out.moments = Moments(gram, force_gram, self.moments.force_rows)
         return out
 
-    def reduced(self, own: Sequence[int], variance: np.ndarray) -> np.ndarray:
-        """Gram matrices with normal coefficients of these columns [n], of variance [n], integrated
-        out [R, K + 1, K + 1]."""
+    def reduced(self, model: Model) -> np.ndarray:
+        """Gram matrices with what is each record's own integrated out [R, K + 1, K + 1]."""
+        own, variance = model.own, model.variance
         key = (tuple(own), variance.tobytes())
         if key not in self._reduced:
             if len(self._reduced) > KEPT:
                 self._reduced.clear()
             gram = self.moments.gram
-            self._reduced[key] = np.array([integrate_out(G, list(own), variance) for G in gram])
+            self._reduced[key] = np.array([integrate_out(G, own, variance) for G in gram])
         return self._reduced[key]
 
-    def by_condition(
-        self, own: Sequence[int], variance: np.ndarray, without: int | None = None
-    ) -> list[np.ndarray]:
+    def by_condition(self, model: Model, without: int | None = None) -> list[np.ndarray]:
         """Sums of `reduced` over the records of each condition; one record may be left out."""
-        reduced = self.reduced(own, variance)
-        return [
-            np.sum([reduced[r] for r in members if r != without], axis=0)
-            if any(r != without for r in members)
-            else np.zeros_like(reduced[0])
-            for members in self.conditions.values()
-        ]
+        reduced = self.reduced(model)
+        kept = ([r for r in members if r != without] for members in self.conditions.values())
+        return [reduced[np.array(members, int)].sum(0) for members in kept]
 
     @functools.cached_property
     def sizes(self) -> Sizes:
@@ -280,7 +276,7 @@ class LinearProblem:
         """Sizes of the discrepancy with columns of causes in the model, and the logarithm of the
         restricted likelihood with the prior."""
         model = self.with_causes(causes)
-        grams = self.by_condition(model.own, model.variance)
+        grams = self.by_condition(model)
         prior = model.prior[model.shared]
         sizes, value = self.discrepancy.fit(grams, model.shared, prior, start)
         return sizes, value - 0.5 * self.own_log_det(model)
@@ -289,15 +285,15 @@ class LinearProblem:
         """The model with columns of causes, their coefficients normal with a standard deviation of
         `PLAUSIBLE` sizes, whatever is usual of them; of columns `unusual` nothing is usual."""
         kinds = self.found.columns
-        own, variance = self.own_prior(
-            unusual, {k: PLAUSIBLE**2 for k in causes if kinds[k].per_record}
-        )
+        free = [k for k in causes if kinds[k].per_record]
         added = [k for k in causes if not kinds[k].per_record]
+        usual = {k: s for k, s in self.usual_own.items() if k not in unusual}
+        deviations = [*self.variation, *usual.values(), *([PLAUSIBLE] * len(free))]
         prior = self.prior()
         prior[added] = 1.0 / PLAUSIBLE**2
         kept = [k for k in self.baseline if k not in (*added, *unusual)]
-        shared = [*kept, *added]
-        return Model(own, variance, shared, prior)
+        own = [*self.own, *usual, *free]
+        return Model(own, np.array(deviations, float) ** 2, [*kept, *added], prior)
 
     def own_log_det(self, model: Model) -> float:
         """Logarithm of the determinant by which what is each record's own widens their spread."""
@@ -311,44 +307,13 @@ class LinearProblem:
     ) -> Weighted:
         """Moments with what is each record's own and the discrepancy integrated out; one record may
         be left out."""
-        grams = self.by_condition(model.own, model.variance, without)
-        return self.discrepancy.weighted(grams, self.sizes if sizes is None else sizes)
+        grams = self.by_condition(model, without)
+        return Weighted(self.discrepancy, grams, self.sizes if sizes is None else sizes)
 
     @property
     def baseline(self) -> list[int]:
         """Numbers of the columns that all records share and that are fitted in any case."""
         return [*self.base, *self.numerical, *self.usual]
-
-    def own_prior(
-        self, without: Sequence[int] = (), free: Mapping[int, float] | None = None
-    ) -> tuple[list[int], np.ndarray]:
-        """Numbers of the columns that are each record's own, and the variances of their
-        coefficients.
-
-        Args:
-            without: Columns to leave out.
-            free: Columns to add, and the variances of their coefficients.
-        """
-        free = free or {}
-        usual = {k: deviation for k, deviation in self.usual_own.items() if k not in without}
-        deviations = np.concatenate([self.variation, np.array(list(usual.values()))])
-        return [*self.own, *usual, *free], np.concatenate([deviations**2, list(free.values())])
-
-    def fit_shared(
-        self, total: np.ndarray, columns: list[int], prior: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Coefficients of columns that all records share, and their covariance.
-
-        Args:
-            total: Gram matrix of all columns, y last, from which what is each record's own and the
-                discrepancy are integrated out.
-            columns: Numbers [n].
-            prior: Precisions of the coefficients of all columns [K]; `prior()` by default.
-        """
-        prior = self.prior() if prior is None else prior
-        A = total[np.ix_(columns, columns)] + np.diag(prior[columns])
-        covariance = scaled_inverse(A)
-        return covariance @ total[columns, -1], covariance
 
     def prior(self) -> np.ndarray:
         """Precision of the columns' coefficients before the data [K]: 0 where nothing is known."""
@@ -413,6 +378,41 @@ def scaled_inverse(A: np.ndarray, cutoff: float = 1e-10) -> np.ndarray:
     scale = np.sqrt(np.maximum(np.diag(A), 1e-30))
     inverse = np.linalg.pinv(A / np.outer(scale, scale), rcond=cutoff, hermitian=True)
     return np.asarray(inverse / np.outer(scale, scale))
+
+
+def fit_shared(total: np.ndarray, model: Model) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients of the columns that all records share [n], and their covariance [n, n].
+
+    Args:
+        total: Gram matrix of all columns, y last, from which what is each record's own and the
+            discrepancy are integrated out.
+        model: What is fitted.
+    """
+    columns = model.shared
+    covariance = fitted_covariance(total, columns, model.prior)
+    return covariance @ total[columns, -1], covariance
+
+
+def fitted_covariance(G: np.ndarray, columns: list[int], prior: np.ndarray) -> np.ndarray:
+    """Covariance of fitted coefficients [n, n], with precisions `prior` of all columns [K]."""
+    return scaled_inverse(G[np.ix_(columns, columns)] + np.diag(prior[columns]))
+
+
+def beside(G: np.ndarray, columns: list[int], prior: np.ndarray) -> np.ndarray:
+    """Gram matrix of what columns that are fitted leave of all; see `fitted_covariance`."""
+    return np.asarray(G - G[:, columns] @ fitted_covariance(G, columns, prior) @ G[columns])
+
+
+def angle_to(
+    G: np.ndarray, own: list[int], coefficients: np.ndarray, others: Iterable[list[int]]
+) -> float:
+    """Between a combination of columns `own` and all that one of other sets can do, degrees."""
+    best = 0.0
+    for columns in others:
+        b = G[np.ix_(columns, own)] @ coefficients
+        best = max(best, float(b @ scaled_inverse(G[np.ix_(columns, columns)], 1e-8) @ b))
+    square = float(coefficients @ G[np.ix_(own, own)] @ coefficients)
+    return float(np.degrees(np.arccos(np.sqrt(min(best / max(square, 1e-12), 1.0)))))
 
 
 def integrate_out(G: np.ndarray, own: list[int], variance: np.ndarray) -> np.ndarray:

@@ -17,8 +17,7 @@ __all__ = ["at_own_values"]
 
 
 def at_own_values(problem: LinearProblem) -> Sensitivities:
-    """The sensitivities of a problem about the mean slice, with the columns of each record's own at
-    their values.
+    """The sensitivities of a problem, with the columns of each record's own at their values.
 
     To second order in them: a change c b + e b^2 is linearised at the b that fits the record best,
     less the mean over all records, which may be another cause's doing. For what e does where that

@@ -24,21 +24,26 @@ import numpy as np
 
 from sliceit_drake.diagnosis.evidence.columns import CauseAtScan, Column
 from sliceit_drake.diagnosis.evidence.effect_size import OwnError, standardised_size
-from sliceit_drake.diagnosis.evidence.linear import PLAUSIBLE, LinearProblem, scaled_inverse
+from sliceit_drake.diagnosis.evidence.linear import (
+    PLAUSIBLE,
+    LinearProblem,
+    angle_to,
+    beside,
+    fit_shared,
+    fitted_covariance,
+)
 from sliceit_drake.prediction.discrepancy import Sizes
 
 __all__ = ["CauseEvidence", "Screening", "screen"]
 
 MIN_DEVIATION = 0.5
-"""Least standard deviation of a gain by chance: a cause that never gains by chance is not proved by
-a gain of next to nothing."""
+"""Least standard deviation of a gain by chance: a gain of next to nothing proves no cause."""
 PRESENT = 5.0
 """Gain for each number of a cause from which on it shows in a record."""
 JITTER = 1e-9
 """Added to the diagonal of Gram matrices of unit columns, some of which are the same."""
 ESTIMATED = 3
-"""Causes with which the sizes of the discrepancy are estimated anew, of those that gain most and of
-those that are largest."""
+"""Causes that gain most, and that are largest, with which sizes are estimated anew."""
 FARTHEST = 1.5
 """Greatest change of the logarithm of a size in a draw."""
 
@@ -59,8 +64,7 @@ class CauseEvidence:
         coefficients: Of the columns, in their sizes; mean over the records where each has its own.
         errors: Standard errors of the coefficients.
         by_record: These [R, n]; empty where they are shared.
-        presence: Fraction of the records that it could show in in which it does; 1 where
-            coefficients are shared.
+        presence: Share of the records that could show it in which it does; 1 where all share it.
         sizes: Of the discrepancy beside it.
         size: `effect_size.standardised_size`; 0 where it gains no more than by chance.
         share: Of the mean square where it acts, that it explains.
@@ -136,28 +140,17 @@ class Screening:
     def angle_to(self, problem: LinearProblem, effect: CauseEvidence, other: str) -> float:
         """Between the effect of a cause as it was found and all that another can do, degrees.
 
-        A cause with several numbers explains more than one with few, so that this is not the same
-        both ways.
+        It is not the same both ways: a cause with several numbers explains more than one with few.
         """
-        G = self.projected
-        own = problem.found.of_causes([effect.cause])
-        e = np.array(effect.coefficients)
-        norm = float(e @ G[np.ix_(own, own)] @ e)
-        best = 0.0
-        for scan in problem.found.scans(other):
-            columns = problem.found.index("cause", other, scan)
-            b = G[np.ix_(columns, own)] @ e
-            best = max(best, float(b @ scaled_inverse(G[np.ix_(columns, columns)], 1e-8) @ b))
-        return float(np.degrees(np.arccos(np.sqrt(min(best / max(norm, 1e-12), 1.0)))))
+        found = problem.found
+        sets = [found.index("cause", other, scan) for scan in found.scans(other)]
+        own = found.of_causes([effect.cause])
+        return angle_to(self.projected, own, np.array(effect.coefficients), sets)
 
 
 class _Statistics:
-    """Gains of all causes at given sizes of the discrepancy.
-
-    Attributes:
-        projected: A of the module's formula, of all columns and y [K + 1, K + 1].
-        options: Of each cause and value of its scan the numbers of its columns.
-    """
+    """Gains of all causes at given sizes of the discrepancy; `projected` is A of the module's
+    formula, of all columns and y [K + 1, K + 1]."""
 
     def __init__(self, problem: LinearProblem, assumed: Sequence[CauseAtScan]) -> None:
         self.problem, found = problem, problem.found
@@ -170,14 +163,13 @@ class _Statistics:
         }
         self.names = list(dict.fromkeys(name for name, _ in self.options))
         self.model = problem.with_causes(self.taken)
-        self.grams = problem.by_condition(self.model.own, self.model.variance)
+        self.grams = problem.by_condition(self.model)
         self.sizes, self.value = problem.fitted_sizes(self.taken)
         self.weighted = problem.weighted(self.model, self.sizes)
         T, F = self.weighted.total, self.model.shared
-        inverse = scaled_inverse(T[np.ix_(F, F)] + np.diag(self.model.prior[F]))
         self.combined = np.eye(len(T))
-        self.combined[F] -= inverse @ T[F]
-        self.projected = T - T[:, F] @ inverse @ T[F]
+        self.combined[F] -= fitted_covariance(T, F, self.model.prior) @ T[F]
+        self.projected = beside(T, F, self.model.prior)
 
     def best(
         self, products: np.ndarray, columns: list[int]
@@ -210,7 +202,7 @@ class _Statistics:
         """Gain of a cause with numbers of its own in each record."""
         problem = self.problem
         model = problem.with_causes([*self.taken, *columns])
-        grams = problem.by_condition(model.own, model.variance)
+        grams = problem.by_condition(model)
         prior = model.prior[model.shared]
         value, _ = problem.discrepancy.likelihood(grams, self.sizes, model.shared, prior)
         return 2.0 * (value - 0.5 * problem.own_log_det(model) - self.value)
@@ -218,7 +210,7 @@ class _Statistics:
     def own_fits(self, columns: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """Coefficients of columns for each record by itself [R, n], and what they gain there [R];
         0 where a record knows nothing of them."""
-        reduced = self.problem.reduced(self.model.own, self.model.variance)
+        reduced = self.problem.reduced(self.model)
         out, gains = np.zeros((len(reduced), len(columns))), np.zeros(len(reduced))
         for r, A in enumerate(reduced):
             inner, b = A[np.ix_(columns, columns)], A[columns, -1]
@@ -240,7 +232,7 @@ class _Chance:
         M = statistics.combined[:, columns]
         of_sizes = W.products(M)
         self.of_sizes = np.concatenate(of_sizes)
-        reduced = problem.reduced(statistics.model.own, statistics.model.variance)
+        reduced = problem.reduced(statistics.model)
         root = problem.variation[:, None]
         of_own = []
         for condition, members in enumerate(problem.conditions.values()):
@@ -279,10 +271,8 @@ class _Chance:
 
     def own_gains(self, columns: list[int], number: int) -> np.ndarray:
         """Gains by columns that each record has coefficients of [number]."""
-        model = self.statistics.model
-        reduced = self.statistics.problem.reduced(model.own, model.variance)
         out = np.zeros(number)
-        for A in reduced:
+        for A in self.statistics.problem.reduced(self.statistics.model):
             values, vectors = np.linalg.eigh(A[np.ix_(columns, columns)])
             known = np.maximum(values, 0.0)
             squares = self.rng.chisquare(1.0, (number, len(known))) * known
@@ -366,15 +356,9 @@ def _evidence(
     by_chance: np.ndarray,
     sizes: Sizes | None = None,
 ) -> CauseEvidence:
-    """Evidence for a cause at the best value of its scan.
-
-    Args:
-        statistics: Of the records.
-        name, gain, scan: As in `CauseEvidence`.
-        columns, active: Numbers of its columns, and of those that are within their bounds.
-        by_chance: Gains where nothing is wrong.
-        sizes: Of the discrepancy beside it; without it by default.
-    """
+    """Evidence for a cause at the best value of its scan, from its columns, those of them that are
+    within their bounds, gains where nothing is wrong, and sizes of the discrepancy beside it (those
+    without it by default)."""
     problem, sizes = statistics.problem, sizes or statistics.sizes
     kinds = [problem.found.columns[k] for k in columns]
     fits, presence = np.zeros((0, 0)), 1.0
@@ -388,8 +372,7 @@ def _evidence(
             value, error = own.mean(0), own.std(0) / np.sqrt(len(own))
     elif active:
         model = problem.with_causes([*statistics.taken, *active])
-        total = problem.weighted(model, sizes).total
-        theta, covariance = problem.fit_shared(total, model.shared, model.prior)
+        theta, covariance = fit_shared(problem.weighted(model, sizes).total, model)
         at = [columns.index(k) for k in active]
         value[at] = theta[-len(active) :]
         error[at] = np.sqrt(np.diag(covariance))[-len(active) :]

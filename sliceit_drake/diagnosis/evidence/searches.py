@@ -79,17 +79,14 @@ FLOOR_BINS = 401
 
 
 def strongest_frequencies(
-    series: Sequence[tuple[np.ndarray, np.ndarray]],
-    low: float,
-    high: float,
+    series: Sequence[tuple[np.ndarray, np.ndarray]], low: float, high: float
 ) -> tuple[float, ...]:
     """Frequencies at which series have most power against their neighbourhood in the spectrum.
 
     The power of all series is summed: the phase of each is its own.
 
     Args:
-        series: Of each a coordinate [m], such as time or path, that does not decrease, and values
-            [m, c].
+        series: Of each a coordinate that does not decrease [m], such as time, and values [m, c].
         low, high: Range of the frequencies, 1 over the coordinate's unit.
 
     Returns:

@@ -10,8 +10,7 @@ change by plus `size` alone. A coefficient of 1 is a parameter of `size`.
   standard deviation, and each record has a coefficient of its own.
 - numerical: `step` and `mesh`, the change from half the step to the step, and from a finer mesh to
   the mesh of the sensitivities. The prediction itself is that of the finer mesh.
-- cause: a cause's parameter at a value of its scan. Where `per_record` is set, each record has a
-  coefficient of its own.
+- cause: a cause's parameter at a value of its scan; with `per_record` one for each record.
 
 `SlicePredictor.predict` gives finite changes and several causes at once, for a refit.
 """
@@ -34,38 +33,24 @@ from sliceit_drake.prediction.record_target import Meshing, RecordTarget
 from sliceit_drake.prediction.simulator import Workers
 from sliceit_drake.records.slice_record import SliceRecord
 
-__all__ = [
-    "FINER",
-    "LINEAR_STEP",
-    "LOG_STEP",
-    "Progress",
-    "sensitivities",
-]
+__all__ = ["FINER", "LINEAR_STEP", "LOG_STEP", "Progress", "sensitivities"]
 
 Progress = Callable[[int, int], None]
 """Called with the number of simulated slices, and of those that must be."""
-
 FINER = 1.5
 """Elements along an edge of the mesh of the prediction, relative to that of its changes."""
 LOG_STEP = 0.05
 """Change of the logarithm of a base parameter."""
 LINEAR_STEP = 0.02
 """Change of one on a linear scale, relative to its range."""
-
 STORED = ("in_contact", "predicted", "columns", "even")
 """Arrays of a record that take simulations."""
 
 
 @dc.dataclass(frozen=True)
 class _Change:
-    """What the prediction changes by in a column.
-
-    Attributes:
-        column: The column.
-        ends: Points at plus its size and, where that may be, at minus.
-        factor: On the change.
-        simulates: Whether slices must be simulated for it.
-    """
+    """What the prediction changes by in a column, times a factor: between points at plus its size
+    and, where that may be, at minus; whether slices must be simulated for it."""
 
     column: Column
     ends: tuple[Point, ...]
@@ -143,8 +128,7 @@ def sensitivities(
         point: Where; the setup's values without any cause by default.
         finer: Elements along an edge of the mesh of the prediction itself, relative to that of its
             changes; None for the same mesh, and no column `mesh`.
-        cache: Folder for finished simulations and sensitivities, found again by their content;
-            some 6 MB a record.
+        cache: Folder for finished simulations and sensitivities, some 6 MB a record.
         workers: What simulates.
         progress: Called with the number of simulated slices, and of those that must be.
 
@@ -186,15 +170,9 @@ def sensitivities(
 class _Computation:
     """Some columns of one set of records; records that are known are not computed again.
 
-    What was measured does not matter: another cut along the same path is found at once.
-
-    Attributes:
-        predictor: Of the records.
-        point: Where.
-        changes: The columns.
-        store: Predictions of records and their changes that were computed before.
-        common: Key of all that does not differ between records; None where nothing is kept.
-        by_slice: Whether it matters which slice of the session a record is.
+    What was measured does not matter: another cut along the same path is found at once. `common` is
+    the key of all that does not differ between records, None where nothing is kept; `by_slice` says
+    whether it matters which slice of the session a record is.
     """
 
     predictor: SlicePredictor
@@ -287,8 +265,6 @@ class _Computation:
     def _empty(
         self, target: RecordTarget, in_contact: np.ndarray, predicted: np.ndarray
     ) -> RecordSensitivity:
-        moved = np.linalg.norm(np.diff(target.p, axis=0), axis=1)
-        way = np.concatenate([[0.0], np.cumsum(moved)])
         nothing = np.zeros((*predicted.shape, len(self.changes)), np.float32)
         return RecordSensitivity(
             name=target.facts.name,
@@ -297,7 +273,7 @@ class _Computation:
             time=target.time,
             phase=target.phase,
             depth=target.depth,
-            path=np.interp(target.time, target.grid, way),
+            path=target.path,
             in_contact=in_contact,
             measured=target.measured,
             doubt=target.doubt,
@@ -312,8 +288,7 @@ class _Computation:
 def _common_key(
     setup: CalibrationSetup, causes: Sequence[Cause], point: Point, *options: object
 ) -> str | None:
-    """Key of all that results depend on beside the record; None where the source of a cause cannot
-    be read."""
+    """Key of all that matters beside the record; None where a cause's source cannot be read."""
     everything = [*causes, *(active.cause for active in point.causes)]
     try:
         code = source_key(__file__, *(inspect.getfile(type(cause)) for cause in everything))

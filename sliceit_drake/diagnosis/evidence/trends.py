@@ -53,11 +53,8 @@ def trend_of_slices(
     if not number.any():
         return None
     number /= np.sqrt(np.mean(number**2))
-    columns = problem.found.of_causes(named)
-    sizes = problem.fitted_sizes(columns, problem.sizes)[0] if columns else problem.sizes
-    model = problem.with_causes(columns)
-    wrong = OwnError(problem, model, sizes)
-    reduced = problem.reduced(model.own, model.variance)
+    wrong = OwnError.beside(problem, named)
+    reduced = problem.reduced(wrong.model)
     Z = np.array(problem.shapes)
     noise = np.array([n.deviation for n in problem.noise])[problem.discrepancy.channel]
     # A trend is as large as the noise before the data, for a deviation of the slice's number.

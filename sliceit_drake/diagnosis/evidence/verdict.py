@@ -6,10 +6,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.stats import norm
 
-from sliceit_drake.diagnosis.evidence.columns import CauseAtScan, Column
+from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
 from sliceit_drake.diagnosis.evidence.effect_size import OwnError, standardised_size
 from sliceit_drake.diagnosis.evidence.held_out import held_out_gain
-from sliceit_drake.diagnosis.evidence.linear import PLAUSIBLE, LinearProblem, scaled_inverse
+from sliceit_drake.diagnosis.evidence.linear import (
+    PLAUSIBLE,
+    LinearProblem,
+    angle_to,
+    beside,
+    fitted_covariance,
+)
 from sliceit_drake.diagnosis.evidence.screen import CauseEvidence, Screening, screen
 from sliceit_drake.diagnosis.evidence.trends import Trend, trend_of_slices
 
@@ -80,8 +86,7 @@ class Finding:
 
     Attributes:
         evidence: Of the cause that explains most.
-        size: What is left of its effect after a refit of the base, over noise and the simulation's
-            own error, where it acts.
+        size: What a refit of the base leaves of its effect where it acts, over noise and own error.
         share: Of the mean square there that it explains.
         others: Names of the causes that would explain as much.
     """
@@ -168,8 +173,7 @@ def reach_verdict(
     progress: Callable[[int], None] | None = None,
     rule: DecisionRule | None = None,
 ) -> Verdict:
-    """Screens, names the cause with most evidence of those that may be named, and goes on with it
-    in the model; see `screen`."""
+    """Screens, names the cause with most evidence that may be named, and goes on beside it."""
     rule = rule or DecisionRule()
     counts = [len(m) for m in problem.conditions.values()]
     needed = rule.replicates - max(counts) if max(counts) < rule.replicates else 0
@@ -196,7 +200,7 @@ def reach_verdict(
         findings = _lasting(problem, findings, rule)
     named = bool(findings)
     wrong, misfit, mostly = _own_error(problem, [f.evidence.cause for f in findings])
-    causes = _verdicts(problem, screenings, findings, refused, rule)
+    causes = _verdicts(screenings, findings, refused, rule)
     shown = f"the simulation is wrong by {100 * wrong:.1f} % of the force by itself"
     if not named and misfit >= rule.unknown and mostly[0][1:3] == ("in", "shared"):
         findings = _nearest(problem, screenings[0])
@@ -270,7 +274,8 @@ def _refusal(
         return "gains no more than chance gives"
     if _may_be_law(problem, e):
         # What the simulation may be wrong by is of the group itself: it is not what this is beside.
-        size = standardised_size(problem, _columns(problem, e), np.array(e.coefficients))
+        own = problem.found.of_causes([e.cause])
+        size = standardised_size(problem, own, np.array(e.coefficients))
         if size >= rule.size and e.gain >= max(other.gain for other in screening.causes):
             return _at_bound(e)
     if e.size < rule.size:
@@ -314,25 +319,24 @@ def _beside(e: CauseEvidence, named: Sequence[CauseAtScan]) -> str:
     return ""
 
 
-def _columns(problem: LinearProblem, e: CauseEvidence) -> list[int]:
-    return problem.found.of_causes([e.cause])
-
-
 def _at_bound(e: CauseEvidence) -> str:
-    """Numbers of a cause that are at a bound, in words."""
-    found = [c.parameter for c, g in zip(e.columns, e.coefficients, strict=True) if _out(c, g)]
+    """Numbers of a cause that are where they cannot be, or at the end of their range, in words."""
+    found = [
+        c.parameter
+        for c, g in zip(e.columns, e.coefficients, strict=True)
+        if g != 0.0 and not c.low < g * c.size < c.high
+    ]
     return f"{', '.join(found)} would be at a bound" if found else ""
 
 
 def _may_be_law(problem: LinearProblem, e: CauseEvidence) -> bool:
-    """Whether a law that is wrong along depth could do what was found."""
-    return e.name in LOCKED_TO_DEPTH and _angle_to_law(problem, e) <= CLASS_ANGLE
-
-
-def _out(column: Column, coefficient: float) -> bool:
-    """Whether a number was found where it cannot be, or at the end of its range."""
-    value = coefficient * column.size
-    return coefficient != 0.0 and not column.low < value < column.high
+    """Whether a law that is wrong along depth, alike in all cuts, could do what was found."""
+    if e.name not in LOCKED_TO_DEPTH:
+        return False
+    model = problem.with_causes()
+    G = beside(problem.reduced(model).sum(0), model.shared, model.prior)
+    own = problem.found.of_causes([e.cause])
+    return angle_to(G, own, np.array(e.coefficients), [problem.shapes]) <= CLASS_ANGLE
 
 
 def _others(problem: LinearProblem, screening: Screening, best: CauseEvidence) -> list[str]:
@@ -352,38 +356,21 @@ def _others(problem: LinearProblem, screening: Screening, best: CauseEvidence) -
     return out
 
 
-def _angle_to_law(problem: LinearProblem, effect: CauseEvidence) -> float:
-    """Between the effect of a cause as it was found and all that a law that is wrong along depth in
-    the same way in all cuts can do, degrees."""
-    model = problem.with_causes()
-    G = problem.reduced(model.own, model.variance).sum(0)
-    F = model.shared
-    inverse = scaled_inverse(G[np.ix_(F, F)] + np.diag(model.prior[F]))
-    G = G - G[:, F] @ inverse @ G[F]
-    own, Z = problem.found.of_causes([effect.cause]), problem.shapes
-    e = np.array(effect.coefficients)
-    b = G[np.ix_(Z, own)] @ e
-    best = float(b @ scaled_inverse(G[np.ix_(Z, Z)], 1e-8) @ b)
-    norm = float(e @ G[np.ix_(own, own)] @ e)
-    return float(np.degrees(np.arccos(np.sqrt(min(best / max(norm, 1e-12), 1.0)))))
-
-
 def _nearest(problem: LinearProblem, screening: Screening) -> list[Finding]:
     """Where the simulation is wrong along depth, alike in all cuts, the cause locked to depth that
     can do most of it, with the others and the law: which it is an experiment tells. None where none
     can do half of it."""
-    model = problem.with_causes()
-    wrong = OwnError(problem, model, problem.sizes)
-    reduced = problem.reduced(model.own, model.variance)
-    F, Z = model.shared, problem.shapes
+    wrong = OwnError.beside(problem, [])
+    reduced = problem.reduced(wrong.model)
+    F, Z = wrong.model.shared, problem.shapes
     K = [values.sum(0).ravel() for values in wrong.coefficients]
     G = reduced.sum(0)
     b = np.sum([A[:, Z] @ k for A, k in zip(reduced, K, strict=True)], axis=0)
     square = sum(float(k @ A[np.ix_(Z, Z)] @ k) for A, k in zip(reduced, K, strict=True))
-    inverse = scaled_inverse(G[np.ix_(F, F)] + np.diag(model.prior[F]))
-    square -= float(b[F] @ inverse @ b[F])
-    b = b - G[:, F] @ inverse @ b[F]
-    G = G - G[:, F] @ inverse @ G[F]
+    covariance = fitted_covariance(G, F, wrong.model.prior)
+    square -= float(b[F] @ covariance @ b[F])
+    b = b - G[:, F] @ covariance @ b[F]
+    G = beside(G, F, wrong.model.prior)
     best, share = None, HALF
     for name in (n for n in LOCKED_TO_DEPTH if n in screening.names):
         for scan in problem.found.scans(name):
@@ -426,9 +413,7 @@ def _own_error(
 ) -> tuple[float, float, list[tuple[str, str, str, float]]]:
     """Of the simulation with what is named: relative to the force, to the noise, and where."""
     noise = np.array([n.deviation for n in problem.noise])
-    columns = problem.found.of_causes(named)
-    sizes = problem.fitted_sizes(columns, problem.sizes)[0] if columns else problem.sizes
-    wrong = OwnError(problem, problem.with_causes(columns), sizes)
+    wrong = OwnError.beside(problem, named)
     squares, force, over, rows = 0.0, 0.0, 0.0, 0
     for record, values in zip(problem.found.records, wrong.values, strict=True):
         inside = record.in_contact
@@ -447,7 +432,6 @@ def _own_error(
 
 
 def _verdicts(
-    problem: LinearProblem,
     screenings: Sequence[Screening],
     findings: Sequence[Finding],
     refused: dict[str, str],

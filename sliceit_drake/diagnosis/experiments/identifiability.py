@@ -39,8 +39,6 @@ SHIFT = 0.25
 """Plausible change of the logarithm of a base parameter."""
 FLAT = 1e-9
 """Precision of base parameters before any data, relative to what the data say of them."""
-
-
 CORRELATED, WHITE = 0.08, 0.035
 """Standard deviations of a force, N, of a part that is correlated over `TIME` and one that is not:
 a good sensor, and food that is not even."""
@@ -100,7 +98,7 @@ class Evidence:
 
     def gram(self, columns: Sequence[int], records: Sequence[int]) -> np.ndarray:
         """Scalar products of columns over records; one for each record where its coefficient is."""
-        sizes = [len(records) if self.found.columns[k].per_record else 1 for k in columns]
+        sizes = [self._width([k], records) for k in columns]
         starts = np.concatenate([[0], np.cumsum(sizes)])
         out = np.zeros((starts[-1], starts[-1]))
         at = np.array([self._place[k] for k in columns])
@@ -108,6 +106,10 @@ class Evidence:
             rows = np.array([s + (r if n > 1 else 0) for s, n in zip(starts, sizes, strict=False)])
             out[np.ix_(rows, rows)] += self.grams[record][np.ix_(at, at)]
         return out
+
+    def _width(self, columns: Sequence[int], records: Sequence[int]) -> int:
+        """Coefficients of columns, over records."""
+        return sum(len(records) if self.found.columns[k].per_record else 1 for k in columns)
 
     def left(
         self, sets: Sequence[Sequence[int]], free: Sequence[int], records: Sequence[int]
@@ -119,10 +121,7 @@ class Evidence:
         X = G[:n, :n]
         X = X + FLAT * np.diag(np.maximum(np.diag(X), 1e-12))
         rest = G[n:, n:] - G[n:, :n] @ np.linalg.solve(X, G[:n, n:]) if n else G
-        widths = [
-            sum(len(records) if self.found.columns[k].per_record else 1 for k in s) for s in sets
-        ]
-        ends = np.cumsum([0, *widths])
+        ends = np.cumsum([0, *(self._width(s, records) for s in sets)])
         places = [slice(int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
         return rest, places
 
@@ -172,8 +171,7 @@ def noise_scale(record: RecordSensitivity) -> np.ndarray:
 
 
 def _share_explained(G: np.ndarray, a: slice, b: slice) -> float:
-    """Fraction of the square of columns `a` that columns `b` explain, from their scalar
-    products."""
+    """Fraction of the square of columns `a` that `b` explain, from their scalar products."""
     total = float(np.trace(G[a, a]))
     if total <= 0.0:
         return 0.0

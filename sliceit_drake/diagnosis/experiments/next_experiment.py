@@ -22,7 +22,7 @@ import numpy as np
 
 from sliceit_drake.cutting.foods.shapes import MeshFile, Remainder, Tapered
 from sliceit_drake.diagnosis.evidence.columns import CauseAtScan, RecordSensitivity, Sensitivities
-from sliceit_drake.diagnosis.evidence.linear import USUAL, LinearProblem, scaled_inverse
+from sliceit_drake.diagnosis.evidence.linear import USUAL, LinearProblem, beside
 from sliceit_drake.diagnosis.evidence.screen import CauseEvidence, Screening
 from sliceit_drake.diagnosis.evidence.sensitivity import Progress, sensitivities
 from sliceit_drake.diagnosis.evidence.verdict import CLASS_ANGLE, LAW, DecisionRule
@@ -37,6 +37,7 @@ from sliceit_drake.diagnosis.experiments.planned_record import (
 )
 from sliceit_drake.diagnosis.experiments.proposal import MARGIN, NEEDED, NextExperiment, Pair, Step
 from sliceit_drake.diagnosis.result import Diagnosis
+from sliceit_drake.prediction.discrepancy import Weighted
 from sliceit_drake.prediction.placement import is_bare
 from sliceit_drake.prediction.simulator import Workers
 from sliceit_drake.records.slice_record import SliceRecord
@@ -54,8 +55,6 @@ ALIKE_GAIN = 0.35
 acts: what it gains depends on how well the form that is assumed for it fits."""
 EXPLORING = ("tour", "draw_3", "draw_1", "air")
 """Motions for what no cause explains: what differs most from one another."""
-
-
 _CauseClass = tuple[list[CauseEvidence], Screening, bool]
 """Evidence for causes to be told apart, the screening that it is from, and whether they are to be
 told from the simulation's own law as well."""
@@ -120,42 +119,40 @@ class _Search:
         """Gram matrices of all columns with the discrepancy integrated out and without one, of the
         records at hand and slices of experiments, by the number of the experiment."""
         problem = self.problem
-        reduced = problem.reduced(*problem.own_prior())
+        reduced = problem.reduced(problem.with_causes())
         weights = [1] * self.count + [counts.get(k, 0) for k in range(len(self.menu))]
         grams = [
             np.sum([weights[r] * reduced[r] for r in members], axis=0)
             for members in problem.conditions.values()
         ]
-        return problem.discrepancy.weighted(grams, self.sizes).total, np.sum(grams, axis=0)
+        return Weighted(problem.discrepancy, grams, self.sizes).total, np.sum(grams, axis=0)
 
     def _projected(self, total: np.ndarray, assumed: Sequence[CauseAtScan]) -> np.ndarray:
         """What is left of a summed Gram matrix beside what is fitted in any case."""
         problem = self.problem
-        baseline = list(dict.fromkeys([*problem.baseline, *problem.found.of_causes(assumed)]))
-        inverse = scaled_inverse(
-            total[np.ix_(baseline, baseline)] + np.diag(problem.prior()[baseline])
-        )
-        return np.asarray(total - total[:, baseline] @ inverse @ total[baseline])
+        baseline = dict.fromkeys([*problem.baseline, *problem.found.of_causes(assumed)])
+        return beside(total, list(baseline), problem.prior())
 
     def _angles(self, total: np.ndarray, plain: np.ndarray) -> list[tuple[str, str, float, float]]:
         """Angle, degrees, and expected gain of each ordered pair of causes, from Gram matrices of
         all columns with the discrepancy integrated out and without one."""
         out = []
+
+        def square_of(effect: CauseEvidence, G: np.ndarray) -> float:
+            own, e = self.problem.found.of_causes([effect.cause]), np.array(effect.coefficients)
+            return float(e @ G[np.ix_(own, own)] @ e)
+
         for evidence, before, with_law in self.classes:
             screening = dc.replace(before, projected=self._projected(total, before.assumed))
             for a, b in itertools.permutations(evidence, 2):
-                own = self.problem.found.of_causes([a.cause])
-                e = np.array(a.coefficients)
-                square = float(e @ screening.projected[np.ix_(own, own)] @ e)
+                square = square_of(a, screening.projected)
                 angle = screening.angle_to(self.problem, a, b.name) if square > 0.0 else 0.0
                 gain = square * float(np.sin(np.radians(angle))) ** 2
                 out.append((a.name, b.name, angle, gain))
             for a in evidence if with_law else ():
                 # What an error of the law, which is alike in all cuts, leaves of the cause.
-                own = self.problem.found.of_causes([a.cause])
-                e, at = np.array(a.coefficients), np.ix_(own, own)
-                left = max(float(e @ screening.projected[at] @ e), 0.0)
-                whole = max(float(e @ self._projected(plain, before.assumed)[at] @ e), 1e-12)
+                left = max(square_of(a, screening.projected), 0.0)
+                whole = max(square_of(a, self._projected(plain, before.assumed)), 1e-12)
                 angle = float(np.degrees(np.arcsin(np.sqrt(min(left / whole, 1.0)))))
                 out.append((a.name, LAW, angle, left))
         return out

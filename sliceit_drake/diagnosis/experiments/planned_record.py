@@ -1,8 +1,7 @@
 """Experiments as planned slices, and the records that these would give, without force.
 
 A planned slice is what the station simulates, the stand-in cuts and the robot runs
-(`diagrams.planned_scenario`), so a proposal is judged by the motion that it would have and by no
-other.
+(`diagrams.planned_scenario`), so a proposal is judged by the motion that it would have.
 """
 
 import copy
@@ -20,6 +19,7 @@ from sliceit_drake.cutting.planned_slice import PlannedSlice
 from sliceit_drake.diagnosis.experiments.designs import CLEARANCE, Experiment, Scale
 from sliceit_drake.prediction.placement import food_of, is_bare, knife_of
 from sliceit_drake.records.metadata import PHASE_LABELS, FoodFacts, NominalMotion, Phase, ToolFacts
+from sliceit_drake.records.phases import nominal_motion
 from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = [
@@ -61,10 +61,7 @@ def scale_of(setup: CalibrationSetup, records: Sequence[SliceRecord]) -> Scale:
 
 
 def planned_slice(
-    experiment: Experiment,
-    setup: CalibrationSetup,
-    template: SliceRecord,
-    knife_slices: int = 0,
+    experiment: Experiment, setup: CalibrationSetup, template: SliceRecord, knife_slices: int = 0
 ) -> PlannedSlice:
     """A slice of an experiment: the model's food, with knife and place as a record has them.
 
@@ -266,12 +263,6 @@ def _nominal(motion: Motion, time: np.ndarray, v: np.ndarray, R: np.ndarray) -> 
             phases[-1].end = end
         else:
             phases.append(Phase(label, begin, end))
-    out = NominalMotion(phases=phases)
-    labels = np.array([motion.phase_at(t) for t in time])
-    in_knife = np.einsum("nji,nj->ni", R, v)
-    slicing = (labels == "slice") & (in_knife[:, 2] > 1e-5)
-    if slicing.any():
-        press = float(np.median(in_knife[slicing, 2]))
-        out.speed = round(press, 6)
-        out.draw_ratio = round(float(np.median(in_knife[slicing, 0])) / press, 4)
-    return out
+    slicing = np.array([motion.phase_at(t) == "slice" for t in time])
+    draw, _, press = np.einsum("nji,nj->ni", R, v).T
+    return nominal_motion(phases, slicing, press, draw)

@@ -27,11 +27,7 @@ from sliceit_drake.diagnosis.one_slice.slice_evidence import (
     SliceEvidence,
     slice_evidence,
 )
-from sliceit_drake.diagnosis.one_slice.slice_fit import (
-    OWN,
-    depth_blocks,
-    fit_slice,
-)
+from sliceit_drake.diagnosis.one_slice.slice_fit import OWN, depth_blocks, fit_slice
 from sliceit_drake.diagnosis.one_slice.slice_result import MIN_GAIN, OneSlice
 from sliceit_drake.diagnosis.prediction import SlicePredictor
 from sliceit_drake.diagnosis.registry import open_causes

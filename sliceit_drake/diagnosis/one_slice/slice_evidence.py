@@ -30,7 +30,6 @@ LEVEL = 0.05
 MIN_SPREAD = 0.5
 """Least standard deviation of a gain where nothing is wrong. A cause that hardly shows has next to
 none, which would turn a small gain into many standard deviations."""
-
 _Option = tuple[str, float | None, list[int]]
 """Cause, value of its scan, and numbers of its columns there."""
 
@@ -45,8 +44,7 @@ class CauseInSlice:
         gain: Twice the gain in log-likelihood.
         p_value: Of a gain as large, relative to its spread, by any cause where nothing is wrong.
         shows: Standard deviations by which its plausible size would stand out of what is left.
-        held_out: Error on left-out depth with it by the linear prediction, N; each block chooses
-            its scan anew.
+        held_out: Error on left-out depth with it, linear, N; each block chooses its scan anew.
         confirmed: The same by simulation, N; None where that was not done.
         fitted: Error of the fit by simulation, N; None where that was not done.
         blocks_better: Of the left-out blocks, those that it predicts better, by simulation.
@@ -122,12 +120,7 @@ def estimate_slice_noise(
         (np.log(0.01 * scale), np.log(3.0 * scale)),
     ]
     fits = [
-        minimize(
-            objective,
-            np.log([scale, tau, 0.1 * scale]),
-            method="L-BFGS-B",
-            bounds=bounds,
-        )
+        minimize(objective, np.log([scale, tau, 0.1 * scale]), method="L-BFGS-B", bounds=bounds)
         for tau in (5.0 * step, 0.05 * span)
     ]
     ar, tau, white = np.exp(min(fits, key=lambda f: f.fun).x).tolist()
@@ -336,9 +329,7 @@ def _best_gains(
 
 
 def _same_effect(
-    problem: SliceProblem,
-    options: Sequence[_Option],
-    found: CauseInSlice,
+    problem: SliceProblem, options: Sequence[_Option], found: CauseInSlice
 ) -> list[str]:
     """Causes that can do what one was found to do to within `ANGLE`, at a value of their scan."""
     own = problem.found.of_causes([(found.name, found.scan)])

@@ -1,8 +1,7 @@
 """Fits one slice by simulation: base parameters, where the knife was, and a cause.
 
 Least squares over all rows of one record, with the whole simulation in each step (Gauss-Newton on
-differences), and the error on blocks of depth that were left out. Nothing here says anything of a
-second slice.
+differences), and the error on blocks of depth that were left out.
 """
 
 import dataclasses as dc
@@ -208,8 +207,7 @@ class _Fitter:
         return out
 
     def cost(self, theta: np.ndarray, predicted: np.ndarray, rows: np.ndarray) -> float:
-        """Sum of squares over some rows, with what is plausible beforehand; infinite for a slice
-        that broke."""
+        """Sum of squares over some rows, with the prior; infinite for a slice that broke down."""
         if not np.isfinite(predicted).all():
             return np.inf
         rest = (self.target.measured - predicted)[rows].ravel() / NOISE

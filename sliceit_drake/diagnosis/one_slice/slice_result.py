@@ -237,8 +237,7 @@ class OneSlice:
         directory.mkdir(parents=True, exist_ok=True)
         text = json.dumps(self.facts(), indent=2) + "\n"
         (directory / "diagnosis.json").write_text(text, encoding="utf-8")
-        page = report_html(self, self.table())
-        (directory / "report.html").write_text(page, encoding="utf-8")
+        (directory / "report.html").write_text(report_html(self), encoding="utf-8")
 
 
 def slice_figure(results: Sequence["OneSlice"], titles: Sequence[str]) -> "Figure":
@@ -303,15 +302,15 @@ def _blocks(axis: "Axes", result: "OneSlice") -> None:
         axis.axvspan(depth[rows].min(), depth[rows].max(), color="0.5", alpha=0.10, lw=0)
 
 
-def report_html(result: "OneSlice", table: str) -> str:
+def report_html(result: "OneSlice") -> str:
     """The report as one self-contained page, with the result as text."""
     parts = [
         "<h1>What the simulation gets wrong in one slice</h1>",
         "<p>This describes one slice. It is no diagnosis: how slices vary is unknown, so that what"
         f" is found may be this slice's own. p is that of a gain as large, by any cause, where"
         f" nothing is wrong; below {LEVEL:g} it counts.</p>",
-        f"<pre>{html.escape(table)}</pre>",
+        f"<pre>{html.escape(result.table())}</pre>",
         "<h2>Measured and simulated</h2>",
-        image(slice_figure([result], [result.record.name])),
+        image(result.plot()),
     ]
     return html_page("One slice", parts)
