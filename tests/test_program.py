@@ -7,6 +7,7 @@ import re
 import shlex
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -241,6 +242,16 @@ def test_a_name_that_leads_out_of_the_folder_of_outputs_is_refused(
     assert said in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == there
     assert {file.read_text(encoding="utf-8") for file in mine} == {"mine"}
+
+
+def test_a_walk_with_a_robot_is_no_dry_run_and_connects_to_nothing(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(socket, "socket", None)
+    monkeypatch.setattr("sliceit_drake.robot_run.operated_robot.OperatedRobot.connected", None)
+    given = ["hardware", "cucumber_measured", "--host", "127.0.0.1", "--commission", "--dry-run"]
+    assert main(given) == 2
+    assert "--dry-run: does not go with --commission" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_protocol_and_a_scenario_go_by_their_names(tmp_path, capsys, monkeypatch):

@@ -125,6 +125,19 @@ def test_each_fault_stops_the_robot_for_good(robot, fault, limit, goes_on):
     link.finish("test over")
 
 
+@pytest.mark.parametrize("time", [np.nan, np.inf])
+def test_a_clock_that_shows_no_time_stops_the_robot_in_plain_words(robot, time):
+    link = make_link(robot)
+    link.start()
+    assert link.arm() is None
+    stream(link, 0.05)
+    robot.time = time
+    assert robot.stopped.wait(10.0), "the program on the robot was not stopped"
+    stop = link.finish("test over")
+    assert (stop.limit, stop.sends) == ("link", False)
+    assert stop.detail == f"the controller's clock shows {time}: no time"
+
+
 def test_a_diagram_that_comes_late_stops_the_robot(robot):
     link = make_link(robot)
     link.start()

@@ -92,6 +92,12 @@ def add_robot_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Runs the command."""
+    if options.commission and options.dry_run:
+        raise ConfigurationError(
+            "does not go with --commission, whose steps move the robot",
+            field="--dry-run",
+            fix="Make the dry run first, by itself, and then walk.",
+        )
     scenario = scenario_of(options)
     suffix = "_commissioning" if options.commission else "_robot"
     directory = output_of(options, scenario.name, suffix)

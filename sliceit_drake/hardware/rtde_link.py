@@ -4,6 +4,7 @@ The diagram and this thread exchange only their newest values: neither waits for
 """
 
 import csv
+import math
 import threading
 import time as clock
 from collections.abc import Iterator, Sequence
@@ -282,6 +283,9 @@ class RobotLink:
                 clock.sleep(POLL)
                 continue
             state = client.read()
+            if not math.isfinite(state.time):
+                self._latch_fault("link", f"the controller's clock shows {state.time}: no time")
+                return
             arrival = clock.perf_counter()
             period = state.time - last_time
             cycles += 1
