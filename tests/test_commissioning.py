@@ -1,12 +1,18 @@
 """The walk from a push by hand to the first cut, on the emulated controller."""
 
+import csv
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hardware_bench import emulated, run_hardware
 
+from sliceit_drake.diagrams.scenario import load_scenario
+from sliceit_drake.hardware.client import PLAYING
+from sliceit_drake.hardware.hardware_config import HardwareConfig
 from sliceit_drake.resources import resource_path
+from sliceit_drake.robot_run.commissioning import Commissioning
 
 pytestmark = [pytest.mark.second_tier, pytest.mark.usefixtures("no_test_hangs")]
 
@@ -73,7 +79,7 @@ def test_the_walk_ends_with_the_first_cut(tmp_path, monkeypatch, capsys):
             emulator, tmp_path, monkeypatch,
             ("ready",), ("move",), ("push", pushed(emulator, 10.0)),
             ("ready",), ("move",), ("slice",),
-            ("ready",), ("move",), ("slice", stop_in_motion),
+            ("ready",), ("move",), ("slice", stop_in_motion), ("pressed",),
             ("ready", lambda: pendant.put_fresh_food(BARE)), ("move",), ("touch",),
             ("ready", lambda: pendant.put_fresh_food(food)), ("move",), ("slice",),
             ("ready",), ("move",), ("slice",),
@@ -102,3 +108,140 @@ def test_a_sensor_that_feels_a_push_otherwise_ends_the_walk(force, tmp_path, mon
         )  # fmt: skip
     assert code == 1 and [step["passed"] for step in steps] == [False]
     assert "The walk ends here" in capsys.readouterr().out
+
+
+def test_a_force_in_the_air_ends_the_walk_at_its_second_step(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sliceit_drake.robot_run.commissioning.MISSED", 1.0)
+    with emulated(SPRING, MOTION) as emulator:
+        pendant = emulator.pendant
+
+        def pull():
+            pendant.inject("sensor_bias:4.5", after=0.2)
+
+        code, steps = walk(
+            emulator, tmp_path, monkeypatch,
+            ("ready",), ("move",), ("push", pushed(emulator, 10.0)),
+            ("ready",), ("move",), ("slice", pull), ("ready",), ("move",), ("slice",),
+        )  # fmt: skip
+    assert code == 1 and "The walk ends here" in capsys.readouterr().out
+    assert [(step["step"], step["passed"]) for step in steps] == [("push", True), ("air", False)]
+    assert set(steps[1]["measured"]) == {"peak_force_N", "missed"}, "nothing stopped it"
+    # The inertia of the tool comes on top.
+    assert 4.4 < steps[1]["measured"]["peak_force_N"] < 6.0
+
+
+# Steps whose runs are written here, as an `OperatedRobot` leaves them.
+
+PROGRAM = "program at controller time 1.000 s: the robot's program is "
+SAFETY = "safety_status at controller time 1.000 s: the robot reports "
+
+
+class WrittenRuns:
+    """An operated robot whose runs leave what is given here.
+
+    Args:
+        stopped: What stops each run; None for its end.
+        force: Its peak force, N.
+        missed: Cycles missed of a thousand.
+        silence: Controller time without a target before the robot's program ended, s.
+        words: What the operator types.
+        is_ready: Whether there is a run at all.
+    """
+
+    def __init__(self, stopped=None, force=2.0, missed=0, silence=0.002, words=(), is_ready=True):
+        self.config, self.found = HardwareConfig(), None
+        self._stopped, self._force, self._missed = stopped, force, missed
+        self._silence, self._words, self._is_ready = silence, list(words), is_ready
+
+    def asks(self, word):
+        return bool(self._words) and self._words.pop(0) == word
+
+    def run(self, scenario, directory, move_to_start):
+        if not self._is_ready:
+            return None
+        directory.mkdir(parents=True)
+        timing = {"missed_cycles": self._missed, "cycles": 1000}
+        summary = {"peak_force_N": self._force, "robot": timing}
+        (directory / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
+        with (directory / "robot.csv").open("w", encoding="utf-8", newline="") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(["time", "sent_1", "runtime_state"])
+            end, last = 1.0, 1.0 - self._silence
+            for k in range(100):
+                time = end - 0.002 * (100 - k)
+                writer.writerow([time, "0.5" if time < last + 1e-9 else "", PLAYING])
+            writer.writerow([end, "", 1])
+        return SimpleNamespace(stopped=self._stopped)
+
+
+STEPS = ["push", "air", "stop", "touch", "foam", "cut"]
+
+
+def result_of(step, robot, directory):
+    """What a step makes of a robot's run; the steps before it have passed."""
+    overrides = "start.clearance=0.005,measurement=null"
+    commissioning = Commissioning(robot, load_scenario(SPRING, overrides), directory)
+    steps = {name: run for name, _, run in commissioning._steps}
+    assert list(steps) == STEPS
+    return steps[step](directory / step)
+
+
+@pytest.mark.parametrize(
+    ("step", "run"),
+    [
+        ("air", {"force": 3.5}),
+        ("air", {"missed": 60}),
+        ("air", {"stopped": PROGRAM + "stopped"}),
+        ("air", {"is_ready": False}),
+        ("stop", {}),
+        ("stop", {"is_ready": False}),
+        ("stop", {"stopped": "force at controller time 1.000 s: the tool meets a force"}),
+        ("stop", {"stopped": "link at controller time 1.000 s: the robot's program is stopped"}),
+        ("stop", {"stopped": "interrupted by the user", "words": ["pressed"]}),
+        ("stop", {"stopped": PROGRAM + "in an unknown state", "words": ["pressed"]}),
+        # A protective stop comes from a collision, too.
+        ("stop", {"stopped": SAFETY + "protective stop, stopped due to safety"}),
+        ("stop", {"stopped": SAFETY + "recovery mode", "words": ["pressed"]}),
+        # Its watchdog ended the program, whatever the operator says.
+        ("stop", {"stopped": PROGRAM + "stopped", "silence": 0.024, "words": ["pressed"]}),
+        ("stop", {"stopped": PROGRAM + "stopped", "silence": 1.0, "words": ["pressed"]}),
+        # Something else did: the operator has pressed nothing.
+        ("stop", {"stopped": PROGRAM + "stopped", "words": ["no"]}),
+        ("stop", {"stopped": PROGRAM + "paused"}),
+        ("foam", {"force": 0.3}),
+        ("foam", {"force": 16.0}),
+        ("foam", {"stopped": "force at controller time 1.000 s: the tool meets a force"}),
+        ("cut", {"force": 45.0}),
+        ("cut", {"missed": 60}),
+        ("cut", {"stopped": "tilt at controller time 1.000 s: the blade's tilt"}),
+    ],
+)
+def test_a_step_whose_criterion_is_not_met_does_not_pass(step, run, tmp_path):
+    assert not result_of(step, WrittenRuns(**run), tmp_path).passed
+
+
+@pytest.mark.parametrize(
+    ("step", "run"),
+    [
+        ("air", {}),
+        ("stop", {"stopped": PROGRAM + "stopped", "words": ["pressed"]}),
+        ("stop", {"stopped": PROGRAM + "paused", "words": ["pressed"]}),
+        ("stop", {"stopped": SAFETY + "robot emergency stop, emergency stop"}),
+        ("stop", {"stopped": SAFETY + "safeguard stop, stopped due to safety"}),
+        ("foam", {}),
+        ("cut", {"force": 30.0}),
+    ],
+)
+def test_a_step_whose_criterion_is_met_passes(step, run, tmp_path):
+    assert result_of(step, WrittenRuns(**run), tmp_path).passed
+
+
+def test_foam_that_is_not_felt_ends_the_walk_before_the_cut(tmp_path, monkeypatch, capsys):
+    robot = WrittenRuns(force=0.2, words=["ready"] * 6)
+    commissioning = Commissioning(robot, load_scenario(SPRING, "measurement=null"), tmp_path)
+    commissioning._steps = commissioning._steps[STEPS.index("foam") :]
+    assert not commissioning.walk()
+    steps = json.loads((tmp_path / "commissioning.json").read_text())["steps"]
+    assert [(step["step"], step["passed"]) for step in steps] == [("foam", False)]
+    assert "NOT PASSED: foam: peak_force_N 0.2" in capsys.readouterr().out
+    assert not (tmp_path / "2_cut").exists()

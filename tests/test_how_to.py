@@ -33,6 +33,14 @@ def run_program(program: str, folder: Path, monkeypatch) -> dict:
     return names
 
 
+@pytest.mark.parametrize("page", ["docs/how_to/hardware.md", "hardware/ur5e.yaml"])
+def test_the_files_that_a_robots_page_and_file_name_are_there(page):
+    text = (DOCS.parent / page).read_text(encoding="utf-8")
+    named = re.findall(r"(?<![\w/.])[\w/]+\.py(?!\w)", text)
+    missing = [name for name in named if not (DOCS.parent / name).is_file()]
+    assert named and missing == []
+
+
 def test_there_are_twenty_tasks_or_more_with_a_command_or_a_short_program_each():
     tasks = re.split(r"^### ", HOW_TO, flags=re.M)[1:]
     assert len(tasks) >= 20

@@ -1,6 +1,7 @@
 """The first hours with a robot, step by step: from checks and a push by hand to the first cut."""
 
 import copy
+import csv
 import dataclasses as dc
 import json
 import math
@@ -13,7 +14,7 @@ from sliceit_drake.cutting.motion import ConstantSpeed, MotionPlan, Retract
 from sliceit_drake.diagrams.hardware_station import make_edge_kinematics
 from sliceit_drake.diagrams.run import Run
 from sliceit_drake.diagrams.scenario import Scenario
-from sliceit_drake.hardware.client import RobotClient
+from sliceit_drake.hardware.client import PLAYING, RobotClient
 from sliceit_drake.hardware.readings import pose_difference
 from sliceit_drake.interruption import raise_if_interrupted
 from sliceit_drake.robot_run.hardware_run import prepare_hardware_run
@@ -36,6 +37,13 @@ MISSED = 0.05
 """Greatest share of missed cycles."""
 SHARE = 0.8
 """Of the limit of force that the first cut may use."""
+PRESSED = "pressed"
+"""Word for having pressed the stop: who ended a program, the robot's data do not tell."""
+SAFETY_STOPS = ("emergency stop", "safeguard stop")
+"""Safety bits that nobody but a person sets."""
+PROGRAM_STOPS = ("the robot's program is stopped", "the robot's program is paused")
+SILENT = 0.5
+"""Of the watchdog's time, without a target, after which it may have ended the program itself."""
 
 
 @dc.dataclass
@@ -166,11 +174,26 @@ class Commissioning:
         return self._judged(made, directory, criterion, 0.0, most)
 
     def _stop(self, directory: Path) -> StepResult:
-        criterion = "it ends because the robot's program does not play, or by its safety"
+        criterion = (
+            f"an emergency or safeguard stop, or a program that you ended, as you say ({PRESSED}), "
+            "while it got its targets in time"
+        )
         made = self._run(self._in_the_air(), directory)
-        stopped = (made.stopped or "nothing stopped it") if made is not None else ""
-        passed = stopped.startswith(("program", "safety_status", "robot_mode"))
-        return StepResult(passed, criterion, {"stopped by": stopped} if stopped else {})
+        if made is None:
+            return StepResult(False, criterion)
+        stopped = made.stopped or "nothing stopped it"
+        measured: dict[str, float | str] = {"stopped by": stopped}
+        if stopped.startswith("safety_status"):
+            return StepResult(any(s in stopped for s in SAFETY_STOPS), criterion, measured)
+        if not (stopped.startswith("program ") and stopped.endswith(PROGRAM_STOPS)):
+            return StepResult(False, criterion, measured)
+        silence = _silence_before_stop(directory / "robot.csv")
+        measured["without_target_s"] = silence
+        # Written so that what is not known does not pass.
+        if not silence < SILENT / self._robot.config.watchdog:
+            return StepResult(False, criterion, measured)
+        print("\nThe robot's program ended. Its watchdog or another program may have done that.")
+        return StepResult(self._robot.asks(PRESSED), criterion, measured)
 
     def _touch(self, directory: Path) -> StepResult:
         config = self._robot.config
@@ -237,6 +260,23 @@ class Commissioning:
 
 def _shown(value: float | str) -> str:
     return value if isinstance(value, str) else f"{value:.4g}"
+
+
+def _silence_before_stop(log: Path) -> float:
+    """Controller time from the last target to the program's end, s; NaN without either.
+
+    Args:
+        log: Written by `RobotLink.write_log`.
+    """
+    sent = math.nan
+    with log.open(encoding="utf-8", newline="") as stream:
+        for row in csv.DictReader(stream):
+            time = float(row["time"])
+            if int(row["runtime_state"]) != PLAYING:
+                return time - sent
+            if row["sent_1"]:
+                sent = time
+    return math.nan
 
 
 def _watch_push(client: RobotClient, pace: float) -> tuple[list[float], float]:
