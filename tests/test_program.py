@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 
 import pytest
+from emulator_bench import free_address
 
 from sliceit_drake.cli import doctor
 from sliceit_drake.cli.main import main, run_program
@@ -179,7 +180,7 @@ def test_a_robot_stops_when_nobody_reads_what_it_says():
 
 
 def test_a_fault_at_no_time_is_refused(capsys):
-    given = ["emulate", "--arm-alone", "--address", "127.0.0.78", "--inject", "silence@soon"]
+    given = ["emulate", "--arm-alone", "--address", free_address(), "--inject", "silence@soon"]
     assert main(given) == 2
     assert "--inject: 'soon' is no time. Write silence@2.5" in capsys.readouterr().err
 
