@@ -359,7 +359,7 @@ def page(rows: list[dict]) -> str:
         worst_force=max((row["force"] for row in stopped if row["injected"]), default=0.0),
         not_held=[row["fault"] for row in made if not is_held(row)],
         free=len(free),
-        false=[f"{row['key']}: {row['said'] or row['by']}" for row in free if row["by"]],
+        needless=[f"{row['key']}: {row['said'] or row['by']}" for row in free if row["by"]],
         busy=sum("beside other work" in row["key"] for row in free),
         noisy=sum("noise" in row["key"] for row in free),
     )
