@@ -377,3 +377,19 @@ def test_bodies_that_would_come_near_each_other_stop_it_while_the_arm_can_still_
         sent = layer.step(state(time, sent), None, time).q
     assert nearest(sent, 1.0)[0] >= limits.clearance
     assert nearest(sent, 1.0)[0] < limits.clearance + 2e-3, "it goes as far as it may"
+
+
+def test_a_measured_arm_that_touches_stops_it_though_its_targets_keep_away():
+    def nearest(q, within):
+        distance = 0.02 - 2.0 * (q[0] - START[0])
+        return (distance, "knife and holder") if distance < within else None
+
+    kinematics = EdgeKinematics(X_WB, X_TK, LENGTH)
+    layer = SafetyLayer(SafetyLimits(), kinematics, BOARD, START, PERIOD, nearest=nearest)
+    layer.arm(state(1.0, START))
+    # Slowly enough for the limits of measured speed.
+    for k, off in enumerate(np.linspace(0.0, 0.0105, 22), 1):
+        measured = [START[0] + off, *START[1:]]
+        stop = layer.step(state(1.0 + PERIOD * k, measured), START, 1.0 + PERIOD * k).stop
+        assert (stop is not None) == (off > 0.01), (off, stop)
+    assert stop.limit == "clearance" and "knife and holder" in stop.detail

@@ -205,7 +205,8 @@ def stopped_by(made: Slice) -> str:
     words = re.search(r"STOPPED: (\w+)", made.said)
     if words:
         return words[1]
-    for _, text in made.log:
+    # A slice that is done ends its program too; late packages leave that to the watchdog.
+    for _, text in made.log if made.code != 0 else ():
         for sign, name in (
             ("RTDE watchdog: no", "the controller's watchdog"),
             ("by the dashboard", "the supervisor"),
