@@ -391,5 +391,5 @@ def test_a_measured_arm_that_touches_stops_it_though_its_targets_keep_away():
     for k, off in enumerate(np.linspace(0.0, 0.0105, 22), 1):
         measured = [START[0] + off, *START[1:]]
         stop = layer.step(state(1.0 + PERIOD * k, measured), START, 1.0 + PERIOD * k).stop
-        assert (stop is not None) == (off > 0.01), (off, stop)
+        assert (stop is not None) == (off > 0.0099), (off, stop)
     assert stop.limit == "clearance" and "knife and holder" in stop.detail
