@@ -131,6 +131,12 @@ TOPICS: dict[str, tuple[Study, ...]] = {
             "5 min",
         ),
         Study(
+            "bands",
+            "calibration.bands_by_law",
+            "how often bands of predicted force hold, on benches of other laws",
+            "1 h",
+        ),
+        Study(
             "coverage",
             "calibration.coverage",
             "how often intervals of calibrations hold the truth",

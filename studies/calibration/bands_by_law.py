@@ -176,6 +176,8 @@ def _table(rows: Sequence[Row]) -> str:
     for law in dict.fromkeys(row.law for row in rows):
         for kind in KINDS:
             of = [row for row in rows if (row.law, row.kind) == (law, kind)]
+            if not of:
+                continue
             mean = {
                 name: float(np.mean([getattr(row, name) for row in of]))
                 for name in ("inside", "whole", "width", "score", "constant", "constant_inside")
