@@ -89,7 +89,7 @@ def test_the_watchdog_is_set_before_the_first_target_and_the_arm_follows(robot):
         ({"connected": False}, "link", False),
         ({"accepts": False}, "link", False),
         ({"call_time": 1.0}, "link", False),
-        ({"wrench": [0.0, 0.0, 60.0, 0.0, 0.0, 0.0]}, "force", True),
+        ({"wrench": [0.0, 0.0, 60.0, 0.0, 0.0, 0.0]}, "force_rate", True),
         ({"wrench": [np.nan] * 6}, "measurement", True),
         ({"payload": (2.0, 0.0, 0.0, 0.06)}, "payload", True),
     ],

@@ -64,7 +64,7 @@ class Supervisor(contextlib.AbstractContextManager["Supervisor"]):
         One at a time in a process; for calls that nothing else watches.
         """
         # Its timer needs no lock of Python. A terminal that stands must not keep it from the end.
-        with open(os.devnull, "w") as nowhere:
+        with open(os.devnull, "w", encoding="utf-8") as nowhere:
             faulthandler.dump_traceback_later(CALL_TIME, exit=True, file=nowhere)
             try:
                 yield
