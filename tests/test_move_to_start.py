@@ -123,6 +123,22 @@ def test_a_fault_on_the_way_stops_it(fault, said, robot, start):
     assert np.abs(robot.q - start).max() > 0.05, "it went on"
 
 
+@pytest.mark.parametrize("shown", [2.0, np.nan])
+def test_a_joint_that_is_shown_too_fast_stops_the_motion(shown, robot):
+    move, read = move_of(robot), robot.read
+    robot.read = lambda: read()._replace(qd=[0.0, shown, 0.0, 0.0, 0.0, 0.0])
+    assert "a joint moves faster" in move.execute()
+    assert robot.stopped.is_set()
+
+
+def test_an_arm_that_is_shown_below_the_board_stops_the_motion(robot, start):
+    move, read = move_of(robot), robot.read
+    low = (start + [0.0, 0.9, 0.0, 0.0, 0.0, 0.0]).tolist()
+    robot.read = lambda: read()._replace(q=low if "move" in robot.log else robot.q)
+    assert "mm too low" in move.execute()
+    assert robot.stopped.is_set()
+
+
 def test_an_operator_who_interrupts_it_stops_the_arm(robot, start):
     move, kicks = move_of(robot), []
 

@@ -172,12 +172,14 @@ class MoveToStart:
                 return f"the tool meets a torque: {torque:.3g} Nm, allowed {limits.torque:g}"
             if doubt is not None:
                 return f"{doubt.limit}: {doubt.detail}"
-            fastest = max(map(abs, state.qd))
-            if fastest > limits.measured_speed * self.speed + AT_REST:
-                return f"a joint moves at {fastest:.3g} rad/s, wanted {self.speed:.3g} at most"
+            most = limits.measured_speed * self.speed + AT_REST
+            # Written so that a NaN fails, as above.
+            if not all(abs(speed) <= most for speed in state.qd):
+                return f"a joint moves faster than {most:.3g} rad/s: {state.qd}"
             heel, tip, _ = kinematics.edge(state.q)
-            if min(heel[2], tip[2]) < floor:
-                return f"the edge is {1e3 * (floor - min(heel[2], tip[2])):.1f} mm too low"
+            lowest = min(heel[2], tip[2])
+            if not lowest >= floor:
+                return f"the edge is {1e3 * (floor - lowest):.1f} mm too low"
             off = max(abs(a - b) for a, b in zip(state.q, start, strict=True))
             if off < ARRIVED and max(map(abs, state.qd)) < AT_REST:
                 return None
