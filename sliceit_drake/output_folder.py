@@ -17,6 +17,7 @@ RESULTS = (
     "summary.json",
     "scenario.yaml",
     "robot.csv",
+    "retreat.csv",
     "slice.csv",
     "slice.yaml",
 )

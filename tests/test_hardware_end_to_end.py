@@ -203,4 +203,9 @@ def test_after_a_breach_of_force_the_knife_goes_back_if_the_operator_says_so(
     force = np.linalg.norm(trace[:, 7:], axis=1)
     assert 6.0 < force.max() < 7.0
     assert (force[-1] < 0.1) == ("retreat" in typed), force[-1]
+    log = tmp_path / "retreat.csv"
+    assert log.exists() == ("retreat" in typed)
+    if log.exists():
+        assert re.search("The knife is back.*program is stopped", printed, re.S), printed
+        assert log.read_text().count("\n") > 100
     assert status["runtime_state"] == "STOPPED" and status["safety_mode"] == "NORMAL"

@@ -6,6 +6,7 @@ import errno
 import io
 import json
 import os
+import signal
 import threading
 import time as clock
 from functools import partial
@@ -256,6 +257,23 @@ def test_with_a_full_disk_the_operator_reads_of_the_stop_and_has_the_log(
     assert printed.index("STOPPED: safety_status") < printed.index("NOT ALL IS WRITTEN")
     assert "DID NOT CONFIRM THAT ITS PROGRAM IS STOPPED (no answer)" in printed
     assert len((tmp_path / "robot.csv").read_text().splitlines()) > 50
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_while_the_record_is_written_does_not_lose_it(
+    number, robot, monkeypatch, capsys, tmp_path
+):
+    save = Run.save
+
+    def interrupted(*args, **kwargs):
+        os.kill(os.getpid(), number)
+        return save(*args, **kwargs)
+
+    monkeypatch.setattr(Run, "save", interrupted)
+    monkeypatch.setattr("sys.stdin", io.StringIO("slice\n"))
+    checked_run(robot, tmp_path, 0.2)
+    assert "Still writing the record." in capsys.readouterr().out
+    assert {"record.csv", "robot.csv", "summary.json"} <= {file.name for file in tmp_path.iterdir()}
 
 
 def test_a_run_that_is_interrupted_again_and_again_keeps_its_log(

@@ -14,6 +14,7 @@ until it meets the board, and back up. A height that is not the expected one end
 
 Writes to DIR what `sliceit simulate` writes, and
   robot.csv          what came from the robot and what was sent, in every cycle
+  retreat.csv        the same of a retreat
   slice.csv, .yaml   the slice record, for `sliceit records` and `sliceit diagnose`
 
 --robot names the file with your robot's payload, board height and limits. Copy hardware/ur5e.yaml.

@@ -100,11 +100,13 @@ class OperatedRobot:
             hardware = prepare_hardware_run(scenario, self.config, client, self.pace, meshcat)
             made = self.checked_run(hardware, directory, duration)
         if Retreat.is_offered_after(hardware):
-            self.retreat(hardware)
+            self.retreat(hardware, directory)
         return made
 
-    def retreat(self, hardware: HardwareRun) -> bool:
+    def retreat(self, hardware: HardwareRun, directory: Path) -> bool:
         """Connects anew and goes back on the last way after the operator's word.
+
+        Its log is retreat.csv in the directory, with the columns of robot.csv.
 
         Returns:
             False if the robot was not ready or stopped, or the operator did not confirm.
@@ -121,10 +123,13 @@ class OperatedRobot:
             )
             if not self.asks(RETREAT_WORD):
                 return False
-            problem = retreat.execute()
-            print(
-                f"STOPPED: {problem}" if problem else "The knife is back. Its program is stopped."
-            )
+            problem: str | None = "the retreat ended by an error"
+            try:
+                problem = retreat.execute()
+            finally:
+                print(f"STOPPED: {problem}" if problem else "The knife is back.")
+                print(_stopped_text(retreat.link), flush=True)
+                retreat.link.write_log(directory / "retreat.csv")
             return problem is None
 
     def move_to_start(self, scenario: Scenario) -> bool:

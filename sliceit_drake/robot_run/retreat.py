@@ -42,6 +42,7 @@ class Retreat:
         limits: What is allowed: those of the run, slower, and a little more than what is felt now.
         force: What is felt now, N.
         distance: How far the knife's faster end goes, m.
+        link: To the robot; its log is whole after `execute`.
     """
 
     def __init__(self, hardware: HardwareRun) -> None:
@@ -59,6 +60,13 @@ class Retreat:
             torque=min(50.0, torque + MORE_TORQUE),
         )
         self.distance = min(DISTANCE, float(self._distances[-1]))
+        edge = self._kinematics.edge(state.q)
+        # It may press into the board a little, and goes nowhere deeper.
+        floor = min(hardware.scenario.board.height, edge.heel[2], edge.tip[2])
+        self.link = RobotLink(
+            hardware.client, make_safety_layer(hardware.twin, self.limits, floor),
+            hardware.config.watchdog, hardware.pace,
+        )  # fmt: skip
 
     @staticmethod
     def is_offered_after(hardware: HardwareRun) -> bool:
@@ -92,14 +100,7 @@ class Retreat:
         Returns:
             Why it stopped early, or None.
         """
-        hardware = self.hardware
-        edge = self._kinematics.edge(hardware.client.read().q)
-        # It may press into the board a little, and goes nowhere deeper.
-        floor = min(hardware.scenario.board.height, edge.heel[2], edge.tip[2])
-        link = RobotLink(
-            hardware.client, make_safety_layer(hardware.twin, self.limits, floor),
-            hardware.config.watchdog, hardware.pace,
-        )  # fmt: skip
+        link = self.link
         link.start()
         reason = "the retreat ended by an error"
         try:
