@@ -10,6 +10,7 @@ import signal
 import threading
 import time as clock
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -257,6 +258,14 @@ def test_with_a_full_disk_the_operator_reads_of_the_stop_and_has_the_log(
     assert printed.index("STOPPED: safety_status") < printed.index("NOT ALL IS WRITTEN")
     assert "DID NOT CONFIRM THAT ITS PROGRAM IS STOPPED (no answer)" in printed
     assert len((tmp_path / "robot.csv").read_text().splitlines()) > 50
+
+
+def test_without_room_for_the_record_nothing_moves(robot, monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=5e6))
+    monkeypatch.setattr("sys.stdin", io.StringIO("slice\n"))
+    assert checked_run(robot, tmp_path / "new" / "run", 2.0) is None
+    assert "5 MB free" in capsys.readouterr().out
+    assert robot.sent == []
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])

@@ -2,6 +2,7 @@
 
 import dataclasses as dc
 import os
+import shutil
 import signal
 import sys
 import termios
@@ -39,6 +40,8 @@ WORD = "slice"
 MOVE_WORD = "move"
 TOUCH_WORD = "touch"
 RETREAT_WORD = "retreat"
+ROOM = 1e8
+"""Least free room on the disk, bytes."""
 LOOK = 2e-3
 """Pause between two looks at the connection while the operator is asked, s."""
 SILENCE = 0.5
@@ -214,7 +217,7 @@ class OperatedRobot:
         if not _report("Robot and plan", hardware.check_before()):
             return None
         duration = _run_duration(hardware, duration)
-        if not _report("Start", hardware.check_at_start()):
+        if not _report("Start", [*hardware.check_at_start(), _room(directory)]):
             return None
         print(plan_text(hardware, duration))
         if self.dry_run:
@@ -336,6 +339,17 @@ def _run_duration(hardware: HardwareRun, duration: float | None) -> float:
             fix=f"Give up to {longest:g}, or leave it out.",
         )
     return duration
+
+
+def _room(directory: Path) -> Check:
+    """Whether the disk has room for the record; what is above the directory need not exist yet."""
+    free = shutil.disk_usage(next(p for p in [directory, *directory.parents] if p.exists())).free
+    return Check(
+        "room for the record",
+        free >= ROOM,
+        f"{1e-6 * free:.0f} MB free at {directory}, wanted {1e-6 * ROOM:.0f}",
+        "Make room, or write elsewhere with --output.",
+    )
 
 
 def _slice(hardware: HardwareRun, duration: float, directory: Path) -> Run:
