@@ -10,6 +10,7 @@ import pytest
 from synthetic_records import COLUMNS, NOISE, ROWS, SPEEDS, VARIATION, record
 
 from sliceit_drake.diagnosis.evidence.columns import Sensitivities
+from sliceit_drake.diagnosis.evidence.effect_size import size_by_record, standardised_size
 from sliceit_drake.diagnosis.evidence.held_out import fitted_changes, held_out_gain
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem
 from sliceit_drake.diagnosis.evidence.noise_levels import ChannelNoise
@@ -133,6 +134,27 @@ def test_a_cause_in_the_air_is_found_where_the_law_is_wrong():
     strict = reach_verdict(LinearProblem(found), 60, rule=DecisionRule(air=30.0))
     why = {c.name: c.why for c in strict.causes}
     assert strict.kind == "unknown" and "a law as wrong as this" in why["rate"]
+
+
+@pytest.mark.parametrize(("slow", "white"), [(0.99, 0.1), (0.1, 0.99)], ids=["slow", "white"])
+def test_a_wave_is_as_large_as_over_the_noise_at_its_frequency(slow, white):
+    """The power of noise with an exponential autocovariance at 20 Hz, in closed form."""
+    found, wave = problem(3).found, 0.04
+    skin = [c.name for c in found.columns].index("skin")
+    for k, r in enumerate(found.records):
+        columns = r.columns.copy()
+        columns[:, 0, skin] = wave * np.sin(2.0 * np.pi * 20.0 * r.time)
+        found.records[k] = dc.replace(r, columns=columns)
+    noise = ChannelNoise(0.1 * slow, 0.1, 0.1 * white)
+    whole = LinearProblem(found, [noise], np.array([0.1]))
+    keep, turn = np.exp(-0.01 / noise.tau), 2.0 * np.pi * 20.0 * 0.01
+    power = noise.white**2 + noise.ar**2 * (1.0 - keep**2) / (
+        1.0 - 2.0 * keep * np.cos(turn) + keep**2
+    )
+    ones = np.ones((len(found.records), 1))
+    size = size_by_record(whole, [skin], ones)
+    assert size == pytest.approx(wave / np.sqrt(2.0 * power), rel=0.1)
+    assert size >= standardised_size(whole, [skin], ones)
 
 
 def test_what_goes_with_the_number_of_the_slice_alone_is_unknown():

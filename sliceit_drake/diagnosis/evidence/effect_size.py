@@ -8,7 +8,7 @@ from sliceit_drake.diagnosis.evidence.columns import CauseAtScan
 from sliceit_drake.diagnosis.evidence.linear import LinearProblem, Model, fit_shared, scaled_inverse
 from sliceit_drake.prediction.discrepancy import PARTS, PHASES, Sizes
 
-__all__ = ["OwnError", "standardised_size"]
+__all__ = ["OwnError", "size_by_record", "standardised_size"]
 
 ACTS, GREAT = 0.1, 99.0
 """An effect acts in a row and channel from this share of this percentile of its changes on: a few
@@ -132,9 +132,46 @@ def standardised_size(
         free.append((record.columns[:, :, base] / scale[:, :, None]).reshape(-1, len(base)))
     effect, X = np.concatenate(effects), np.concatenate(free)
     left = effect - X @ (scaled_inverse(X.T @ X) @ (X.T @ effect)) if base else effect
+    acts = _acts(effect)
+    return float(np.sqrt(np.mean(left[acts] ** 2))) if acts.any() else 0.0
+
+
+def size_by_record(
+    problem: LinearProblem, columns: Sequence[int], coefficients: np.ndarray
+) -> float:
+    """Size of an effect that differs from record to record: `standardised_size` over the noise, or
+    the same over the noise at the effect's own frequencies, whichever is more.
+
+    A wave of 20 Hz shows plainly under noise that wanders within a second and has more variance.
+    Whitened by the covariance of the noise, both have the same power at all frequencies.
+
+    Args:
+        problem: The records.
+        columns: Numbers of the effect's columns [n].
+        coefficients: Of the columns in each record [R, n].
+    """
+    own, base = list(columns), problem.base
+    gram = problem.moments.gram
+    square = np.einsum("ri,rij,rj->", coefficients, gram[np.ix_(range(len(gram)), own, own)],
+                       coefficients)  # fmt: skip
+    product = np.einsum("rij,rj->i", gram[np.ix_(range(len(gram)), base, own)], coefficients)
+    square -= product @ scaled_inverse(gram.sum(0)[np.ix_(base, base)]) @ product
+    noise = np.array([n.deviation for n in problem.noise])
+    effect = np.concatenate(
+        [
+            (r.columns[:, :, own] @ g / np.hypot(noise, problem.model_error(r))).ravel()
+            for r, g in zip(problem.found.records, coefficients, strict=True)
+        ]
+    )
+    rows = int(_acts(effect).sum())
+    whitened = float(np.sqrt(max(square, 0.0) / rows)) if rows else 0.0
+    return max(whitened, standardised_size(problem, columns, coefficients))
+
+
+def _acts(effect: np.ndarray) -> np.ndarray:
+    """Rows and channels in which an effect acts."""
     whole = np.abs(effect)
     changed = whole[whole > 1e-3 * whole.max(initial=1e-12)]
     if not changed.size:
-        return 0.0
-    acts = whole > ACTS * np.percentile(changed, GREAT)
-    return float(np.sqrt(np.mean(left[acts] ** 2)))
+        return np.zeros(len(whole), bool)
+    return np.asarray(whole > ACTS * np.percentile(changed, GREAT))

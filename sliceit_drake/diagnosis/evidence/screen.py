@@ -23,7 +23,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from sliceit_drake.diagnosis.evidence.columns import CauseAtScan, Column
-from sliceit_drake.diagnosis.evidence.effect_size import OwnError, standardised_size
+from sliceit_drake.diagnosis.evidence.effect_size import (
+    OwnError,
+    size_by_record,
+    standardised_size,
+)
 from sliceit_drake.diagnosis.evidence.linear import (
     PLAUSIBLE,
     LinearProblem,
@@ -392,7 +396,7 @@ def _evidence(
     )
     if out.score > 0.0:
         if out.per_record:
-            out.size = left = standardised_size(problem, columns, fits)
+            out.size = left = size_by_record(problem, columns, fits)
         else:
             wrong = OwnError(problem, problem.with_causes([*statistics.taken, *active]), sizes)
             out.size = standardised_size(problem, columns, value, wrong)
