@@ -45,7 +45,8 @@ include_patterns = [
     "models/*/README.md",
 ]
 exclude_patterns = [".*", "**/.*", "output"]
-myst_enable_extensions = ["dollarmath"]
+# "html_image": a picture of the given width, in a table.
+myst_enable_extensions = ["dollarmath", "html_image"]
 myst_heading_anchors = 3
 # A single backtick in a docstring is code, as in Markdown.
 default_role = "code"

@@ -11,6 +11,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+from sliceit_drake.configuration import ConfigurationError, did_you_mean
+
 if TYPE_CHECKING:
     from pydrake.multibody.parsing import Parser
 
@@ -18,6 +20,7 @@ __all__ = [
     "add_package_map",
     "file_or_resource",
     "here_or_shipped",
+    "known_yaml",
     "load_subclasses",
     "named_yaml",
     "resource_path",
@@ -96,6 +99,29 @@ def named_yaml(name: str | Path, folder: str) -> Path | None:
         return here_or_shipped(file)
     file = resource_path(folder) / f"{name}.yaml"
     return file if file.is_file() and file.parent == resource_path(folder) else None
+
+
+def known_yaml(name: str | Path, folder: str, unknown: str, field: str, otherwise: str) -> Path:
+    """As `named_yaml`, for a name that is given.
+
+    Args:
+        name, folder: See there.
+        unknown: What is wrong with a name that does not ship, up to the names that do.
+        field: Path of what names it.
+        otherwise: What to do where no name is alike.
+
+    Raises:
+        ConfigurationError: No file of that name ships.
+    """
+    file = named_yaml(name, folder)
+    if file is None:
+        names = shipped_names(folder)
+        raise ConfigurationError(
+            f"{unknown} {', '.join(names)}",
+            field=field,
+            fix=did_you_mean(str(name), names, otherwise),
+        )
+    return file
 
 
 def shipped_names(folder: str) -> list[str]:

@@ -1,5 +1,6 @@
 """How figures of the studies are made, styled and saved."""
 
+import argparse
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -13,6 +14,7 @@ __all__ = [
     "ORANGE",
     "PURPLE",
     "RED",
+    "add_figure_argument",
     "draw_boxes",
     "new_figure",
     "save_figure",
@@ -24,6 +26,14 @@ GUIDE_FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
 
 BLUE, ORANGE, GREEN, RED, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"
 """Colours of Okabe and Ito, which the colour-blind can tell apart."""
+
+
+def add_figure_argument(parser: argparse.ArgumentParser, name: str) -> None:
+    """Adds --output, the picture of a guide, by default docs/figures/NAME.png."""
+    file = Path("docs/figures") / f"{name}.png"
+    parser.add_argument(
+        "--output", metavar="FILE", type=Path, default=file, help=f"figure; default {file}"
+    )
 
 
 def new_figure(width: float, height: float) -> Figure:

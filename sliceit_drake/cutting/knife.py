@@ -6,14 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sliceit_drake.configuration import (
-    ConfigurationError,
-    choice,
-    did_you_mean,
-    load_yaml,
-    quantity,
-)
-from sliceit_drake.resources import named_yaml, shipped_names
+from sliceit_drake.configuration import ConfigurationError, choice, load_yaml, quantity
+from sliceit_drake.resources import known_yaml
 
 __all__ = [
     "STEEL_DENSITY",
@@ -181,18 +175,9 @@ def load_knife(name: str | Path, field: str = "knife_name") -> NamedKnife:
     Raises:
         ConfigurationError: Naming file, field and fix.
     """
-    file = named_yaml(name, FOLDER)
-    if file is None:
-        raise ConfigurationError(
-            f"there is no knife {str(name)!r}; there are {', '.join(shipped_names(FOLDER))}",
-            field=field,
-            fix=did_you_mean(
-                str(name),
-                shipped_names(FOLDER),
-                "Name one of them, or give a YAML file (docs/reference/foods.md).",
-            ),
-        )
-    return load_yaml(NamedKnife, file)
+    unknown = f"there is no knife {str(name)!r}; there are"
+    otherwise = "Name one of them, or give a YAML file (docs/reference/foods.md)."
+    return load_yaml(NamedKnife, known_yaml(name, FOLDER, unknown, field, otherwise))
 
 
 def section_distance(knife: Knife, y: np.ndarray, height: np.ndarray) -> np.ndarray:

@@ -53,9 +53,9 @@ def encode_frame(kind: int, payload: bytes = b"") -> bytes:
     return _HEADER.pack(size, kind) + payload
 
 
-def encode_text(message: str, level: int, source: str = "emulator") -> bytes:
+def encode_text(message: str, level: int) -> bytes:
     """A text message to a client; its level is a `modes.MessageLevel`."""
-    text, origin = (s.encode("ascii", "replace")[:255] for s in (message, source))
+    text, origin = message.encode("ascii", "replace")[:255], b"emulator"
     payload = bytes([len(text)]) + text + bytes([len(origin)]) + origin + bytes([level])
     return encode_frame(PackageType.TEXT, payload)
 

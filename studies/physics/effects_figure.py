@@ -31,7 +31,7 @@ from sliceit_drake.cutting.foods.shapes import Box
 from sliceit_drake.cutting.knife import Knife
 from sliceit_drake.cutting.model import CuttingModel, Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, Motion, MotionPlan, Retract
-from studies.figures import BLUE, new_figure, save_figure
+from studies.figures import BLUE, add_figure_argument, new_figure, save_figure
 
 WIDTH, HEIGHT, DEPTH, CLEARANCE, PERIOD, HOLD, SPEED = 0.024, 0.02, 0.014, 1e-3, 2e-3, 0.5, 0.02
 BASE, CHANGED, DRAW = "0.55", BLUE, 2.0
@@ -90,13 +90,7 @@ def draw(axes: Axes, command: np.ndarray, cut: BatchSlice, axis: int, style: dic
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of the study."""
-    parser.add_argument(
-        "--output",
-        metavar="FILE",
-        type=Path,
-        default=Path("docs/figures/effects.png"),
-        help="figure; default docs/figures/effects.png",
-    )
+    add_figure_argument(parser, "effects")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -18,7 +18,7 @@ from sliceit_drake.cutting.mesh.cut_geometry import make_cut_geometry
 from sliceit_drake.cutting.mesh.split import CutPlane
 from sliceit_drake.cutting.mesh.tetrahedra import TetrahedralMesh
 from sliceit_drake.cutting.model import Numerics, prepare_cut
-from studies.figures import ORANGE, new_figure, save_figure
+from studies.figures import ORANGE, add_figure_argument, new_figure, save_figure
 from studies.physics.neo_hookean import small_strain_stiffness
 
 BODIES: dict[str, Box | Cylinder | Ellipsoid] = {
@@ -84,13 +84,7 @@ def random_planes(mesh: TetrahedralMesh, count: int, seed: int) -> list[CutPlane
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of the study."""
     parser.add_argument("--planes", type=int, default=1000, help="random planes in total")
-    parser.add_argument(
-        "--output",
-        metavar="FILE",
-        type=Path,
-        default=Path("docs/figures/split_step_limit.png"),
-        help="figure; default docs/figures/split_step_limit.png",
-    )
+    add_figure_argument(parser, "split_step_limit")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -7,7 +7,6 @@ Needs the extra "hardware".
 
 import argparse
 from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 
@@ -18,11 +17,10 @@ from sliceit_drake.hardware.hardware_config import load_hardware_config
 from sliceit_drake.hardware.ur_client import UrClient
 from sliceit_drake.resources import resource_path
 from sliceit_drake.robot_run.hardware_run import prepare_hardware_run
-from studies.figures import BLUE, ORANGE, new_figure, save_figure, tidy
+from studies.figures import BLUE, ORANGE, add_figure_argument, new_figure, save_figure, tidy
 
 __all__ = ["add_arguments", "run"]
 
-FIGURE = Path("docs/figures/emulator.png")
 PACE = 0.1
 """Controller seconds in a second."""
 CLIENT_PACE = 0.02
@@ -33,9 +31,7 @@ PATIENT = """{serial: "", watchdog: 10.0,
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of the study."""
-    parser.add_argument(
-        "--output", metavar="FILE", type=Path, default=FIGURE, help=f"default {FIGURE}"
-    )
+    add_figure_argument(parser, "emulator")
     parser.add_argument(
         "--address", default="127.0.0.9", help="of the emulator (default 127.0.0.9)"
     )

@@ -4,14 +4,14 @@ import copy
 import dataclasses as dc
 from pathlib import Path
 
-from sliceit_drake.configuration import ConfigurationError, did_you_mean, load_yaml, quantity
+from sliceit_drake.configuration import load_yaml, quantity
 from sliceit_drake.cutting.bench_errors import BenchErrors
 from sliceit_drake.cutting.foods.distribution import ParameterDistribution
 from sliceit_drake.cutting.foods.effects import Compliance
 from sliceit_drake.cutting.foods.food import Food
 from sliceit_drake.cutting.foods.spring_food import SpringFood
 from sliceit_drake.cutting.knife import Knife
-from sliceit_drake.resources import named_yaml, shipped_names
+from sliceit_drake.resources import known_yaml
 
 __all__ = ["CalibratedFood", "load_calibrated_food"]
 
@@ -73,17 +73,9 @@ def load_calibrated_food(name: str | Path) -> CalibratedFood:
     Raises:
         ConfigurationError: Naming file, field and fix.
     """
-    file = named_yaml(name, FOLDER)
-    if file is None:
-        raise ConfigurationError(
-            f"{name!r} is not calibrated; there are {', '.join(shipped_names(FOLDER))}",
-            field="calibration",
-            fix=did_you_mean(
-                str(name),
-                shipped_names(FOLDER),
-                "Name one of them, or give the food.yaml of a calibration.",
-            ),
-        )
+    unknown = f"{name!r} is not calibrated; there are"
+    otherwise = "Name one of them, or give the food.yaml of a calibration."
+    file = known_yaml(name, FOLDER, unknown, "calibration", otherwise)
     food: CalibratedFood = load_yaml(CalibratedFood, file)
     food.food.look_beside(file)
     return food
