@@ -19,6 +19,7 @@ from sliceit_drake.learning.environment import SlicingEnv  # noqa: E402
 from sliceit_drake.learning.reward import (  # noqa: E402
     TERMS,
     RewardConfig,
+    failed_potential,
     reward_potential,
     reward_terms,
     reward_weights,
@@ -316,9 +317,12 @@ def test_the_term_of_the_jerk_ends_at_one():
 
 def test_the_potential_tells_what_is_left_and_pays_no_policy():
     config = RewardConfig(way=15.0, hold=5.0)
-    assert reward_potential(config, 0.03, 0.0) == pytest.approx(-12.5)
-    assert reward_potential(config, 1e-4, 0.5) == pytest.approx(-2.525)
-    assert reward_potential(config, -1e-4, 1.1) == 0.0
+    assert reward_potential(config, 0.1, 0.0) == 0.0
+    assert reward_potential(config, 0.04, 0.0) == pytest.approx(15.0)
+    assert reward_potential(config, 1e-4, 0.5) == pytest.approx(27.475)
+    assert reward_potential(config, -1e-4, 1.1) == 30.0
+    # A failure costs what was left.
+    assert failed_potential(config, 1e-4, 0.5) == pytest.approx(-2.525)
     # What is paid on the way depends on where it begins and ends alone.
     env = SlicingEnv(task_of("spring"))
     config = env.task.reward
@@ -330,6 +334,14 @@ def test_the_potential_tells_what_is_left_and_pays_no_policy():
             paid += config.discount**k * info["shaping"]
         after = config.discount ** len(actions) * reward_potential(config, info["height"], 0.0)
         assert paid == pytest.approx(after - potential, abs=1e-5)
+
+
+@pytest.mark.parametrize("at_goal", [0.0, 0.5, 1.1])
+@pytest.mark.parametrize("height", [-1e-3, 0.0, 1e-3, 0.03, 0.1, 0.2])
+def test_standing_still_pays_nothing(height, at_goal):
+    config = RewardConfig()
+    potential = reward_potential(config, height, at_goal)
+    assert config.discount * potential - potential <= 0.0
 
 
 def test_weights_are_ratios():

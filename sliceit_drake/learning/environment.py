@@ -20,7 +20,13 @@ from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.agent_station import AgentStation
 from sliceit_drake.diagrams.live_view import make_meshcat, viewing_instructions
 from sliceit_drake.diagrams.outputs.animation import NEEDED, Film, can_draw
-from sliceit_drake.learning.reward import TERMS, reward_potential, reward_terms, reward_weights
+from sliceit_drake.learning.reward import (
+    TERMS,
+    failed_potential,
+    reward_potential,
+    reward_terms,
+    reward_weights,
+)
 from sliceit_drake.learning.task import TaskConfig, make_agent_station
 
 __all__ = ["SlicingEnv"]
@@ -176,7 +182,7 @@ class SlicingEnv(gymnasium.Env):
         shift = RigidTransform(RotationMatrix.MakeYRotation(turn), [along, 0.0, -up])
         station.begin(simulator, rng, shift)
         self._decisions = 0
-        self._potential = self._calc_potential(float(self._output("error")[1]))
+        self._potential = reward_potential(self.task.reward, *self._come())
         return self._observation(), {"food": food}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -206,14 +212,16 @@ class SlicingEnv(gymnasium.Env):
         error, wrench = self._output("error"), self._output("wrench")
         terms = reward_terms(config, float(error[1]), wrench[:2], observation[JERK])
         reward = float(reward_weights(config, self.progress) @ terms)
-        before, self._potential = self._potential, self._calc_potential(float(error[1]))
-        shaping = config.discount * self._potential - before
-        reward += shaping
         end = end or self._end(context.get_time(), error)
+        before, self._potential = self._potential, reward_potential(config, *self._come())
         if end == "goal":
+            self._potential = 0.0
             reward += config.goal
         elif end:
+            self._potential = failed_potential(config, *self._come())
             reward += config.collision
+        shaping = config.discount * self._potential - before
+        reward += shaping
         food, board = self._output("food_wrench_vector"), self._output("board_wrench_vector")
         info: dict[str, Any] = {
             "reward_terms": dict(zip(TERMS, terms.tolist(), strict=True)),
@@ -250,9 +258,10 @@ class SlicingEnv(gymnasium.Env):
     def _observation(self) -> np.ndarray:
         return self._output("observation").astype(np.float32)
 
-    def _calc_potential(self, height: float) -> float:
+    def _come(self) -> tuple[float, float]:
+        """Height over the board, m, and fraction of the decisions at the goal."""
         share = float(self._output("at_goal")[0]) / max(self.task.agent.goal_decisions, 1)
-        return reward_potential(self.task.reward, height, share)
+        return float(self._output("error")[1]), share
 
     def _end(self, time: float, error: np.ndarray) -> str:
         """Why the episode ends, or nothing."""
