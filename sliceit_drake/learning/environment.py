@@ -46,8 +46,8 @@ class SlicingEnv(gymnasium.Env):
     a collision (force, torque or shaking), workspace, guard or time. A guard of the simulation that
     ends an episode (an inverted element, say) is `guard_error`, its kind.
 
-    A seed given to `reset` fixes all that follows. The variants of the foods come from a seed of
-    their own, the same in every environment of a task.
+    A seed given to `reset` fixes all that follows. The stations and the variants of the foods come
+    from a seed of their own, the same in every environment of a task.
 
     A copy, or what comes out of a pickle, is at the same moment of the same episode: it has
     repeated the actions. The mode "human" shows the station in Meshcat, in real time at most, and
@@ -90,13 +90,13 @@ class SlicingEnv(gymnasium.Env):
         size = self.task.agent.observation_size()
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float32)
-        self._built: dict[str, tuple[AgentStation, Simulator]] = {}
+        self._built: dict[tuple[str, int], tuple[AgentStation, Simulator]] = {}
         self._current: tuple[AgentStation, Simulator] | None = None
         self._decisions = 0
         self._potential = 0.0
         self._moment: dict[str, Any] = {}
         self._ended = False
-        self._pictures: dict[str, Iterator[np.ndarray]] = {}
+        self._pictures: dict[AgentStation, Iterator[np.ndarray]] = {}
         self._meshcat = make_meshcat() if render_mode == "human" else None
         if self._meshcat is not None:
             print(viewing_instructions(self._meshcat.port()), flush=True)
@@ -123,12 +123,11 @@ class SlicingEnv(gymnasium.Env):
         if self.render_mode != "rgb_array":
             return None
         station, simulator = self._current
-        food = self._moment["food"]
-        if food not in self._pictures:
+        if station not in self._pictures:
             film, context = Film(station.station, 1.0), simulator.get_context()
             film.frame(context)
-            self._pictures[food] = film.draw(iter(lambda: film.frame(context), None))
-        return next(self._pictures[food])
+            self._pictures[station] = film.draw(iter(lambda: film.frame(context), None))
+        return next(self._pictures[station])
 
     def moment(self) -> dict[str, Any]:
         """Where the episode is, for `return_to`, as plain data: how it began, the actions since.
@@ -174,11 +173,11 @@ class SlicingEnv(gymnasium.Env):
         up = float(rng.uniform(low, high))
         along = float(rng.uniform(-1.0, 1.0)) * randomization.offset
         turn = float(rng.uniform(-1.0, 1.0)) * randomization.tilt
+        which = int(rng.integers(randomization.stations))
         food = (options or {}).get("food", food)
         if food not in foods:
             raise ValueError(f"the task has no food {food!r}; it has {', '.join(foods)}.")
-        self._moment["food"] = food
-        self._current = station, simulator = self._station(food)
+        self._current = station, simulator = self._station(food, which)
         shift = RigidTransform(RotationMatrix.MakeYRotation(turn), [along, 0.0, -up])
         station.begin(simulator, rng, shift)
         self._decisions = 0
@@ -239,15 +238,15 @@ class SlicingEnv(gymnasium.Env):
             info["is_success"] = end == "goal"
         return observation, reward, bool(end), truncated, info
 
-    def _station(self, food: str) -> tuple[AgentStation, Simulator]:
-        if food not in self._built:
-            rng = np.random.default_rng([VARIANT_SEED, self.task.foods.index(food)])
-            station = make_agent_station(self.task, food, rng, self._meshcat)
+    def _station(self, food: str, which: int) -> tuple[AgentStation, Simulator]:
+        if (food, which) not in self._built:
+            rng = np.random.default_rng([VARIANT_SEED, self.task.foods.index(food), which])
+            station = make_agent_station(self.task, food, rng, self._meshcat, which)
             simulator = Simulator(station)
             if self.render_mode == "human":
                 simulator.set_target_realtime_rate(1.0)
-            self._built[food] = station, simulator
-        return self._built[food]
+            self._built[food, which] = station, simulator
+        return self._built[food, which]
 
     def _output(self, port: str) -> Any:
         """Value of an output port of the station."""

@@ -99,8 +99,8 @@ class AgentConfig:
     goal_decisions: int = quantity(10, "", low=0, high=1000)
     """Decisions within the goal, after which the slice ends."""
     goal_lost: float = quantity(2e-3, "m", low=0.0, high=0.1)
-    """Height over the board above which they are counted anew. Up to it the count stands still: where
-    a draw turns round the edge rises by some tenths of a millimetre from a food that is cut."""
+    """Height over the board above which they are counted anew. Up to it the count stands still: the
+    edge rises by some tenths of a millimetre where a draw turns round."""
     lift_speed: float = quantity(0.05, "m/s", low=1e-3, high=0.5)
     """Speed of the target upwards once the slice has ended."""
 
