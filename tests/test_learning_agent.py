@@ -423,6 +423,16 @@ def test_another_seed_gives_another_policy(tmp_path, one_process):
     assert one != other
 
 
+def test_stable_baselines3_loads_the_policy_that_is_exported(tmp_path, one_process):
+    config = training_of(steps=60)
+    train(config, tmp_path)
+    model = SAC.load(tmp_path / training.MODEL, device="cpu")
+    decide = load_network(dc.replace(config.task.agent, network=str(tmp_path / training.POLICY)))
+    observation = np.random.default_rng(0).normal(size=SIZE).astype(np.float32)
+    expected, _ = model.predict(observation, deterministic=True)
+    assert decide(observation) == pytest.approx(expected, abs=1e-6)
+
+
 def test_a_stop_at_the_last_step_is_the_end(tmp_path, one_process):
     outcome = train(training_of(steps=30, warm_up=20), tmp_path, is_stopped=after(30))
     assert outcome.steps == 30

@@ -34,6 +34,7 @@ from sliceit_drake.systems.agent import ERROR, observation_names
 __all__ = ["CHECKPOINT", "Outcome", "make_model", "train", "value_limit"]
 
 CHECKPOINT, EPISODES, VALIDATION = "checkpoint.pt", "episodes.jsonl", "validation.jsonl"
+MODEL = "model.zip"
 VALIDATION_SEED = 1_000_000
 """Of the first validation slice: episodes of a training follow from its own seed."""
 GUARD_SHARE = 1e-3
@@ -78,9 +79,10 @@ def train(
 
     Args:
         config: Training; of a run that goes on, that which it was begun with.
-        output: Folder for checkpoint, training.yaml, TensorBoard, policy.onnx, and a line for each
-            slice in episodes.jsonl and for each validation in validation.jsonl. A return is what
-            is trained: discounted, the potential's part included.
+        output: Folder for checkpoint, training.yaml, TensorBoard, policy.onnx, model.zip (for
+            `stable_baselines3.SAC.load`), and a line for each slice in episodes.jsonl and for each
+            validation in validation.jsonl. A return is what is trained: discounted, the
+            potential's part included.
         progress: Called with the steps so far and a line about the last episodes.
         is_stopped: Asked at each decision whether to end with a checkpoint there.
 
@@ -126,6 +128,8 @@ def train(
             if callback.best_actor is not None:
                 model.actor.load_state_dict(callback.best_actor)
             export_policy(model.actor, config.task.agent, output / POLICY)
+            # For `stable_baselines3.SAC.load`, which knows nothing of these.
+            model.save(output / MODEL, exclude=["value_limit", "running"])
         summary = json.dumps(dc.asdict(outcome), indent=2) + "\n"
         (output / "summary.json").write_text(summary, encoding="utf-8")
         return outcome
