@@ -14,6 +14,7 @@ from sliceit_drake.configuration import ConfigurationError, choice, quantity
 
 __all__ = [
     "HEIGHT",
+    "REACH",
     "TERMS",
     "RewardConfig",
     "failed_potential",

@@ -31,7 +31,7 @@ from sliceit_drake.learning.task import TaskConfig, check_task
 from sliceit_drake.learning.training_config import CONFIGURATION, POLICY, TrainingConfig
 from sliceit_drake.systems.agent import ERROR, observation_names
 
-__all__ = ["CHECKPOINT", "Outcome", "make_model", "train", "value_limit"]
+__all__ = ["CHECKPOINT", "Outcome", "make_model", "train", "validate", "value_limit"]
 
 CHECKPOINT, EPISODES, VALIDATION = "checkpoint.pt", "episodes.jsonl", "validation.jsonl"
 MODEL = "model.zip"
