@@ -8,7 +8,16 @@ import pytest
 from scipy import stats
 
 from sliceit_drake.systems.agent import ACTIONS, AgentConfig, observation_names
-from studies.learning.fronts import KINDS, interval, over_rule, split, strategies, summarise
+from studies.learning.fronts import (
+    KINDS,
+    cells,
+    comparisons,
+    interval,
+    over_rule,
+    split,
+    strategies,
+    summarise,
+)
 from studies.learning.rules import Rule, uniform, with_draw
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -90,13 +99,18 @@ def test_policies_and_not_slices_are_the_unit_of_an_interval():
     assert interval(np.array([4.0])) == (4.0, 4.0, 4.0)
 
 
-def test_the_page_has_all_that_cuts_on_the_same_slices():
-    file = ROOT / "docs/results/learning_fronts.jsonl"
-    rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+def test_the_page_is_that_of_the_slices():
+    results = ROOT / "docs/results"
+    lines = (results / "learning_fronts.jsonl").read_text(encoding="utf-8").splitlines()
+    rows = [json.loads(line) for line in lines]
     names = strategies()
     assert {split(name)[0] for name in names} == set(KINDS)
     slices = {name: set() for name in names}
     for row in rows:
         slices[row["policy"]].add((row["world"], row["food"], row["slice"], row["seed"]))
+    # All cut the same.
     assert len({frozenset(each) for each in slices.values()}) == 1
     assert len(rows) == sum(map(len, slices.values()))
+    page, points = (results / "learning_fronts.md").read_text(encoding="utf-8"), summarise(rows)
+    for shown in (*map(cells, points), *comparisons(points)):
+        assert f"| {' | '.join(shown)} |" in page

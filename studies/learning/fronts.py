@@ -31,7 +31,19 @@ from studies.figures import BLUE, GREEN, ORANGE, PURPLE, RED, new_figure, save_f
 from studies.learning.rules import TUNED, Rule, uniform, with_draw
 from studies.pages import publish, render_and_store
 
-__all__ = ["add_arguments", "cut", "run", "strategies", "summarise"]
+__all__ = [
+    "KINDS",
+    "add_arguments",
+    "cells",
+    "comparisons",
+    "cut",
+    "interval",
+    "over_rule",
+    "run",
+    "split",
+    "strategies",
+    "summarise",
+]
 
 SEEDS = range(5)
 METRICS = {"median_force": "median force", "peak_force": "peak", "board_peak": "board"}
