@@ -19,6 +19,7 @@ from tqdm import tqdm
 from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
 from sliceit_drake.learning.evaluation import SliceMetrics, cut_slice
 from sliceit_drake.learning.task import TaskConfig, station_scenario
+from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig
 from studies.learning.rules import Rule
 
 __all__ = ["add_arguments", "run", "worth"]
@@ -58,7 +59,8 @@ def run(options: argparse.Namespace) -> int:
             row = json.loads(line)
             known[tuple(row["rule"])] = row["worth"]
     options.output.parent.mkdir(parents=True, exist_ok=True)
-    task = TaskConfig()
+    # Without noise a candidate is worth the same each time.
+    task = TaskConfig(sensor=WrenchSensorConfig())
     foods = {name: load_calibrated_food(name) for name in task.foods}
     bar = tqdm(total=MEMBERS * (options.generations + 1), desc="candidates")
 
