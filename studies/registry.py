@@ -195,6 +195,13 @@ TOPICS: dict[str, tuple[Study, ...]] = {
         Study(
             "slicing", "learning.comparison", "policies of both simulators in unseen worlds", "5 s"
         ),
+        Study(
+            "fronts",
+            "learning.fronts",
+            "force against time of policies, rules and chance",
+            "30 min",
+        ),
+        Study("tune_rule", "learning.tune_rule", "tunes the rule of `fronts`", "10 min"),
         Study("faster_draws", "learning.faster_draws", "what faster draws bring", "5 s"),
         Study(
             "unfinished_slices",

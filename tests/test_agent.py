@@ -291,15 +291,23 @@ def test_a_slice_ends_after_more_than_so_many_decisions_at_the_goal_and_the_knif
     assert len(times) == 4
 
 
-def test_decisions_at_the_goal_count_only_in_a_row():
+@pytest.mark.parametrize(("risen", "counts"), [(0.007, (1, 2, 0, 1, 2)), (5e-4, (1, 2, 2, 3, 3))])
+def test_decisions_at_the_goal_count_anew_after_a_lift_and_not_where_a_draw_turns(risen, counts):
     def place(time):
-        return (0.0, 0.03 if 0.075 < time < 0.125 else 0.037, 0.0)
+        return (0.0, 0.037 - risen if 0.075 < time < 0.125 else 0.037, 0.0)
 
     simulator, agent = agent_of(place, AgentConfig(goal_decisions=2))
-    for k, count in enumerate((1, 2, 0, 1, 2)):
+    for k, count in enumerate(counts):
         simulator.AdvanceTo(k * T + 0.01)
         assert out(simulator, agent, "at_goal") == [count]
         assert observed(simulator, agent)["at_goal"] == 0.5 * count
+
+
+def test_decisions_at_the_goal_count_anew_beside_it():
+    simulator, agent = agent_of(lambda time: (0.05 if 0.075 < time < 0.125 else 0.0, 0.037, 0.0))
+    for k, count in enumerate((1, 2, 0, 1)):
+        simulator.AdvanceTo(k * T + 0.01)
+        assert out(simulator, agent, "at_goal") == [count]
 
 
 @pytest.mark.parametrize(("height", "near"), [(0.03, 1.0), (1e-3, 0.5), (-1e-4, -0.05)])

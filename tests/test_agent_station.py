@@ -171,7 +171,7 @@ def test_randomize_is_made_by_the_seed_and_by_nothing_before(simulator):
         simulator=simulator,
         foods=["cucumber"],
         refinement=0.5,
-        randomization=RandomizationConfig(variants=6 if simulator == "cutting" else 1),
+        randomization=RandomizationConfig(variants=6 if simulator == "cutting" else 1, stations=1),
     )
     diagram = make_agent_station(task, "cucumber", np.random.default_rng(0))
     context = diagram.CreateDefaultContext()

@@ -285,6 +285,7 @@ READ_ONLY = {
         python -m studies endurance --minutes 60 --output docs/results/endurance.md
         python -m studies faults --output docs/results
         python -m studies faster_draws docs/results/slicing_evaluation.jsonl docs/results/faster_draws.jsonl --output docs/results/learning.md
+        python -m studies fronts --slices 2 --slices-file docs/results/learning_fronts.jsonl --output docs/results
         python -m studies first_run --json docs/results/benchmarks/first_run.json
         python -m studies foods_page --cut --output docs/reference/foods.md
         python -m studies foods_page --hold --output docs/reference/foods.md
@@ -300,6 +301,7 @@ READ_ONLY = {
         python -m studies bench_figures
         python -m studies station_speed --repeat 20 --before docs/results/data/before/station_speed.json --json docs/results/benchmarks/station_speed.json --output docs/results/speed.md
         python -m studies station_speed --json docs/results/benchmarks/station_speed.json
+        python -m studies tune_rule --output output/tune_rule.jsonl
         python -m studies unfinished_slices docs/results/slicing_evaluation.jsonl --output docs/results/learning.md
         """,  # noqa: E501
 }

@@ -348,7 +348,7 @@ def test_no_slice_gets_more_than_what_is_left_to_get():
     observations[2, names.index("error_z")] = -0.01
     observations[2, names.index("at_goal")] = 1.1
     found = training.value_limit(reward)(observations).ravel()
-    assert found.tolist() == pytest.approx([15.0 + 5.0 + 7.5, 15.0 + 1.0, 15.0])
+    assert found.tolist() == pytest.approx([15.0 - 17.5, 15.0 - 29.0, 15.0 - 30.0])
     for row, limit in zip(observations.tolist(), found.tolist(), strict=True):
         height, count = 0.06 * row[names.index("error_z")], row[names.index("at_goal")]
         assert limit == pytest.approx(reward.goal - reward_potential(reward, height, count))
@@ -368,6 +368,7 @@ def training_of(**values):
         decisions=15,
     )
     settings = {"steps": 120, "warm_up": 20, "batch": 16, "layers": [16], "seed": 3}
+    settings |= {"validation_interval": 25, "validation_slices": 1}
     return TrainingConfig(task=task, **(settings | values))
 
 
@@ -383,19 +384,17 @@ def after(decisions):
     return lambda: next(count) >= decisions
 
 
-def lines(folder):
-    return [json.loads(line) for line in (folder / training.EPISODES).read_text().splitlines()]
+def lines(folder, name=training.EPISODES):
+    return [json.loads(line) for line in (folder / name).read_text().splitlines()]
 
 
 @pytest.mark.parametrize("environments", [1, 2, 3])
-def test_a_training_that_was_stopped_goes_on_as_if_it_had_not(
-    environments, tmp_path, one_process, monkeypatch
-):
-    # So few that a policy is chosen before the stop and compared with those after it.
-    monkeypatch.setattr(training, "SELECTION", 3)
+def test_a_training_that_was_stopped_goes_on_as_if_it_had_not(environments, tmp_path, one_process):
     config = training_of(checkpoint_interval=25, environments=environments)
     straight = train(config, tmp_path / "straight")
-    assert straight.best_return is not None
+    steps = [line["steps"] for line in lines(tmp_path / "straight", training.VALIDATION)]
+    # A policy is validated before the stop, and compared with those after it.
+    assert len(steps) >= 4 and steps[0] < 50 and steps[-1] == 120
     # In the midst of a slice.
     first = train(config, tmp_path / "halves", is_stopped=after(7))
     assert first.episodes == 0 and first.steps == 7 * environments
@@ -404,12 +403,14 @@ def test_a_training_that_was_stopped_goes_on_as_if_it_had_not(
     assert 50 <= half.steps < 50 + environments
     assert not (tmp_path / "halves" / training.POLICY).exists()
     # What was logged after the checkpoint is dropped.
-    with (tmp_path / "halves" / training.EPISODES).open("a") as file:
-        file.write('{"steps": 99}\n')
+    for name in (training.EPISODES, training.VALIDATION):
+        with (tmp_path / "halves" / name).open("a") as file:
+            file.write('{"steps": 99}\n')
     whole = train(config, tmp_path / "halves")
     policies = [(tmp_path / name / training.POLICY).read_bytes() for name in ("straight", "halves")]
     assert policies[0] == policies[1]
-    assert lines(tmp_path / "straight") == lines(tmp_path / "halves")
+    for name in (training.EPISODES, training.VALIDATION):
+        assert lines(tmp_path / "straight", name) == lines(tmp_path / "halves", name)
     assert dc.replace(straight, wall_time=0.0) == dc.replace(whole, wall_time=0.0)
     assert straight.steps == 120 and straight.failed is None
     assert straight.episodes == environments * (120 // environments // 15)
@@ -420,6 +421,16 @@ def test_another_seed_gives_another_policy(tmp_path, one_process):
         train(training_of(seed=seed, steps=40), tmp_path / str(seed))
     one, other = ((tmp_path / str(seed) / training.POLICY).read_bytes() for seed in (3, 4))
     assert one != other
+
+
+def test_stable_baselines3_loads_the_policy_that_is_exported(tmp_path, one_process):
+    config = training_of(steps=60)
+    train(config, tmp_path)
+    model = SAC.load(tmp_path / training.MODEL, device="cpu")
+    decide = load_network(dc.replace(config.task.agent, network=str(tmp_path / training.POLICY)))
+    observation = np.random.default_rng(0).normal(size=SIZE).astype(np.float32)
+    expected, _ = model.predict(observation, deterministic=True)
+    assert decide(observation) == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_stop_at_the_last_step_is_the_end(tmp_path, one_process):
@@ -531,51 +542,73 @@ def test_one_guard_in_a_thousand_episodes_may_be(tmp_path, episodes, failed):
     assert (watch.outcome(1.0).failed is not None) == failed
 
 
-class Episodes:
-    """Slices of one decision, told to a training's watch; the actor's weights are their number."""
-
-    def __init__(self, output):
-        config = training_of()
-        config.task.reward = RewardConfig()
-        self.model = training.make_model(config, OverlapVecEnv(DummyVecEnv([Still])))
-        self.model.set_logger(Logger(None, []))
-        self.watch = training._Watch(config, output, "", None, None)
-        self.watch.init_callback(self.model)
-
-    def cut(self, returns):
-        for number, value in enumerate(returns, 1):
-            with torch.no_grad():
-                self.model.actor.mu.bias.fill_(float(number))
-            self.watch.num_timesteps = 10 * number
-            info = {"end": "goal", "force": 1.0, "cut_progress": 1.0, "reward_terms": {}}
-            self.watch.locals = {"infos": [info], "rewards": [value], "dones": [True]}
-            self.watch._on_step()
-        return self.watch.outcome(1.0)
+def watch_of(output, config):
+    """A training's watch of a model that has learned nothing."""
+    model = training.make_model(config, OverlapVecEnv(DummyVecEnv([Still])))
+    model.set_logger(Logger(None, []))
+    watch = training._Watch(config, output, "", None, lambda: False)
+    watch.init_callback(model)
+    return watch
 
 
-def test_the_policy_is_that_after_the_best_slices_in_a_row(tmp_path):
-    count = training.SELECTION
-    returns = np.random.default_rng(5).normal(size=4 * count)
-    returns[2 * count : 3 * count] += 2.0
-    # A single slice that is better than all does not count for more than its share.
-    returns[-1] = returns[2 * count : 3 * count].max() + 1.0
-    episodes = Episodes(tmp_path)
-    outcome = episodes.cut(returns)
-    means = np.convolve(returns, np.ones(count) / count, mode="valid")
-    best = int(means.argmax()) + count
-    assert 2 * count < best < len(returns)
-    assert outcome.best_steps == 10 * best
-    assert outcome.best_return == pytest.approx(means.max())
+def test_the_policy_is_that_with_the_greatest_return_on_the_validation_slices(
+    tmp_path, monkeypatch
+):
+    watch, found = watch_of(tmp_path, training_of()), {"length": 9.0, "force": 5.0}
+    for number, value in enumerate([1.0, 4.0, 3.0], 1):
+        monkeypatch.setattr(training, "validate", lambda *_, value=value: {"return": value} | found)
+        watch.num_timesteps = 100 * number
+        with torch.no_grad():
+            watch.model.actor.mu.bias.fill_(float(number))
+        watch.validate()
+        watch.validate()  # Once in a place.
+    outcome = watch.outcome(1.0)
+    assert (outcome.best_return, outcome.best_steps) == (4.0, 200)
     # Not the one that learned on since.
-    assert episodes.watch.best_actor["mu.bias"].tolist() == [float(best)] * 6
-    assert episodes.model.actor.mu.bias.tolist() == [float(len(returns))] * 6
+    assert watch.best_actor["mu.bias"].tolist() == [2.0] * 6
+    assert watch.model.actor.mu.bias.tolist() == [3.0] * 6
+    rows = [{"steps": 100 * k, "return": v} | found for k, v in ((1, 1.0), (2, 4.0), (3, 3.0))]
+    assert lines(tmp_path, training.VALIDATION) == rows
 
 
-def test_fewer_slices_than_are_compared_choose_no_policy(tmp_path):
-    episodes = Episodes(tmp_path)
-    outcome = episodes.cut(np.ones(training.SELECTION - 1))
-    assert outcome.best_return is None and episodes.watch.best_actor is None
-    assert episodes.cut([1.0]).best_return == 1.0
+def test_a_validation_is_the_discounted_return_of_fixed_slices_without_randomness(tmp_path):
+    config = training_of()
+    model = watch_of(tmp_path, config).model
+    env = training.SlicingEnv(config.task)
+    random = torch.get_rng_state()
+    found = training.validate(model, env, 2)
+    assert torch.equal(torch.get_rng_state(), random)
+    env.reset(seed=5)
+    assert training.validate(model, env, 2) == found
+    assert training.validate(model, env, 1)["return"] != found["return"]
+    env.progress, returns = 1.0, []
+    for k in (0, 1):
+        observation, done, worth, weight = env.reset(seed=10**6 + k)[0], False, 0.0, 1.0
+        while not done:
+            action, _ = model.predict(observation, deterministic=True)
+            observation, reward, terminated, truncated, _ = env.step(action)
+            worth, weight = worth + weight * reward, weight * config.task.reward.discount
+            done = terminated or truncated
+        returns.append(worth)
+    assert found["return"] == pytest.approx(np.mean(returns), rel=1e-9)
+
+
+def test_the_return_of_an_episode_is_discounted_as_it_is_trained(tmp_path):
+    config = training_of()
+    config.task.reward = RewardConfig(discount=0.5)
+    watch = watch_of(tmp_path, config)
+    for k, reward in enumerate([1.0, 2.0, 4.0]):
+        info = {"end": "goal", "force": 1.0, "cut_progress": 1.0, "reward_terms": {}}
+        watch.locals = {"infos": [info], "rewards": [reward], "dones": [k == 2]}
+        watch._on_step()
+    assert [line["return"] for line in lines(tmp_path)] == [3.0]
+
+
+def test_a_training_without_a_validation_chooses_no_policy(tmp_path):
+    watch = watch_of(tmp_path, training_of())
+    watch.num_timesteps = 20
+    watch.validate()
+    assert watch.outcome(1.0).best_return is None and watch.best_actor is None
 
 
 @pytest.mark.parametrize("is_chosen", [True, False])

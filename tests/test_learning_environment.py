@@ -12,6 +12,7 @@ gymnasium = pytest.importorskip("gymnasium")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from sliceit_drake.configuration import ConfigurationError, validate  # noqa: E402
+from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food  # noqa: E402
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver  # noqa: E402
 from sliceit_drake.diagrams.outputs import animation  # noqa: E402
 from sliceit_drake.diagrams.scenario import Start  # noqa: E402
@@ -19,12 +20,14 @@ from sliceit_drake.learning.environment import SlicingEnv  # noqa: E402
 from sliceit_drake.learning.reward import (  # noqa: E402
     TERMS,
     RewardConfig,
+    failed_potential,
     reward_potential,
     reward_terms,
     reward_weights,
 )
 from sliceit_drake.learning.task import RandomizationConfig, TaskConfig  # noqa: E402
 from sliceit_drake.systems.agent import AgentConfig  # noqa: E402
+from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig  # noqa: E402
 
 PRESS = np.array([0.2, 0.1, 1.0, 0.3, 0.4, 1.0])
 
@@ -316,9 +319,12 @@ def test_the_term_of_the_jerk_ends_at_one():
 
 def test_the_potential_tells_what_is_left_and_pays_no_policy():
     config = RewardConfig(way=15.0, hold=5.0)
-    assert reward_potential(config, 0.03, 0.0) == pytest.approx(-12.5)
-    assert reward_potential(config, 1e-4, 0.5) == pytest.approx(-2.525)
-    assert reward_potential(config, -1e-4, 1.1) == 0.0
+    assert reward_potential(config, 0.1, 0.0) == 0.0
+    assert reward_potential(config, 0.04, 0.0) == pytest.approx(15.0)
+    assert reward_potential(config, 1e-4, 0.5) == pytest.approx(27.475)
+    assert reward_potential(config, -1e-4, 1.1) == 30.0
+    # A failure costs what was left.
+    assert failed_potential(config, 1e-4, 0.5) == pytest.approx(-2.525)
     # What is paid on the way depends on where it begins and ends alone.
     env = SlicingEnv(task_of("spring"))
     config = env.task.reward
@@ -330,6 +336,14 @@ def test_the_potential_tells_what_is_left_and_pays_no_policy():
             paid += config.discount**k * info["shaping"]
         after = config.discount ** len(actions) * reward_potential(config, info["height"], 0.0)
         assert paid == pytest.approx(after - potential, abs=1e-5)
+
+
+@pytest.mark.parametrize("at_goal", [0.0, 0.5, 1.1])
+@pytest.mark.parametrize("height", [-1e-3, 0.0, 1e-3, 0.03, 0.1, 0.2])
+def test_standing_still_pays_nothing(height, at_goal):
+    config = RewardConfig()
+    potential = reward_potential(config, height, at_goal)
+    assert config.discount * potential - potential <= 0.0
 
 
 def test_weights_are_ratios():
@@ -385,12 +399,46 @@ def test_a_task_that_cannot_be_is_named(values, field):
 
 
 def test_all_variants_of_a_food_are_the_same_in_every_environment_of_a_task():
-    task = dc.replace(task_of("cutting"), randomization=RandomizationConfig(variants=3))
+    randomization = RandomizationConfig(variants=4, stations=2)
+    task = dc.replace(task_of("cutting"), randomization=randomization)
     pairs = []
     for env in (SlicingEnv(task), SlicingEnv(task)):
-        env.reset(seed=0)
-        station, _ = env._current
-        states = [s.model.material for s in station.station.cutting.solvers]
-        pairs.append(states)
+        stations = [env._station("cucumber", which)[0].station for which in range(2)]
+        pairs.append([s.model.material for each in stations for s in each.cutting.solvers])
     assert pairs[0] == pairs[1]
-    assert len({repr(material) for material in pairs[0]}) == 3
+    assert len({repr(material) for material in pairs[0]}) == 4
+    # Twice as tough and half as soft, at most, than the posterior has them.
+    calibrated = load_calibrated_food("cucumber").food.material
+    for name in ("toughness", "youngs_modulus"):
+        factors = [getattr(each, name) / getattr(calibrated, name) for each in pairs[0]]
+        assert 0.4 < min(factors) < 0.8 < 1.25 < max(factors) < 2.5
+
+
+def test_a_training_meets_the_boards_sensors_and_servos_of_an_evaluation():
+    env = SlicingEnv(task_of(randomization={"stations": 6}))
+    scenarios = [env._station("cucumber", which)[0].station.scenario for which in range(6)]
+    stiffness = [each.board.stiffness for each in scenarios]
+    assert min(stiffness) < 1e4 < 1e5 < max(stiffness) < 3e5
+    for each in scenarios:
+        # As many steps of the plant in an impact as on the default board.
+        assert each.robot.plant_time_step <= 1e-3 * min(1.0, (3e4 / each.board.stiffness) ** 0.5)
+        assert each.sensor.force_noise > 0.0 and 0.0 < each.sensor.delay < 8e-3
+    biases = np.array([each.sensor.force_bias for each in scenarios])
+    assert 0.15 < biases.std() < 0.6
+    assert len({each.robot.servo.delay for each in scenarios}) > 2
+    taken = {env.reset(seed=seed) and env._current[0] for seed in range(40)}
+    assert len(taken) == 6
+
+
+def test_a_task_without_variation_is_one_bench():
+    fixed = {name: [1.0, 1.0] for name in ("board", "toughness", "modulus")}
+    fixed |= {name: [0.0, 0.0] for name in ("delay", "servo_delay")}
+    fixed |= {"stations": 1, "force_bias": 0.0, "moment_bias": 0.0}
+    task = task_of(randomization=fixed, sensor=WrenchSensorConfig())
+    scenario = SlicingEnv(task)._station("cucumber", 0)[0].station.scenario
+    assert (scenario.board, scenario.sensor) == (task.board, task.sensor)
+    assert scenario.robot.plant_time_step == 1e-3 and scenario.robot.servo.delay == 0.0
+
+
+def test_no_training_cuts_a_carrot_by_default():
+    assert TaskConfig().foods == ["cucumber", "tomato", "potato"]

@@ -132,6 +132,7 @@ COMPARED = {
     "faster_draws.jsonl": "test_learning_comparison.py::test_the_table_of_faster_draws_is_that_of",
     "hidden_effects.json": "test_hidden_effects_page.py::test_the_page_is_made_from_the_runs_and",
     "hidden_effects.jsonl": "test_hidden_effects_page.py::test_the_page_is_made_from_the_runs_and",
+    "learning_fronts.jsonl": "test_learning_fronts.py::test_the_page_is_that_of_the_slices",
     "robot_faults.jsonl": "test_robot_faults.py::test_the_page_is_that_of_the_stored_results",
     "slicing_evaluation.jsonl": "test_learning_comparison.py::test_the_page_is_that_of_the_slices",
     "slicing_results.json": "test_learning_comparison.py::test_the_page_is_that_of_the_slices",

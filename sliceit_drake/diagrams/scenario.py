@@ -1,6 +1,7 @@
 """A scenario: everything about one simulated or real slice, and the YAML that holds it."""
 
 import dataclasses as dc
+import math
 from pathlib import Path
 
 import numpy as np
@@ -123,6 +124,14 @@ class Scenario:
     """Slices in a row; it places the cuts and makes the motion."""
     policy: PolicyConfig | AgentConfig | None = None
     """Decides how the knife moves, in the place of a motion."""
+
+    def set_board_stiffness(self, stiffness: float) -> None:
+        """Sets the board's stiffness, N/m, and steps of the plant that resolve a stiffer one."""
+        board, robot, period = self.board, self.robot, self.exchange_period
+        # As many plant steps in an impact, whose duration goes with the root of the stiffness.
+        more = max(1.0, math.sqrt(stiffness / board.stiffness))
+        robot.plant_time_step = period / math.ceil(period / robot.plant_time_step * more)
+        board.stiffness = stiffness
 
     def check(self, where: str) -> None:
         if isinstance(self.food, Food):

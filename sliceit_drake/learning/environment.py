@@ -20,7 +20,13 @@ from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.diagrams.agent_station import AgentStation
 from sliceit_drake.diagrams.live_view import make_meshcat, viewing_instructions
 from sliceit_drake.diagrams.outputs.animation import NEEDED, Film, can_draw
-from sliceit_drake.learning.reward import TERMS, reward_potential, reward_terms, reward_weights
+from sliceit_drake.learning.reward import (
+    TERMS,
+    failed_potential,
+    reward_potential,
+    reward_terms,
+    reward_weights,
+)
 from sliceit_drake.learning.task import TaskConfig, make_agent_station
 
 __all__ = ["SlicingEnv"]
@@ -40,8 +46,8 @@ class SlicingEnv(gymnasium.Env):
     a collision (force, torque or shaking), workspace, guard or time. A guard of the simulation that
     ends an episode (an inverted element, say) is `guard_error`, its kind.
 
-    A seed given to `reset` fixes all that follows. The variants of the foods come from a seed of
-    their own, the same in every environment of a task.
+    A seed given to `reset` fixes all that follows. The stations and the variants of the foods come
+    from a seed of their own, the same in every environment of a task.
 
     A copy, or what comes out of a pickle, is at the same moment of the same episode: it has
     repeated the actions. The mode "human" shows the station in Meshcat, in real time at most, and
@@ -84,13 +90,13 @@ class SlicingEnv(gymnasium.Env):
         size = self.task.agent.observation_size()
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float32)
-        self._built: dict[str, tuple[AgentStation, Simulator]] = {}
+        self._built: dict[tuple[str, int], tuple[AgentStation, Simulator]] = {}
         self._current: tuple[AgentStation, Simulator] | None = None
         self._decisions = 0
         self._potential = 0.0
         self._moment: dict[str, Any] = {}
         self._ended = False
-        self._pictures: dict[str, Iterator[np.ndarray]] = {}
+        self._pictures: dict[AgentStation, Iterator[np.ndarray]] = {}
         self._meshcat = make_meshcat() if render_mode == "human" else None
         if self._meshcat is not None:
             print(viewing_instructions(self._meshcat.port()), flush=True)
@@ -117,12 +123,11 @@ class SlicingEnv(gymnasium.Env):
         if self.render_mode != "rgb_array":
             return None
         station, simulator = self._current
-        food = self._moment["food"]
-        if food not in self._pictures:
+        if station not in self._pictures:
             film, context = Film(station.station, 1.0), simulator.get_context()
             film.frame(context)
-            self._pictures[food] = film.draw(iter(lambda: film.frame(context), None))
-        return next(self._pictures[food])
+            self._pictures[station] = film.draw(iter(lambda: film.frame(context), None))
+        return next(self._pictures[station])
 
     def moment(self) -> dict[str, Any]:
         """Where the episode is, for `return_to`, as plain data: how it began, the actions since.
@@ -168,15 +173,15 @@ class SlicingEnv(gymnasium.Env):
         up = float(rng.uniform(low, high))
         along = float(rng.uniform(-1.0, 1.0)) * randomization.offset
         turn = float(rng.uniform(-1.0, 1.0)) * randomization.tilt
+        which = int(rng.integers(randomization.stations))
         food = (options or {}).get("food", food)
         if food not in foods:
             raise ValueError(f"the task has no food {food!r}; it has {', '.join(foods)}.")
-        self._moment["food"] = food
-        self._current = station, simulator = self._station(food)
+        self._current = station, simulator = self._station(food, which)
         shift = RigidTransform(RotationMatrix.MakeYRotation(turn), [along, 0.0, -up])
         station.begin(simulator, rng, shift)
         self._decisions = 0
-        self._potential = self._calc_potential(float(self._output("error")[1]))
+        self._potential = reward_potential(self.task.reward, *self._come())
         return self._observation(), {"food": food}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -206,14 +211,16 @@ class SlicingEnv(gymnasium.Env):
         error, wrench = self._output("error"), self._output("wrench")
         terms = reward_terms(config, float(error[1]), wrench[:2], observation[JERK])
         reward = float(reward_weights(config, self.progress) @ terms)
-        before, self._potential = self._potential, self._calc_potential(float(error[1]))
-        shaping = config.discount * self._potential - before
-        reward += shaping
         end = end or self._end(context.get_time(), error)
+        before, self._potential = self._potential, reward_potential(config, *self._come())
         if end == "goal":
+            self._potential = 0.0
             reward += config.goal
         elif end:
+            self._potential = failed_potential(config, *self._come())
             reward += config.collision
+        shaping = config.discount * self._potential - before
+        reward += shaping
         food, board = self._output("food_wrench_vector"), self._output("board_wrench_vector")
         info: dict[str, Any] = {
             "reward_terms": dict(zip(TERMS, terms.tolist(), strict=True)),
@@ -231,15 +238,15 @@ class SlicingEnv(gymnasium.Env):
             info["is_success"] = end == "goal"
         return observation, reward, bool(end), truncated, info
 
-    def _station(self, food: str) -> tuple[AgentStation, Simulator]:
-        if food not in self._built:
-            rng = np.random.default_rng([VARIANT_SEED, self.task.foods.index(food)])
-            station = make_agent_station(self.task, food, rng, self._meshcat)
+    def _station(self, food: str, which: int) -> tuple[AgentStation, Simulator]:
+        if (food, which) not in self._built:
+            rng = np.random.default_rng([VARIANT_SEED, self.task.foods.index(food), which])
+            station = make_agent_station(self.task, food, rng, self._meshcat, which)
             simulator = Simulator(station)
             if self.render_mode == "human":
                 simulator.set_target_realtime_rate(1.0)
-            self._built[food] = station, simulator
-        return self._built[food]
+            self._built[food, which] = station, simulator
+        return self._built[food, which]
 
     def _output(self, port: str) -> Any:
         """Value of an output port of the station."""
@@ -250,9 +257,10 @@ class SlicingEnv(gymnasium.Env):
     def _observation(self) -> np.ndarray:
         return self._output("observation").astype(np.float32)
 
-    def _calc_potential(self, height: float) -> float:
+    def _come(self) -> tuple[float, float]:
+        """Height over the board, m, and fraction of the decisions at the goal."""
         share = float(self._output("at_goal")[0]) / max(self.task.agent.goal_decisions, 1)
-        return reward_potential(self.task.reward, height, share)
+        return float(self._output("error")[1]), share
 
     def _end(self, time: float, error: np.ndarray) -> str:
         """Why the episode ends, or nothing."""

@@ -12,11 +12,22 @@ import numpy as np
 
 from sliceit_drake.configuration import ConfigurationError, choice, quantity
 
-__all__ = ["HEIGHT", "TERMS", "RewardConfig", "reward_potential", "reward_terms", "reward_weights"]
+__all__ = [
+    "HEIGHT",
+    "REACH",
+    "TERMS",
+    "RewardConfig",
+    "failed_potential",
+    "reward_potential",
+    "reward_terms",
+    "reward_weights",
+]
 
 TERMS = ("distance", "force", "jerk", "step")
 HEIGHT = 0.06
 """Scale of the height over the board, metres."""
+REACH = 0.1
+"""Height over the board above which no way counts, metres: a default workspace ends there."""
 WIDTH, FLOOR = 0.25, 0.1
 """Width of the Gaussians by which a schedule moves weight, as a fraction of the training, and their
 least value."""
@@ -77,21 +88,35 @@ def reward_terms(
 
 
 def reward_potential(config: RewardConfig, height: float, at_goal: float) -> float:
-    """The potential of a slice: the reward still to be earned, below zero; zero when it is done.
+    """The potential of a slice that goes on: what it has come to, from zero at `REACH`.
 
     A decision's reward has ``discount * potential after - potential before`` added to it. No policy
     becomes better by that than another (Ng, Harada and Russell, "Policy invariance under reward
     transformations", 1999), but each decision sees at once what it brings: where only the end
-    pays, and time costs little, agents learned to put the end off. That theorem wants a potential
-    of zero at every end; it is kept where a limit or a failure ends a slice, which therefore costs
-    what was still to be earned besides `RewardConfig.collision`.
+    pays, and time costs little, agents learned to put the end off. As the potential is nowhere
+    below zero, a decision that changes nothing is paid nothing and costs ``(1 - discount) *
+    potential``.
+
+    That theorem wants a potential of zero at every end. The goal's is; that of a failure is
+    `failed_potential`.
 
     Args:
         config: Its `way` and `hold`.
         height: Height of the edge over the board, metres.
         at_goal: Fraction of the decisions at the goal that end a slice.
     """
-    return -config.way * max(height, 0.0) / HEIGHT - config.hold * (1.0 - min(at_goal, 1.0))
+    share = (REACH - min(max(height, 0.0), REACH)) / HEIGHT
+    return config.way * share + config.hold * min(at_goal, 1.0)
+
+
+def failed_potential(config: RewardConfig, height: float, at_goal: float) -> float:
+    """The potential, zero or less, where a limit or a failure ends a slice.
+
+    It costs what was still to be earned, besides `RewardConfig.collision`: else an agent that fails
+    early saves steps.
+    """
+    whole = reward_potential(config, 0.0, 1.0)
+    return reward_potential(config, height, at_goal) - whole
 
 
 def reward_weights(config: RewardConfig, progress: float = 0.0) -> np.ndarray:

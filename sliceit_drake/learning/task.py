@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses as dc
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -86,7 +87,7 @@ class RandomizationConfig:
     """Where a food's parameters are drawn from: its calibration, a uniform relative noise on
     toughness, modulus and friction, or nowhere. The spring's ERP has its own noise."""
     variants: int = quantity(8, "", low=1, high=1000)
-    """Draws prepared of each food; an episode takes one."""
+    """Draws prepared of each food, in equal parts on its stations; an episode takes one."""
     noise: float = quantity(0.3, "", low=0.0, high=0.9)
     """Half width of the uniform noise, and of that on ERP."""
     height: list[float] = quantity([0.0, 0.01], "m", low=-0.01, high=0.1, size=2)
@@ -95,12 +96,32 @@ class RandomizationConfig:
     """Half width of the start's place along the edge."""
     tilt: float = quantity(0.01, "rad", low=0.0, high=0.1)
     """Half width of the blade's turn about Ky."""
+    toughness: list[float] = quantity([0.5, 2.0], "", low=0.1, high=10.0, size=2)
+    """Range of a factor on a drawn food's toughness, uniform in its logarithm."""
+    modulus: list[float] = quantity([0.5, 2.0], "", low=0.1, high=10.0, size=2)
+    """Likewise, on its Young's modulus."""
+    stations: int = quantity(3, "", low=1, high=100)
+    """Stations prepared of each food, each with a board, sensor and servo of its own; an episode
+    takes one."""
+    board: list[float] = quantity([0.1, 10.0], "", low=1e-2, high=100.0, size=2)
+    """Range of a factor on the board's stiffness, uniform in its logarithm."""
+    force_bias: float = quantity(0.3, "N", low=0.0, high=10.0)
+    """Standard deviation of the sensor's bias, each axis; 0.6 N is the spread of an FT 300's
+    weighings (`WrenchSensorConfig`)."""
+    moment_bias: float = quantity(0.02, "Nm", low=0.0, high=1.0)
+    """Likewise, of the moment."""
+    delay: list[float] = quantity([0.0, 8e-3], "s", low=0.0, high=0.2, size=2)
+    """Range of what is added to the sensor's delay."""
+    servo_delay: list[float] = quantity([0.0, 4e-3], "s", low=0.0, high=0.1, size=2)
+    """Range of the servo's transport delay, in whole steps of the plant."""
 
     def check(self, where: str) -> None:
-        if not self.height[0] <= self.height[1]:
-            raise ConfigurationError(
-                f"{self.height} is no range", field=f"{where}.height", fix="Swap the two."
-            )
+        for name in ("height", "toughness", "modulus", "board", "delay", "servo_delay"):
+            low, high = getattr(self, name)
+            if not low <= high:
+                raise ConfigurationError(
+                    f"{[low, high]} is no range", field=f"{where}.{name}", fix="Swap the two."
+                )
 
 
 @dc.dataclass
@@ -117,7 +138,10 @@ class TaskConfig:
     time_step: float = quantity(2e-3 / 12, "s", low=1e-6, high=2e-3)
     """Longest sub-step of the food, s."""
     board: Board = dc.field(default_factory=Board)
-    sensor: WrenchSensorConfig = dc.field(default_factory=WrenchSensorConfig)
+    sensor: WrenchSensorConfig = dc.field(
+        default_factory=lambda: WrenchSensorConfig(force_noise=0.2, moment_noise=0.02)
+    )
+    """Its noise is between an FT 300's resolution and the spread of its weighings."""
     start: Start = dc.field(default_factory=Start)
     agent: AgentConfig = dc.field(default_factory=AgentConfig)
     """`descent` follows from the food and `start`, and `network` and `duration` are not used."""
@@ -175,17 +199,22 @@ def station_scenario(task: TaskConfig, calibrated: CalibratedFood, food: str) ->
 
 
 def make_agent_station(
-    task: TaskConfig, food: str, rng: np.random.Generator, meshcat: Meshcat | None = None
+    task: TaskConfig,
+    food: str,
+    rng: np.random.Generator,
+    meshcat: Meshcat | None = None,
+    which: int = 0,
 ) -> AgentStation:
-    """The station of one of a task's foods with all its variants, drawn by `rng`, and the agent.
+    """The station `which` of one of a task's foods, with its part of the variants, and the agent.
 
-    It is shown in `meshcat`, if there is one.
+    Board, sensor, servo and variants are drawn by `rng`. It is shown in `meshcat`, if there is one.
 
     Raises:
         ConfigurationError: The food cannot be loaded or cut.
     """
     calibrated = load_calibrated_food(food)
     scenario = station_scenario(task, calibrated, food)
+    _vary_bench(task.randomization, scenario, rng, which)
     cutting = None
     if task.simulator == "cutting":
         models = _variants(task, calibrated, scenario, rng)
@@ -208,6 +237,36 @@ def check_task(task: TaskConfig) -> None:
         make_agent_station(few, food, np.random.default_rng(0))
 
 
+def _between(limits: Sequence[float], share: np.ndarray) -> np.ndarray:
+    """Numbers between positive limits, uniform in the logarithm of what is uniform in 0 to 1."""
+    low, high = limits
+    return low * (high / low) ** share
+
+
+def _spread(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Random numbers from 0 to 1 [count], one in each of as many equal parts, in random order."""
+    return (rng.permutation(count) + rng.uniform(size=count)) / count
+
+
+def _vary_bench(
+    randomization: RandomizationConfig, scenario: Scenario, rng: np.random.Generator, which: int
+) -> None:
+    """Draws a scenario's board, sensor and servo."""
+    # Few stations fill the range of boards, each a part of it.
+    share = (which + rng.uniform(size=1)) / randomization.stations
+    factor = float(_between(randomization.board, share)[0])
+    scenario.set_board_stiffness(scenario.board.stiffness * factor)
+    sensor, robot = scenario.sensor, scenario.robot
+    sensor.force_bias = (sensor.force_bias + randomization.force_bias * rng.normal(size=3)).tolist()
+    moments = sensor.moment_bias + randomization.moment_bias * rng.normal(size=3)
+    sensor.moment_bias = moments.tolist()
+    low, high = randomization.delay
+    sensor.delay += rng.uniform(low, high)
+    low, high = randomization.servo_delay
+    steps = round(rng.uniform(low, high) / robot.plant_time_step)
+    robot.servo.delay = steps * robot.plant_time_step
+
+
 def _variants(
     task: TaskConfig, calibrated: CalibratedFood, scenario: Scenario, rng: np.random.Generator
 ) -> list:
@@ -216,13 +275,18 @@ def _variants(
     randomization = task.randomization
     if randomization.foods == "none":
         return [model]
+    count = math.ceil(randomization.variants / randomization.stations)
+    at = {name: getattr(scenario.food.material, name.split(".")[1]) for name in VARIED}
     if randomization.foods == "posterior":
-        draws: Sequence[dict[str, float]] = calibrated.distribution.draw(
-            rng, randomization.variants
-        )
+        draws: Sequence[dict[str, float]] = calibrated.distribution.draw(rng, count)
     else:
-        size = (randomization.variants, len(VARIED))
-        factors = 1.0 + randomization.noise * rng.uniform(-1.0, 1.0, size)
-        at = [getattr(scenario.food.material, name.split(".")[1]) for name in VARIED]
-        draws = [dict(zip(VARIED, row, strict=True)) for row in (factors * at).tolist()]
+        factors = 1.0 + randomization.noise * rng.uniform(-1.0, 1.0, (count, len(VARIED)))
+        rows = (factors * list(at.values())).tolist()
+        draws = [dict(zip(VARIED, row, strict=True)) for row in rows]
+    for name, limits in zip(VARIED, (randomization.toughness, randomization.modulus), strict=False):
+        factors = _between(limits, _spread(rng, count))
+        draws = [
+            draw | {name: draw.get(name, at[name]) * float(factor)}
+            for draw, factor in zip(draws, factors, strict=True)
+        ]
     return [with_parameters(model, draw) for draw in draws]

@@ -10,7 +10,7 @@ import multiprocessing
 import os
 import pickle
 import time as clock
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,17 +25,18 @@ from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.workers import children_without_interrupts, start_worker
 from sliceit_drake.learning.environment import SlicingEnv
 from sliceit_drake.learning.network import HistoryExtractor, export_policy
-from sliceit_drake.learning.reward import HEIGHT, RewardConfig
+from sliceit_drake.learning.reward import HEIGHT, REACH, RewardConfig
 from sliceit_drake.learning.sac import OverlapVecEnv, PrioritizedSAC
 from sliceit_drake.learning.task import TaskConfig, check_task
 from sliceit_drake.learning.training_config import CONFIGURATION, POLICY, TrainingConfig
 from sliceit_drake.systems.agent import ERROR, observation_names
 
-__all__ = ["CHECKPOINT", "Outcome", "make_model", "train", "value_limit"]
+__all__ = ["CHECKPOINT", "Outcome", "make_model", "train", "validate", "value_limit"]
 
-CHECKPOINT, EPISODES = "checkpoint.pt", "episodes.jsonl"
-SELECTION = 20
-"""Slices in a row by whose mean return the policy is chosen that is exported."""
+CHECKPOINT, EPISODES, VALIDATION = "checkpoint.pt", "episodes.jsonl", "validation.jsonl"
+MODEL = "model.zip"
+VALIDATION_SEED = 1_000_000
+"""Of the first validation slice: episodes of a training follow from its own seed."""
 GUARD_SHARE = 1e-3
 """Fraction of the episodes that guards of the simulation may end."""
 
@@ -50,8 +51,8 @@ class Outcome:
         wall_time: Wall time of this run, s.
         guard_errors: Episodes that guards ended, by kind.
         ends: Episodes by how they ended.
-        best_return: Greatest mean return of `SELECTION` slices in a row, after which the policy is
-            the one that is exported; None where there were not so many, and it is the last.
+        best_return: Greatest mean discounted return over the validation slices, of the policy that
+            is exported; None where there was no validation, and it is the last.
         best_steps: When that was.
         failed: Why the result cannot be used, or None.
     """
@@ -78,7 +79,10 @@ def train(
 
     Args:
         config: Training; of a run that goes on, that which it was begun with.
-        output: Folder for checkpoint, training.yaml, episodes.jsonl, TensorBoard and policy.onnx.
+        output: Folder for checkpoint, training.yaml, TensorBoard, policy.onnx, model.zip (for
+            `stable_baselines3.SAC.load`), and a line for each slice in episodes.jsonl and for each
+            validation in validation.jsonl. A return is what is trained: discounted, the
+            potential's part included.
         progress: Called with the steps so far and a line about the last episodes.
         is_stopped: Asked at each decision whether to end with a checkpoint there.
 
@@ -108,19 +112,24 @@ def train(
                 environments.set_attr("progress", model.num_timesteps / config.steps)
             callback.restore(saved["watch"])
         # What was logged after the checkpoint is dropped.
-        if (log := output / EPISODES).exists():
-            kept = log.read_text(encoding="utf-8").splitlines(keepends=True)[: callback.episodes]
-            log.write_text("".join(kept), encoding="utf-8")
+        for name, count in ((EPISODES, callback.episodes), (VALIDATION, callback.validations)):
+            if (log := output / name).exists():
+                kept = log.read_text(encoding="utf-8").splitlines(keepends=True)[:count]
+                log.write_text("".join(kept), encoding="utf-8")
         begin = clock.perf_counter()
         remaining = config.steps - model.num_timesteps
         with contextlib.suppress(_Stopped):
             if remaining > 0:
                 model.learn(remaining, callback, reset_num_timesteps=False)
+        if not callback.was_stopped:
+            callback.validate()
         outcome = callback.outcome(clock.perf_counter() - begin)
         if not callback.was_stopped:
             if callback.best_actor is not None:
                 model.actor.load_state_dict(callback.best_actor)
             export_policy(model.actor, config.task.agent, output / POLICY)
+            # For `stable_baselines3.SAC.load`, which knows nothing of these.
+            model.save(output / MODEL, exclude=["value_limit", "running"])
         summary = json.dumps(dc.asdict(outcome), indent=2) + "\n"
         (output / "summary.json").write_text(summary, encoding="utf-8")
         return outcome
@@ -174,15 +183,15 @@ def make_model(config: TrainingConfig, environments: OverlapVecEnv) -> Prioritiz
 def value_limit(reward: RewardConfig) -> Callable[[torch.Tensor], torch.Tensor]:
     """A bound on values: from observations [batch, n] to the most still to be earned [batch, 1].
 
-    It is the reward of the goal and what is left of the potential: all other terms only cost.
+    It is the reward of the goal less the potential, which ends at zero: all other terms only cost.
     """
     names = observation_names(1)
     height, at_goal = names.index("error_z"), names.index("at_goal")
 
     def limit(observations: torch.Tensor) -> torch.Tensor:
-        left = 1.0 - observations[:, at_goal].clamp(max=1.0)
-        way = observations[:, height].clamp(min=0.0) * (ERROR[1] / HEIGHT)
-        return (reward.goal + reward.hold * left + reward.way * way)[:, None]
+        held = observations[:, at_goal].clamp(max=1.0)
+        way = (REACH - (observations[:, height] * ERROR[1]).clamp(0.0, REACH)) / HEIGHT
+        return (reward.goal - reward.hold * held - reward.way * way)[:, None]
 
     return limit
 
@@ -212,8 +221,38 @@ def _load(file: Path, described: str) -> dict[str, Any] | None:
     )
 
 
+def validate(model: PrioritizedSAC, env: SlicingEnv, slices: int) -> dict[str, float]:
+    """Lets the policy cut fixed slices, without randomness.
+
+    Args:
+        model: Has the policy; nothing of it changes.
+        env: Of the training's task.
+        slices: How many, of the task's foods in turn; a number is always the same slice.
+
+    Returns:
+        Means over the slices: return (discounted, as it is trained), length in decisions, force
+        (mean, N), peak (N), and the fraction that reached the goal.
+    """
+    foods, discount = env.task.foods, env.task.reward.discount
+    env.progress, rows = 1.0, []
+    for k in range(slices):
+        food = foods[k % len(foods)]
+        observation, _ = env.reset(seed=VALIDATION_SEED + k, options={"food": food})
+        rewards, forces, done = [], [], False
+        while not done:
+            action, _ = model.predict(observation, deterministic=True)
+            observation, reward, terminated, truncated, info = env.step(action)
+            rewards.append(reward)
+            forces.append(info["force"])
+            done = terminated or truncated
+        worth = float(np.array(rewards) @ discount ** np.arange(len(rewards)))
+        rows.append((worth, len(rewards), np.mean(forces), max(forces), info["is_success"]))
+    names = ("return", "length", "force", "peak", "goal")
+    return dict(zip(names, np.mean(np.array(rows, float), axis=0).tolist(), strict=True))
+
+
 class _Watch(BaseCallback):
-    """Logs episodes, counts guards, keeps checkpoints."""
+    """Logs episodes, validates, counts guards, keeps checkpoints."""
 
     def __init__(
         self,
@@ -231,14 +270,15 @@ class _Watch(BaseCallback):
         self._ends: Counter[str] = Counter()
         self._guards: Counter[str] = Counter()
         self._sums: list[Counter] = [Counter() for _ in range(config.environments)]
-        self._returns: deque[float] = deque(maxlen=SELECTION)
+        self._validation: SlicingEnv | None = None
+        self.validations, self._validated_at = 0, config.warm_up
         self.best_return, self.best_steps = -math.inf, 0
         self.best_actor: dict[str, torch.Tensor] | None = None
 
     def restore(self, state: dict[str, Any]) -> None:
         self.episodes, self._saved_at = state["episodes"], state["steps"]
         self._ends, self._guards = Counter(state["ends"]), Counter(state["guards"])
-        self._returns.extend(state["returns"])
+        self.validations, self._validated_at = state["validations"]
         self._sums = [Counter(sums) for sums in state["sums"]]
         self.best_return, self.best_steps, self.best_actor = state["best"]
 
@@ -265,7 +305,8 @@ class _Watch(BaseCallback):
         each = (self.locals[name] for name in ("infos", "rewards", "dones"))
         for sums, info, reward, done in zip(self._sums, *each, strict=True):
             terms = {f"reward_{name}": value for name, value in info["reward_terms"].items()}
-            sums.update({"return": float(reward), "length": 1.0, "force": info["force"], **terms})
+            worth = self._config.task.reward.discount ** sums["length"] * float(reward)
+            sums.update({"return": worth, "length": 1.0, "force": info["force"], **terms})
             sums["peak"] = max(sums["peak"], info["force"])
             if done:
                 self._finish_episode(info, sums)
@@ -275,6 +316,8 @@ class _Watch(BaseCallback):
         return True
 
     def _on_rollout_start(self) -> None:
+        if self.num_timesteps - self._validated_at >= self._config.validation_interval:
+            self.validate()
         # Only here the last transitions are in the buffer.
         self.was_stopped = self._is_stopped()
         if (
@@ -284,6 +327,24 @@ class _Watch(BaseCallback):
             self._save()
         if self.was_stopped:
             raise _Stopped
+
+    def validate(self) -> None:
+        """Validates the policy once in a place of the training, and keeps the best."""
+        if self.num_timesteps <= self._validated_at:
+            return
+        assert isinstance(self.model, PrioritizedSAC)
+        if self._validation is None:
+            self._validation = SlicingEnv(self._config.task)
+        found = validate(self.model, self._validation, self._config.validation_slices)
+        self.validations, self._validated_at = self.validations + 1, self.num_timesteps
+        with (self._output / VALIDATION).open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"steps": self.num_timesteps, **found}) + "\n")
+        for name, value in found.items():
+            self.logger.record(f"validation/{name}", value)
+        self.logger.dump(self.num_timesteps)
+        if found["return"] > self.best_return:
+            self.best_return, self.best_steps = found["return"], self.num_timesteps
+            self.best_actor = copy.deepcopy(self.model.actor.state_dict())
 
     def _save(self) -> None:
         self._saved_at = self.num_timesteps
@@ -297,7 +358,7 @@ class _Watch(BaseCallback):
                 "steps": self.num_timesteps,
                 "ends": dict(self._ends),
                 "guards": dict(self._guards),
-                "returns": list(self._returns),
+                "validations": (self.validations, self._validated_at),
                 "sums": [dict(sums) for sums in self._sums],
                 "best": (self.best_return, self.best_steps, self.best_actor),
             },
@@ -327,19 +388,13 @@ class _Watch(BaseCallback):
             row["guard"] = info["guard_message"]
         with (self._output / EPISODES).open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
-        self._returns.append(sums["return"])
-        mean = float(np.mean(self._returns))
-        if len(self._returns) == SELECTION and mean > self.best_return:
-            self.best_return, self.best_steps = mean, self.num_timesteps
-            assert isinstance(self.model, PrioritizedSAC)
-            self.best_actor = copy.deepcopy(self.model.actor.state_dict())
         for name, value in row.items():
             if isinstance(value, int | float):
                 self.logger.record(f"episode/{name}", value)
         self.logger.record("guards/episodes", sum(self._guards.values()))
         self.logger.dump(self.num_timesteps)
         if self._progress is not None:
-            self._progress(self.num_timesteps, f"return {mean:.1f}, {info['end']}")
+            self._progress(self.num_timesteps, f"return {row['return']:.1f}, {row['end']}")
 
 
 class _Stopped(Exception):

@@ -41,6 +41,11 @@ class TrainingConfig:
     environments: int = quantity(1, "", low=1, high=64)
     """Environments side by side, each a process; there is an update for each decision. Another
     number gives another policy."""
+    validation_interval: int = quantity(2000, "", low=1, high=10**9)
+    """Decisions between validations, after the warm-up; one more ends a training."""
+    validation_slices: int = quantity(6, "", low=1, high=1000)
+    """Fixed slices of a validation, the foods in turn. The policy with the greatest mean return is
+    exported."""
     checkpoint_interval: int = quantity(5000, "", low=1, high=10**9)
     """Decisions between checkpoints."""
 

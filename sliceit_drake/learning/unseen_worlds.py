@@ -81,6 +81,7 @@ def evaluate(
     output: Path,
     workers: int,
     progress: Callable[[int], None] | None = None,
+    cut_case: Callable[[Case], dict] | None = None,
 ) -> None:
     """Cuts the slices that a file does not have yet, and adds a line for each.
 
@@ -89,6 +90,7 @@ def evaluate(
         output: File of lines of JSON, one for each slice.
         workers: Processes.
         progress: Called with how many of the cases are done.
+        cut_case: Cuts a slice and returns its row, in another process; None for `cut`.
     """
     done = {case for case, _ in _rows(output)} if output.exists() else set()
     left = [case for case in cases if case not in done]
@@ -98,7 +100,7 @@ def evaluate(
     batch = SLICES * workers
     for first in range(0, len(left), batch):
         with worker_processes(workers, "forkserver") as pool:
-            tasks = [pool.submit(cut, case) for case in left[first : first + batch]]
+            tasks = [pool.submit(cut_case or cut, case) for case in left[first : first + batch]]
             for task in as_completed(tasks):
                 with output.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(task.result()) + "\n")

@@ -17,7 +17,6 @@ seed, the food and the slice's index alone. Both are simulated: a table made fro
 import abc
 import copy
 import dataclasses as dc
-import math
 import typing
 import zlib
 
@@ -159,11 +158,7 @@ class SlicingWorld(abc.ABC):
             ),
         )
         if board_stiffness is not None:
-            board, robot, period = scenario.board, scenario.robot, scenario.exchange_period
-            # As many plant steps in an impact, whose duration goes with the root of the stiffness.
-            more = max(1.0, math.sqrt(board_stiffness / board.stiffness))
-            robot.plant_time_step = period / math.ceil(period / robot.plant_time_step * more)
-            board.stiffness = board_stiffness
+            scenario.set_board_stiffness(board_stiffness)
         return WorldSlice(scenario, self._cut(scenario, calibrated, rng))
 
     def rng(self, food: str, slice: int) -> np.random.Generator:

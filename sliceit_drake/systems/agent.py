@@ -97,7 +97,10 @@ class AgentConfig:
     goal: list[float] = quantity([0.04, 2e-4, 0.04], "m, m, rad", low=0.0, size=3)
     """Error along Kx, height over the board and error about Ky within which the slice ends."""
     goal_decisions: int = quantity(10, "", low=0, high=1000)
-    """Decisions in a row within the goal, after which the slice ends."""
+    """Decisions within the goal, after which the slice ends."""
+    goal_lost: float = quantity(2e-3, "m", low=0.0, high=0.1)
+    """Height over the board above which they are counted anew. Up to it the count stands still: the
+    edge rises by some tenths of a millimetre where a draw turns round."""
     lift_speed: float = quantity(0.05, "m/s", low=1e-3, high=0.5)
     """Speed of the target upwards once the slice has ended."""
 
@@ -178,7 +181,7 @@ class AgentSystem(PlainSystem):
         observation: What a decision at this instant would be taken by, see `observation_names`.
         error: Distance to the final pose, along Kx and Kz and about Ky [3], m and rad.
         wrench: Mean of the readings seen: force along Kx and Kz, moment about Ky at Ko [3].
-        at_goal: Decisions in a row within the goal [1].
+        at_goal: Decisions within the goal since the knife was last lifted from it [1].
 
     Args:
         config: What the agent may do.
@@ -305,10 +308,11 @@ class AgentSystem(PlainSystem):
         config, error = self._config, self._error(context)
         if not self.is_done(context):
             self._act(context, discrete_state, error)
-            is_near = error[1] <= config.goal[1] and bool(
-                (np.abs(error[[0, 2]]) <= np.array(config.goal)[[0, 2]]).all()
-            )
-            count = self._value(context, self._at_goal)[0] + 1 if is_near else 0
+            is_beside = bool((np.abs(error[[0, 2]]) > np.array(config.goal)[[0, 2]]).any())
+            is_lost = is_beside or error[1] > max(config.goal_lost, config.goal[1])
+            count = 0.0 if is_lost else self._value(context, self._at_goal)[0]
+            if not is_beside and error[1] <= config.goal[1]:
+                count += 1.0
             discrete_state.set_value(self._at_goal, [count])
             if count > config.goal_decisions:
                 discrete_state.set_value(self._lift_time, [context.get_time()])

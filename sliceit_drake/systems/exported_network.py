@@ -16,7 +16,10 @@ LAYOUT = "sliceit_layout"
 
 
 # What does not change the meaning of an observation or an action.
-FREE = ("network", "descent", "duration", "history", "lift_speed", "goal", "goal_decisions")
+FREE = (
+    *("network", "descent", "duration", "history", "lift_speed"),
+    *("goal", "goal_decisions", "goal_lost"),
+)
 
 
 def layout_of(config: AgentConfig) -> str:

@@ -22,7 +22,8 @@ VARIANTS = {
     "as it is": "{}",
     "no force history": "{history: false}",
     "no randomisation": "{task: {randomization: {foods: none, height: [0.0, 0.0], offset: 0.0, "
-    "tilt: 0.0}}}",
+    "tilt: 0.0, stations: 1, board: [1.0, 1.0], force_bias: 0.0, moment_bias: 0.0, "
+    "delay: [0.0, 0.0], servo_delay: [0.0, 0.0]}}}",
     "uniform replay": "{priority: 0.0}",
     "action mapping of the authors' code": "{task: {agent: {mapping: upper}}}",
     "draws up to 150 mm/s, not 40": "{task: {agent: {draw_increment: 7.5e-3}}}",
