@@ -524,6 +524,7 @@ def test_a_distribution_that_is_none_is_refused():
     assert CalibratedFood().distribution.draw(np.random.default_rng(0), 1) == [{}]
 
 
+@pytest.mark.second_tier
 def test_a_command_that_was_killed_ends_with_the_same_numbers(records, tmp_path):
     write_record(records[0], tmp_path / "press")
     dump_yaml(coarse_setup(), tmp_path / "setup.yaml")

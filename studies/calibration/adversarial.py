@@ -257,12 +257,12 @@ def run(options: argparse.Namespace) -> int:
 HEAD = """\
 # Curves with something wrong
 
-    python -m studies adversarial --output docs/results/adversarial_curves.md
+What a new user brings, and what the import and the calibration say of it. The good curve is the
+paper's potato; how each is made stands in `studies/calibration/adversarial.py`. "Used" are curves
+whose commands end well, with a warning or without. kgf cannot be told from a curve: a potato of 3 N
+is possible. The warning of the first row is about the coarse mesh, not about the curve.
 
-What a new user brings, and what `sliceit records import force` and `sliceit calibrate` say. The
-good curve is the paper's potato; how each is made stands in `studies/calibration/adversarial.py`.
-"Used" are curves whose commands end well, with a warning or without. kgf cannot be told from a curve: a
-potato of 3 N is possible. The warning of the first row is about the coarse mesh, not the curve.
+    python -m studies adversarial --output docs/results/adversarial_curves.md
 """
 
 
