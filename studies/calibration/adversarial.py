@@ -26,6 +26,7 @@ from sliceit_drake.configuration import dump_yaml
 from sliceit_drake.records.force_profile import load_force_profile
 from sliceit_drake.records.validation import load_record
 from sliceit_drake.resources import resource_path
+from studies.figures import BLUE, new_figure, save_figure, tidy
 from studies.pages import publish, table
 
 __all__ = ["CURVES", "Curve", "add_arguments", "is_right", "run", "said_of"]
@@ -232,6 +233,24 @@ def is_right(curve: Curve, status: int, said: str) -> bool:
     return status == 0 and not re.search(r"(?m)^(?:error|warning|sliceit): (?!.*not given)", said)
 
 
+SHOWN = ("nothing wrong", "clipped at 20 N", "the knife waits at the end, speed unknown")
+SHOWN += ("zero drifts by 1 N/s", "one row of 600 N", "grows without a cut")
+PICTURE = "figures/adversarial_curves.png"
+
+
+def draw(file: Path) -> None:
+    """Draws some of the curves."""
+    time, force = good_curve()
+    figure = new_figure(9.0, 4.2)
+    chosen = [curve for curve in CURVES if curve.name in SHOWN]
+    for axes, curve in zip(figure.subplots(2, 3).flat, chosen, strict=True):
+        rng = np.random.default_rng(0)
+        axes.plot(*curve.make(time, force + _noise(rng, len(time)), rng), color=BLUE, lw=0.9)
+        axes.set(ylim=(-3.0, 45.0), xlabel="time [s]", ylabel="force [N]")
+        tidy(axes, curve.name)
+    save_figure(figure, file)
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the study's arguments."""
     parser.add_argument("--no-fit", action="store_true", help="only import")
@@ -251,6 +270,8 @@ def run(options: argparse.Namespace) -> int:
         rows.append((curve.name, step, line, ("used", "refused")[status != 0], right))
     page = f"{HEAD}\n{table('what the user did | commands | what was said | then | verdict', rows)}"
     publish(page, options.output)
+    if options.output is not None:
+        draw(options.output.parent / PICTURE)
     return int(any("wrong" in row[-1] for row in rows))
 
 
@@ -263,6 +284,8 @@ whose commands end well, with a warning or without. kgf cannot be told from a cu
 is possible. The warning of the first row is about the coarse mesh, not about the curve.
 
     python -m studies adversarial --output docs/results/adversarial_curves.md
+
+![Force over time of six of the curves, as a user brings them](figures/adversarial_curves.png)
 """
 
 
