@@ -259,6 +259,7 @@ READ_ONLY = {
         """,  # noqa: E501
     "a study of minutes to hours, whose results stand in docs": """
         python -m studies adversarial --output docs/results/adversarial_curves.md
+        python -m studies bands --laws bonds --draws 2
         python -m studies calibration --output FOLDER
         python -m studies control --output FOLDER
         python -m studies coverage --replicates 12 --output docs/results
