@@ -137,6 +137,12 @@ TOPICS: dict[str, tuple[Study, ...]] = {
             "1 h",
         ),
         Study(
+            "adversarial",
+            "calibration.adversarial",
+            "curves with something wrong, and what the commands say of them",
+            "3 min",
+        ),
+        Study(
             "coverage",
             "calibration.coverage",
             "how often intervals of calibrations hold the truth",

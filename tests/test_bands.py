@@ -7,6 +7,7 @@ import pytest
 
 from sliceit_drake.calibration.bands import force_band
 from sliceit_drake.calibration.gauss_newton import gauss_newton
+from sliceit_drake.calibration.prediction import Parameter
 
 ROWS = 200
 HEIGHT = 0.03
@@ -17,7 +18,8 @@ class PressModel:
 
     def __init__(self, speeds=(0.02,)):
         self.targets, depths, columns = [], [], []
-        for speed in speeds:
+        self.parameters = []
+        for k, speed in enumerate(speeds):
             time = np.linspace(0.0, HEIGHT / speed, ROWS)
             depth = speed * time - 1e-3
             self.targets.append(
@@ -26,6 +28,7 @@ class PressModel:
                     depth=depth,
                     path=depth - depth[0],
                     facts=SimpleNamespace(height=HEIGHT),
+                    record=SimpleNamespace(name=f"record {k}"),
                     measured=np.zeros((ROWS, 1)),
                 )
             )
@@ -133,3 +136,30 @@ def test_more_rows_of_the_same_error_do_not_narrow_a_band():
         model.used = (np.arange(ROWS) % every == 0) & (model.depth < 0.5 * HEIGHT)
         widths.append(band_of(model).deviation[~model.used & (model.depth > 0.02)].mean())
     assert widths[0] == pytest.approx(widths[1], rel=0.3)
+
+
+class PlacedModel(PressModel):
+    """Each record has a place of its own, by which it meets something hard at the end."""
+
+    def __init__(self):
+        super().__init__(speeds=(0.02, 0.02, 0.02))
+        self.parameters = [Parameter(n, 0.0, 1.0, False, 0.5) for n in ("shared", "other")]
+        end = 100.0 * (self.depth > 0.9 * HEIGHT)
+        for k in range(3):
+            own = np.where(self.record_of == k, end, 0.0)
+            self.columns = np.column_stack([self.columns, own])
+            self.parameters.append(Parameter(f"height_offset:record {k}", 0.0, 1.0, False, 0.5))
+        self.measured = self.columns @ [0.5, 0.5, 0.48, 0.52, 0.49]
+        self.measured += 0.1 * np.random.default_rng(4).normal(size=len(self.measured))
+
+
+def test_a_record_that_was_not_fitted_is_where_the_others_are():
+    widths = []
+    for fitted in (1, 2):
+        model = PlacedModel()
+        model.used = model.record_of < fitted
+        low, high = force_band(model, np.full(5, 0.5)).interval()
+        last = (model.record_of == 2) & (model.depth > 0.9 * HEIGHT)
+        assert ((low <= model.measured) & (model.measured <= high))[last].mean() > 0.9
+        widths.append((high - low)[last].mean())
+    assert widths[1] < 0.3 * widths[0]

@@ -4,6 +4,10 @@ import copy
 import dataclasses as dc
 import json
 import multiprocessing
+import signal
+import subprocess
+import sys
+import time
 
 import numpy as np
 import optuna
@@ -35,7 +39,7 @@ from sliceit_drake.cutting.model import Numerics
 from sliceit_drake.cutting.motion import ConstantSpeed, Hold, MotionPlan
 from sliceit_drake.diagrams.scenario import Scenario, load_scenario
 from sliceit_drake.records.preprocessing import low_pass
-from sliceit_drake.records.slice_record import SliceRecord
+from sliceit_drake.records.slice_record import SliceRecord, write_record
 from sliceit_drake.resources import shipped_names
 from sliceit_drake.stand_in.effect_registry import make_effect
 from sliceit_drake.stand_in.finite_element_world import FiniteElementSettings
@@ -518,3 +522,50 @@ def test_a_distribution_that_is_none_is_refused():
     with pytest.raises(ConfigurationError, match="entries"):
         dc.replace(bad, low=[]).check("distribution")
     assert CalibratedFood().distribution.draw(np.random.default_rng(0), 1) == [{}]
+
+
+def test_the_age_of_a_lock_that_a_killed_run_left_can_be_told(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "out").mkdir()
+    backend = open_study("out/trials.log", "s")._storage._backend
+    backend = getattr(backend, "_backend", backend)
+    backend._lock.acquire()
+    # A link to nowhere has no age, and whoever waits for it waits for ever.
+    assert (tmp_path / "out/trials.log.lock").exists()
+    assert backend._lock.grace_period <= 10
+
+
+@pytest.mark.second_tier
+def test_a_command_that_was_killed_ends_with_the_same_numbers(records, tmp_path):
+    write_record(records[0], tmp_path / "press")
+    dump_yaml(coarse_setup(), tmp_path / "setup.yaml")
+
+    def calibration(folder: str) -> subprocess.Popen:
+        words = ["press.csv", "--food", "setup.yaml", "--output", folder, "--workers", "1"]
+        words += ["--trials", "8", "--steps", "2", "--starts", "1", "--blocks", "0"]
+        program = [sys.executable, "-m", "sliceit_drake.cli.main", "calibrate"]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        return subprocess.Popen([*program, *words], cwd=tmp_path, **quiet)
+
+    killed, log = calibration("killed"), tmp_path / "killed/trials.log"
+    # One of two generations is begun. Whoever is killed as it writes leaves its lock.
+    while killed.poll() is None and not (log.exists() and log.read_text().count("\n") > 4):
+        time.sleep(0.01)
+    killed.kill()
+    assert killed.wait() == -signal.SIGKILL
+    results = []
+    for folder in ("killed", "whole"):
+        assert calibration(folder).wait() == 0
+        results.append(json.loads((tmp_path / folder / "calibration.json").read_text()))
+    assert results[0] == results[1]
+
+
+def test_rows_of_a_sensor_at_its_limit_do_not_count(records):
+    clipped = copy.deepcopy(records[0])
+    clipped.force[:, 2] = np.minimum(clipped.force[:, 2], 0.8 * clipped.force[:, 2].max())
+    predictor = Predictor(coarse_setup(), [clipped])
+    up = predictor.split(predictor.used)[0][:, 2]
+    at_limit = predictor.targets[0].measured[:, 2] == clipped.force[:, 2].max()
+    assert at_limit.sum() > 5
+    np.testing.assert_array_equal(up, ~at_limit)
+    assert Predictor(coarse_setup(), [records[0]]).used.all()

@@ -258,6 +258,8 @@ READ_ONLY = {
         sliceit record next.yaml --replicates 3 --effect skin --refinement 0.7 --seed 132 --output new
         """,  # noqa: E501
     "a study of minutes to hours, whose results stand in docs": """
+        python -m studies adversarial --output docs/results/adversarial_curves.md
+        python -m studies bands --laws bonds --draws 2
         python -m studies calibration --output FOLDER
         python -m studies control --output FOLDER
         python -m studies coverage --replicates 12 --output docs/results

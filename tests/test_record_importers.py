@@ -1,6 +1,7 @@
 """Records made from other formats say what the source said, in the frames of a record."""
 
 import dataclasses as dc
+import re
 from pathlib import Path
 
 import numpy as np
@@ -499,3 +500,48 @@ def test_the_program_imports_a_recording_and_says_what_is_wrong(tmp_path, capsys
     assert f"{tmp_path / 'out' / 'right.csv'}: nothing found" in out
     assert "2 records, 1 with errors" in out
     assert main(["records", "check", str(tmp_path / "out" / "right.csv")]) == 0
+
+
+def import_by_hand(folder: Path, rows: np.ndarray, capsys, *options: str) -> tuple[int, str]:
+    """Status of an import, and what it says."""
+    np.savetxt(folder / "scale.csv", rows, delimiter=",")
+    words = ["--shape", "cylinder", "--size", "0.027", "0.12", "0.027", *options]
+    status = main(
+        ["records", "import", "force", str(folder / "scale.csv"), "--output", str(folder), *words]
+    )
+    return status, capsys.readouterr().out
+
+
+def test_a_spike_above_all_forces_does_not_hide_the_contact(tmp_path, capsys):
+    rows = slice_in_air_and_food()
+    rows[600, 1] = 2000.0
+    said = import_by_hand(tmp_path, rows, capsys, "--component", "vertical", "--speed", "0.02")[1]
+    begins = float(re.search(r"The force begins at (\S+) s", said)[1])
+    assert begins == pytest.approx(0.5, abs=0.02)
+    assert "1 row far from those before and after" in said
+
+
+@pytest.mark.parametrize("level", [10.0, 0.0])
+def test_a_knife_that_stands_or_leaves_at_the_end_is_asked_about(tmp_path, capsys, level):
+    rows = slice_in_air_and_food()
+    rest = np.column_stack([np.arange(1.8, 3.0, 2e-3), np.full(600, level)])
+    rest[:, 1] += 0.02 * np.random.default_rng(1).normal(size=600)
+    said = import_by_hand(tmp_path, np.vstack([rows, rest]), capsys, "--component", "vertical")[1]
+    assert re.search(r"force_vertical: the force is level at .* from 1\.\d+ s to the end", said)
+    assert "import it again with --between START END" in said
+    whole = import_by_hand(tmp_path, rows, capsys, "--component", "vertical")[1]
+    assert "is level" not in whole
+
+
+def test_a_vertical_force_that_is_taken_for_a_norm_is_told_from_one(tmp_path, capsys):
+    rows = slice_in_air_and_food() * [1.0, -1.0]
+    status, said = import_by_hand(tmp_path, rows, capsys, "--speed", "0.02")
+    assert status == 1 and "a norm is -" in said
+    assert "import it again with --component vertical (and --sign by_knife if" in said
+
+
+def test_a_slice_that_ends_far_from_the_board_is_asked_about(tmp_path, capsys):
+    rows = slice_in_air_and_food()
+    options = ("--component", "vertical", "--speed")
+    assert "correct --speed" in import_by_hand(tmp_path, rows, capsys, *options, "0.01")[1]
+    assert "correct --speed" not in import_by_hand(tmp_path, rows, capsys, *options, "0.02")[1]

@@ -19,6 +19,7 @@ from sliceit_drake.calibration.structure import (
     choice_in,
     choose_structure,
     find_puncture,
+    puncture_lines,
 )
 from sliceit_drake.cli.main import main
 from sliceit_drake.configuration import ConfigurationError
@@ -41,6 +42,8 @@ def test_a_sudden_fall_of_the_force_is_a_puncture_and_a_smooth_one_is_none():
     found = find_puncture(curve(depth, np.where(depth > 6e-3, 0.7, 1.0) * smooth))
     assert found.depth == pytest.approx(6e-3, abs=2e-4)
     assert found.drop == pytest.approx(0.3 * found.force, rel=0.15)
+    noise = np.random.default_rng(0).normal(size=600)
+    assert find_puncture(curve(depth, smooth + 0.8 * noise)) is None
     # Of what falls near the board the food's end may be the cause.
     assert find_puncture(curve(depth, np.where(depth > 24e-3, 0.2, 1.0) * smooth)) is None
 
@@ -53,6 +56,19 @@ def test_of_the_measured_curves_the_tomato_punctures(name, depth):
     (target,) = structure.coarse_predictor(load_setup(name), [record], 1).targets
     found = find_puncture(target)
     assert (found and found.depth) == (depth and pytest.approx(depth, abs=2e-3))
+
+
+def test_a_puncture_is_told_with_the_skin_that_the_setup_lacks():
+    depth = np.linspace(-2e-3, 28e-3, 600)
+    force = np.where(depth > 6e-3, 0.7, 1.0) * 20.0 * np.sin(np.pi * depth.clip(0.0) / 0.03)
+    setup = coarse_setup()
+    (line,) = puncture_lines(setup, [curve(depth, force)])
+    assert re.search(
+        r"falls by 3\.\d+ of 11\.\d+ N at a depth of [56].* the setup has no skin$", line
+    )
+    setup.food.effects.skin.toughness = 0.5
+    (line,) = puncture_lines(setup, [curve(depth, force)])
+    assert line.endswith("as where a skin is punctured")
 
 
 def test_left_out_depth_shows_an_overfit_as_blocks_that_are_held_out_do():

@@ -3,7 +3,8 @@
 A record's force is the simulated one, plus what the parameters may change of it, plus what the
 simulation gets wrong by itself (`prediction.discrepancy`), plus noise. All are normal, and their
 sizes are those of the records that were fitted. Where nothing was fitted, deeper or at another
-speed, parameters and discrepancy are what they were before.
+speed, parameters and discrepancy are what they were before. Height and speed of a record that was
+not fitted are as far from those that were as these are apart.
 """
 
 import dataclasses as dc
@@ -78,7 +79,7 @@ def force_band(model: Predictor, unit: np.ndarray, draws: int = 0) -> ForceBand:
     z = Z.shape[1]
     level = float(np.sqrt(np.mean(model.measured[used] ** 2)))
     variance = float(np.mean(r[used] ** 2))
-    prior = np.full(d, 1.0 / PRIOR_VARIANCE)
+    center, prior = np.full(d, PRIOR_CENTER), np.full(d, 1.0 / PRIOR_VARIANCE)
     conditions = _conditions(model)
     problem = Discrepancy(
         range(z), channel, phase, range(z, z + d + 1), [factors[k] for k, _ in conditions], usual
@@ -90,18 +91,50 @@ def force_band(model: Predictor, unit: np.ndarray, draws: int = 0) -> ForceBand:
         grams = [weight * columns[rows & used].T @ columns[rows & used] for _, rows in conditions]
         sizes, _ = problem.fit(grams, range(d), prior)
         coefficients = _Coefficients(problem, sizes, conditions, Z, J)
-        mean, _ = coefficients.posterior(r, used, weight, unit)
+        mean, _ = coefficients.posterior(r, used, weight, unit, center, prior)
         rest = r - coefficients.columns @ mean
         variance = max(float(np.mean(rest[used] ** 2)), (LEAST * level) ** 2)
     weight = 1.0 / independent(model, rest).variance
-    mean, covariance = coefficients.posterior(r, used, weight, unit)
+    mean, covariance = coefficients.posterior(r, used, weight, unit, center, prior)
+    center, prior = _like_the_fitted(model, unit + mean[:d], np.diag(covariance)[:d])
+    mean, covariance = coefficients.posterior(r, used, weight, unit, center, prior)
     if draws:
         normal = mean[:d], covariance[:d, :d]
-        forces, spread = _drawn(model, unit, draws, normal, coefficients.columns[:, d:], weight)
+        C = coefficients.columns[:, d:]
+        forces, spread = _drawn(model, unit, draws, normal, C, weight, center, prior)
         return ForceBand(forces, np.sqrt(spread + variance))
     A = coefficients.columns
     spread = np.einsum("ij,jk,ik->i", A, covariance, A)
     return ForceBand(model.measured - r + A @ mean, np.sqrt(np.maximum(spread, 0.0) + variance))
+
+
+def _like_the_fitted(
+    model: Predictor, unit: np.ndarray, variance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Centres and precisions of the places before the data, each [d].
+
+    They are those of uniform ranges, but for height and speed of a record that has no entry in use:
+    if two records or more have, these tell where another one is, and how uncertainly.
+
+    Args:
+        unit, variance: Of the places after the data [d].
+    """
+    center = np.full(len(unit), PRIOR_CENTER)
+    precision = np.full(len(unit), 1.0 / PRIOR_VARIANCE)
+    fitted = {model.targets[k].record.name for k in np.unique(model.record_of[model.used])}
+    owners: dict[str, list[tuple[int, bool]]] = {}
+    for k, p in enumerate(model.parameters):
+        if not p.shared:
+            kind, name = p.name.split(":", 1)
+            owners.setdefault(kind, []).append((k, name in fitted))
+    for own in owners.values():
+        known, other = ([k for k, is_known in own if is_known == w] for w in (True, False))
+        if len(known) > 1:
+            apart = np.var(unit[known], ddof=1) * (1.0 + 1.0 / len(known))
+            center[other] = unit[known].mean()
+            spread = float(apart + variance[known].mean())
+            precision[other] = 1.0 / min(spread, PRIOR_VARIANCE)
+    return center, precision
 
 
 def _drawn(
@@ -111,6 +144,8 @@ def _drawn(
     normal: tuple[np.ndarray, np.ndarray],
     C: np.ndarray,
     weight: float,
+    center: np.ndarray,
+    precision: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean and variance of the entries [M] without noise, from slices at drawn places.
 
@@ -118,6 +153,7 @@ def _drawn(
         normal: Mean and covariance of the places from `unit`, as the linear problem has them.
         C: By which the discrepancy's coefficients change the entries [M, n].
         weight: One over the variance of the entries that are used.
+        center, precision: Of the places before the data [d].
     """
     rng, used = np.random.default_rng(0), model.used
     values, vectors = np.linalg.eigh(WIDER**2 * normal[1])
@@ -132,7 +168,7 @@ def _drawn(
     inner = np.linalg.inv(np.eye(C.shape[1]) + weight * C[used].T @ C[used])
     found = weight * rest[:, used] @ C[used] @ inner
     fit = weight * ((rest[:, used] ** 2).sum(1) - ((rest[:, used] @ C[used]) * found).sum(1))
-    prior = ((places - PRIOR_CENTER) ** 2).sum(1) / PRIOR_VARIANCE
+    prior = (places - center) ** 2 @ precision
     logs = -0.5 * (fit + prior - (steps**2).sum(1))
     shares = _shares(logs)
     means = forces + found @ C.T
@@ -157,7 +193,7 @@ class _Coefficients:
 
     Attributes:
         columns: By which each entry changes [M, n].
-        precision: Before the data [n].
+        parameters: How many of the columns, the first, are theirs.
     """
 
     def __init__(
@@ -176,19 +212,23 @@ class _Coefficients:
             own.append(np.where(rows[:, None], deviations[3] * Z, 0.0))
         self.columns = np.column_stack([J, *parts, *own])
         self.parameters = J.shape[1]
-        self.precision = np.ones(self.columns.shape[1])
-        self.precision[: self.parameters] = 1.0 / PRIOR_VARIANCE
 
     def posterior(
-        self, r: np.ndarray, used: np.ndarray, weight: float, unit: np.ndarray
+        self,
+        r: np.ndarray,
+        used: np.ndarray,
+        weight: float,
+        unit: np.ndarray,
+        center: np.ndarray,
+        precision: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Mean [n] and covariance [n, n] of the coefficients after the entries that are used."""
-        A = self.columns[used]
-        before = np.zeros(len(self.precision))
-        before[: self.parameters] = PRIOR_CENTER - unit
-        H = weight * A.T @ A + np.diag(self.precision)
-        covariance = np.linalg.inv(H)
-        return covariance @ (weight * A.T @ r[used] + self.precision * before), covariance
+        """Mean [n] and covariance [n, n] of the coefficients after the entries that are used; the
+        parameters' places have `center` and `precision` before them [d]."""
+        A, rest = self.columns[used], self.columns.shape[1] - self.parameters
+        before = np.append(center - unit, np.zeros(rest))
+        precisions = np.append(precision, np.ones(rest))
+        covariance = np.linalg.inv(weight * A.T @ A + np.diag(precisions))
+        return covariance @ (weight * A.T @ r[used] + precisions * before), covariance
 
 
 def _shared(rest: np.ndarray, used: np.ndarray, record_of: np.ndarray) -> float:

@@ -22,6 +22,7 @@ from sliceit_drake.prediction.clock import EXCHANGE_PERIOD, Clock
 from sliceit_drake.prediction.placement import is_bare
 from sliceit_drake.prediction.record_target import Meshing, RecordTarget, make_targets
 from sliceit_drake.prediction.simulator import Job, JobResult, Simulator
+from sliceit_drake.records.force_checks import flat_top
 from sliceit_drake.records.slice_record import SliceRecord
 
 __all__ = ["Parameter", "Prediction", "Predictor"]
@@ -154,7 +155,9 @@ class Predictor:
         sizes = [t.measured.size for t in self.targets]
         self.record_of = np.repeat(np.arange(len(sizes)), sizes)
         self.time, self.depth = map(self._by_entry, ("time", "depth"))
-        self.used = np.ones(len(self.time), bool)
+        # What a sensor at its limit shows is no force.
+        clipped = [np.apply_along_axis(flat_top, 0, t.measured) for t in self.targets]
+        self.used = ~np.concatenate([mask.ravel() for mask in clipped])
         self.conditions = [t.record.metadata.condition for t in self.targets]
         self.point_factors: dict[str, np.ndarray] = {}
         self.step_error = np.zeros(self.measured.size)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import optuna
-from optuna.storages.journal import JournalFileBackend
+from optuna.storages.journal import JournalFileBackend, JournalFileSymlinkLock
 
 from sliceit_drake.configuration import ConfigurationError
 
@@ -16,6 +16,8 @@ __all__ = ["keeps_answering", "open_storage", "without_password"]
 
 CONNECT = 10
 """Time to reach a database, s."""
+STALE = 10
+"""Age of a journal file's lock, s, from which on whoever took it was killed: it is held for ms."""
 BEGINNERS = 20
 """Attempts to make the tables: workers that begin together on an empty database collide."""
 EXAMPLE = "postgresql://USER@HOST/DATABASE"
@@ -38,7 +40,10 @@ def open_storage(storage: str | Path) -> optuna.storages.BaseStorage:
     text = str(storage)
     if "://" not in text:
         try:
-            return optuna.storages.JournalStorage(JournalFileBackend(text))
+            # Of a relative path the lock would be a link to nowhere, whose age nobody can tell.
+            file = str(Path(text).absolute())
+            lock = JournalFileSymlinkLock(file, grace_period=STALE)
+            return optuna.storages.JournalStorage(JournalFileBackend(file, lock))
         except Exception as error:
             raise ConfigurationError(
                 f"cannot be opened ({error})",

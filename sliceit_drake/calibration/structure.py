@@ -43,6 +43,7 @@ __all__ = [
     "coarse_predictor",
     "find_puncture",
     "first_starts",
+    "puncture_lines",
 ]
 
 COARSE = 0.5
@@ -63,6 +64,8 @@ APART = 0.1
 """Part of the greatest force by which two predictions differ."""
 DROP, WITHIN = 0.12, 2e-3
 """Part of a force, and depth in metres over which it falls, of a puncture."""
+NOISES = 8.0
+"""Standard deviations of the noise by which it falls at least: those of a thousand rows span 7."""
 DEEPEST = 0.6
 """Part of the food's height above which a skin is punctured, or a wall."""
 OFF = {
@@ -168,6 +171,8 @@ def find_puncture(target: RecordTarget) -> Puncture | None:
     force = np.linalg.norm(target.measured[:, :3], axis=1)
     depth, height = target.depth, target.facts.height
     inside = np.flatnonzero((depth > 0.0) & np.append(np.diff(depth) > 0.0, False))
+    # Of neighbours, that differ by the noise of both; 1.48 medians are a standard deviation.
+    least = NOISES * 1.48 / np.sqrt(2.0) * float(np.median(np.abs(np.diff(force))))
     found = None
     for k in inside[force[inside] > 0.2 * force.max()]:
         after = (depth > depth[k]) & (depth <= depth[k] + WITHIN) & (np.arange(len(depth)) > k)
@@ -178,9 +183,22 @@ def find_puncture(target: RecordTarget) -> Puncture | None:
         lowest = int(np.flatnonzero(after)[force[after].argmin()])
         drop = float(force[k] - force[lowest])
         goes_on = depth[-1] > depth[k] + 2.0 * WITHIN
-        if drop > DROP * force[k] and goes_on and (found is None or drop > found.drop):
+        if drop > max(DROP * force[k], least) and goes_on and (found is None or drop > found.drop):
             found = Puncture(float(depth[k]), float(force[k]), drop)
     return found
+
+
+def puncture_lines(setup: CalibrationSetup, targets: Sequence[RecordTarget]) -> list[str]:
+    """A sentence on the first record whose force falls as where a skin is punctured, if any."""
+    found = next((p for p in map(find_puncture, targets) if p is not None), None)
+    if found is None:
+        return []
+    known = any(r.name == "effects.skin.toughness" for r in setup.parameters)
+    none = "" if known or setup.food.effects.skin.toughness > 0.0 else "; the setup has no skin"
+    return [
+        f"The force falls by {found.drop:.3g} of {found.force:.3g} N at a depth of "
+        f"{1e3 * found.depth:.3g} mm, as where a skin is punctured{none}"
+    ]
 
 
 def choose_structure(
@@ -203,17 +221,9 @@ def choose_structure(
     plain = _without_elements(setup)
     first = coarse_predictor(plain, records, workers)
     height = max(t.facts.height for t in first.targets)
-    punctures = [p for p in map(find_puncture, first.targets) if p is not None]
     free = all(r.metadata.food.support == "unknown" for r in records)
     elements = _elements(setup, height, free)
-    lines, warnings = [], []
-    for p in punctures[:1]:
-        lines.append(
-            f"The force falls by {p.drop:.3g} of {p.force:.3g} N at a depth of "
-            f"{1e3 * p.depth:.3g} mm, as where a skin is punctured"
-        )
-        if not any(r.name == "effects.skin.toughness" for r in setup.parameters):
-            lines[-1] += "; the setup has no skin"
+    lines, warnings = puncture_lines(setup, first.targets), []
     done, tried = 0, 1 + FITTED
 
     def show(best: float) -> None:

@@ -180,7 +180,7 @@ def _calibrate(options: argparse.Namespace) -> int:
     from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate, values_of
     from sliceit_drake.calibration.setup import load_setup, setup_of_record
     from sliceit_drake.calibration.storage import without_password
-    from sliceit_drake.calibration.structure import choice_in
+    from sliceit_drake.calibration.structure import choice_in, puncture_lines
     from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
     from sliceit_drake.records.validation import check_record, load_record, record_files
 
@@ -234,6 +234,8 @@ def _calibrate(options: argparse.Namespace) -> int:
             [r for r in records if r.name in options.hold_out],
             bars.show_error,
         )
+    if options.structure == "setup":
+        warnings = puncture_lines(setup, result.predictor.targets)
     # The command is kept with the food, for others to read.
     command = shlex.join(["sliceit", *(without_password(a) for a in sys.argv[1:])])
     result.save(options.output, command)

@@ -62,8 +62,14 @@ AGAIN = {
     "flipped sign": "--sign by_knife",
     "kilonewtons": "--units s kN",
     "force unit": "--units s mN",
+    "negative norm": "--component vertical (and --sign by_knife if a press is negative)",
+    "level end": "--between START END",
 }
 """What mends an import of a force in which something was found."""
+
+
+MOST = 0.7
+"""Part of the food's height below which a slice that ends there is asked about."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -243,12 +249,17 @@ def _say_what_was_taken(record: "SliceRecord") -> None:
             f"By the last row the knife is {1e3 * way:.0f} mm deep in a food that is "
             f"{1e3 * facts.food.size[2]:.0f} mm high."
         )
+        if way < MOST * facts.food.size[2]:
+            print(
+                "If it went on to the board, correct --speed, or the height, the last number of "
+                "--size."
+            )
     if "no unit" in facts.processing[0].note:
         print("The table names no unit: s and N are taken. Give --units if they are others.")
     if spikes := int((without_spikes(record.measured_force)[1] > 0.0).any(1).sum()):
         print(
-            f"{spikes} rows stand out from those before and after, as of a faulty cable: they "
-            "count for little."
+            f"{spikes} row{'s' * (spikes > 1)} far from those before and after, as of a faulty "
+            "cable: the fit hardly counts such."
         )
     if any(step.name == "tare" for step in facts.processing):
         print("The mean force before that is taken off.")

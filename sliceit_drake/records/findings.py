@@ -54,8 +54,9 @@ KINDS = {
     "frame": ("warning", "Check wrench.frame, and the placement of the knife on the tool."),
     "clipped": (
         "warning",
-        "Leave these rows out of comparisons, or repeat the slice with a sensor of greater range.",
+        "A calibration leaves these rows out; repeat the slice with a sensor of greater range.",
     ),
+    "level end": ("warning", "Did the knife stand, or leave the food? End the slice before that."),
     "frozen": ("warning", "Check the sensor's connection; leave these rows out."),
 }
 """What is looked for: how bad it is, and what to do where the record does not tell it better."""

@@ -8,7 +8,7 @@ from sliceit_drake.records.findings import Findings, runs
 from sliceit_drake.records.preprocessing import MIN_AIR_ROWS
 from sliceit_drake.records.slice_record import SliceRecord, SliceTable
 
-__all__ = ["check_force"]
+__all__ = ["check_force", "flat_top"]
 
 MIN_FORCE = 0.1
 """A slice whose force stays below this, N, is too light even for soft tofu: it is in kN."""
@@ -29,6 +29,9 @@ FLAT, FLAT_FAR = 5.0, 50.0
 """Rows at exactly the greatest value that tell a saturated sensor, near its range and far."""
 DRIFT = 0.05
 """Fraction of the greatest force by which a sensor's zero may drift over the record."""
+LEVEL, LONG = 0.02, 0.2
+"""Fractions of the greatest force within which, and of the slice for which, it is level at the end
+where the knife stands still or has left the food."""
 ALONG = 0.2
 """Fraction of |F| |v| that the power must have at least for its sign to mean something."""
 
@@ -57,6 +60,8 @@ def check_force(table: SliceTable, record: SliceRecord, findings: Findings) -> N
             _check_sign(table, record, air, cut, findings)
     _check_saturation(table, record, findings)
     _check_frozen(table, cut, findings)
+    if record.metadata.motion.phases and not findings.has("clipped", "frozen", "kilonewtons"):
+        _check_end(record, air, record.first_phase("slice"), findings)
 
 
 def _known_offset(record: SliceRecord, air: np.ndarray) -> np.ndarray | None:
@@ -235,19 +240,30 @@ def _in_sensor_axes(
     return [(name, table.columns[name]) for name in names]
 
 
-def _check_flat_top(name: str, values: np.ndarray, findings: Findings, least: float = FLAT) -> None:
-    """Runs of exactly the greatest or least value, longer than the signal's usual runs."""
+def flat_top(values: np.ndarray, least: float = FLAT) -> np.ndarray:
+    """Rows [n] at exactly the greatest or least value, where more of them follow each other than
+    the signal [n] usually repeats: the sensor is at its limit."""
     starts = np.concatenate([[0], np.flatnonzero(np.diff(values) != 0.0) + 1])
     lengths = np.diff(np.concatenate([starts, [len(values)]]))
+    out = np.zeros(len(values), bool)
     for extreme in (values.max(), values.min()):
         is_extreme = values[starts] == extreme
         if abs(extreme) < 0.5 * np.abs(values).max() or is_extreme.all():
             continue
-        longest = int(lengths[is_extreme].max())
         # A slow sensor in a fast table, or a coarse one, repeats values all the time.
-        if longest >= max(least, 3.0 * np.percentile(lengths[~is_extreme], 95.0)):
-            text = f"{longest} rows in a row are exactly {extreme:.6g}, as of a sensor at its limit"
-            _report_clipping(findings, name, text, values == extreme)
+        usual = 3.0 * np.percentile(lengths[~is_extreme], 95.0)
+        if lengths[is_extreme].max() >= max(least, usual):
+            out |= values == extreme
+    return out
+
+
+def _check_flat_top(name: str, values: np.ndarray, findings: Findings, least: float = FLAT) -> None:
+    at = flat_top(values, least)
+    for extreme in np.unique(values[at])[::-1]:
+        same = values == extreme
+        first, last = max(runs(same), key=lambda run: run[1] - run[0])
+        text = f"{last - first + 1} rows in a row are exactly {extreme:.6g}, as of a sensor at its"
+        _report_clipping(findings, name, f"{text} limit", same)
 
 
 def _report_clipping(findings: Findings, name: str, text: str, at: np.ndarray) -> None:
@@ -266,3 +282,24 @@ def _check_frozen(table: SliceTable, cut: np.ndarray, findings: Findings) -> Non
             )
             findings.add("frozen", names[0], text, (first, last + 1))
             return
+
+
+def _check_end(record: SliceRecord, air: np.ndarray, cut: np.ndarray, findings: Findings) -> None:
+    """A force that is level at the end of the slice: the knife stood, or had left the food."""
+    rows = np.flatnonzero(cut)
+    if len(rows) < 2 * MIN_AIR_ROWS:
+        return
+    force = record.measured_force[rows]
+    force = force[:, [np.ptp(force, axis=0).argmax()]]
+    around = np.median(force[-max(MIN_AIR_ROWS, len(rows) // 20) :])
+    least = max(LEVEL * np.ptp(force), 5.0 * _noise(record, air))
+    away = np.flatnonzero(np.abs(force[:, 0] - around) > least)
+    if away.size == 0:
+        return
+    first = int(away[-1]) + 1
+    time = record.time[rows]
+    if first < len(rows) and time[-1] - time[first] > LONG * (time[-1] - time[0]):
+        text = f"the force is level at {around:.3g} N from {time[first]:.4g} s to the end of the"
+        fix = f"Did the knife stand, or leave the food? End the slice at {time[first]:.4g} s."
+        name = record.force_columns[0]
+        findings.add("level end", name, f"{text} slice", (rows[first], rows[-1]), fix)

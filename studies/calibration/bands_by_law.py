@@ -98,7 +98,8 @@ def scored(law: str, number: int) -> list[Row]:
     model = predictor.holding_out(predictor.record_of >= len(fitted))
     unit = np.array([p.unit(found.get(p.name, p.start)) for p in predictor.parameters])
     low, high = force_band(model, unit, DRAWS).interval(LEVEL)
-    (residual,) = residuals_at(model, [unit])
+    # Of all entries: those that `model` does not use have no residual there.
+    (residual,) = residuals_at(predictor, [unit])
     measured, fit = model.measured, model.measured + residual
     reach = 1.645 * float(np.std(residual[model.used]))
     out = []
