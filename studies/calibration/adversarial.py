@@ -64,6 +64,15 @@ class Curve:
     options: Sequence[str] = ()
     fit: bool = False
 
+    @property
+    def verdict(self) -> str:
+        """Where the expected words were said."""
+        return "not told" if self.name in NOT_TOLD else "right"
+
+
+NOT_TOLD = ("kgf", "begins in the food, with an offset", "grows without a cut")
+"""Curves of which no more is said than of others, in which this is not wrong."""
+
 
 def _spoiled(force: np.ndarray, rows: slice, value: float) -> np.ndarray:
     out = force.copy()
@@ -272,7 +281,7 @@ def run(options: argparse.Namespace) -> int:
             chosen = dc.replace(curve, fit=False) if options.no_fit else curve
             status, said = said_of(chosen, Path(folder))
         line = _line(curve, said)
-        right = "right" if is_right(curve, status, said) else "**wrong**"
+        right = curve.verdict if is_right(curve, status, said) else "**wrong**"
         step = "import, fit" if chosen.fit else "import"
         rows.append((curve.name, step, line, ("used", "refused")[status != 0], right))
     page = f"{HEAD}\n{table('what the user did | commands | what was said | then | verdict', rows)}"
@@ -287,8 +296,11 @@ HEAD = """\
 
 What a new user brings, and what the import and the calibration say of it. The good curve is the
 paper's potato; how each is made stands in `studies/calibration/adversarial.py`. "Used" are curves
-whose commands end well, with a warning or without. kgf cannot be told from a curve: a potato of 3 N
-is possible. The warning of the first row is about the coarse mesh, not about the curve.
+whose commands end well, with a warning or without. What should be said was written down with the
+answers of an earlier run in sight: "right" means that the fault is named. Three are not told from
+curves without it: a potato of 3 N is possible, so that kgf cannot be seen; a force that only grows
+is said to leave modulus and toughness open, as many good curves do; an offset cannot be taken off a
+curve that begins in the food. The warning of the first row is about the coarse mesh, not about the curve.
 
     python -m studies adversarial --output docs/results/adversarial_curves.md
 
