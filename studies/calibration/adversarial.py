@@ -300,7 +300,8 @@ whose commands end well, with a warning or without. What should be said was writ
 answers of an earlier run in sight: "right" means that the fault is named. Three are not told from
 curves without it: a potato of 3 N is possible, so that kgf cannot be seen; a force that only grows
 is said to leave modulus and toughness open, as many good curves do; an offset cannot be taken off a
-curve that begins in the food. The warning of the first row is about the coarse mesh, not about the curve.
+curve that begins in the food. The warning of the first row is about the coarse mesh, not about the
+curve.
 
     python -m studies adversarial --output docs/results/adversarial_curves.md
 
