@@ -8,6 +8,8 @@ from scipy.ndimage import maximum_filter1d
 
 __all__ = ["MESH", "CauseAtScan", "Column", "RecordSensitivity", "Sensitivities", "replicates"]
 
+NEAR = 3e-3
+"""Height over the food below which a knife may touch: slices differ in height, metres."""
 KINK_TIME = 0.02
 """By which the time of a jump of the force may be wrong, s."""
 CauseAtScan = tuple[str, float | None]
@@ -101,6 +103,11 @@ class RecordSensitivity:
     def forces(self) -> list[int]:
         """Numbers of the channels that are forces."""
         return [k for k, name in enumerate(self.channels) if name.startswith("force")]
+
+    @property
+    def near(self) -> np.ndarray:
+        """Whether the knife touches, or would in a slice that stands `NEAR` higher [m]."""
+        return np.asarray(self.in_contact | (self.in_contact.any() & (self.depth > -NEAR)))
 
     @property
     def shown(self) -> int:

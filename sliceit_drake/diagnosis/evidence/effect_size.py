@@ -123,11 +123,10 @@ def standardised_size(
     """
     records, base = problem.found.records, problem.base
     coefficients = np.broadcast_to(coefficients, (len(records), len(columns)))
-    noise = np.array([n.deviation for n in problem.noise])
     scales = wrong.scales(found) if wrong is not None else [np.zeros(1)] * len(records)
     effects, free = [], []
     for record, own, g in zip(records, scales, coefficients, strict=True):
-        scale = np.hypot(np.hypot(own, noise), problem.model_error(record))
+        scale = np.hypot(np.hypot(own, problem.noise_of(record)), problem.model_error(record))
         effects.append((record.columns[:, :, list(columns)] @ g / scale).ravel())
         free.append((record.columns[:, :, base] / scale[:, :, None]).reshape(-1, len(base)))
     effect, X = np.concatenate(effects), np.concatenate(free)
@@ -156,10 +155,11 @@ def size_by_record(
                        coefficients)  # fmt: skip
     product = np.einsum("rij,rj->i", gram[np.ix_(range(len(gram)), base, own)], coefficients)
     square -= product @ scaled_inverse(gram.sum(0)[np.ix_(base, base)]) @ product
-    noise = np.array([n.deviation for n in problem.noise])
     effect = np.concatenate(
         [
-            (r.columns[:, :, own] @ g / np.hypot(noise, problem.model_error(r))).ravel()
+            (
+                r.columns[:, :, own] @ g / np.hypot(problem.noise_of(r), problem.model_error(r))
+            ).ravel()
             for r, g in zip(problem.found.records, coefficients, strict=True)
         ]
     )

@@ -22,7 +22,12 @@ from sliceit_drake.diagnosis.evidence.columns import (
     Sensitivities,
     replicates,
 )
-from sliceit_drake.diagnosis.evidence.noise_levels import ChannelNoise, differences, estimate_noise
+from sliceit_drake.diagnosis.evidence.noise_levels import (
+    ChannelNoise,
+    differences,
+    estimate_noise,
+    in_air,
+)
 from sliceit_drake.prediction.discrepancy import (
     USUAL_SHARE,
     Covariates,
@@ -136,7 +141,8 @@ class LinearProblem:
         of = {r: k for k, members in enumerate(self.conditions.values()) for r in members}
         self.condition_of = [of[r] for r in range(len(found.records))]
         if noise is None:
-            self.noise, self.repeated = estimate_noise(found.records, self.own)
+            zero = [k for k in self._usual()[1]]
+            self.noise, self.repeated = estimate_noise(found.records, self.own, zero)
         else:
             self.noise, self.repeated = tuple(noise), True
         self._reduced: dict[tuple[tuple[int, ...], bytes], np.ndarray] = {}
@@ -206,7 +212,7 @@ class LinearProblem:
         force_gram = np.zeros_like(gram)
         error, calm = self.model_error(record), self.calm(record)
         for c, at, X in self._parts(record, shapes):
-            G = X.T @ self.noise[c].solve(record.time, X, error[:, c])
+            G = X.T @ self.noise[c].solve(record.time, X, error[:, c], record.near)
             gram[np.ix_(at, at)] += 0.5 * (G + G.T)
             if c in self.forces:
                 force_gram[np.ix_(at, at)] += X[calm].T @ X[calm]
@@ -219,15 +225,20 @@ class LinearProblem:
         products, of_force = np.zeros(self.size + 1), np.zeros(self.size + 1)
         error, calm = self.model_error(record), self.calm(record)
         for c, at, X in self._parts(moved, shapes):
-            products[at] += X.T @ self.noise[c].solve(record.time, X[:, -1:], error[:, c])[:, 0]
+            noise, y = self.noise[c], X[:, -1:]
+            products[at] += X.T @ noise.solve(record.time, y, error[:, c], record.near)[:, 0]
             if c in self.forces:
                 of_force[at] += X[calm].T @ X[calm, -1]
         return products, of_force
 
     def calm(self, record: RecordSensitivity) -> np.ndarray:
         """Rows in contact at which the force does not jump [m]."""
-        deviation = np.array([noise.deviation for noise in self.noise])
-        return np.asarray(record.in_contact & (record.kinks() < deviation).all(1))
+        kinks = record.kinks() < self.noise_of(record)
+        return np.asarray(record.in_contact & kinks.all(1))
+
+    def noise_of(self, record: RecordSensitivity) -> np.ndarray:
+        """Standard deviation of the noise at each row [m, c]."""
+        return np.column_stack([n.deviations(record.near) for n in self.noise])
 
     def predicting(self, predicted: Sequence[np.ndarray]) -> "LinearProblem":
         """The same problem, weights included, about another prediction of each record [m, c]."""
@@ -331,12 +342,12 @@ class LinearProblem:
         own = [*self.own, *self.usual_own]
         for group in self.conditions.values():
             n, members = len(group), [self.found.records[k] for k in group]
-            error = self.model_error(members[0])
+            error, near = self.model_error(members[0]), ~in_air(members)[:, 0]
             for time, rest, columns in differences(members, own) if n > 1 else ():
                 scaled = np.sqrt(n / (n - 1.0)) * rest
                 X = np.concatenate([columns, scaled[:, :, None]], axis=2)
                 # Of n deviations from their mean n - 1 are independent.
-                grams.append((self._weighted(time, X, error[: len(time)]), (n - 1.0) / n))
+                grams.append((self._weighted(time, X, error[: len(time)], near), (n - 1.0) / n))
         d = len(self.own)
         usual = np.array(list(self.usual_own.values()))
 
@@ -365,11 +376,13 @@ class LinearProblem:
             out = np.hypot(out, SECOND_ORDER * record.bent)
         return np.asarray(out)
 
-    def _weighted(self, time: np.ndarray, X: np.ndarray, model_error: np.ndarray) -> np.ndarray:
+    def _weighted(
+        self, time: np.ndarray, X: np.ndarray, model_error: np.ndarray, near: np.ndarray
+    ) -> np.ndarray:
         """Gram matrix of columns [m, c, k], weighted with noise and model error [k, k]."""
         G = np.zeros((X.shape[2], X.shape[2]))
         for c, noise in enumerate(self.noise):
-            G += X[:, c].T @ noise.solve(time, X[:, c], model_error[:, c])
+            G += X[:, c].T @ noise.solve(time, X[:, c], model_error[:, c], near)
         return 0.5 * (G + G.T)
 
 

@@ -2,7 +2,8 @@
 
 Records of one condition were nominally the same cut: what is wrong with the model is wrong in all
 of them alike, and drops out of their differences. What is left there is the sensor's noise and the
-food's unevenness (and what slices differ in as a whole, which is projected out before).
+food's unevenness (and what slices differ in as a whole, which is projected out before). In the air
+there is the sensor's noise alone, often a tenth of that, which tells what no food can hide.
 """
 
 import dataclasses as dc
@@ -15,10 +16,14 @@ from sliceit_drake.diagnosis.evidence.columns import RecordSensitivity, replicat
 from sliceit_drake.prediction.noise import MarkovCovariance
 from sliceit_drake.tables import interpolated
 
-__all__ = ["ChannelNoise", "differences", "estimate_noise"]
+__all__ = ["ChannelNoise", "differences", "estimate_noise", "in_air"]
+
+Series = tuple[np.ndarray, np.ndarray, float]
+"""Times [m], s, values [m, c], NaN where they do not count, and a factor on their variance."""
 
 LAGS = 40
-MIN_ROWS = 60
+MIN_ROWS = 300
+"""Rows in the air, and as many in the food, from which each has a noise of its own."""
 FLOOR = 1e-3
 """Least standard deviation, in N and Nm."""
 
@@ -31,48 +36,87 @@ class ChannelNoise:
         ar: Standard deviation of the correlated part, N or Nm.
         tau: Its correlation time, s.
         white: Standard deviation of the rest.
+        air: Noise in the air, independent of that in the food; None for the same.
     """
 
     ar: float
     tau: float
     white: float
+    air: "ChannelNoise | None" = None
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of a sample."""
+        """Standard deviation of a sample in the food."""
         return float(np.hypot(self.ar, self.white))
 
+    def deviations(self, near: np.ndarray) -> np.ndarray:
+        """Standard deviation of samples, by whether the knife is near the food [m]."""
+        return np.where(near, self.deviation, (self.air or self).deviation)
+
     def solve(
-        self, time: np.ndarray, columns: np.ndarray, model_error: np.ndarray | float = 0.0
+        self,
+        time: np.ndarray,
+        columns: np.ndarray,
+        model_error: np.ndarray | float = 0.0,
+        near: np.ndarray | None = None,
     ) -> np.ndarray:
-        """The inverse covariance at increasing times [m], s, times columns [m, k]; `model_error` is
-        the standard deviation of what the model is unsure of at each row [m]."""
-        white = np.hypot(self.white, model_error)
-        return MarkovCovariance(np.diff(time), self.ar, self.tau, white).solve(columns)
+        """The inverse covariance times columns.
+
+        Args:
+            time: Increasing [m], s.
+            columns: [m, k].
+            model_error: Standard deviation of what the model is unsure of at each row [m].
+            near: Whether the knife is near the food [m]; None for all rows.
+        """
+        error, out = np.broadcast_to(model_error, time.shape), np.empty(columns.shape)
+        parts = [(np.ones(len(time), bool), self)]
+        if self.air is not None and near is not None:
+            parts = [(near, self), (~near, self.air)]
+        for rows, noise in parts:
+            if rows.any():
+                white = np.hypot(noise.white, error[rows])
+                covariance = MarkovCovariance(np.diff(time[rows]), noise.ar, noise.tau, white)
+                out[rows] = covariance.solve(columns[rows])
+        return out
 
 
 def estimate_noise(
-    records: Sequence[RecordSensitivity], own: Sequence[int]
+    records: Sequence[RecordSensitivity], own: Sequence[int], zero: Sequence[int] = ()
 ) -> tuple[tuple[ChannelNoise, ...], bool]:
     """Noise of each channel, pooled over the records.
 
     Args:
         records: With the same channels.
         own: Columns that differ from record to record; they are projected out of the differences.
+        zero: Those of the sensor's zero, which differ too; they are projected out of what is in the
+            air.
 
     Returns:
         The noise of each channel, and whether it is from replicates: where no condition has two
         records it is from the air phases and from what is rough in the residuals.
     """
-    groups = [g for g in replicates(records).values() if len(g) > 1]
-    series: list[tuple[np.ndarray, np.ndarray, float]] = []
-    for members in groups:
-        series += _deviations([records[k] for k in members], own)
-    repeated = bool(series)
-    if not repeated:
-        series = [_roughness(r) for r in records]
-    channels = len(records[0].channels)
-    return tuple(_channel(series, c) for c in range(channels)), repeated
+    whole: list[Series] = []
+    in_food: list[Series] = []
+    airborne: list[Series] = []
+    for members in replicates(records).values():
+        if len(members) == 1:
+            continue
+        alike, factor = [records[k] for k in members], len(members) / (len(members) - 1.0)
+        air = in_air(alike)
+        for grid, rest, columns in differences(alike, own):
+            rest = _beside(rest, columns)
+            whole.append((grid, rest, factor))
+            in_food.append((grid, np.where(air, np.nan, rest), factor))
+        for grid, rest, columns in differences(alike, zero) if air.any() else ():
+            known = np.full_like(rest, np.nan)
+            known[air[:, 0]] = _beside(rest[air[:, 0]], columns[air[:, 0]])
+            airborne.append((grid, known, factor))
+    channels = range(len(records[0].channels))
+    if min(map(_rows, (in_food, airborne))) >= MIN_ROWS:
+        parts = [(_channel(in_food, c), _channel(airborne, c)) for c in channels]
+        return tuple(dc.replace(of_food, air=of_air) for of_food, of_air in parts), True
+    series = whole or [_roughness(r) for r in records]
+    return tuple(_channel(series, c) for c in channels), bool(whole)
 
 
 def differences(
@@ -101,23 +145,30 @@ def differences(
     return [(grid, v - mean, c) for v, c in zip(values, columns, strict=True)]
 
 
-def _deviations(
-    members: list[RecordSensitivity], own: Sequence[int]
-) -> list[tuple[np.ndarray, np.ndarray, float]]:
-    """Times, differences less what columns take of them [m, c], and a factor on their variance."""
-    n = len(members)
-    out = []
-    for grid, rest, column in differences(members, own):
-        flat = column.reshape(-1, len(own))
-        flat = flat[:, np.linalg.norm(flat, axis=0) > 1e-9]
-        if flat.shape[1]:
-            fitted, *_ = np.linalg.lstsq(flat, rest.ravel(), rcond=1e-6)
-            rest = rest - (flat @ fitted).reshape(rest.shape)
-        out.append((grid, rest, n / (n - 1.0)))
-    return out
+def _rows(series: Sequence[Series]) -> int:
+    """Number of rows that count."""
+    return sum(int(np.isfinite(values[:, 0]).sum()) for _, values, _ in series)
 
 
-def _roughness(record: RecordSensitivity) -> tuple[np.ndarray, np.ndarray, float]:
+def in_air(members: Sequence[RecordSensitivity]) -> np.ndarray:
+    """Whether no replicate is near its food, at the rows of `differences` [m, 1]."""
+    count = min(len(r.time) for r in members)
+    grid = members[0].time[:count] - members[0].time[0]
+    inside = [np.interp(grid, r.time - r.time[0], r.near.astype(float)) for r in members]
+    return np.asarray(np.max(inside, axis=0) == 0.0)[:, None]
+
+
+def _beside(rest: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Values [m, c] less what columns [m, c, k] take of them."""
+    flat = columns.reshape(len(rest) * rest.shape[1], -1)
+    flat = flat[:, np.linalg.norm(flat, axis=0) > 1e-9]
+    if not flat.shape[1]:
+        return rest
+    fitted, *_ = np.linalg.lstsq(flat, rest.ravel(), rcond=1e-6)
+    return np.asarray(rest - (flat @ fitted).reshape(rest.shape))
+
+
+def _roughness(record: RecordSensitivity) -> Series:
     """The residual less its running mean over a tenth of a second."""
     step = float(np.median(np.diff(record.time)))
     width = max(3, 2 * round(0.05 / step) + 1)
@@ -128,7 +179,7 @@ def _roughness(record: RecordSensitivity) -> tuple[np.ndarray, np.ndarray, float
     return record.time[inside], rest, 1.0 / (1.0 - 1.0 / width)
 
 
-def _channel(series: list[tuple[np.ndarray, np.ndarray, float]], c: int) -> ChannelNoise:
+def _channel(series: list[Series], c: int) -> ChannelNoise:
     """Fits the autocovariance of a channel."""
     step = float(np.median(np.concatenate([np.diff(t) for t, _, _ in series])))
     sums, counts = np.zeros(LAGS), np.zeros(LAGS)
@@ -136,8 +187,9 @@ def _channel(series: list[tuple[np.ndarray, np.ndarray, float]], c: int) -> Chan
         x = rest[:, c]
         for lag in range(min(LAGS, len(x) - 1)):
             products = x[lag:] * x[: len(x) - lag]
-            sums[lag] += factor * products.sum()
-            counts[lag] += len(products)
+            known = np.isfinite(products)
+            sums[lag] += factor * products[known].sum()
+            counts[lag] += known.sum()
     used = counts > 0
     covariance = sums[used] / counts[used]
     lags = np.arange(LAGS)[used] * step

@@ -301,10 +301,9 @@ def _refusal(
 
 def _share_in_contact(problem: LinearProblem, e: CauseEvidence) -> float:
     """Share of the mean square of a cause's doing, over the noise, where the knife touches."""
-    noise = np.array([n.deviation for n in problem.noise])
     columns, inside, whole = problem.found.of_causes([e.cause]), 0.0, 0.0
     for record in problem.found.records:
-        effect = record.columns[:, :, columns] @ np.array(e.coefficients) / noise
+        effect = record.columns[:, :, columns] @ np.array(e.coefficients) / problem.noise_of(record)
         squares = (effect**2).sum(1)
         inside += float(squares[record.in_contact].sum())
         whole += float(squares.sum())
