@@ -155,15 +155,11 @@ def size_by_record(
                        coefficients)  # fmt: skip
     product = np.einsum("rij,rj->i", gram[np.ix_(range(len(gram)), base, own)], coefficients)
     square -= product @ scaled_inverse(gram.sum(0)[np.ix_(base, base)]) @ product
-    effect = np.concatenate(
-        [
-            (
-                r.columns[:, :, own] @ g / np.hypot(problem.noise_of(r), problem.model_error(r))
-            ).ravel()
-            for r, g in zip(problem.found.records, coefficients, strict=True)
-        ]
-    )
-    rows = int(_acts(effect).sum())
+    effects = []
+    for record, g in zip(problem.found.records, coefficients, strict=True):
+        scale = np.hypot(problem.noise_of(record), problem.model_error(record))
+        effects.append((record.columns[:, :, own] @ g / scale).ravel())
+    rows = int(_acts(np.concatenate(effects)).sum())
     whitened = float(np.sqrt(max(square, 0.0) / rows)) if rows else 0.0
     return max(whitened, standardised_size(problem, columns, coefficients))
 
