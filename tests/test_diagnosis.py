@@ -157,6 +157,38 @@ def test_a_wave_is_as_large_as_over_the_noise_at_its_frequency(slow, white):
     assert size >= standardised_size(whole, [skin], ones)
 
 
+def uneven(seed: int, up: float = 0.0) -> Sensitivities:
+    """Slices that differ along the cut by ten times the noise in the air, far above the food; there
+    alone the column "rate" has a wave, of which `up` is in the force."""
+    found = problem(seed, replicates=4, speeds=(0.01, 0.02, 0.04, 0.08, 0.16)).found
+    rate = [c.name for c in found.columns].index("rate")
+    rng = np.random.default_rng(seed)
+    for k, r in enumerate(found.records):
+        columns, air = r.columns.copy(), ~r.in_contact[:, None]
+        columns[:, 0, rate] = np.where(air[:, 0], np.cos(20.0 * r.time), 0.0)
+        quiet = 0.1 * NOISE * rng.normal(size=(ROWS, 1)) + up * columns[:, :1, rate]
+        measured = np.where(air, r.predicted + quiet, r.measured)
+        depth = np.where(air[:, 0], -0.01, r.depth)
+        found.records[k] = dc.replace(r, columns=columns, measured=measured, depth=depth)
+    return found
+
+
+def test_the_noise_in_the_air_is_that_of_the_sensor():
+    whole = LinearProblem(uneven(3))
+    (noise,) = whole.noise
+    assert noise.air is not None
+    assert noise.air.deviation == pytest.approx(0.1 * NOISE, rel=0.15)
+    assert noise.deviation == pytest.approx(NOISE, rel=0.3)
+    record = whole.found.records[0]
+    size = np.where(record.near, noise.deviation, noise.air.deviation)
+    assert np.array_equal(whole.noise_of(record)[:, 0], size)
+
+
+def test_what_is_below_the_unevenness_of_food_is_found_in_the_air():
+    for up, names in ((0.0, []), (0.2 * NOISE, [["rate"]])):
+        assert reach_verdict(LinearProblem(uneven(7, up)), 60).names == names
+
+
 def test_what_goes_with_the_number_of_the_slice_alone_is_unknown():
     for trend, kind in ((0.0, "nothing"), (0.1, "unknown")):
         found = problem(45, replicates=5).found
