@@ -147,7 +147,7 @@ def size_by_record(
     Args:
         problem: The records.
         columns: Numbers of the effect's columns [n].
-        coefficients: Of the columns in each record [R, n].
+        coefficients: Of the columns in each record [R, n], 0 where it does not show.
     """
     own, base = list(columns), problem.base
     gram = problem.moments.gram

@@ -366,6 +366,7 @@ def _evidence(
     problem, sizes = statistics.problem, sizes or statistics.sizes
     kinds = [problem.found.columns[k] for k in columns]
     fits, presence = np.zeros((0, 0)), 1.0
+    shown = np.zeros(0, bool)
     value, error = np.zeros(len(columns)), np.full(len(columns), np.inf)
     if kinds[0].per_record:
         fits, own_gains = statistics.own_fits(columns)
@@ -396,7 +397,7 @@ def _evidence(
     )
     if out.score > 0.0:
         if out.per_record:
-            out.size = left = size_by_record(problem, columns, fits)
+            out.size = left = size_by_record(problem, columns, fits * shown[:, None])
         else:
             wrong = OwnError(problem, problem.with_causes([*statistics.taken, *active]), sizes)
             out.size = standardised_size(problem, columns, value, wrong)
