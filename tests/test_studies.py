@@ -132,3 +132,13 @@ def test_each_motion_of_the_picture_of_proposals_is_one_that_may_be_proposed():
     assert names == [each.name for each in proposed if not each.by_hand]
     for draw in (guide_diagrams.hardware_figure, guide_diagrams.scaling_figure):
         draw().canvas.draw()
+
+
+def test_the_safety_layer_that_is_timed_stops_nothing(monkeypatch, capsys):
+    monkeypatch.setattr("studies.robot.safety_layer.CYCLES", 60)
+    monkeypatch.setattr("studies.robot.safety_layer.RUNS", 1)
+    assert main(["safety_layer"]) == 0
+    assert re.fullmatch(
+        r"[\d.]+ us a decision, [\d.]+ us with the distances of the bodies\n",
+        capsys.readouterr().out,
+    )
