@@ -25,7 +25,7 @@ from sliceit_drake.learning.reward import (  # noqa: E402
     reward_terms,
     reward_weights,
 )
-from sliceit_drake.learning.task import RandomizationConfig, TaskConfig  # noqa: E402
+from sliceit_drake.learning.task import RandomizationConfig, TaskConfig, make_agent_station  # noqa: E402
 from sliceit_drake.systems.agent import AgentConfig  # noqa: E402
 from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig  # noqa: E402
 
@@ -229,6 +229,28 @@ def test_a_guard_of_the_simulation_terminates_with_the_reward_of_a_collision(mon
     # The next episode is as if nothing had happened.
     expected = rollout(SlicingEnv(env.task), 3, seed=4)
     assert np.array_equal(rollout(env, 3, seed=4), expected)
+
+
+@pytest.mark.parametrize("seed", [6, 117], ids=["tomato", "cucumber"])
+def test_sawing_at_random_ends_by_no_guard(seed):
+    """Both did without `TaskConfig.edge_spread`: the food moved with the knife."""
+    env = SlicingEnv(TaskConfig())
+    env.reset(seed=seed)
+    rng, ended = np.random.default_rng(seed), False
+    while not ended:
+        *_, terminated, truncated, info = env.step(rng.uniform(-1.0, 1.0, 6).astype(np.float32))
+        ended = terminated or truncated
+    assert info["end"] == "goal", info.get("guard_message")
+
+
+def test_no_variant_is_softer_than_its_mesh_follows():
+    task = TaskConfig()
+    for which in range(task.randomization.stations):
+        station = make_agent_station(task, "tomato", np.random.default_rng(which), which=which)
+        for model in (solver.model for solver in station.station.cutting.solvers):
+            assert model.skin_fold <= 1.0
+            assert model.wide_spread <= model.numerics.edge_spread
+            assert model.numerics.edge_spread >= task.edge_spread
 
 
 def test_any_other_error_ends_the_training(monkeypatch, spring):

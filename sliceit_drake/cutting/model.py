@@ -518,6 +518,11 @@ class CuttingModel(CutGeometry):
         return tuple(texts)
 
     @property
+    def skin_fold(self) -> float:
+        """`skin_softness` over the greatest that is verified: above 1 elements may invert."""
+        return self.skin_softness / SOFTEST_UNDER_SKIN
+
+    @property
     def wide_spread(self) -> float:
         """The `Numerics.edge_spread` that a food as soft as this one needs, metres."""
         return 1.01 * self.softness * self._edge_scale / SOFTEST

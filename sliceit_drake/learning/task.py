@@ -34,7 +34,10 @@ __all__ = [
     "station_scenario",
 ]
 
-VARIED = ("material.toughness", "material.youngs_modulus", "material.friction")
+MODULUS = "material.youngs_modulus"
+VARIED = ("material.toughness", MODULUS, "material.friction")
+STIFFER = 1.01
+"""By which a food is stiffer than one whose skin would fold around the edge."""
 
 
 @dc.dataclass(frozen=True)
@@ -137,6 +140,9 @@ class TaskConfig:
     """Elements along an edge, relative to the food's mesh."""
     time_step: float = quantity(2e-3 / 12, "s", low=1e-6, high=2e-3)
     """Longest sub-step of the food, s."""
+    edge_spread: float = quantity(0.01, "m", low=0.0, high=0.05)
+    """Least `Numerics.edge_spread`; a food whose variants are softer has what they need. Without
+    one an agent that saws at random moves the food with the knife, and a guard ends its slice."""
     board: Board = dc.field(default_factory=Board)
     sensor: WrenchSensorConfig = dc.field(
         default_factory=lambda: WrenchSensorConfig(force_noise=0.2, moment_noise=0.02)
@@ -272,13 +278,30 @@ def _variants(
 ) -> list:
     assert isinstance(scenario.food, Food)
     model = make_food_model(scenario.food, scenario.knife, scenario.numerics)
-    randomization = task.randomization
+    draws = _draws(task.randomization, calibrated, scenario.food, rng)
+    for k, variant in enumerate(with_parameters(model, draw) for draw in draws):
+        if variant.skin_fold > 1.0:
+            stiff = STIFFER * variant.skin_fold * variant.material.youngs_modulus
+            draws[k] = {**draws[k], MODULUS: stiff}
+    softest = max(with_parameters(model, draw).wide_spread for draw in draws)
+    scenario.numerics.edge_spread = max(task.edge_spread, softest)
+    model = make_food_model(scenario.food, scenario.knife, scenario.numerics)
+    return [with_parameters(model, draw) for draw in draws]
+
+
+def _draws(
+    randomization: RandomizationConfig,
+    calibrated: CalibratedFood,
+    food: Food,
+    rng: np.random.Generator,
+) -> list[dict[str, float]]:
+    """Parameters of the variants of a station's food."""
     if randomization.foods == "none":
-        return [model]
+        return [{}]
     count = math.ceil(randomization.variants / randomization.stations)
-    at = {name: getattr(scenario.food.material, name.split(".")[1]) for name in VARIED}
+    at = {name: getattr(food.material, name.split(".")[1]) for name in VARIED}
     if randomization.foods == "posterior":
-        draws: Sequence[dict[str, float]] = calibrated.distribution.draw(rng, count)
+        draws = list(calibrated.distribution.draw(rng, count))
     else:
         factors = 1.0 + randomization.noise * rng.uniform(-1.0, 1.0, (count, len(VARIED)))
         rows = (factors * list(at.values())).tolist()
@@ -289,4 +312,4 @@ def _variants(
             draw | {name: draw.get(name, at[name]) * float(factor)}
             for draw, factor in zip(draws, factors, strict=True)
         ]
-    return [with_parameters(model, draw) for draw in draws]
+    return draws
