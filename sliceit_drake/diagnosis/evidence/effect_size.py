@@ -151,8 +151,8 @@ def size_by_record(
     """
     own, base = list(columns), problem.base
     gram = problem.moments.gram
-    square = np.einsum("ri,rij,rj->", coefficients, gram[np.ix_(range(len(gram)), own, own)],
-                       coefficients)  # fmt: skip
+    inner = gram[np.ix_(range(len(gram)), own, own)]
+    square = np.einsum("ri,rij,rj->", coefficients, inner, coefficients)
     product = np.einsum("rij,rj->i", gram[np.ix_(range(len(gram)), base, own)], coefficients)
     square -= product @ scaled_inverse(gram.sum(0)[np.ix_(base, base)]) @ product
     effects = []

@@ -140,13 +140,13 @@ class LinearProblem:
         self.conditions = replicates(found.records)
         of = {r: k for k, members in enumerate(self.conditions.values()) for r in members}
         self.condition_of = [of[r] for r in range(len(found.records))]
+        self.usual, self.usual_own = self._usual()
         if noise is None:
-            zero = [k for k in self._usual()[1]]
+            zero = list(self.usual_own)
             self.noise, self.repeated = estimate_noise(found.records, self.own, zero)
         else:
             self.noise, self.repeated = tuple(noise), True
         self._reduced: dict[tuple[tuple[int, ...], bytes], np.ndarray] = {}
-        self.usual, self.usual_own = self._usual()
         self._make_moments()
         self.variation_samples = sum(len(g) - 1 for g in self.conditions.values())
         self.variation = self._estimate_variation() if variation is None else variation

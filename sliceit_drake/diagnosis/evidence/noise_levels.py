@@ -3,7 +3,7 @@
 Records of one condition were nominally the same cut: what is wrong with the model is wrong in all
 of them alike, and drops out of their differences. What is left there is the sensor's noise and the
 food's unevenness (and what slices differ in as a whole, which is projected out before). In the air
-there is the sensor's noise alone, often a tenth of that, which tells what no food can hide.
+there is the sensor's noise alone, beside which shows what a food's unevenness would hide.
 """
 
 import dataclasses as dc
