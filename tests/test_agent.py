@@ -10,6 +10,7 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from sliceit_drake.configuration import ConfigurationError, validate
 from sliceit_drake.systems.agent import ACTIONS, AgentConfig, AgentSystem, observation_names
+from sliceit_drake.systems.agent_rule import AgentRule
 from sliceit_drake.systems.motion_sources import placed_motion
 
 START = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), [0.1, 0.2, 0.3])
@@ -249,6 +250,25 @@ def test_the_target_moves_by_each_decision_as_far_as_it_may_and_is_aimed_at_by_i
         reached = [observation["target_x"], observation["target_z"]]
         assert reached == pytest.approx([draw / 0.005, press / 0.003], abs=1e-12)
         assert observation["last_draw"] == (1.0 if k < 4 else -1.0)
+
+
+def test_a_network_corrects_the_rule_by_what_it_may():
+    rule = AgentRule(10.0, gain=1.0, softness=0.5, reach=0.5, correction=0.25)
+    config = AgentConfig(rule=rule)
+    found = {}
+    for name, action in (("rule", np.zeros(6)), ("both", np.array([1, -1, 1, 0.4, -1, -1.0]))):
+        # It feels 8 N, and is 30 mm over the board.
+        simulator, agent = agent_of(
+            at_rest(0.0, 0.007),
+            config,
+            wrench=lambda _: [0, 0, 0, 0, 0, -8.0],
+            decide=lambda _, a=action: a,
+        )
+        simulator.AdvanceTo(0.21)
+        last = observed(simulator, agent)
+        found[name] = np.array([last[f"last_{each}"] for each in ACTIONS])
+    assert found["rule"] == pytest.approx([1.0, 0.0, 0.7, 0.0, 1.0, 0.2])
+    assert found["both"] == pytest.approx([1.0, -0.25, 0.95, 0.1, 0.75, -0.05])
 
 
 def test_an_action_beyond_its_range_counts_as_the_nearest_within():

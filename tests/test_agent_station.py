@@ -10,6 +10,7 @@ from sliceit_drake.diagrams.scenario import load_scenario
 from sliceit_drake.diagrams.scenario_diagram import ScenarioDiagram
 from sliceit_drake.learning.task import RandomizationConfig, TaskConfig, make_agent_station
 from sliceit_drake.systems.agent import AgentConfig, AgentSystem
+from sliceit_drake.systems.agent_rule import AgentRule
 from sliceit_drake.systems.exported_network import LAYOUT, layout_of
 
 SCENARIO = """
@@ -87,6 +88,35 @@ def test_a_scenario_with_a_network_runs_as_its_network_decides(tmp_path):
     height = diagram.policy.GetOutputPort("error").Eval(own)[1]
     simulator.AdvanceTo(0.5)
     assert diagram.policy.GetOutputPort("error").Eval(own)[1] < height - 2e-3
+
+
+def test_a_rule_needs_no_network(tmp_path):
+    scenario = scenario_of(tmp_path, "")
+    scenario.policy.rule = AgentRule(12.0)
+    diagram = ScenarioDiagram(scenario)
+    simulator = Simulator(diagram)
+    context = simulator.get_mutable_context()
+    diagram.SetStart(context)
+    simulator.Initialize()
+    own = diagram.policy.GetMyContextFromRoot(context)
+    height = diagram.policy.GetOutputPort("error").Eval(own)[1]
+    simulator.AdvanceTo(0.5)
+    assert diagram.policy.GetOutputPort("error").Eval(own)[1] < height - 2e-3
+    assert "a rule that keeps to 12 N decides" in scenario.policy.describe()
+
+
+def test_a_network_that_corrected_another_rule_is_refused(tmp_path):
+    theirs = AgentConfig(history=3, rule=AgentRule(12.0))
+    scenario = scenario_of(tmp_path, network_of(tmp_path / "policy.onnx", config=theirs))
+    with pytest.raises(
+        ConfigurationError, match=r"has rule \{'level': 12.0.*the scenario's agent No"
+    ):
+        ScenarioDiagram(scenario)
+    scenario.policy.rule = AgentRule(12.0)
+    ScenarioDiagram(scenario)
+    scenario.policy.rule = AgentRule(14.0)
+    with pytest.raises(ConfigurationError, match="'level': 14.0"):
+        ScenarioDiagram(scenario)
 
 
 def test_a_network_of_another_observation_is_refused(tmp_path):

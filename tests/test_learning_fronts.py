@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 
 from sliceit_drake.systems.agent import ACTIONS, AgentConfig, observation_names
+from sliceit_drake.systems.agent_rule import AgentRule
 from studies.learning.fronts import (
     KINDS,
     cells,
@@ -18,48 +19,17 @@ from studies.learning.fronts import (
     strategies,
     summarise,
 )
-from studies.learning.rules import Rule, uniform, with_draw
+from studies.learning.rules import uniform, with_draw
 
 ROOT = Path(__file__).resolve().parent.parent
 NAMES = observation_names(AgentConfig().history)
-DRAW, PRESS, SOFT = (ACTIONS.index(name) for name in ("draw", "press", "p_z"))
-
-
-def observed(force=0.0, height=0.03, **values):
-    """An observation: of a force upwards in all readings, N, and a height over the board, m."""
-    seen = np.zeros(len(NAMES))
-    seen[NAMES.index("error_z")] = height / 0.06
-    for k, name in enumerate(NAMES):
-        if name.startswith("force_z"):
-            seen[k] = -force / 50.0
-    for name, value in values.items():
-        seen[NAMES.index(name)] = value
-    return seen
-
-
-def test_a_rule_draws_on_to_its_reach_and_back():
-    rule = Rule(9.0, reach=0.5)
-    assert rule(observed())[DRAW] == 1.0
-    assert rule(observed(last_draw=1.0, target_x=0.4))[DRAW] == 1.0
-    assert rule(observed(last_draw=1.0, target_x=0.5))[DRAW] == -1.0
-    assert rule(observed(last_draw=-1.0, target_x=0.4))[DRAW] == -1.0
-    assert rule(observed(last_draw=-1.0, target_x=-0.5))[DRAW] == 1.0
-    assert Rule(9.0, reach=0.0)(observed())[DRAW] == 0.0
-
-
-def test_a_rule_presses_where_it_feels_less_than_its_level_and_gives_way_where_more():
-    rule = Rule(10.0, gain=1.0, softness=0.0)
-    assert rule(observed(10.0))[[PRESS, SOFT]] == pytest.approx([0.0, 0.0])
-    assert rule(observed(5.0))[[PRESS, SOFT]] == pytest.approx([0.5, 0.5])
-    assert rule(observed(15.0))[[PRESS, SOFT]] == pytest.approx([-0.5, -0.5])
-    # At the board its level is lower.
-    assert Rule(10.0, landing=0.5)(observed(5.0, 0.0))[PRESS] == pytest.approx(0.0)
-    assert (np.abs(rule(observed(1e3))) <= 1.0).all()
+DRAW = ACTIONS.index("draw")
 
 
 def test_a_policys_draw_is_replaced_and_nothing_else():
-    seen, own = observed(last_draw=-1.0), np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
-    for rule, draw in ((Rule(9.0), -1.0), (None, 0.0)):
+    seen, own = np.zeros(len(NAMES)), np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+    seen[NAMES.index("last_draw")] = -1.0
+    for rule, draw in ((AgentRule(9.0), -1.0), (None, 0.0)):
         found = with_draw(lambda _: own, rule)(seen)
         assert found.tolist() == [0.1, 0.2, 0.3, 0.4, draw, 0.6]
     assert own[DRAW] == 0.5
@@ -67,7 +37,7 @@ def test_a_policys_draw_is_replaced_and_nothing_else():
 
 def test_random_actions_fill_their_range():
     decide = uniform(np.random.default_rng(0))
-    actions = np.array([decide(observed()) for _ in range(500)])
+    actions = np.array([decide(np.zeros(len(NAMES))) for _ in range(500)])
     assert np.abs(actions).max() <= 1.0 and np.ptp(actions, axis=0).min() > 1.95
 
 

@@ -99,6 +99,8 @@ class Numerics:
     edge's direction then follows its motion past the food, which may move with the blade."""
     direction_length: float = quantity(2e-4, "m", low=1e-7, high=1e-2)
     """Travel over which the edge's direction follows."""
+    work_error: float = quantity(0.02, "", low=0.0, high=0.5)
+    """Fraction of a cut's work that the edge may still owe when it is through; more is refused."""
     precision: str = choice("float32", ("float32", "float64"))
     """Arithmetic of the kernels."""
     device: str = "cpu"

@@ -35,6 +35,7 @@ NUMERICAL = (
     "flank_length",
     "anchor_length",
     "edge_spread",
+    "work_error",
     "slices",
     "slip",
     "thickness",

@@ -16,7 +16,6 @@ from sliceit_drake.cutting.solver import NOT_FINITE, CuttingError, CuttingSolver
 
 __all__ = [
     "COMPLETE",
-    "DEBT_LIMIT",
     "ENERGY_RATIO_LIMIT",
     "LATERAL_LIMIT",
     "SliceForces",
@@ -31,8 +30,6 @@ __all__ = [
 ENERGY_RATIO_LIMIT = 0.05
 """Kinetic energy of the added inertia, over the internal energy, above which scaled masses are not
 quasi-static."""
-DEBT_LIMIT = 0.02
-"""Part of the work of cutting a section through that the edge may still owe when it is cut."""
 TURN_LIMIT = 0.5
 """Tangent of the angle by which the food may have turned in the plane of the cut: the front of the
 cut is followed for small ones."""
@@ -183,7 +180,7 @@ def check_energies(
     if model.numerics.edge_spread == 0.0:
         advice = f"{advice} give numerics.edge_spread: {model.wide_spread:.3g} for sawing,"
     # On what is left the edge does up to twice the work.
-    if owed > DEBT_LIMIT + 2.0 * (1.0 - cut):
+    if owed > model.numerics.work_error + 2.0 * (1.0 - cut):
         raise CuttingError(
             f"at {time:.4g} s {100 * cut:.3g} % of the section are cut, and the edge has done "
             f"{100 * owed:.1f} % less work than its toughness asks for, more than it can make up: "

@@ -140,9 +140,9 @@ class TaskConfig:
     """Elements along an edge, relative to the food's mesh."""
     time_step: float = quantity(2e-3 / 12, "s", low=1e-6, high=2e-3)
     """Longest sub-step of the food, s."""
-    edge_spread: float = quantity(0.01, "m", low=0.0, high=0.05)
-    """Least `Numerics.edge_spread`; a food whose variants are softer has what they need. Without
-    one an agent that saws at random moves the food with the knife, and a guard ends its slice."""
+    work_error: float = quantity(0.05, "", low=0.0, high=0.5)
+    """See `Numerics.work_error`. Where an agent turns round or saws, the food moves with the knife,
+    and the edge does some per cent less work: little beside what foods differ by."""
     board: Board = dc.field(default_factory=Board)
     sensor: WrenchSensorConfig = dc.field(
         default_factory=lambda: WrenchSensorConfig(force_noise=0.2, moment_noise=0.02)
@@ -186,7 +186,7 @@ def station_scenario(task: TaskConfig, calibrated: CalibratedFood, food: str) ->
         board=copy.deepcopy(task.board),
         sensor=copy.deepcopy(task.sensor),
         start=copy.deepcopy(task.start),
-        numerics=Numerics(time_step=task.time_step),
+        numerics=Numerics(time_step=task.time_step, work_error=task.work_error),
     )
     if task.simulator == "cutting":
         food_model = calibrated.held()
@@ -283,8 +283,8 @@ def _variants(
         if variant.skin_fold > 1.0:
             stiff = STIFFER * variant.skin_fold * variant.material.youngs_modulus
             draws[k] = {**draws[k], MODULUS: stiff}
-    softest = max(with_parameters(model, draw).wide_spread for draw in draws)
-    scenario.numerics.edge_spread = max(task.edge_spread, softest)
+    spread = max(with_parameters(model, draw).wide_spread for draw in draws)
+    scenario.numerics.edge_spread = spread
     model = make_food_model(scenario.food, scenario.knife, scenario.numerics)
     return [with_parameters(model, draw) for draw in draws]
 

@@ -32,6 +32,7 @@ from pydrake.systems.framework import Context, DiscreteStateIndex, DiscreteValue
 
 from sliceit_drake.configuration import ConfigurationError, choice, quantity
 from sliceit_drake.cutting.motion import MotionPlan
+from sliceit_drake.systems.agent_rule import AgentRule
 from sliceit_drake.systems.declare import PlainSystem, declare_cached, declare_output
 from sliceit_drake.systems.policy import envelope, envelope_time
 
@@ -51,6 +52,9 @@ WRENCH = np.array([50.0, 50.0, 10.0])
 NEAR = 2e-3
 """Scale of the height over the board where it is small, metres; ours."""
 
+FELT = 4
+"""Newest readings whose mean is the force that a rule feels."""
+
 ENVELOPE_SPEED = 0.05
 """Speed on the path through all places where the knife may go, m/s."""
 
@@ -61,6 +65,8 @@ class AgentConfig:
 
     network: str = ""
     """Exported network (`sliceit train`), relative to the resources or to the working directory."""
+    rule: AgentRule | None = None
+    """Decides in the place of a network; with one, the network corrects what it decides."""
     descent: float = quantity(0.037, "m", low=1e-3, high=0.5)
     """Height of the edge over the board at the start."""
     duration: float = quantity(8.0, "s", low=0.05, high=600.0)
@@ -133,8 +139,12 @@ class AgentConfig:
 
     def describe(self) -> str:
         """Who decides and what it may do at most, for an operator to read."""
+        who = f"the network {self.network}" if self.network else ""
+        if self.rule is not None:
+            rule = f"a rule that keeps to {self.rule.level:g} N"
+            who = f"{rule}, corrected by {who}," if who else rule
         return (
-            f"the network {self.network} decides every {self.period:g} s how compliant the knife "
+            f"{who} decides every {self.period:g} s how compliant the knife "
             f"is, at most {1e3 * self.descent:.1f} mm down, {1e3 * self.draw:.1f} mm along the "
             f"edge; its target lies up to {1e3 * self.overtravel:g} mm below the board"
         )
@@ -172,7 +182,7 @@ class AgentSystem(PlainSystem):
     Inputs:
         sensor_wrench: SpatialForce at So, in S.
         knife_pose: RigidTransform X_WK.
-        action: [6], each within [-1, 1]; where no network decides.
+        action: [6], each within [-1, 1]; where no network decides. With a rule it corrects that.
 
     Outputs:
         target_pose: RigidTransform X_WK.
@@ -334,6 +344,9 @@ class AgentSystem(PlainSystem):
                 f"for {action}; {len(ACTIONS)} finite numbers are needed ({', '.join(ACTIONS)})."
             )
         action = np.clip(action, -1.0, 1.0)
+        if config.rule is not None:
+            by_rule = self._by_rule(config.rule, context, error)
+            action = np.clip(by_rule + config.rule.correction * action, -1.0, 1.0)
         share = 0.5 * (action[:4] + 1.0) if config.mapping == "whole" else np.maximum(action[:4], 0)
         ranges = np.array([config.stiffness_x, config.stiffness_ry, config.p_z, config.p_ry])
         chosen = ranges[:, 0] + share * (ranges[:, 1] - ranges[:, 0])
@@ -360,6 +373,12 @@ class AgentSystem(PlainSystem):
             (self._error_scale, [scale]),
         ):
             discrete_state.set_value(state, value)
+
+    def _by_rule(self, rule: AgentRule, context: Context, error: np.ndarray) -> np.ndarray:
+        force = float(np.hypot(*self._history(context)[-FELT:, :2].mean(axis=0)))
+        place = self._value(context, self._offset)[0] / max(self._config.draw, 1e-9)
+        way = self._value(context, self._action)[ACTIONS.index("draw")]
+        return rule.action(float(error[1]), force, float(place), float(way))
 
     def _target(self, context: Context) -> np.ndarray:
         """The target's place from the start, along Kx and Kz [2], m."""

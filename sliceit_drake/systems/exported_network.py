@@ -24,7 +24,7 @@ FREE = (
 
 def layout_of(config: AgentConfig) -> str:
     """What an agent's network takes and gives, and what its actions do, as text for its file."""
-    meaning = {k: v for k, v in dc.asdict(config).items() if k not in FREE}
+    meaning = {k: v for k, v in dc.asdict(config).items() if k not in FREE and v is not None}
     layout = {"observation": observation_names(config.history), "action": list(ACTIONS)}
     return json.dumps(layout | meaning)
 
@@ -33,12 +33,15 @@ def load_network(config: AgentConfig) -> Decide:
     """The network of an agent's configuration.
 
     Returns:
-        A function from an observation to the action [6], float64.
+        A function from an observation to the action [6], float64; nothing but zeros where there is
+        a rule and no network.
 
     Raises:
         ConfigurationError: There is no such file, it is no network, or it was trained on another
             observation.
     """
+    if config.rule is not None and not config.network:
+        return lambda _: np.zeros(len(ACTIONS))
     import onnxruntime
 
     def refusal(
@@ -84,10 +87,10 @@ def _difference(found: str | None, wanted: str) -> str:
         theirs = dict(json.loads(found))
     except (TypeError, ValueError):
         return "says what it observes in a way that cannot be read"
-    for key in ours:
-        if ours[key] != theirs.get(key):
+    for key in ours | theirs:
+        if ours.get(key) != theirs.get(key):
             if key == "observation":
                 sizes = len(theirs.get(key, [])), len(ours[key])
                 return f"observes {sizes[0]} numbers, the scenario's agent {sizes[1]}"
-            return f"has {key} {theirs.get(key)}, the scenario's agent {ours[key]}"
+            return f"has {key} {theirs.get(key)}, the scenario's agent {ours.get(key)}"
     return "has another layout than the scenario's agent"

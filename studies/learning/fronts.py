@@ -1,7 +1,7 @@
 """Force against time: what policies are worth beside rules and chance.
 
 Policies of both simulators, the same with draws by rule and without draws, rules that draw and
-press (studies/learning/rules.py), straight presses and random actions cut the same slices of a
+press (`AgentRule`), straight presses and random actions cut the same slices of a
 world that no training has seen, through the same actions. Slices are kept in --slices-file: the
 same command goes on where it was stopped. Writes learning_fronts.md and
 figures/learning_fronts.png to --output.
@@ -26,9 +26,10 @@ from sliceit_drake.learning.unseen_worlds import WORLDS, Case, evaluate
 from sliceit_drake.resources import resource_path
 from sliceit_drake.stand_in.slicing_worlds import SLICING_FOODS
 from sliceit_drake.systems.agent import AgentConfig, Decide
+from sliceit_drake.systems.agent_rule import AgentRule
 from sliceit_drake.systems.exported_network import load_network
 from studies.figures import BLUE, GREEN, ORANGE, PURPLE, RED, new_figure, save_figure, tidy
-from studies.learning.rules import TUNED, Rule, uniform, with_draw
+from studies.learning.rules import TUNED, nothing, uniform, with_draw
 from studies.pages import publish, render_and_store
 
 __all__ = [
@@ -93,17 +94,19 @@ def split(name: str) -> tuple[str, float]:
 def decider(case: Case) -> tuple[AgentConfig, Decide]:
     """What cuts a slice."""
     kind, number = split(case.policy)
-    agent, rule = AgentConfig(), Rule(number)
+    agent, rule = AgentConfig(), AgentRule(number)
     if kind == "random":
         text = f"{case.food}{case.slice}".encode()
         return agent, uniform(np.random.default_rng([int(number), case.seed, *text]))
     if kind == "press":
-        return agent, dc.replace(rule, reach=0.0, softness=1.0, landing=1.0)
+        rule = dc.replace(rule, reach=0.0, softness=1.0, landing=1.0)
+        return dc.replace(agent, rule=rule), nothing
     if kind in ("rule", "fast rule"):
-        return dc.replace(agent, draw_increment=FAST) if kind == "fast rule" else agent, rule
+        draw = FAST if kind == "fast rule" else agent.draw_increment
+        return dc.replace(agent, draw_increment=draw, rule=rule), nothing
     if kind == "tuned rule":
-        return agent, TUNED
-    simulator, _, draw = kind.partition(", ")
+        return dc.replace(agent, rule=TUNED), nothing
+    simulator, _, other = kind.partition(", ")
     folder = resource_path(f"models/policies/{simulator}_{int(number)}")
     # All end their slices alike, whatever the policy was trained with.
     agent = dc.replace(
@@ -112,8 +115,8 @@ def decider(case: Case) -> tuple[AgentConfig, Decide]:
         goal_lost=agent.goal_lost,
     )
     decide = load_network(agent)
-    if draw:
-        decide = with_draw(decide, rule if draw == "draw by rule" else None)
+    if other:
+        decide = with_draw(decide, rule if other == "draw by rule" else None)
     return agent, decide
 
 
@@ -335,7 +338,7 @@ def run(options: argparse.Namespace) -> int:
             "world": options.world.replace("_", "-"),
             "slices": options.slices,
             "seed": options.seed,
-            "tuned": re.sub(r"^Rule", "", str(TUNED)),
+            "tuned": re.sub(r"^AgentRule", "", str(TUNED)),
             "command": options.command,
         },
         points,

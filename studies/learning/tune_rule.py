@@ -19,8 +19,9 @@ from tqdm import tqdm
 from sliceit_drake.cutting.foods.calibrated_food import load_calibrated_food
 from sliceit_drake.learning.evaluation import SliceMetrics, cut_slice
 from sliceit_drake.learning.task import TaskConfig, station_scenario
+from sliceit_drake.systems.agent_rule import AgentRule
 from sliceit_drake.systems.wrench_sensor import WrenchSensorConfig
-from studies.learning.rules import Rule
+from studies.learning.rules import nothing
 
 __all__ = ["add_arguments", "run", "worth"]
 
@@ -31,7 +32,7 @@ BOUNDS = {
     "softness": (-1.0, 1.0),
     "landing": (0.1, 1.0),
 }
-START = Rule(9.0)
+START = AgentRule(9.0)
 MEMBERS = 12
 """Candidates of a generation."""
 
@@ -67,9 +68,9 @@ def run(options: argparse.Namespace) -> int:
     def cost(values: np.ndarray) -> float:
         key = tuple(float(f"{value:.6g}") for value in values)
         if key not in known:
-            rule = Rule(*key)
+            agent = dc.replace(task.agent, rule=AgentRule(*key))
             slices = [
-                cut_slice(station_scenario(task, food, name), task.agent, rule).metrics
+                cut_slice(station_scenario(task, food, name), agent, nothing).metrics
                 for name, food in foods.items()
             ]
             known[key] = float(np.mean([worth(each) for each in slices]))
@@ -95,5 +96,5 @@ def run(options: argparse.Namespace) -> int:
     bar.close()
     begin = cost(np.array(start))
     values = [float(f"{value:.6g}") for value in found.x]
-    print(f"F sqrt(T) {math.exp(found.fun - begin):.3f} of the start's: {Rule(*values)}")
+    print(f"F sqrt(T) {math.exp(found.fun - begin):.3f} of the start's: {AgentRule(*values)}")
     return 0

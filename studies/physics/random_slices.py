@@ -30,7 +30,7 @@ from sliceit_drake.cutting.mesh.split import CutPlane
 from sliceit_drake.cutting.mesh.tetrahedra import MeshError, TetrahedralMesh
 from sliceit_drake.cutting.model import CuttingModel, Numerics, TimeStepError, prepare_cut
 from sliceit_drake.cutting.motion import Hold, Motion, MotionPlan, PressAndDraw, Retract, Segment
-from sliceit_drake.cutting.simulate import COMPLETE, DEBT_LIMIT, SliceResult, simulate_slice
+from sliceit_drake.cutting.simulate import COMPLETE, SliceResult, simulate_slice
 from sliceit_drake.cutting.solver import CuttingError, CuttingSolver
 from sliceit_drake.cutting.workers import worker_processes
 from studies.pages import publish, render_and_store
@@ -70,7 +70,7 @@ root of the mean square over that of the force."""
 SHAPES = ("cylinder", "half cylinder", "tapered", "box", "plate", "ellipsoid")
 MEASURES = {
     "energy balance, of the knife's work": IMBALANCE,
-    "work of edge and opening less than R A of what is cut": DEBT_LIMIT,
+    "work of edge and opening less than R A of what is cut": Numerics().work_error,
     "force against sub-steps of 0.05 ms": STEP_ERROR,
     "force against the mirrored slice": MIRROR_ERROR,
 }
@@ -361,7 +361,7 @@ def _wrong(
     if result.cut[-1] < COMPLETE:
         del errors["work of edge and opening less than R A of what is cut"]
     # On what is left the edge does up to twice the work.
-    if owed > DEBT_LIMIT + 2.0 * (1.0 - result.cut[-1]):
+    if owed > model.numerics.work_error + 2.0 * (1.0 - result.cut[-1]):
         return f"edge and opening do {100 * owed:.1f} % less than toughness times the area", errors
     if lack > IMBALANCE:
         return f"the energy balance lacks {100 * lack:.1f} % of the knife's work", errors

@@ -1,0 +1,33 @@
+"""The rule that presses and draws by itself, and the network that corrects it."""
+
+import numpy as np
+import pytest
+
+from sliceit_drake.systems.agent import ACTIONS
+from sliceit_drake.systems.agent_rule import AgentRule
+
+DRAW, PRESS, SOFT = (ACTIONS.index(name) for name in ("draw", "press", "p_z"))
+
+
+def acted(rule, force=0.0, height=0.03, place=0.0, way=0.0):
+    return rule.action(height, force, place, way)
+
+
+def test_it_draws_on_to_its_reach_and_back():
+    rule = AgentRule(9.0, reach=0.5)
+    assert acted(rule)[DRAW] == 1.0
+    assert acted(rule, way=1.0, place=0.4)[DRAW] == 1.0
+    assert acted(rule, way=1.0, place=0.5)[DRAW] == -1.0
+    assert acted(rule, way=-1.0, place=0.4)[DRAW] == -1.0
+    assert acted(rule, way=-1.0, place=-0.5)[DRAW] == 1.0
+    assert acted(AgentRule(9.0, reach=0.0))[DRAW] == 0.0
+
+
+def test_it_presses_where_it_feels_less_than_its_level_and_gives_way_where_more():
+    rule = AgentRule(10.0, gain=1.0, softness=0.0)
+    assert acted(rule, 10.0)[[PRESS, SOFT]] == pytest.approx([0.0, 0.0])
+    assert acted(rule, 5.0)[[PRESS, SOFT]] == pytest.approx([0.5, 0.5])
+    assert acted(rule, 15.0)[[PRESS, SOFT]] == pytest.approx([-0.5, -0.5])
+    # At the board its level is lower.
+    assert acted(AgentRule(10.0, landing=0.5), 5.0, 0.0)[PRESS] == pytest.approx(0.0)
+    assert (np.abs(acted(rule, 1e3)) <= 1.0).all()
