@@ -39,6 +39,7 @@ from sliceit_drake.learning.task import RandomizationConfig, TaskConfig  # noqa:
 from sliceit_drake.learning.training import train  # noqa: E402
 from sliceit_drake.learning.training_config import TrainingConfig  # noqa: E402
 from sliceit_drake.systems.agent import AgentConfig, observation_names  # noqa: E402
+from sliceit_drake.systems.agent_rule import AgentRule  # noqa: E402
 from sliceit_drake.systems.exported_network import load_network  # noqa: E402
 
 # torch comes with the second tier.
@@ -339,6 +340,26 @@ def test_a_training_starts_with_little_entropy_and_its_discount():
     assert model.gamma == config.task.reward.discount
 
 
+def test_what_corrects_a_rule_begins_with_no_correction():
+    environments = OverlapVecEnv(DummyVecEnv([Still]))
+    seen = np.random.default_rng(0).normal(size=SIZE).astype(np.float32)
+    for rule, is_still in ((AgentRule(), True), (None, False)):
+        config = training_of()
+        config.task.agent = dc.replace(config.task.agent, rule=rule)
+        action, _ = training.make_model(config, environments).predict(seen, deterministic=True)
+        assert (action == 0.0).all() == is_still
+
+
+def test_each_decision_has_its_updates(monkeypatch):
+    model = training.make_model(training_of(updates=3), OverlapVecEnv(DummyVecEnv([Still] * 2)))
+    made = []
+    monkeypatch.setattr(model, "_train_batch", made.append)
+    model.set_logger(Logger(None, []))
+    for model.num_timesteps in (20, 21):
+        model.update()
+    assert made == [16] * 6
+
+
 def test_no_slice_gets_more_than_what_is_left_to_get():
     reward = RewardConfig(goal=15.0, way=15.0, hold=5.0)
     names = observation_names(3)
@@ -556,7 +577,9 @@ def test_the_policy_is_that_with_the_greatest_return_on_the_validation_slices(
 ):
     watch, found = watch_of(tmp_path, training_of()), {"length": 9.0, "force": 5.0}
     for number, value in enumerate([1.0, 4.0, 3.0], 1):
-        monkeypatch.setattr(training, "validate", lambda *_, value=value: {"return": value} | found)
+        monkeypatch.setattr(
+            training, "cut_fixed_slices", lambda *_, value=value: {"return": value} | found
+        )
         watch.num_timesteps = 100 * number
         with torch.no_grad():
             watch.model.actor.mu.bias.fill_(float(number))
@@ -573,19 +596,23 @@ def test_the_policy_is_that_with_the_greatest_return_on_the_validation_slices(
 
 def test_a_validation_is_the_discounted_return_of_fixed_slices_without_randomness(tmp_path):
     config = training_of()
-    model = watch_of(tmp_path, config).model
+    watch = watch_of(tmp_path, config)
     env = training.SlicingEnv(config.task)
     random = torch.get_rng_state()
-    found = training.validate(model, env, 2)
+
+    def cut(count):
+        return training.cut_fixed_slices(watch._decide, env, count, 10**6)
+
+    found = cut(2)
     assert torch.equal(torch.get_rng_state(), random)
     env.reset(seed=5)
-    assert training.validate(model, env, 2) == found
-    assert training.validate(model, env, 1)["return"] != found["return"]
+    assert cut(2) == found
+    assert cut(1)["return"] != found["return"]
     env.progress, returns = 1.0, []
     for k in (0, 1):
         observation, done, worth, weight = env.reset(seed=10**6 + k)[0], False, 0.0, 1.0
         while not done:
-            action, _ = model.predict(observation, deterministic=True)
+            action, _ = watch.model.predict(observation, deterministic=True)
             observation, reward, terminated, truncated, _ = env.step(action)
             worth, weight = worth + weight * reward, weight * config.task.reward.discount
             done = terminated or truncated

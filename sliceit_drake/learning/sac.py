@@ -62,6 +62,7 @@ class PrioritizedSAC(SAC):
     """SAC whose replay buffer is a `PrioritizedReplayBuffer`.
 
     Args:
+        updates: Updates for each decision.
         beta_steps: Steps in which the power of the importance weights grows linearly to 1 from that
             of the replay buffer; None to leave it as it is.
         value_limit: Bound on values, from observations [batch, n] to [batch, 1]; None for none.
@@ -74,19 +75,20 @@ class PrioritizedSAC(SAC):
     def __init__(
         self,
         *arguments: Any,
+        updates: int = 1,
         beta_steps: int | None = None,
         value_limit: Callable[[torch.Tensor], torch.Tensor] | None = None,
         **options: Any,
     ) -> None:
-        self.beta_steps, self.value_limit = beta_steps, value_limit
+        self.updates, self.beta_steps, self.value_limit = updates, beta_steps, value_limit
         self.running: dict[str, float] = {}
         super().__init__(*arguments, replay_buffer_class=PrioritizedReplayBuffer, **options)
         self.beta_begin = self.replay_buffer.beta
 
     def update(self) -> None:
-        """As many updates as there are environments, once the warm-up is over."""
+        """Makes the updates of a decision of each environment, once the warm-up is over."""
         if self.num_timesteps > self.learning_starts:
-            self.train(self.n_envs, self.batch_size)
+            self.train(self.updates * self.n_envs, self.batch_size)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         if self.beta_steps is not None:

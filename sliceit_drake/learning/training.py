@@ -29,9 +29,9 @@ from sliceit_drake.learning.reward import HEIGHT, REACH, RewardConfig
 from sliceit_drake.learning.sac import OverlapVecEnv, PrioritizedSAC
 from sliceit_drake.learning.task import TaskConfig, check_task
 from sliceit_drake.learning.training_config import CONFIGURATION, POLICY, TrainingConfig
-from sliceit_drake.systems.agent import ERROR, observation_names
+from sliceit_drake.systems.agent import ERROR, Decide, observation_names
 
-__all__ = ["CHECKPOINT", "Outcome", "make_model", "train", "validate", "value_limit"]
+__all__ = ["CHECKPOINT", "Outcome", "cut_fixed_slices", "make_model", "train", "value_limit"]
 
 CHECKPOINT, EPISODES, VALIDATION = "checkpoint.pt", "episodes.jsonl", "validation.jsonl"
 MODEL = "model.zip"
@@ -158,6 +158,7 @@ def make_model(config: TrainingConfig, environments: OverlapVecEnv) -> Prioritiz
         tau=config.tau,
         gamma=config.task.reward.discount,
         ent_coef=f"auto_{config.entropy:.9g}",
+        updates=config.updates,
         value_limit=value_limit(config.task.reward),
         beta_steps=config.steps,
         train_freq=1,
@@ -177,6 +178,11 @@ def make_model(config: TrainingConfig, environments: OverlapVecEnv) -> Prioritiz
         device="cpu",
     )
     model.replay_buffer.seed(config.seed)
+    if agent.rule is not None:
+        # What corrects a rule begins with no correction.
+        with torch.no_grad():
+            model.actor.mu.weight.zero_()
+            model.actor.mu.bias.zero_()
     return model
 
 
@@ -221,13 +227,14 @@ def _load(file: Path, described: str) -> dict[str, Any] | None:
     )
 
 
-def validate(model: PrioritizedSAC, env: SlicingEnv, slices: int) -> dict[str, float]:
-    """Lets the policy cut fixed slices, without randomness.
+def cut_fixed_slices(decide: Decide, env: SlicingEnv, slices: int, seed: int) -> dict[str, float]:
+    """Lets a policy cut fixed slices.
 
     Args:
-        model: Has the policy; nothing of it changes.
+        decide: The policy.
         env: Of the training's task.
-        slices: How many, of the task's foods in turn; a number is always the same slice.
+        slices: How many, of the task's foods in turn.
+        seed: Of the first; those of the others follow.
 
     Returns:
         Means over the slices: return (discounted, as it is trained), length in decisions, force
@@ -237,11 +244,10 @@ def validate(model: PrioritizedSAC, env: SlicingEnv, slices: int) -> dict[str, f
     env.progress, rows = 1.0, []
     for k in range(slices):
         food = foods[k % len(foods)]
-        observation, _ = env.reset(seed=VALIDATION_SEED + k, options={"food": food})
+        observation, _ = env.reset(seed=seed + k, options={"food": food})
         rewards, forces, done = [], [], False
         while not done:
-            action, _ = model.predict(observation, deterministic=True)
-            observation, reward, terminated, truncated, info = env.step(action)
+            observation, reward, terminated, truncated, info = env.step(decide(observation))
             rewards.append(reward)
             forces.append(info["force"])
             done = terminated or truncated
@@ -332,10 +338,10 @@ class _Watch(BaseCallback):
         """Validates the policy once in a place of the training, and keeps the best."""
         if self.num_timesteps <= self._validated_at:
             return
-        assert isinstance(self.model, PrioritizedSAC)
         if self._validation is None:
             self._validation = SlicingEnv(self._config.task)
-        found = validate(self.model, self._validation, self._config.validation_slices)
+        slices = self._config.validation_slices
+        found = cut_fixed_slices(self._decide, self._validation, slices, VALIDATION_SEED)
         self.validations, self._validated_at = self.validations + 1, self.num_timesteps
         with (self._output / VALIDATION).open("a", encoding="utf-8") as file:
             file.write(json.dumps({"steps": self.num_timesteps, **found}) + "\n")
@@ -367,6 +373,10 @@ class _Watch(BaseCallback):
         part = self._output / f"{CHECKPOINT}.part"
         torch.save(state, part)
         os.replace(part, self._output / CHECKPOINT)
+
+    def _decide(self, observation: np.ndarray) -> np.ndarray:
+        action, _ = self.model.predict(observation, deterministic=True)
+        return action
 
     def _finish_episode(self, info: dict[str, Any], sums: Counter) -> None:
         self.episodes += 1

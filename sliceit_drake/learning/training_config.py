@@ -23,6 +23,8 @@ class TrainingConfig:
     """Seed of everything random."""
     learning_rate: float = quantity(3e-4, "", low=1e-7, high=1.0)
     """Learning rate of all networks."""
+    updates: int = quantity(1, "", low=1, high=100)
+    """Updates for each decision."""
     batch: int = quantity(256, "", low=1, high=10**6)
     """Transitions in an update."""
     warm_up: int = quantity(1000, "", low=1, high=10**9)
@@ -39,8 +41,7 @@ class TrainingConfig:
     history: bool = True
     """Whether the network sees the force/torque history."""
     environments: int = quantity(1, "", low=1, high=64)
-    """Environments side by side, each a process; there is an update for each decision. Another
-    number gives another policy."""
+    """Environments side by side, each a process. Another number gives another policy."""
     validation_interval: int = quantity(2000, "", low=1, high=10**9)
     """Decisions between validations, after the warm-up; one more ends a training."""
     validation_slices: int = quantity(6, "", low=1, high=1000)

@@ -29,7 +29,7 @@ from sliceit_drake.systems.agent import AgentConfig, Decide
 from sliceit_drake.systems.agent_rule import AgentRule
 from sliceit_drake.systems.exported_network import load_network
 from studies.figures import BLUE, GREEN, ORANGE, PURPLE, RED, new_figure, save_figure, tidy
-from studies.learning.rules import TUNED, nothing, uniform, with_draw
+from studies.learning.rules import FAST, TUNED, nothing, uniform, with_draw
 from studies.pages import publish, render_and_store
 
 __all__ = [
@@ -51,8 +51,6 @@ METRICS = {"median_force": "median force", "peak_force": "peak", "board_peak": "
 NUMBERS = (*METRICS, "duration")
 COMPARED = ("cutting", "spring", "spring, draw by rule", "random", "tuned rule")
 """What is set beside the rule in the short table."""
-FAST = 7.5e-3
-"""Draw of a decision at 150 mm/s, the limit of the optimised motions, m."""
 LEVELS = {
     "press": (20.0, 30.0, 45.0),
     "rule": (6.0, 9.0, 14.0, 20.0, 30.0),

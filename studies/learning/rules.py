@@ -5,10 +5,12 @@ import numpy as np
 from sliceit_drake.systems.agent import ACTIONS, AgentConfig, Decide, observation_names
 from sliceit_drake.systems.agent_rule import AgentRule
 
-__all__ = ["TUNED", "nothing", "uniform", "with_draw"]
+__all__ = ["FAST", "TUNED", "nothing", "uniform", "with_draw"]
 
 DRAW = ACTIONS.index("draw")
 NAMES = observation_names(AgentConfig().history)
+FAST = 7.5e-3
+"""Draw of a decision at 150 mm/s, the limit of the optimised motions, m."""
 PLACE, LAST = NAMES.index("target_x"), NAMES.index("last_draw")
 
 
