@@ -8,6 +8,7 @@ import math
 import multiprocessing
 import os
 import pickle
+import textwrap
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from stable_baselines3.common.logger import Logger  # noqa: E402
 from stable_baselines3.common.vec_env import DummyVecEnv  # noqa: E402
 
 from sliceit_drake.cli.main import main  # noqa: E402
-from sliceit_drake.configuration import ConfigurationError, dump_yaml  # noqa: E402
+from sliceit_drake.configuration import ConfigurationError, dump_yaml, load_yaml  # noqa: E402
 from sliceit_drake.cutting.solver import CuttingError  # noqa: E402
 from sliceit_drake.diagrams.scenario import Start  # noqa: E402
 from sliceit_drake.learning import training  # noqa: E402
@@ -452,6 +453,20 @@ def test_stable_baselines3_loads_the_policy_that_is_exported(tmp_path, one_proce
     observation = np.random.default_rng(0).normal(size=SIZE).astype(np.float32)
     expected, _ = model.predict(observation, deterministic=True)
     assert decide(observation) == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_policys_card_has_its_validation_and_runs_it(tmp_path, one_process):
+    config = training_of(steps=60)
+    config.task.agent = dc.replace(AGENT, rule=AgentRule(12.0))
+    outcome = train(config, tmp_path)
+    card = (tmp_path / training.CARD).read_text(encoding="utf-8")
+    rows = lines(tmp_path, training.VALIDATION)
+    found = next(row for row in rows if row["steps"] == outcome.best_steps)
+    assert f"| {found['return']:.2f} |" in card and f"learned after {found['steps']}." in card
+    text = textwrap.dedent(card.split("AgentConfig\n")[1].split("\n\n")[0])
+    agent = load_yaml(AgentConfig, None, overrides_text=text)
+    assert agent.network == training.POLICY
+    load_network(dc.replace(agent, network=str(tmp_path / training.POLICY)))
 
 
 def test_a_stop_at_the_last_step_is_the_end(tmp_path, one_process):

@@ -6,6 +6,8 @@ trains the baseline of the paper, for which food is a spring, on the same task.
 
 Writes to --output:
   policy.onnx       the policy; a scenario runs it as "policy: !AgentConfig {network: policy.onnx}"
+  model.zip         the same, for Stable-Baselines3's SAC.load
+  README.md         what it is, what it is worth, how it is run
   training.yaml     all settings
   episodes.jsonl    what each episode came to
   events.*          for TensorBoard

@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 from sliceit_drake.configuration import ConfigurationError, dump_yaml
 from sliceit_drake.cutting.workers import children_without_interrupts, start_worker
 from sliceit_drake.learning.environment import SlicingEnv
+from sliceit_drake.learning.model_card import model_card
 from sliceit_drake.learning.network import HistoryExtractor, export_policy
 from sliceit_drake.learning.reward import HEIGHT, REACH, RewardConfig
 from sliceit_drake.learning.sac import OverlapVecEnv, PrioritizedSAC
@@ -34,7 +35,7 @@ from sliceit_drake.systems.agent import ERROR, Decide, observation_names
 __all__ = ["CHECKPOINT", "Outcome", "cut_fixed_slices", "make_model", "train", "value_limit"]
 
 CHECKPOINT, EPISODES, VALIDATION = "checkpoint.pt", "episodes.jsonl", "validation.jsonl"
-MODEL = "model.zip"
+MODEL, CARD = "model.zip", "README.md"
 VALIDATION_SEED = 1_000_000
 """Of the first validation slice: episodes of a training follow from its own seed."""
 GUARD_SHARE = 1e-3
@@ -80,9 +81,9 @@ def train(
     Args:
         config: Training; of a run that goes on, that which it was begun with.
         output: Folder for checkpoint, training.yaml, TensorBoard, policy.onnx, model.zip (for
-            `stable_baselines3.SAC.load`), and a line for each slice in episodes.jsonl and for each
-            validation in validation.jsonl. A return is what is trained: discounted, the
-            potential's part included.
+            `stable_baselines3.SAC.load`), README.md (the policy's card), and a line for each
+            slice in episodes.jsonl and for each validation in validation.jsonl. A return is what
+            is trained: discounted, the potential's part included.
         progress: Called with the steps so far and a line about the last episodes.
         is_stopped: Asked at each decision whether to end with a checkpoint there.
 
@@ -130,6 +131,7 @@ def train(
             export_policy(model.actor, config.task.agent, output / POLICY)
             # For `stable_baselines3.SAC.load`, which knows nothing of these.
             model.save(output / MODEL, exclude=["value_limit", "running"])
+            (output / CARD).write_text(_card(config, outcome, output), encoding="utf-8")
         summary = json.dumps(dc.asdict(outcome), indent=2) + "\n"
         (output / "summary.json").write_text(summary, encoding="utf-8")
         return outcome
@@ -142,6 +144,15 @@ def train(
         # A process that has ended cannot be told to end.
         with contextlib.suppress(EOFError, ConnectionError):
             environments.close()
+
+
+def _card(config: TrainingConfig, outcome: Outcome, output: Path) -> str:
+    steps, found = outcome.steps, None
+    if outcome.best_return is not None:
+        rows = map(json.loads, (output / VALIDATION).read_text(encoding="utf-8").splitlines())
+        found = next(row for row in rows if row["steps"] == outcome.best_steps)
+        steps = outcome.best_steps
+    return model_card(config, steps, outcome.ends, found)
 
 
 def make_model(config: TrainingConfig, environments: OverlapVecEnv) -> PrioritizedSAC:
