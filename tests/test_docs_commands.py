@@ -134,6 +134,9 @@ TESTED = {
         "sliceit train --output policy",
         "sliceit train --output output/ours --seed 0",
         "sliceit train --output output/baseline --seed 0 --simulator spring",
+        "sliceit train --output output/corrected --steps 20000"
+        ' --set "{updates: 2, task: {agent: {draw_increment: 7.5e-3,'
+        ' rule: {level: 20.0, landing: 0.1, correction: 1.0}}}}"',
         "sliceit train --output output/draws/cutting_0 --seed 0 --steps 15000"
         ' --set "{task: {agent: {draw_increment: 7.5e-3}}}"',
         "sliceit train --output output/draws/spring_0 --seed 0 --steps 15000 --simulator spring"
