@@ -570,11 +570,15 @@ def test_a_training_whose_guards_end_episodes_has_failed(tmp_path, one_process, 
     assert all("an element is inverted" in line["guard"] for line in lines(tmp_path))
 
 
-@pytest.mark.parametrize(("episodes", "failed"), [(1000, False), (999, True)])
-def test_one_guard_in_a_thousand_episodes_may_be(tmp_path, episodes, failed):
+@pytest.mark.parametrize(
+    ("guards", "episodes", "failed"),
+    # At 0.1 % one of 52 has a probability of 5.07 %, and two of 356 of 5.01 %.
+    [(0, 1, False), (1, 52, False), (1, 51, True), (2, 356, False), (2, 355, True)],
+)
+def test_guards_fail_a_training_where_they_are_no_chance(tmp_path, guards, episodes, failed):
     watch = training._Watch(training_of(), tmp_path, "", None, None)
     watch.episodes = episodes
-    watch._guards.update({"CuttingError": 1})
+    watch._guards.update({"CuttingError": guards})
     assert (watch.outcome(1.0).failed is not None) == failed
 
 

@@ -15,7 +15,8 @@ Writes to --output:
   checkpoint.pt     all that is needed to go on; the same command goes on from it
 
 Ctrl-C ends the training with a checkpoint.
-Ends with status 1 if guards of the simulation ended more than 0.1 % of the episodes.
+Ends with status 1 if guards of the simulation ended so many episodes that more than 0.1 % would be
+the rule (at a level of 5 %: 2 of 300).
 """
 
 import argparse

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.stats import binom
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import SubprocVecEnv
@@ -38,8 +39,9 @@ CHECKPOINT, EPISODES, VALIDATION = "checkpoint.pt", "episodes.jsonl", "validatio
 MODEL, CARD = "model.zip", "README.md"
 VALIDATION_SEED = 1_000_000
 """Of the first validation slice: episodes of a training follow from its own seed."""
-GUARD_SHARE = 1e-3
-"""Fraction of the episodes that guards of the simulation may end."""
+GUARD_SHARE, SURE = 1e-3, 0.05
+"""Fraction of the episodes that guards of the simulation may end, and how improbable their number
+has to be at that fraction for a training to fail."""
 
 
 @dc.dataclass
@@ -302,7 +304,7 @@ class _Watch(BaseCallback):
     def outcome(self, wall_time: float) -> Outcome:
         guarded = sum(self._guards.values())
         failed = None
-        if guarded > GUARD_SHARE * max(self.episodes, 1):
+        if guarded and binom.sf(guarded - 1, self.episodes, GUARD_SHARE) < SURE:
             failed = (
                 f"guards of the simulation ended {guarded} of {self.episodes} episodes "
                 f"({dict(self._guards)}), more than {100 * GUARD_SHARE:g} %"

@@ -49,12 +49,12 @@ __all__ = [
 SEEDS = range(5)
 METRICS = {"median_force": "median force", "peak_force": "peak", "board_peak": "board"}
 NUMBERS = (*METRICS, "duration")
-COMPARED = ("cutting", "spring", "spring, draw by rule", "random", "tuned rule")
+COMPARED = ("cutting", "spring", "spring, draw by rule", "random", "tuned rule", "corrected")
 """What is set beside the rule in the short table."""
 LEVELS = {
     "press": (20.0, 30.0, 45.0),
     "rule": (6.0, 9.0, 14.0, 20.0, 30.0),
-    "fast rule": (6.0, 9.0, 14.0, 20.0),
+    "fast rule": (6.0, 9.0, 14.0, 20.0, 30.0, 45.0),
 }
 """Forces that presses and rules keep to, N: each is a point of a front."""
 TIMES, FORCES = (2, 3, 5, 10, 20), (2, 5, 10, 20, 50)
@@ -63,8 +63,9 @@ KINDS = {
     "random": ("random actions", "0.45", "x"),
     "press": ("straight press", "0.2", "v"),
     "rule": ("rule, 40 mm/s", GREEN, "o"),
-    "tuned rule": ("tuned rule, 40 mm/s", GREEN, "*"),
     "fast rule": ("rule, 150 mm/s", PURPLE, "o"),
+    "tuned rule": ("tuned rule, 150 mm/s", PURPLE, "*"),
+    "corrected": ("our corrections of a rule, 150 mm/s", BLUE, "P"),
     "spring": ("spring policies", RED, "s"),
     "spring, draw by rule": ("spring policies, draw by rule", ORANGE, "s"),
     "spring, no draw": ("spring policies, no draw", RED, "^"),
@@ -79,8 +80,10 @@ def strategies() -> list[str]:
     names = [f"random {seed}" for seed in SEEDS]
     names += [f"{kind} {level:g}" for kind, levels in LEVELS.items() for level in levels]
     names += ["tuned rule 0"]
-    policies = ("spring", "spring, draw by rule", "spring, no draw", "cutting", "cutting, no draw")
-    return names + [f"{kind} {seed}" for kind in policies for seed in SEEDS]
+    kinds = ("spring", "spring, draw by rule", "spring, no draw", "cutting", "cutting, no draw")
+    policies = [f"{kind} {seed}" for kind in kinds for seed in SEEDS]
+    corrected = resource_path("models/policies").glob("corrected_*")
+    return names + policies + sorted(path.name.replace("_", " ") for path in corrected)
 
 
 def split(name: str) -> tuple[str, float]:
@@ -103,7 +106,7 @@ def decider(case: Case) -> tuple[AgentConfig, Decide]:
         draw = FAST if kind == "fast rule" else agent.draw_increment
         return dc.replace(agent, draw_increment=draw, rule=rule), nothing
     if kind == "tuned rule":
-        return dc.replace(agent, rule=TUNED), nothing
+        return dc.replace(agent, draw_increment=FAST, rule=TUNED), nothing
     simulator, _, other = kind.partition(", ")
     folder = resource_path(f"models/policies/{simulator}_{int(number)}")
     # All end their slices alike, whatever the policy was trained with.
