@@ -149,8 +149,9 @@ TESTED = {
     ],
     "tests/test_learning_comparison.py::test_an_evaluation_goes_on_over_batches_of_processes_and_"
     "runs": [
-        "sliceit evaluate models/policies/*_[0-4] --output docs/results/slicing_evaluation.jsonl",
-        "sliceit evaluate models/policies/*_[0-4] --board-stiffness 3e3 3e5"
+        "sliceit evaluate models/policies/{cutting,spring}_[0-4]"
+        " --output docs/results/slicing_evaluation.jsonl",
+        "sliceit evaluate models/policies/{cutting,spring}_[0-4] --board-stiffness 3e3 3e5"
         " --output docs/results/slicing_evaluation.jsonl",
     ],
     "tests/test_learning_comparison.py::test_a_trained_policy_runs_in_a_scenario": [
@@ -306,7 +307,7 @@ READ_ONLY = {
         python -m studies bench_figures
         python -m studies station_speed --repeat 20 --before docs/results/data/before/station_speed.json --json docs/results/benchmarks/station_speed.json --output docs/results/speed.md
         python -m studies station_speed --json docs/results/benchmarks/station_speed.json
-        python -m studies tune_rule --output output/tune_rule.jsonl
+        python -m studies tune_rule --generations 3 --output output/tune_rule.jsonl
         python -m studies unfinished_slices docs/results/slicing_evaluation.jsonl --output docs/results/learning.md
         """,  # noqa: E501
 }

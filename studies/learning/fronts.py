@@ -339,7 +339,7 @@ def run(options: argparse.Namespace) -> int:
             "world": options.world.replace("_", "-"),
             "slices": options.slices,
             "seed": options.seed,
-            "tuned": re.sub(r"^AgentRule", "", str(TUNED)),
+            "tuned": re.sub(r"^AgentRule|, correction.*(?=\))", "", str(TUNED)),
             "command": options.command,
         },
         points,
