@@ -3,6 +3,7 @@
 import copy
 import dataclasses as dc
 import re
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -130,6 +131,35 @@ def test_a_choice_is_read_back_and_made_anew_for_other_records(tmp_path, monkeyp
     other.metadata.food.peeled = True
     choice_in(tmp_path, setup, [other])
     assert len(made) == 2
+
+
+@pytest.mark.parametrize(("file", "share"), [("setup", 0.5), ("setup", 1.0), ("structure", 0.5)])
+def test_a_run_that_is_killed_as_it_writes_leaves_no_half_choice(
+    tmp_path, monkeypatch, file, share
+):
+    (record,) = bench_records(1)
+    setups = [coarse_setup(), coarse_setup()]
+    setups[1].food.material.toughness = 200.0
+
+    def choose(setup, *_):
+        return StructureChoice(setup, {}, [], [str(setup.food.material.toughness)], [])
+
+    write = Path.write_text
+
+    def killed(path, text, **options):
+        begun = path.name.startswith(file)
+        write(path, text[: int(share * len(text))] if begun else text, **options)
+        if begun:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(structure, "choose_structure", choose)
+    choice_in(tmp_path, setups[0], [record])
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Path, "write_text", killed)
+        choice_in(tmp_path, setups[1], [record])
+    for setup, toughness in zip(setups, ("300.0", "200.0"), strict=True):
+        found = choice_in(tmp_path, setup, [record])
+        assert (found.lines, found.setup) == ([toughness], setup)
 
 
 def test_a_food_that_no_setup_ships_for_is_what_its_record_says():

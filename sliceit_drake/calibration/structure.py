@@ -9,6 +9,7 @@ the linear problem there. All is computed on a coarse mesh: it is to choose, not
 
 import dataclasses as dc
 import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -159,10 +160,14 @@ def choice_in(
             return StructureChoice(load_yaml(CalibrationSetup, directory / "setup.yaml"), **known)
     choice = choose_structure(setup, records, workers, progress)
     directory.mkdir(parents=True, exist_ok=True)
+    # A run may be killed at any line: notes that are there are whole, and of the setup beside.
+    notes.unlink(missing_ok=True)
     dump_yaml(choice.setup, directory / "setup.yaml")
     content = {n: getattr(choice, n) for n in ("values", "taken", "lines", "warnings")}
     text = json.dumps({"problem": problem} | content, indent=2) + "\n"
-    notes.write_text(text, encoding="utf-8")
+    part = directory / "structure.json.part"
+    part.write_text(text, encoding="utf-8")
+    os.replace(part, notes)
     return choice
 
 
