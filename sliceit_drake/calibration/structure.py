@@ -276,7 +276,9 @@ def choose_structure(
         for other in others:
             if found[other].left_out < (1.0 + ALIKE) * found[best].left_out:
                 warnings += _alike(best, found[best], other, found[other])
-        lines.append(f"{best}: taken. {_change(current, found[best])}")
+        lines.append(
+            f"{best}: taken. {_change(current, found[best])}{_layer(best, found[best].values)}"
+        )
         current, minima = found[best], by_name[best]
         taken.append(best)
         rest = [e for e in rest if e.name != best]
@@ -300,6 +302,17 @@ def _change(before: _Fitted, after: _Fitted) -> str:
     return (
         f"Left-out depth {before.left_out:.3f} to {after.left_out:.3f} N, on the records "
         f"{before.rms:.3f} to {after.rms:.3f} N"
+    )
+
+
+def _layer(taken: str, values: Mapping[str, float]) -> str:
+    """What a core says of the layer around it: a thick skin is such a layer."""
+    if taken != "core":
+        return ""
+    ratio, rind = (values[f"effects.core.{name}"] for name in ("toughness_ratio", "rind"))
+    what = ", as a rind or a thick skin is" if ratio < 1.0 else ""
+    return (
+        f". The outer {1e3 * rind:.2g} mm are {1.0 / ratio:.2g} times as tough as the inside{what}"
     )
 
 
