@@ -276,10 +276,10 @@ def comparison_tables(comparisons: Sequence[FoodComparison]) -> str:
             )
         for what, band in (("fitted", k.band), ("left out", c.left_out)):
             low, high = band.interval()
-            inside = np.mean((low <= c.measured) & (c.measured <= high))
-            wide = np.mean(high - low)
-            bands.append((c.food, what, percent(inside), f"{wide:.2f}"))
-            bands[-1] += (f"{wide / np.mean(np.abs(c.measured)):.2f}",)
+            inside = float(np.mean((low <= c.measured) & (c.measured <= high)))
+            wide = float(np.mean(high - low))
+            share = wide / float(np.mean(np.abs(c.measured)))
+            bands.append((c.food, what, percent(inside), f"{wide:.2f}", f"{share:.2f}"))
         half = 0.5 * next(r.rms for r in c.rows if r.name == "DiSECt")
         points = "" if c.per_point_rms is None else f"{c.per_point_rms:.2f}"
         costs.append(
@@ -296,8 +296,8 @@ def comparison_tables(comparisons: Sequence[FoodComparison]) -> str:
         " | a toughness for each cut point [N] | cut points",
         costs,
     )
-    band = table("food | depth is | in the 90 % band | its width [N] | width / force", bands)
-    return f"{curves}\n\n{band}\n\n{cost}"
+    shares = table("food | depth is | in the 90 % band | its width [N] | width / force", bands)
+    return f"{curves}\n\n{shares}\n\n{cost}"
 
 
 def plot_comparisons(comparisons: Sequence[FoodComparison], file: Path) -> None:
@@ -313,13 +313,14 @@ def plot_comparisons(comparisons: Sequence[FoodComparison], file: Path) -> None:
     for column, c in enumerate(comparisons):
         upper, lower = axes[0, column], axes[1, column]
         upper.plot(c.time, c.measured, color="#111827", lw=1.8, label="measured")
-        for band, alpha, label in (
+        shades = (
             (c.left_out, 0.12, "ours, 90 % band of depth that was left out"),
             (c.calibration.band, 0.25, "ours, 90 % band"),
-        ):
-            ends = band.interval()
-            colour = COLOURS["ours"]
-            upper.fill_between(c.time, *ends, color=colour, alpha=alpha, lw=0, label=label)
+        )
+        for shown, alpha, name in shades:
+            upper.fill_between(
+                c.time, *shown.interval(), color=COLOURS["ours"], alpha=alpha, lw=0, label=name
+            )
         for row in c.rows:
             style = "-" if row.name == "ours" else "--"
             label = "ours" if row.name == "ours" else NAMES.get(row.name, row.name)
