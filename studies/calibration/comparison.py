@@ -330,7 +330,9 @@ def plot_comparisons(comparisons: Sequence[FoodComparison], file: Path) -> None:
             )
             if row.name != "spring":
                 lower.plot(c.time, row.force - c.measured, style, color=colour, lw=1.0)
-        upper.set_title(c.food)
+        # Where the last block is left out its height is free, and the band goes into the board.
+        peak = max(c.measured.max(), *(row.force.max() for row in c.rows))
+        upper.set(title=c.food, ylim=(-0.15 * peak, 1.4 * peak))
         upper.legend(frameon=False, fontsize=7)
         lower.set_xlabel("time [s]")
         for axis in (upper, lower):
