@@ -137,6 +137,12 @@ TOPICS: dict[str, tuple[Study, ...]] = {
             "1 h",
         ),
         Study(
+            "calibration_times",
+            "calibration.times",
+            "how long the foods that ship take to calibrate",
+            "15 min",
+        ),
+        Study(
             "adversarial",
             "calibration.adversarial",
             "curves with something wrong, and what the commands say of them",

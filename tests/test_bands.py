@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sliceit_drake.calibration.bands import force_band
+from sliceit_drake.calibration.bands import force_band, independent
 from sliceit_drake.calibration.gauss_newton import gauss_newton
 from sliceit_drake.calibration.prediction import Parameter
 
@@ -163,3 +163,72 @@ def test_a_record_that_was_not_fitted_is_where_the_others_are():
         assert ((low <= model.measured) & (model.measured <= high))[last].mean() > 0.9
         widths.append((high - low)[last].mean())
     assert widths[1] < 0.3 * widths[0]
+
+
+class ThreeChannels(PressModel):
+    """A press, again and again, then a draw; forces across, along and down, as those of a robot."""
+
+    def __init__(self, presses, draws=0):
+        super().__init__(speeds=(0.02,) * (presses + draws))
+        self.conditions = ["press"] * presses + ["draw"] * draws
+        along = np.repeat([0.0] * presses + [0.7] * draws, ROWS)
+        down = np.repeat([1.0] * presses + [0.5] * draws, ROWS)
+        for target, draws_too in zip(self.targets, along[::ROWS] > 0.0, strict=True):
+            target.measured = np.zeros((ROWS, 3))
+            target.path = target.path * (1.8 if draws_too else 1.0)
+        self.ways = np.column_stack([0.0 * along, along, down])
+        self.columns = np.einsum("mp,mc->mcp", self.columns, self.ways).reshape(-1, 2)
+        self.depth, self.record_of = (np.repeat(x, 3) for x in (self.depth, self.record_of))
+        self.channel = np.tile(np.arange(3), len(self.ways))
+        self.used = self.record_of < presses
+        self.measured = self.columns @ [0.5, 0.5]
+
+    def inside(self):
+        low, high = force_band(self, gauss_newton(self, np.full(2, 0.4)).unit).interval()
+        return (low <= self.measured) & (self.measured <= high), high - low
+
+
+def test_neighbours_share_their_error_in_each_channel():
+    """An autoregressive series of correlation c tells as much as (1 - c) / (1 + c) of its rows."""
+    model, correlation = ThreeChannels(20), 0.8
+    rng, rest = np.random.default_rng(5), np.zeros((20 * ROWS, 3))
+    for k in range(1, len(rest)):
+        rest[k] = correlation * rest[k - 1] + rng.normal(size=3)
+    found = independent(model, rest.ravel()).variance / np.mean(rest**2)
+    assert found == pytest.approx((1.0 + correlation) / (1.0 - correlation), rel=0.2)
+
+
+def test_a_channel_without_force_has_a_band_as_wide_as_its_noise():
+    model, rng = ThreeChannels(3), np.random.default_rng(6)
+    noise = np.where(model.channel == 2, 0.8, 0.05)
+    model.measured = model.measured + noise * rng.normal(size=len(noise))
+    model.used = model.record_of < 2
+    inside, width = model.inside()
+    other = (model.record_of == 2) & (model.channel < 2)
+    assert width[other].mean() == pytest.approx(2.0 * 1.645 * 0.05, rel=0.15)
+    assert inside[other].mean() == pytest.approx(0.9, abs=0.04)
+
+
+def test_slices_that_differ_by_a_factor_widen_the_band_of_another():
+    rng, shares = np.random.default_rng(7), []
+    for _ in range(12):
+        model = ThreeChannels(4)
+        factor = np.repeat(1.0 + 0.1 * rng.normal(size=4), 3 * ROWS)
+        model.measured = factor * model.measured + 0.05 * rng.normal(size=len(factor))
+        model.used = model.record_of < 3
+        inside, _ = model.inside()
+        shares.append(inside[(model.record_of == 3) & (model.channel == 2)].mean())
+    assert 0.8 < np.mean(shares) < 0.98
+
+
+def test_a_press_tells_nothing_of_what_a_draw_changes():
+    """It has no force along the edge, in which the simulation of a draw may err all the more."""
+    rng, shares = np.random.default_rng(8), []
+    for _ in range(12):
+        model = ThreeChannels(2, draws=1)
+        wrong = np.where(model.record_of == 2, 1.0 + 0.3 * rng.choice([-1.0, 1.0]), 1.0)
+        model.measured = wrong * model.measured + 0.05 * rng.normal(size=len(wrong))
+        inside, _ = model.inside()
+        draw = (model.record_of == 2) & (model.depth > 0.3 * HEIGHT)
+        shares += [inside[draw & (model.channel == c)].mean() for c in (1, 2)]
+    assert np.mean(shares) > 0.85

@@ -27,7 +27,7 @@ def test_the_band_is_asked_for_what_was_not_fitted():
 
 def test_its_table_has_means_by_law_and_kind():
     rows = [
-        Row("bonds", k, "draws", inside, False, 0.5, 2.0, 4.0, 0.7)
+        Row("training", "bonds", k, "draws", inside, False, 0.5, 2.0, 4.0, 0.7)
         for k, inside in enumerate((0.8, 1.0))
     ]
     (line,) = [line for line in _table(rows).splitlines() if "draws" in line]

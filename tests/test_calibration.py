@@ -560,6 +560,51 @@ def test_a_command_that_was_killed_ends_with_the_same_numbers(records, tmp_path)
     assert results[0] == results[1]
 
 
+KILLED_IN_THE_CHOICE = """
+import os, signal, sys
+from sliceit_drake.calibration import structure
+from sliceit_drake.cli.main import main
+fit, fits = structure._fit, []
+def third_kills(*given):
+    fits.append(fit(*given))
+    if len(fits) == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return fits[-1]
+structure._fit = third_kills
+main(sys.argv[1:])
+"""
+
+
+@pytest.mark.second_tier
+def test_a_choice_of_structure_that_was_killed_ends_with_the_same_numbers(tmp_path):
+    """Killed within the choice, and once more when it is made and the fit begins."""
+    (record,) = bench_records(1, hidden=("core:0.5",))
+    write_record(record, tmp_path / "press")
+    dump_yaml(coarse_setup(), tmp_path / "setup.yaml")
+
+    def calibration(folder: str, *program: str) -> subprocess.Popen:
+        words = ["press.csv", "--food", "setup.yaml", "--output", folder, "--workers", "1"]
+        words = [sys.executable, *program, "calibrate", *words, "--blocks", "0"]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        return subprocess.Popen(words, cwd=tmp_path, **quiet)
+
+    usual, chosen = ("-m", "sliceit_drake.cli.main"), tmp_path / "killed/structure.json"
+    assert calibration("killed", "-c", KILLED_IN_THE_CHOICE).wait() == -signal.SIGKILL
+    assert not chosen.exists()
+    killed = calibration("killed", *usual)
+    while killed.poll() is None and not chosen.exists():
+        time.sleep(0.01)
+    killed.kill()
+    assert killed.wait() == -signal.SIGKILL
+    assert not (tmp_path / "killed/food.yaml").exists()
+    for folder in ("killed", "whole"):
+        assert calibration(folder, *usual).wait() == 0
+    assert json.loads(chosen.read_text())["taken"]
+    for name in ("calibration.json", "structure.json", "setup.yaml"):
+        ends = [(tmp_path / folder / name).read_text() for folder in ("killed", "whole")]
+        assert ends[0] == ends[1], name
+
+
 def test_rows_of_a_sensor_at_its_limit_do_not_count(records):
     clipped = copy.deepcopy(records[0])
     clipped.force[:, 2] = np.minimum(clipped.force[:, 2], 0.8 * clipped.force[:, 2].max())

@@ -258,19 +258,21 @@ READ_ONLY = {
         sliceit calibrate RECORD... --food NAME --output DIR
         sliceit calibrate calibration/records/NAME.csv --food NAME --start NAME --output FOLDER --blocks 0 --per-point 60
         sliceit calibrate --food carrot --literature --output DIR
+        sliceit calibrate calibration/records/NAME.csv --food NAME --output DIR --structure setup --trials 4 --steps 0 --starts 1 --blocks 0
         sliceit record calibration/protocols/poor.yaml --effect skin --refinement 0.7 --seed 32 --output old
         sliceit record next.yaml --replicates 3 --effect skin --refinement 0.7 --seed 132 --output new
         """,  # noqa: E501
     "a study of minutes to hours, whose results stand in docs": """
         python -m studies adversarial --output docs/results/adversarial_curves.md
-        python -m studies bands --laws bonds --draws 2
+        python -m studies bands --laws slice_push bonds --draws 2
+        python -m studies calibration --foods cucumber potato --polish cucumber potato --steps 0 --starts 1 --point-steps 0 --output FOLDER
         python -m studies calibration --output FOLDER
         python -m studies control --output FOLDER
         python -m studies coverage --replicates 12 --output docs/results
         python -m studies disect --output docs/results
         python -m studies bench_misfit --draws 2 --output output/misfit.md
         python -m studies benches --output output/benches --commit HEAD --laws slice_push bonds
-        python -m studies half_depth
+        python -m studies half_depth --output docs/figures/half_depth.png
         python -m studies hidden --output output/hidden --seed 1 --replicates 100
         python -m studies identifiability --output docs/results/identifiability.md --figure docs/results/figures/identifiability.png
         python -m studies random --count 200 --seed 1 --output docs/results
@@ -282,6 +284,7 @@ READ_ONLY = {
         """,  # noqa: E501
     "measures times or draws figures, whose results stand in docs": """
         python -m studies batch_speed --output docs/results/speed.md
+        python -m studies calibration_times --foods cucumber tomato potato
         python -m studies contact --output docs/results/contact.md
         python -m studies cutting_speed --json docs/results/benchmarks/cutting_speed.json
         python -m studies cutting_speed --repeats 3 --output docs/results/figures/cutting_speed.png --json docs/results/benchmarks/cutting_speed.json

@@ -3,6 +3,7 @@
 import copy
 import dataclasses as dc
 import re
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -82,13 +83,15 @@ def test_left_out_depth_shows_an_overfit_as_blocks_that_are_held_out_do():
         assert left_out == pytest.approx(blocked_error(model, fit.unit).rms, rel=0.2)
 
 
+ELEMENTS = structure._elements
+
+
 @pytest.fixture
 def few_elements(monkeypatch):
     """Only skin and core, on the mesh that is coarse already."""
-    usual = structure._elements
 
     def some(*given):
-        return [e for e in usual(*given) if e.name in ("skin", "core")]
+        return [e for e in ELEMENTS(*given) if e.name in ("skin", "core")]
 
     monkeypatch.setattr(structure, "_elements", some)
     monkeypatch.setattr(structure, "COARSE", 1.0)
@@ -114,6 +117,36 @@ def test_a_core_is_taken_where_there_is_one_and_nothing_where_there_is_none(few_
     assert "effects.core.toughness_ratio" in [p.name for p in found.setup.parameters]
 
 
+@pytest.mark.second_tier
+def test_a_thick_skin_is_a_layer_that_is_tougher_and_no_line_load(few_elements):
+    """The stand-in's skin is a toughness that falls over a millimetre. The model's skin is a load
+    on a line, which not even with a thickness of its own fits as well as an outer layer does."""
+    (record,) = bench_records(1, hidden=("skin:0.3",))
+    found = choose_structure(coarse_setup(), [record], 1)
+    assert found.taken == ["core"]
+    (line,) = [line for line in found.lines if line.startswith("core")]
+    assert line.endswith("as tough as the inside, as a rind or a thick skin is")
+    rms = float(re.search(r"records .* to (.*?) N\.", line)[1])
+    elements = {e.name: e for e in ELEMENTS(coarse_setup(), 0.03, False)}
+    setup = structure._without_elements(coarse_setup())
+    for name in ("skin", "puncture"):
+        setup = structure._with_element(setup, elements[name])
+    predictor = structure.coarse_predictor(setup, [record], 1)
+    skin = {"effects.skin.toughness": 0.3, "effects.skin.thickness": 1.2e-3}
+    fit = structure._fit(predictor, setup, found.values | skin)
+    assert fit.rms > 1.1 * rms
+
+
+def test_a_core_says_what_the_layer_around_it_is():
+    values = {"effects.core.toughness_ratio": 0.5, "effects.core.rind": 2e-3}
+    assert structure._layer("core", values) == (
+        ". The outer 2 mm are 2 times as tough as the inside, as a rind or a thick skin is"
+    )
+    values["effects.core.toughness_ratio"] = 1.6
+    assert structure._layer("core", values).endswith("0.62 times as tough as the inside")
+    assert structure._layer("compliance", values) == ""
+
+
 def test_a_choice_is_read_back_and_made_anew_for_other_records(tmp_path, monkeypatch):
     (record,) = bench_records(1)
     setup = coarse_setup()
@@ -130,6 +163,35 @@ def test_a_choice_is_read_back_and_made_anew_for_other_records(tmp_path, monkeyp
     other.metadata.food.peeled = True
     choice_in(tmp_path, setup, [other])
     assert len(made) == 2
+
+
+@pytest.mark.parametrize(("file", "share"), [("setup", 0.5), ("setup", 1.0), ("structure", 0.5)])
+def test_a_run_that_is_killed_as_it_writes_leaves_no_half_choice(
+    tmp_path, monkeypatch, file, share
+):
+    (record,) = bench_records(1)
+    setups = [coarse_setup(), coarse_setup()]
+    setups[1].food.material.toughness = 200.0
+
+    def choose(setup, *_):
+        return StructureChoice(setup, {}, [], [str(setup.food.material.toughness)], [])
+
+    write = Path.write_text
+
+    def killed(path, text, **options):
+        begun = path.name.startswith(file)
+        write(path, text[: int(share * len(text))] if begun else text, **options)
+        if begun:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(structure, "choose_structure", choose)
+    choice_in(tmp_path, setups[0], [record])
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Path, "write_text", killed)
+        choice_in(tmp_path, setups[1], [record])
+    for setup, toughness in zip(setups, ("300.0", "200.0"), strict=True):
+        found = choice_in(tmp_path, setup, [record])
+        assert (found.lines, found.setup) == ([toughness], setup)
 
 
 def test_a_food_that_no_setup_ships_for_is_what_its_record_says():

@@ -1,13 +1,18 @@
 """Bands of predicted force: what parameters, noise and the simulation's own error leave open.
 
 A record's force is the simulated one, plus what the parameters may change of it, plus what the
-simulation gets wrong by itself (`prediction.discrepancy`), plus noise. All are normal, and their
-sizes are those of the records that were fitted. Where nothing was fitted, deeper or at another
-speed, parameters and discrepancy are what they were before. Height and speed of a record that was
-not fitted are as far from those that were as these are apart.
+simulation gets wrong by itself (`prediction.discrepancy`), plus what slices differ by, plus noise.
+All are normal, and their sizes are those of the records that were fitted. Where nothing was fitted,
+deeper or at another speed, parameters and discrepancy are what they were before. Height and speed
+of a record that was not fitted are as far from those that were as these are apart.
+
+What the simulation gets wrong is a part of the force that it predicts, in each channel: a press
+tells how wrong it is, but nothing of the force along the edge, which only a draw has. Slices differ
+by a factor. Noise is what is left, in each channel and phase of the motion.
 """
 
 import dataclasses as dc
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.special import ndtri
@@ -20,6 +25,7 @@ from sliceit_drake.prediction.discrepancy import (
     Covariates,
     Discrepancy,
     Sizes,
+    motion_phases,
     motion_shapes,
 )
 from sliceit_drake.prediction.noise import EvenNoise
@@ -32,6 +38,13 @@ ROUNDS = 3
 """Alternations of the noise and the sizes of the discrepancy."""
 LEAST = 1e-3
 """Least standard deviation of the noise, relative to the root mean square force."""
+USUAL = 0.9
+"""Share of what is left that tells the noise."""
+APART = 0.1
+"""Standard deviation of the factors by which slices differ before any data: vegetables are so."""
+UNSEEN = (0.0, 0.1, 0.3)
+"""Least sizes of the discrepancy's shared parts: what a decade of the speed and a draw change of
+the force, as a part of it, where no record tells."""
 
 
 @dc.dataclass
@@ -55,7 +68,7 @@ class ForceBand:
 def independent(model: Predictor, residuals: np.ndarray) -> EvenNoise:
     """Independent noise that tells as little as residuals [M], N, whose neighbours are alike."""
     variance = float(np.mean(residuals[model.used] ** 2))
-    return EvenNoise(variance * _shared(residuals, model.used, model.record_of))
+    return EvenNoise(variance * _shared(model, residuals))
 
 
 def force_band(model: Predictor, unit: np.ndarray, draws: int = 0) -> ForceBand:
@@ -72,40 +85,48 @@ def force_band(model: Predictor, unit: np.ndarray, draws: int = 0) -> ForceBand:
         CuttingError: A slice breaks down near the fit.
     """
     residuals, J = model.jacobian(unit)
-    used = model.used
-    Z, phase, channel, factors, usual = _shapes(model)
-    r, d = -residuals, J.shape[1]
-    columns = np.column_stack([Z, J, r])
-    z = Z.shape[1]
-    level = float(np.sqrt(np.mean(model.measured[used] ** 2)))
-    variance = float(np.mean(r[used] ** 2))
-    center, prior = np.full(d, PRIOR_CENTER), np.full(d, 1.0 / PRIOR_VARIANCE)
-    conditions = _conditions(model)
+    used, d = model.used, J.shape[1]
+    force, r = model.measured + residuals, -residuals
+    conditions, groups = _conditions(model), _groups(model)
+    known = [c for c in conditions if (c.rows & used).any()]
+    slices = _slices(model, force, r, known)
+    Z, phase = _shapes(model, force)
+    z, n = Z.shape[1], d + slices.shape[1]
+    columns = np.column_stack([Z, J, slices, r])
+    total = n + (3 + len(conditions)) * z
+    center, precision = np.zeros(total), np.ones(total)
+    center[:d], precision[:d] = PRIOR_CENTER - unit, 1.0 / PRIOR_VARIANCE
     problem = Discrepancy(
-        range(z), channel, phase, range(z, z + d + 1), [factors[k] for k, _ in conditions], usual
+        range(z),
+        np.zeros(z, int),
+        phase,
+        range(z, z + n + 1),
+        [c.covariates for c in known],
+        np.array([USUAL_SHARE]),
     )
     rest = r
     for _ in range(ROUNDS):
-        # Neighbours share their error: they tell as much as fewer rows would.
-        weight = 1.0 / independent(model, rest).variance
-        grams = [weight * columns[rows & used].T @ columns[rows & used] for _, rows in conditions]
-        sizes, _ = problem.fit(grams, range(d), prior)
-        coefficients = _Coefficients(problem, sizes, conditions, Z, J)
-        mean, _ = coefficients.posterior(r, used, weight, unit, center, prior)
-        rest = r - coefficients.columns @ mean
-        variance = max(float(np.mean(rest[used] ** 2)), (LEAST * level) ** 2)
-    weight = 1.0 / independent(model, rest).variance
-    mean, covariance = coefficients.posterior(r, used, weight, unit, center, prior)
-    center, prior = _like_the_fitted(model, unit + mean[:d], np.diag(covariance)[:d])
-    mean, covariance = coefficients.posterior(r, used, weight, unit, center, prior)
+        weight = _weight(model, rest, groups)
+        grams = []
+        for rows in (c.rows & used for c in known):
+            grams.append((weight[rows, None] * columns[rows]).T @ columns[rows])
+        sizes, _ = problem.fit(grams, range(n), precision[:n])
+        A = np.column_stack([J, slices, _parts(problem, sizes, conditions, Z)])
+        mean, _ = _posterior(A[used], r[used], weight[used], center, precision)
+        rest = r - A @ mean
+    weight, variance = _weight(model, rest, groups), _variance(model, rest, groups)
+    mean, covariance = _posterior(A[used], r[used], weight[used], center, precision)
+    middle, precision[:d] = _like_the_fitted(model, unit + mean[:d], np.diag(covariance)[:d])
+    center[:d] = middle - unit
+    mean, covariance = _posterior(A[used], r[used], weight[used], center, precision)
     if draws:
         normal = mean[:d], covariance[:d, :d]
-        C = coefficients.columns[:, d:]
-        forces, spread = _drawn(model, unit, draws, normal, C, weight, center, prior)
+        forces, spread = _drawn(
+            model, unit, draws, normal, A[:, d:], weight[used], middle, precision[:d]
+        )
         return ForceBand(forces, np.sqrt(spread + variance))
-    A = coefficients.columns
     spread = np.einsum("ij,jk,ik->i", A, covariance, A)
-    return ForceBand(model.measured - r + A @ mean, np.sqrt(np.maximum(spread, 0.0) + variance))
+    return ForceBand(force + A @ mean, np.sqrt(np.maximum(spread, 0.0) + variance))
 
 
 def _like_the_fitted(
@@ -143,7 +164,7 @@ def _drawn(
     draws: int,
     normal: tuple[np.ndarray, np.ndarray],
     C: np.ndarray,
-    weight: float,
+    weight: np.ndarray,
     center: np.ndarray,
     precision: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -151,8 +172,8 @@ def _drawn(
 
     Args:
         normal: Mean and covariance of the places from `unit`, as the linear problem has them.
-        C: By which the discrepancy's coefficients change the entries [M, n].
-        weight: One over the variance of the entries that are used.
+        C: By which the other coefficients change the entries [M, n].
+        weight: One over the variance of each entry that is used.
         center, precision: Of the places before the data [d].
     """
     rng, used = np.random.default_rng(0), model.used
@@ -164,10 +185,12 @@ def _drawn(
     forces = np.array([np.concatenate([p.predicted.ravel() for p in row]) for row in rows])
     cut = np.isfinite(forces).all(1)
     forces, places, steps = forces[cut], places[cut], steps[cut]
-    rest = model.measured - forces
-    inner = np.linalg.inv(np.eye(C.shape[1]) + weight * C[used].T @ C[used])
-    found = weight * rest[:, used] @ C[used] @ inner
-    fit = weight * ((rest[:, used] ** 2).sum(1) - ((rest[:, used] @ C[used]) * found).sum(1))
+    rest = (model.measured - forces)[:, used]
+    weighted = weight[:, None] * C[used]
+    inner = np.linalg.inv(np.eye(C.shape[1]) + weighted.T @ C[used])
+    seen = rest @ weighted
+    found = seen @ inner
+    fit = rest**2 @ weight - (seen * found).sum(1)
     prior = (places - center) ** 2 @ precision
     logs = -0.5 * (fit + prior - (steps**2).sum(1))
     shares = _shares(logs)
@@ -188,94 +211,138 @@ def _shares(logs: np.ndarray) -> np.ndarray:
     return np.asarray(shares)
 
 
-class _Coefficients:
-    """Those of parameters and of the discrepancy's parts: u, v, w, and each condition's own.
+@dc.dataclass(frozen=True)
+class _Condition:
+    """Records that were cut alike: mask of their entries [M], and covariates of the first."""
 
-    Attributes:
-        columns: By which each entry changes [M, n].
-        parameters: How many of the columns, the first, are theirs.
-    """
-
-    def __init__(
-        self,
-        problem: Discrepancy,
-        sizes: Sizes,
-        conditions: list[tuple[int, np.ndarray]],
-        Z: np.ndarray,
-        J: np.ndarray,
-    ) -> None:
-        deviations = sizes.deviations(problem.channel, problem.phase)
-        parts = np.zeros((3, *Z.shape))
-        own = []
-        for (_, rows), factors in zip(conditions, problem.factors, strict=True):
-            parts[:, rows] = factors[:, None, None] * deviations[:3, None] * Z[rows]
-            own.append(np.where(rows[:, None], deviations[3] * Z, 0.0))
-        self.columns = np.column_stack([J, *parts, *own])
-        self.parameters = J.shape[1]
-
-    def posterior(
-        self,
-        r: np.ndarray,
-        used: np.ndarray,
-        weight: float,
-        unit: np.ndarray,
-        center: np.ndarray,
-        precision: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Mean [n] and covariance [n, n] of the coefficients after the entries that are used; the
-        parameters' places have `center` and `precision` before them [d]."""
-        A, rest = self.columns[used], self.columns.shape[1] - self.parameters
-        before = np.append(center - unit, np.zeros(rest))
-        precisions = np.append(precision, np.ones(rest))
-        covariance = np.linalg.inv(weight * A.T @ A + np.diag(precisions))
-        return covariance @ (weight * A.T @ r[used] + precisions * before), covariance
+    rows: np.ndarray
+    covariates: Covariates
 
 
-def _shared(rest: np.ndarray, used: np.ndarray, record_of: np.ndarray) -> float:
-    """How alike neighbours' errors are: the sum of their autocorrelation up to its first zero."""
-    factors = []
-    for record in np.unique(record_of[used]):
-        x = rest[used & (record_of == record)]
-        x = x - x.mean()
-        n = len(x)
-        spectrum = np.abs(np.fft.rfft(x, 2 * n)) ** 2
-        correlation = np.fft.irfft(spectrum)[:n] / max(float(x @ x), 1e-300)
-        first = int(np.argmax(correlation < 0.0)) or n
-        factors.append(1.0 + 2.0 * float(correlation[1:first].sum()))
-    return max(1.0, float(np.mean(factors)))
-
-
-def _conditions(model: Predictor) -> list[tuple[int, np.ndarray]]:
-    """Of each condition its first record and the mask of its entries [M]."""
+def _conditions(model: Predictor) -> list[_Condition]:
     groups: dict[str, list[int]] = {}
     for k, name in enumerate(model.conditions):
         groups.setdefault(name or f"record {k}", []).append(k)
-    return [(own[0], np.isin(model.record_of, own)) for own in groups.values()]
+    out = []
+    for own in groups.values():
+        first = model.targets[own[0]]
+        covariates = Covariates.of(first.time, first.depth, first.path)
+        out.append(_Condition(np.isin(model.record_of, own), covariates))
+    return out
 
 
-def _shapes(
-    model: Predictor,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Covariates], np.ndarray]:
-    """Of the discrepancy: shapes at the entries [M, z], phase and channel of each [z], covariates
-    of the records, and usual size in each channel, N."""
-    reach = max(float(t.depth.max()) for t in model.targets)
+def _channel(model: Predictor) -> np.ndarray:
+    """Number of the channel of each entry [M]: entries go by row, then by channel."""
+    return np.arange(model.measured.size) % model.targets[0].measured.shape[1]
+
+
+def _groups(model: Predictor) -> np.ndarray:
+    """Number of the channel and phase of each entry [M], that of the air first."""
     channels = model.targets[0].measured.shape[1]
-    blocks, covariates = [], []
-    phase = np.zeros(0, int)
-    for target in model.targets:
-        time, depth, path = target.time, target.depth, target.path
-        values, phase = motion_shapes(time, depth, path, depth > 0.0, reach, target.facts.height)
-        covariates.append(Covariates.of(time, depth, path))
-        # Entries go by row, then by channel.
-        blocks.append(np.einsum("mn,cd->mcdn", values, np.eye(channels)))
-    n = len(phase)
+    phases = [motion_phases(t.time, t.depth, t.path)[0] + 1 for t in model.targets]
+    return channels * np.repeat(np.concatenate(phases), channels) + _channel(model)
+
+
+def _shapes(model: Predictor, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Shapes of the discrepancy at the entries [M, z], N, in parts of the root mean square of each
+    record's predicted force in each channel [M], and the phase of each [z]."""
+    reach = max(float(t.depth.max()) for t in model.targets)
+    blocks, phase = [], np.zeros(0, int)
+    for k, t in enumerate(model.targets):
+        height = t.facts.height
+        values, phase = motion_shapes(t.time, t.depth, t.path, t.depth > 0.0, reach, height)
+        own = force[model.record_of == k].reshape(t.measured.shape)
+        inside = t.depth > 0.0
+        level = np.sqrt((own[inside] ** 2).sum(0) / max(int(inside.sum()), 1))
+        blocks.append(np.einsum("mn,cd->mcdn", values, np.diag(level)))
+    channels, n = blocks[0].shape[2:]
     Z = np.concatenate([b.reshape(-1, channels * n) for b in blocks])
     in_use = np.tile(phase != PHASES.index("any"), channels)
-    size = USUAL_SHARE * float(np.sqrt(np.mean(model.measured[model.used] ** 2)))
-    return (
-        Z[:, in_use],
-        np.tile(phase, channels)[in_use],
-        np.repeat(np.arange(channels), n)[in_use],
-        covariates,
-        np.full(channels, size),
-    )
+    return Z[:, in_use], np.tile(phase, channels)[in_use]
+
+
+def _slices(
+    model: Predictor, force: np.ndarray, r: np.ndarray, known: Sequence[_Condition]
+) -> np.ndarray:
+    """By which a factor on each record's predicted force changes the entries [M, records], in
+    standard deviations of what slices of one condition differ by.
+
+    Args:
+        force: Predicted [M], N.
+        r: Measured less predicted force [M], N.
+        known: Conditions that were fitted.
+    """
+    square, degrees = APART**2, 1
+    for rows in (c.rows & model.used for c in known):
+        records = [rows & (model.record_of == k) for k in np.unique(model.record_of[rows])]
+        factors = [
+            force[own] @ r[own] / max(float(force[own] @ force[own]), 1e-300) for own in records
+        ]
+        square += float(np.sum((factors - np.mean(factors)) ** 2))
+        degrees += len(records) - 1
+    apart = np.sqrt(square / degrees)
+    return apart * force[:, None] * (model.record_of[:, None] == np.arange(len(model.targets)))
+
+
+def _parts(
+    problem: Discrepancy, sizes: Sizes, conditions: Sequence[_Condition], Z: np.ndarray
+) -> np.ndarray:
+    """By which the discrepancy's coefficients, the shared ones, those of speed and draw and each
+    condition's own, change the entries [M, n]."""
+    deviations = sizes.deviations(problem.channel, problem.phase)
+    told = np.any([np.abs(f) > 0.0 for f in problem.factors], axis=0)
+    unseen = np.where(told, 0.0, UNSEEN)[:, None] * deviations[0] / np.exp(sizes.channel)
+    deviations[:3] = np.maximum(deviations[:3], unseen)
+    parts, own = np.zeros((3, *Z.shape)), []
+    for c in conditions:
+        factors = problem.factor(c.covariates)
+        parts[:, c.rows] = factors[:, None, None] * deviations[:3, None] * Z[c.rows]
+        own.append(np.where(c.rows[:, None], deviations[3] * Z, 0.0))
+    return np.column_stack([*parts, *own])
+
+
+def _posterior(
+    A: np.ndarray, r: np.ndarray, weight: np.ndarray, center: np.ndarray, precision: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean [n] and covariance [n, n] of the coefficients of columns A [m, n] after residuals [m],
+    with these centres and precisions before them [n]."""
+    weighted = weight[:, None] * A
+    covariance = np.linalg.inv(weighted.T @ A + np.diag(precision))
+    return covariance @ (weighted.T @ r + precision * center), covariance
+
+
+def _variance(model: Predictor, rest: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """Variance of what is left [M], N^2, in its channel and phase, or where that was not measured
+    in its channel: that of a normal distribution of which nine of ten are as near. What stands out
+    for a few rows, as the board does, is not the noise of all."""
+    channel, level = _channel(model), np.mean(model.measured[model.used] ** 2)
+    out = np.zeros(len(rest))
+    for of in (channel, groups):
+        for number in np.unique(of[model.used]):
+            near = np.quantile(np.abs(rest[model.used & (of == number)]), USUAL)
+            out[of == number] = (near / ndtri(0.5 + USUAL / 2.0)) ** 2
+    return np.maximum(out, LEAST**2 * level)
+
+
+def _weight(model: Predictor, rest: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """What each entry tells [M], 1/N^2: neighbours share their error, and tell as much as fewer
+    entries would. Where little force is, little is left, but the mesh errs there as elsewhere: no
+    entry tells more than in the mean."""
+    variance = np.maximum(_variance(model, rest, groups), np.mean(rest[model.used] ** 2))
+    return 1.0 / (_shared(model, rest) * variance)
+
+
+def _shared(model: Predictor, rest: np.ndarray) -> float:
+    """How alike neighbours' errors are: the sum of their autocorrelation up to its first zero, of
+    all channels of all records."""
+    series, channel = [], _channel(model)
+    for record in np.unique(model.record_of[model.used]):
+        for c in np.unique(channel):
+            x = rest[model.used & (model.record_of == record) & (channel == c)]
+            series.append(x - x.mean())
+    longest = max(map(len, series))
+    spectra = [np.abs(np.fft.rfft(x, 2 * longest)) ** 2 for x in series]
+    covariance = np.fft.irfft(np.sum(spectra, axis=0))[:longest]
+    correlation = covariance / max(float(covariance[0]), 1e-300)
+    first = int(np.argmax(correlation < 0.0)) or longest
+    return max(1.0, 1.0 + 2.0 * float(correlation[1:first].sum()))

@@ -9,6 +9,7 @@ the linear problem there. All is computed on a coarse mesh: it is to choose, not
 
 import dataclasses as dc
 import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -159,10 +160,14 @@ def choice_in(
             return StructureChoice(load_yaml(CalibrationSetup, directory / "setup.yaml"), **known)
     choice = choose_structure(setup, records, workers, progress)
     directory.mkdir(parents=True, exist_ok=True)
+    # A run may be killed at any line: notes that are there are whole, and of the setup beside.
+    notes.unlink(missing_ok=True)
     dump_yaml(choice.setup, directory / "setup.yaml")
     content = {n: getattr(choice, n) for n in ("values", "taken", "lines", "warnings")}
     text = json.dumps({"problem": problem} | content, indent=2) + "\n"
-    notes.write_text(text, encoding="utf-8")
+    part = directory / "structure.json.part"
+    part.write_text(text, encoding="utf-8")
+    os.replace(part, notes)
     return choice
 
 
@@ -271,7 +276,9 @@ def choose_structure(
         for other in others:
             if found[other].left_out < (1.0 + ALIKE) * found[best].left_out:
                 warnings += _alike(best, found[best], other, found[other])
-        lines.append(f"{best}: taken. {_change(current, found[best])}")
+        lines.append(
+            f"{best}: taken. {_change(current, found[best])}{_layer(best, found[best].values)}"
+        )
         current, minima = found[best], by_name[best]
         taken.append(best)
         rest = [e for e in rest if e.name != best]
@@ -295,6 +302,17 @@ def _change(before: _Fitted, after: _Fitted) -> str:
     return (
         f"Left-out depth {before.left_out:.3f} to {after.left_out:.3f} N, on the records "
         f"{before.rms:.3f} to {after.rms:.3f} N"
+    )
+
+
+def _layer(taken: str, values: Mapping[str, float]) -> str:
+    """What a core says of the layer around it: a thick skin is such a layer."""
+    if taken != "core":
+        return ""
+    ratio, rind = (values[f"effects.core.{name}"] for name in ("toughness_ratio", "rind"))
+    what = ", as a rind or a thick skin is" if ratio < 1.0 else ""
+    return (
+        f". The outer {1e3 * rind:.2g} mm are {1.0 / ratio:.2g} times as tough as the inside{what}"
     )
 
 

@@ -33,6 +33,7 @@ __all__ = [
     "Discrepancy",
     "Sizes",
     "Weighted",
+    "motion_phases",
     "motion_shapes",
 ]
 
@@ -78,7 +79,7 @@ class Covariates:
     @staticmethod
     def of(time: np.ndarray, depth: np.ndarray, path: np.ndarray) -> "Covariates":
         """Of a record: times [m], depths [m] and the way of the knife [m], s and metres."""
-        going, _ = _phases(time, depth, path)
+        going, _ = motion_phases(time, depth, path)
         first = going == PHASES.index("in")
         if first.sum() < 5:
             return Covariates(np.nan, 0.0)
@@ -89,7 +90,9 @@ class Covariates:
         return Covariates(float(np.log10(np.median(speed))), draw if draw > 0.1 else 0.0)
 
 
-def _phases(time: np.ndarray, depth: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def motion_phases(
+    time: np.ndarray, depth: np.ndarray, path: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Number of the phase at each row, -1 outside of the food [m], and time at rest so far [m]."""
     step = np.diff(time, prepend=time[0] - (time[1] - time[0]))
     speed, rate = np.gradient(path, time), np.gradient(depth, time)
@@ -129,7 +132,7 @@ def motion_shapes(
     Returns:
         Values [m, n], and the number of the phase of each shape [n].
     """
-    going, rested = _phases(time, depth, path)
+    going, rested = motion_phases(time, depth, path)
     going = np.where(touching, going, -1)
     at = np.log1p(np.clip(depth, 0.0, reach) / ENTRY) / np.log1p(max(reach, 1e-9) / ENTRY)
     if height <= 0.0:
@@ -319,15 +322,19 @@ class Discrepancy:
         self.others = list(others)
         speeds = np.array([c.speed for c in covariates])
         known = np.isfinite(speeds)
-        middle = speeds[known].mean() if known.any() else 0.0
-        away = np.where(known, speeds - middle, 0.0)
-        self.factors = [np.array([1.0, s, c.draw]) for s, c in zip(away, covariates, strict=True)]
+        self._middle = float(speeds[known].mean()) if known.any() else 0.0
+        self.factors = [self.factor(c) for c in covariates]
         phases = len(PHASES) - 1
         less = np.log(np.full(3 + phases, LESS))
         self.prior = Sizes(np.log(usual), less[:3], less[3:])
         self.spread = np.concatenate(
             [np.full(len(usual), PRIOR["channel"]), [PRIOR["part"]] * 3, [PRIOR["phase"]] * phases]
         )
+
+    def factor(self, of: Covariates) -> np.ndarray:
+        """By which the parts of a condition's discrepancy count, but for its own [3]."""
+        away = of.speed - self._middle if np.isfinite(of.speed) else 0.0
+        return np.array([1.0, away, of.draw])
 
     def likelihood(
         self, grams: Sequence[np.ndarray], sizes: Sizes, fitted: Sequence[int], prior: np.ndarray

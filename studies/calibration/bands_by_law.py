@@ -6,8 +6,9 @@ of constant width, 1.645 standard deviations of what the fit leaves to both side
 mean interval score (Gneiting and Raftery 2007), N, is the width and 20 times what lies outside; the
 lower the better.
 
-The benches are those of the training part (docs/results/benches.md). With --output each draw is
-kept there as a line of JSON, from which the study goes on if it was stopped.
+The benches are those of one part (docs/results/benches.md): what bands take for usual was set by
+draws of the training part, and is reported on others. With --output each draw is kept there as a
+line of JSON, from which the study goes on if it was stopped.
 """
 
 import argparse
@@ -25,7 +26,7 @@ from sliceit_drake.calibration.setup import setup_of_record
 from sliceit_drake.calibration.structure import coarse_predictor, first_starts
 from sliceit_drake.cutting.solver import CuttingError
 from sliceit_drake.records.slice_record import SliceRecord
-from studies.benches.draw import LAWS, RESERVED, Draw, seed_of
+from studies.benches.draw import LAWS, PARTS, RESERVED, Draw, seed_of
 from studies.pages import percent, publish, table
 
 __all__ = ["Row", "add_arguments", "interval_score", "run", "scored"]
@@ -45,7 +46,7 @@ class Row:
     """A record that was not fitted.
 
     Attributes:
-        law, draw: Of its bench.
+        part, law, draw: Of its bench.
         kind: One of `KINDS`.
         inside: Share of it in the band.
         whole: Whether all of it is.
@@ -54,6 +55,7 @@ class Row:
         constant_inside: Share of it in that one.
     """
 
+    part: str
     law: str
     draw: int
     kind: str
@@ -71,13 +73,13 @@ def interval_score(low: np.ndarray, high: np.ndarray, measured: np.ndarray) -> f
     return float(np.mean(high - low + 2.0 / (1.0 - LEVEL) * outside))
 
 
-def scored(law: str, number: int) -> list[Row]:
-    """The records that are not fitted, of a draw.
+def scored(part: str, law: str, number: int) -> list[Row]:
+    """The records that are not fitted, of a draw of a part.
 
     Raises:
         CuttingError: No start leads to slices that can be cut.
     """
-    draw = Draw(law, seed_of(COMMIT, "training", law, number))
+    draw = Draw(law, seed_of(COMMIT, part, law, number))
     fitted, left = _chosen(draw.records())
     setup = setup_of_record(fitted[0])
     few = coarse_predictor(setup, fitted, 1)
@@ -109,6 +111,7 @@ def scored(law: str, number: int) -> list[Row]:
         force = float(np.sqrt(np.mean(y**2)))
         near = np.abs(y - fit[rows]) <= reach
         row = Row(
+            part,
             law,
             number,
             kind,
@@ -141,6 +144,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the study's arguments."""
     known = [law for law in LAWS if law != RESERVED]
     parser.add_argument("--laws", nargs="+", choices=known, default=known, help="default: all")
+    parser.add_argument(
+        "--part", choices=PARTS, default="reporting", help="of the benches (default reporting)"
+    )
     parser.add_argument("--draws", type=int, default=6, help="of each law (default 6)")
     parser.add_argument("--output", type=Path, metavar="FILE", help="of JSON lines, to go on from")
     parser.set_defaults(resumes=True)
@@ -151,12 +157,12 @@ def run(options: argparse.Namespace) -> int:
     rows: list[Row] = []
     if options.output is not None and options.output.exists():
         lines = options.output.read_text(encoding="utf-8").splitlines()
-        rows = [Row(**json.loads(line)) for line in lines]
+        rows = [row for row in (Row(**json.loads(x)) for x in lines) if row.part == options.part]
     done = {(row.law, row.draw) for row in rows}
     todo = [(law, k) for k in range(options.draws) for law in options.laws]
     for law, k in tqdm([pair for pair in todo if pair not in done], desc="draws"):
         try:
-            found = scored(law, k)
+            found = scored(options.part, law, k)
         except CuttingError as error:
             print(f"{law} {k}: {error}")
             continue

@@ -16,8 +16,15 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from sliceit_drake.calibration.calibrate import CalibrationOptions, calibrate, values_of
+from sliceit_drake.calibration.bands import ForceBand, force_band
+from sliceit_drake.calibration.calibrate import (
+    CalibrationOptions,
+    calibrate,
+    depth_blocks,
+    values_of,
+)
 from sliceit_drake.calibration.per_point import fit_points
+from sliceit_drake.calibration.prediction import Predictor
 from sliceit_drake.calibration.result import Calibration
 from sliceit_drake.calibration.setup import load_setup
 from sliceit_drake.cli.progress import StageBars
@@ -26,7 +33,7 @@ from sliceit_drake.records.force_profile import ForceProfile, load_force_profile
 from sliceit_drake.records.validation import load_record
 from sliceit_drake.resources import resource_path
 from studies.figures import new_figure, save_figure
-from studies.pages import publish, table
+from studies.pages import percent, publish, table
 
 __all__ = [
     "FoodComparison",
@@ -34,11 +41,14 @@ __all__ = [
     "add_arguments",
     "compare",
     "comparison_tables",
+    "left_out_band",
     "plot_comparisons",
     "run",
 ]
 
 FOODS = ("cucumber", "tomato", "potato")
+BLOCKS = 5
+"""Of depth, for the bands of what was left out."""
 LARGEST_SHIFT = 0.4
 """In time, that other simulators' curves get, s."""
 NAMES = {"DiSECt": "authors' calibrated DiSECt", "spring": "authors' spring"}
@@ -169,6 +179,7 @@ class FoodComparison:
         time, measured: The record [m], s and N.
         rows: Of the simulators; the last is ours.
         calibration: Ours.
+        left_out: Band of ours, of each block of depth from the others.
         minutes: What it took.
         per_point_rms: Error with a toughness for each cut point besides, N; None if not fitted.
     """
@@ -178,6 +189,7 @@ class FoodComparison:
     measured: np.ndarray
     rows: list[Row]
     calibration: Calibration
+    left_out: ForceBand
     minutes: float
     per_point_rms: float | None = None
 
@@ -198,9 +210,21 @@ def compare(calibration: Calibration, profile: ForceProfile, minutes: float) -> 
         rows.append(_row(name, time, force, measured, shift, speed))
     ours = prediction.predicted[:, 0]
     rows.append(_row("ours", time, ours, measured, 0.0, speed))
-    return FoodComparison(
-        calibration.predictor.setup.food.name, time, measured, rows, calibration, minutes
-    )
+    name = calibration.predictor.setup.food.name
+    left_out = left_out_band(calibration.predictor, calibration.unit)
+    return FoodComparison(name, time, measured, rows, calibration, left_out, minutes)
+
+
+def left_out_band(model: Predictor, unit: np.ndarray, blocks: int = BLOCKS) -> ForceBand:
+    """The band of each block of depth from the entries of the others, with the force taken for
+    linear about the fit to all [d]."""
+    block = depth_blocks(model, blocks)
+    mean, deviation = np.zeros(len(block)), np.zeros(len(block))
+    for k in range(blocks):
+        band = force_band(model.holding_out(block == k), unit)
+        mean[block == k] = band.mean[block == k]
+        deviation[block == k] = band.deviation[block == k]
+    return ForceBand(mean, deviation)
 
 
 def _best_shift(
@@ -232,7 +256,7 @@ def _row(
 
 def comparison_tables(comparisons: Sequence[FoodComparison]) -> str:
     """The comparison as Markdown."""
-    rows, costs = [], []
+    rows, costs, bands = [], [], []
     for c in comparisons:
         k = c.calibration
         target = k.predictor.targets[0]
@@ -250,6 +274,12 @@ def comparison_tables(comparisons: Sequence[FoodComparison]) -> str:
                 (c.food, name, f"{row.rms:.2f}", f"{row.peak:.1f}", f"{row.work:.3f}", shift)
                 + (count, held)
             )
+        for what, band in (("fitted", k.band), ("left out", c.left_out)):
+            low, high = band.interval()
+            inside = float(np.mean((low <= c.measured) & (c.measured <= high)))
+            wide = float(np.mean(high - low))
+            share = wide / float(np.mean(np.abs(c.measured)))
+            bands.append((c.food, what, percent(inside), f"{wide:.2f}", f"{share:.2f}"))
         half = 0.5 * next(r.rms for r in c.rows if r.name == "DiSECt")
         points = "" if c.per_point_rms is None else f"{c.per_point_rms:.2f}"
         costs.append(
@@ -266,7 +296,8 @@ def comparison_tables(comparisons: Sequence[FoodComparison]) -> str:
         " | a toughness for each cut point [N] | cut points",
         costs,
     )
-    return f"{curves}\n\n{cost}"
+    shares = table("food | depth is | in the 90 % band | its width [N] | width / force", bands)
+    return f"{curves}\n\n{shares}\n\n{cost}"
 
 
 def plot_comparisons(comparisons: Sequence[FoodComparison], file: Path) -> None:
@@ -282,6 +313,14 @@ def plot_comparisons(comparisons: Sequence[FoodComparison], file: Path) -> None:
     for column, c in enumerate(comparisons):
         upper, lower = axes[0, column], axes[1, column]
         upper.plot(c.time, c.measured, color="#111827", lw=1.8, label="measured")
+        shades = (
+            (c.left_out, 0.12, "ours, 90 % band of depth that was left out"),
+            (c.calibration.band, 0.25, "ours, 90 % band"),
+        )
+        for shown, alpha, name in shades:
+            upper.fill_between(
+                c.time, *shown.interval(), color=COLOURS["ours"], alpha=alpha, lw=0, label=name
+            )
         for row in c.rows:
             style = "-" if row.name == "ours" else "--"
             label = "ours" if row.name == "ours" else NAMES.get(row.name, row.name)
@@ -291,7 +330,9 @@ def plot_comparisons(comparisons: Sequence[FoodComparison], file: Path) -> None:
             )
             if row.name != "spring":
                 lower.plot(c.time, row.force - c.measured, style, color=colour, lw=1.0)
-        upper.set_title(c.food)
+        # Where the last block is left out its height is free, and the band goes into the board.
+        peak = max(c.measured.max(), *(row.force.max() for row in c.rows))
+        upper.set(title=c.food, ylim=(-0.15 * peak, 1.4 * peak))
         upper.legend(frameon=False, fontsize=7)
         lower.set_xlabel("time [s]")
         for axis in (upper, lower):
