@@ -26,6 +26,10 @@ MIN_ROWS = 300
 """Rows in the air, and as many in the food, from which each has a noise of its own."""
 FLOOR = 1e-3
 """Least standard deviation, in N and Nm."""
+LONGEST = 10.0
+"""Greatest correlation time, s."""
+STAYS = 0.5
+"""Readings come in steps where less than this share of them differs from the one before."""
 
 
 @dc.dataclass(frozen=True)
@@ -112,11 +116,14 @@ def estimate_noise(
             known[air[:, 0]] = _beside(rest[air[:, 0]], columns[air[:, 0]])
             airborne.append((grid, known, factor))
     channels = range(len(records[0].channels))
+    steps = _resolution(records)
     if min(map(_rows, (in_food, airborne))) >= MIN_ROWS:
-        parts = [(_channel(in_food, c), _channel(airborne, c)) for c in channels]
+        parts = [
+            (_channel(in_food, c, steps[c]), _channel(airborne, c, steps[c])) for c in channels
+        ]
         return tuple(dc.replace(of_food, air=of_air) for of_food, of_air in parts), True
     series = whole or [_roughness(r) for r in records]
-    return tuple(_channel(series, c) for c in channels), bool(whole)
+    return tuple(_channel(series, c, steps[c]) for c in channels), bool(whole)
 
 
 def differences(
@@ -179,8 +186,21 @@ def _roughness(record: RecordSensitivity) -> Series:
     return record.time[inside], rest, 1.0 / (1.0 - 1.0 / width)
 
 
-def _channel(series: list[Series], c: int) -> ChannelNoise:
-    """Fits the autocovariance of a channel."""
+def _resolution(records: Sequence[RecordSensitivity]) -> list[float]:
+    """Step in which each channel's readings come, the same for all forces; 0 where they do not."""
+    changes = [np.abs(np.diff(r.measured, axis=0)) for r in records]
+    out = []
+    for c in range(len(records[0].channels)):
+        alike = records[0].forces if c in records[0].forces else [c]
+        values = np.concatenate([change[:, alike].ravel() for change in changes])
+        moved = values[values > 1e-9]
+        in_steps = 0 < len(moved) < STAYS * len(values)
+        out.append(float(np.quantile(moved, 0.1)) if in_steps else 0.0)
+    return out
+
+
+def _channel(series: list[Series], c: int, resolution: float) -> ChannelNoise:
+    """Fits the autocovariance of a channel whose readings come in steps of a resolution."""
     step = float(np.median(np.concatenate([np.diff(t) for t, _, _ in series])))
     sums, counts = np.zeros(LAGS), np.zeros(LAGS)
     for _, rest, factor in series:
@@ -192,6 +212,10 @@ def _channel(series: list[Series], c: int) -> ChannelNoise:
             counts[lag] += known.sum()
     used = counts > 0
     covariance = sums[used] / counts[used]
+    rounding = resolution / np.sqrt(12.0)
+    if covariance[0] < rounding**2:
+        # Replicates are rounded alike, and stay so for as long as the force is steady.
+        return ChannelNoise(float(rounding), LONGEST, float(0.1 * rounding))
     lags = np.arange(LAGS)[used] * step
     total = max(float(covariance[0]), FLOOR**2)
 
@@ -202,7 +226,7 @@ def _channel(series: list[Series], c: int) -> ChannelNoise:
         return model - covariance / total
 
     start = np.array([np.clip(covariance[1] / total, 0.05, 0.95) if len(lags) > 1 else 0.5, -3.5])
-    fit = least_squares(misfit, start, bounds=([0.0, np.log(step)], [0.99, np.log(10.0)]))
+    fit = least_squares(misfit, start, bounds=([0.0, np.log(step)], [0.99, np.log(LONGEST)]))
     share, tau = float(fit.x[0]), float(np.exp(fit.x[1]))
     ar = max(np.sqrt(share * total), 0.1 * FLOOR)
     white = max(np.sqrt((1.0 - share) * total), 0.1 * np.sqrt(total))
