@@ -214,8 +214,11 @@ def test_a_sensor_that_reads_in_steps_is_unsure_by_what_it_rounds():
         # Nothing differs among replicates but by rounding.
         measured = step * np.round((r.predicted + 0.1) / step)
         found.records[k] = dc.replace(r, measured=measured, depth=depth)
-    noise = LinearProblem(found).noise[0]
-    assert noise.deviations(found.records[0].near).min() >= step / np.sqrt(12.0)
+    noise, r = LinearProblem(found).noise[0], found.records[0]
+    assert noise.deviations(r.near).min() >= step / np.sqrt(12.0)
+    # Where the force comes to the next step is as good as chance.
+    late = step * ((r.time > 1.5) & (r.time < 1.6))[:, None]
+    assert (late.T @ noise.solve(r.time, late, 0.0, r.near)).item() < 10.0
 
 
 def uneven(seed: int, up: float = 0.0) -> Sensitivities:

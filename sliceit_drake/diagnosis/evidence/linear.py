@@ -243,8 +243,9 @@ class LinearProblem:
     def with_noise_beside(
         self, columns: Sequence[int], coefficients: np.ndarray
     ) -> "LinearProblem":
-        """The same problem, moments included, with the noise estimated anew beside an effect that
-        differs from record to record: replicates do not share it, so that it is in their noise.
+        """The same problem, its moments as they are, with the noise estimated anew beside an effect
+        that differs from record to record: replicates do not share it, so that it is in their
+        noise.
 
         Args:
             columns: Numbers of the effect's columns [n].
@@ -252,7 +253,7 @@ class LinearProblem:
         """
         out = copy.copy(self)
         records = [
-            dc.replace(r, measured=r.measured - r.columns[:, :, list(columns)] @ g)
+            dc.replace(r, predicted=r.predicted + r.columns[:, :, list(columns)] @ g)
             for r, g in zip(self.found.records, coefficients, strict=True)
         ]
         out.noise, _ = estimate_noise(records, self.own, list(self.usual_own))

@@ -41,12 +41,14 @@ class ChannelNoise:
         tau: Its correlation time, s.
         white: Standard deviation of the rest.
         air: Noise in the air, independent of that in the food; None for the same.
+        stays: Rows for which a reading in steps stays: it is rounded once for all of them.
     """
 
     ar: float
     tau: float
     white: float
     air: "ChannelNoise | None" = None
+    stays: float = 0.0
 
     @property
     def deviation(self) -> float:
@@ -78,7 +80,10 @@ class ChannelNoise:
             parts = [(near, self), (~near, self.air)]
         for rows, noise in parts:
             if rows.any():
-                white = np.hypot(noise.white, error[rows])
+                # Jumps from step to step are as usual as what is rounded is large.
+                white = np.hypot(
+                    np.hypot(noise.white, noise.ar * np.sqrt(noise.stays)), error[rows]
+                )
                 covariance = MarkovCovariance(np.diff(time[rows]), noise.ar, noise.tau, white)
                 out[rows] = covariance.solve(columns[rows])
         return out
@@ -186,8 +191,9 @@ def _roughness(record: RecordSensitivity) -> Series:
     return record.time[inside], rest, 1.0 / (1.0 - 1.0 / width)
 
 
-def _resolution(records: Sequence[RecordSensitivity]) -> list[float]:
-    """Step in which each channel's readings come, the same for all forces; 0 where they do not."""
+def _resolution(records: Sequence[RecordSensitivity]) -> list[tuple[float, float]]:
+    """Step in which each channel's readings come, the same for all forces, 0 where they do not; and
+    the rows for which they stay."""
     changes = [np.abs(np.diff(r.measured, axis=0)) for r in records]
     out = []
     for c in range(len(records[0].channels)):
@@ -195,12 +201,14 @@ def _resolution(records: Sequence[RecordSensitivity]) -> list[float]:
         values = np.concatenate([change[:, alike].ravel() for change in changes])
         moved = values[values > 1e-9]
         in_steps = 0 < len(moved) < STAYS * len(values)
-        out.append(float(np.quantile(moved, 0.1)) if in_steps else 0.0)
+        own = np.concatenate([change[:, c] for change in changes])
+        stays = len(own) / (len(records) + np.count_nonzero(own > 1e-9))
+        out.append((float(np.quantile(moved, 0.1)) if in_steps else 0.0, float(stays)))
     return out
 
 
-def _channel(series: list[Series], c: int, resolution: float) -> ChannelNoise:
-    """Fits the autocovariance of a channel whose readings come in steps of a resolution."""
+def _channel(series: list[Series], c: int, steps: tuple[float, float]) -> ChannelNoise:
+    """Fits the autocovariance of a channel whose readings come in steps; see `_resolution`."""
     step = float(np.median(np.concatenate([np.diff(t) for t, _, _ in series])))
     sums, counts = np.zeros(LAGS), np.zeros(LAGS)
     for _, rest, factor in series:
@@ -212,10 +220,10 @@ def _channel(series: list[Series], c: int, resolution: float) -> ChannelNoise:
             counts[lag] += known.sum()
     used = counts > 0
     covariance = sums[used] / counts[used]
-    rounding = resolution / np.sqrt(12.0)
+    rounding = steps[0] / np.sqrt(12.0)
     if covariance[0] < rounding**2:
         # Replicates are rounded alike, and stay so for as long as the force is steady.
-        return ChannelNoise(float(rounding), LONGEST, float(0.1 * rounding))
+        return ChannelNoise(float(rounding), LONGEST, float(0.1 * rounding), stays=steps[1])
     lags = np.arange(LAGS)[used] * step
     total = max(float(covariance[0]), FLOOR**2)
 
